@@ -1,0 +1,1 @@
+"""Relative pose of two rolling-shutter images, aided by an IMU."""

@@ -1,0 +1,247 @@
+"""The rolling-shutter camera: pixel <-> unit ray, and the time of a row.
+
+Camera frame: x right, y down, z forward. The **raw, distorted** row decides the row time; the
+point is undistorted, the row never is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rs_relpose_ros.errors import InputError
+
+REFERENCE_ROWS = ('first', 'middle', 'last')
+READOUT_DIRECTIONS = ('down', 'up')
+
+# Legal numbers of coefficients of each model, in the order of sensor_msgs/CameraInfo and OpenCV.
+DISTORTION_COEFFICIENTS = {
+    'plumb_bob': (0, 4, 5, 8),
+    'rational_polynomial': (8, 12, 14),
+    'equidistant': (4,),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RollingShutterCamera:
+    """A calibrated camera that reads its rows one after the other.
+
+    Parameters
+    ----------
+    width, height : int
+        Size of the image [px].
+    fx, fy, cx, cy : float
+        Pinhole intrinsics [px]; pixel centres at integer coordinates, as in OpenCV.
+    distortion_model : {'plumb_bob', 'rational_polynomial', 'equidistant'}
+        As in sensor_msgs/CameraInfo (REP-104); ``'equidistant'`` is OpenCV's fisheye model.
+    distortion : sequence of float
+        Coefficients in OpenCV's order; empty for none.
+    readout_time : float
+        `height` times the line delay [s]; 0 is a global shutter. It has no default.
+    readout_direction : {'down', 'up'}
+        Whether row 0 is read first ('down') or last ('up').
+    reference_row : {'first', 'middle', 'last'}
+        The row from which row times count (rows 0, (height-1)/2, height-1): motion holds there,
+        and a relative pose relates the reference rows of its two frames.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion_model: str = 'plumb_bob'
+    distortion: tuple[float, ...] = field(default=())
+    readout_time: float
+    readout_direction: str = 'down'
+    reference_row: str = 'first'
+
+    def __post_init__(self) -> None:
+        for name in ('width', 'height'):
+            value = getattr(self, name)
+            if int(value) != value or value <= 0:
+                raise InputError(f'{name} must be a positive number of pixels, got {value!r}')
+        for name in ('fx', 'fy'):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0.0):
+                raise InputError(f'{name} must be finite and > 0 px, got {value!r}')
+        for name in ('cx', 'cy'):
+            value = getattr(self, name)
+            if not np.isfinite(value):
+                raise InputError(f'{name} must be finite, got {value!r}')
+        if not (np.isfinite(self.readout_time) and 0.0 <= self.readout_time < 1.0):
+            raise InputError(
+                'readout_time must lie in [0, 1) s (it is height times line delay; '
+                f'0 for a global shutter), got {self.readout_time!r}')
+        if self.readout_direction not in READOUT_DIRECTIONS:
+            raise InputError(f'readout_direction must be one of {READOUT_DIRECTIONS}, '
+                             f'got {self.readout_direction!r}')
+        if self.reference_row not in REFERENCE_ROWS:
+            raise InputError(
+                f'reference_row must be one of {REFERENCE_ROWS}, got {self.reference_row!r}')
+        if self.distortion_model not in DISTORTION_COEFFICIENTS:
+            raise InputError(
+                f'distortion_model must be one of {tuple(DISTORTION_COEFFICIENTS)}, '
+                f'got {self.distortion_model!r}')
+        coefficients = tuple(float(c) for c in self.distortion)
+        if not all(np.isfinite(coefficients)):
+            raise InputError(f'distortion must be finite, got {coefficients}')
+        legal = DISTORTION_COEFFICIENTS[self.distortion_model]
+        if coefficients and len(coefficients) not in legal:
+            raise InputError(
+                f'distortion of model {self.distortion_model!r} must have one of {legal} '
+                f'coefficients, got {len(coefficients)}')
+        object.__setattr__(self, 'distortion', coefficients)
+
+    # -- rows and time -----------------------------------------------------------------------
+
+    @property
+    def line_delay(self) -> float:
+        """Signed time from one row to the row below it [s]; negative when read upwards."""
+        delay = self.readout_time / self.height
+        return delay if self.readout_direction == 'down' else -delay
+
+    @property
+    def reference_row_index(self) -> float:
+        """Row from which row times count: 0, (height - 1) / 2 or height - 1."""
+        return {'first': 0.0, 'middle': (self.height - 1) / 2, 'last': self.height - 1.0}[
+            self.reference_row]
+
+    def row_times(self, rows: ArrayLike) -> NDArray[np.float64]:
+        """Row times ``tau = (row - reference row) * line_delay`` [s] of raw, distorted rows."""
+        rows = np.asarray(rows, dtype=np.float64)
+        return (rows - self.reference_row_index) * self.line_delay
+
+    @property
+    def row_time_span(self) -> tuple[float, float]:
+        """Smallest and largest row time of the image [s]."""
+        ends = self.row_times([0.0, self.height - 1.0])
+        return float(ends.min()), float(ends.max())
+
+    # -- pixels and rays ---------------------------------------------------------------------
+
+    @property
+    def camera_matrix(self) -> NDArray[np.float64]:
+        """The 3x3 intrinsic matrix."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def is_undistorted(self) -> bool:
+        """Whether the model is a plain pinhole (``'equidistant'`` never is)."""
+        return self.distortion_model != 'equidistant' and not any(self.distortion)
+
+    def project(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Raw pixels (N, 2) of points (N, 3) in the camera frame; NaN behind the camera.
+
+        A single exposure instant: a moving camera's rows are the caller's business.
+        """
+        points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
+        pixels = np.full((len(points), 2), np.nan)
+        front = points[:, 2] > 1e-9
+        if front.any():
+            normalized = points[front, :2] / points[front, 2:]
+            pixels[front] = self._distort(normalized)[0]
+        return pixels
+
+    def unproject(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Unit rays (N, 3) in the camera frame of raw pixels (N, 2).
+
+        A pixel outside the region where the distortion can be inverted gives a row of NaN.
+        """
+        return self._unproject(points)[0]
+
+    def unproject_with_jacobian(
+            self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Unit rays (N, 3) and their derivatives (N, 3, 2) by the raw pixel coordinates u, v."""
+        rays, normalized_by_pixel, scale = self._unproject(points)
+        # m = n / |n| with n = (x, y, 1): dm = (I - m m^T) dn / |n|.
+        jacobian = np.empty((len(rays), 3, 2))
+        jacobian[:, :2] = normalized_by_pixel
+        jacobian[:, 2] = 0.0
+        along = np.einsum('ni,nij->nj', rays, jacobian)
+        jacobian = (jacobian - rays[:, :, None] * along[:, None, :]) * scale[:, None, None]
+        return rays, jacobian
+
+    def _unproject(self, points: ArrayLike) -> tuple[NDArray[np.float64], ...]:
+        """Rays (N, 3), d(normalised)/d(pixel) (N, 2, 2), and 1 / |(x, y, 1)| (N,)."""
+        points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 2)
+        normalized = (points - (self.cx, self.cy)) / (self.fx, self.fy)
+        if self.is_undistorted:
+            inverse = np.broadcast_to(
+                np.diag([1.0 / self.fx, 1.0 / self.fy]), (len(points), 2, 2))
+        else:
+            normalized, inverse = self._undistort(points, normalized)
+        scale = 1.0 / np.sqrt(1.0 + (normalized**2).sum(axis=1))
+        rays = np.empty((len(points), 3))
+        rays[:, :2] = normalized * scale[:, None]
+        rays[:, 2] = scale
+        return rays, inverse, scale
+
+    def _undistort(
+            self, points: NDArray[np.float64], start: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Newton's method on OpenCV's forward model.
+
+        cv2.undistortPoints stops after five fixed-point steps, which leaves pixels of error on
+        strong distortion, and the calls that iterate longer differ between OpenCV 4 and 5.
+        """
+        if len(points) == 0:
+            return start, np.empty((0, 2, 2))
+        if self.distortion_model == 'equidistant':
+            # The fixed point overshoots far off the axis; the ideal fisheye is a safe start.
+            angle = np.linalg.norm(start, axis=1)
+            bounded = np.minimum(angle, 1.5)
+            start = start * (np.tan(bounded) / np.maximum(angle, 1e-12))[:, None]
+        normalized = start
+        with np.errstate(all='ignore'):
+            for _ in range(_NEWTON_ITERATIONS):
+                projected, jacobian = self._distort(normalized)
+                error = points - projected
+                step = np.einsum('nij,nj->ni', _inverse_2x2(jacobian), error)
+                # A step may not leave the cell in which the model is monotonic.
+                length = np.linalg.norm(step, axis=1, keepdims=True)
+                limit = 0.5 * (1.0 + np.linalg.norm(normalized, axis=1, keepdims=True))
+                normalized = normalized + step * np.minimum(1.0, limit / np.maximum(length, 1e-300))
+                if not np.any(length > 1e-12):
+                    break
+            projected, jacobian = self._distort(normalized)
+            failed = ~(np.linalg.norm(points - projected, axis=1) < 1e-6)
+            # Past the turning point of the polynomial a root exists but is a mirror image.
+            failed |= ~(np.linalg.det(jacobian) > 0.0)
+        normalized = np.where(failed[:, None], np.nan, normalized)
+        return normalized, _inverse_2x2(jacobian)
+
+    def _distort(
+            self, normalized: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Raw pixels (N, 2) of normalised points (N, 2), and the derivative (N, 2, 2)."""
+        homogeneous = np.ones((len(normalized), 1, 3))
+        homogeneous[:, 0, :2] = normalized
+        zero = np.zeros(3)
+        coefficients = np.array(self.distortion or (0.0,) * 4)
+        # The derivative by the translation is the derivative by the point itself.
+        if self.distortion_model == 'equidistant':
+            pixels, jacobian = cv2.fisheye.projectPoints(
+                homogeneous, zero, zero, self.camera_matrix, coefficients)
+            first = 11
+        else:
+            pixels, jacobian = cv2.projectPoints(
+                homogeneous, zero, zero, self.camera_matrix, coefficients)
+            first = 3
+        by_point = jacobian.reshape(-1, 2, jacobian.shape[-1])[:, :, first:first + 2]
+        return pixels.reshape(-1, 2), by_point
+
+
+_NEWTON_ITERATIONS = 30
+
+
+def _inverse_2x2(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverses of (N, 2, 2) matrices; inf or NaN where singular, never an exception."""
+    a, b, c, d = (matrices[:, i, j] for i in (0, 1) for j in (0, 1))
+    with np.errstate(all='ignore'):
+        determinant = a * d - b * c
+        return np.stack([d, -b, -c, a], axis=1).reshape(-1, 2, 2) / determinant[:, None, None]

@@ -1,0 +1,136 @@
+"""What the IMU says of one frame: how the camera turned while its rows were read, and gravity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_ros.errors import InputError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameMotion:
+    """Rotation during the read-out of one frame, and the direction of gravity.
+
+    The camera at row time tau is turned by ``Exp(w tau)`` against the reference row (constant
+    rate), or by the exact integral of the gyro when made by `from_gyro`.
+
+    Parameters
+    ----------
+    angular_velocity : (3,) array_like
+        Rate [rad/s] in the camera's own frame.
+    gravity : (3,) array_like, optional
+        Direction of free fall (**down**), any length, in the camera frame at the reference row.
+    knot_times : (K,) array_like
+        Row times [s] of the integrated gyro, increasing; empty for a constant rate.
+    knot_rotations : (K, 3, 3) array_like
+        Orientation at each knot, in the camera frame of the reference row.
+    """
+
+    angular_velocity: Array
+    gravity: Array | None = None
+    knot_times: Array | None = None
+    knot_rotations: Array | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'angular_velocity',
+                           _vector3('angular_velocity', self.angular_velocity))
+        if self.gravity is not None:
+            gravity = _vector3('gravity', self.gravity)
+            if not np.linalg.norm(gravity) > 1e-6:
+                raise InputError(
+                    'gravity must have a direction (or be None where it is not known), '
+                    f'got {gravity.tolist()}')
+            object.__setattr__(self, 'gravity', gravity)
+
+    @classmethod
+    def from_gyro(cls, times: ArrayLike, angular_velocities: ArrayLike,
+                  gravity: ArrayLike | None = None) -> FrameMotion:
+        """Exact integral of gyro samples over the rows.
+
+        Parameters
+        ----------
+        times : (K,) array_like
+            Instants [s] of the samples relative to the reference row's, strictly increasing; the
+            first and the last enclose 0 and every row time that will be asked for.
+        angular_velocities : (K, 3) array_like
+            Rates [rad/s] in the camera frame, bias removed.
+        gravity : (3,) array_like, optional
+            As in the class.
+        """
+        times = np.ascontiguousarray(times, dtype=np.float64)
+        rates = np.ascontiguousarray(angular_velocities, dtype=np.float64)
+        if times.ndim != 1 or rates.shape != (len(times), 3) or len(times) < 2:
+            raise InputError('times and angular_velocities must have shapes (K,) and (K, 3) with '
+                             f'K >= 2, got {times.shape} and {rates.shape}')
+        if not (np.isfinite(times).all() and np.isfinite(rates).all()):
+            raise InputError('times and angular_velocities must be finite')
+        steps = np.diff(times)
+        if not (steps > 0.0).all():
+            raise InputError('times must be strictly increasing')
+        if not times[0] <= 0.0 <= times[-1]:
+            raise InputError('times must enclose 0, the reference row, '
+                             f'got [{times[0]:.6f}, {times[-1]:.6f}] s')
+        # Rate linear between samples: the midpoint rate is exact to second order.
+        turns = Rotation.from_rotvec(0.5 * (rates[1:] + rates[:-1]) * steps[:, None]).as_matrix()
+        rotations = np.empty((len(times), 3, 3))
+        rotations[0] = np.eye(3)
+        for k, turn in enumerate(turns):
+            rotations[k + 1] = rotations[k] @ turn
+        span = times[-1] - times[0]
+        # As a mean over the rows: of one sample, the noise would be several times larger.
+        mean_rate = (0.5 * (rates[1:] + rates[:-1]) * steps[:, None]).sum(axis=0) / span
+        unaligned = cls(mean_rate, None, times, rotations)
+        at_reference = unaligned.rotations([0.0])[0]
+        return cls(mean_rate, None if gravity is None else np.asarray(gravity, dtype=np.float64),
+                   times, at_reference.T @ rotations)
+
+    def rotations(self, row_times: ArrayLike) -> Array:
+        """Orientation (N, 3, 3) at row times (N,) [s], in the frame of the reference row.
+
+        Raises
+        ------
+        InputError
+            A row time lies outside the gyro samples: nothing is extrapolated.
+        """
+        tau = np.asarray(row_times, dtype=np.float64)
+        if self.knot_times is None or self.knot_rotations is None:
+            return Rotation.from_rotvec(tau[:, None] * self.angular_velocity).as_matrix()
+        times = self.knot_times
+        tolerance = 1e-6
+        if len(tau) and not (times[0] - tolerance <= tau.min()
+                             and tau.max() <= times[-1] + tolerance):
+            raise InputError(
+                f'row times [{tau.min():.6f}, {tau.max():.6f}] s are not covered by the gyro '
+                f'samples, [{times[0]:.6f}, {times[-1]:.6f}] s')
+        k = np.clip(np.searchsorted(times, tau, side='right') - 1, 0, len(times) - 2)
+        # Constant rate between two knots (their rotation is already the exact integral).
+        steps = Rotation.from_matrix(
+            np.swapaxes(self.knot_rotations[:-1], 1, 2) @ self.knot_rotations[1:]).as_rotvec()
+        fraction = (tau - times[k]) / (times[k + 1] - times[k])
+        return self.knot_rotations[k] @ Rotation.from_rotvec(fraction[:, None] * steps[k]).as_matrix()
+
+    def derotate(self, rays: ArrayLike, row_times: ArrayLike) -> Array:
+        """Rays (N, 3) measured at `row_times` (N,) [s], turned into the reference row's frame."""
+        return np.einsum('nij,nj->ni', self.rotations(row_times), np.asarray(rays, dtype=np.float64))
+
+    def shifted(self, delay: float) -> FrameMotion:
+        """The same motion with the reference row `delay` seconds later."""
+        turn = self.rotations([delay])[0]
+        moved = self.gravity if self.gravity is None else turn.T @ self.gravity
+        if self.knot_times is None or self.knot_rotations is None:
+            return replace(self, gravity=moved)
+        return replace(self, gravity=moved, knot_times=self.knot_times - delay,
+                       knot_rotations=turn.T @ self.knot_rotations)
+
+
+def _vector3(name: str, value: ArrayLike) -> Array:
+    vector = np.array(value, dtype=np.float64)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise InputError(f'{name} must be 3 finite numbers, got {value!r}')
+    return vector

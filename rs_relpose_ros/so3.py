@@ -1,0 +1,99 @@
+"""Rotation kernels for compiled code; everything else uses ``scipy.spatial.transform.Rotation``."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@numba.njit(cache=True, nogil=True)
+def exp_so3(v: Array) -> Array:
+    """Rotation matrix of the rotation vector `v` (3,) [rad] (Rodrigues' formula)."""
+    x, y, z = v[0], v[1], v[2]
+    theta2 = x * x + y * y + z * z
+    if theta2 < 1e-8:
+        a = 1.0 - theta2 / 6.0
+        b = 0.5 - theta2 / 24.0
+    else:
+        theta = math.sqrt(theta2)
+        a = math.sin(theta) / theta
+        b = (1.0 - math.cos(theta)) / theta2
+    rotation = np.empty((3, 3))
+    rotation[0, 0] = 1.0 - b * (y * y + z * z)
+    rotation[1, 1] = 1.0 - b * (x * x + z * z)
+    rotation[2, 2] = 1.0 - b * (x * x + y * y)
+    rotation[0, 1] = b * x * y - a * z
+    rotation[1, 0] = b * x * y + a * z
+    rotation[0, 2] = b * x * z + a * y
+    rotation[2, 0] = b * x * z - a * y
+    rotation[1, 2] = b * y * z - a * x
+    rotation[2, 1] = b * y * z + a * x
+    return rotation
+
+
+@numba.njit(cache=True, nogil=True)
+def log_so3(rotation: Array) -> Array:
+    """Rotation vector (3,) [rad], of length at most pi, of a rotation matrix."""
+    # Through the quaternion: exact near 0 and near pi, where the trace formula loses digits.
+    q = np.empty(4)
+    trace = rotation[0, 0] + rotation[1, 1] + rotation[2, 2]
+    if trace > 0.0:
+        s = math.sqrt(trace + 1.0) * 2.0
+        q[3] = 0.25 * s
+        q[0] = (rotation[2, 1] - rotation[1, 2]) / s
+        q[1] = (rotation[0, 2] - rotation[2, 0]) / s
+        q[2] = (rotation[1, 0] - rotation[0, 1]) / s
+    else:
+        i = 0
+        if rotation[1, 1] > rotation[0, 0]:
+            i = 1
+        if rotation[2, 2] > rotation[i, i]:
+            i = 2
+        j = (i + 1) % 3
+        k = (i + 2) % 3
+        s = math.sqrt(max(rotation[i, i] - rotation[j, j] - rotation[k, k] + 1.0, 0.0)) * 2.0
+        q[i] = 0.25 * s
+        q[3] = (rotation[k, j] - rotation[j, k]) / s
+        q[j] = (rotation[j, i] + rotation[i, j]) / s
+        q[k] = (rotation[k, i] + rotation[i, k]) / s
+    if q[3] < 0.0:
+        q = -q
+    sine = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
+    if sine < 1e-9:
+        factor = 2.0
+    else:
+        factor = 2.0 * math.atan2(sine, q[3]) / sine
+    vector = np.empty(3)
+    for i in range(3):
+        vector[i] = factor * q[i]
+    return vector
+
+
+@numba.njit(cache=True, nogil=True)
+def left_jacobian_so3(v: Array) -> Array:
+    """Left Jacobian (3, 3) of SO(3): ``Exp(v + dv) = Exp(J dv) Exp(v)`` to first order."""
+    x, y, z = v[0], v[1], v[2]
+    theta2 = x * x + y * y + z * z
+    if theta2 < 1e-8:
+        b = 0.5 - theta2 / 24.0
+        c = 1.0 / 6.0 - theta2 / 120.0
+    else:
+        theta = math.sqrt(theta2)
+        b = (1.0 - math.cos(theta)) / theta2
+        c = (theta - math.sin(theta)) / (theta2 * theta)
+    jacobian = np.empty((3, 3))
+    jacobian[0, 0] = 1.0 - c * (y * y + z * z)
+    jacobian[1, 1] = 1.0 - c * (x * x + z * z)
+    jacobian[2, 2] = 1.0 - c * (x * x + y * y)
+    jacobian[0, 1] = c * x * y - b * z
+    jacobian[1, 0] = c * x * y + b * z
+    jacobian[0, 2] = c * x * z + b * y
+    jacobian[2, 0] = c * x * z - b * y
+    jacobian[1, 2] = c * y * z - b * x
+    jacobian[2, 1] = c * y * z + b * x
+    return jacobian
