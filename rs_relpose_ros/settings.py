@@ -25,6 +25,7 @@ class Declared:
     choices: tuple[str, ...] = ()
     length: int | None = None
     live: bool = False
+    kind: type = float
 
     @property
     def legal(self) -> str:
@@ -42,8 +43,6 @@ class Declared:
         """Raise InputError unless `value` is legal; says the name, what is legal and what came."""
         if isinstance(value, str | bool):
             legal = not self.choices or value in self.choices
-        elif value is None:
-            legal = True
         else:
             values = list(value) if isinstance(value, tuple | list) else [value]
             legal = self.length is None or len(values) == self.length
@@ -56,12 +55,14 @@ class Declared:
 
 def setting(default: Any, description: str, unit: str = '', *, low: float = -math.inf,
             high: float = math.inf, choices: tuple[str, ...] = (), length: int | None = None,
-            live: bool = False) -> Any:
+            live: bool = False, kind: type | None = None) -> Any:
     """Field of a configuration dataclass, with its declaration as metadata.
 
     `live`: whether a running node may change it. A tuple setting declares its `length`.
+    `kind`: the type of a setting that has no default (None), which the user must give.
     """
-    declared = Declared(description, unit, low, high, choices, length, live)
+    declared = Declared(description, unit, low, high, choices, length, live,
+                        type(default) if kind is None else kind)
     return dataclasses.field(default=default, metadata={'declared': declared})
 
 
@@ -75,10 +76,15 @@ def check_settings(config: Any) -> None:
     for field in dataclasses.fields(config):
         if 'declared' in field.metadata:
             value = getattr(config, field.name)
-            kind = type(field.default)
+            kind = declared(field).kind
+            if value is None and field.default is None:
+                continue
+            if kind is tuple and isinstance(value, list | tuple):
+                value = tuple(float(v) if type(v) is int else v for v in value)
+                object.__setattr__(config, field.name, value)
             if kind is float and type(value) is int:
                 object.__setattr__(config, field.name, float(value))
-            elif kind in (bool, int, str) and type(value) is not kind:
+            elif kind in (bool, int, str, tuple) and type(value) is not kind:
                 raise InputError(
                     f'{field.name} must be of type {kind.__name__}, got {value!r}')
             declared(field).check(field.name, value)
