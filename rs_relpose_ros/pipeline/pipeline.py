@@ -1,0 +1,222 @@
+"""Frames in, keyframe pairs out: the part that the live node and the replay share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.camera import RollingShutterCamera
+from rs_relpose_ros.errors import MissingInputError
+from rs_relpose_ros.estimator.estimate import estimate_relative_pose
+from rs_relpose_ros.imu.frame_imu import FrameImu, GyroSegment
+from rs_relpose_ros.imu.integration import integrate_rotation
+from rs_relpose_ros.pipeline.calibration import Calibration
+from rs_relpose_ros.pipeline.frame import Frame
+from rs_relpose_ros.pipeline.pair import PairResult
+from rs_relpose_ros.pipeline.parameters import Parameters
+from rs_relpose_ros.result import RelativePose, Status
+from rs_relpose_ros.tracking.keyframes import KeyframeDecision, decide_keyframe
+from rs_relpose_ros.tracking.matches import Matches
+from rs_relpose_ros.tracking.tracker import make_tracker
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _View:
+    """A processed frame: what a later pair needs of it."""
+
+    stamp_ns: int
+    imu: FrameImu
+    image: NDArray[np.uint8]
+
+
+class Pipeline:
+    """Tracks frames against a reference keyframe and estimates a pose whenever a pair closes.
+
+    Parameters
+    ----------
+    parameters : Parameters
+    keep_images : bool
+        Whether results carry the two images (for pictures).
+    """
+
+    def __init__(self, parameters: Parameters, keep_images: bool = False) -> None:
+        missing = parameters.sensor.missing()
+        if missing:
+            raise MissingInputError('parameters are missing: ' + ', '.join(missing))
+        self._parameters = parameters
+        self._keep_images = keep_images
+        self._tracker = make_tracker(parameters.tracking)
+        self._calibration: Calibration | None = None
+        self._camera: RollingShutterCamera | None = None
+        self._reference: _View | None = None
+        self._previous: _View | None = None
+        self._gyro: GyroSegment | None = None
+        self._frames = 0
+
+    def update(self, parameters: Parameters) -> None:
+        """Take over parameters that may change while running (settings declared `live`)."""
+        self._parameters = parameters
+
+    def reset(self) -> None:
+        """Forget the reference keyframe: the next frame starts anew."""
+        self._tracker.reset()
+        self._reference = self._previous = self._gyro = None
+        self._frames = 0
+
+    def process(self, frame: Frame, imu: FrameImu) -> PairResult | None:
+        """Track `frame`; the estimate of the pair that it closes, or None.
+
+        Frames come in the order of their stamps. A frame whose calibration differs from the last
+        one's starts anew.
+        """
+        if frame.calibration != self._calibration:
+            self.reset()
+            self._calibration = frame.calibration
+            self._camera = sensor_camera(frame.calibration, self._parameters)
+        view = _View(frame.stamp_ns, imu, frame.image)
+        if self._reference is None or self._previous is None:
+            self._tracker.start(frame.image)
+            self._restart_from(view)
+            return None
+        self._frames += 1
+        self._gyro = _extended(self._gyro, imu.since_previous, first=self._frames == 1)
+        matches = self._tracker.track(frame.image, self._predictor(self._previous.imu, imu))
+        self._previous = view
+        parallax, _ = self._parallax(matches, view)
+        decision = decide_keyframe(
+            self._parameters.keyframes, parallax, self._interval(view), self._frames,
+            self._tracker.tracked_fraction)
+        if decision is KeyframeDecision.WAIT:
+            return None
+        result = self._close_pair(frame, view)
+        self._tracker.promote()
+        self._restart_from(view)
+        return result
+
+    # -- one pair ----------------------------------------------------------------------------
+
+    def _close_pair(self, frame: Frame, view: _View) -> PairResult:
+        reference, camera = self._reference, self._camera
+        assert reference is not None and camera is not None and self._calibration is not None
+        matches = self._tracker.refined_matches()
+        pixels1 = self._calibration.to_sensor(matches.points1)
+        pixels2 = self._calibration.to_sensor(matches.points2)
+        pair = self._parameters.pair
+        gyro_rotation = gyro_covariance = None
+        if self._gyro is not None:
+            gyro_rotation, gyro_covariance = integrate_rotation(
+                self._gyro.stamps_ns, self._gyro.angular_velocities, self._parameters.imu)
+        motion1, motion2 = reference.imu.motion, view.imu.motion
+        config = self._parameters.estimator
+        sigmas = [m.gravity_sigma for m in (reference.imu, view.imu)]
+        if pair.use_gravity and None not in sigmas:
+            # One figure for both frames; the filter's own, where it is worse than the told one.
+            config = replace(config, gravity_sigma=min(
+                max(config.gravity_sigma, *(s for s in sigmas if s is not None)), 1.5))
+        else:
+            motion1, motion2 = replace(motion1, gravity=None), replace(motion2, gravity=None)
+        pose = estimate_relative_pose(
+            pixels1, pixels2, camera, motion1, motion2,
+            relative_rotation=gyro_rotation if pair.use_gyro_rotation else None,
+            relative_rotation_covariance=gyro_covariance if pair.use_gyro_rotation else None,
+            interval=self._interval(view), config=config, quality=matches.quality,
+            rng=np.random.default_rng([pair.seed, reference.stamp_ns, view.stamp_ns]))
+        parallax, (rays1, rays2, tau1, tau2) = self._parallax(matches, view)
+        return PairResult(
+            reference_stamp_ns=reference.stamp_ns, stamp_ns=view.stamp_ns,
+            frame_id=frame.frame_id, interval=self._interval(view), pose=pose, matches=matches,
+            row_times1=tau1, row_times2=tau2, rays1=rays1, rays2=rays2, parallax=parallax,
+            gyro_rotation=gyro_rotation,
+            image1=reference.image if self._keep_images else None,
+            image2=frame.image if self._keep_images else None)
+
+    def _restart_from(self, view: _View) -> None:
+        self._reference = self._previous = view
+        self._gyro = None
+        self._frames = 0
+
+    def _interval(self, view: _View) -> float:
+        assert self._reference is not None
+        return (view.imu.reference_ns - self._reference.imu.reference_ns) * 1e-9
+
+    def _parallax(self, matches: Matches,
+                  view: _View) -> tuple[float, tuple[Array, Array, Array, Array]]:
+        """Median parallax [px] after derotation, and the derotated rays with their row times."""
+        camera, calibration, reference = self._camera, self._calibration, self._reference
+        assert camera is not None and calibration is not None and reference is not None
+        pixels1 = calibration.to_sensor(matches.points1)
+        pixels2 = calibration.to_sensor(matches.points2)
+        tau1, tau2 = camera.row_times(pixels1[:, 1]), camera.row_times(pixels2[:, 1])
+        rays1 = reference.imu.motion.derotate(camera.unproject(pixels1), tau1)
+        rays2 = view.imu.motion.derotate(camera.unproject(pixels2), tau2)
+        if len(rays1) == 0:
+            return 0.0, (rays1, rays2, tau1, tau2)
+        if self._gyro is not None:
+            rotation, _ = integrate_rotation(
+                self._gyro.stamps_ns, self._gyro.angular_velocities, self._parameters.imu)
+        else:
+            rotation = best_rotation(rays1, rays2)
+        parallax = np.linalg.norm(np.cross(rays1, rays2 @ rotation.T), axis=1)
+        return float(camera.fx * np.nanmedian(parallax)), (rays1, rays2, tau1, tau2)
+
+    def _predictor(self, previous: FrameImu, current: FrameImu) -> Callable[[Array], Array] | None:
+        """Where the gyro expects previous-image points in the current image; None without gyro."""
+        if current.since_previous is None:
+            return None
+        camera, calibration = self._camera, self._calibration
+        assert camera is not None and calibration is not None
+        rotation, _ = integrate_rotation(
+            current.since_previous.stamps_ns, current.since_previous.angular_velocities,
+            self._parameters.imu)
+
+        def predict(points: Array) -> Array:
+            pixels = calibration.to_sensor(points)
+            rays = previous.motion.derotate(camera.unproject(pixels),
+                                            camera.row_times(pixels[:, 1])) @ rotation
+            first, last = camera.row_time_span
+            row_times = camera.row_times(pixels[:, 1])
+            for _ in range(2):   # the row that sees the point depends on where the point is
+                turned = current.motion.rotations(np.clip(row_times, first, last))
+                predicted = camera.project(np.einsum('nji,nj->ni', turned, rays))
+                row_times = np.where(np.isfinite(predicted[:, 1]),
+                                     camera.row_times(predicted[:, 1]), row_times)
+            return calibration.to_image(predicted)
+
+        return predict
+
+
+def sensor_camera(calibration: Calibration, parameters: Parameters) -> RollingShutterCamera:
+    """Camera model of the full sensor; published pixels map to it by `Calibration.to_sensor`."""
+    sensor = parameters.sensor
+    if sensor.readout_time is None:
+        raise MissingInputError('parameter readout_time is not set: give image height times line '
+                                'delay in seconds (0 for a global shutter)')
+    return RollingShutterCamera(
+        width=calibration.width, height=calibration.height, fx=calibration.fx, fy=calibration.fy,
+        cx=calibration.cx, cy=calibration.cy, distortion_model=calibration.distortion_model,
+        distortion=calibration.distortion, readout_time=sensor.readout_time,
+        readout_direction=sensor.readout_direction, reference_row=sensor.stamp_row)
+
+
+def best_rotation(rays1: Array, rays2: Array) -> Array:
+    """Rotation (3, 3) that best maps unit `rays2` onto `rays1` (Kabsch), for want of a gyro."""
+    u, _, vt = np.linalg.svd(rays1.T @ rays2)
+    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
+
+
+def _extended(gyro: GyroSegment | None, segment: GyroSegment | None,
+              first: bool) -> GyroSegment | None:
+    """Gyro since the reference, continued by one frame; None as soon as a part is missing."""
+    if segment is None:
+        return None
+    if first:
+        return segment
+    return None if gyro is None else gyro.joined(segment)
+
+
+__all__ = ['Pipeline', 'RelativePose', 'Status', 'best_rotation', 'sensor_camera']
