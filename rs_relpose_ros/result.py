@@ -8,6 +8,8 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.so3 import skew
+
 Array = NDArray[np.float64]
 
 
@@ -89,7 +91,7 @@ class RelativePose:
         """Pose of camera 1 in camera 2, covariance and velocities exchanged accordingly."""
         R_inv = self.R.T
         # t' = -R^T t: dt' = -R^T (dt + t x dtheta); theta' = -R^T theta.
-        tx = _skew(self.t)
+        tx = skew(self.t)
         jacobian = np.zeros((6, 6))
         jacobian[:3, :3] = -R_inv
         jacobian[:3, 3:] = -R_inv @ tx
@@ -102,6 +104,3 @@ class RelativePose:
             model=self.model, velocity_sigma=self.velocity_sigma, iterations=self.iterations,
             residual_rms=self.residual_rms, duration=self.duration)
 
-
-def _skew(v: Array) -> Array:
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

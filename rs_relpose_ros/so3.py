@@ -97,3 +97,8 @@ def left_jacobian_so3(v: Array) -> Array:
     jacobian[1, 2] = c * y * z - b * x
     jacobian[2, 1] = c * y * z + b * x
     return jacobian
+
+
+def skew(v: Array) -> Array:
+    """Cross-product matrix (3, 3) of a vector (3,): ``skew(a) @ b = a x b``."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

@@ -1,0 +1,1 @@
+"""Robust estimation of one frame pair: hypotheses, consensus, refinement, covariance."""

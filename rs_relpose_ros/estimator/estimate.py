@@ -1,0 +1,423 @@
+"""One frame pair, end to end: derotate, sample, optimise, refine, covariance."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rs_relpose_ros.camera import RollingShutterCamera
+from rs_relpose_ros.config import EstimatorConfig
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.estimator import sampson
+from rs_relpose_ros.estimator.alternating import refine_alternating
+from rs_relpose_ros.estimator.consensus import SCALES
+from rs_relpose_ros.estimator.hypotheses import (
+    ANGULAR_3PT,
+    ANGULAR_5PT,
+    GYRO_2PT,
+    UNIFORM_9PT,
+    UNIFORM_11PT,
+    Knowledge,
+    gravity_alignment,
+)
+from rs_relpose_ros.estimator.local_optimisation import (
+    cheirality_sign,
+    optimise,
+    select_inliers,
+    signed,
+)
+from rs_relpose_ros.estimator.map_fit import PINNED, Priors, State, normal_equations
+from rs_relpose_ros.estimator.problem import (
+    PairState,
+    TwoViewProblem,
+    build_problem,
+    middle_row_delay,
+    to_reference_row,
+)
+from rs_relpose_ros.estimator.rotation_only import fit_rotation, transfer_errors
+from rs_relpose_ros.estimator.sampling import POOL, sample_hypotheses
+from rs_relpose_ros.estimator.velocity_prior import GRID, fit_with_evidence, with_velocity_sigma
+from rs_relpose_ros.motion import FrameMotion
+from rs_relpose_ros.result import RelativePose, Status
+from rs_relpose_ros.so3 import exp_so3
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class SolverMode:
+    """What a solver assumes and which generators it samples."""
+
+    model: str
+    derotate: bool
+    velocities: bool
+    generators: tuple[int, ...]
+    needs_gravity: bool = False
+
+
+MODES = {
+    'auto': SolverMode('uniform', True, True, (GYRO_2PT, ANGULAR_3PT, ANGULAR_5PT)),
+    'uniform_9pt': SolverMode('uniform', True, True, (UNIFORM_9PT,), needs_gravity=True),
+    'uniform_11pt': SolverMode('uniform', True, True, (UNIFORM_11PT,)),
+    'linear_9pt': SolverMode('linear', False, True, (UNIFORM_9PT,), needs_gravity=True),
+    'angular_5pt': SolverMode('angular', True, False, (ANGULAR_5PT,)),
+    'angular_3pt': SolverMode('angular', True, False, (ANGULAR_3PT,), needs_gravity=True),
+    'global_5pt': SolverMode('global', False, False, (ANGULAR_5PT,)),
+}
+
+# Prior sigma of the velocities while hypotheses are compared [baselines per second].
+SAMPLING_VELOCITY_SIGMA = 3.0
+# A translation direction less certain than this says nothing.
+MAX_TRANSLATION_SIGMA = 0.5
+
+
+def estimate_relative_pose(
+        points1: ArrayLike, points2: ArrayLike, camera: RollingShutterCamera, motion1: FrameMotion,
+        motion2: FrameMotion, relative_rotation: ArrayLike | None = None,
+        relative_rotation_covariance: ArrayLike | None = None, interval: float | None = None,
+        config: EstimatorConfig | None = None, rng: int | np.random.Generator = 0, *,
+        quality: ArrayLike | None = None) -> RelativePose:
+    """Relative pose of two rolling-shutter frames from matches, gyro and gravity.
+
+    Parameters
+    ----------
+    points1, points2 : (N, 2) array_like
+        Matches in raw (distorted) pixels.
+    camera : RollingShutterCamera
+        The pose relates its reference rows.
+    motion1, motion2 : FrameMotion
+        Angular velocity and gravity of each frame at its reference row; gravity may be None.
+    relative_rotation : (3, 3) array_like, optional
+        ``R_1^T R_2`` between the reference rows as predicted from the gyro.
+    relative_rotation_covariance : (3, 3) array_like, optional
+        Of its error dtheta in camera 1 [rad^2]: ``R_true = Exp(dtheta) relative_rotation``. Both
+        or neither.
+    interval : float, optional
+        Seconds between the two reference instants.
+    config : EstimatorConfig, optional
+    rng : int or numpy.random.Generator
+        Equal input and state give an equal result, bit by bit.
+    quality : (N,) array_like, optional
+        Higher is better: the order in which matches are sampled.
+
+    Returns
+    -------
+    RelativePose
+        Falsy, with `status` and `reason`, where the data hold no pose.
+
+    Raises
+    ------
+    InputError
+        (a ValueError) An argument of the wrong shape, not finite, or contradictory.
+
+    Notes
+    -----
+    Design: hypotheses from derotated rays (gyro rotation and 2 points, angular 3- and 5-point),
+    multi-scale MSAC, local optimisation of the uniform model on a shrinking threshold, joint MAP
+    fit with the velocity prior chosen by its evidence, covariance from the Hessian; see
+    `docs/estimator.md`.
+
+    Examples
+    --------
+    >>> camera = RollingShutterCamera(width=640, height=480, fx=450.0, fy=450.0, cx=319.5,
+    ...                               cy=239.5, readout_time=0.03)
+    >>> still = FrameMotion(angular_velocity=[0.0, 0.0, 0.0])
+    >>> pose = estimate_relative_pose([[1.0, 2.0]], [[1.5, 2.0]], camera, still, still)
+    >>> bool(pose), pose.status.value
+    (False, 'TOO_FEW_MATCHES')
+    """
+    started = time.perf_counter()
+    config = EstimatorConfig() if config is None else config
+    points1, points2, order = _checked_matches(points1, points2, quality)
+    rotation, rotation_covariance = _checked_rotation(
+        relative_rotation, relative_rotation_covariance)
+    if interval is not None and not (np.isfinite(interval) and interval > 0.0):
+        raise InputError(f'interval must be a positive number of seconds or None, got {interval}')
+    mode = MODES[config.solver]
+    if mode.needs_gravity and (motion1.gravity is None or motion2.gravity is None):
+        raise InputError(f'solver {config.solver!r} needs gravity in both frames; use auto, '
+                         'uniform_11pt or angular_5pt without it')
+    problem = build_problem(points1, points2, camera, motion1, motion2, rotation,
+                            rotation_covariance, mode.derotate)
+    seed = np.array([np.random.default_rng(rng).integers(2**63)], dtype=np.uint64)
+    pose = _Estimation(problem, mode, config, order, seed).run(middle_row_delay(camera))
+    object.__setattr__(pose, 'duration', time.perf_counter() - started)
+    return pose
+
+
+class _Estimation:
+    """The steps of one estimate, in the order of `run`."""
+
+    def __init__(self, problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig,
+                 order: NDArray[np.int64], seed: NDArray[np.uint64]) -> None:
+        self.problem, self.mode, self.config = problem, mode, config
+        self.order = order[problem.valid[order]]
+        self.seed = seed
+        self.angle_sigma = config.pixel_sigma / problem.focal
+        self.priors = _priors(problem, mode, config)
+        self.iterations = 0
+
+    def run(self, delay: float) -> RelativePose:
+        problem, config = self.problem, self.config
+        if len(self.order) < config.min_inliers:
+            return self._failure(Status.TOO_FEW_MATCHES,
+                                 f'{len(self.order)} usable matches, fewer than min_inliers = '
+                                 f'{config.min_inliers}')
+        # 1. Hypotheses from minimal samples, ranked by multi-scale MSAC.
+        hypotheses = self._sample()
+        # 2. Local optimisation of each; the best in the cost of the full model.
+        state = self._best(hypotheses)
+        if state is None:
+            return self._failure(Status.NO_CONSENSUS, 'no hypothesis explains the matches')
+        # 3. Refinement on its inliers.
+        state, inliers, velocity_sigma, sigma = self._refine(state)
+        count = int(inliers.sum())
+        chance = self._inliers_by_chance()
+        if count < max(config.min_inliers, chance):
+            return self._failure(
+                Status.NO_CONSENSUS, f'{count} of {len(self.order)} matches agree, fewer than '
+                f'max(min_inliers = {config.min_inliers}, {chance} expected by chance)')
+        # 4. Is there a translation at all?
+        turned = self._rotation_only(state, inliers, delay)
+        if turned is not None:
+            return turned
+        # 5. Covariance at the optimum, then from the middle to the reference row.
+        final = self._with_covariance(state, inliers, velocity_sigma, sigma)
+        pose = to_reference_row(final, -delay, *self._turns(state, -delay))
+        return self._result(pose, state, inliers, velocity_sigma)
+
+    # -- steps -------------------------------------------------------------------------------
+
+    def _sample(self) -> list[State]:
+        problem, config = self.problem, self.config
+        eye, zero = np.eye(3), np.zeros(3)
+        align1, align2 = eye, eye
+        g1, g2 = problem.motion1.gravity, problem.motion2.gravity
+        if g1 is not None and g2 is not None:
+            align1, align2 = gravity_alignment(g1), gravity_alignment(g2)
+        start = problem.rotation if problem.rotation is not None else eye
+        knowledge = Knowledge(align1, align2, np.ascontiguousarray(start))
+        threshold2 = (config.threshold * SCALES / problem.focal)**2
+        pool_R, pool_x = np.zeros((POOL, 3, 3)), np.zeros((POOL, 9))
+        pool_cost = np.full(POOL, np.inf)
+        best_inliers = 0
+        for generator in self.mode.generators:
+            if generator == GYRO_2PT and problem.rotation is None:
+                continue
+            if generator == ANGULAR_3PT and (g1 is None or g2 is None):
+                continue
+            drawn, best_inliers = sample_hypotheses(
+                generator, problem.points, knowledge, self.order, self.seed, threshold2,
+                config.confidence, config.max_iterations, best_inliers, pool_R, pool_x, pool_cost)
+            self.iterations += drawn
+        found = np.argsort(pool_cost)[:np.isfinite(pool_cost).sum()]
+        return [State(pool_R[k].copy(), pool_x[k, :3] / np.linalg.norm(pool_x[k, :3]),
+                      pool_x[k, 3:6].copy(), pool_x[k, 6:9].copy(), zero, zero) for k in found]
+
+    def _best(self, hypotheses: list[State]) -> State | None:
+        config, problem = self.config, self.problem
+        if config.refinement != 'map':
+            # The paper's way: the best hypothesis as it is.
+            return self._in_front(hypotheses[0]) if hypotheses else None
+        best, best_cost = None, np.inf
+        priors = with_velocity_sigma(self.priors, SAMPLING_VELOCITY_SIGMA) \
+            if self.mode.velocities or self.mode.derotate else self.priors
+        for start in hypotheses:
+            state, cost = optimise(
+                problem.observations, problem.valid, start, priors, config.pixel_sigma,
+                config.threshold, self.angle_sigma)
+            if cost < best_cost:
+                best, best_cost = state, cost
+        return best
+
+    def _in_front(self, state: State) -> State:
+        near = np.abs(sampson.residuals(self.problem.observations, *state)) \
+            < self.config.threshold * SCALES[1]
+        return signed(state, cheirality_sign(
+            self.problem.observations, near & self.problem.valid, state))
+
+    def _refine(self, state: State) -> tuple[State, NDArray[np.bool_], float, float]:
+        config, problem = self.config, self.problem
+        free = self.mode.velocities or (self.mode.derotate and config.refinement == 'map')
+        if config.refinement == 'map':
+            grid = GRID if free else np.array([1.0 / np.sqrt(PINNED)])
+            return fit_with_evidence(
+                problem.observations, problem.valid, state, self.priors, config.pixel_sigma,
+                config.threshold, self.angle_sigma, grid)
+        inliers = select_inliers(problem.observations, problem.valid, state, config.threshold,
+                                 self.angle_sigma)
+        if config.refinement == 'alternating' and inliers.sum() >= 12:
+            state = self._in_front(refine_alternating(
+                problem.observations, inliers, state, config.pixel_sigma, free))
+            inliers = select_inliers(problem.observations, problem.valid, state, config.threshold,
+                                     self.angle_sigma)
+        sigma = SAMPLING_VELOCITY_SIGMA if free else 1.0 / np.sqrt(PINNED)
+        return state, inliers, sigma, config.pixel_sigma
+
+    def _inliers_by_chance(self) -> int:
+        """Inliers that the best of many fits reaches on random matches (about 5 sigma)."""
+        size = self.problem.focal
+        expected = len(self.order) * min(4.0 * self.config.threshold / size, 0.5)
+        return int(expected + 5.0 * np.sqrt(expected)) + 6
+
+    def _rotation_only(self, state: State, inliers: NDArray[np.bool_],
+                       delay: float) -> RelativePose | None:
+        problem, config = self.problem, self.config
+        R, information = fit_rotation(
+            problem.observations, inliers, np.ascontiguousarray(state.R), self.priors,
+            problem.focal, config.pixel_sigma)
+        left = float(np.median(transfer_errors(problem.observations, R, problem.focal)[inliers]))
+        if left > max(config.min_parallax, 2.5 * config.pixel_sigma):
+            return None
+        # Turned back to the reference row; the translation takes no part.
+        turn1, turn2 = self._turns(state, -delay)
+        covariance = np.full((6, 6), np.nan)
+        covariance[3:, 3:] = turn1.T @ np.linalg.inv(information) @ turn1
+        noise = 2.5 * config.pixel_sigma
+        status = Status.PURE_ROTATION if left < noise else Status.LOW_PARALLAX
+        return RelativePose(
+            status=status,
+            reason=f'median parallax after the best rotation is {left:.2f} px: no translation can '
+                   'be seen',
+            R=turn1.T @ R @ turn2, covariance=covariance, inliers=inliers,
+            angular_velocity1=problem.motion1.angular_velocity,
+            angular_velocity2=problem.motion2.angular_velocity, model='angular',
+            iterations=self.iterations,
+            residual_rms=float(np.sqrt(np.mean(
+                transfer_errors(problem.observations, R, problem.focal)[inliers]**2))))
+
+    def _with_covariance(self, state: State, inliers: NDArray[np.bool_], velocity_sigma: float,
+                         sigma: float) -> PairState:
+        """Covariance of (dt, dtheta, dv_1, dv_2, dw_1, dw_2) from the regularised Hessian."""
+        priors = with_velocity_sigma(self.priors, velocity_sigma)
+        hessian, _, _ = normal_equations(self.problem.observations, inliers, state, priors, sigma)
+        local = np.linalg.inv(hessian)
+        # Local parameters (theta, tangent, d1, d2, dw1, dw2 in frame 1) to the state's.
+        jacobian = np.zeros((18, 17))
+        jacobian[0:3, 3:5] = sampson.tangent_basis(state.t)
+        jacobian[3:6, 0:3] = np.eye(3)
+        jacobian[6:9, 5:8] = np.eye(3)
+        # v_2 = R^T d_2, w_2 = w + R^T dw_2: the error of R turns them with it.
+        jacobian[9:12, 8:11] = state.R.T
+        jacobian[9:12, 0:3] = state.R.T @ _skew_of(state.d2)
+        jacobian[12:15, 11:14] = np.eye(3)
+        jacobian[15:18, 14:17] = state.R.T
+        w1 = self.problem.motion1.angular_velocity + state.dw1
+        w2 = self.problem.motion2.angular_velocity + state.R.T @ state.dw2
+        return PairState(state.R, state.t, state.d1, state.R.T @ state.d2, w1, w2,
+                         jacobian @ local @ jacobian.T)
+
+    def _turns(self, state: State, delay: float) -> tuple[Array, Array]:
+        """How each camera turns from the middle row to the one `delay` later, as corrected."""
+        problem = self.problem
+        turn1 = problem.motion1.rotations([delay])[0]
+        turn2 = problem.motion2.rotations([delay])[0]
+        if not self.mode.derotate:
+            return np.eye(3), np.eye(3)
+        return (exp_so3(delay * state.dw1) @ turn1,
+                exp_so3(delay * (state.R.T @ state.dw2)) @ turn2)
+
+    def _result(self, pose: PairState, state: State, inliers: NDArray[np.bool_],
+                velocity_sigma: float) -> RelativePose:
+        translation_sigma = np.sqrt(max(np.trace(pose.covariance[:3, :3]), 0.0))
+        r = sampson.residuals(self.problem.observations, *state)[inliers]
+        carries_pose = translation_sigma <= MAX_TRANSLATION_SIGMA
+        v2w2 = np.r_[9:12, 15:18]
+        return RelativePose(
+            status=Status.OK if carries_pose else Status.LOW_PARALLAX,
+            reason='' if carries_pose else 'the direction of translation is uncertain by '
+            f'{np.degrees(translation_sigma):.0f} deg: too little parallax',
+            R=pose.R, t=pose.t if carries_pose else np.full(3, np.nan),
+            linear_velocity1=pose.v1, linear_velocity2=pose.v2, angular_velocity1=pose.w1,
+            angular_velocity2=pose.w2, inliers=inliers, covariance=pose.covariance[:6, :6],
+            velocity_covariance=pose.covariance[np.ix_(v2w2, v2w2)], model=self.mode.model,
+            velocity_sigma=velocity_sigma, iterations=self.iterations,
+            residual_rms=float(np.sqrt(np.mean(r**2))))
+
+    def _failure(self, status: Status, reason: str) -> RelativePose:
+        return RelativePose(status=status, reason=reason, model=self.mode.model,
+                            iterations=self.iterations,
+                            inliers=np.zeros(len(self.problem.valid), dtype=bool))
+
+
+def warm_up() -> None:
+    """Compile (or load from the cache) every kernel, so that the first estimate is not slow."""
+    rng = np.random.default_rng(0)
+    camera = RollingShutterCamera(width=640, height=480, fx=450.0, fy=450.0, cx=319.5, cy=239.5,
+                                  readout_time=0.03)
+    down = np.array([0.0, 1.0, 0.0])
+    motion = FrameMotion([0.0, 0.1, 0.0], gravity=down)
+    world = rng.uniform([-4.0, -3.0, 4.0], [4.0, 3.0, 12.0], (100, 3))
+    points1, points2 = camera.project(world), camera.project(world - [0.5, 0.0, 0.0])
+    for solver in MODES:
+        estimate_relative_pose(points1, points2, camera, motion, motion, np.eye(3),
+                               1e-4 * np.eye(3), config=EstimatorConfig(solver=solver))
+
+
+def _priors(problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig) -> Priors:
+    g1, g2 = problem.motion1.gravity, problem.motion2.gravity
+    known = g1 is not None and g2 is not None
+    unit1 = g1 / np.linalg.norm(g1) if g1 is not None else np.zeros(3)
+    unit2 = g2 / np.linalg.norm(g2) if g2 is not None else np.zeros(3)
+    rotation = problem.rotation if problem.rotation is not None else np.eye(3)
+    information = problem.rotation_information
+    return Priors(
+        unit1, unit2, config.gravity_sigma**-2 if known else 0.0,
+        config.gyro_sigma**-2 if mode.derotate else PINNED,
+        SAMPLING_VELOCITY_SIGMA**-2 if mode.velocities or mode.derotate else PINNED,
+        np.ascontiguousarray(rotation),
+        np.ascontiguousarray(information) if information is not None else np.zeros((3, 3)))
+
+
+def _skew_of(v: Array) -> Array:
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def _checked_matches(points1: ArrayLike, points2: ArrayLike, quality: ArrayLike | None,
+                     ) -> tuple[Array, Array, NDArray[np.int64]]:
+    checked = []
+    for name, value in (('points1', points1), ('points2', points2)):
+        points = np.ascontiguousarray(value, dtype=np.float64)
+        if points.size == 0:
+            points = points.reshape(0, 2)
+        if points.ndim != 2 or points.shape[1] != 2:
+            raise InputError(f'{name} must have shape (N, 2), got {points.shape}')
+        if not np.isfinite(points).all():
+            raise InputError(f'{name} must be finite pixels, got NaN or inf in row '
+                             f'{int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])}')
+        if points.size and np.abs(points).max() > 1e6:
+            raise InputError(f'{name} must be pixels within 1e6, got {np.abs(points).max():g}')
+        checked.append(points)
+    if len(checked[0]) != len(checked[1]):
+        raise InputError('points1 and points2 must have the same length, '
+                         f'got {len(checked[0])} and {len(checked[1])}')
+    order = np.arange(len(checked[0]))
+    if quality is not None:
+        values = np.asarray(quality, dtype=np.float64)
+        if values.shape != order.shape or not np.isfinite(values).all():
+            raise InputError(f'quality must be {len(order)} finite numbers, '
+                             f'got shape {values.shape}')
+        order = np.argsort(-values, kind='stable')
+    return checked[0], checked[1], order
+
+
+def _checked_rotation(rotation: ArrayLike | None, covariance: ArrayLike | None,
+                      ) -> tuple[Array | None, Array | None]:
+    if rotation is None and covariance is None:
+        return None, None
+    if rotation is None or covariance is None:
+        raise InputError('relative_rotation and relative_rotation_covariance go together: give '
+                         'both or neither')
+    R = np.array(rotation, dtype=np.float64)
+    if R.shape != (3, 3) or not (np.allclose(R @ R.T, np.eye(3), atol=1e-6)
+                                 and np.linalg.det(R) > 0.0):
+        raise InputError(f'relative_rotation must be a (3, 3) rotation matrix, got {R.tolist()}')
+    C = np.array(covariance, dtype=np.float64)
+    if C.shape != (3, 3) or not np.isfinite(C).all() or not np.allclose(C, C.T, atol=1e-9) \
+            or np.linalg.eigvalsh(C).min() < -1e-12:
+        raise InputError('relative_rotation_covariance must be a (3, 3) covariance matrix '
+                         f'[rad^2], got {C.tolist()}')
+    return R, C

@@ -1,0 +1,83 @@
+"""Hypothesis generators: minimal samples to (R, t, d_1, d_2), by number, for compiled loops."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+GYRO_2PT, ANGULAR_3PT, ANGULAR_5PT, UNIFORM_9PT, UNIFORM_11PT = range(5)
+SAMPLE_SIZES = np.array([2, 3, 5, 9, 11])
+MAX_SOLUTIONS = 40
+
+_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
+
+
+class Knowledge(NamedTuple):
+    """What the IMU gives to the generators: gravity-aligning rotations, predicted rotation."""
+
+    align1: Array
+    align2: Array
+    rotation: Array
+
+
+@_jit
+def _gyro_2pt(f1: Array, f2: Array, rotation: Array, R_out: Array, x_out: Array) -> int:
+    """The gyro's rotation, and t perpendicular to both normals ``n = f_1 x R f_2``."""
+    n = np.empty((2, 3))
+    for i in range(2):
+        hx = rotation[0, 0] * f2[i, 0] + rotation[0, 1] * f2[i, 1] + rotation[0, 2] * f2[i, 2]
+        hy = rotation[1, 0] * f2[i, 0] + rotation[1, 1] * f2[i, 1] + rotation[1, 2] * f2[i, 2]
+        hz = rotation[2, 0] * f2[i, 0] + rotation[2, 1] * f2[i, 1] + rotation[2, 2] * f2[i, 2]
+        n[i, 0] = f1[i, 1] * hz - f1[i, 2] * hy
+        n[i, 1] = f1[i, 2] * hx - f1[i, 0] * hz
+        n[i, 2] = f1[i, 0] * hy - f1[i, 1] * hx
+    tx = n[0, 1] * n[1, 2] - n[0, 2] * n[1, 1]
+    ty = n[0, 2] * n[1, 0] - n[0, 0] * n[1, 2]
+    tz = n[0, 0] * n[1, 1] - n[0, 1] * n[1, 0]
+    norm = math.sqrt(tx * tx + ty * ty + tz * tz)
+    if not norm > 1e-14:
+        return 0
+    R_out[0] = rotation
+    x_out[0] = 0.0
+    x_out[0, 0], x_out[0, 1], x_out[0, 2] = tx / norm, ty / norm, tz / norm
+    return 1
+
+
+@_jit
+def generate(generator: int, points: Array, sample: NDArray[np.int64], knowledge: Knowledge,
+             R_out: Array, x_out: Array) -> int:
+    """Hypotheses of one minimal sample; their number.
+
+    Parameters
+    ----------
+    points : (N, 6) ndarray
+        As in `consensus.multi_scale_cost`.
+    R_out, x_out : (MAX_SOLUTIONS, 3, 3), (MAX_SOLUTIONS, 9) ndarray
+        Receive R and ``(t, d_1, d_2)``, t of unit length, all in frame 1.
+    """
+    m = sample.shape[0]
+    f1, f2 = np.empty((m, 3)), np.empty((m, 3))
+    tau1, tau2 = np.empty(m), np.empty(m)
+    for k in range(m):
+        p = points[sample[k]]
+        if math.isnan(p[0]):
+            return 0
+        s1 = 1.0 / math.sqrt(1.0 + p[0] * p[0] + p[1] * p[1])
+        s2 = 1.0 / math.sqrt(1.0 + p[2] * p[2] + p[3] * p[3])
+        f1[k, 0], f1[k, 1], f1[k, 2] = p[0] * s1, p[1] * s1, s1
+        f2[k, 0], f2[k, 1], f2[k, 2] = p[2] * s2, p[3] * s2, s2
+        tau1[k], tau2[k] = p[4], p[5]
+    if generator == GYRO_2PT:
+        return _gyro_2pt(f1, f2, knowledge.rotation, R_out, x_out)
+    return 0
+
+
+def gravity_alignment(g):
+    from scipy.spatial.transform import Rotation
+    return np.eye(3)

@@ -1,0 +1,137 @@
+"""From a hypothesis to the uniform model: inlier selection and fits on a shrinking threshold."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.estimator import sampson
+from rs_relpose_ros.estimator.map_fit import Priors, State, fit, prior_cost
+
+Array = NDArray[np.float64]
+
+# Multiples of the inlier threshold: the angular model leaves up to 20 px at true inliers.
+SHRINKING = np.array([6.0, 3.0, 1.5, 1.0])
+ITERATIONS = 2
+
+# A depth is judged only where the parallax is this many times its noise.
+SIGNIFICANT_PARALLAX = 4.0
+# Robust sigmas of the logarithm of depth beyond which a match is taken for an outlier.
+DEPTH_GATE = 4.0
+# Scenes are never flatter than this (log units): keeps the gate open on planar scenes.
+MIN_DEPTH_SPREAD = 0.25
+
+_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
+
+
+@_jit
+def cheirality_sign(observations: Array, use: NDArray[np.bool_], state: State) -> float:
+    """+1 or -1: the sign of (t, d_1, d_2) that puts more of the matches in front, weighted.
+
+    Matches vote with their parallax: the sign of a depth without parallax is noise.
+    """
+    out = np.empty((observations.shape[0], 2))
+    sampson.depths(observations, state.R, state.t, state.d1, state.d2, out)
+    vote = 0.0
+    for i in range(observations.shape[0]):
+        if use[i] and not math.isnan(out[i, 0]):
+            # Bounded: a match on the baseline has an arbitrarily large inverse depth.
+            vote += max(-1.0, min(1.0, 0.5 / out[i, 0])) + max(-1.0, min(1.0, 0.5 / out[i, 1]))
+    return 1.0 if vote >= 0.0 else -1.0
+
+
+@_jit
+def signed(state: State, sign: float) -> State:
+    """The state with its translation and velocities multiplied by `sign`."""
+    return State(state.R, sign * state.t, sign * state.d1, sign * state.d2, state.dw1, state.dw2)
+
+
+@_jit
+def gate_depths(observations: Array, use: NDArray[np.bool_], state: State,
+                angle_sigma: float) -> None:
+    """Remove from `use` what lies behind a camera or far from the others' depths.
+
+    A random match that survives the epipolar band is invisible to the epipolar residual, but not
+    to geometry. `angle_sigma` is the noise of a match [rad].
+    """
+    n = observations.shape[0]
+    out = np.empty((n, 2))
+    sampson.depths(observations, state.R, state.t, state.d1, state.d2, out)
+    logs = np.empty(n)
+    significant = np.zeros(n, dtype=np.bool_)
+    count = 0
+    for i in range(n):
+        if not use[i] or math.isnan(out[i, 0]):
+            continue
+        o = observations[i]
+        # Parallax: the angle between the rays, of order |b| / depth.
+        nearest = min(abs(out[i, 0]), abs(out[i, 1]))
+        bx = state.t[0] - o[18] * state.d1[0] + o[19] * state.d2[0]
+        by = state.t[1] - o[18] * state.d1[1] + o[19] * state.d2[1]
+        bz = state.t[2] - o[18] * state.d1[2] + o[19] * state.d2[2]
+        hx = state.R[0, 0] * o[9] + state.R[0, 1] * o[10] + state.R[0, 2] * o[11]
+        hy = state.R[1, 0] * o[9] + state.R[1, 1] * o[10] + state.R[1, 2] * o[11]
+        hz = state.R[2, 0] * o[9] + state.R[2, 1] * o[10] + state.R[2, 2] * o[11]
+        cx = o[1] * hz - o[2] * hy
+        cy = o[2] * hx - o[0] * hz
+        cz = o[0] * hy - o[1] * hx
+        parallax = math.sqrt(cx * cx + cy * cy + cz * cz)
+        if parallax < SIGNIFICANT_PARALLAX * angle_sigma:
+            continue
+        if out[i, 0] <= 0.0 or out[i, 1] <= 0.0:
+            use[i] = False
+            continue
+        significant[i] = True
+        logs[count] = math.log(nearest / math.sqrt(bx * bx + by * by + bz * bz))
+        count += 1
+    if count < 8:
+        return
+    centre = np.median(logs[:count])
+    spread = max(1.4826 * np.median(np.abs(logs[:count] - centre)), MIN_DEPTH_SPREAD)
+    k = 0
+    for i in range(n):
+        if significant[i]:
+            if abs(logs[k] - centre) > DEPTH_GATE * spread:
+                use[i] = False
+            k += 1
+
+
+@_jit
+def select_inliers(observations: Array, valid: NDArray[np.bool_], state: State, threshold: float,
+                   angle_sigma: float) -> NDArray[np.bool_]:
+    """Matches within `threshold` [px] whose depths are plausible."""
+    r = sampson.residuals(observations, state.R, state.t, state.d1, state.d2, state.dw1, state.dw2)
+    use = valid & (np.abs(r) < threshold)
+    gate_depths(observations, use, state, angle_sigma)
+    return use
+
+
+@_jit
+def truncated_cost(observations: Array, valid: NDArray[np.bool_], state: State, priors: Priors,
+                   threshold: float, sigma: float) -> float:
+    """MSAC cost of the uniform model in units of sigma, priors included."""
+    r = sampson.residuals(observations, state.R, state.t, state.d1, state.d2, state.dw1, state.dw2)
+    cost = 0.0
+    for i in range(observations.shape[0]):
+        if valid[i]:
+            cost += min(r[i] * r[i], threshold * threshold)
+    return cost / (sigma * sigma) + prior_cost(state, priors)
+
+
+@_jit
+def optimise(observations: Array, valid: NDArray[np.bool_], start: State, priors: Priors,
+             sigma: float, threshold: float, angle_sigma: float) -> tuple[State, float]:
+    """Fit the uniform model from a hypothesis on a shrinking threshold; state and MSAC cost."""
+    state = start
+    everything = select_inliers(observations, valid, state, SHRINKING[0] * threshold, 1e9)
+    state = signed(state, cheirality_sign(observations, everything, state))
+    for k in range(SHRINKING.shape[0]):
+        use = select_inliers(observations, valid, state, SHRINKING[k] * threshold, angle_sigma)
+        if use.sum() < 6:
+            return state, math.inf
+        # Wide selections hold outliers: their residuals are not pixel noise.
+        state, _ = fit(observations, use, state, priors, sigma * SHRINKING[k], ITERATIONS)
+    return state, truncated_cost(observations, valid, state, priors, threshold, sigma)

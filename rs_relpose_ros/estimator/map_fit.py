@@ -1,0 +1,215 @@
+"""Joint maximum-a-posteriori fit of the uniform model: Sampson errors and IMU priors.
+
+Minimises, over ``R, t`` (unit), ``d_1, d_2, dw_1, dw_2`` (design section 4)::
+
+    sum r_i^2 / s^2  +  |g_1 x R g_2|^2 / (2 s_g^2)  +  (|dw_1|^2 + |dw_2|^2) / s_w^2
+        +  (|d_1|^2 + |d_2|^2) / s_d^2  +  theta^T Lambda theta,  theta = Log(R R_gyro^T)
+
+by Levenberg-Marquardt with the exact Jacobian (the Sampson denominator included: treating it as
+constant converges to another point). A weight of `PINNED` holds a block at its start, which is how
+the angular, linear and global models are fitted by the same code.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.estimator import sampson
+from rs_relpose_ros.estimator.sampson import D1, D2, DW1, DW2, PARAMETERS
+from rs_relpose_ros.so3 import exp_so3, log_so3
+
+Array = NDArray[np.float64]
+
+PINNED = 1e14
+
+_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
+
+
+class Priors(NamedTuple):
+    """Weights are inverse variances; 0 where nothing is known. All at the middle row."""
+
+    gravity1: Array
+    gravity2: Array
+    gravity_weight: float
+    rate_weight: float
+    velocity_weight: float
+    rotation: Array
+    rotation_information: Array
+
+
+class State(NamedTuple):
+    """The unknowns of the uniform model, all in frame 1."""
+
+    R: Array
+    t: Array
+    d1: Array
+    d2: Array
+    dw1: Array
+    dw2: Array
+
+
+@_jit
+def _add_priors(state: State, priors: Priors, hessian: Array, gradient: Array) -> float:
+    """Add the priors to the normal equations; their part of the cost."""
+    cost = 0.0
+    if priors.gravity_weight > 0.0:
+        # r = g_1 x k, k = R g_2;  dr/dtheta = (g_1.k) I - k g_1^T
+        g = priors.gravity1
+        k = state.R @ priors.gravity2
+        r = np.empty(3)
+        r[0] = g[1] * k[2] - g[2] * k[1]
+        r[1] = g[2] * k[0] - g[0] * k[2]
+        r[2] = g[0] * k[1] - g[1] * k[0]
+        dot = g[0] * k[0] + g[1] * k[1] + g[2] * k[2]
+        jac = np.empty((3, 3))
+        for i in range(3):
+            for j in range(3):
+                jac[i, j] = -k[i] * g[j]
+            jac[i, i] += dot
+        # Each of the two directions carries the error: twice the variance of one.
+        w = 0.5 * priors.gravity_weight
+        for i in range(3):
+            cost += w * r[i] * r[i]
+            for j in range(3):
+                gradient[j] += w * jac[i, j] * r[i]
+                for m in range(3):
+                    hessian[j, m] += w * jac[i, j] * jac[i, m]
+    theta = log_so3(state.R @ priors.rotation.T)
+    info = priors.rotation_information
+    for i in range(3):
+        product = info[i, 0] * theta[0] + info[i, 1] * theta[1] + info[i, 2] * theta[2]
+        cost += theta[i] * product
+        gradient[i] += product
+        for j in range(3):
+            hessian[i, j] += info[i, j]
+    for i in range(3):
+        hessian[D1 + i, D1 + i] += priors.velocity_weight
+        hessian[D2 + i, D2 + i] += priors.velocity_weight
+        gradient[D1 + i] += priors.velocity_weight * state.d1[i]
+        gradient[D2 + i] += priors.velocity_weight * state.d2[i]
+        hessian[DW1 + i, DW1 + i] += priors.rate_weight
+        hessian[DW2 + i, DW2 + i] += priors.rate_weight
+        gradient[DW1 + i] += priors.rate_weight * state.dw1[i]
+        gradient[DW2 + i] += priors.rate_weight * state.dw2[i]
+        cost += priors.velocity_weight * (state.d1[i] ** 2 + state.d2[i] ** 2)
+        cost += priors.rate_weight * (state.dw1[i] ** 2 + state.dw2[i] ** 2)
+    return cost
+
+
+@_jit
+def prior_cost(state: State, priors: Priors) -> float:
+    """The priors' part of the cost."""
+    return _add_priors(state, priors, np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS))
+
+
+@_jit
+def normal_equations(observations: Array, use: NDArray[np.bool_], state: State, priors: Priors,
+                     sigma: float) -> tuple[Array, Array, float]:
+    """Hessian (17, 17), half gradient (17,) and cost of the whole objective at `state`."""
+    hessian, gradient, squares, _ = sampson.normal_equations(
+        observations, use, state.R, state.t, state.d1, state.d2, state.dw1, state.dw2)
+    weight = 1.0 / (sigma * sigma)
+    hessian *= weight
+    gradient *= weight
+    return hessian, gradient, squares * weight + _add_priors(state, priors, hessian, gradient)
+
+
+@_jit
+def moved(state: State, step: Array) -> State:
+    """The state after a step (17,) of its local parameters."""
+    basis = sampson.tangent_basis(state.t)
+    t = state.t + basis[:, 0] * step[3] + basis[:, 1] * step[4]
+    return State(exp_so3(step[:3]) @ state.R, t / math.sqrt((t * t).sum()),
+                 state.d1 + step[D1:D1 + 3], state.d2 + step[D2:D2 + 3],
+                 state.dw1 + step[DW1:DW1 + 3], state.dw2 + step[DW2:DW2 + 3])
+
+
+@_jit
+def cholesky(matrix: Array, factor: Array) -> bool:
+    """Lower Cholesky factor of a symmetric matrix; False unless it is positive definite."""
+    n = matrix.shape[0]
+    for i in range(n):
+        for j in range(i + 1):
+            value = matrix[i, j]
+            for k in range(j):
+                value -= factor[i, k] * factor[j, k]
+            if i == j:
+                if not value > 0.0:
+                    return False
+                factor[i, i] = math.sqrt(value)
+            else:
+                factor[i, j] = value / factor[j, j]
+    return True
+
+
+@_jit
+def cholesky_solve(factor: Array, right: Array) -> Array:
+    """Solution of ``L L^T x = right``."""
+    n = right.shape[0]
+    x = right.copy()
+    for i in range(n):
+        for k in range(i):
+            x[i] -= factor[i, k] * x[k]
+        x[i] /= factor[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            x[i] -= factor[k, i] * x[k]
+        x[i] /= factor[i, i]
+    return x
+
+
+@_jit
+def fit(observations: Array, use: NDArray[np.bool_], start: State, priors: Priors, sigma: float,
+        iterations: int) -> tuple[State, float]:
+    """Levenberg-Marquardt from `start` over the matches in `use`; the state and its cost."""
+    state = start
+    damping = 1e-4
+    hessian, gradient, cost = normal_equations(observations, use, state, priors, sigma)
+    damped = np.empty((PARAMETERS, PARAMETERS))
+    factor = np.zeros((PARAMETERS, PARAMETERS))
+    done = 0
+    while done < iterations:
+        done += 1
+        damped[:] = hessian
+        for i in range(PARAMETERS):
+            damped[i, i] += damping * hessian[i, i] + 1e-12
+        if not cholesky(damped, factor):
+            damping = max(damping * 10.0, 1e-6)
+            if damping > 1e8:
+                break
+            continue
+        step = cholesky_solve(factor, -gradient)
+        candidate = moved(state, step)
+        candidate_cost = sampson.sum_of_squares(
+            observations, use, candidate.R, candidate.t, candidate.d1, candidate.d2, candidate.dw1,
+            candidate.dw2) / (sigma * sigma) + prior_cost(candidate, priors)
+        if candidate_cost <= cost:
+            gain = cost - candidate_cost
+            state = candidate
+            hessian, gradient, cost = normal_equations(observations, use, state, priors, sigma)
+            damping = max(damping * 0.1, 1e-9)
+            # Relative to one degree of freedom's worth of chi-square.
+            if gain < 1e-6 * (1.0 + cost):
+                break
+        else:
+            damping *= 10.0
+            if not damping < 1e8:
+                break
+    return state, cost
+
+
+@_jit
+def log_determinant(hessian: Array) -> float:
+    """Log-determinant of a positive definite matrix; infinite where it is not."""
+    factor = np.zeros(hessian.shape)
+    if not cholesky(hessian, factor):
+        return math.inf
+    value = 0.0
+    for i in range(hessian.shape[0]):
+        value += 2.0 * math.log(factor[i, i])
+    return value

@@ -1,0 +1,178 @@
+"""A two-view problem at the **middle** row: what every step of the estimator works on.
+
+The user's reference row is a matter of the interface. Inside, motion and pose refer to the middle
+row of each frame, which decouples the translation from the velocities; `to_reference_row` brings
+the result back, with its covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.camera import RollingShutterCamera
+from rs_relpose_ros.motion import FrameMotion
+from rs_relpose_ros.so3 import skew
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TwoViewProblem:
+    """Observations and IMU knowledge of one pair, frames at their middle rows.
+
+    Attributes
+    ----------
+    observations : (N, 20) ndarray
+        Rows of `sampson`; NaN-free (matches that cannot be unprojected are left out by `valid`).
+    points : (N, 6) ndarray
+        Rows of `consensus.multi_scale_cost`.
+    valid : (N,) ndarray of bool
+        Matches with finite rays.
+    focal : float
+        Mean focal length [px]: pixels per radian at the image centre.
+    motion1, motion2 : FrameMotion
+        At the middle row.
+    rotation, rotation_information : (3, 3) ndarray or None
+        Gyro-predicted ``R_1^T R_2`` between the middle rows, and the inverse covariance of its
+        error in frame 1.
+    """
+
+    observations: Array
+    points: Array
+    valid: NDArray[np.bool_]
+    focal: float
+    motion1: FrameMotion
+    motion2: FrameMotion
+    rotation: Array | None
+    rotation_information: Array | None
+
+
+def middle_row_delay(camera: RollingShutterCamera) -> float:
+    """Row time [s] of the middle row, against the camera's reference row."""
+    return float(camera.row_times((camera.height - 1) / 2))
+
+
+def build_problem(points1: Array, points2: Array, camera: RollingShutterCamera,
+                  motion1: FrameMotion, motion2: FrameMotion, relative_rotation: Array | None,
+                  relative_rotation_covariance: Array | None,
+                  derotate: bool = True) -> TwoViewProblem:
+    """Unproject, derotate and move to the middle row.
+
+    Parameters
+    ----------
+    derotate : bool
+        False for the models that know no angular velocity (linear, global): rays stay as measured.
+    """
+    delay = middle_row_delay(camera)
+    middle = replace(camera, reference_row='middle')
+    motion1, motion2 = motion1.shifted(delay), motion2.shifted(delay)
+    rotation = information = None
+    if relative_rotation is not None and relative_rotation_covariance is not None:
+        # R' = Exp(w_1 D)^T R Exp(w_2 D); after the shift, the old reference row lies at -D.
+        turn1 = motion1.rotations([-delay])[0]
+        turn2 = motion2.rotations([-delay])[0]
+        rotation = turn1 @ relative_rotation @ turn2.T
+        covariance = turn1 @ relative_rotation_covariance @ turn1.T
+        # A floor far below any gyro keeps the information finite.
+        information = np.linalg.inv(covariance + 1e-14 * np.eye(3))
+        information = 0.5 * (information + information.T)
+    observations = np.empty((len(points1), 20))
+    _observe(points1, middle, motion1, derotate, observations[:, 0:9], observations[:, 18])
+    _observe(points2, middle, motion2, derotate, observations[:, 9:18], observations[:, 19])
+    valid = np.isfinite(observations).all(axis=1)
+    with np.errstate(all='ignore'):
+        points = np.column_stack([
+            observations[:, 0] / observations[:, 2], observations[:, 1] / observations[:, 2],
+            observations[:, 9] / observations[:, 11], observations[:, 10] / observations[:, 11],
+            observations[:, 18], observations[:, 19]])
+    behind = ~((observations[:, 2] > 1e-6) & (observations[:, 11] > 1e-6))
+    points[behind | ~valid] = np.nan
+    observations[~valid] = 0.0
+    return TwoViewProblem(observations, points, valid, 0.5 * (camera.fx + camera.fy), motion1,
+                          motion2, rotation, information)
+
+
+def _observe(points: Array, camera: RollingShutterCamera, motion: FrameMotion, derotate: bool,
+             block: Array, row_times: Array) -> None:
+    """Fill one camera's (N, 9) block: ray and its derivatives by u and v; and its row times."""
+    rays, jacobian = camera.unproject_with_jacobian(points)
+    tau = camera.row_times(points[:, 1])
+    row_times[:] = tau
+    if not derotate:
+        block[:, 0:3], block[:, 3:6], block[:, 6:9] = rays, jacobian[:, :, 0], jacobian[:, :, 1]
+        return
+    turns = motion.rotations(tau)
+    block[:, 0:3] = np.einsum('nij,nj->ni', turns, rays)
+    block[:, 3:6] = np.einsum('nij,nj->ni', turns, jacobian[:, :, 0])
+    # One row further down, the camera has turned on by one line delay.
+    block[:, 6:9] = (np.einsum('nij,nj->ni', turns, jacobian[:, :, 1])
+                     + camera.line_delay * np.cross(motion.angular_velocity, block[:, 0:3]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairState:
+    """A pose between two rows with its covariance; velocities each in its own camera's frame.
+
+    ``covariance`` (18, 18) is of ``(dt, dtheta, dv_1, dv_2, dw_1, dw_2)``: dt and dtheta in
+    camera 1 as in `RelativePose`, velocities in their own frames.
+    """
+
+    R: Array
+    t: Array
+    v1: Array
+    v2: Array
+    w1: Array
+    w2: Array
+    covariance: Array
+
+
+def to_reference_row(state: PairState, delay: float, turn1: Array, turn2: Array) -> PairState:
+    """The same motion between rows that lie `delay` seconds later (design section 1).
+
+    ``R' = E_1^T R E_2``, ``t' = E_1^T (t - D v_1 + D R v_2)``, then ``|t'| = 1`` again: velocities
+    and covariance are rescaled. First-order covariance.
+
+    Parameters
+    ----------
+    turn1, turn2 : (3, 3) ndarray
+        ``E_i``: how each camera turns during `delay`; ``Exp(w_i D)`` at a constant rate.
+    """
+    e1, e2 = turn1, turn2
+    R = e1.T @ state.R @ e2
+    baseline = state.t - delay * state.v1 + delay * state.R @ state.v2
+    scale = float(np.linalg.norm(baseline))
+    moved = e1.T @ baseline
+    t = moved / scale
+    v1, v2 = e1.T @ state.v1 / scale, e2.T @ state.v2 / scale
+
+    eye = np.eye(3)
+    jacobian = np.zeros((18, 18))
+    TT, TH, V1, V2, W1, W2 = (slice(3 * k, 3 * k + 3) for k in range(6))
+    # t_true = t + dt, R_true = Exp(th) R: baseline' = E1^T (dt - D dv1 + D R dv2 - D [R v2]x th
+    #   + D [baseline]x dw1), for rate errors that turn E_i into Exp(D dw_i) E_i.
+    by = np.zeros((3, 18))
+    by[:, TT] = eye
+    by[:, V1] = -delay * eye
+    by[:, V2] = delay * state.R
+    by[:, TH] = -delay * skew(state.R @ state.v2)
+    by[:, W1] = delay * skew(baseline)
+    by = e1.T @ by / scale
+    projector = eye - np.outer(t, t)
+    jacobian[TT] = projector @ by
+    # th' = E1^T (th - D dw1) + E1^T R E2 (D dw2): errors of the rates turn the rows.
+    jacobian[TH, TH] = e1.T
+    jacobian[TH, W1] = -delay * e1.T
+    jacobian[TH, W2] = delay * e1.T @ state.R
+    along = t @ by
+    for block, velocity, turn in ((V1, v1, e1), (V2, v2, e2)):
+        jacobian[block, block] = turn.T / scale
+        jacobian[block] -= np.outer(velocity, along)
+    jacobian[V1, W1] += delay * skew(v1) @ e1.T
+    jacobian[V2, W2] += delay * skew(v2) @ e2.T
+    jacobian[W1, W1] = eye
+    jacobian[W2, W2] = eye
+    return PairState(R, t, v1, v2, state.w1, state.w2, jacobian @ state.covariance @ jacobian.T)
+
