@@ -1,0 +1,1 @@
+"""Bag files, by rosbags: no ROS installation is needed to read or write them."""
