@@ -1,0 +1,1 @@
+"""The live node; the only sub-package that imports rclpy."""
