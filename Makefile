@@ -1,0 +1,64 @@
+# make demo | test | test-all | lint | clean | distclean
+# Needs Python 3.11 or later with venv, make and git; everything else goes into $(VENV).
+
+PYTHON ?= python3
+VENV ?= .venv
+# Optional pip constraints, e.g. CONSTRAINTS=requirements/ubuntu-24.04.txt
+CONSTRAINTS ?=
+# More options for pytest, e.g. PYTEST_ARGS='test/test_camera.py -x'
+PYTEST_ARGS ?=
+
+bin := $(VENV)/bin
+# Absolute without resolving the link that venv makes: the environment is where the link lies.
+prefix := $(abspath $(VENV))
+stamp := $(VENV)/.installed
+
+# The environment brings its own ROS; one that a sourced setup.bash offers must not mix with it.
+unexport PYTHONPATH LD_LIBRARY_PATH
+export AMENT_PREFIX_PATH := $(prefix)
+export RMW_IMPLEMENTATION := rmw_fastrtps_cpp
+export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
+
+.DELETE_ON_ERROR:
+.PHONY: demo test test-all lint clean distclean same-python
+
+demo: $(stamp)
+	$(bin)/python demo/run_demo.py
+
+# Message types are checked in tests; in Jazzy that is off unless asked for.
+test: $(stamp)
+	ROS_PYTHON_CHECK_FIELDS=1 $(bin)/python -m pytest $(PYTEST_ARGS)
+
+test-all: $(stamp)
+	ROS_PYTHON_CHECK_FIELDS=1 $(bin)/python -m pytest -m 'long or not long' $(PYTEST_ARGS)
+
+lint: $(stamp)
+	$(bin)/ruff check .
+	$(bin)/mypy
+
+$(stamp): requirements/base.txt requirements/test.txt $(CONSTRAINTS) setup.py setup.cfg
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	    { echo '$(PYTHON) is no Python 3.11 or later; choose one: make PYTHON=python3.12 ...' >&2; exit 1; }
+	$(bin)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)
+	$(bin)/python -m pip install --quiet --disable-pip-version-check \
+	    -r requirements/test.txt $(CONSTRAINTS:%=-c %)
+	$(bin)/python -m pip install --quiet --disable-pip-version-check \
+	    --no-deps --no-build-isolation --editable .
+	touch $@
+
+# A PYTHON that was asked for must be the one that an existing environment was made with.
+version := -c 'import sys; print(*sys.version_info[:2], sep=".")'
+ifneq ($(filter command environment,$(origin PYTHON)),)
+$(stamp): | same-python
+endif
+same-python:
+	@test ! -e $(stamp) || test "$$($(PYTHON) $(version))" = "$$($(bin)/python $(version))" || \
+	    { echo '$(VENV) was made with another Python: make distclean, or choose VENV=...' >&2; exit 1; }
+
+clean:
+	rm -rf build install log dist demo_out *.egg-info \
+	    .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name '.venv*' -prune -o -name __pycache__ -type d -exec rm -rf {} +
+
+distclean: clean
+	rm -rf .venv .venv-*

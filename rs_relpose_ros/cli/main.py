@@ -1,0 +1,137 @@
+"""``rs_relpose <command>``: everything that runs offline."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+import importlib
+import logging
+import os
+import sys
+from typing import Any, Protocol, cast
+
+from rs_relpose_ros.errors import RsRelposeError
+
+PROGRAM = 'rs_relpose'
+
+# Name -> one line of help. The module rs_relpose_ros.cli.<name> is imported only when its command
+# is asked for, so that the overview does not wait for OpenCV and Numba.
+COMMANDS: Mapping[str, str] = {
+    'convert': 'turn a public recording into a rosbag2 bag and its parameter file',
+    'replay': 'estimate relative poses from a bag: CSV, summary and pictures',
+    'simulate': 'render rolling-shutter images and IMU of a known motion into a bag',
+}
+
+DONE, FAILED, BAD_INPUT = 0, 1, 2
+INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+PIPE_CLOSED = 141  # 128 + SIGPIPE
+
+_logger = logging.getLogger(__name__)
+
+
+class Command(Protocol):
+    """What a command's module offers."""
+
+    HELP: str
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Declare the command's arguments."""
+
+    def run(self, args: argparse.Namespace) -> int:
+        """Do the work; return 0 when done, 1 when it ran and failed."""
+
+
+class _Version(argparse.Action):
+    """``--version``; looks the version up only when asked."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any, **__: Any) -> None:
+        from importlib.metadata import version
+        print(f'{PROGRAM} {version("rs_relpose_ros")}')
+        parser.exit()
+
+
+def load_command(name: str) -> Command:
+    """Import the module of command `name`."""
+    return cast('Command', importlib.import_module(f'{__package__}.{name}'))
+
+
+def make_parser(selected: str | None) -> argparse.ArgumentParser:
+    """Return the parser of all commands, with the arguments of the `selected` one only."""
+    parser = argparse.ArgumentParser(
+        prog=PROGRAM,
+        description='Relative poses of rolling-shutter images, aided by an IMU: the offline tools.',
+        epilog=f'"{PROGRAM} COMMAND --help" describes a command. Exit codes: 0 done, 1 the work '
+               'ran and failed, 2 bad usage or bad input.')
+    parser.add_argument('--version', action=_Version, nargs=0, help='print the version and exit')
+    _add_verbose(parser, default=0)
+    commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
+    for name, one_line in COMMANDS.items():
+        command = commands.add_parser(name, help=one_line)
+        if name == selected:
+            module = load_command(name)
+            command.description = module.HELP
+            module.add_arguments(command)
+            # Without a default of its own, so that an -v before the command is kept.
+            _add_verbose(command, default=argparse.SUPPRESS)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line `argv` (default: that of the process) and return its exit code."""
+    try:
+        code = _run(sys.argv[1:] if argv is None else list(argv))
+        # A closed pipe shows here, and not as a complaint while the interpreter shuts down.
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return PIPE_CLOSED
+    except KeyboardInterrupt:
+        return _complain('interrupted', INTERRUPTED)
+    return code
+
+
+def _run(arguments: list[str]) -> int:
+    """Parse and run; errors in the input become one line and exit code 2."""
+    # No option of the top parser takes a value, so the first plain word is the command.
+    selected = next((word for word in arguments if not word.startswith('-')), None)
+    try:
+        args = make_parser(selected).parse_args(arguments)
+    except SystemExit as end:  # argparse has said why, or has printed the help
+        return end.code if isinstance(end.code, int) else BAD_INPUT
+    _set_up_logging(args.verbose)
+    try:
+        return load_command(args.command).run(args)
+    except RsRelposeError as error:
+        _logger.debug('refused here', exc_info=True)
+        return _complain(f'error: {error}', BAD_INPUT)
+    except BrokenPipeError:
+        raise
+    except (FileNotFoundError, FileExistsError, PermissionError, IsADirectoryError,
+            NotADirectoryError) as error:  # a path of the user's that cannot be used
+        _logger.debug('refused here', exc_info=True)
+        return _complain(f'error: {error.filename}: {error.strerror}', BAD_INPUT)
+    except OSError as error:  # such as a full disk: the input was fine
+        _logger.debug('failed here', exc_info=True)
+        return _complain(f'error: {error}', FAILED)
+
+
+def _add_verbose(parser: argparse.ArgumentParser, default: Any) -> None:
+    parser.add_argument('-v', '--verbose', action='count', default=default,
+                        help='log what is done; twice for details')
+
+
+def _set_up_logging(verbosity: int) -> None:
+    level = {0: logging.WARNING, 1: logging.INFO}.get(verbosity, logging.DEBUG)
+    logging.basicConfig(level=logging.WARNING, format='%(levelname)s %(name)s: %(message)s')
+    # Numba and Matplotlib would fill pages at level DEBUG.
+    logging.getLogger('rs_relpose_ros').setLevel(level)
+
+
+def _complain(message: str, code: int) -> int:
+    """Print one line to stderr and return `code`."""
+    print(f'{PROGRAM}: {" ".join(message.split())}', file=sys.stderr)
+    return code
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,127 @@
+"""The package as a ROS machine sees it: built by colcon, run from the install space."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+from conftest import ROOT
+import pytest
+
+NAME = 'rs_relpose_ros'
+START_UP = 60.0  # seconds; discovery takes up to 4, compiled kernels may not be cached yet
+
+
+def tracked_files() -> list[Path]:
+    if not (ROOT / '.git').exists() or shutil.which('git') is None:
+        pytest.skip('no git checkout: the tracked files are unknown')
+    listed = subprocess.run(['git', 'ls-files', '-z'], cwd=ROOT, capture_output=True, text=True,
+                            check=True).stdout
+    return [Path(name) for name in listed.split('\0') if name and (ROOT / name).is_file()]
+
+
+@pytest.fixture(scope='module')
+def install_space(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Install space of a colcon build of the tracked files."""
+    colcon = shutil.which('colcon', path=f'{Path(sys.executable).parent}:{os.environ["PATH"]}')
+    if colcon is None:
+        pytest.skip('colcon is not installed')
+    workspace = tmp_path_factory.mktemp('workspace')
+    for name in tracked_files():
+        if name.parts[0] in ('bags', 'docs', 'benchmarks'):  # not installed, and bags are big
+            continue
+        copy = workspace / 'src' / NAME / name
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, copy)
+    built = subprocess.run(
+        [colcon, 'build', '--event-handlers', 'console_direct+'], cwd=workspace,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=110, check=False)
+    assert built.returncode == 0, built.stdout
+    # A manifest that colcon finds invalid makes the folder a plain Python package, without a word.
+    assert (workspace / 'install' / NAME / 'share' / NAME / 'package.dsv').is_file(), built.stdout
+    return workspace / 'install'
+
+
+def in_install_space(install_space: Path, *command: str) -> list[str]:
+    """Return the command line that runs `command` after sourcing the install space."""
+    return ['bash', '-c', 'source "$0/local_setup.bash" && exec "$@"', str(install_space),
+            *command]
+
+
+def executable(install_space: Path, name: str) -> str:
+    """Return the path where ``ros2 run`` looks for executable `name`."""
+    return str(install_space / NAME / 'lib' / NAME / name)
+
+
+def test_everything_is_installed(install_space):
+    share = install_space / NAME / 'share'
+    assert (share / 'ament_index' / 'resource_index' / 'packages' / NAME).is_file()
+    assert (share / NAME / 'package.xml').is_file()
+    located = subprocess.run(
+        in_install_space(install_space, sys.executable, '-c',
+                         f'import {NAME}; print({NAME}.__path__[0])'),
+        cwd=install_space, capture_output=True, text=True, timeout=60, check=True)
+    library = Path(located.stdout.strip())
+    assert library.is_relative_to(install_space)
+    missing = [str(name) for name in tracked_files()
+               if (name.parts[0] == NAME and not (library.parent / name).is_file())
+               or (name.parts[0] in ('config', 'launch') and not name.name.startswith('.')
+                   and not (share / NAME / name).is_file())]
+    assert missing == []
+
+
+def test_share_folder_is_found(install_space):
+    found = subprocess.run(
+        in_install_space(install_space, sys.executable, '-c',
+                         'from ament_index_python.packages import get_package_share_directory as f;'
+                         f'print(f("{NAME}"))'),
+        capture_output=True, text=True, timeout=60, check=True)
+    assert Path(found.stdout.strip()) == install_space / NAME / 'share' / NAME
+
+
+def test_command_line_runs(install_space):
+    shown = subprocess.run(
+        in_install_space(install_space, executable(install_space, 'rs_relpose'), '--help'),
+        cwd=install_space, capture_output=True, text=True, timeout=60, check=False)
+    assert shown.returncode == 0, shown.stderr
+    assert 'replay' in shown.stdout
+
+
+def test_node_starts_and_stops(install_space, ros_domain_id, tmp_path):
+    from diagnostic_msgs.msg import DiagnosticArray
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=ros_domain_id)
+    observer = rclpy.create_node('observer', context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(observer)
+    received = []
+    observer.create_subscription(DiagnosticArray, '/diagnostics', received.append, 10)
+    output = tmp_path / 'node.txt'
+    with output.open('w') as sink:
+        node = subprocess.Popen(
+            in_install_space(install_space, executable(install_space, 'relpose_node'),
+                             '--ros-args', '-r', '__node:=installed', '-p', 'readout_time:=0.03'),
+            cwd=install_space, stdout=sink, stderr=subprocess.STDOUT)
+    try:
+        deadline = time.monotonic() + START_UP
+        while not received and node.poll() is None and time.monotonic() < deadline:
+            executor.spin_once(timeout_sec=0.1)
+        assert received, output.read_text()
+        assert 'installed' in observer.get_node_names()
+        node.send_signal(signal.SIGINT)
+        assert node.wait(timeout=20) == 0, output.read_text()
+    finally:
+        node.kill()
+        node.wait()
+        executor.shutdown()
+        observer.destroy_node()
+        rclpy.shutdown(context=context)
+    assert 'Traceback' not in output.read_text()

@@ -1,0 +1,279 @@
+"""The package as a whole: metadata, layers of its modules, commands."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+import fcntl
+import graphlib
+from importlib.metadata import distribution
+import os
+from pathlib import Path
+import re
+import subprocess
+import sys
+import tempfile
+
+from conftest import ROOT
+import pytest
+
+from rs_relpose_ros.cli import main as command_line
+from rs_relpose_ros.errors import InputError, MissingInputError
+
+NAME = 'rs_relpose_ros'
+VERSION = '0.1.0'
+ROS = re.compile(r'(rclpy|rcl_interfaces|ament_\w+|builtin_interfaces|launch\w*|rosgraph_msgs'
+                 r'|tf2_ros|std_srvs|\w+_msgs)$')
+MODULES = {'.'.join(path.relative_to(ROOT).with_suffix('').parts).removesuffix('.__init__'): path
+           for path in sorted((ROOT / NAME).rglob('*.py'))}
+
+
+def run(*command: str | Path, **kwargs) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([str(word) for word in command], capture_output=True, text=True,
+                          timeout=100, check=False, **kwargs)
+
+
+def loaded_after(code: str) -> set[str]:
+    """Top-level names of the modules that a new interpreter has after `code`."""
+    ended = run(sys.executable, '-c', f'import sys\n{code}\n'
+                'print(*sorted({name.partition(".")[0] for name in sys.modules}), file=sys.stderr)',
+                cwd=ROOT)
+    assert ended.returncode == 0, ended.stderr
+    return set(ended.stderr.splitlines()[-1].split())
+
+
+def imports(path: Path) -> Iterator[str]:
+    """Yield absolute names of what a module imports, wherever in it, except for types only."""
+    todo = [ast.parse(path.read_text())]
+    while todo:
+        node = todo.pop()
+        if isinstance(node, ast.If) and ast.unparse(node.test).endswith('TYPE_CHECKING'):
+            todo.extend(node.orelse)
+            continue
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f'{path}: relative import'
+            yield from (f'{node.module}.{alias.name}' for alias in node.names)
+        todo.extend(ast.iter_child_nodes(node))
+
+
+def module_behind(name: str) -> str:
+    """Return the module of this package that the imported `name` is or lies in, or ''."""
+    while name and name not in MODULES:
+        name = name.rpartition('.')[0]
+    return name
+
+
+# --- metadata
+
+
+def test_manifest_is_valid():
+    package = pytest.importorskip('catkin_pkg.package')
+    manifest = package.parse_package(str(ROOT), warnings=(warnings := []))
+    assert not warnings
+    assert manifest.name == NAME
+    assert [licence.file for licence in manifest.licenses] == ['LICENSE']
+    assert manifest.get_build_type() == 'ament_python'
+
+
+def test_versions_agree():
+    manifest = (ROOT / 'package.xml').read_text()
+    assert re.search(r'<version>(.*?)</version>', manifest)[1] == VERSION
+    assert re.search(r"version='(.*?)'", (ROOT / 'setup.py').read_text())[1] == VERSION
+    releases = re.findall(r'^(\d+\.\d+\.\d+) \(\d{4}-\d\d-\d\d\)\n-+$',
+                          (ROOT / 'CHANGELOG.rst').read_text(), re.MULTILINE)
+    assert releases[0] == VERSION
+    assert distribution(NAME).version == VERSION
+
+
+def test_manifest_names_every_ros_package_that_is_imported():
+    manifest = (ROOT / 'package.xml').read_text()
+    declared = set(re.findall(r'<(?:exec_)?depend>(.*?)</', manifest))
+    used = {name.partition('.')[0] for path in MODULES.values() for name in imports(path)}
+    assert {name for name in used if ROS.match(name)} - declared == set()
+
+
+def test_every_folder_of_modules_is_a_package():
+    missing = {path.parent for path in MODULES.values()} - {
+        path.parent for path in MODULES.values() if path.name == '__init__.py'}
+    assert missing == set()
+
+
+# --- layers
+
+
+def test_core_imports_neither_ros_nor_rosbags():
+    core = sorted(name for name in MODULES
+                  if not name.startswith((f'{NAME}.ros', f'{NAME}.bags', f'{NAME}.cli'))
+                  and re.match(rf'{NAME}($|\.(estimator|solvers|imu|tracking|pipeline|messages))',
+                               name))
+    assert f'{NAME}.estimator.estimate' in core
+    loaded = loaded_after('\n'.join(f'import {name}' for name in core))
+    assert NAME in loaded
+    assert {name for name in loaded if ROS.match(name) or name == 'rosbags'} == set()
+
+
+@pytest.mark.parametrize(('library', 'folder'), [(ROS, 'ros'), (re.compile('rosbags$'), 'bags')])
+def test_library_is_imported_in_one_folder_only(library, folder):
+    users = {path for path in MODULES.values()
+             if any(library.match(name.partition('.')[0]) for name in imports(path))}
+    assert users, f'nothing imports {library.pattern}: the test would see nothing'
+    assert {path for path in users if path.parent != ROOT / NAME / folder} == set()
+
+
+def test_modules_import_each_other_without_cycles():
+    graph = {name: {module_behind(imported) for imported in imports(path)} - {name, ''}
+             for name, path in MODULES.items()}
+    assert len(graph) > 10
+    graphlib.TopologicalSorter(graph).prepare()  # CycleError names the cycle
+
+
+def test_the_library_does_not_print_or_exit():
+    """Only the command line and the node's main do (what ruff's T20 cannot see: sys.exit)."""
+    exits = [f'{path.relative_to(ROOT)}:{node.lineno}'
+             for path in MODULES.values() if path.parent.name not in ('cli', 'ros')
+             for node in ast.walk(ast.parse(path.read_text()))
+             if isinstance(node, ast.Call)
+             and ast.unparse(node.func) in ('sys.exit', 'exit', 'quit', 'os._exit', 'print')]
+    assert exits == []
+
+
+# --- commands
+
+
+@pytest.mark.parametrize('script', ['relpose_node', 'rs_relpose'])
+def test_console_script_resolves(script):
+    entries = {entry.name: entry for entry in distribution(NAME).entry_points
+               if entry.group == 'console_scripts'}
+    assert callable(entries[script].load())
+
+
+def test_node_describes_itself():
+    ended = run(sys.executable, '-m', f'{NAME}.ros.node', '--help')
+    assert ended.returncode == 0, ended.stderr
+    assert 'readout_time' in ended.stdout
+    assert ended.stderr == ''
+
+
+@pytest.mark.parametrize('name', command_line.COMMANDS)
+def test_command_describes_itself(name, capsys):
+    assert command_line.main([name, '--help']) == 0
+    shown = ' '.join(capsys.readouterr().out.split())
+    assert f'rs_relpose {name}' in shown
+    assert command_line.load_command(name).HELP.partition('\n')[0] in shown
+
+
+def test_overview_names_every_command_and_imports_none():
+    ended = run(sys.executable, '-m', f'{NAME}.cli.main', '--help')
+    assert ended.returncode == 0
+    for name, one_line in command_line.COMMANDS.items():
+        assert re.search(rf'{name}\s+{one_line}', ' '.join(ended.stdout.split()))
+    package = loaded_after(f'import {NAME}')
+    overview = loaded_after(f'import {NAME}.cli.main as m; m.main(["--help"])')
+    assert overview - package & {'numpy', 'scipy', 'cv2', 'numba', 'rosbags', 'matplotlib'} == set()
+
+
+def test_version(capsys):
+    assert command_line.main(['--version']) == 0
+    assert capsys.readouterr().out == f'rs_relpose {VERSION}\n'
+
+
+@pytest.mark.parametrize('arguments', [[], ['nonsense'], ['--nonsense'], ['-v']])
+def test_bad_usage(arguments, capsys):
+    assert command_line.main(arguments) == 2
+    assert 'rs_relpose: error: ' in capsys.readouterr().err
+
+
+class Stand:
+    """A command whose work is given by the test."""
+
+    HELP = 'stand in'
+
+    def __init__(self, work):
+        self.work = work
+
+    def add_arguments(self, parser):
+        parser.add_argument('number', type=int)
+
+    def run(self, args):
+        return self.work(args)
+
+
+@pytest.fixture
+def as_replay(monkeypatch):
+    def install(work):
+        monkeypatch.setattr(command_line, 'load_command', lambda name: Stand(work))
+    return install
+
+
+def test_command_gets_its_arguments_and_gives_the_exit_code(as_replay):
+    as_replay(lambda args: args.number)
+    assert command_line.main(['replay', '0']) == 0
+    assert command_line.main(['replay', '1']) == 1
+
+
+@pytest.mark.parametrize('words', [['-v', 'replay', '3'], ['replay', '-v', '3']])
+def test_verbose_before_and_after_the_command(words, as_replay):
+    as_replay(lambda args: args.verbose)
+    assert command_line.main(words) == 1
+
+
+@pytest.mark.parametrize(('error', 'code', 'line'), [
+    (InputError('the bag\nends early'), 2, 'rs_relpose: error: the bag ends early\n'),
+    (MissingInputError('no topic'), 2, 'rs_relpose: error: no topic\n'),
+    (FileNotFoundError(2, 'No such file or directory', 'x.bag'), 2,
+     'rs_relpose: error: x.bag: No such file or directory\n'),
+    (OSError(28, 'No space left on device'), 1,
+     'rs_relpose: error: [Errno 28] No space left on device\n'),
+    (KeyboardInterrupt(), 130, 'rs_relpose: interrupted\n'),
+])
+def test_error_is_one_line_and_an_exit_code(error, code, line, as_replay, capsys):
+    def work(args):
+        raise error
+    as_replay(work)
+    assert command_line.main(['replay', '1']) == code
+    assert capsys.readouterr().err == line
+
+
+def test_programming_error_is_not_hidden(as_replay):
+    as_replay(lambda args: args.no_such_argument)
+    with pytest.raises(AttributeError):
+        command_line.main(['replay', '1'])
+
+
+def test_closed_pipe_is_quiet():
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, 'w') as pipe:
+        ended = subprocess.run([sys.executable, '-m', f'{NAME}.cli.main', '--help'], stdout=pipe,
+                               stderr=subprocess.PIPE, text=True, timeout=60, check=False)
+    assert ended.returncode == command_line.PIPE_CLOSED
+    assert ended.stderr == ''
+
+
+# --- the fixtures of conftest.py
+
+
+def test_domain_id_is_locked_while_the_test_runs(ros_domain_id):
+    assert os.environ['ROS_DOMAIN_ID'] == str(ros_domain_id)
+    assert os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
+    lock = Path(tempfile.gettempdir()) / f'rs_relpose_ros_domain_{ros_domain_id}.lock'
+    with lock.open('a') as other, pytest.raises(BlockingIOError):
+        fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+@pytest.mark.parametrize(('data', 'outcome'), [(None, 'skipped'), ('missing', 'failed'),
+                                               ('.', 'passed')])
+def test_recordings_skip_only_where_none_are_given(data, outcome, tmp_path):
+    (tmp_path / 'conftest.py').symlink_to(ROOT / 'test' / 'conftest.py')
+    (tmp_path / 'test_one.py').write_text(
+        'import pytest\n\n\n@pytest.mark.recordings\ndef test_one(recordings):\n'
+        '    assert recordings.is_dir()\n')
+    environment = {key: value for key, value in os.environ.items() if key != 'RS_RELPOSE_DATA'}
+    if data is not None:
+        environment['RS_RELPOSE_DATA'] = str(tmp_path / data)
+    ended = run(sys.executable, '-m', 'pytest', '-c', ROOT / 'pyproject.toml', '--rootdir',
+                tmp_path, '-p', 'no:cacheprovider', tmp_path / 'test_one.py', env=environment)
+    expected = outcome if outcome != 'failed' else 'error'
+    assert f'1 {expected}' in ended.stdout, ended.stdout
