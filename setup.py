@@ -9,8 +9,7 @@ NAME = 'rs_relpose_ros'
 
 def files_in(folder: str) -> list[str]:
     """Files directly in `folder`, relative to the package root, as data_files takes them."""
-    return sorted(str(path) for path in Path(folder).iterdir()
-                  if path.is_file() and not path.name.startswith('.'))
+    return sorted(str(path) for path in Path(folder).glob('[!.]*') if path.is_file())
 
 
 setup(

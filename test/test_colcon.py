@@ -78,8 +78,8 @@ def test_everything_is_installed(install_space):
 def test_share_folder_is_found(install_space):
     found = subprocess.run(
         in_install_space(install_space, sys.executable, '-c',
-                         'from ament_index_python.packages import get_package_share_directory as f;'
-                         f'print(f("{NAME}"))'),
+                         'from ament_index_python import get_package_share_directory as share;'
+                         f'print(share("{NAME}"))'),
         capture_output=True, text=True, timeout=60, check=True)
     assert Path(found.stdout.strip()) == install_space / NAME / 'share' / NAME
 

@@ -8,7 +8,7 @@ import importlib
 import logging
 import os
 import sys
-from typing import Any, Protocol, cast
+from typing import Any, cast, Protocol
 
 from rs_relpose_ros.errors import RsRelposeError
 
@@ -59,7 +59,7 @@ def make_parser(selected: str | None) -> argparse.ArgumentParser:
     """Return the parser of all commands, with the arguments of the `selected` one only."""
     parser = argparse.ArgumentParser(
         prog=PROGRAM,
-        description='Relative poses of rolling-shutter images, aided by an IMU: the offline tools.',
+        description='Relative poses of rolling-shutter images, aided by an IMU: offline tools.',
         epilog=f'"{PROGRAM} COMMAND --help" describes a command. Exit codes: 0 done, 1 the work '
                'ran and failed, 2 bad usage or bad input.')
     parser.add_argument('--version', action=_Version, nargs=0, help='print the version and exit')
