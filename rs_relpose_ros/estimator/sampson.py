@@ -29,8 +29,10 @@ Array = NDArray[np.float64]
 PARAMETERS = 17
 THETA, TANGENT, D1, D2, DW1, DW2 = 0, 3, 5, 8, 11, 14
 
-_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
-_inline = numba.njit(cache=True, nogil=True, error_model='numpy', inline='always')
+# Fused multiply-add and reordered sums: a fifth faster. NaN and infinity keep their meaning.
+_FAST = {'contract', 'reassoc', 'nsz', 'arcp'}
+_jit = numba.njit(cache=True, nogil=True, error_model='numpy', fastmath=_FAST)
+_inline = numba.njit(cache=True, nogil=True, error_model='numpy', fastmath=_FAST, inline='always')
 
 
 @_inline
