@@ -12,6 +12,7 @@ bin := $(VENV)/bin
 # Absolute without resolving the link that venv makes: the environment is where the link lies.
 prefix := $(abspath $(VENV))
 stamp := $(VENV)/.installed
+pip := $(bin)/python -m pip --quiet --quiet --disable-pip-version-check
 
 # The environment brings its own ROS; one that a sourced setup.bash offers must not mix with it.
 unexport PYTHONPATH LD_LIBRARY_PATH
@@ -39,11 +40,10 @@ lint: $(stamp)
 $(stamp): requirements/base.txt requirements/test.txt $(CONSTRAINTS) setup.py setup.cfg
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	    { echo '$(PYTHON) is no Python 3.11 or later; choose one: make PYTHON=python3.12 ...' >&2; exit 1; }
-	$(bin)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)
-	$(bin)/python -m pip install --quiet --disable-pip-version-check \
-	    -r requirements/test.txt $(CONSTRAINTS:%=-c %)
-	$(bin)/python -m pip install --quiet --disable-pip-version-check \
-	    --no-deps --no-build-isolation --editable .
+	@echo 'Setting up $(VENV): about a minute and 1.1 GB.'
+	@$(bin)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)
+	$(pip) install -r requirements/test.txt $(CONSTRAINTS:%=-c %)
+	$(pip) install --no-deps --no-build-isolation --editable .
 	touch $@
 
 # A PYTHON that was asked for must be the one that an existing environment was made with.
