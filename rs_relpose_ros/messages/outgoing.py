@@ -1,0 +1,195 @@
+"""Results to messages, for rclpy's classes and for those of rosbags alike.
+
+`types` gives the class of a message type name (``'geometry_msgs/msg/Pose'``), so that the node and
+the bag writer share these functions. All messages of a pair carry the stamp of the current image.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.pipeline.pair import PairResult
+from rs_relpose_ros.timing import NANOSECONDS
+
+MessageTypes = Callable[[str], Any]
+
+_UINT32, _FLOAT32 = 6, 7   # sensor_msgs/PointField
+
+MATCH_DTYPE = np.dtype([('id', '<u4')] + [(name, '<f4') for name in (
+    'u1', 'v1', 'u2', 'v2', 'tau1', 'tau2', 'x1', 'y1', 'z1', 'x2', 'y2', 'z2')])
+
+
+@dataclass(frozen=True, slots=True)
+class PairMessages:
+    """The messages of one pair with a pose, all of the same stamp."""
+
+    relative_pose: Any
+    reference: Any
+    velocity: Any
+    matches: Any
+
+
+def pair_messages(result: PairResult, types: MessageTypes,
+                  reference_frame: str = '') -> PairMessages:
+    """Messages of a pair.
+
+    Parameters
+    ----------
+    result : PairResult
+        With a pose: there is no message that says "none".
+    types : callable
+    reference_frame : str
+        frame_id of the relative pose; empty for ``<camera frame>_reference``.
+    """
+    if not result.pose:
+        raise InputError(f'a pair without a pose ({result.pose.status.value}) has no messages')
+    return PairMessages(
+        relative_pose=relative_pose_message(result, types, reference_frame),
+        reference=reference_message(result, types),
+        velocity=velocity_message(result, types),
+        matches=matches_message(result, types))
+
+
+def relative_pose_message(result: PairResult, types: MessageTypes,
+                          reference_frame: str = '') -> Any:
+    """geometry_msgs/PoseWithCovarianceStamped: the current camera in the reference keyframe's.
+
+    The covariance needs no conversion: (dt, dtheta) with ``R_true = Exp(dtheta) R`` in camera 1 is
+    ROS's order x, y, z and rotations about the fixed axes of the header's frame.
+    """
+    frame_id = reference_frame or f'{result.frame_id}_reference'
+    pose = types('geometry_msgs/msg/Pose')(
+        position=_point(result.pose.t, types), orientation=_quaternion(result.pose.R, types))
+    return types('geometry_msgs/msg/PoseWithCovarianceStamped')(
+        header=header(result.stamp_ns, frame_id, types),
+        pose=types('geometry_msgs/msg/PoseWithCovariance')(
+            pose=pose, covariance=_covariance(result.pose.covariance)))
+
+
+def reference_message(result: PairResult, types: MessageTypes) -> Any:
+    """sensor_msgs/TimeReference: the stamp of the reference keyframe."""
+    return types('sensor_msgs/msg/TimeReference')(
+        header=header(result.stamp_ns, result.frame_id, types),
+        time_ref=time(result.reference_stamp_ns, types), source='reference_keyframe')
+
+
+def velocity_message(result: PairResult, types: MessageTypes) -> Any:
+    """geometry_msgs/TwistWithCovarianceStamped of the current camera, in its own frame.
+
+    Angular in rad/s, linear in baselines per second.
+    """
+    twist = types('geometry_msgs/msg/Twist')(
+        linear=_vector(result.pose.linear_velocity2, types),
+        angular=_vector(result.pose.angular_velocity2, types))
+    return types('geometry_msgs/msg/TwistWithCovarianceStamped')(
+        header=header(result.stamp_ns, result.frame_id, types),
+        twist=types('geometry_msgs/msg/TwistWithCovariance')(
+            twist=twist, covariance=_covariance(result.pose.velocity_covariance)))
+
+
+def matches_message(result: PairResult, types: MessageTypes) -> Any:
+    """sensor_msgs/PointCloud2 of the inliers, fields as in `MATCH_DTYPE`.
+
+    Pixels of the published images, row times [s] against the stamped row, rays turned to it.
+    """
+    points = inlier_records(result)
+    field_type = types('sensor_msgs/msg/PointField')
+    fields = [field_type(name=name, offset=offset, count=1,
+                         datatype=_UINT32 if name == 'id' else _FLOAT32)
+              for name, (_, offset) in MATCH_DTYPE.fields.items()]   # type: ignore[union-attr]
+    message_type = types('sensor_msgs/msg/PointCloud2')
+    return message_type(
+        header=header(result.stamp_ns, result.frame_id, types), height=1, width=len(points),
+        fields=fields, is_bigendian=False, point_step=MATCH_DTYPE.itemsize,
+        row_step=MATCH_DTYPE.itemsize * len(points), data=_byte_data(points, message_type),
+        is_dense=True)
+
+
+def inlier_records(result: PairResult) -> NDArray[np.void]:
+    """Inlier matches (N,) as records of `MATCH_DTYPE`."""
+    inliers = result.pose.inliers
+    records = np.empty(int(np.count_nonzero(inliers)), dtype=MATCH_DTYPE)
+    records['id'] = result.matches.track_ids[inliers]
+    for names, values in (
+            ('u1 v1', result.matches.points1), ('u2 v2', result.matches.points2),
+            ('tau1', result.row_times1[:, None]), ('tau2', result.row_times2[:, None]),
+            ('x1 y1 z1', result.rays1), ('x2 y2 z2', result.rays2)):
+        for column, name in enumerate(names.split()):
+            records[name] = values[inliers, column]
+    return records
+
+
+def diagnostics_message(stamp_ns: int, status: Any, types: MessageTypes) -> Any:
+    """diagnostic_msgs/DiagnosticArray of one status."""
+    return types('diagnostic_msgs/msg/DiagnosticArray')(
+        header=header(stamp_ns, '', types), status=[status])
+
+
+def status_message(level: int, name: str, text: str, hardware_id: str,
+                   values: Sequence[tuple[str, str]], types: MessageTypes) -> Any:
+    """diagnostic_msgs/DiagnosticStatus; `level` 0 OK, 1 warning, 2 error, 3 stale."""
+    key_value = types('diagnostic_msgs/msg/KeyValue')
+    status_type = types('diagnostic_msgs/msg/DiagnosticStatus')
+    return status_type(
+        level=bytes([level]) if _is_rclpy(status_type) else level, name=name, message=text,
+        hardware_id=hardware_id, values=[key_value(key=key, value=value) for key, value in values])
+
+
+# -- parts -----------------------------------------------------------------------------------
+
+
+def time(stamp_ns: int, types: MessageTypes) -> Any:
+    """builtin_interfaces/Time of an instant [ns]."""
+    seconds, nanoseconds = divmod(int(stamp_ns), NANOSECONDS)
+    return types('builtin_interfaces/msg/Time')(sec=seconds, nanosec=nanoseconds)
+
+
+def header(stamp_ns: int, frame_id: str, types: MessageTypes) -> Any:
+    """std_msgs/Header."""
+    return types('std_msgs/msg/Header')(stamp=time(stamp_ns, types), frame_id=frame_id)
+
+
+def quat_xyzw(R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Quaternion (4,) x, y, z, w of a rotation matrix, with w >= 0."""
+    quaternion = Rotation.from_matrix(R).as_quat()
+    return quaternion if quaternion[3] >= 0.0 else -quaternion
+
+
+def _quaternion(R: NDArray[np.float64], types: MessageTypes) -> Any:
+    x, y, z, w = (float(value) for value in quat_xyzw(R))
+    return types('geometry_msgs/msg/Quaternion')(x=x, y=y, z=z, w=w)
+
+
+def _point(vector: NDArray[np.float64], types: MessageTypes) -> Any:
+    x, y, z = (float(value) for value in vector)
+    return types('geometry_msgs/msg/Point')(x=x, y=y, z=z)
+
+
+def _vector(vector: NDArray[np.float64], types: MessageTypes) -> Any:
+    x, y, z = (float(value) for value in vector)
+    return types('geometry_msgs/msg/Vector3')(x=x, y=y, z=z)
+
+
+def _covariance(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.ascontiguousarray(covariance, dtype=np.float64).reshape(36)
+
+
+def _byte_data(records: NDArray[Any], message_type: Any) -> Any:
+    """Bytes in the container that is cheap: rclpy copies an ndarray element by element."""
+    if _is_rclpy(message_type):
+        data = array('B')
+        data.frombytes(records.tobytes())
+        return data
+    return np.frombuffer(records.tobytes(), dtype=np.uint8)
+
+
+def _is_rclpy(message_type: Any) -> bool:
+    return hasattr(message_type, 'get_fields_and_field_types')

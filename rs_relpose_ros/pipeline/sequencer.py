@@ -1,0 +1,385 @@
+"""Brings frames and IMU together: a frame goes on once the IMU covers its last row.
+
+The live node and the replay use the same object. Live, a mailbox keeps the latest frames and the
+oldest goes when the worker is too slow; offline nothing is dropped and no clock is read. Whatever
+does not go on is counted by its cause.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Enum
+
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.imu.buffer import Coverage, ImuBuffer
+from rs_relpose_ros.imu.frame_imu import FrameImu, frame_imu
+from rs_relpose_ros.imu.samples import ImuSample
+from rs_relpose_ros.pipeline.calibration import Calibration
+from rs_relpose_ros.pipeline.frame import EncodedFrame, Frame
+from rs_relpose_ros.pipeline.parameters import Parameters
+from rs_relpose_ros.pipeline.pipeline import sensor_camera
+from rs_relpose_ros.result import Status
+from rs_relpose_ros.timing import NANOSECONDS, ImageClock, seconds_between
+
+# A stamp that lies further back than this is a bag that starts anew, not a late message.
+CLOCK_JUMP_NS = NANOSECONDS
+# IMU history that is kept for frames to come; of it, the longest turn between two frames.
+HISTORY_NS = 10 * NANOSECONDS
+LONGEST_TURN_NS = HISTORY_NS // 2
+# Frames that wait for the worker; bounds the latency of an overloaded node.
+MAILBOX_FRAMES = 3
+# Frames that wait for the IMU; bounds the memory.
+WAITING_FRAMES = 16
+# How long a frame waits for the IMU.
+MAX_IMU_WAIT_NS = NANOSECONDS
+# An accelerometer this far behind the gyro has stopped; frames no longer wait for it.
+_ACCELEROMETER_STALE_NS = NANOSECONDS // 10
+# Refusals that nobody has taken yet; the counters lose none.
+_REFUSALS_KEPT = 256
+
+
+class Refusal(str, Enum):
+    """Why a frame was not processed."""
+
+    OVERLOAD = 'overload'
+    NO_IMU = 'no_imu'
+    IMU_GAP = 'imu_gap'
+    DUPLICATE = 'duplicate'
+    OUT_OF_ORDER = 'out_of_order'
+    CLOCK_JUMP = 'clock_jump'
+    BAD_IMAGE = 'bad_image'
+    NO_CALIBRATION = 'no_calibration'
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReadyFrame:
+    """A decoded frame with its IMU.
+
+    Attributes
+    ----------
+    frame : Frame
+    imu : FrameImu
+    restart : bool
+        Time jumped since the frame before: what was tracked belongs to another time.
+    ready_ns : int
+        When the later of the image and the IMU sample that covers its last row came, on the
+        monotonic clock; 0 offline.
+    """
+
+    frame: Frame
+    imu: FrameImu
+    restart: bool
+    ready_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRefused:
+    """A frame that was not processed, and one sentence why."""
+
+    stamp_ns: int
+    cause: Refusal
+    reason: str
+
+    @property
+    def status(self) -> Status:
+        """The outcome as a pair's status."""
+        no_imu = self.cause in (Refusal.NO_IMU, Refusal.IMU_GAP)
+        return Status.NO_IMU if no_imu else Status.BAD_INPUT
+
+
+@dataclass(frozen=True, slots=True)
+class SequencerCounts:
+    """What came and what became of it, since the start."""
+
+    frames: int
+    frames_taken: int
+    refused: Mapping[Refusal, int]
+    imu_samples: int
+    imu_gaps: int
+    clock_jumps: int
+
+
+@dataclass(slots=True, eq=False)
+class _Waiting:
+    """A frame with its instants on the IMU clock and the monotonic clock [ns]."""
+
+    frame: Frame | EncodedFrame
+    start_ns: int
+    end_ns: int
+    reference_ns: int
+    received_ns: int
+    generation: int
+    ready_ns: int | None = None
+
+
+class Sequencer:
+    """Thread-safe meeting point of frames and IMU samples.
+
+    Parameters
+    ----------
+    parameters : Parameters
+        Sensor and IMU settings; those that have no default must be given.
+    offline : bool
+        Every frame is kept until the IMU covers it or the input is closed.
+    clock : callable
+        Monotonic time [ns]; for tests.
+    """
+
+    def __init__(self, parameters: Parameters, *, offline: bool = False,
+                 clock: Callable[[], int] = time.monotonic_ns) -> None:
+        self._parameters = parameters
+        self._R_cam_imu = parameters.sensor.R_cam_imu
+        self._offline = offline
+        self._now: Callable[[], int] = (lambda: 0) if offline else clock
+        self._max_gap_ns = round(parameters.imu.max_imu_gap * NANOSECONDS)
+        self._changed = threading.Condition()
+        self._buffer = ImuBuffer(parameters.imu)
+        self._waiting: deque[_Waiting] = deque()
+        self._refusals: deque[FrameRefused] = deque(maxlen=None if offline else _REFUSALS_KEPT)
+        self._calibration: Calibration | None = None
+        self._image_clock: ImageClock | None = None
+        self._last_stamp_ns: int | None = None
+        self._previous_reference_ns: int | None = None
+        self._newest_imu_ns: int | None = None
+        self._newest_gyro_ns: int | None = None
+        self._newest_accelerometer_ns: int | None = None
+        self._pruned_ns = 0
+        self._generation = 0
+        self._taken_generation = 0
+        self._closed = False
+        self._frames = self._frames_taken = self._imu_samples = 0
+        self._imu_gaps = self._clock_jumps = 0
+        self._refused: Counter[Refusal] = Counter()
+
+    # -- input -------------------------------------------------------------------------------
+
+    def add_imu(self, sample: ImuSample) -> None:
+        """Store an IMU sample.
+
+        Raises
+        ------
+        InputError
+            It cannot be used; nothing is stored.
+        """
+        with self._changed:
+            newest = self._newest_imu_ns
+            if newest is not None and sample.stamp_ns < newest - CLOCK_JUMP_NS:
+                self._jump(f'IMU stamps jumped back by '
+                           f'{seconds_between(sample.stamp_ns, newest):.3f} s')
+                self._clear_imu()
+            self._buffer.add(sample)
+            self._imu_samples += 1
+            self._newest_imu_ns = _later(self._newest_imu_ns, sample.stamp_ns)
+            if sample.linear_acceleration is not None:
+                self._newest_accelerometer_ns = _later(
+                    self._newest_accelerometer_ns, sample.stamp_ns)
+            if sample.angular_velocity is not None:
+                if (self._newest_gyro_ns is not None
+                        and sample.stamp_ns - self._newest_gyro_ns > self._max_gap_ns):
+                    self._imu_gaps += 1
+                self._newest_gyro_ns = _later(self._newest_gyro_ns, sample.stamp_ns)
+            # Without frames nobody else prunes.
+            if self._newest_imu_ns - self._pruned_ns > 2 * HISTORY_NS:
+                self._prune(self._newest_imu_ns - HISTORY_NS)
+            self._sort_out()
+
+    def add_frame(self, frame: Frame | EncodedFrame) -> None:
+        """Take a frame into the mailbox, or refuse it for its stamp."""
+        with self._changed:
+            self._frames += 1
+            image_clock = self._clock_of(frame.calibration)
+            start_ns, end_ns = image_clock.row_span_ns(frame.stamp_ns)
+            if self._last_stamp_ns is not None and frame.stamp_ns <= self._last_stamp_ns:
+                back = seconds_between(frame.stamp_ns, self._last_stamp_ns)
+                if frame.stamp_ns == self._last_stamp_ns:
+                    self._refuse(frame.stamp_ns, Refusal.DUPLICATE,
+                                 'a frame of this stamp came before')
+                    return
+                if self._last_stamp_ns - frame.stamp_ns <= CLOCK_JUMP_NS:
+                    self._refuse(frame.stamp_ns, Refusal.OUT_OF_ORDER,
+                                 f'the frame is {back:.3f} s older than the one before')
+                    return
+                self._jump(f'image stamps jumped back by {back:.3f} s')
+                # The IMU may have jumped already, and then holds what this frame needs.
+                if (self._newest_imu_ns is not None
+                        and self._newest_imu_ns > end_ns + CLOCK_JUMP_NS):
+                    self._clear_imu()
+            self._last_stamp_ns = frame.stamp_ns
+            self._waiting.append(_Waiting(
+                frame, start_ns, end_ns, image_clock.reference_ns(frame.stamp_ns),
+                received_ns=self._now(), generation=self._generation))
+            self._sort_out()
+
+    def refuse(self, stamp_ns: int, cause: Refusal, reason: str) -> None:
+        """Count a frame that could not even be added."""
+        with self._changed:
+            self._frames += 1
+            self._refuse(stamp_ns, cause, reason)
+
+    def close(self) -> None:
+        """End of the input: `take` gives what is there, then None."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    # -- output ------------------------------------------------------------------------------
+
+    def take(self, timeout: float = 0.0) -> ReadyFrame | FrameRefused | None:
+        """The next frame in the order of stamps, or a refusal, or None after `timeout` seconds.
+
+        The image is decoded outside of the lock.
+        """
+        taken = self._take_waiting(timeout)
+        if not isinstance(taken, _Waiting):
+            return taken
+        try:
+            frame = taken.frame.decoded()
+        except InputError as error:
+            with self._changed:
+                return self._counted(taken.frame.stamp_ns, Refusal.BAD_IMAGE, str(error))
+        with self._changed:
+            # While it was decoded time may have jumped, and the buffer belongs to another time.
+            if (taken.generation != self._generation or self._buffer.coverage(
+                    taken.start_ns, taken.end_ns) is not Coverage.AVAILABLE):
+                return self._counted(
+                    frame.stamp_ns, Refusal.CLOCK_JUMP,
+                    'the gyro samples of the frame went while it was decoded: stamps jumped')
+            previous_ns = self._previous_reference_ns
+            if previous_ns is not None and taken.reference_ns - previous_ns > LONGEST_TURN_NS:
+                previous_ns = None
+            imu = frame_imu(self._buffer, (taken.start_ns, taken.end_ns), taken.reference_ns,
+                            self._R_cam_imu, previous_ns)
+            self._previous_reference_ns = taken.reference_ns
+            self._prune(min(taken.start_ns, taken.reference_ns) - CLOCK_JUMP_NS)
+            self._frames_taken += 1
+            restart = self._taken_generation != self._generation
+            self._taken_generation = self._generation
+            return ReadyFrame(frame, imu, restart, taken.ready_ns or 0)
+
+    def counts(self) -> SequencerCounts:
+        """A snapshot of the counters."""
+        with self._changed:
+            return SequencerCounts(
+                frames=self._frames, frames_taken=self._frames_taken,
+                refused=dict(self._refused), imu_samples=self._imu_samples,
+                imu_gaps=self._imu_gaps, clock_jumps=self._clock_jumps)
+
+    # -- under the lock ----------------------------------------------------------------------
+
+    def _take_waiting(self, timeout: float) -> _Waiting | FrameRefused | None:
+        with self._changed:
+            # Offline, what is not there yet does not come by waiting.
+            wait_ns = 0 if self._offline else round(timeout * NANOSECONDS)
+            deadline_ns = self._now() + wait_ns
+            while True:
+                if self._refusals:
+                    return self._refusals.popleft()
+                if self._waiting:
+                    head = self._waiting[0]
+                    if head.ready_ns is not None:
+                        coverage = self._buffer.coverage(head.start_ns, head.end_ns)
+                        if coverage is Coverage.AVAILABLE:
+                            return self._waiting.popleft()
+                        if coverage is Coverage.NEVER:
+                            self._waiting.popleft()
+                            return self._counted(
+                                head.frame.stamp_ns, Refusal.IMU_GAP,
+                                'the gyro does not cover the read-out of the frame: it has a gap '
+                                'there, or begins later')
+                    if self._closed:
+                        self._waiting.popleft()
+                        return self._counted(head.frame.stamp_ns, Refusal.NO_IMU,
+                                             'the gyro ends before the last row of the frame')
+                elif self._closed:
+                    return None
+                now_ns = self._now()
+                wait_until_ns = deadline_ns
+                if self._waiting and not self._offline:
+                    overdue_ns = self._waiting[0].received_ns + MAX_IMU_WAIT_NS
+                    if now_ns >= overdue_ns:
+                        stamp_ns = self._waiting.popleft().frame.stamp_ns
+                        return self._counted(
+                            stamp_ns, Refusal.NO_IMU,
+                            'no gyro sample that covers the last row of the frame came within '
+                            f'{MAX_IMU_WAIT_NS / NANOSECONDS:g} s')
+                    wait_until_ns = min(wait_until_ns, overdue_ns)
+                if now_ns >= deadline_ns:
+                    return None
+                self._changed.wait((wait_until_ns - now_ns) / NANOSECONDS)
+
+    def _sort_out(self) -> None:
+        """Mark the frames that the IMU covers by now, and keep the mailbox within its bounds."""
+        now_ns = self._now()
+        ready = 0
+        for waiting in self._waiting:
+            if waiting.ready_ns is None:
+                if not self._covers(waiting.end_ns):
+                    break
+                waiting.ready_ns = now_ns
+            ready += 1
+        if not self._offline:
+            for _ in range(ready - MAILBOX_FRAMES):
+                self._refuse(self._waiting.popleft().frame.stamp_ns, Refusal.OVERLOAD,
+                             'the worker was too slow, newer frames wait')
+            while len(self._waiting) > WAITING_FRAMES:
+                self._refuse(self._waiting.popleft().frame.stamp_ns, Refusal.NO_IMU,
+                             f'{WAITING_FRAMES} newer frames wait for the gyro')
+        if ready:
+            self._changed.notify()
+
+    def _covers(self, end_ns: int) -> bool:
+        """Whether the IMU has come as far as `end_ns`, the accelerometer too where there is one."""
+        gyro_ns, accelerometer_ns = self._newest_gyro_ns, self._newest_accelerometer_ns
+        if gyro_ns is None or gyro_ns < end_ns:
+            return False
+        # Gravity must not depend on which of two topics came first.
+        return (accelerometer_ns is None or accelerometer_ns >= end_ns
+                or gyro_ns - accelerometer_ns > _ACCELEROMETER_STALE_NS)
+
+    def _clock_of(self, calibration: Calibration) -> ImageClock:
+        if self._image_clock is None or calibration != self._calibration:
+            sensor = self._parameters.sensor
+            self._image_clock = ImageClock(
+                sensor_camera(calibration, self._parameters), sensor.time_offset,
+                sensor.stamp_exposure, sensor.exposure_time)
+            self._calibration = calibration
+        return self._image_clock
+
+    def _counted(self, stamp_ns: int, cause: Refusal, reason: str) -> FrameRefused:
+        self._refused[cause] += 1
+        return FrameRefused(stamp_ns, cause, reason)
+
+    def _refuse(self, stamp_ns: int, cause: Refusal, reason: str) -> None:
+        self._refusals.append(self._counted(stamp_ns, cause, reason))
+        self._changed.notify()
+
+    def _jump(self, reason: str) -> None:
+        """Time starts anew: what waits belongs to the time before."""
+        self._clock_jumps += 1
+        self._generation += 1
+        while self._waiting:
+            self._refuse(self._waiting.popleft().frame.stamp_ns, Refusal.CLOCK_JUMP, reason)
+        self._last_stamp_ns = self._previous_reference_ns = None
+
+    def _clear_imu(self) -> None:
+        self._buffer.clear()
+        self._newest_imu_ns = self._newest_gyro_ns = self._newest_accelerometer_ns = None
+        self._pruned_ns = 0
+
+    def _prune(self, before_ns: int) -> None:
+        if self._waiting:
+            before_ns = min(before_ns, self._waiting[0].start_ns - CLOCK_JUMP_NS)
+        # The turn from the last processed frame to the next one must stay.
+        if (self._previous_reference_ns is not None
+                and before_ns - self._previous_reference_ns <= LONGEST_TURN_NS):
+            before_ns = min(before_ns, self._previous_reference_ns)
+        self._buffer.prune(before_ns)
+        self._pruned_ns = before_ns
+
+
+def _later(known_ns: int | None, stamp_ns: int) -> int:
+    return stamp_ns if known_ns is None else max(known_ns, stamp_ns)

@@ -1,0 +1,234 @@
+"""Plays a bag into the ROS graph at bag time: a stand-in for camera and IMU drivers.
+
+    python -m rs_relpose_ros.ros.player bags/hand_held --wait-for-subscribers 10
+
+For tests, the demo and machines without ``ros2 bag``. Ends by itself after the last message.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+import time
+from array import array
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import rclpy
+from rclpy.duration import Duration
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from rclpy.utilities import remove_ros_args
+from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.interfaces import Connection
+from rosbags.typesys import Stores, get_typestore
+
+from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
+from rs_relpose_ros.timing import NANOSECONDS
+
+_COMPRESSED = 'sensor_msgs/msg/CompressedImage'
+# What the node subscribes to, and so what is worth waiting for.
+_SENSOR_TYPES = ('sensor_msgs/msg/Image', _COMPRESSED, 'sensor_msgs/msg/CameraInfo',
+                 'sensor_msgs/msg/Imu')
+_DEPTH = 1000
+# Best-effort samples are confirmed by nobody; the last ones need this long to be read.
+_LINGER = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class PlayerOptions:
+    """How a bag is played.
+
+    Parameters
+    ----------
+    bag : Path
+        Rosbag2 directory, MCAP file or ROS 1 bag.
+    rate : float
+        Speed against bag time.
+    best_effort : bool
+        QoS of the publishers; reliable otherwise.
+    decode : {'', 'mono8', 'bgr8'}
+        Publish compressed images raw, in this encoding, on the topic without ``/compressed``.
+    topics : tuple of str
+        Only these topics of the bag; empty for all.
+    wait_for_subscribers : float
+        Longest wait [s] for a subscription to each sensor topic; 0 starts at once.
+    """
+
+    bag: Path
+    rate: float = 1.0
+    best_effort: bool = False
+    decode: str = ''
+    topics: tuple[str, ...] = ()
+    wait_for_subscribers: float = 0.0
+
+
+def play(node: Node, options: PlayerOptions) -> int:
+    """Publish the bag; the number of messages published.
+
+    Raises
+    ------
+    InputError, MissingInputError
+        No bag, no such topic, or no subscriber in time.
+    """
+    try:
+        with AnyReader([options.bag],
+                       default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+            connections = _chosen(reader, options)
+            publishers = {c.id: _publisher(node, c, options) for c in connections}
+            if options.wait_for_subscribers > 0.0:
+                _wait_for_subscribers(
+                    [publishers[c.id] for c in connections if c.msgtype in _SENSOR_TYPES],
+                    options.wait_for_subscribers)
+            return _publish(_messages(reader, connections, options), publishers, options.rate)
+    except (AnyReaderError, OSError) as error:
+        raise InputError(f'cannot play {options.bag}: {error}') from error
+
+
+def _chosen(reader: AnyReader, options: PlayerOptions) -> list[Connection]:
+    there = sorted({c.topic for c in reader.connections})
+    for topic in options.topics:
+        if topic not in there:
+            raise MissingInputError(
+                f'the bag {options.bag} has no topic {topic}; it has {", ".join(there)}')
+    return [c for c in reader.connections if not options.topics or c.topic in options.topics]
+
+
+def _publisher(node: Node, connection: Connection, options: PlayerOptions) -> Publisher:
+    topic, msgtype = connection.topic, connection.msgtype
+    if options.decode and msgtype == _COMPRESSED:
+        topic, msgtype = topic.removesuffix('/compressed'), 'sensor_msgs/msg/Image'
+    reliability = (ReliabilityPolicy.BEST_EFFORT if options.best_effort
+                   else ReliabilityPolicy.RELIABLE)
+    depth = _DEPTH if msgtype == 'sensor_msgs/msg/Imu' else 10
+    return node.create_publisher(message_class(msgtype), topic, QoSProfile(
+        history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=reliability))
+
+
+def message_class(msgtype: str) -> Any:
+    """rclpy's class of a message type name such as ``'sensor_msgs/msg/Imu'``."""
+    package, _, name = msgtype.split('/')
+    try:
+        return getattr(importlib.import_module(f'{package}.msg'), name)
+    except (ImportError, AttributeError):
+        raise MissingInputError(
+            f'message type {msgtype} is not installed; install its package, or choose other '
+            'topics') from None
+
+
+def _wait_for_subscribers(publishers: Sequence[Publisher], seconds: float) -> None:
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline and rclpy.ok():
+        if all(p.get_subscription_count() > 0 for p in publishers):
+            return
+        time.sleep(0.02)
+    lonely = [p.topic_name for p in publishers if p.get_subscription_count() == 0]
+    if lonely:
+        raise MissingInputError(
+            f'nobody subscribed to {", ".join(lonely)} within {seconds:g} s: start the node '
+            'first, and remap its topics to these names')
+
+
+def _messages(reader: AnyReader, connections: list[Connection],
+              options: PlayerOptions) -> Iterator[tuple[int, int, Any]]:
+    """Connection id, bag time [ns] and message (serialised where it goes on as it is)."""
+    for connection, bag_time_ns, raw in reader.messages(connections):
+        if not reader.is2:
+            raw = reader.typestore.ros1_to_cdr(raw, connection.msgtype)
+        message: Any = bytes(raw)
+        if options.decode and connection.msgtype == _COMPRESSED:
+            message = _decoded(deserialize_message(message, message_class(_COMPRESSED)),
+                               options.decode)
+        yield connection.id, bag_time_ns, message
+
+
+def _decoded(compressed: Any, encoding: str) -> Any:
+    flags = cv2.IMREAD_GRAYSCALE if encoding == 'mono8' else cv2.IMREAD_COLOR
+    pixels = cv2.imdecode(np.frombuffer(compressed.data, np.uint8),
+                          flags | cv2.IMREAD_IGNORE_ORIENTATION)
+    if pixels is None:
+        raise InputError('a compressed image of the bag cannot be decoded: it is corrupt')
+    data = array('B')
+    data.frombytes(pixels.tobytes())
+    return message_class('sensor_msgs/msg/Image')(
+        header=compressed.header, height=pixels.shape[0], width=pixels.shape[1],
+        encoding=encoding, step=pixels.shape[1] * pixels[0, 0].size, data=data)
+
+
+def _publish(messages: Iterator[tuple[int, int, Any]], publishers: dict[int, Publisher],
+             rate: float) -> int:
+    count = 0
+    first_ns = start_ns = 0
+    for connection_id, bag_time_ns, message in messages:
+        if count == 0:
+            first_ns, start_ns = bag_time_ns, time.monotonic_ns()
+        due_ns = start_ns + round((bag_time_ns - first_ns) / rate)
+        wait_ns = due_ns - time.monotonic_ns()
+        if wait_ns > 0:
+            time.sleep(wait_ns / NANOSECONDS)
+        if not rclpy.ok():
+            return count
+        publishers[connection_id].publish(message)
+        count += 1
+    for publisher in publishers.values():
+        publisher.wait_for_all_acked(Duration(seconds=1))
+    time.sleep(_LINGER)
+    return count
+
+
+def parse(arguments: Sequence[str]) -> PlayerOptions:
+    """Options of a command line."""
+    parser = argparse.ArgumentParser(
+        prog='player', description='Play a bag into the ROS graph at bag time.')
+    parser.add_argument('bag', type=Path, help='rosbag2 directory, MCAP file or ROS 1 bag')
+    parser.add_argument('--rate', type=_rate, default=1.0, help='speed against bag time')
+    parser.add_argument('--best-effort', action='store_true',
+                        help='best-effort publishers instead of reliable ones')
+    parser.add_argument('--decode', choices=('mono8', 'bgr8'), default='',
+                        help='publish compressed images raw in this encoding')
+    parser.add_argument('--topics', nargs='+', default=(), metavar='TOPIC',
+                        help='only these topics of the bag')
+    parser.add_argument('--wait-for-subscribers', type=float, default=0.0, metavar='SECONDS',
+                        help='longest wait for a subscription to each sensor topic')
+    given = parser.parse_args(arguments)
+    return PlayerOptions(given.bag, given.rate, given.best_effort, given.decode,
+                         tuple(given.topics), given.wait_for_subscribers)
+
+
+def _rate(text: str) -> float:
+    rate = float(text)
+    if not 0.0 < rate <= 1000.0:
+        raise argparse.ArgumentTypeError(f'must lie in (0, 1000], got {text}')
+    return rate
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; its exit code."""
+    given = sys.argv if arguments is None else ['player', *arguments]
+    options = parse(remove_ros_args(given)[1:])
+    rclpy.init(args=list(given))
+    node = rclpy.create_node('player')
+    try:
+        count = play(node, options)
+        node.get_logger().info(f'played {count} messages of {options.bag}')
+    except RsRelposeError as error:
+        node.get_logger().fatal(str(error))
+        return 2
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return 0
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
