@@ -157,7 +157,8 @@ def test_node_describes_itself():
 
 
 @pytest.mark.parametrize('name', command_line.COMMANDS)
-def test_command_describes_itself(name, capsys):
+def test_command_describes_itself(name, capsys, monkeypatch):
+    monkeypatch.setenv('COLUMNS', '400')  # no line breaks inside of what is looked for
     assert command_line.main([name, '--help']) == 0
     shown = ' '.join(capsys.readouterr().out.split())
     assert f'rs_relpose {name}' in shown
@@ -165,7 +166,8 @@ def test_command_describes_itself(name, capsys):
 
 
 def test_overview_names_every_command_and_imports_none():
-    ended = run(sys.executable, '-m', f'{NAME}.cli.main', '--help')
+    ended = run(sys.executable, '-m', f'{NAME}.cli.main', '--help',
+                env={**os.environ, 'COLUMNS': '400'})
     assert ended.returncode == 0
     for name, one_line in command_line.COMMANDS.items():
         assert re.search(rf'{name}\s+{one_line}', ' '.join(ended.stdout.split()))
