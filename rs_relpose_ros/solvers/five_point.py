@@ -1,0 +1,422 @@
+"""Calibrated 5-point solver: the essential matrix of five pairs of rays.
+
+Nister, *An Efficient Solution to the Five-Point Relative Pose Problem*, PAMI 2004, with the roots
+of the degree-10 polynomial isolated by its derivatives, the essential matrix decomposed by Horn's
+closed form (*Recovering Baseline and Orientation from 'Essential' Matrix*, 1990), and every
+solution polished by Newton's method on the five constraints themselves, which removes the
+rounding of the elimination.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.so3 import exp_so3
+from rs_relpose_ros.solvers.cheirality import cheirality_votes
+from rs_relpose_ros.solvers.polynomial import real_roots
+
+Array = NDArray[np.float64]
+
+_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
+
+MAX_SOLUTIONS = 10
+# A double root that rounding has made a conjugate pair; Newton's method decides on it.
+_PAIR_TOLERANCE = 1e-4
+_POLISH_STEPS = 4
+# Constraint residual (unit rays, unit t) above which a candidate is no solution.
+_ACCEPTED_RESIDUAL = 1e-10
+_CONVERGED = 1e-15
+_NO_TIMES = np.zeros(5)
+
+# Monomials, in Nister's order of the cubic ones: the first ten are eliminated.
+_CUBIC = ['xxx', 'yyy', 'xxy', 'xyy', 'xxz', 'xx1', 'yyz', 'yy1', 'xyz', 'xy1',
+          'xzz', 'xz1', 'x11', 'yzz', 'yz1', 'y11', 'zzz', 'zz1', 'z11', '111']
+_QUADRATIC = ['xx', 'xy', 'xz', 'x1', 'yy', 'yz', 'y1', 'zz', 'z1', '11']
+_ORDER = 'xyz1'
+
+
+def _product_table(left: list[str], products: list[str]) -> NDArray[np.int64]:
+    """Index in `products` of each monomial of `left` times each of x, y, z, 1."""
+    return np.array([[products.index(''.join(sorted(m + v, key=_ORDER.index))) for v in _ORDER]
+                     for m in left])
+
+
+_TO_QUADRATIC = _product_table(list(_ORDER), _QUADRATIC)
+_TO_CUBIC = _product_table(_QUADRATIC, _CUBIC)
+
+
+@_jit
+def _null_space(rows: Array, basis: Array) -> None:
+    """Orthonormal basis (4, 9) of the vectors perpendicular to `rows` (5, 9), overwritten.
+
+    Householder reflections of the transposed matrix: the last four columns of its Q.
+    """
+    scale = np.zeros(5)
+    for k in range(5):
+        norm2 = 0.0
+        for j in range(k, 9):
+            norm2 += rows[k, j] * rows[k, j]
+        if norm2 > 0.0:
+            alpha = math.sqrt(norm2) if rows[k, k] > 0.0 else -math.sqrt(norm2)
+            rows[k, k] += alpha
+            scale[k] = 1.0 / (alpha * rows[k, k])
+        for i in range(k + 1, 5):
+            dot = 0.0
+            for j in range(k, 9):
+                dot += rows[k, j] * rows[i, j]
+            dot *= scale[k]
+            for j in range(k, 9):
+                rows[i, j] -= dot * rows[k, j]
+    for c in range(4):
+        for j in range(9):
+            basis[c, j] = 0.0
+        basis[c, 5 + c] = 1.0
+        for k in range(4, -1, -1):
+            dot = 0.0
+            for j in range(k, 9):
+                dot += rows[k, j] * basis[c, j]
+            dot *= scale[k]
+            for j in range(k, 9):
+                basis[c, j] -= dot * rows[k, j]
+
+
+@_jit
+def _add_quadratic(p: Array, q: Array, factor: float, out: Array) -> None:
+    """Add `factor` times the product of two linear polynomials (4,) to `out` (10,)."""
+    for i in range(4):
+        for j in range(4):
+            out[_TO_QUADRATIC[i, j]] += factor * p[i] * q[j]
+
+
+@_jit
+def _add_cubic(p: Array, q: Array, out: Array) -> None:
+    """Add the product of a quadratic (10,) and a linear (4,) polynomial to `out` (20,)."""
+    for i in range(10):
+        for j in range(4):
+            out[_TO_CUBIC[i, j]] += p[i] * q[j]
+
+
+@_jit
+def _cubic_constraints(basis: Array, M: Array) -> None:
+    """``det E = 0`` and ``(E E^T - trace(E E^T) / 2) E = 0`` in the 20 monomials: `M` (10, 20).
+
+    ``E = x B_0 + y B_1 + z B_2 + B_3`` with the four rows of `basis`.
+    """
+    E = np.empty((9, 4))
+    for c in range(4):
+        for j in range(9):
+            E[j, c] = basis[c, j]
+    M[:] = 0.0
+    minor = np.empty(10)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        minor[:] = 0.0
+        _add_quadratic(E[3 + j], E[6 + k], 1.0, minor)
+        _add_quadratic(E[3 + k], E[6 + j], -1.0, minor)
+        _add_cubic(minor, E[i], M[0])
+    EET = np.zeros((9, 10))
+    for i in range(3):
+        for j in range(i, 3):
+            for k in range(3):
+                _add_quadratic(E[3 * i + k], E[3 * j + k], 1.0, EET[3 * i + j])
+            EET[3 * j + i] = EET[3 * i + j]
+    for m in range(10):
+        half_trace = 0.5 * (EET[0, m] + EET[4, m] + EET[8, m])
+        EET[0, m] -= half_trace
+        EET[4, m] -= half_trace
+        EET[8, m] -= half_trace
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                _add_cubic(EET[3 * i + k], E[3 * k + j], M[1 + 3 * i + j])
+
+
+@_jit
+def _eliminate(M: Array) -> bool:
+    """Gauss-Jordan with row pivoting, as far as needed: identity in rows and columns 4 to 9."""
+    for k in range(10):
+        pivot = k
+        for i in range(k + 1, 10):
+            if abs(M[i, k]) > abs(M[pivot, k]):
+                pivot = i
+        if not abs(M[pivot, k]) > 1e-300:
+            return False
+        if pivot != k:
+            for j in range(k, 20):
+                M[k, j], M[pivot, j] = M[pivot, j], M[k, j]
+        inverse = 1.0 / M[k, k]
+        for j in range(k, 20):
+            M[k, j] *= inverse
+        for i in range(k + 1, 10):
+            factor = M[i, k]
+            for j in range(k + 1, 20):
+                M[i, j] -= factor * M[k, j]
+    for k in range(9, 4, -1):
+        for i in range(4, k):
+            factor = M[i, k]
+            for j in range(10, 20):
+                M[i, j] -= factor * M[k, j]
+    return True
+
+
+@_jit
+def _multiply_add(p: Array, p_size: int, q: Array, q_size: int, factor: float,
+                  out: Array) -> None:
+    """Add `factor` times the product of two polynomials in z to `out`."""
+    for i in range(p_size):
+        for j in range(q_size):
+            out[i + j] += factor * p[i] * q[j]
+
+
+@_jit
+def _degree_10(M: Array, B: Array, p: Array) -> None:
+    """The 3x3 matrix of polynomials in z, `B` (3, 3, 5), with ``B(z) (x, y, 1) = 0``; its det."""
+    B[:] = 0.0
+    for r in range(3):
+        upper, lower = M[4 + 2 * r], M[5 + 2 * r]
+        # upper - z lower: the leading monomials cancel.
+        for c in range(3):
+            first = 10 + 3 * c
+            terms = 4 if c == 2 else 3
+            for j in range(terms):
+                power = terms - 1 - j
+                B[r, c, power] += upper[first + j]
+                B[r, c, power + 1] -= lower[first + j]
+    p[:] = 0.0
+    minor = np.empty(7)
+    for r in range(3):
+        i, j = (r + 1) % 3, (r + 2) % 3
+        minor[:] = 0.0
+        _multiply_add(B[i, 0], 4, B[j, 1], 4, 1.0, minor)
+        _multiply_add(B[j, 0], 4, B[i, 1], 4, -1.0, minor)
+        _multiply_add(minor, 7, B[r, 2], 5, 1.0, p)
+
+
+@_jit
+def _essential_matrix(B: Array, z: float, basis: Array, E: Array) -> bool:
+    """E (3, 3) with ``|E| = sqrt(2)`` at a root z: (x, y, 1) is the null vector of B(z)."""
+    V = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for k in range(4, -1, -1):
+                V[i, j] = V[i, j] * z + B[i, j, k]
+    longest = 0.0
+    x, y, w = 0.0, 0.0, 0.0
+    for i in range(3):
+        p, q = V[i], V[(i + 1) % 3]
+        cx = p[1] * q[2] - p[2] * q[1]
+        cy = p[2] * q[0] - p[0] * q[2]
+        cw = p[0] * q[1] - p[1] * q[0]
+        length2 = cx * cx + cy * cy + cw * cw
+        if length2 > longest:
+            longest = length2
+            x, y, w = cx, cy, cw
+    norm2 = 0.0
+    for i in range(3):
+        for j in range(3):
+            m = 3 * i + j
+            E[i, j] = x * basis[0, m] + y * basis[1, m] + w * (z * basis[2, m] + basis[3, m])
+            norm2 += E[i, j] * E[i, j]
+    if not 0.0 < norm2 < math.inf:
+        return False
+    E *= math.sqrt(2.0 / norm2)
+    return True
+
+
+@_jit
+def _orthonormalise(R: Array) -> bool:
+    """Nearest rotation by Newton's iteration of the polar decomposition; False if far off."""
+    G = np.empty((3, 3))
+    for _ in range(3):
+        worst = 0.0
+        for i in range(3):
+            for j in range(3):
+                gram = R[0, i] * R[0, j] + R[1, i] * R[1, j] + R[2, i] * R[2, j]
+                G[i, j] = -0.5 * gram
+                if i == j:
+                    G[i, j] += 1.5
+                    gram -= 1.0
+                worst = max(worst, abs(gram))
+        if not worst < 0.1:
+            return False
+        for i in range(3):
+            x, y, z = R[i, 0], R[i, 1], R[i, 2]
+            for j in range(3):
+                R[i, j] = x * G[0, j] + y * G[1, j] + z * G[2, j]
+        if worst < 1e-8:
+            return True
+    return True
+
+
+@_jit
+def _decompose(E: Array, f1: Array, f2: Array, R: Array, t: Array) -> bool:
+    """R and t of ``E = [t]x R`` that put most points in front of both cameras.
+
+    Horn: ``(t.t) R = cofactors(E) -+ [t]x E``, for t and -t.
+    """
+    longest = 0.0
+    for i in range(3):
+        j = (i + 1) % 3
+        x = E[1, i] * E[2, j] - E[2, i] * E[1, j]
+        y = E[2, i] * E[0, j] - E[0, i] * E[2, j]
+        z = E[0, i] * E[1, j] - E[1, i] * E[0, j]
+        length2 = x * x + y * y + z * z
+        if length2 > longest:
+            longest = length2
+            t[0], t[1], t[2] = x, y, z
+    if not longest > 1e-20:
+        return False
+    t *= 1.0 / math.sqrt(longest)
+    candidate = np.empty((3, 3))
+    best = -1
+    sign = 1.0
+    for twist in (1.0, -1.0):
+        for i in range(3):
+            i1, i2 = (i + 1) % 3, (i + 2) % 3
+            for j in range(3):
+                j1, j2 = (j + 1) % 3, (j + 2) % 3
+                cofactor = E[i1, j1] * E[i2, j2] - E[i1, j2] * E[i2, j1]
+                cross = t[i1] * E[i2, j] - t[i2] * E[i1, j]
+                candidate[i, j] = cofactor - twist * cross
+        if not _orthonormalise(candidate):
+            continue
+        front, behind = cheirality_votes(f1, f2, _NO_TIMES, _NO_TIMES, candidate, t)
+        votes = max(front, behind)
+        if votes > best:
+            best = votes
+            sign = 1.0 if front >= behind else -1.0
+            R[:] = candidate
+    t *= sign
+    return best >= 0
+
+
+@_jit
+def _solve5(J: Array, r: Array) -> bool:
+    """Solve ``J x = r`` in place of `r` (5,) by Gauss elimination with row pivoting."""
+    for k in range(5):
+        pivot = k
+        for i in range(k + 1, 5):
+            if abs(J[i, k]) > abs(J[pivot, k]):
+                pivot = i
+        if not abs(J[pivot, k]) > 1e-14:
+            return False
+        if pivot != k:
+            for j in range(k, 5):
+                J[k, j], J[pivot, j] = J[pivot, j], J[k, j]
+            r[k], r[pivot] = r[pivot], r[k]
+        for i in range(k + 1, 5):
+            factor = J[i, k] / J[k, k]
+            for j in range(k + 1, 5):
+                J[i, j] -= factor * J[k, j]
+            r[i] -= factor * r[k]
+    for k in range(4, -1, -1):
+        for j in range(k + 1, 5):
+            r[k] -= J[k, j] * r[j]
+        r[k] /= J[k, k]
+    return True
+
+
+@_jit
+def _polish(f1: Array, f2: Array, R: Array, t: Array) -> bool:
+    """Newton's method on ``e = (f_1 x R f_2) . t``, R by ``Exp(theta) R``, t on the sphere."""
+    J, step = np.empty((5, 5)), np.empty(5)
+    # Two unit vectors perpendicular to t.
+    u, v = np.empty(3), np.empty(3)
+    for attempt in range(_POLISH_STEPS + 1):
+        smallest = 0
+        for i in range(1, 3):
+            if abs(t[i]) < abs(t[smallest]):
+                smallest = i
+        i, j = (smallest + 1) % 3, (smallest + 2) % 3
+        norm = math.sqrt(t[i] * t[i] + t[j] * t[j])
+        u[smallest], u[i], u[j] = 0.0, -t[j] / norm, t[i] / norm
+        v[0] = t[1] * u[2] - t[2] * u[1]
+        v[1] = t[2] * u[0] - t[0] * u[2]
+        v[2] = t[0] * u[1] - t[1] * u[0]
+        worst = 0.0
+        for k in range(5):
+            f = f1[k]
+            hx = R[0, 0] * f2[k, 0] + R[0, 1] * f2[k, 1] + R[0, 2] * f2[k, 2]
+            hy = R[1, 0] * f2[k, 0] + R[1, 1] * f2[k, 1] + R[1, 2] * f2[k, 2]
+            hz = R[2, 0] * f2[k, 0] + R[2, 1] * f2[k, 1] + R[2, 2] * f2[k, 2]
+            nx, ny, nz = f[1] * hz - f[2] * hy, f[2] * hx - f[0] * hz, f[0] * hy - f[1] * hx
+            # de / d theta = h x (t x f_1)
+            mx, my, mz = t[1] * f[2] - t[2] * f[1], t[2] * f[0] - t[0] * f[2], (
+                t[0] * f[1] - t[1] * f[0])
+            J[k, 0] = hy * mz - hz * my
+            J[k, 1] = hz * mx - hx * mz
+            J[k, 2] = hx * my - hy * mx
+            J[k, 3] = nx * u[0] + ny * u[1] + nz * u[2]
+            J[k, 4] = nx * v[0] + ny * v[1] + nz * v[2]
+            step[k] = -(nx * t[0] + ny * t[1] + nz * t[2])
+            worst = max(worst, abs(step[k]))
+        if worst < _CONVERGED or attempt == _POLISH_STEPS:
+            return worst < _ACCEPTED_RESIDUAL
+        if not _solve5(J, step):
+            return worst < _ACCEPTED_RESIDUAL
+        length2 = 0.0
+        for k in range(5):
+            length2 += step[k] * step[k]
+        # Rounding, not another solution, is what is corrected here.
+        if not length2 < 0.01:
+            return False
+        R[:] = exp_so3(step[:3]) @ R
+        norm = math.sqrt(1.0 + step[3] * step[3] + step[4] * step[4])
+        for i in range(3):
+            t[i] = (t[i] + step[3] * u[i] + step[4] * v[i]) / norm
+    return False
+
+
+@_jit
+def five_point_kernel(f1: Array, f2: Array, R_out: Array, t_out: Array) -> int:
+    """All real solutions of the calibrated 5-point problem; their number.
+
+    Parameters
+    ----------
+    f1, f2 : (5, 3) ndarray
+        Unit rays, measured (`global_5pt`) or derotated (`angular_5pt`).
+    R_out, t_out : (>= 10, 3, 3), (>= 10, 3) ndarray
+        Receive R and the unit t: of the four decompositions of each essential matrix the one
+        that puts most of the five points in front of both cameras.
+    """
+    rows = np.empty((5, 9))
+    for k in range(5):
+        for i in range(3):
+            for j in range(3):
+                rows[k, 3 * i + j] = f1[k, i] * f2[k, j]  # f_1^T E f_2 = 0
+    basis, M = np.empty((4, 9)), np.empty((10, 20))
+    _null_space(rows, basis)
+    _cubic_constraints(basis, M)
+    if not _eliminate(M):
+        return 0
+    B, p, roots = np.empty((3, 3, 5)), np.empty(11), np.empty(10)
+    _degree_10(M, B, p)
+    largest = 0.0
+    for k in range(11):
+        largest = max(largest, abs(p[k]))
+    if not 0.0 < largest < math.inf:
+        return 0
+    p *= 1.0 / largest
+    found = real_roots(p, _PAIR_TOLERANCE, roots)
+    E = np.empty((3, 3))
+    count = 0
+    for k in range(found):
+        R, t = R_out[count], t_out[count]
+        if not (_essential_matrix(B, roots[k], basis, E) and _decompose(E, f1, f2, R, t)
+                and _polish(f1, f2, R, t)):
+            continue
+        repeated = False
+        for j in range(count):
+            gap = 0.0
+            for i in range(3):
+                gap += abs(R_out[j, i, 0] - R[i, 0]) + abs(R_out[j, i, 1] - R[i, 1])
+                gap += abs(t_out[j, i] - t[i])
+            if gap < 1e-9:
+                repeated = True
+        if not repeated:
+            count += 1
+    return count
