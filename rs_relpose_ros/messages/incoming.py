@@ -34,7 +34,7 @@ _COLOR = {
     'bgra8': (4, cv2.COLOR_BGRA2GRAY),
     'rgba8': (4, cv2.COLOR_RGBA2GRAY),
 }
-# OpenCV names a Bayer pattern by its second row's second and third pixel, ROS by the first two rows.
+# OpenCV names a Bayer pattern by the second row from its second pixel on, ROS from the corner.
 _BAYER = {
     'bayer_rggb': cv2.COLOR_BayerBG2GRAY,
     'bayer_bggr': cv2.COLOR_BayerRG2GRAY,

@@ -11,8 +11,13 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.messages.incoming import (
-    accelerometer_sample_from_message, calibration_from_info, image_from_compressed,
-    image_from_message, imu_sample_from_message, stamp_ns)
+    accelerometer_sample_from_message,
+    calibration_from_info,
+    image_from_compressed,
+    image_from_message,
+    imu_sample_from_message,
+    stamp_ns,
+)
 from rs_relpose_ros.pipeline.calibration import Calibration
 from rs_relpose_ros.pipeline.frame import EncodedFrame
 from rs_relpose_ros.pipeline.sequencer import Refusal, Sequencer

@@ -104,7 +104,7 @@ def matches_message(result: PairResult, types: MessageTypes) -> Any:
     field_type = types('sensor_msgs/msg/PointField')
     fields = [field_type(name=name, offset=offset, count=1,
                          datatype=_UINT32 if name == 'id' else _FLOAT32)
-              for name, (_, offset) in MATCH_DTYPE.fields.items()]   # type: ignore[union-attr]
+              for name, offset in _match_offsets()]
     message_type = types('sensor_msgs/msg/PointCloud2')
     return message_type(
         header=header(result.stamp_ns, result.frame_id, types), height=1, width=len(points),
@@ -125,6 +125,11 @@ def inlier_records(result: PairResult) -> NDArray[np.void]:
         for column, name in enumerate(names.split()):
             records[name] = values[inliers, column]
     return records
+
+
+def _match_offsets() -> list[tuple[str, int]]:
+    fields = MATCH_DTYPE.fields or {}
+    return [(name, int(entry[1])) for name, entry in fields.items()]
 
 
 def diagnostics_message(stamp_ns: int, status: Any, types: MessageTypes) -> Any:

@@ -7,29 +7,26 @@ does not go on is counted by its cause.
 
 from __future__ import annotations
 
-import threading
-import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
+import threading
+import time
 
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.imu.buffer import Coverage, ImuBuffer
-from rs_relpose_ros.imu.frame_imu import FrameImu, frame_imu
+from rs_relpose_ros.imu.frame_imu import frame_imu, FrameImu
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.pipeline.calibration import Calibration
 from rs_relpose_ros.pipeline.frame import EncodedFrame, Frame
 from rs_relpose_ros.pipeline.parameters import Parameters
 from rs_relpose_ros.pipeline.pipeline import sensor_camera
 from rs_relpose_ros.result import Status
-from rs_relpose_ros.timing import NANOSECONDS, ImageClock, seconds_between
+from rs_relpose_ros.timing import ImageClock, NANOSECONDS, seconds_between, to_nanoseconds
 
 # A stamp that lies further back than this is a bag that starts anew, not a late message.
 CLOCK_JUMP_NS = NANOSECONDS
-# IMU history that is kept for frames to come; of it, the longest turn between two frames.
-HISTORY_NS = 10 * NANOSECONDS
-LONGEST_TURN_NS = HISTORY_NS // 2
 # Frames that wait for the worker; bounds the latency of an overloaded node.
 MAILBOX_FRAMES = 3
 # Frames that wait for the IMU; bounds the memory.
@@ -135,7 +132,10 @@ class Sequencer:
         self._R_cam_imu = parameters.sensor.R_cam_imu
         self._offline = offline
         self._now: Callable[[], int] = (lambda: 0) if offline else clock
-        self._max_gap_ns = round(parameters.imu.max_imu_gap * NANOSECONDS)
+        self._max_gap_ns = to_nanoseconds(parameters.imu.max_imu_gap)
+        # How much of the history is left depends on when it is asked for; half of it always is,
+        # so that live and replay agree.
+        self._longest_turn_ns = to_nanoseconds(0.5 * parameters.imu.imu_buffer_seconds)
         self._changed = threading.Condition()
         self._buffer = ImuBuffer(parameters.imu)
         self._waiting: deque[_Waiting] = deque()
@@ -147,7 +147,6 @@ class Sequencer:
         self._newest_imu_ns: int | None = None
         self._newest_gyro_ns: int | None = None
         self._newest_accelerometer_ns: int | None = None
-        self._pruned_ns = 0
         self._generation = 0
         self._taken_generation = 0
         self._closed = False
@@ -182,9 +181,6 @@ class Sequencer:
                         and sample.stamp_ns - self._newest_gyro_ns > self._max_gap_ns):
                     self._imu_gaps += 1
                 self._newest_gyro_ns = _later(self._newest_gyro_ns, sample.stamp_ns)
-            # Without frames nobody else prunes.
-            if self._newest_imu_ns - self._pruned_ns > 2 * HISTORY_NS:
-                self._prune(self._newest_imu_ns - HISTORY_NS)
             self._sort_out()
 
     def add_frame(self, frame: Frame | EncodedFrame) -> None:
@@ -249,12 +245,12 @@ class Sequencer:
                     frame.stamp_ns, Refusal.CLOCK_JUMP,
                     'the gyro samples of the frame went while it was decoded: stamps jumped')
             previous_ns = self._previous_reference_ns
-            if previous_ns is not None and taken.reference_ns - previous_ns > LONGEST_TURN_NS:
+            if (previous_ns is not None
+                    and taken.reference_ns - previous_ns > self._longest_turn_ns):
                 previous_ns = None
             imu = frame_imu(self._buffer, (taken.start_ns, taken.end_ns), taken.reference_ns,
                             self._R_cam_imu, previous_ns)
             self._previous_reference_ns = taken.reference_ns
-            self._prune(min(taken.start_ns, taken.reference_ns) - CLOCK_JUMP_NS)
             self._frames_taken += 1
             restart = self._taken_generation != self._generation
             self._taken_generation = self._generation
@@ -332,7 +328,7 @@ class Sequencer:
             self._changed.notify()
 
     def _covers(self, end_ns: int) -> bool:
-        """Whether the IMU has come as far as `end_ns`, the accelerometer too where there is one."""
+        """Whether the IMU has come as far as `end_ns`, an accelerometer on its own topic too."""
         gyro_ns, accelerometer_ns = self._newest_gyro_ns, self._newest_accelerometer_ns
         if gyro_ns is None or gyro_ns < end_ns:
             return False
@@ -368,17 +364,6 @@ class Sequencer:
     def _clear_imu(self) -> None:
         self._buffer.clear()
         self._newest_imu_ns = self._newest_gyro_ns = self._newest_accelerometer_ns = None
-        self._pruned_ns = 0
-
-    def _prune(self, before_ns: int) -> None:
-        if self._waiting:
-            before_ns = min(before_ns, self._waiting[0].start_ns - CLOCK_JUMP_NS)
-        # The turn from the last processed frame to the next one must stay.
-        if (self._previous_reference_ns is not None
-                and before_ns - self._previous_reference_ns <= LONGEST_TURN_NS):
-            before_ns = min(before_ns, self._previous_reference_ns)
-        self._buffer.prune(before_ns)
-        self._pruned_ns = before_ns
 
 
 def _later(known_ns: int | None, stamp_ns: int) -> int:

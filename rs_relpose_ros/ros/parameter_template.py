@@ -1,13 +1,13 @@
 """The commented parameter file ``config/relpose.yaml``, written from the declared settings.
 
-    python -m rs_relpose_ros.ros.parameter_template config/relpose.yaml
+python -m rs_relpose_ros.ros.parameter_template config/relpose.yaml
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 import sys
 import textwrap
-from pathlib import Path
 from typing import Any
 
 from rs_relpose_ros.pipeline.parameters import Parameters

@@ -8,13 +8,12 @@ For tests, the demo and machines without ``ros2 bag``. Ends by itself after the 
 from __future__ import annotations
 
 import argparse
-import importlib
-import sys
-import time
 from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+import sys
+import time
 from typing import Any
 
 import cv2
@@ -29,9 +28,10 @@ from rclpy.serialization import deserialize_message
 from rclpy.utilities import remove_ros_args
 from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.interfaces import Connection
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import get_typestore, Stores
 
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
+from rs_relpose_ros.ros.message_types import message_class
 from rs_relpose_ros.timing import NANOSECONDS
 
 _COMPRESSED = 'sensor_msgs/msg/CompressedImage'
@@ -113,17 +113,6 @@ def _publisher(node: Node, connection: Connection, options: PlayerOptions) -> Pu
         history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=reliability))
 
 
-def message_class(msgtype: str) -> Any:
-    """rclpy's class of a message type name such as ``'sensor_msgs/msg/Imu'``."""
-    package, _, name = msgtype.split('/')
-    try:
-        return getattr(importlib.import_module(f'{package}.msg'), name)
-    except (ImportError, AttributeError):
-        raise MissingInputError(
-            f'message type {msgtype} is not installed; install its package, or choose other '
-            'topics') from None
-
-
 def _wait_for_subscribers(publishers: Sequence[Publisher], seconds: float) -> None:
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline and rclpy.ok():
@@ -142,8 +131,9 @@ def _messages(reader: AnyReader, connections: list[Connection],
     """Connection id, bag time [ns] and message (serialised where it goes on as it is)."""
     for connection, bag_time_ns, raw in reader.messages(connections):
         if not reader.is2:
-            raw = reader.typestore.ros1_to_cdr(raw, connection.msgtype)
-        message: Any = bytes(raw)
+            message: Any = bytes(reader.typestore.ros1_to_cdr(raw, connection.msgtype))
+        else:
+            message = bytes(raw)
         if options.decode and connection.msgtype == _COMPRESSED:
             message = _decoded(deserialize_message(message, message_class(_COMPRESSED)),
                                options.decode)

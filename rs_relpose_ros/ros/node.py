@@ -1,0 +1,317 @@
+"""The node: subscribes, hands messages over, publishes what the worker finds."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+import logging
+import os
+from pathlib import Path
+import sys
+import traceback
+from typing import Any, TextIO
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
+import rclpy
+from rclpy.clock import Clock, ClockType
+from rclpy.exceptions import InvalidHandle
+from rclpy.executors import ExternalShutdownException
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.utilities import remove_ros_args
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2, TimeReference
+
+from rs_relpose_ros.errors import InputError, RsRelposeError
+from rs_relpose_ros.messages.intake import MessageIntake
+from rs_relpose_ros.messages.outgoing import diagnostics_message, pair_messages, status_message
+from rs_relpose_ros.pipeline.pair import PairResult
+from rs_relpose_ros.pipeline.parameters import Parameters
+from rs_relpose_ros.pipeline.sequencer import FrameRefused, ReadyFrame, Refusal, Sequencer
+from rs_relpose_ros.ros.cause_log import CauseLog
+from rs_relpose_ros.ros.diagnostics import Inputs, SILENCE, Statistics
+from rs_relpose_ros.ros.message_types import message_class
+from rs_relpose_ros.ros.params import NodeParameters, unknown_overrides
+from rs_relpose_ros.ros.worker import Worker
+from rs_relpose_ros.timing import NANOSECONDS
+
+# Best effort matches every publisher; a reliable subscription would not.
+IMAGE_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=5,
+                       reliability=ReliabilityPolicy.BEST_EFFORT)
+# Samples of some seconds, so that no stall loses any.
+IMU_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000,
+                     reliability=ReliabilityPolicy.BEST_EFFORT)
+
+# The worker ends within a frame, unless it compiles.
+_JOIN_TIMEOUT = 0.7
+
+
+class RelposeNode(Node):
+    """Relative poses of a rolling-shutter camera with an IMU.
+
+    Callbacks convert little and hand over; one worker thread does the rest.
+
+    Raises
+    ------
+    InputError
+        A parameter is not legal.
+    """
+
+    def __init__(self) -> None:
+        super().__init__('relpose_node')
+        self._warn = CauseLog(self.get_logger().warning)
+        self._error = CauseLog(self.get_logger().error)
+        self._settings = NodeParameters(self, self._on_parameters)
+        for sentence in unknown_overrides(self):
+            self._warn(sentence)
+        self._statistics = Statistics()
+        self._counts = dict.fromkeys(
+            ('images', 'camera_infos', 'imu', 'accelerometer', 'invalid'), 0)
+        self._sequencer: Sequencer | None = None
+        self._intake: MessageIntake | None = None
+        self._worker: Worker | None = None
+        self._stamps: TextIO | None = None
+        self._ready_ns = 0
+        self._heard_ns: dict[str, int] = {}
+        # Diagnostics and time-outs go by the wall's pace also where /clock stands still.
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._relative_pose = self.create_publisher(
+            PoseWithCovarianceStamped, '~/relative_pose', 10)
+        self._reference = self.create_publisher(TimeReference, '~/reference', 10)
+        self._velocity = self.create_publisher(TwistWithCovarianceStamped, '~/velocity', 10)
+        self._matches = self.create_publisher(PointCloud2, '~/matches', 10)
+        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._refused = self._cannot_estimate()
+        if self._refused:
+            self._error(self._refused)
+        else:
+            self._start()
+        self.create_timer(1.0, self._report, clock=self._steady)
+
+    # -- start and stop ----------------------------------------------------------------------
+
+    def _cannot_estimate(self) -> str:
+        """Why nothing can be estimated with these parameters and topics; empty for no reason."""
+        missing = self._settings.current.sensor.missing()
+        if missing:
+            return (f'not estimating: parameter {" and ".join(missing)} must be given: see '
+                    'config/relpose.yaml, and start again')
+        topic = self.resolve_topic_name('image')
+        if 'image_rect' in topic:
+            return (f'not estimating: {topic} is a rectified image, in which a row no longer has '
+                    'one instant; remap image to the raw one')
+        return ''
+
+    def _start(self) -> None:
+        parameters = self._settings.current
+        if parameters.pair.stamps_file:
+            self._stamps = _opened(parameters.pair.stamps_file)
+        self._sequencer = Sequencer(parameters)
+        self._intake = MessageIntake(self._sequencer)
+        self._worker = Worker(parameters, self._sequencer, self._on_frame, self._on_refused,
+                              self._on_failure)
+        self._worker.start()
+        # Subscribed only when ready: what comes earlier would be dropped.
+        self._warm_timer = self.create_timer(0.02, self._subscribe_when_warm, clock=self._steady)
+
+    def _subscribe_when_warm(self) -> None:
+        assert self._worker is not None and self._intake is not None
+        if not self._worker.warm:
+            return
+        self.destroy_timer(self._warm_timer)
+        intake = self._intake
+        image_type: type = Image
+        image_topic, add_image = self.resolve_topic_name('image'), intake.add_image
+        if self._settings.current.pair.image_transport == 'compressed':
+            # As image_transport does: the transport's name follows the remapped one.
+            image_type = CompressedImage
+            image_topic, add_image = f'{image_topic}/compressed', intake.add_compressed_image
+        overriding = QoSOverridingOptions.with_default_policies()
+        self._image_topic = image_topic
+        for kind, msgtype, topic, qos, add in (
+                ('images', image_type, image_topic, IMAGE_QOS, add_image),
+                ('camera_infos', CameraInfo, 'camera_info', IMAGE_QOS, intake.add_camera_info),
+                ('imu', Imu, 'imu', IMU_QOS, intake.add_imu),
+                ('accelerometer', Imu, 'accel', IMU_QOS, intake.add_accelerometer)):
+            self.create_subscription(msgtype, topic, self._receiver(kind, add), qos,
+                                     qos_overriding_options=overriding)
+        self._ready_ns = self._now_ns()
+        self.get_logger().info(
+            f'ready: {image_topic}, {self.resolve_topic_name("camera_info")} and '
+            f'{self.resolve_topic_name("imu")}')
+
+    def stop(self) -> bool:
+        """End the worker; whether it did. Call it before `destroy_node`."""
+        stopped = self._worker is None or self._worker.stop(_JOIN_TIMEOUT)
+        if self._stamps is not None and stopped:
+            self._stamps.close()
+        return stopped
+
+    # -- messages in -------------------------------------------------------------------------
+
+    def _receiver(self, kind: str, add: Callable[[Any], None]) -> Callable[[Any], None]:
+        def receive(msg: Any) -> None:
+            self._counts[kind] += 1
+            self._heard_ns[kind] = self._now_ns()
+            try:
+                add(msg)
+            except RsRelposeError as error:
+                self._counts['invalid'] += 1
+                self._error(str(error))
+        return receive
+
+    def _on_parameters(self, parameters: Parameters) -> None:
+        if self._worker is not None:
+            self._worker.change(parameters)
+
+    # -- results out (called by the worker) --------------------------------------------------
+
+    def _on_frame(self, ready: ReadyFrame, result: PairResult | None) -> None:
+        if self._stamps is not None:
+            self._stamps.write(f'{ready.frame.stamp_ns}\n')
+        if result is None:
+            return
+        if result.pose:
+            messages = pair_messages(result, message_class,
+                                     self._settings.current.pair.reference_frame)
+            try:
+                self._relative_pose.publish(messages.relative_pose)
+                self._reference.publish(messages.reference)
+                self._velocity.publish(messages.velocity)
+                self._matches.publish(messages.matches)
+            except (rclpy_implementation.RCLError, InvalidHandle):
+                if self.context.ok():   # else the node is being shut down
+                    raise
+        self._statistics.add_pair(result, ready.ready_ns)
+
+    def _on_refused(self, refused: FrameRefused) -> None:
+        if refused.cause is Refusal.NO_IMU:
+            self._warn(f'a frame was not used: {refused.reason}; is '
+                       f'{self.resolve_topic_name("imu")} published, with a gyro, and are its '
+                       'stamps on the clock of the images (time_offset)?')
+        else:
+            self._warn(f'a frame was not used ({refused.cause.value}): {refused.reason}')
+
+    def _on_failure(self, sentence: str, error: Exception) -> None:
+        self._statistics.add_failure(f'{sentence}: {error}')
+        if isinstance(error, RsRelposeError):
+            self._error(f'{sentence}: {error}')
+        else:
+            text = ''.join(traceback.format_exception(error))
+            self._error(f'{sentence}: {type(error).__name__}: {error}\n{text}')
+
+    # -- diagnostics -------------------------------------------------------------------------
+
+    def _report(self) -> None:
+        problem, missing = self._problem()
+        counts = None if self._sequencer is None else self._sequencer.counts()
+        report = self._statistics.report(
+            Inputs(**self._counts), counts, problem=problem, missing=missing)
+        status = status_message(
+            report.level, f'{self.get_fully_qualified_name()}: relative pose', report.text,
+            self.resolve_topic_name('image'), report.values, message_class)
+        self._diagnostics.publish(diagnostics_message(
+            self.get_clock().now().nanoseconds, status, message_class))
+
+    def _problem(self) -> tuple[str, tuple[str, ...]]:
+        """Why nothing is estimated at the moment, and the names of what is missing."""
+        if self._refused:
+            return self._refused, tuple(self._settings.current.sensor.missing())
+        assert self._worker is not None and self._intake is not None
+        if not self._ready_ns:
+            if not self._worker.is_alive():
+                return 'not estimating: the worker ended, see the log', ()
+            return 'starting: kernels are compiled or loaded', ()
+        silent = {kind: self._silent(kind) for kind in ('images', 'camera_infos', 'imu')}
+        topics = {'images': self._image_topic,
+                  'camera_infos': self.resolve_topic_name('camera_info'),
+                  'imu': self.resolve_topic_name('imu')}
+        missing = tuple(topics[kind] for kind, is_silent in silent.items() if is_silent)
+        if self._intake.calibration_problem:
+            return f'not estimating: {self._intake.calibration_problem}', ('calibration',)
+        # Where nothing comes at all the driver is not running yet: worth a status, not a warning.
+        if silent['images']:
+            return f'not estimating: no image on {topics["images"]} for {SILENCE:g} s', missing
+        if self._intake.calibration is None and silent['camera_infos']:
+            text = (f'not estimating: no CameraInfo on {topics["camera_infos"]}; remap '
+                    'camera_info to the topic of the driver, which must publish a calibration')
+            self._error(text)
+            return text, missing
+        if silent['imu']:
+            text = (f'not estimating: no IMU message on {topics["imu"]} for {SILENCE:g} s; remap '
+                    'imu to the topic of the driver')
+            self._error(text)
+            return text, missing
+        return '', ()
+
+    def _silent(self, kind: str) -> bool:
+        heard_ns = self._heard_ns.get(kind, self._ready_ns)
+        return self._now_ns() - heard_ns > SILENCE * NANOSECONDS
+
+    def _now_ns(self) -> int:
+        return int(self._steady.now().nanoseconds)
+
+
+def _opened(path: str) -> TextIO:
+    try:
+        return Path(path).open('w', buffering=1, encoding='ascii')
+    except OSError as error:
+        raise InputError(f'stamps_file {path} cannot be written: {error.strerror}') from error
+
+
+def _help() -> argparse.ArgumentParser:
+    lines = ['parameters (set them with --ros-args -p NAME:=VALUE or --params-file FILE):']
+    for name, default, declared in Parameters.declarations():
+        shown = 'no default' if default is None else f'default {default!r}'
+        lines.append(f'  {name}: {declared.description}. {declared.legal}; {shown}'
+                     f'{"; live" if declared.live else ""}')
+    return argparse.ArgumentParser(
+        prog='relpose_node', formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=(
+            'Relative poses of a rolling-shutter camera, aided by an IMU.\n\n'
+            'subscribes: image (or image/compressed with image_transport:=compressed), '
+            'camera_info, imu, accel\n'
+            'publishes:  ~/relative_pose, ~/reference, ~/velocity, ~/matches, /diagnostics'),
+        epilog='\n'.join(lines))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the node; its exit code: 0 after SIGINT or SIGTERM, 2 for an illegal parameter."""
+    given = sys.argv if arguments is None else ['relpose_node', *arguments]
+    _help().parse_args(remove_ros_args(given)[1:])
+    rclpy.init(args=list(given))
+    node: RelposeNode | None = None
+    try:
+        node = RelposeNode()
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except rclpy_implementation.RCLError:
+        # A signal may end the context amid a call.
+        if rclpy.ok():
+            raise
+    except RsRelposeError as error:
+        rclpy.logging.get_logger('relpose_node').fatal(str(error))
+        return 2
+    finally:
+        _finish(node)
+    return 0
+
+
+def _finish(node: RelposeNode | None) -> None:
+    if node is not None:
+        if not node.stop():
+            # Compiling or loading kernels cannot be interrupted, and a thread that still runs
+            # while the interpreter goes down aborts the process.
+            logging.shutdown()
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(0)
+        node.destroy_node()
+    rclpy.try_shutdown()
+
+
+if __name__ == '__main__':
+    sys.exit(main())

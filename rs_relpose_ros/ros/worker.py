@@ -1,0 +1,90 @@
+"""The thread that estimates: takes frames from the sequencer, hands pairs to the node."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import threading
+
+from rs_relpose_ros.estimator.estimate import warm_up
+from rs_relpose_ros.pipeline.pair import PairResult
+from rs_relpose_ros.pipeline.parameters import Parameters
+from rs_relpose_ros.pipeline.pipeline import Pipeline
+from rs_relpose_ros.pipeline.sequencer import FrameRefused, ReadyFrame, Sequencer
+
+_TAKE_TIMEOUT = 0.1
+
+
+class Worker(threading.Thread):
+    """Runs the pipeline until it is stopped; an error in one frame never ends it.
+
+    Parameters
+    ----------
+    parameters : Parameters
+    sequencer : Sequencer
+    on_frame : callable
+        Called with the frame and its pair or None, after the frame was processed.
+    on_refused : callable
+        Called with every frame that was refused.
+    on_error : callable
+        Called with a sentence and the exception when a frame failed.
+    """
+
+    def __init__(self, parameters: Parameters, sequencer: Sequencer,
+                 on_frame: Callable[[ReadyFrame, PairResult | None], None],
+                 on_refused: Callable[[FrameRefused], None],
+                 on_error: Callable[[str, Exception], None]) -> None:
+        # A thread that compiles cannot be stopped; a daemon does not hold up the exit.
+        super().__init__(name='relpose_worker', daemon=True)
+        self._sequencer = sequencer
+        self._on_frame = on_frame
+        self._on_refused = on_refused
+        self._on_error = on_error
+        self._pipeline = Pipeline(parameters)
+        self._changed_parameters: Parameters | None = None
+        self._stopping = threading.Event()
+        self._warm = threading.Event()
+
+    @property
+    def warm(self) -> bool:
+        """Whether the kernels are compiled and frames are taken."""
+        return self._warm.is_set()
+
+    def change(self, parameters: Parameters) -> None:
+        """Use these parameters from the next frame on."""
+        self._changed_parameters = parameters
+
+    def stop(self, timeout: float) -> bool:
+        """Ask the thread to end and wait for it; whether it did in time."""
+        self._stopping.set()
+        self._sequencer.close()
+        self.join(timeout)
+        return not self.is_alive()
+
+    def run(self) -> None:
+        """Work until `stop`."""
+        try:
+            warm_up()
+        except Exception as error:  # noqa: BLE001 - the node shows it; a silent thread is worse
+            self._on_error('the kernels cannot be compiled', error)
+            return
+        self._warm.set()
+        while not self._stopping.is_set():
+            taken = self._sequencer.take(_TAKE_TIMEOUT)
+            if isinstance(taken, FrameRefused):
+                self._on_refused(taken)
+            elif taken is not None and not self._stopping.is_set():
+                self._process(taken)
+
+    def _process(self, ready: ReadyFrame) -> None:
+        try:
+            if self._changed_parameters is not None:
+                self._pipeline.update(self._changed_parameters)
+                self._changed_parameters = None
+            if ready.restart:
+                self._pipeline.reset()
+            result = self._pipeline.process(ready.frame, ready.imu)
+        except Exception as error:  # noqa: BLE001 - told with its traceback by the node
+            self._pipeline.reset()
+            self._on_error('a frame failed and tracking starts anew', error)
+            result = None
+        self._on_frame(ready, result)
