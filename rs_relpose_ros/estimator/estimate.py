@@ -21,7 +21,6 @@ from rs_relpose_ros.estimator.hypotheses import (
     UNIFORM_9PT,
     UNIFORM_11PT,
     Knowledge,
-    gravity_alignment,
 )
 from rs_relpose_ros.estimator.local_optimisation import (
     cheirality_sign,
@@ -42,7 +41,8 @@ from rs_relpose_ros.estimator.sampling import POOL, sample_hypotheses
 from rs_relpose_ros.estimator.velocity_prior import GRID, fit_with_evidence, with_velocity_sigma
 from rs_relpose_ros.motion import FrameMotion
 from rs_relpose_ros.result import RelativePose, Status
-from rs_relpose_ros.so3 import exp_so3
+from rs_relpose_ros.so3 import exp_so3, skew
+from rs_relpose_ros.solvers.gravity import gravity_alignment
 
 Array = NDArray[np.float64]
 
@@ -302,7 +302,7 @@ class _Estimation:
         jacobian[6:9, 5:8] = np.eye(3)
         # v_2 = R^T d_2, w_2 = w + R^T dw_2: the error of R turns them with it.
         jacobian[9:12, 8:11] = state.R.T
-        jacobian[9:12, 0:3] = state.R.T @ _skew_of(state.d2)
+        jacobian[9:12, 0:3] = state.R.T @ skew(state.d2)
         jacobian[12:15, 11:14] = np.eye(3)
         jacobian[15:18, 14:17] = state.R.T
         w1 = self.problem.motion1.angular_velocity + state.dw1
@@ -370,10 +370,6 @@ def _priors(problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig) 
         SAMPLING_VELOCITY_SIGMA**-2 if mode.velocities or mode.derotate else PINNED,
         np.ascontiguousarray(rotation),
         np.ascontiguousarray(information) if information is not None else np.zeros((3, 3)))
-
-
-def _skew_of(v: Array) -> Array:
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 def _checked_matches(points1: ArrayLike, points2: ArrayLike, quality: ArrayLike | None,

@@ -9,11 +9,14 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.solvers.angular_3pt import angular_3pt_kernel
+from rs_relpose_ros.solvers.five_point import five_point_kernel
+
 Array = NDArray[np.float64]
 
 GYRO_2PT, ANGULAR_3PT, ANGULAR_5PT, UNIFORM_9PT, UNIFORM_11PT = range(5)
 SAMPLE_SIZES = np.array([2, 3, 5, 9, 11])
-MAX_SOLUTIONS = 40
+MAX_SOLUTIONS = 12
 
 _jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 
@@ -75,9 +78,9 @@ def generate(generator: int, points: Array, sample: NDArray[np.int64], knowledge
         tau1[k], tau2[k] = p[4], p[5]
     if generator == GYRO_2PT:
         return _gyro_2pt(f1, f2, knowledge.rotation, R_out, x_out)
+    x_out[:] = 0.0
+    if generator == ANGULAR_3PT:
+        return angular_3pt_kernel(f1, f2, knowledge.align1, knowledge.align2, R_out, x_out)
+    if generator == ANGULAR_5PT:
+        return five_point_kernel(f1, f2, R_out, x_out)
     return 0
-
-
-def gravity_alignment(g):
-    from scipy.spatial.transform import Rotation
-    return np.eye(3)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_ros.camera import READOUT_DIRECTIONS, REFERENCE_ROWS
 from rs_relpose_ros.config import EstimatorConfig
 from rs_relpose_ros.errors import InputError, MissingInputError
-from rs_relpose_ros.imu.buffer import ImuConfig
+from rs_relpose_ros.imu.config import ImuConfig
 from rs_relpose_ros.settings import Declared, check_settings, declared, setting
 from rs_relpose_ros.timing import STAMP_EXPOSURES
 from rs_relpose_ros.tracking.config import TrackingConfig

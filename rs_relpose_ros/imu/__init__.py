@@ -1,0 +1,1 @@
+"""The IMU front end: samples, buffer, rotation by the gyro, direction of gravity."""

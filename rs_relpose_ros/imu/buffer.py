@@ -1,0 +1,239 @@
+"""IMU history: takes samples in any order, answers for intervals, says when it cannot."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.imu.config import ImuConfig
+from rs_relpose_ros.imu.gravity import MEAN_WINDOW_NS, GravityEstimate, GravityFilter, mean_gravity
+from rs_relpose_ros.imu.integration import integrate_rotation
+from rs_relpose_ros.imu.samples import ImuSample
+from rs_relpose_ros.timing import to_nanoseconds
+
+Array = NDArray[np.float64]
+
+# Older than the newest sample by more than this: the clock was set back (a bag that loops).
+JUMP_BACK_NS = 1_000_000_000
+
+
+class Coverage(Enum):
+    """Whether the buffer can answer for an interval."""
+
+    AVAILABLE = 'available'
+    NOT_YET = 'not yet'
+    NEVER = 'never'
+
+
+class AddResult(Enum):
+    """What became of a sample."""
+
+    ADDED = 'added'
+    DUPLICATE = 'duplicate'
+    LATE = 'late'
+    JUMPED_BACK = 'jumped back'
+
+
+class _Series:
+    """Stamped vectors (K, 3) in the order of their stamps, in growing contiguous arrays."""
+
+    def __init__(self) -> None:
+        self._stamps = np.empty(256, dtype=np.int64)
+        self._values = np.empty((256, 3))
+        self._start = 0
+        self._end = 0
+
+    @property
+    def stamps(self) -> NDArray[np.int64]:
+        return self._stamps[self._start:self._end]
+
+    @property
+    def values(self) -> Array:
+        return self._values[self._start:self._end]
+
+    def insert(self, stamp_ns: int, value: tuple[float, float, float]) -> bool:
+        """Insert in order; False for a stamp that is there already."""
+        stamps = self.stamps
+        position = len(stamps)
+        if position and stamp_ns <= stamps[-1]:
+            position = int(np.searchsorted(stamps, stamp_ns))
+            if stamps[position] == stamp_ns:
+                return False
+        if self._end == len(self._stamps):
+            self._make_room()
+        at = self._start + position
+        self._stamps[at + 1:self._end + 1] = self._stamps[at:self._end]
+        self._values[at + 1:self._end + 1] = self._values[at:self._end]
+        self._stamps[at], self._values[at] = stamp_ns, value
+        self._end += 1
+        return True
+
+    def prune(self, before_ns: int) -> None:
+        """Forget samples before `before_ns`, but for the last of them: borders interpolate."""
+        keep = int(np.searchsorted(self.stamps, before_ns, side='right')) - 1
+        if keep > 0:
+            self._start += keep
+
+    def _make_room(self) -> None:
+        count = self._end - self._start
+        size = max(256, 2 * count)
+        stamps, values = np.empty(size, dtype=np.int64), np.empty((size, 3))
+        stamps[:count], values[:count] = self.stamps, self.values
+        self._stamps, self._values, self._start, self._end = stamps, values, 0, count
+
+
+class ImuBuffer:
+    """Gyro and accelerometer of the last seconds, with a causal gravity filter.
+
+    Gyro and accelerometer may come in one message or in two (RealSense). Equal samples in equal
+    order give bit-equal answers, however the queries interleave: the gravity filter runs sample by
+    sample over the sorted gyro, up to the instant that is asked for.
+    """
+
+    def __init__(self, config: ImuConfig) -> None:
+        self._config = config
+        self._bias = np.array(config.gyro_bias)
+        self._gap_ns = to_nanoseconds(config.max_imu_gap)
+        self._keep_ns = to_nanoseconds(config.imu_buffer_seconds)
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._gyro, self._force = _Series(), _Series()
+        self._filter = GravityFilter(self._config)
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Stamp of the newest gyro sample."""
+        stamps = self._gyro.stamps
+        return int(stamps[-1]) if len(stamps) else None
+
+    def add(self, sample: ImuSample) -> AddResult:
+        """Store a sample.
+
+        Raises
+        ------
+        InputError
+            A value is not finite; nothing is stored then.
+        """
+        for name, value in (('angular_velocity', sample.angular_velocity),
+                            ('linear_acceleration', sample.linear_acceleration)):
+            if value is not None and not np.isfinite(value).all():
+                raise InputError(f'IMU sample at {sample.stamp_ns} ns: {name} must be finite, '
+                                 f'got {list(value)}')
+        newest = max((int(s.stamps[-1]) for s in (self._gyro, self._force) if len(s.stamps)),
+                     default=sample.stamp_ns)
+        if sample.stamp_ns < newest - JUMP_BACK_NS:
+            return AddResult.JUMPED_BACK
+        added = False
+        for series, value in ((self._gyro, sample.angular_velocity),
+                              (self._force, sample.linear_acceleration)):
+            if value is not None:
+                added |= series.insert(sample.stamp_ns, value)
+        if not added:
+            return AddResult.DUPLICATE
+        if sample.stamp_ns > newest:
+            # The filter takes in what is about to be forgotten.
+            self._run_filter(newest - self._keep_ns)
+            self.prune(newest - self._keep_ns)
+        return AddResult.LATE if sample.stamp_ns < newest else AddResult.ADDED
+
+    def prune(self, before_ns: int) -> None:
+        """Forget what is older than `before_ns`."""
+        self._gyro.prune(before_ns)
+        self._force.prune(before_ns)
+
+    def coverage(self, start_ns: int, end_ns: int) -> Coverage:
+        """Whether the gyro covers [start_ns, end_ns] without a gap."""
+        stamps = self._gyro.stamps
+        if len(stamps) == 0:
+            return Coverage.NOT_YET
+        if start_ns < stamps[0]:
+            return Coverage.NEVER
+        first = int(np.searchsorted(stamps, start_ns, side='right')) - 1
+        last = int(np.searchsorted(stamps, end_ns, side='left'))
+        within = stamps[first:last + 1]
+        if len(within) > 1 and int(np.diff(within).max()) > self._gap_ns:
+            return Coverage.NEVER
+        if last == len(stamps):
+            return Coverage.NOT_YET
+        return Coverage.AVAILABLE
+
+    def angular_velocity(self, start_ns: int, end_ns: int) -> tuple[NDArray[np.int64], Array]:
+        """Gyro over an interval, its borders interpolated.
+
+        Returns
+        -------
+        stamps_ns : (K,) ndarray of int64
+            From `start_ns` to `end_ns`; one entry where they are equal.
+        rates : (K, 3) ndarray
+            IMU frame [rad/s], bias subtracted.
+        """
+        if end_ns < start_ns:
+            raise InputError(f'the interval must not end ({end_ns}) before it starts ({start_ns})')
+        if self.coverage(start_ns, end_ns) is not Coverage.AVAILABLE:
+            raise InputError(f'the gyro does not cover [{start_ns}, {end_ns}] ns: '
+                             f'{self.coverage(start_ns, end_ns).value}')
+        stamps, values = self._gyro.stamps, self._gyro.values
+        inner = slice(int(np.searchsorted(stamps, start_ns, side='right')),
+                      int(np.searchsorted(stamps, end_ns, side='left')))
+        borders = [start_ns] if end_ns == start_ns else [start_ns, end_ns]
+        out_stamps = np.concatenate([borders[:1], stamps[inner], borders[1:]]).astype(np.int64)
+        out = np.concatenate([self._interpolated(start_ns)[None], values[inner],
+                              *([] if len(borders) == 1
+                                else [self._interpolated(end_ns)[None]])])
+        return out_stamps, out - self._bias
+
+    def rotation(self, start_ns: int, end_ns: int) -> tuple[Array, Array]:
+        """``R_start^T R_end`` (3, 3) in the IMU frame and the covariance of its error.
+
+        See `integrate_rotation`.
+        """
+        return integrate_rotation(*self.angular_velocity(start_ns, end_ns), self._config)
+
+    def gravity(self, at_ns: int) -> GravityEstimate | None:
+        """Direction of gravity at an instant that the gyro covers, from samples up to it."""
+        if self._config.gravity_filter == 'mean':
+            stamps = self._force.stamps
+            window = slice(int(np.searchsorted(stamps, at_ns - MEAN_WINDOW_NS)),
+                           int(np.searchsorted(stamps, at_ns, side='right')))
+            return mean_gravity(self._force.values[window])
+        self._run_filter(at_ns)
+        estimate, stamp_ns = self._filter.estimate(), self._filter.stamp_ns
+        if estimate is None or stamp_ns is None or stamp_ns >= at_ns:
+            return estimate
+        if self.coverage(stamp_ns, at_ns) is not Coverage.AVAILABLE:
+            return None
+        turn, _ = self.rotation(stamp_ns, at_ns)
+        return GravityEstimate(turn.T @ estimate.direction, estimate.sigma)
+
+    # -- inside ------------------------------------------------------------------------------
+
+    def _interpolated(self, at_ns: int) -> Array:
+        stamps, values = self._gyro.stamps, self._gyro.values
+        after = int(np.searchsorted(stamps, at_ns, side='left'))
+        if stamps[after] == at_ns:
+            return values[after]
+        before = after - 1
+        fraction = (at_ns - stamps[before]) / (stamps[after] - stamps[before])
+        return np.asarray(values[before] + fraction * (values[after] - values[before]))
+
+    def _run_filter(self, until_ns: int) -> None:
+        stamps = self._gyro.stamps
+        done = self._filter.stamp_ns
+        first = 0 if done is None else int(np.searchsorted(stamps, done, side='right'))
+        last = int(np.searchsorted(stamps, until_ns, side='right'))
+        for k in range(first, last):
+            stamp_ns = int(stamps[k])
+            self._filter.add(stamp_ns, self._gyro.values[k] - self._bias, self._force_at(stamp_ns))
+
+    def _force_at(self, stamp_ns: int) -> Array:
+        """Latest specific force not after `stamp_ns`; NaN where it is older than a gap."""
+        stamps = self._force.stamps
+        k = int(np.searchsorted(stamps, stamp_ns, side='right')) - 1
+        if k < 0 or stamp_ns - stamps[k] > self._gap_ns:
+            return np.full(3, np.nan)
+        return self._force.values[k]

@@ -1,0 +1,65 @@
+"""Integration of the gyro on SO(3), with covariance."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.imu.config import ImuConfig
+from rs_relpose_ros.so3 import exp_so3, left_jacobian_so3
+
+Array = NDArray[np.float64]
+
+
+@numba.njit(cache=True, nogil=True)
+def _integrate(seconds: Array, rates: Array) -> tuple[Array, Array, Array]:
+    """Rotation ``R_start^T R_end``, its derivative by a constant rate error, and noise growth.
+
+    ``R <- R Exp(w dt)`` with the midpoint rate. An error dw of a step's rate turns the result by
+    ``R J_l(w dt) dw dt`` on the left (in the start frame).
+    """
+    rotation = np.eye(3)
+    by_bias = np.zeros((3, 3))
+    noise = np.zeros((3, 3))
+    for k in range(seconds.shape[0] - 1):
+        dt = seconds[k + 1] - seconds[k]
+        turn = 0.5 * (rates[k] + rates[k + 1]) * dt
+        left = rotation @ left_jacobian_so3(turn)
+        by_bias += left * dt
+        noise += left @ left.T * dt
+        rotation = rotation @ exp_so3(turn)
+    return rotation, by_bias, noise
+
+
+def integrate_rotation(stamps_ns: NDArray[np.int64], rates: ArrayLike,
+                       config: ImuConfig) -> tuple[Array, Array]:
+    """Rotation between the first and the last sample.
+
+    Parameters
+    ----------
+    stamps_ns : (K,) ndarray of int64
+        Strictly increasing.
+    rates : (K, 3) array_like
+        Angular velocity [rad/s], bias removed, linear between samples.
+    config : ImuConfig
+        Noise density and bias uncertainty.
+
+    Returns
+    -------
+    rotation : (3, 3) ndarray
+        ``R_start^T R_end``.
+    covariance : (3, 3) ndarray
+        Of dtheta in the start frame, ``R_true = Exp(dtheta) rotation`` [rad^2].
+    """
+    rates = np.ascontiguousarray(rates, dtype=np.float64)
+    if len(stamps_ns) < 1 or rates.shape != (len(stamps_ns), 3):
+        raise InputError(f'rates must have shape ({len(stamps_ns)}, 3), got {rates.shape}')
+    seconds = (stamps_ns - stamps_ns[0]) * 1e-9
+    if not (np.diff(seconds) > 0.0).all():
+        raise InputError('stamps_ns must be strictly increasing')
+    rotation, by_bias, noise = _integrate(seconds, rates)
+    covariance = (config.gyro_noise_density**2 * noise
+                  + config.gyro_bias_sigma**2 * by_bias @ by_bias.T)
+    return rotation, covariance

@@ -1,0 +1,170 @@
+"""IMU buffer and gyro integration: against SciPy, in any order, with gaps."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.imu.buffer import AddResult, Coverage, ImuBuffer
+from rs_relpose_ros.imu.config import ImuConfig
+from rs_relpose_ros.imu.frame_imu import frame_imu
+from rs_relpose_ros.imu.integration import integrate_rotation
+from rs_relpose_ros.imu.samples import ImuSample
+
+PERIOD = 5_000_000
+START = 1_650_458_790_000_000_000
+UP = (0.0, 0.0, 9.81)
+
+
+def samples(rate, count=100, force=UP):
+    return [ImuSample(START + k * PERIOD, tuple(rate(k * 0.005)), force) for k in range(count)]
+
+
+def filled(items, **config):
+    buffer = ImuBuffer(ImuConfig(**config))
+    for item in items:
+        buffer.add(item)
+    return buffer
+
+
+def wobble(t):
+    return np.array([0.6 * np.sin(3.0 * t), -0.8 * np.cos(2.0 * t), 0.5 + 0.3 * t])
+
+
+def test_constant_rate_is_the_exponential_of_rate_times_time():
+    buffer = filled(samples(lambda t: np.array([0.2, -1.1, 0.7])))
+    rotation, _ = buffer.rotation(START + 1_234_567, START + 301_234_567)
+    expected = Rotation.from_rotvec(0.3 * np.array([0.2, -1.1, 0.7])).as_matrix()
+    np.testing.assert_allclose(rotation, expected, atol=1e-12)
+
+
+def test_rotation_composes_over_adjoining_intervals():
+    buffer = filled(samples(wobble))
+    a, b, c = START + 3_000_000, START + 111_111_111, START + 400_000_001
+    whole, _ = buffer.rotation(a, c)
+    parts = buffer.rotation(a, b)[0] @ buffer.rotation(b, c)[0]
+    np.testing.assert_allclose(parts, whole, atol=2e-6)
+
+
+def test_bias_is_subtracted():
+    bias = (0.01, -0.02, 0.03)
+    buffer = filled(samples(lambda t: np.array(bias)), gyro_bias=bias)
+    np.testing.assert_allclose(buffer.rotation(START, START + 400_000_000)[0], np.eye(3),
+                               atol=1e-12)
+
+
+def test_any_order_of_arrival_gives_the_same_bits():
+    items = samples(wobble)
+    shuffled = [items[k] for k in np.random.default_rng(0).permutation(len(items))]
+    a, b = filled(items), filled(shuffled)
+    assert np.array_equal(a.rotation(START, START + 450_000_001)[0],
+                          b.rotation(START, START + 450_000_001)[0])
+
+
+def test_answers_do_not_depend_on_when_they_are_asked():
+    rng = np.random.default_rng(1)
+    items = [ImuSample(START + k * PERIOD, tuple(rng.normal(size=3)),
+                       tuple(rng.normal(size=3) + UP)) for k in range(2000)]
+    patient = filled(items)
+    eager = ImuBuffer(ImuConfig())
+    for k, item in enumerate(items):
+        eager.add(item)
+        if k > 10 and k % 7 == 0:
+            eager.gravity(item.stamp_ns - 2_000_000)
+    at = items[-1].stamp_ns - 1_000_000
+    assert np.array_equal(patient.gravity(at).direction, eager.gravity(at).direction)
+    assert patient.gravity(at).sigma == eager.gravity(at).sigma
+
+
+def test_coverage():
+    buffer = ImuBuffer(ImuConfig(max_imu_gap=0.02))
+    assert buffer.coverage(START, START + 1) is Coverage.NOT_YET
+    for item in samples(wobble, 10):
+        buffer.add(item)
+    end = START + 9 * PERIOD
+    assert buffer.coverage(START, end) is Coverage.AVAILABLE
+    assert buffer.coverage(START - 1, end) is Coverage.NEVER
+    assert buffer.coverage(START, end + 1) is Coverage.NOT_YET
+    buffer.add(ImuSample(end + 21_000_000, (0.0, 0.0, 0.0), UP))
+    assert buffer.coverage(START, end + 1) is Coverage.NEVER
+    assert buffer.coverage(START, end) is Coverage.AVAILABLE
+    with pytest.raises(InputError, match='does not cover'):
+        buffer.angular_velocity(START, end + 1)
+
+
+def test_duplicates_late_samples_and_jumps_are_told():
+    buffer = ImuBuffer(ImuConfig())
+    first, second, third = samples(wobble, 3)
+    assert buffer.add(first) is AddResult.ADDED
+    assert buffer.add(third) is AddResult.ADDED
+    assert buffer.add(second) is AddResult.LATE
+    assert buffer.add(second) is AddResult.DUPLICATE
+    back = ImuSample(START - 2_000_000_000, (0.0, 0.0, 0.0), UP)
+    assert buffer.add(back) is AddResult.JUMPED_BACK
+
+
+@pytest.mark.parametrize('broken', [
+    ImuSample(START, (float('nan'), 0.0, 0.0), UP), ImuSample(START, (0.0, 0.0, 0.0), (0.0, 0.0, float('inf'))),
+])
+def test_a_broken_sample_is_refused_and_nothing_of_it_is_kept(broken):
+    buffer = ImuBuffer(ImuConfig())
+    with pytest.raises(InputError, match='must be finite'):
+        buffer.add(broken)
+    assert buffer.newest_ns is None
+
+
+def test_gyro_and_accelerometer_in_separate_messages():
+    buffer = ImuBuffer(ImuConfig())
+    for k in range(400):
+        buffer.add(ImuSample(START + k * PERIOD, (0.0, 0.0, 0.0), None))
+        buffer.add(ImuSample(START + k * PERIOD - 1_700_000, None, UP))
+    np.testing.assert_allclose(buffer.gravity(START + 399 * PERIOD).direction, [0.0, 0.0, -1.0],
+                               atol=1e-12)
+
+
+def test_history_is_bounded():
+    buffer = filled(samples(wobble, 3000), imu_buffer_seconds=2.0)
+    newest = START + 2999 * PERIOD
+    assert buffer.coverage(newest - 1_900_000_000, newest) is Coverage.AVAILABLE
+    assert buffer.coverage(newest - 2_100_000_000, newest) is Coverage.NEVER
+
+
+def test_covariance_equals_the_spread_of_noisy_integrations():
+    rng = np.random.default_rng(2)
+    config = ImuConfig(gyro_noise_density=2e-3, gyro_bias_sigma=5e-3)
+    stamps = START + PERIOD * np.arange(81)
+    rates = np.array([3.0 * wobble(k * 0.005) for k in range(81)])
+    expected, covariance = integrate_rotation(stamps, rates, config)
+    errors = []
+    for _ in range(3000):
+        # White noise of density n sampled at f has n sqrt(f) per sample.
+        noise = rng.normal(size=rates.shape) * 2e-3 * np.sqrt(200.0)
+        bias = rng.normal(size=3) * 5e-3
+        noisy, _ = integrate_rotation(stamps, rates + noise + bias, config)
+        errors.append(Rotation.from_matrix(expected @ noisy.T).as_rotvec())
+    sigma = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(np.cov(np.array(errors).T) / np.outer(sigma, sigma),
+                               covariance / np.outer(sigma, sigma), atol=0.1)
+
+
+def test_frame_imu_is_in_the_camera_frame_at_the_stamped_row():
+    rate = np.array([0.0, 0.0, 0.8])
+    R_cam_imu = Rotation.from_euler('xyz', [90, 0, 30], degrees=True).as_matrix()
+    buffer = filled(samples(lambda t: rate, 400))
+    reference = START + 1_500_000_123
+    answer = frame_imu(buffer, (reference, reference + 30_000_000), reference, R_cam_imu,
+                       reference - 66_000_000)
+    np.testing.assert_allclose(answer.motion.angular_velocity, R_cam_imu @ rate, atol=1e-12)
+    np.testing.assert_allclose(
+        answer.motion.rotations([0.03])[0],
+        Rotation.from_rotvec(0.03 * (R_cam_imu @ rate)).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(answer.motion.gravity, R_cam_imu @ [0.0, 0.0, -1.0], atol=1e-9)
+    assert answer.since_previous.stamps_ns[0] == reference - 66_000_000
+    assert answer.since_previous.stamps_ns[-1] == reference
+
+
+def test_frame_imu_of_a_global_shutter():
+    buffer = filled(samples(lambda t: np.array([0.1, 0.2, 0.3])))
+    answer = frame_imu(buffer, (START + 7, START + 7), START + 7, np.eye(3))
+    np.testing.assert_allclose(answer.motion.angular_velocity, [0.1, 0.2, 0.3], atol=1e-12)
+    assert answer.since_previous is None
