@@ -128,7 +128,7 @@ def inlier_records(result: PairResult) -> NDArray[np.void]:
 
 
 def _match_offsets() -> list[tuple[str, int]]:
-    fields = MATCH_DTYPE.fields or {}
+    fields: Any = MATCH_DTYPE.fields
     return [(name, int(entry[1])) for name, entry in fields.items()]
 
 

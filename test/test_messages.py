@@ -1,0 +1,462 @@
+"""Message conversion, with rclpy's classes and with those of rosbags."""
+
+from __future__ import annotations
+
+import struct
+from types import SimpleNamespace
+import zlib
+
+import cv2
+import message_builders as build
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.messages import incoming, outgoing
+from rs_relpose_ros.messages.intake import MessageIntake
+from rs_relpose_ros.pipeline.pair import PairResult
+from rs_relpose_ros.pipeline.parameters import Parameters
+from rs_relpose_ros.pipeline.sequencer import FrameRefused, ReadyFrame, Refusal, Sequencer
+from rs_relpose_ros.result import RelativePose, Status
+from rs_relpose_ros.tracking.matches import Matches
+
+# Luma of ITU-R BT.601.
+WEIGHTS = np.array([0.299, 0.587, 0.114])
+
+
+@pytest.fixture(params=['rclpy', 'rosbags'])
+def types(request: pytest.FixtureRequest) -> build.Types:
+    return build.rclpy_types if request.param == 'rclpy' else build.rosbags_types
+
+
+@pytest.fixture
+def rgb() -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, (7, 10, 3), dtype=np.uint8)
+
+
+def padded(rows: np.ndarray, padding: int) -> tuple[bytes, int]:
+    """Bytes of an array of rows with `padding` bytes of garbage after each, and the step."""
+    flat = rows.reshape(len(rows), -1).view(np.uint8)
+    filled = np.concatenate([flat, np.full((len(rows), padding), 0xaa, np.uint8)], axis=1)
+    return filled.tobytes(), filled.shape[1]
+
+
+# -- images ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('padding', [0, 3])
+@pytest.mark.parametrize(('encoding', 'order'), [
+    ('rgb8', [0, 1, 2]), ('bgr8', [2, 1, 0]), ('rgba8', [0, 1, 2, 0]), ('bgra8', [2, 1, 0, 0])])
+def test_color_becomes_luma(types, rgb, encoding, order, padding):
+    data, step = padded(np.ascontiguousarray(rgb[:, :, order]), padding)
+    gray = incoming.image_from_message(build.image(types, 10, 7, encoding, data, step=step))
+    assert gray.dtype == np.uint8
+    np.testing.assert_allclose(gray, rgb @ WEIGHTS, atol=0.51)
+
+
+@pytest.mark.parametrize('padding', [0, 5])
+def test_mono8_is_passed_on(types, rgb, padding):
+    data, step = padded(rgb[:, :, 0], padding)
+    gray = incoming.image_from_message(build.image(types, 10, 7, 'mono8', data, step=step))
+    np.testing.assert_array_equal(gray, rgb[:, :, 0])
+
+
+def test_last_row_needs_no_padding(types, rgb):
+    data, step = padded(rgb[:, :, 0], 5)
+    gray = incoming.image_from_message(build.image(types, 10, 7, 'mono8', data[:-5], step=step))
+    np.testing.assert_array_equal(gray, rgb[:, :, 0])
+
+
+@pytest.mark.parametrize(('order', 'is_bigendian'), [('<u2', 0), ('>u2', 1)])
+def test_mono16_honours_byte_order(types, order, is_bigendian):
+    values = np.arange(0, 65536, 977, dtype=np.uint16)[:60].reshape(6, 10)
+    data, step = padded(values.astype(order), 2)
+    gray = incoming.image_from_message(
+        build.image(types, 10, 6, 'mono16', data, step=step, is_bigendian=is_bigendian))
+    np.testing.assert_array_equal(gray, values // 256)
+
+
+@pytest.mark.parametrize(('encoding', 'luma_first'), [
+    ('yuv422_yuy2', True), ('yuyv', True), ('yuv422', False), ('uyvy', False)])
+def test_packed_yuv_gives_its_luma(types, rgb, encoding, luma_first):
+    luma = rgb[:, :, 0]
+    packed = np.full((7, 10, 2), 128, np.uint8)
+    packed[:, :, 0 if luma_first else 1] = luma
+    gray = incoming.image_from_message(
+        build.image(types, 10, 7, encoding, packed.tobytes(), step=20))
+    np.testing.assert_array_equal(gray, luma)
+
+
+@pytest.mark.parametrize('bits', [8, 16])
+@pytest.mark.parametrize('pattern', ['rggb', 'bggr', 'gbrg', 'grbg'])
+def test_bayer_knows_its_colors(types, pattern, bits):
+    # Red and blue differ: exchanged, the luma would be 96 instead of 124.
+    level = {'r': 200, 'g': 100, 'b': 50}
+    tile = np.array([level[c] for c in pattern], dtype=np.uint8).reshape(2, 2)
+    mosaic = np.tile(tile, (4, 5))
+    raw = mosaic if bits == 8 else mosaic.astype('<u2') * 256
+    gray = incoming.image_from_message(build.image(
+        types, 10, 8, f'bayer_{pattern}{bits}', raw.tobytes(), step=10 * bits // 8))
+    np.testing.assert_allclose(gray[2:-2, 2:-2], WEIGHTS @ [200, 100, 50], atol=1.0)
+
+
+@pytest.mark.parametrize(('change', 'sentence'), [
+    ({'encoding': '32FC1'}, "encoding '32FC1' is not known; publish one of mono8"),
+    ({'encoding': 'bayer_rggb12'}, "encoding 'bayer_rggb12' is not known"),
+    ({'width': 0}, 'image size 0x7 is not usable'),
+    ({'height': 0}, 'image size 10x0 is not usable'),
+    ({'width': 2**32 - 1, 'height': 2**32 - 1, 'step': 2**32 - 1}, 'is not usable'),
+    ({'width': 16384, 'height': 16384, 'step': 16384}, 'is not usable'),
+    ({'width': 8192, 'height': 8192, 'step': 8192}, 'image has 70 bytes of data, but 8192x8192'),
+    ({'step': 9}, 'image step is 9 bytes, but a row of 10 px in mono8 has 10'),
+    ({'step': 2**32 - 1}, 'image has 70 bytes of data'),
+    ({'height': 8}, 'image has 70 bytes of data, but 10x8 in mono8 with step 10 needs 80'),
+    ({'encoding': 'bgr8'}, 'image step is 10 bytes, but a row of 10 px in bgr8 has 30'),
+    ({'encoding': 'mono16'}, 'image step is 10 bytes, but a row of 10 px in mono16 has 20'),
+])
+def test_unusable_image_is_refused(change, sentence):
+    fields = {'width': 10, 'height': 7, 'encoding': 'mono8', 'step': 10, **change}
+    message = build.image(build.rosbags_types, data=bytes(70), **fields)
+    with pytest.raises(InputError) as caught:
+        incoming.image_from_message(message)
+    assert sentence in str(caught.value)
+
+
+@pytest.mark.parametrize('extension', ['.jpg', '.png'])
+def test_compressed_image_is_decoded(types, extension):
+    ramp = np.tile(np.arange(64, dtype=np.uint8) * 3, (48, 1))
+    data = cv2.imencode(extension, ramp)[1].tobytes()
+    gray = incoming.image_from_compressed(build.compressed(types, data))
+    np.testing.assert_allclose(gray, ramp, atol=4 if extension == '.jpg' else 0)
+
+
+def test_trailing_bytes_of_a_camera_are_no_fault():
+    data = build.jpeg(np.full((48, 64), 77, np.uint8)) + bytes(100)
+    gray = incoming.image_from_compressed(build.compressed(build.rosbags_types, data))
+    assert gray.shape == (48, 64)
+
+
+def test_orientation_tag_does_not_turn_the_rows():
+    # An Exif segment that asks for a turn by 90 degrees (orientation 6).
+    tiff = struct.pack('<2sHIHHHIHHI', b'II', 42, 8, 1, 0x0112, 3, 1, 6, 0, 0)
+    segment = b'Exif\0\0' + tiff
+    plain = build.jpeg(np.zeros((48, 64), np.uint8))
+    data = plain[:2] + b'\xff\xe1' + struct.pack('>H', len(segment) + 2) + segment + plain[2:]
+    assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE).shape == (64, 48)
+    gray = incoming.image_from_compressed(build.compressed(build.rosbags_types, data))
+    assert gray.shape == (48, 64)
+
+
+def png_of_size(width: int, height: int) -> bytes:
+    chunk = b'IHDR' + struct.pack('>IIBBBBB', width, height, 8, 0, 0, 0, 0)
+    end = b'IEND'
+    return (b'\x89PNG\r\n\x1a\n' + struct.pack('>I', 13) + chunk
+            + struct.pack('>I', zlib.crc32(chunk)) + struct.pack('>I', 0) + end
+            + struct.pack('>I', zlib.crc32(end)))
+
+
+JPEG = build.jpeg(np.random.default_rng(1).integers(0, 256, (48, 64), dtype=np.uint8))
+
+
+@pytest.mark.parametrize(('data', 'sentence'), [
+    (b'', 'of 0 bytes is neither JPEG nor PNG'),
+    (b'GIF89a' + bytes(100), 'of 106 bytes is neither JPEG nor PNG'),
+    (JPEG[:len(JPEG) // 2], 'is truncated'),
+    (JPEG[:3], 'is truncated'),
+    (b'\xff\xd8\xff\xd9', 'has no frame header'),
+    (b'\xff\xd8\xff\xe0\x00\x00' + bytes(20) + b'\xff\xd9', 'has no frame header'),
+    (JPEG[:24] + b'\xff\xd9', 'has no frame header'),
+    # Decoded, it would take 1.8 GB.
+    (JPEG.replace(b'\x00\x30\x00\x40', b'\xa8\xca\xa8\xca', 1), 'size 43210x43210 is not usable'),
+    (png_of_size(2**31 - 1, 2**31 - 1), 'size 2147483647x2147483647 is not usable'),
+    (png_of_size(64, 48), 'cannot be decoded: it is corrupt'),
+    (png_of_size(64, 48)[:30], 'truncated'),
+])
+def test_unusable_compressed_image_is_refused(data, sentence):
+    with pytest.raises(InputError) as caught:
+        incoming.image_from_compressed(build.compressed(build.rosbags_types, data))
+    assert sentence in str(caught.value)
+
+
+# -- calibration -----------------------------------------------------------------------------
+
+
+def test_calibration_of_the_full_sensor(types):
+    calibration = incoming.calibration_from_info(build.camera_info(
+        types, d=(0.1, -0.2, 0.001, 0.002, 0.05)))
+    assert (calibration.fx, calibration.fy, calibration.cx, calibration.cy) == (
+        450.0, 451.0, 319.5, 239.5)
+    assert calibration.distortion == (0.1, -0.2, 0.001, 0.002, 0.05)
+    assert (calibration.image_width, calibration.image_height) == (640, 480)
+    points = np.array([[0.0, 0.0], [12.25, 400.5]])
+    np.testing.assert_array_equal(calibration.to_sensor(points), points)
+
+
+def test_region_and_binning_shift_rows(types):
+    calibration = incoming.calibration_from_info(build.camera_info(
+        types, roi=(100, 60, 400, 300), binning=(2, 2)))
+    assert (calibration.image_width, calibration.image_height) == (200, 150)
+    # The first published pixel covers sensor pixels 100 and 101: its centre lies between them.
+    np.testing.assert_array_equal(
+        calibration.to_sensor([[0.0, 0.0], [199.0, 149.0]]), [[100.5, 60.5], [498.5, 358.5]])
+    points = np.random.default_rng(0).uniform(0, 150, (20, 2))
+    np.testing.assert_allclose(
+        calibration.to_image(calibration.to_sensor(points)), points, atol=1e-12)
+
+
+@pytest.mark.parametrize(('model', 'count'), [
+    ('plumb_bob', 0), ('plumb_bob', 4), ('plumb_bob', 5), ('plumb_bob', 8),
+    ('rational_polynomial', 8), ('equidistant', 4)])
+def test_known_distortion(types, model, count):
+    coefficients = tuple(0.001 * (i + 1) for i in range(count))
+    calibration = incoming.calibration_from_info(
+        build.camera_info(types, model=model, d=coefficients))
+    assert (calibration.distortion_model, calibration.distortion) == (model, coefficients)
+
+
+def test_capital_fields_of_ros_1():
+    new = build.camera_info(build.rosbags_types)
+    old = SimpleNamespace(
+        header=new.header, height=480, width=640, distortion_model='plumb_bob', D=new.d, K=new.k,
+        binning_x=0, binning_y=0, roi=new.roi)
+    assert incoming.calibration_from_info(old) == incoming.calibration_from_info(new)
+
+
+@pytest.mark.parametrize(('change', 'error', 'sentence'), [
+    ({'k': (0.0,) * 9}, MissingInputError, 'uncalibrated'),
+    ({'model': 'double_sphere', 'd': (0.1, 0.2)}, InputError, "'double_sphere'"),
+    ({'d': (0.1,) * 6}, InputError, 'got 6'),
+    ({'d': (0.1,) * 1000}, InputError, '1000 coefficients'),
+    ({'d': (float('nan'),) * 5}, InputError, 'distortion must be finite'),
+    ({'k': (-450.0, 0, 320, 0, 450, 240, 0, 0, 1)}, InputError, 'fx must be'),
+    ({'k': (float('inf'), 0, 320, 0, 450, 240, 0, 0, 1)}, InputError, 'must be finite'),
+    ({'k': (450.0, 3.0, 320, 0, 450, 240, 0, 0, 1)}, InputError, 'must be [fx 0 cx'),
+    ({'width': 0}, InputError, 'image size 0x480'),
+    ({'roi': (400, 0, 400, 300)}, InputError, 'leaves the sensor in x'),
+    ({'roi': (0, 400, 400, 300)}, InputError, 'leaves the sensor in y'),
+    ({'binning': (1000, 1)}, InputError, 'image_width must be >= 1'),
+])
+def test_unusable_calibration_is_refused(change, error, sentence):
+    with pytest.raises(error) as caught:
+        incoming.calibration_from_info(build.camera_info(build.rosbags_types, **change))
+    assert sentence in str(caught.value)
+
+
+# -- IMU -------------------------------------------------------------------------------------
+
+
+def test_imu_sample(types):
+    sample = incoming.imu_sample_from_message(build.imu(types, 1_700_000_000_123_456_789))
+    assert sample.stamp_ns == 1_700_000_000_123_456_789
+    assert sample.angular_velocity == (0.1, 0.2, 0.3)
+    assert sample.linear_acceleration == (0.0, 0.0, 9.8)
+
+
+def test_absent_sensors_are_none(types):
+    no_accelerometer = incoming.imu_sample_from_message(
+        build.imu(types, 0, accelerometer_covariance=-1.0))
+    assert no_accelerometer.linear_acceleration is None
+    assert no_accelerometer.angular_velocity == (0.1, 0.2, 0.3)
+    all_zero = incoming.imu_sample_from_message(build.imu(types, 0, accelerometer=(0.0,) * 3))
+    assert all_zero.linear_acceleration is None
+    no_gyro = incoming.imu_sample_from_message(build.imu(types, 0, gyro_covariance=-1.0))
+    assert no_gyro.angular_velocity is None
+    assert no_gyro.linear_acceleration == (0.0, 0.0, 9.8)
+
+
+def test_a_gyro_at_rest_is_a_sensor(types):
+    sample = incoming.imu_sample_from_message(build.imu(types, 0, gyro=(0.0, 0.0, 0.0)))
+    assert sample.angular_velocity == (0.0, 0.0, 0.0)
+
+
+def test_accelerometer_topic_has_no_gyro(types):
+    sample = incoming.accelerometer_sample_from_message(build.imu(types, 5, gyro=(0.0,) * 3))
+    assert sample.angular_velocity is None
+    assert sample.linear_acceleration == (0.0, 0.0, 9.8)
+
+
+@pytest.mark.parametrize(('change', 'sentence'), [
+    ({'gyro': (float('nan'), 0.0, 0.0)}, 'angular_velocity of an IMU message must be finite'),
+    ({'accelerometer': (0.0, float('inf'), 0.0)}, 'linear_acceleration of an IMU message must be'),
+    ({'gyro_covariance': -1.0, 'accelerometer_covariance': -1.0}, 'neither gyro nor accel'),
+])
+def test_unusable_imu_is_refused(change, sentence):
+    with pytest.raises(InputError, match=sentence):
+        incoming.imu_sample_from_message(build.imu(build.rosbags_types, 0, **change))
+
+
+def test_impossible_stamp_is_refused():
+    header = build.header(build.rosbags_types, 0)
+    header.stamp.nanosec = 1_000_000_000
+    with pytest.raises(InputError, match='out of range'):
+        incoming.stamp_ns(header)
+
+
+# -- outgoing --------------------------------------------------------------------------------
+
+
+def pair(count: int = 40, status: Status = Status.OK) -> PairResult:
+    rng = np.random.default_rng(3)
+    half = rng.normal(size=(6, 6))
+    velocity_half = rng.normal(size=(6, 6))
+    # A turn by more than 180 degrees about z, for which a quaternion routine may give w < 0.
+    R = Rotation.from_euler('xyz', [0.1, -0.2, 3.3]).as_matrix()
+    pose = RelativePose(
+        status=status, R=R, t=np.array([0.6, 0.0, -0.8]), linear_velocity2=np.array([1.0, 2, 3]),
+        angular_velocity2=np.array([0.1, 0.2, 0.3]), inliers=rng.random(count) < 0.7,
+        covariance=half @ half.T, velocity_covariance=velocity_half @ velocity_half.T,
+        model='uniform')
+    matches = Matches(rng.permutation(count).astype(np.uint32) + 7,
+                      rng.uniform(0, 640, (count, 2)), rng.uniform(0, 640, (count, 2)),
+                      np.ones(count))
+    rays1, rays2 = rng.normal(size=(2, count, 3))
+    return PairResult(
+        reference_stamp_ns=1_700_000_000_100_000_000, stamp_ns=1_700_000_000_999_999_999,
+        frame_id='camera_optical_frame', interval=0.9, pose=pose, matches=matches,
+        row_times1=rng.uniform(0, 0.03, count), row_times2=rng.uniform(0, 0.03, count),
+        rays1=rays1, rays2=rays2, parallax=12.0)
+
+
+def test_pair_messages(types):
+    result = pair()
+    messages = outgoing.pair_messages(result, types)
+    for message in (messages.relative_pose, messages.reference, messages.velocity,
+                    messages.matches):
+        assert incoming.stamp_ns(message.header) == result.stamp_ns
+    pose = messages.relative_pose
+    assert pose.header.frame_id == 'camera_optical_frame_reference'
+    position, orientation = pose.pose.pose.position, pose.pose.pose.orientation
+    assert [position.x, position.y, position.z] == result.pose.t.tolist()
+    assert orientation.w >= 0.0
+    np.testing.assert_allclose(
+        Rotation.from_quat([orientation.x, orientation.y, orientation.z, orientation.w]
+                           ).as_matrix(), result.pose.R, atol=1e-12)
+    # ROS: row-major, x y z rotX rotY rotZ.
+    np.testing.assert_array_equal(
+        np.reshape(pose.pose.covariance, (6, 6)), result.pose.covariance)
+    time_ref = messages.reference.time_ref
+    assert time_ref.sec * 10**9 + time_ref.nanosec == result.reference_stamp_ns
+    velocity = messages.velocity
+    assert velocity.header.frame_id == 'camera_optical_frame'
+    linear, angular = velocity.twist.twist.linear, velocity.twist.twist.angular
+    assert [linear.x, linear.y, linear.z] == [1.0, 2.0, 3.0]
+    assert [angular.x, angular.y, angular.z] == [0.1, 0.2, 0.3]
+    np.testing.assert_array_equal(
+        np.reshape(velocity.twist.covariance, (6, 6)), result.pose.velocity_covariance)
+
+
+def test_matches_are_the_inliers(types):
+    result = pair()
+    cloud = outgoing.matches_message(result, types)
+    names = ['id', 'u1', 'v1', 'u2', 'v2', 'tau1', 'tau2', 'x1', 'y1', 'z1', 'x2', 'y2', 'z2']
+    assert [field.name for field in cloud.fields] == names
+    assert [field.datatype for field in cloud.fields] == [6] + [7] * 12
+    count = int(result.pose.inliers.sum())
+    assert 0 < count < len(result.pose.inliers)
+    assert (cloud.height, cloud.width) == (1, count)
+    assert len(cloud.data) == cloud.row_step == count * cloud.point_step
+    raw = bytes(cloud.data)
+    for row, index in enumerate(np.flatnonzero(result.pose.inliers)):
+        record = struct.unpack_from('<I12f', raw, row * cloud.point_step)
+        expected = [result.matches.track_ids[index], *result.matches.points1[index],
+                    *result.matches.points2[index], result.row_times1[index],
+                    result.row_times2[index], *result.rays1[index], *result.rays2[index]]
+        np.testing.assert_allclose(record, expected, rtol=1e-6)
+
+
+def test_both_worlds_serialise_alike():
+    from rclpy.serialization import deserialize_message
+    ours = outgoing.pair_messages(pair(), build.rclpy_types)
+    theirs = outgoing.pair_messages(pair(), build.rosbags_types)
+    for name in ('relative_pose', 'reference', 'velocity', 'matches'):
+        message = getattr(theirs, name)
+        data = build.TYPESTORE.serialize_cdr(message, message.__msgtype__)
+        assert deserialize_message(bytes(data), type(getattr(ours, name))) == getattr(ours, name)
+
+
+def test_diagnostics(types):
+    status = outgoing.status_message(1, 'node: pose', 'text', 'cam', [('a', '1')], types)
+    message = outgoing.diagnostics_message(1_500_000_000, status, types)
+    assert message.header.stamp.sec == 1
+    assert message.status[0].level in (1, b'\x01')
+    assert [(v.key, v.value) for v in message.status[0].values] == [('a', '1')]
+
+
+def test_no_message_without_a_pose():
+    with pytest.raises(InputError, match='LOW_PARALLAX'):
+        outgoing.pair_messages(pair(status=Status.LOW_PARALLAX), build.rosbags_types)
+
+
+# -- intake ----------------------------------------------------------------------------------
+
+
+def intake() -> tuple[MessageIntake, Sequencer]:
+    sequencer = Sequencer(Parameters.from_mapping({
+        'readout_time': 0.02, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0]}), offline=True)
+    return MessageIntake(sequencer), sequencer
+
+
+def feed_imu(target: MessageIntake, start_ns: int, end_ns: int) -> None:
+    for stamp_ns in range(start_ns, end_ns, 5_000_000):
+        target.add_imu(build.imu(build.rosbags_types, stamp_ns))
+
+
+def taken(sequencer: Sequencer) -> list[ReadyFrame | FrameRefused]:
+    out = []
+    while (item := sequencer.take()) is not None:
+        out.append(item)
+    return out
+
+
+PIXELS = np.random.default_rng(5).integers(0, 256, (480, 640), dtype=np.uint8)
+
+
+def test_image_before_its_camera_info_is_kept():
+    target, sequencer = intake()
+    feed_imu(target, 0, 10**9)
+    target.add_image(build.gray_image(build.rosbags_types, PIXELS, stamp_ns=500_000_000))
+    assert taken(sequencer) == []
+    target.add_camera_info(build.camera_info(build.rosbags_types))
+    [frame] = taken(sequencer)
+    np.testing.assert_array_equal(frame.frame.image, PIXELS)
+    assert frame.frame.frame_id == 'camera'
+
+
+def test_images_without_camera_info_are_counted():
+    target, sequencer = intake()
+    feed_imu(target, 0, 10**9)
+    for k in range(6):
+        target.add_image(build.gray_image(build.rosbags_types, PIXELS, stamp_ns=k * 10**8))
+    target.refuse_held()
+    refused = taken(sequencer)
+    assert [item.stamp_ns for item in refused] == [k * 10**8 for k in range(6)]
+    assert {item.cause for item in refused} == {Refusal.NO_CALIBRATION}
+    assert 'no CameraInfo' in refused[0].reason
+
+
+def test_no_outdated_calibration_is_used():
+    target, sequencer = intake()
+    feed_imu(target, 0, 10**9)
+    target.add_camera_info(build.camera_info(build.rosbags_types))
+    with pytest.raises(MissingInputError):
+        target.add_camera_info(build.camera_info(build.rosbags_types, k=(0.0,) * 9))
+    assert 'uncalibrated' in target.calibration_problem
+    target.add_image(build.gray_image(build.rosbags_types, PIXELS, stamp_ns=10**8))
+    [refused] = taken(sequencer)
+    assert refused.cause is Refusal.NO_CALIBRATION
+    assert 'uncalibrated' in refused.reason
+
+
+def test_image_of_another_size_is_refused():
+    target, sequencer = intake()
+    feed_imu(target, 0, 10**9)
+    target.add_camera_info(build.camera_info(build.rosbags_types))
+    target.add_image(build.gray_image(build.rosbags_types, PIXELS[:240], stamp_ns=10**8))
+    target.add_compressed_image(
+        build.compressed(build.rosbags_types, build.jpeg(PIXELS), stamp_ns=2 * 10**8))
+    refused, ready = taken(sequencer)
+    assert refused.cause is Refusal.BAD_IMAGE
+    assert 'image is 640x240, but its CameraInfo tells 640x480' in refused.reason
+    assert ready.frame.image.shape == (480, 640)
+    assert sequencer.counts().refused == {Refusal.BAD_IMAGE: 1}
