@@ -121,7 +121,8 @@ class Sequencer:
     parameters : Parameters
         Sensor and IMU settings; those that have no default must be given.
     offline : bool
-        Every frame is kept until the IMU covers it or the input is closed.
+        Every frame is kept until the IMU covers it or the input is closed. Take what is ready
+        after each message: the IMU history is only `imu_buffer_seconds` long.
     clock : callable
         Monotonic time [ns]; for tests.
     """
