@@ -1,1 +1,42 @@
-"""Relative pose of two rolling-shutter images, aided by an IMU."""
+"""Relative pose of two rolling-shutter images, aided by an IMU.
+
+The public API, loaded on first use so that ``rs_relpose --help`` does not wait for NumPy and
+Numba::
+
+    from rs_relpose_ros import EstimatorConfig, FrameMotion, RollingShutterCamera
+    from rs_relpose_ros import estimate_relative_pose
+"""
+
+from importlib import import_module
+import logging
+from typing import Any, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rs_relpose_ros.camera import RollingShutterCamera
+    from rs_relpose_ros.config import EstimatorConfig
+    from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
+    from rs_relpose_ros.estimator.estimate import estimate_relative_pose, warm_up
+    from rs_relpose_ros.motion import FrameMotion
+    from rs_relpose_ros.result import RelativePose, Status
+
+__all__ = ['EstimatorConfig', 'FrameMotion', 'InputError', 'MissingInputError', 'RelativePose',
+           'RollingShutterCamera', 'RsRelposeError', 'Status', 'estimate_relative_pose', 'warm_up']
+
+_HOMES = {
+    'EstimatorConfig': 'config', 'FrameMotion': 'motion', 'InputError': 'errors',
+    'MissingInputError': 'errors', 'RelativePose': 'result', 'RollingShutterCamera': 'camera',
+    'RsRelposeError': 'errors', 'Status': 'result', 'estimate_relative_pose': 'estimator.estimate',
+    'warm_up': 'estimator.estimate',
+}
+
+logging.getLogger(__name__).addHandler(logging.NullHandler())
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        return getattr(import_module(f'{__name__}.{_HOMES[name]}'), name)
+    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

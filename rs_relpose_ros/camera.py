@@ -205,7 +205,8 @@ class RollingShutterCamera:
                 # A step may not leave the cell in which the model is monotonic.
                 length = np.linalg.norm(step, axis=1, keepdims=True)
                 limit = 0.5 * (1.0 + np.linalg.norm(normalized, axis=1, keepdims=True))
-                normalized = normalized + step * np.minimum(1.0, limit / np.maximum(length, 1e-300))
+                normalized = normalized + step * np.minimum(
+                    1.0, limit / np.maximum(length, 1e-300))
                 if not np.any(length > 1e-12):
                     break
             projected, jacobian = self._distort(normalized)
@@ -233,7 +234,7 @@ class RollingShutterCamera:
                 homogeneous, zero, zero, self.camera_matrix, coefficients)
             first = 3
         by_point = jacobian.reshape(-1, 2, jacobian.shape[-1])[:, :, first:first + 2]
-        return pixels.reshape(-1, 2), by_point
+        return np.asarray(pixels.reshape(-1, 2), np.float64), np.asarray(by_point, np.float64)
 
 
 _NEWTON_ITERATIONS = 30

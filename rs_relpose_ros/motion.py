@@ -113,11 +113,13 @@ class FrameMotion:
         steps = Rotation.from_matrix(
             np.swapaxes(self.knot_rotations[:-1], 1, 2) @ self.knot_rotations[1:]).as_rotvec()
         fraction = (tau - times[k]) / (times[k + 1] - times[k])
-        return self.knot_rotations[k] @ Rotation.from_rotvec(fraction[:, None] * steps[k]).as_matrix()
+        turns = Rotation.from_rotvec(fraction[:, None] * steps[k]).as_matrix()
+        return np.asarray(self.knot_rotations[k] @ turns)
 
     def derotate(self, rays: ArrayLike, row_times: ArrayLike) -> Array:
         """Rays (N, 3) measured at `row_times` (N,) [s], turned into the reference row's frame."""
-        return np.einsum('nij,nj->ni', self.rotations(row_times), np.asarray(rays, dtype=np.float64))
+        rays = np.asarray(rays, dtype=np.float64)
+        return np.einsum('nij,nj->ni', self.rotations(row_times), rays)
 
     def shifted(self, delay: float) -> FrameMotion:
         """The same motion with the reference row `delay` seconds later."""

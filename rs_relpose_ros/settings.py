@@ -7,8 +7,8 @@ and the parameter table of the documentation are derived from their fields.
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
+import math
 from typing import Any
 
 from rs_relpose_ros.errors import InputError
@@ -68,7 +68,7 @@ def setting(default: Any, description: str, unit: str = '', *, low: float = -mat
 
 def declared(field: dataclasses.Field[Any]) -> Declared:
     """Declaration of a field that `setting` made."""
-    return field.metadata['declared']  # type: ignore[no-any-return]
+    return field.metadata['declared']
 
 
 def check_settings(config: Any) -> None:

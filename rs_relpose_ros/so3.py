@@ -1,4 +1,4 @@
-"""Rotation kernels for compiled code; everything else uses ``scipy.spatial.transform.Rotation``."""
+"""Rotation kernels for compiled code; everything else uses SciPy's ``Rotation``."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ STAMP_EXPOSURES = ('start', 'middle', 'end')
 
 
 def seconds_between(start_ns: int, end_ns: int) -> float:
-    """Float seconds from `start_ns` to `end_ns`: subtract first, then convert, never the reverse."""
+    """Float seconds from `start_ns` to `end_ns`: subtracted as integers, then converted."""
     return (end_ns - start_ns) / NANOSECONDS
 
 

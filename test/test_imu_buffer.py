@@ -104,7 +104,8 @@ def test_duplicates_late_samples_and_jumps_are_told():
 
 
 @pytest.mark.parametrize('broken', [
-    ImuSample(START, (float('nan'), 0.0, 0.0), UP), ImuSample(START, (0.0, 0.0, 0.0), (0.0, 0.0, float('inf'))),
+    ImuSample(START, (float('nan'), 0.0, 0.0), UP),
+    ImuSample(START, (0.0, 0.0, 0.0), (0.0, 0.0, float('inf'))),
 ])
 def test_a_broken_sample_is_refused_and_nothing_of_it_is_kept(broken):
     buffer = ImuBuffer(ImuConfig())

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-import yaml
 from scipy.spatial.transform import Rotation
+import yaml
 
 from rs_relpose_ros.imu.buffer import ImuBuffer
 from rs_relpose_ros.imu.config import ImuConfig
@@ -19,7 +19,8 @@ def run(config, orientation, acceleration, seconds, rng, noise=0.02):
         t = k * 0.005
         now, later = orientation(t), orientation(t + 1e-4)
         rate = Rotation.from_matrix(now.T @ later).as_rotvec() / 1e-4
-        force = now.T @ (acceleration(t) + [0.0, 0.0, 9.80665]) + rng.normal(size=3) * noise
+        force = now.T @ (acceleration(t) + np.array([0.0, 0.0, 9.80665]))
+        force += rng.normal(size=3) * noise
         buffer.add(ImuSample(k * PERIOD, tuple(rate), tuple(force)))
     return buffer, (int(seconds * 200) - 1) * PERIOD
 

@@ -60,8 +60,8 @@ def test_derotated_rays_are_those_of_the_reference_row():
     motion = FrameMotion([0.3, 1.0, -0.5])
     world = np.array([[1.0, 2.0, 5.0]])
     tau = np.array([0.03])
-    seen = np.einsum('nji,nj->ni', Rotation.from_rotvec(tau[:, None] * [0.3, 1.0, -0.5]).as_matrix(),
-                     world)
+    turned = Rotation.from_rotvec(tau[:, None] * [0.3, 1.0, -0.5])
+    seen = turned.inv().apply(world)
     np.testing.assert_allclose(motion.derotate(seen, tau), world, atol=1e-12)
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
+import time
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,9 +18,9 @@ from rs_relpose_ros.estimator.hypotheses import (
     ANGULAR_3PT,
     ANGULAR_5PT,
     GYRO_2PT,
+    Knowledge,
     UNIFORM_9PT,
     UNIFORM_11PT,
-    Knowledge,
 )
 from rs_relpose_ros.estimator.local_optimisation import (
     cheirality_sign,
@@ -28,17 +28,17 @@ from rs_relpose_ros.estimator.local_optimisation import (
     select_inliers,
     signed,
 )
-from rs_relpose_ros.estimator.map_fit import PINNED, Priors, State, normal_equations
+from rs_relpose_ros.estimator.map_fit import normal_equations, PINNED, Priors, State
 from rs_relpose_ros.estimator.problem import (
-    PairState,
-    TwoViewProblem,
     build_problem,
     middle_row_delay,
+    PairState,
     to_reference_row,
+    TwoViewProblem,
 )
 from rs_relpose_ros.estimator.rotation_only import fit_rotation, transfer_errors
 from rs_relpose_ros.estimator.sampling import POOL, sample_hypotheses
-from rs_relpose_ros.estimator.velocity_prior import GRID, fit_with_evidence, with_velocity_sigma
+from rs_relpose_ros.estimator.velocity_prior import fit_with_evidence, GRID, with_velocity_sigma
 from rs_relpose_ros.motion import FrameMotion
 from rs_relpose_ros.result import RelativePose, Status
 from rs_relpose_ros.so3 import exp_so3, skew
@@ -161,7 +161,7 @@ class _Estimation:
         self.iterations = 0
 
     def run(self, delay: float) -> RelativePose:
-        problem, config = self.problem, self.config
+        config = self.config
         if len(self.order) < config.min_inliers:
             return self._failure(Status.TOO_FEW_MATCHES,
                                  f'{len(self.order)} usable matches, fewer than min_inliers = '
@@ -349,7 +349,7 @@ def warm_up() -> None:
     camera = RollingShutterCamera(width=640, height=480, fx=450.0, fy=450.0, cx=319.5, cy=239.5,
                                   readout_time=0.03)
     down = np.array([0.0, 1.0, 0.0])
-    motion = FrameMotion([0.0, 0.1, 0.0], gravity=down)
+    motion = FrameMotion(np.array([0.0, 0.1, 0.0]), gravity=down)
     world = rng.uniform([-4.0, -3.0, 4.0], [4.0, 3.0, 12.0], (100, 3))
     points1, points2 = camera.project(world), camera.project(world - [0.5, 0.0, 0.0])
     for solver in MODES:

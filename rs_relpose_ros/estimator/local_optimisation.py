@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.estimator import sampson
-from rs_relpose_ros.estimator.map_fit import Priors, State, fit, prior_cost
+from rs_relpose_ros.estimator.map_fit import fit, prior_cost, Priors, State
 
 Array = NDArray[np.float64]
 

@@ -82,7 +82,7 @@ def build_problem(points1: Array, points2: Array, camera: RollingShutterCamera,
     observations = np.empty((len(points1), 20))
     _observe(points1, middle, motion1, derotate, observations[:, 0:9], observations[:, 18])
     _observe(points2, middle, motion2, derotate, observations[:, 9:18], observations[:, 19])
-    valid = np.isfinite(observations).all(axis=1)
+    valid = np.asarray(np.isfinite(observations).all(axis=1))
     with np.errstate(all='ignore'):
         points = np.column_stack([
             observations[:, 0] / observations[:, 2], observations[:, 1] / observations[:, 2],

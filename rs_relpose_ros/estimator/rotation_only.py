@@ -8,7 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.estimator.map_fit import Priors, cholesky, cholesky_solve
+from rs_relpose_ros.estimator.map_fit import cholesky, cholesky_solve, Priors
 from rs_relpose_ros.so3 import exp_so3, log_so3
 
 Array = NDArray[np.float64]

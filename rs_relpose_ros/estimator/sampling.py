@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.estimator.consensus import multi_scale_cost
-from rs_relpose_ros.estimator.hypotheses import MAX_SOLUTIONS, SAMPLE_SIZES, Knowledge, generate
+from rs_relpose_ros.estimator.hypotheses import generate, Knowledge, MAX_SOLUTIONS, SAMPLE_SIZES
 
 Array = NDArray[np.float64]
 
@@ -68,7 +68,8 @@ def _same(Ra: Array, xa: Array, Rb: Array, xb: Array) -> bool:
 
 
 @_jit
-def _offer(R: Array, x: Array, cost: float, pool_R: Array, pool_x: Array, pool_cost: Array) -> None:
+def _offer(R: Array, x: Array, cost: float, pool_R: Array, pool_x: Array,
+           pool_cost: Array) -> None:
     """Put a hypothesis into the pool in place of its like or of the worst, if it is better."""
     place = -1
     for k in range(pool_cost.shape[0]):
@@ -76,7 +77,7 @@ def _offer(R: Array, x: Array, cost: float, pool_R: Array, pool_x: Array, pool_c
             place = k
             break
     if place < 0:
-        place = np.argmax(pool_cost)
+        place = int(np.argmax(pool_cost))
     if cost < pool_cost[place]:
         pool_R[place] = R
         pool_x[place] = x

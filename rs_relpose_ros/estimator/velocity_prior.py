@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.estimator.local_optimisation import select_inliers
-from rs_relpose_ros.estimator.map_fit import Priors, State, fit, log_determinant, normal_equations
+from rs_relpose_ros.estimator.map_fit import fit, log_determinant, normal_equations, Priors, State
 
 Array = NDArray[np.float64]
 

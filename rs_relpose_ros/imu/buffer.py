@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.imu.config import ImuConfig
-from rs_relpose_ros.imu.gravity import MEAN_WINDOW_NS, GravityEstimate, GravityFilter, mean_gravity
+from rs_relpose_ros.imu.gravity import GravityEstimate, GravityFilter, mean_gravity, MEAN_WINDOW_NS
 from rs_relpose_ros.imu.integration import integrate_rotation
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.timing import to_nanoseconds

@@ -7,8 +7,8 @@ differs from 9.81 m/s^2 in length is known to hold acceleration and gets less we
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+import math
 
 import numba
 import numpy as np

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
-import difflib
 from collections.abc import Iterator, Mapping
+import dataclasses
 from dataclasses import dataclass, field
+import difflib
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from rs_relpose_ros.camera import READOUT_DIRECTIONS, REFERENCE_ROWS
 from rs_relpose_ros.config import EstimatorConfig
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.imu.config import ImuConfig
-from rs_relpose_ros.settings import Declared, check_settings, declared, setting
+from rs_relpose_ros.settings import check_settings, Declared, declared, setting
 from rs_relpose_ros.timing import STAMP_EXPOSURES
 from rs_relpose_ros.tracking.config import TrackingConfig
 from rs_relpose_ros.tracking.keyframes import KeyframeConfig
@@ -36,7 +36,7 @@ class SensorConfig:
     stamp_exposure: str = setting(
         'middle', 'instant of that exposure which the stamp marks', choices=STAMP_EXPOSURES)
     exposure_time: float = setting(
-        0.0, 'exposure of a row; only used unless stamp_exposure is middle', 's', low=0.0, high=1.0)
+        0.0, 'exposure of a row; used unless stamp_exposure is middle', 's', low=0.0, high=1.0)
     time_offset: float = setting(
         0.0, 'IMU clock minus camera clock: t_imu = stamp + time_offset', 's', low=-10.0,
         high=10.0)
@@ -103,7 +103,7 @@ class Parameters:
     def declarations() -> Iterator[tuple[str, Any, Declared]]:
         """Name, default (None where the user must give one) and declaration of every parameter."""
         for group in dataclasses.fields(Parameters):
-            for item in dataclasses.fields(group.default_factory):  # type: ignore[arg-type, misc]
+            for item in dataclasses.fields(group.default_factory):  # type: ignore[arg-type]
                 yield item.name, item.default, declared(item)
 
     @classmethod

@@ -18,7 +18,7 @@ from rs_relpose_ros.pipeline.frame import Frame
 from rs_relpose_ros.pipeline.pair import PairResult
 from rs_relpose_ros.pipeline.parameters import Parameters
 from rs_relpose_ros.result import RelativePose, Status
-from rs_relpose_ros.tracking.keyframes import KeyframeDecision, decide_keyframe
+from rs_relpose_ros.tracking.keyframes import decide_keyframe, KeyframeDecision
 from rs_relpose_ros.tracking.matches import Matches
 from rs_relpose_ros.tracking.tracker import make_tracker
 
