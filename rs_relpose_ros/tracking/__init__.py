@@ -1,0 +1,1 @@
+"""Features: corners tracked or descriptors matched from a reference keyframe, and its renewal."""

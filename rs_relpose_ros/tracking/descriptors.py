@@ -1,0 +1,140 @@
+"""Matches of SIFT or ORB descriptors: for baselines over which corners cannot be followed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.tracking.config import TrackingConfig
+from rs_relpose_ros.tracking.corners import feature_rows
+from rs_relpose_ros.tracking.images import Image, checked
+from rs_relpose_ros.tracking.matches import Matches
+from rs_relpose_ros.tracking.tracker import Predict
+
+Array = NDArray[np.float64]
+
+# ORB's patch and its border; below that it has nothing to describe.
+_SMALLEST_SIDE = 32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Keypoints:
+    """Keypoints of an image: ids (N,), pixels (N, 2), descriptors (N, D)."""
+
+    ids: NDArray[np.uint32]
+    points: Array
+    descriptors: NDArray[np.generic]
+
+
+class DescriptorTracker:
+    """Mutual nearest neighbours under a ratio test; see `rs_relpose_ros.tracking.tracker.Tracker`.
+
+    A keypoint of a new reference keeps the id of the keypoint that it was matched with.
+    """
+
+    def __init__(self, config: TrackingConfig) -> None:
+        self._config = config
+        if config.detector == 'sift':
+            self._detector: cv2.Feature2D = cv2.SIFT_create(nfeatures=config.max_descriptors)
+            norm = cv2.NORM_L2
+        else:
+            self._detector = cv2.ORB_create(nfeatures=config.max_descriptors)
+            norm = cv2.NORM_HAMMING
+        self._matcher = cv2.BFMatcher(norm)
+        self._next_id = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all images; ids are not used again."""
+        self._shape: tuple[int, ...] | None = None
+        self._reference: _Keypoints | None = None
+        self._current: _Keypoints | None = None
+        self._matches = _no_matches()
+        self._most = 0
+
+    @property
+    def tracked_fraction(self) -> float:
+        """Matches, as a share of the most that an image had with this reference.
+
+        Only some of the keypoints of an image are found again in any other one.
+        """
+        return len(self._matches) / self._most if self._most else 0.0
+
+    def start(self, image: Image) -> None:
+        """Make `image` (H, W) the reference keyframe."""
+        image = checked(image, self._shape)
+        self.reset()
+        self._shape = image.shape
+        self._reference = self._current = self._detect(image)
+
+    def track(self, image: Image, predict: Predict | None = None) -> Matches:
+        """Match `image`, which then is the current one, with the reference.
+
+        `predict` speaks of the previous image, and is not needed: the search is not local.
+        """
+        if self._reference is None:
+            raise InputError('the tracker has no reference keyframe: call start() first')
+        image = checked(image, self._shape)
+        found = self._detect(image)
+        indices1, indices2, quality = self._match(self._reference, found)
+        # What is matched takes over the reference's id.
+        found.ids[indices2] = self._reference.ids[indices1]
+        self._current = found
+        self._matches = Matches(self._reference.ids[indices1], self._reference.points[indices1],
+                                found.points[indices2], quality)
+        self._most = max(self._most, len(self._matches))
+        return self._matches
+
+    def refined_matches(self) -> Matches:
+        """The matches of the current image: each stands for itself, nothing has drifted."""
+        return self._matches
+
+    def promote(self) -> None:
+        """Make the current image the reference."""
+        if self._current is None:
+            raise InputError('the tracker has no current image: call start() first')
+        self._reference = self._current
+        self._matches = _no_matches()
+        self._most = 0
+
+    # -- inside ------------------------------------------------------------------------------
+
+    def _detect(self, image: Image) -> _Keypoints:
+        keypoints, descriptors = (), None
+        if min(image.shape) >= _SMALLEST_SIDE:
+            keypoints, descriptors = self._detector.detectAndCompute(image, None)
+        if descriptors is None or len(keypoints) == 0:
+            return _Keypoints(np.empty(0, dtype=np.uint32), np.empty((0, 2)), np.empty((0, 0)))
+        points = np.array([k.pt for k in keypoints], dtype=np.float64)
+        first, last = feature_rows(self._config, image.shape[0])
+        # One keypoint per place: SIFT gives a place with several orientations several times.
+        _, once = np.unique(points, axis=0, return_index=True)
+        kept = np.sort(once)
+        kept = kept[(points[kept, 1] >= first) & (points[kept, 1] <= last)]
+        ids = (np.arange(self._next_id, self._next_id + len(kept)) % 2**32).astype(np.uint32)
+        self._next_id += len(kept)
+        return _Keypoints(ids, points[kept], np.ascontiguousarray(descriptors[kept]))
+
+    def _match(self, first: _Keypoints,
+               second: _Keypoints) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+        """Indices into both and quality: 1 - (best / second best distance)."""
+        if len(first.ids) < 2 or len(second.ids) < 2:
+            return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0)
+        forth = self._matcher.knnMatch(first.descriptors, second.descriptors, k=2)
+        back = self._matcher.match(second.descriptors, first.descriptors)
+        nearest = np.array([m.trainIdx for m in back])
+        rows = []
+        for best, other in forth:
+            ratio = best.distance / other.distance if other.distance > 0.0 else 1.0
+            if ratio < self._config.match_ratio and nearest[best.trainIdx] == best.queryIdx:
+                rows.append((best.queryIdx, best.trainIdx, 1.0 - ratio))
+        table = np.array(rows, dtype=np.float64).reshape(-1, 3)
+        return table[:, 0].astype(np.int64), table[:, 1].astype(np.int64), table[:, 2]
+
+
+def _no_matches() -> Matches:
+    return Matches(np.empty(0, dtype=np.uint32), np.empty((0, 2)), np.empty((0, 2)), np.empty(0))

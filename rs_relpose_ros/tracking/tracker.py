@@ -1,0 +1,54 @@
+"""What a tracker does, and the choice of one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.tracking.config import TrackingConfig
+from rs_relpose_ros.tracking.matches import Matches
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+# (N, 2) points of the previous image -> (N, 2) where they are expected in this one, NaN if unknown.
+Predict = Callable[[Array], Array]
+
+
+class Tracker(Protocol):
+    """Finds again in later images what the reference keyframe shows.
+
+    All images between two resets have one size; another one raises InputError.
+    """
+
+    @property
+    def tracked_fraction(self) -> float:
+        """Share of the reference's features that the current image still shows."""
+
+    def start(self, image: Image) -> None:
+        """Make `image` (H, W) the reference keyframe."""
+
+    def track(self, image: Image, predict: Predict | None = None) -> Matches:
+        """Make `image` the current one; its matches with the reference."""
+
+    def refined_matches(self) -> Matches:
+        """Matches of reference and current image, as exact as they get; for a closing pair."""
+
+    def promote(self) -> None:
+        """Make the current image the reference; tracks go on under their ids."""
+
+    def reset(self) -> None:
+        """Forget all images; ids are not used again."""
+
+
+def make_tracker(config: TrackingConfig) -> Tracker:
+    """The tracker that `config.detector` names."""
+    # Imported here: the other one's kernels need not be loaded.
+    if config.detector == 'klt':
+        from rs_relpose_ros.tracking.klt import KltTracker
+        return KltTracker(config)
+    from rs_relpose_ros.tracking.descriptors import DescriptorTracker
+    return DescriptorTracker(config)
