@@ -12,8 +12,8 @@ distortion and the turn of the camera from row to row, so the error is in pixels
 An observation row (20 floats) holds, for one match,
 ``f_1, df_1/du, df_1/dv, f_2, df_2/du, df_2/dv, tau_1, tau_2``.
 
-The state is ``R, t`` (unit), ``d_1, d_2`` and the gyro corrections ``dw_1, dw_2``, all in frame 1;
 The state is ``R, t`` (unit), ``d_1, d_2`` and gyro corrections ``dw_1, dw_2``, all in frame 1;
+its 17 local parameters are ``(theta, t tangent, d_1, d_2, dw_1, dw_2)``, ``R <- Exp(theta) R``.
 """
 
 from __future__ import annotations
