@@ -1,10 +1,9 @@
 """Alignment of image patches: Lucas-Kanade, inverse compositional, blind to gain and offset.
 
 With the template ``T`` of the first image and its gradient ``G`` (both over the window), the
-second image at an estimate off by ``e`` reads ``I = gain (T + G e) + offset`` to first order. ``P``
-projects a function of the window on what is perpendicular to 1 and T, so ``(P G) . I = gain
-(P G) . (P G) e``: the matrix is that of the template, computed once, and neither gain nor offset
-disturbs it.
+second image at an estimate off by ``e`` reads ``I = gain (T + G e) + offset`` to first order. Let
+``P`` project on what is perpendicular to 1 and T; then ``(P G) . I = gain (P G) . (P G) e``. The
+matrix is that of the template, computed once, and neither gain nor offset disturbs it.
 
 OpenCV's ``calcOpticalFlowPyrLK`` builds the pyramids of both images at each call and takes no
 prepared ones from Python, which costs more than the tracking itself; it knows no gain either.

@@ -36,7 +36,7 @@ class TrackingConfig:
     forward_backward_threshold: float = setting(
         0.7, 'largest distance after tracking forth and back', 'px', low=0.01, high=20.0)
     min_correlation: float = setting(
-        0.75, 'least correlation of a corner\'s window with that in the reference keyframe',
+        0.75, 'least correlation of a window with that in the reference keyframe',
         low=0.0, high=1.0)
     match_ratio: float = setting(
         0.8, 'largest ratio of best to second best descriptor distance', low=0.1, high=1.0)

@@ -76,7 +76,7 @@ def keep_apart(points: Array, radius: float, height: int, width: int) -> NDArray
     blocked = np.zeros((height, width), dtype=np.bool_)
     kept = np.zeros(len(points), dtype=np.bool_)
     for n in range(len(points)):
-        column, row = int(round(points[n, 0])), int(round(points[n, 1]))
+        column, row = round(points[n, 0]), round(points[n, 1])
         if 0 <= column < width and 0 <= row < height and not blocked[row, column]:
             kept[n] = True
             _block(blocked, column, row, radius)
@@ -103,7 +103,7 @@ def _spread(candidates: NDArray[np.int64], taken: Array, radii: Array, count: in
     for radius in radii:
         blocked = np.zeros((height, width), dtype=np.bool_)
         for n in range(len(taken)):
-            _block(blocked, int(round(taken[n, 0])), int(round(taken[n, 1])), radius)
+            _block(blocked, round(taken[n, 0]), round(taken[n, 1]), radius)
         for n in range(found):
             _block(blocked, candidates[chosen[n], 0], candidates[chosen[n], 1], radius)
         for n in range(len(candidates)):

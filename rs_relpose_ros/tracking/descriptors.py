@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.tracking.config import TrackingConfig
 from rs_relpose_ros.tracking.corners import feature_rows
-from rs_relpose_ros.tracking.images import Image, checked
+from rs_relpose_ros.tracking.images import checked, Image
 from rs_relpose_ros.tracking.matches import Matches
 from rs_relpose_ros.tracking.tracker import Predict
 
@@ -27,7 +27,7 @@ class _Keypoints:
 
     ids: NDArray[np.uint32]
     points: Array
-    descriptors: NDArray[np.generic]
+    descriptors: NDArray[np.uint8] | NDArray[np.float32]
 
 
 class DescriptorTracker:
@@ -39,10 +39,10 @@ class DescriptorTracker:
     def __init__(self, config: TrackingConfig) -> None:
         self._config = config
         if config.detector == 'sift':
-            self._detector: cv2.Feature2D = cv2.SIFT_create(nfeatures=config.max_descriptors)
+            self._detector: cv2.Feature2D = cv2.SIFT.create(nfeatures=config.max_descriptors)
             norm = cv2.NORM_L2
         else:
-            self._detector = cv2.ORB_create(nfeatures=config.max_descriptors)
+            self._detector = cv2.ORB.create(nfeatures=config.max_descriptors)
             norm = cv2.NORM_HAMMING
         self._matcher = cv2.BFMatcher(norm)
         self._next_id = 0
@@ -104,11 +104,11 @@ class DescriptorTracker:
     # -- inside ------------------------------------------------------------------------------
 
     def _detect(self, image: Image) -> _Keypoints:
-        keypoints, descriptors = (), None
-        if min(image.shape) >= _SMALLEST_SIDE:
-            keypoints, descriptors = self._detector.detectAndCompute(image, None)
-        if descriptors is None or len(keypoints) == 0:
-            return _Keypoints(np.empty(0, dtype=np.uint32), np.empty((0, 2)), np.empty((0, 0)))
+        if min(image.shape) < _SMALLEST_SIDE:
+            return _no_keypoints()
+        keypoints, descriptors = self._detector.detectAndCompute(image, None)
+        if not keypoints:
+            return _no_keypoints()
         points = np.array([k.pt for k in keypoints], dtype=np.float64)
         first, last = feature_rows(self._config, image.shape[0])
         # One keypoint per place: SIFT gives a place with several orientations several times.
@@ -134,6 +134,11 @@ class DescriptorTracker:
                 rows.append((best.queryIdx, best.trainIdx, 1.0 - ratio))
         table = np.array(rows, dtype=np.float64).reshape(-1, 3)
         return table[:, 0].astype(np.int64), table[:, 1].astype(np.int64), table[:, 2]
+
+
+def _no_keypoints() -> _Keypoints:
+    return _Keypoints(np.empty(0, dtype=np.uint32), np.empty((0, 2)),
+                      np.empty((0, 0), dtype=np.uint8))
 
 
 def _no_matches() -> Matches:

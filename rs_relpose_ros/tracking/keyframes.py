@@ -22,7 +22,7 @@ class KeyframeConfig:
         30, 'frames after which a pair is closed whatever its parallax', low=1, high=1000,
         live=True)
     min_tracked_fraction: float = setting(
-        0.4, 'a pair is closed when fewer of the reference\'s features are still tracked',
+        0.4, 'a pair is closed when a smaller share of the features is still tracked',
         low=0.0, high=1.0, live=True)
 
     def __post_init__(self) -> None:

@@ -10,7 +10,7 @@ from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.tracking.alignment import align
 from rs_relpose_ros.tracking.config import TrackingConfig
 from rs_relpose_ros.tracking.corners import feature_rows, find_corners, keep_apart
-from rs_relpose_ros.tracking.images import Image, checked, pyramid
+from rs_relpose_ros.tracking.images import checked, Image, pyramid
 from rs_relpose_ros.tracking.matches import Matches
 from rs_relpose_ros.tracking.tracker import Predict
 
@@ -157,8 +157,9 @@ def _warps(points1: Array, points2: Array) -> Array:
     """Derivatives (N, 2, 2) of the homography that fits all tracks; empty where none does."""
     if len(points1) < 8:
         return _NO_WARPS
-    H, _ = cv2.findHomography(points1, points2, method=0)
-    if H is None:
+    # None, where there is none, becomes an array without shape.
+    H = np.asarray(cv2.findHomography(points1, points2, method=0)[0], dtype=np.float64)
+    if H.shape != (3, 3):
         return _NO_WARPS
     x, y = points1[:, 0], points1[:, 1]
     scale = H[2, 0] * x + H[2, 1] * y + H[2, 2]

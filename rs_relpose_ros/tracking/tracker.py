@@ -14,7 +14,7 @@ from rs_relpose_ros.tracking.matches import Matches
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-# (N, 2) points of the previous image -> (N, 2) where they are expected in this one, NaN if unknown.
+# Points (N, 2) of the previous image -> (N, 2) where they are expected now; NaN where unknown.
 Predict = Callable[[Array], Array]
 
 
