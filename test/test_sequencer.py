@@ -376,7 +376,8 @@ def test_latency_counts_from_the_later_of_image_and_imu(live, clock):
 def test_interleaving_does_not_change_the_answer():
     """Live asks early, late, or skips frames: what it gets is what a replay gets, bit by bit."""
     rng = np.random.default_rng(1)
-    samples = [sample(5 * k, tuple(rng.normal(size=3)), tuple(rng.normal(size=3) + [0, -9.8, 0]))
+    up = np.array([0.0, -9.8, 0.0])
+    samples = [sample(5 * k, tuple(rng.normal(size=3)), tuple(rng.normal(size=3) + up))
                for k in range(400)]
     patient, eager = (Sequencer(parameters(), offline=True) for _ in range(2))
     for item in samples:

@@ -96,7 +96,7 @@ class RelposeNode(Node):
         """Why nothing can be estimated with these parameters and topics; empty for no reason."""
         missing = self._settings.current.sensor.missing()
         if missing:
-            return (f'not estimating: parameter {" and ".join(missing)} must be given: see '
+            return (f'not estimating: {" and ".join(missing)} must be given as parameter: see '
                     'config/relpose.yaml, and start again')
         topic = self.resolve_topic_name('image')
         if 'image_rect' in topic:

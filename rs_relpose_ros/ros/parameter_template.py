@@ -37,9 +37,9 @@ def parameter_template() -> str:
 
 
 def _comment(declared: Declared) -> list[str]:
-    text = f'{declared.description[0].upper()}{declared.description[1:]}.'
+    text = declared.description
     if declared.kind is not bool and declared.legal != 'finite':
-        text += f' {declared.legal[0].upper()}{declared.legal[1:]}.'
+        text += f': {declared.legal}'
     if declared.live:
         text += ' [live]'
     return textwrap.wrap(text, 95, initial_indent='    # ', subsequent_indent='    # ')

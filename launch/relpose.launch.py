@@ -1,0 +1,55 @@
+"""Start relpose_node beside a camera driver.
+
+    ros2 launch rs_relpose_ros relpose.launch.py camera_namespace:=/camera imu:=/imu/data_raw \
+        params_file:=my_camera.yaml
+"""
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
+from launch.conditions import LaunchConfigurationNotEquals
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node
+from launch_ros.substitutions import FindPackageShare
+
+ARGUMENTS = {
+    'namespace': ('', 'namespace of the node'),
+    'name': ('relpose_node', 'name of the node'),
+    'camera_namespace': ('/camera', 'namespace of the camera driver'),
+    'image': ('image_raw', 'raw image topic, within camera_namespace unless absolute'),
+    'camera_info': ('camera_info', 'CameraInfo topic, likewise'),
+    'imu': ('/imu/data_raw', 'IMU topic'),
+    'accel': ('accel', 'topic of an accelerometer that is published apart from the gyro'),
+    'image_transport': ('raw', 'raw or compressed; this and not the parameter file decides'),
+    'params_file': (
+        PathJoinSubstitution([FindPackageShare('rs_relpose_ros'), 'config', 'relpose.yaml']),
+        'parameter file; readout_time and quat_cam_imu_xyzw have no default'),
+    'fastdds_profile': (
+        '', 'Fast DDS profile, for images above 512 KB: config/fastdds.xml of this package; the '
+        'driver needs the same'),
+    'use_sim_time': ('false', 'clock of log lines and diagnostics; estimates go by stamps alone'),
+}
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Arguments, environment and the node."""
+    argument = {name: LaunchConfiguration(name) for name in ARGUMENTS}
+    camera = argument['camera_namespace']
+    return LaunchDescription([
+        *(DeclareLaunchArgument(name, default_value=default, description=description)
+          for name, (default, description) in ARGUMENTS.items()),
+        SetEnvironmentVariable(
+            'FASTRTPS_DEFAULT_PROFILES_FILE', argument['fastdds_profile'],
+            condition=LaunchConfigurationNotEquals('fastdds_profile', '')),
+        Node(
+            package='rs_relpose_ros', executable='relpose_node', name=argument['name'],
+            namespace=argument['namespace'], output='screen',
+            parameters=[argument['params_file'], {
+                'image_transport': argument['image_transport'],
+                'use_sim_time': argument['use_sim_time']}],
+            remappings=[
+                # An absolute path swallows what stands before it.
+                ('image', PathJoinSubstitution([camera, argument['image']])),
+                ('camera_info', PathJoinSubstitution([camera, argument['camera_info']])),
+                ('imu', argument['imu']),
+                ('accel', argument['accel'])]),
+    ])
