@@ -1,0 +1,296 @@
+"""Read rosbag2 bags (SQLite3, MCAP, compressed) and ROS 1 bags, and find the sensors' topics."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+import logging
+from pathlib import Path
+from typing import Any
+
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import get_typestore, Stores
+
+from rs_relpose_ros.bags.mcap_check import check_mcap
+from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
+
+IMAGE = 'sensor_msgs/msg/Image'
+COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
+CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
+IMU = 'sensor_msgs/msg/Imu'
+POSE_STAMPED = 'geometry_msgs/msg/PoseStamped'
+
+# Where the project's own bags keep the truth; taken where several topics could be it.
+_GROUND_TRUTH = '/ground_truth/pose'
+# Largest message that is decoded: above any image that is accepted (64 Mpx in four channels).
+_MAX_MESSAGE_BYTES = 1 << 29
+_STORAGE_SUFFIXES = ('.mcap', '.db3')
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A topic of a bag with the number of its messages."""
+
+    name: str
+    msgtype: str
+    count: int
+
+    def __str__(self) -> str:
+        return f'{self.name} ({self.msgtype})'
+
+
+@dataclass(frozen=True, slots=True)
+class TopicOptions:
+    """Topics that the user chose; an empty name is found by its type."""
+
+    image: str = ''
+    camera_info: str = ''
+    imu: str = ''
+    accel: str = ''
+    truth: str = ''
+
+
+@dataclass(frozen=True, slots=True)
+class SensorTopics:
+    """Topics to read; `accel` only where the driver publishes the accelerometer apart."""
+
+    image: Topic
+    camera_info: Topic
+    imu: Topic
+    accel: Topic | None
+    truth: Topic | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BagMessage:
+    """A message with its topic and the time at which it was recorded [ns]."""
+
+    topic: str
+    bag_time_ns: int
+    message: Any
+
+
+class Bag:
+    """An open bag; made by `open_bag`."""
+
+    def __init__(self, path: Path, reader: AnyReader) -> None:
+        self.path = path
+        self._reader = reader
+        counts: dict[tuple[str, str], int] = {}
+        for connection in reader.connections:
+            key = connection.topic, connection.msgtype
+            counts[key] = counts.get(key, 0) + connection.msgcount
+        self.topics = tuple(Topic(name, msgtype, count)
+                            for (name, msgtype), count in sorted(counts.items()))
+
+    def find_topics(self, options: TopicOptions | None = None) -> SensorTopics:
+        """The sensors' topics: as chosen, or by type where only one can be meant.
+
+        Of several CameraInfo topics the one beside the image is taken, and of two Imu topics one
+        with 'gyro' and one with 'accel' in its name make a pair (RealSense).
+
+        Raises
+        ------
+        MissingInputError
+            A topic is absent; says which there are.
+        InputError
+            Several could be meant, or the chosen one has another type or is rectified.
+        """
+        options = TopicOptions() if options is None else options
+        image = self._find(options.image, (IMAGE, COMPRESSED_IMAGE), 'image', '--image-topic')
+        if 'image_rect' in image.name:
+            raise InputError(f'{image.name} is a rectified image, in which a row no longer has '
+                             'one instant: choose the raw one with --image-topic')
+        imu, accel = self._find_imu(options)
+        return SensorTopics(image, self._find_camera_info(options, image), imu, accel,
+                            self._find_truth(options))
+
+    def messages(self, topics: Sequence[Topic]) -> Iterator[BagMessage]:
+        """Messages of `topics` in the order of bag time.
+
+        Raises
+        ------
+        InputError
+            The bag is damaged, or a message cannot be decoded.
+        """
+        names = {topic.name for topic in topics}
+        connections = [c for c in self._reader.connections if c.topic in names]
+        if not connections:
+            return
+        messages = self._reader.messages(connections)
+        while True:
+            try:
+                connection, bag_time_ns, data = next(messages)
+            except StopIteration:
+                return
+            # A damaged file makes the parsers below fail in any way.
+            except Exception as error:
+                raise InputError(f'{self.path} is damaged: {_sentence(error)}') from error
+            if len(data) > _MAX_MESSAGE_BYTES:
+                raise InputError(f'a message of {connection.topic} in {self.path} has {len(data)} '
+                                 f'bytes; at most {_MAX_MESSAGE_BYTES} are read')
+            try:
+                message = self._reader.deserialize(data, connection.msgtype)
+            except Exception as error:
+                raise InputError(
+                    f'a message of {connection.topic} in {self.path} is corrupt, it is no '
+                    f'{connection.msgtype}: {_sentence(error)}') from error
+            yield BagMessage(connection.topic, bag_time_ns, message)
+
+    # -- finding topics ----------------------------------------------------------------------
+
+    def _of_type(self, *msgtypes: str) -> list[Topic]:
+        return [topic for topic in self.topics if topic.msgtype in msgtypes and topic.count]
+
+    def _find(self, chosen: str, msgtypes: tuple[str, ...], what: str, option: str) -> Topic:
+        if chosen:
+            return self._chosen(chosen, msgtypes, option)
+        candidates = self._of_type(*msgtypes)
+        if len(candidates) == 1:
+            return candidates[0]
+        if not candidates:
+            raise MissingInputError(f'{self.path} has no {what} topic ({" or ".join(msgtypes)}); '
+                                    f'{self._listed()}')
+        raise InputError(f'{self.path} has several {what} topics, choose one with {option}: '
+                         f'{", ".join(map(str, candidates))}')
+
+    def _chosen(self, name: str, msgtypes: tuple[str, ...], option: str) -> Topic:
+        found = [topic for topic in self.topics if topic.name.lstrip('/') == name.lstrip('/')]
+        if not found:
+            raise MissingInputError(f'{self.path} has no topic {name} ({option}); '
+                                    f'{self._listed()}')
+        if found[0].msgtype not in msgtypes:
+            raise InputError(f'topic {name} ({option}) is of type {found[0].msgtype}, but must be '
+                             f'{" or ".join(msgtypes)}')
+        if not found[0].count:
+            raise MissingInputError(f'topic {name} ({option}) of {self.path} has no messages')
+        return found[0]
+
+    def _find_camera_info(self, options: TopicOptions, image: Topic) -> Topic:
+        if not options.camera_info:
+            folder = image.name.removesuffix('/compressed').rpartition('/')[0]
+            for topic in self._of_type(CAMERA_INFO):
+                if topic.name == f'{folder}/camera_info':
+                    return topic
+        return self._find(options.camera_info, (CAMERA_INFO,), 'CameraInfo',
+                          '--camera-info-topic')
+
+    def _find_imu(self, options: TopicOptions) -> tuple[Topic, Topic | None]:
+        accel = self._chosen(options.accel, (IMU,), '--accel-topic') if options.accel else None
+        if options.imu:
+            return self._chosen(options.imu, (IMU,), '--imu-topic'), accel
+        candidates = [topic for topic in self._of_type(IMU) if topic != accel]
+        if len(candidates) == 2 and accel is None:
+            gyros = [topic for topic in candidates if 'gyro' in topic.name]
+            accels = [topic for topic in candidates if 'accel' in topic.name]
+            if len(gyros) == 1 and len(accels) == 1 and gyros != accels:
+                return gyros[0], accels[0]
+        if len(candidates) > 1:
+            raise InputError(
+                f'{self.path} has several IMU topics, choose one with --imu-topic (and '
+                '--accel-topic where the accelerometer is apart): '
+                f'{", ".join(map(str, candidates))}')
+        if not candidates:
+            raise MissingInputError(f'{self.path} has no IMU topic ({IMU}); {self._listed()}')
+        return candidates[0], accel
+
+    def _find_truth(self, options: TopicOptions) -> Topic | None:
+        if options.truth:
+            return self._chosen(options.truth, (POSE_STAMPED,), '--truth-topic')
+        candidates = self._of_type(POSE_STAMPED)
+        named = [topic for topic in candidates if topic.name == _GROUND_TRUTH]
+        if named:
+            return named[0]
+        if len(candidates) > 1:
+            _logger.warning('several topics could be the ground truth and none is used; choose '
+                            'one with --truth-topic: %s', ', '.join(map(str, candidates)))
+        return candidates[0] if len(candidates) == 1 else None
+
+    def _listed(self) -> str:
+        there = ', '.join(map(str, self.topics))
+        return f'it has {there}' if there else 'it has no topics at all'
+
+
+@contextmanager
+def open_bag(path: Path | str) -> Iterator[Bag]:
+    """Open a bag for reading.
+
+    Parameters
+    ----------
+    path : path-like
+        rosbag2 directory, or a single ``.mcap``, ``.db3`` or ROS 1 ``.bag`` file.
+
+    Yields
+    ------
+    Bag
+
+    Raises
+    ------
+    MissingInputError
+        There is nothing at `path`.
+    InputError
+        It is no bag, or it is truncated or damaged; one sentence says which.
+    """
+    path = Path(path)
+    _check_path(path)
+    reader = None
+    try:
+        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
+        reader.open()
+    except PermissionError as error:
+        raise InputError(f'{path} cannot be read: {error.strerror}') from error
+    # A damaged file makes the parsers fail in any way.
+    except Exception as error:
+        raise InputError(_why_not_opened(path, error)) from error
+    try:
+        yield Bag(path, reader)
+    finally:
+        reader.close()
+
+
+def _check_path(path: Path) -> None:
+    """What can be told before a parser sees the bag."""
+    if not path.exists():
+        raise MissingInputError(f'there is no bag at {path}')
+    if path.is_dir():
+        files = sorted(file for file in path.iterdir() if file.suffix in _STORAGE_SUFFIXES)
+        if not (path / 'metadata.yaml').exists():
+            if files:
+                raise InputError(
+                    f'{path} has no metadata.yaml, so its recorder was not stopped properly: give '
+                    f'{files[0].name} itself, or make one with "ros2 bag reindex {path}"')
+            raise InputError(f'{path} is no bag: it has no metadata.yaml')
+    elif path.suffix in (*_STORAGE_SUFFIXES, '.bag'):
+        files = [path]
+    else:
+        raise InputError(f'{path} is no bag: give a rosbag2 directory (with metadata.yaml) or a '
+                         '.mcap, .db3 or .bag file')
+    for file in files:
+        if file.stat().st_size == 0:
+            raise InputError(f'{file} is empty')
+        if file.suffix == '.mcap':
+            check_mcap(file)
+
+
+def _why_not_opened(path: Path, error: Exception) -> str:
+    if isinstance(error, RsRelposeError):
+        return str(error)
+    text = _sentence(error)
+    if path.suffix == '.bag':
+        with path.open('rb') as file:
+            head = file.read(9)
+        if head != b'#ROSBAG V':
+            return f'{path} is no ROS 1 bag'
+        return (f'{path} is truncated or damaged ({text}): copy it again, or repair it with '
+                f'"rosbag reindex {path.name}"')
+    kind = 'is truncated or damaged, or no bag' if path.is_file() else 'is damaged'
+    return f'{path} {kind}: {text}'
+
+
+def _sentence(error: Exception) -> str:
+    """What a parser says, in one line, without its full stop; its type where it says nothing."""
+    text = ' '.join(str(error).split()).rstrip('.')
+    return text[:300] if text else type(error).__name__

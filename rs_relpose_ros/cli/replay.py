@@ -1,0 +1,130 @@
+"""``rs_relpose replay``: relative poses from a bag."""
+
+from __future__ import annotations
+
+import argparse
+from importlib.metadata import PackageNotFoundError, version
+import logging
+from pathlib import Path
+import sys
+from typing import Any
+
+from tqdm import tqdm
+
+from rs_relpose_ros.bags.reader import open_bag, TopicOptions
+from rs_relpose_ros.errors import MissingInputError
+from rs_relpose_ros.replay.outputs import replay_into, ReplayOutcome, SUMMARY_FILE
+from rs_relpose_ros.replay.parameter_file import read_parameters
+from rs_relpose_ros.replay.stamps import read_stamps
+from rs_relpose_ros.replay.summary import with_provenance, write_summary
+
+HELP = (
+    'Estimate relative poses from a bag (rosbag2 with SQLite3 or MCAP, compressed or not, or ROS '
+    '1) with the pipeline of relpose_node. Topics are found by their types where only one can be '
+    'meant. Writes relative_poses.csv, summary.json and pictures, and errors.csv where the bag '
+    "has the camera's true poses (geometry_msgs/PoseStamped of the optical frame, IMU clock). "
+    'Translations are unit vectors. Exit code 1: the bag was processed, but no pair got a pose.')
+
+_NO_POSE = 1
+
+_logger = logging.getLogger(__name__)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument('bag', metavar='BAG', type=Path,
+                        help='rosbag2 directory, or a .mcap, .db3 or ROS 1 .bag file')
+    parser.add_argument('--params', metavar='FILE', type=Path,
+                        help="the node's parameter file (ROS format)")
+    parser.add_argument('--set', metavar='NAME=VALUE', action='append', default=[],
+                        help='set a parameter, after --params; may be repeated')
+    parser.add_argument('--out', metavar='DIR', type=Path,
+                        help='directory of the results (default: BAGNAME_relpose in the current '
+                        'one); those of an earlier run are replaced')
+    parser.add_argument('--stamps', metavar='FILE', type=Path,
+                        help='use only the frames whose stamps [ns] are in FILE, one per line, as '
+                        'the parameter stamps_file of a live node wrote them: the poses are then '
+                        'equal to its poses, bit by bit')
+    parser.add_argument('--no-pictures', action='store_true', help='tables and summary only')
+    parser.add_argument('--bag', dest='with_bag', action='store_true',
+                        help="write the node's topics as an MCAP bag, too")
+    topics = parser.add_argument_group('topics')
+    for role, what in (('image', 'Image or CompressedImage'), ('camera-info', 'CameraInfo'),
+                       ('imu', 'Imu'), ('accel', 'Imu of the accelerometer, where it is apart'),
+                       ('truth', "PoseStamped of the camera's true poses")):
+        topics.add_argument(f'--{role}-topic', metavar='TOPIC', default='', help=what)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Replay a bag; 1 when no pair got a pose."""
+    options = TopicOptions(image=args.image_topic, camera_info=args.camera_info_topic,
+                           imu=args.imu_topic, accel=args.accel_topic, truth=args.truth_topic)
+    parameters = read_parameters(args.params, args.set)
+    stamps = None if args.stamps is None else read_stamps(args.stamps)
+    bag_name = args.bag.resolve().stem if args.bag.is_file() else args.bag.resolve().name
+    folder = args.out if args.out is not None else Path(f'{bag_name}_relpose')
+    with open_bag(args.bag) as bag:
+        topics = bag.find_topics(options)
+        missing = parameters.sensor.missing()
+        beside = args.bag.resolve().with_name(f'{bag_name}.yaml')
+        if missing and args.params is None and beside.is_file():
+            raise MissingInputError(f'parameter {" and ".join(missing)} must be given; use '
+                                    f'--params {beside}, which lies beside the bag')
+        with tqdm(total=topics.image.count, unit='image', desc=bag_name, leave=False,
+                  disable=not sys.stderr.isatty()) as bar:
+            outcome = replay_into(folder, bag, topics, parameters, stamps=stamps,
+                                  pictures=not args.no_pictures, with_bag=args.with_bag,
+                                  on_image=bar.update)
+        summary = with_provenance(
+            outcome.figures, bag=args.bag, topics=topics, parameters=parameters, command=sys.argv,
+            package_version=_version())
+    write_summary(folder / SUMMARY_FILE, summary)
+    for reason, count in outcome.counts.reasons.items():
+        _logger.warning('not used, %d times: %s', count, reason)
+    for line in report(outcome, folder):
+        print(line)
+    return 0 if summary['pairs']['answered'] else _NO_POSE
+
+
+def report(outcome: ReplayOutcome, folder: Path) -> list[str]:
+    """The outcome in some lines."""
+    figures, counts = outcome.figures, outcome.counts
+    pairs = figures['pairs']
+    refused = sum(counts.sequencer.refused.values()) + counts.failed_frames
+    lines = [f'{counts.sequencer.frames_taken} of {counts.images} images processed'
+             + (f', {refused} refused' if refused else '')
+             + f' ({_text(figures["timing"]["processing_per_frame_ms"], "ms per image")})',
+             f'{pairs["total"]} pairs, {pairs["answered"]} with a pose'
+             + ''.join(f', {count} {status}' for status, count in pairs['by_status'].items()
+                       if count and status != 'OK')]
+    if not pairs['total']:
+        lines.append('no pair was closed: the bag is shorter than a keyframe interval, or too few '
+                     'frames could be used')
+    elif not pairs['answered']:
+        reasons = sorted({record.reason for record in outcome.records})
+        lines += [f'no pose: {reason}' for reason in reasons[:5]]
+    errors, medians = figures['errors_against_truth'], figures['medians']
+    if errors:
+        lines.append(
+            f'against the truth (median, 90 %): rotation {errors["rotation_median_deg"]:.3g}, '
+            f'{errors["rotation_p90_deg"]:.3g} deg; direction of translation '
+            f'{errors["translation_median_deg"]:.3g}, {errors["translation_p90_deg"]:.3g} deg')
+    if pairs['answered']:
+        lines.append(
+            f'medians: {_text(medians["inliers"], "inliers")}, residual '
+            f'{_text(medians["residual_rms_px"], "px")}, rotation against the gyro '
+            f'{_text(medians["rotation_difference_to_gyro_deg"], "deg")}')
+    names = [*(path.name for path in outcome.files), SUMMARY_FILE]
+    lines.append(f'in {folder}: {", ".join(names)}')
+    return lines
+
+
+def _text(value: Any, unit: str) -> str:
+    return f'no {unit}' if value is None else f'{value:.3g} {unit}'
+
+
+def _version() -> str:
+    try:
+        return version('rs_relpose_ros')
+    except PackageNotFoundError:   # run from a source tree
+        return 'not installed'

@@ -1,0 +1,160 @@
+"""Runs a replay into a directory: tables while it runs, then the summary and the pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rs_relpose_ros.bags.reader import Bag, SensorTopics
+from rs_relpose_ros.bags.writer import BagWriter
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.messages.outgoing import pair_messages
+from rs_relpose_ros.pipeline.pair import PairResult
+from rs_relpose_ros.pipeline.parameters import Parameters
+from rs_relpose_ros.replay.record import pair_record, PairRecord
+from rs_relpose_ros.replay.run import read_truth, Replay, ReplayCounts, ReplayedPair
+from rs_relpose_ros.replay.summary import summarize
+from rs_relpose_ros.replay.tables import (
+    error_cells,
+    ERROR_COLUMNS,
+    relative_pose_cells,
+    RELATIVE_POSE_COLUMNS,
+    TableWriter,
+)
+from rs_relpose_ros.replay.truth import TrueTrajectory
+
+POSES_FILE, ERRORS_FILE, SUMMARY_FILE = 'relative_poses.csv', 'errors.csv', 'summary.json'
+BAG_FOLDER = 'relpose_bag'
+_PICTURES = ('matches.png', 'errors.png', 'residuals.png', 'rotation.png')
+
+_TOPIC_TYPES = {
+    'relative_pose': 'geometry_msgs/msg/PoseWithCovarianceStamped',
+    'reference': 'sensor_msgs/msg/TimeReference',
+    'velocity': 'geometry_msgs/msg/TwistWithCovarianceStamped',
+    'matches': 'sensor_msgs/msg/PointCloud2',
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReplayOutcome:
+    """What a replay gave.
+
+    Attributes
+    ----------
+    records : list of PairRecord
+    counts : ReplayCounts
+    figures : dict
+        As in summary.json, without provenance.
+    files : list of Path
+        Written so far: tables, bag and pictures.
+    """
+
+    records: list[PairRecord]
+    counts: ReplayCounts
+    figures: dict[str, Any]
+    files: list[Path]
+
+
+def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parameters, *,
+                stamps: frozenset[int] | None = None, pictures: bool = True,
+                with_bag: bool = False, on_image: Callable[[], object] = lambda: None,
+                on_pair: Callable[[PairResult], object] = lambda result: None) -> ReplayOutcome:
+    """Run `bag` through the pipeline and write tables, pictures and a bag into `folder`.
+
+    Files of an earlier run in `folder` are replaced.
+
+    Parameters
+    ----------
+    folder : Path
+        Created as needed.
+    bag : Bag
+    topics : SensorTopics
+    parameters : Parameters
+    stamps : set of int, optional
+        Only these frames.
+    pictures, with_bag : bool
+        Whether to draw, and whether to write the node's topics as a bag.
+    on_image : callable
+        Called after each image.
+    on_pair : callable
+        Called with each pair; it carries images where `pictures` are drawn.
+
+    Raises
+    ------
+    InputError, MissingInputError
+        As `Replay.pairs`; or `folder` cannot be written.
+    """
+    run = Replay(bag, topics, parameters, stamps=stamps, keep_images=pictures, on_image=on_image)
+    truth = read_truth(bag, topics)
+    _prepare(folder, with_bag)
+    records: list[PairRecord] = []
+    shown: PairResult | None = None
+    files = [folder / POSES_FILE]
+    with ExitStack() as stack:
+        poses = stack.enter_context(TableWriter(folder / POSES_FILE, RELATIVE_POSE_COLUMNS))
+        errors = None
+        if truth is not None:
+            errors = stack.enter_context(TableWriter(folder / ERRORS_FILE, ERROR_COLUMNS))
+            files.append(folder / ERRORS_FILE)
+        out_bag = stack.enter_context(BagWriter(folder / BAG_FOLDER)) if with_bag else None
+        for pair in run.pairs():
+            record = pair_record(pair.result, pair.reference_ns1, pair.reference_ns2, truth)
+            records.append(record)
+            poses.write(relative_pose_cells(record))
+            if errors is not None:
+                errors.write(error_cells(record))
+            if out_bag is not None and pair.result.pose:
+                _write_messages(out_bag, pair, parameters.pair.reference_frame)
+            on_pair(pair.result)
+            if pictures and _better_shown(pair.result, shown):
+                shown = pair.result
+    if with_bag:
+        files.append(folder / BAG_FOLDER)
+    if pictures and records and shown is not None:
+        files += _draw(folder, records, shown, truth)
+    counts = run.counts()
+    return ReplayOutcome(records, counts, summarize(records, counts), files)
+
+
+def _prepare(folder: Path, with_bag: bool) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f'{folder} is a file: choose another directory with --out')
+    if with_bag and (folder / BAG_FOLDER).exists():
+        raise InputError(f'{folder / BAG_FOLDER} exists already: remove it or choose another '
+                         'directory with --out')
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in (POSES_FILE, ERRORS_FILE, SUMMARY_FILE, *_PICTURES):
+            (folder / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f'{folder} cannot be written: {error.strerror}') from error
+
+
+def _write_messages(bag: BagWriter, pair: ReplayedPair, reference_frame: str) -> None:
+    messages = pair_messages(pair.result, bag.type, reference_frame)
+    for name, msgtype in _TOPIC_TYPES.items():
+        bag.write(f'/relpose_node/{name}', msgtype, getattr(messages, name), pair.bag_time_ns)
+
+
+def _better_shown(result: PairResult, shown: PairResult | None) -> bool:
+    """Whether a pair is the better picture: one with a pose, and with more inliers."""
+    def rank(pair: PairResult) -> tuple[bool, int]:
+        return bool(pair.pose), int(pair.pose.inliers.sum())
+    return shown is None or rank(result) > rank(shown)
+
+
+def _draw(folder: Path, records: list[PairRecord], shown: PairResult,
+          truth: TrueTrajectory | None) -> list[Path]:
+    # Matplotlib takes a second to import; not for those who want no pictures.
+    from rs_relpose_ros.replay import pictures
+    matches, errors, residuals, rotation = (folder / name for name in _PICTURES)
+    pictures.draw_matches(shown, matches)
+    pictures.draw_residuals(records, residuals)
+    pictures.draw_rotation(records, rotation, truth)
+    if truth is None:
+        return [matches, residuals, rotation]
+    pictures.draw_errors(records, errors)
+    return [matches, errors, residuals, rotation]

@@ -1,0 +1,236 @@
+"""Pictures of a replay: matches of a pair, errors and residuals over time, orientation.
+
+Figures are drawn on a canvas of their own, so that nothing of matplotlib's global state is used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_ros.pipeline.pair import PairResult
+from rs_relpose_ros.replay.record import PairRecord, rotation_sigmas, translation_sigmas
+from rs_relpose_ros.replay.truth import TrueTrajectory
+from rs_relpose_ros.result import Status
+from rs_relpose_ros.timing import seconds_between
+
+Array = NDArray[np.float64]
+
+_COLORMAP = 'plasma'
+_DPI = 110
+_OUTLIER_COLOR = 'cyan'
+_NO_POSE_COLOR = '0.6'
+# Colours that are told apart in every kind of colour vision (Okabe and Ito).
+_BLUE, _ORANGE, _GREEN, _RED = '#0072B2', '#E69F00', '#009E73', '#D55E00'
+
+
+def draw_matches(result: PairResult, path: Path) -> None:
+    """Both images of a pair with its matches, coloured by row time; needs the pair's images."""
+    assert result.image1 is not None and result.image2 is not None
+    inliers = _inliers(result)
+    height, width = result.image1.shape
+    row_times = 1e3 * np.concatenate([result.row_times1, result.row_times2, [0.0]])
+    norm = Normalize(row_times.min(), max(row_times.max(), row_times.min() + 1e-3))
+    figure = Figure(figsize=(13.0, 1.2 + 6.1 * height / width), dpi=_DPI, layout='constrained')
+    left, right = figure.subplots(1, 2)
+    _image(left, result.image1, 'reference keyframe: inliers, coloured by their row time')
+    _image(right, result.image2, 'current image: the same, with their way since the keyframe')
+    points1, points2 = result.matches.points1, result.matches.points2
+    tau1, tau2 = 1e3 * result.row_times1, 1e3 * result.row_times2
+    left.scatter(*points1[inliers].T, c=tau1[inliers], cmap=_COLORMAP, norm=norm, s=16,
+                 edgecolors='black', linewidths=0.4)
+    ways = LineCollection(list(np.stack([points1[inliers], points2[inliers]], axis=1)),
+                          cmap=_COLORMAP, norm=norm, linewidths=1.3)
+    ways.set_array(tau2[inliers])
+    right.add_collection(ways)
+    right.scatter(*points2[inliers].T, c=tau2[inliers], cmap=_COLORMAP, norm=norm, s=16,
+                  edgecolors='black', linewidths=0.4)
+    for axes, points in ((left, points1), (right, points2)):
+        axes.scatter(*points[~inliers].T, marker='x', color=_OUTLIER_COLOR, s=26, linewidths=1.4,
+                     label=f'outliers ({np.count_nonzero(~inliers)})')
+    if not inliers.all():
+        right.legend(loc='lower right', framealpha=0.9, fontsize=9)
+    figure.colorbar(ScalarMappable(norm, _COLORMAP), ax=[left, right], shrink=0.8, pad=0.01,
+                    label='row time, from the stamped row [ms]')
+    figure.suptitle(_pair_title(result, int(inliers.sum())), fontsize=12)
+    _save(figure, path)
+
+
+def draw_errors(records: Sequence[PairRecord], path: Path) -> None:
+    """Errors against the truth over time, with the sigmas that the estimates claim."""
+    figure, axes = _over_time(2, 'errors of the relative poses against the ground truth')
+    start_ns = records[0].reference_ns1
+    known = [r for r in records if r.status is Status.OK and r.errors is not None]
+    times = _middles(known, start_ns)
+    rotation = [r.errors.rotation_error for r in known if r.errors]
+    translation = [r.errors.translation_error for r in known if r.errors]
+    # Of a 3-vector and of a 2-vector with these sigmas: the root of the mean square length.
+    rotation_sigma = [np.degrees(np.linalg.norm(rotation_sigmas(r.covariance))) for r in known]
+    translation_sigma = [np.degrees(np.linalg.norm(translation_sigmas(r.covariance)))
+                         for r in known]
+    for axis, values, sigmas, label in (
+            (axes[0], rotation, rotation_sigma, 'rotation error [deg]'),
+            (axes[1], translation, translation_sigma, 'translation direction\nerror [deg]')):
+        if known:
+            axis.plot(times, sigmas, '-', color=_ORANGE, linewidth=1.2,
+                      label='1 sigma, as estimated')
+            axis.plot(times, values, 'o', color=_BLUE, markersize=5, label='error')
+            axis.axhline(float(np.median(values)), color=_BLUE, linestyle='--', linewidth=1.0,
+                         label=f'median error {np.median(values):.2g} deg')
+            axis.set_yscale('log')
+        axis.set_ylabel(label)
+        _shade_no_pose(axis, records, start_ns)
+        axis.legend(loc='upper left', bbox_to_anchor=(1.0, 1.0), fontsize=9)
+    axes[-1].set_xlabel('time since the first keyframe [s]')
+    _save(figure, path)
+
+
+def draw_residuals(records: Sequence[PairRecord], path: Path) -> None:
+    """What can be judged without a truth: residuals, inliers, rotation against the gyro."""
+    figure, axes = _over_time(3, 'residuals of the relative poses')
+    start_ns = records[0].reference_ns1
+    known = [r for r in records if r.status is Status.OK]
+    times = _middles(known, start_ns)
+    series = (
+        ([r.residual_rms for r in known], 'residual of inliers,\nrms [px]'),
+        ([100.0 * r.inliers / max(r.matches, 1) for r in known], 'inliers [%]'),
+        ([r.gyro_difference for r in known], 'rotation: estimate\nagainst gyro [deg]'))
+    for axis, (values, label) in zip(axes, series, strict=True):
+        finite = np.isfinite(np.array(values, dtype=np.float64))
+        if finite.any():
+            median = float(np.median(np.array(values)[finite]))
+            axis.plot(times, values, 'o', color=_BLUE, markersize=4)
+            axis.axhline(median, color=_BLUE, linestyle='--', linewidth=1.0,
+                         label=f'median {median:.3g}')
+        axis.set_ylabel(label)
+        axis.set_ylim(bottom=0.0)
+        _shade_no_pose(axis, records, start_ns)
+        axis.legend(loc='upper left', bbox_to_anchor=(1.0, 1.0), fontsize=9)
+    axes[-1].set_xlabel('time since the first keyframe [s]')
+    _save(figure, path)
+
+
+def draw_rotation(records: Sequence[PairRecord], path: Path,
+                  truth: TrueTrajectory | None = None) -> None:
+    """Rotation accumulated over the pairs, beside the gyro's and the true one."""
+    estimated = [r.R for r in records]
+    gyro = [np.full((3, 3), np.nan) if r.gyro_rotation is None else r.gyro_rotation
+            for r in records]
+    # Where a pair has no rotation the gyro bridges it, and the span is shaded.
+    bridged = [g if np.isnan(R).any() else R for R, g in zip(estimated, gyro, strict=True)]
+    curves = [('estimated', _accumulated(bridged), _BLUE, 'o-'),
+              ('gyro alone', _accumulated(gyro), _ORANGE, '-')]
+    if truth is not None:
+        true = [truth.relative_pose(r.reference_ns1, r.reference_ns2) for r in records]
+        rotations = [np.full((3, 3), np.nan) if pose is None else pose[0] for pose in true]
+        curves.append(('truth', _accumulated(rotations), 'black', '--'))
+    start_ns = records[0].reference_ns1
+    times = [0.0, *(seconds_between(start_ns, r.reference_ns2) for r in records)]
+    figure, axes = _over_time(3, 'orientation against the first keyframe (rotation vector, '
+                              'axes of the camera), pairs chained')
+    for column, axis in enumerate(axes):
+        for label, curve, color, style in curves:
+            axis.plot(times, curve[:, column], style, color=color, label=label, markersize=3,
+                      linewidth=1.4)
+        axis.set_ylabel(f'{"xyz"[column]} ({("right", "down", "forward")[column]}) [deg]')
+        _shade_no_pose(axis, [r for r in records if np.isnan(r.R).any()], start_ns,
+                       'no rotation: gyro')
+    axes[0].legend(loc='upper left', bbox_to_anchor=(1.0, 1.0), fontsize=9)
+    axes[-1].set_xlabel('time since the first keyframe [s]')
+    _save(figure, path)
+
+
+# -- parts -----------------------------------------------------------------------------------
+
+
+def _inliers(result: PairResult) -> NDArray[np.bool_]:
+    """Mask over the matches; a pair that failed early has none."""
+    inliers = result.pose.inliers
+    if len(inliers) == len(result.matches.points1):
+        return inliers
+    return np.zeros(len(result.matches.points1), dtype=bool)
+
+
+def _pair_title(result: PairResult, inliers: int) -> str:
+    text = (f'{inliers} inliers of {len(result.matches.points1)} matches over '
+            f'{1e3 * result.interval:.0f} ms')
+    pose = result.pose
+    if np.isfinite(pose.R).all():
+        text += f', rotation {np.degrees(Rotation.from_matrix(pose.R).magnitude()):.2f} deg'
+    if pose:
+        x, y, z = pose.t
+        text += f', direction of translation ({x:+.2f}, {y:+.2f}, {z:+.2f})'
+        return text + f', residual {pose.residual_rms:.2f} px'
+    return f'{text}: {pose.status.value}'
+
+
+def _image(axes: Axes, image: NDArray[np.uint8], title: str) -> None:
+    height, width = image.shape
+    axes.imshow(image, cmap='gray', vmin=0, vmax=320, interpolation='antialiased')
+    axes.set_title(title, fontsize=10)
+    axes.set_xlim(-0.5, width - 0.5)
+    axes.set_ylim(height - 0.5, -0.5)
+    axes.set_xlabel('column [px]', fontsize=9)
+    axes.set_ylabel('row [px]', fontsize=9)
+    axes.tick_params(labelsize=8)
+
+
+def _over_time(count: int, title: str) -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=(10.5, 0.9 + 2.1 * count), dpi=_DPI, layout='constrained')
+    axes = list(figure.subplots(count, 1, sharex=True))
+    for axis in axes:
+        axis.grid(True, which='major', color='0.88')
+        axis.set_axisbelow(True)
+    figure.suptitle(title, fontsize=12)
+    return figure, axes
+
+
+def _shade_no_pose(axis: Axes, records: Sequence[PairRecord], start_ns: int,
+                   label: str = '') -> None:
+    """Spans of the pairs without a pose, one entry of the legend per status."""
+    labelled = set()
+    hatches = {Status.PURE_ROTATION: '', Status.LOW_PARALLAX: '..'}
+    for record in records:
+        if record.status is Status.OK:
+            continue
+        text = label or f'no pose: {record.status.value}'
+        axis.axvspan(seconds_between(start_ns, record.reference_ns1),
+                     seconds_between(start_ns, record.reference_ns2), facecolor=_NO_POSE_COLOR,
+                     alpha=0.35, edgecolor='0.3', linewidth=0.0,
+                     hatch=hatches.get(record.status, '//'),
+                     label=None if text in labelled else text)
+        labelled.add(text)
+
+
+def _middles(records: Sequence[PairRecord], start_ns: int) -> list[float]:
+    return [0.5 * (seconds_between(start_ns, r.reference_ns1)
+                   + seconds_between(start_ns, r.reference_ns2)) for r in records]
+
+
+def _accumulated(rotations: Sequence[Array]) -> Array:
+    """Rotation vectors (K + 1, 3) [deg] of the products; NaN from the first unknown one on."""
+    total = np.eye(3)
+    vectors = [np.zeros(3)]
+    for rotation in rotations:
+        total = total @ rotation
+        vectors.append(np.full(3, np.nan) if np.isnan(total).any()
+                       else np.degrees(Rotation.from_matrix(total).as_rotvec()))
+    return np.array(vectors)
+
+
+def _save(figure: Figure, path: Path) -> None:
+    # Without the version of matplotlib in it, equal figures are equal files.
+    with mpl.rc_context({'savefig.facecolor': 'white'}):
+        FigureCanvasAgg(figure)
+        figure.savefig(path, metadata={'Software': None})

@@ -1,0 +1,242 @@
+"""Feeds a bag to the pipeline of the live node: the same sequencer, conversion and estimator."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+import logging
+import time
+from typing import Any
+
+import numpy as np
+
+from rs_relpose_ros.bags.reader import Bag, COMPRESSED_IMAGE, SensorTopics
+from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
+from rs_relpose_ros.estimator.estimate import warm_up
+from rs_relpose_ros.messages.incoming import stamp_ns
+from rs_relpose_ros.messages.intake import MessageIntake
+from rs_relpose_ros.pipeline.calibration import Calibration
+from rs_relpose_ros.pipeline.pair import PairResult
+from rs_relpose_ros.pipeline.parameters import Parameters
+from rs_relpose_ros.pipeline.pipeline import Pipeline
+from rs_relpose_ros.pipeline.sequencer import FrameRefused, ReadyFrame, Sequencer, SequencerCounts
+from rs_relpose_ros.replay.truth import TrueTrajectory
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReplayedPair:
+    """A pair, the instants of its stamped rows on the IMU clock, and when it closed [ns]."""
+
+    result: PairResult
+    reference_ns1: int
+    reference_ns2: int
+    bag_time_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayCounts:
+    """What came, and what became of it.
+
+    Attributes
+    ----------
+    images : int
+        In the bag; `images_skipped` of them are not among the chosen stamps.
+    sequencer : SequencerCounts
+    invalid_messages, failed_frames : int
+    reasons : dict
+        Number of frames and messages that were not used, by the sentence that says why.
+    seconds : float
+        Wall time of the whole, without compilation.
+    processing_seconds : float
+        Of it, in tracking and estimation.
+    bag_seconds : float
+        From the first to the last message.
+    """
+
+    images: int
+    images_skipped: int
+    sequencer: SequencerCounts
+    invalid_messages: int
+    failed_frames: int
+    reasons: dict[str, int]
+    seconds: float
+    processing_seconds: float
+    bag_seconds: float
+
+
+class Replay:
+    """One run over a bag; iterate over `pairs`, then ask for `counts`.
+
+    Parameters
+    ----------
+    bag : Bag
+        Open.
+    topics : SensorTopics
+    parameters : Parameters
+    stamps : set of int, optional
+        Only these frames are handed over, as those that a live node processed.
+    keep_images : bool
+        Whether pairs carry their images.
+    on_image : callable
+        Called after each image of the bag, for a progress bar.
+    """
+
+    def __init__(self, bag: Bag, topics: SensorTopics, parameters: Parameters, *,
+                 stamps: frozenset[int] | None = None, keep_images: bool = False,
+                 on_image: Callable[[], object] = lambda: None) -> None:
+        missing = parameters.sensor.missing()
+        if missing:
+            raise MissingInputError(
+                f'parameter {" and ".join(missing)} must be given, by --params FILE or --set '
+                f'{missing[0]}=...: see config/relpose.yaml')
+        self._bag, self._topics, self._stamps = bag, topics, stamps
+        self._on_image = on_image
+        self._sequencer = Sequencer(parameters, offline=True)
+        self._intake = MessageIntake(self._sequencer)
+        self._pipeline = Pipeline(parameters, keep_images=keep_images)
+        self._references_ns: dict[int, int] = {}
+        self._stamps_found: set[int] = set()
+        self._images = self._skipped = self._invalid = self._failed = self._pairs = 0
+        self._reasons: Counter[str] = Counter()
+        self._seconds = self._processing_seconds = 0.0
+        self._first_ns = self._last_ns = 0
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """The calibration in force."""
+        return self._intake.calibration
+
+    def pairs(self) -> Iterator[ReplayedPair]:
+        """Run over the bag; every pair as it closes.
+
+        Raises
+        ------
+        InputError, MissingInputError
+            The bag is damaged, its camera is not calibrated, or no frame of it could be used.
+        """
+        warm_up()
+        started = time.perf_counter()
+        topics = [self._topics.image, self._topics.camera_info, self._topics.imu]
+        if self._topics.accel is not None:
+            topics.append(self._topics.accel)
+        for message in self._bag.messages(topics):
+            self._first_ns = self._first_ns or message.bag_time_ns
+            self._last_ns = message.bag_time_ns
+            self._hand_over(message.topic, message.message)
+            yield from self._drain()
+        self._intake.refuse_held()
+        self._sequencer.close()
+        yield from self._drain()
+        self._seconds = time.perf_counter() - started
+        self._check_outcome()
+
+    def counts(self) -> ReplayCounts:
+        """Counts so far."""
+        return ReplayCounts(
+            images=self._images, images_skipped=self._skipped,
+            sequencer=self._sequencer.counts(), invalid_messages=self._invalid,
+            failed_frames=self._failed, reasons=dict(self._reasons.most_common()),
+            seconds=self._seconds, processing_seconds=self._processing_seconds,
+            bag_seconds=(self._last_ns - self._first_ns) * 1e-9)
+
+    # -- inside ------------------------------------------------------------------------------
+
+    def _hand_over(self, topic: str, msg: Any) -> None:
+        topics, intake = self._topics, self._intake
+        try:
+            if topic == topics.imu.name:
+                intake.add_imu(msg)
+            elif topics.accel is not None and topic == topics.accel.name:
+                intake.add_accelerometer(msg)
+            elif topic == topics.camera_info.name:
+                intake.add_camera_info(msg)
+            else:
+                self._hand_over_image(msg)
+        except RsRelposeError as error:
+            if topic == topics.camera_info.name and not self._sequencer.counts().frames_taken:
+                # Nothing was estimated and nothing can be: say so now.
+                raise type(error)(f'{topic}: {error}') from error
+            self._invalid += 1
+            self._not_used(f'{topic}: {error}')
+
+    def _hand_over_image(self, msg: Any) -> None:
+        self._images += 1
+        self._on_image()
+        if self._stamps is not None:
+            stamp = stamp_ns(msg.header)
+            if stamp not in self._stamps:
+                self._skipped += 1
+                return
+            self._stamps_found.add(stamp)
+        if self._topics.image.msgtype == COMPRESSED_IMAGE:
+            self._intake.add_compressed_image(msg)
+        else:
+            self._intake.add_image(msg)
+
+    def _drain(self) -> Iterator[ReplayedPair]:
+        while (taken := self._sequencer.take()) is not None:
+            if isinstance(taken, FrameRefused):
+                self._not_used(f'{taken.cause.value}: {taken.reason}')
+                continue
+            result = self._process(taken)
+            if result is not None:
+                self._pairs += 1
+                reference_ns1 = self._references_ns[result.reference_stamp_ns]
+                # Later pairs begin at this frame.
+                self._references_ns = {result.stamp_ns: taken.imu.reference_ns}
+                yield ReplayedPair(result, reference_ns1, taken.imu.reference_ns, self._last_ns)
+
+    def _process(self, ready: ReadyFrame) -> PairResult | None:
+        started = time.perf_counter()
+        self._references_ns[ready.frame.stamp_ns] = ready.imu.reference_ns
+        try:
+            if ready.restart:
+                self._pipeline.reset()
+            return self._pipeline.process(ready.frame, ready.imu)
+        except RsRelposeError as error:
+            # As the live node does it: one frame does not end the run.
+            self._pipeline.reset()
+            self._failed += 1
+            self._not_used(str(error))
+            return None
+        finally:
+            self._processing_seconds += time.perf_counter() - started
+
+    def _not_used(self, reason: str) -> None:
+        self._reasons[reason] += 1
+        if self._reasons[reason] == 1:
+            _logger.info('not used: %s', reason)
+
+    def _check_outcome(self) -> None:
+        counts = self._sequencer.counts()
+        if self._stamps is not None:
+            absent = len(self._stamps - self._stamps_found)
+            if absent == len(self._stamps):
+                raise InputError(f'none of the {absent} chosen stamps is the stamp of an image on '
+                                 f'{self._topics.image.name}')
+            if absent:
+                _logger.warning('%d of the %d chosen stamps are not in the bag', absent,
+                                len(self._stamps))
+        if self._reasons and (not counts.frames_taken or (self._failed and not self._pairs)):
+            reason, _ = Counter(self._reasons).most_common(1)[0]
+            raise InputError(f'no frame of {self._bag.path} could be used: {reason}')
+
+
+def read_truth(bag: Bag, topics: SensorTopics) -> TrueTrajectory | None:
+    """The camera's true trajectory; None where the bag has none."""
+    if topics.truth is None:
+        return None
+    stamps, positions, quats = [], [], []
+    for message in bag.messages([topics.truth]):
+        pose = message.message.pose
+        stamps.append(stamp_ns(message.message.header))
+        positions.append((pose.position.x, pose.position.y, pose.position.z))
+        quats.append((pose.orientation.x, pose.orientation.y, pose.orientation.z,
+                      pose.orientation.w))
+    try:
+        return TrueTrajectory(stamps, np.array(positions), np.array(quats))
+    except InputError as error:
+        raise InputError(f'{topics.truth.name}: {error}') from error

@@ -1,0 +1,121 @@
+"""``summary.json``: counts, medians, errors and timing of a replay, and what it was made with."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+import json
+import math
+from pathlib import Path
+import platform
+from typing import Any
+
+import cv2
+import numba
+import numpy as np
+import scipy
+
+from rs_relpose_ros.bags.reader import SensorTopics
+from rs_relpose_ros.pipeline.parameters import Parameters
+from rs_relpose_ros.replay.record import PairRecord
+from rs_relpose_ros.replay.run import ReplayCounts
+from rs_relpose_ros.replay.truth import median_and_p90
+from rs_relpose_ros.result import Status
+
+
+def summarize(records: Sequence[PairRecord], counts: ReplayCounts) -> dict[str, Any]:
+    """Figures of a run; medians are over the answered pairs, null where there are none."""
+    answered = [record for record in records if record.status is Status.OK]
+    by_status = Counter(record.status.value for record in records)
+    seconds = counts.processing_seconds
+    taken = counts.sequencer.frames_taken
+    return {
+        'pairs': {
+            'total': len(records),
+            'answered': len(answered),
+            'by_status': {status.value: by_status.get(status.value, 0) for status in Status},
+        },
+        'frames': {
+            'in_bag': counts.images,
+            'not_among_stamps': counts.images_skipped,
+            'processed': taken,
+            'refused': {cause.value: n for cause, n in counts.sequencer.refused.items()},
+            'failed': counts.failed_frames,
+        },
+        'imu': {
+            'samples': counts.sequencer.imu_samples,
+            'gaps': counts.sequencer.imu_gaps,
+            'clock_jumps': counts.sequencer.clock_jumps,
+        },
+        'invalid_messages': counts.invalid_messages,
+        'not_used': counts.reasons,
+        'medians': {
+            'matches': _median([r.matches for r in answered]),
+            'inliers': _median([r.inliers for r in answered]),
+            'inlier_ratio': _median([r.inliers / r.matches for r in answered if r.matches]),
+            'residual_rms_px': _median([r.residual_rms for r in answered]),
+            'parallax_px': _median([r.parallax for r in answered]),
+            'interval_s': _median([r.interval for r in answered]),
+            'rotation_difference_to_gyro_deg': _median([r.gyro_difference for r in answered]),
+        },
+        'errors_against_truth': _errors(answered),
+        'timing': {
+            'bag_s': _finite(counts.bag_seconds),
+            'wall_s': _finite(counts.seconds),
+            'frame_rate_hz': _finite(taken / seconds) if seconds > 0.0 else None,
+            'processing_per_frame_ms': _finite(1e3 * seconds / taken) if taken else None,
+            'estimate_median_ms': _median([1e3 * r.duration for r in records]),
+        },
+    }
+
+
+def with_provenance(figures: dict[str, Any], *, bag: Path, topics: SensorTopics,
+                    parameters: Parameters, command: Sequence[str],
+                    package_version: str) -> dict[str, Any]:
+    """The figures, and what they were made from."""
+    names = {'image': topics.image, 'camera_info': topics.camera_info, 'imu': topics.imu,
+             'accel': topics.accel, 'truth': topics.truth}
+    return {
+        'bag': str(bag),
+        'topics': {role: topic.name if topic else None for role, topic in names.items()},
+        **figures,
+        'parameters': parameters.to_mapping(),
+        'command': list(command),
+        'versions': {
+            'rs_relpose_ros': package_version,
+            'python': platform.python_version(),
+            'numpy': np.__version__,
+            'scipy': scipy.__version__,
+            'opencv': cv2.__version__,
+            'numba': numba.__version__,
+        },
+    }
+
+
+def write_summary(path: Path, summary: dict[str, Any]) -> None:
+    """Write a summary as JSON; NaN, which JSON has not, must not be in it."""
+    path.write_text(json.dumps(summary, indent=2, allow_nan=False) + '\n', encoding='utf-8')
+
+
+def _errors(answered: Sequence[PairRecord]) -> dict[str, Any] | None:
+    errors = [record.errors for record in answered if record.errors is not None]
+    if not errors:
+        return None
+    rotation = median_and_p90([e.rotation_error for e in errors])
+    translation = median_and_p90([e.translation_error for e in errors])
+    return {
+        'pairs': len(errors),
+        'rotation_median_deg': _finite(rotation[0]),
+        'rotation_p90_deg': _finite(rotation[1]),
+        'translation_median_deg': _finite(translation[0]),
+        'translation_p90_deg': _finite(translation[1]),
+        'baseline_median_m': _median([e.baseline for e in errors]),
+    }
+
+
+def _median(values: Sequence[float]) -> float | None:
+    return _finite(median_and_p90(values)[0])
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

@@ -1,0 +1,130 @@
+"""Errors of relative poses against a recorded trajectory of the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, Slerp
+
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.timing import NANOSECONDS, to_nanoseconds
+
+Array = NDArray[np.float64]
+
+# A longer step between two poses is a hole: nothing is interpolated across it.
+_MAX_GAP_NS = to_nanoseconds(0.2)
+_MIN_POSES = 4
+
+
+@dataclass(frozen=True, slots=True)
+class PairErrors:
+    """True motion of a pair and the errors of its estimate, NaN where there is no such figure.
+
+    Attributes
+    ----------
+    baseline : float
+        True distance of the two reference instants' positions [m].
+    rotation : float
+        True angle of rotation [deg].
+    rotation_error : float
+        Angle of ``R_estimated^T R_true`` [deg].
+    translation_error : float
+        Angle between the directions of translation [deg], 0 to 180.
+    """
+
+    baseline: float
+    rotation: float
+    rotation_error: float
+    translation_error: float
+
+
+class TrueTrajectory:
+    """Camera poses in the world, interpolated: SLERP and a cubic spline of the position.
+
+    Parameters
+    ----------
+    stamps_ns : (K,) array_like of int
+        On the IMU clock.
+    positions : (K, 3) array_like
+        [m].
+    quats_xyzw : (K, 4) array_like
+        Rotation of the camera's optical frame in the world.
+    """
+
+    def __init__(self, stamps_ns: ArrayLike, positions: ArrayLike, quats_xyzw: ArrayLike) -> None:
+        stamps = np.asarray(stamps_ns, dtype=np.int64)
+        order = np.argsort(stamps, kind='stable')
+        order = order[np.append(True, np.diff(stamps[order]) > 0)] if len(order) else order
+        positions = np.asarray(positions, dtype=np.float64).reshape(-1, 3)[order]
+        quats = np.asarray(quats_xyzw, dtype=np.float64).reshape(-1, 4)[order]
+        if len(order) < _MIN_POSES:
+            raise InputError(f'the ground truth has {len(order)} poses of distinct stamps; at '
+                             f'least {_MIN_POSES} are needed')
+        norms = np.linalg.norm(quats, axis=1)
+        if not (np.isfinite(positions).all() and np.isfinite(quats).all()
+                and (np.abs(norms - 1.0) < 1e-2).all()):
+            raise InputError('the ground truth has a pose that is not finite, or whose quaternion '
+                             'has not the length 1')
+        self._stamps = stamps[order]
+        # Seconds since the first pose: absolute stamps do not fit into a float.
+        seconds = (self._stamps - self._stamps[0]) / NANOSECONDS
+        self._position = CubicSpline(seconds, positions)
+        self._rotation = Slerp(seconds, Rotation.from_quat(quats))
+
+    def covers(self, at_ns: int) -> bool:
+        """Whether there are poses close enough on both sides of an instant."""
+        after = int(np.searchsorted(self._stamps, at_ns))
+        if after == len(self._stamps):
+            return False
+        if self._stamps[after] == at_ns:
+            return True
+        return after > 0 and bool(
+            self._stamps[after] - self._stamps[after - 1] <= _MAX_GAP_NS)
+
+    def relative_pose(self, ns1: int, ns2: int) -> tuple[Array, Array] | None:
+        """R (3, 3) and t (3,) [m] with ``X1 = R X2 + t``; None where the truth does not reach."""
+        if not (self.covers(ns1) and self.covers(ns2)):
+            return None
+        seconds = (np.array([ns1, ns2], dtype=np.int64) - self._stamps[0]) / NANOSECONDS
+        R1, R2 = self._rotation(seconds).as_matrix()
+        p1, p2 = self._position(seconds)
+        return R1.T @ R2, R1.T @ (p2 - p1)
+
+    def errors(self, R: Array, t: Array, ns1: int, ns2: int) -> PairErrors | None:
+        """Errors of an estimate, NaN in it allowed; None where the truth does not reach."""
+        truth = self.relative_pose(ns1, ns2)
+        if truth is None:
+            return None
+        R_true, t_true = truth
+        return PairErrors(
+            baseline=float(np.linalg.norm(t_true)), rotation=rotation_angle(R_true),
+            rotation_error=rotation_angle(R.T @ R_true),
+            translation_error=direction_angle(t, t_true))
+
+
+def rotation_angle(R: Array) -> float:
+    """Angle of a rotation matrix [deg]; NaN for NaN."""
+    if not np.isfinite(R).all():
+        return float('nan')
+    return float(np.degrees(Rotation.from_matrix(R).magnitude()))
+
+
+def direction_angle(a: Array, b: Array) -> float:
+    """Angle between two vectors [deg]; NaN where one is NaN or zero."""
+    if not (np.linalg.norm(a) > 0.0 and np.linalg.norm(b) > 0.0):
+        return float('nan')
+    # The arc cosine loses digits at small angles.
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), np.dot(a, b))))
+
+
+def median_and_p90(values: Sequence[float]) -> tuple[float, float]:
+    """Median and 90th percentile of the finite values; NaN without any."""
+    finite = np.asarray(values, dtype=np.float64)
+    finite = finite[np.isfinite(finite)]
+    if not len(finite):
+        return float('nan'), float('nan')
+    return float(np.median(finite)), float(np.percentile(finite, 90))
