@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.solvers.cheirality import cheirality_votes
-from rs_relpose_ros.solvers.gravity import normals_at_yaw, rotate_rows, rotation_from_yaw
-from rs_relpose_ros.solvers.polynomial import angles_of_zeros, half_angle_matrix
+from rs_relpose_ros.solvers.gravity import (
+    normals_at_yaw, rotate_rows, rotation_from_yaw, yaw_window)
+from rs_relpose_ros.solvers.polynomial import angles_of_zeros, half_angle_matrix, node_angle
 
 Array = NDArray[np.float64]
 
@@ -47,19 +48,20 @@ def angular_3pt_kernel(f1: Array, f2: Array, A1: Array, A2: Array, R_out: Array,
     a, b = np.empty((3, 3)), np.empty((3, 3))
     rotate_rows(A1, f1, a)
     rotate_rows(A2, f2, b)
+    centre, zoom = yaw_window(a, b)
     n, dn = np.empty((3, 3)), np.empty((3, 3))
     samples = np.empty(_SAMPLES)
     for k in range(_SAMPLES):
-        normals_at_yaw(a, b, 2.0 * math.pi * k / _SAMPLES, n, dn)
+        normals_at_yaw(a, b, centre + node_angle(k, _DEGREE, zoom), n, dn)
         samples[k] = _triple(n[0], n[1], n[2])
-    angles, is_pair = np.empty(MAX_SOLUTIONS), np.empty(MAX_SOLUTIONS, dtype=np.bool_)
-    found = angles_of_zeros(samples, _HALF_ANGLE, PAIR_TOLERANCE, angles, is_pair)
+    angles, half_gaps = np.empty(MAX_SOLUTIONS), np.empty(MAX_SOLUTIONS)
+    found = angles_of_zeros(samples, _HALF_ANGLE, zoom, PAIR_TOLERANCE, angles, half_gaps)
     t = np.empty(3)
     count = 0
     for k in range(found):
-        psi = angles[k]
+        psi = centre + angles[k]
         normals_at_yaw(a, b, psi, n, dn)
-        if not is_pair[k]:
+        if half_gaps[k] == 0.0:
             # One Newton step on the determinant itself, free of the polynomial's rounding.
             slope = (_triple(dn[0], n[1], n[2]) + _triple(n[0], dn[1], n[2])
                      + _triple(n[0], n[1], dn[2]))

@@ -84,3 +84,36 @@ def normals_at_yaw(a: Array, b: Array, psi: float, normals: Array, derivatives: 
         derivatives[k, 0] = -a[k, 2] * hx
         derivatives[k, 1] = -a[k, 2] * hy
         derivatives[k, 2] = a[k, 0] * hx + a[k, 1] * hy
+
+
+@_jit
+def yaw_window(a: Array, b: Array) -> tuple[float, float]:
+    """Where the solutions crowd: the yaw that best aligns the rays, and their spread there.
+
+    The normals ``a x Rz(psi) b`` of distant points all nearly vanish at the true yaw, so that the
+    zeros of a determinant of them crowd there, within about the parallax.
+
+    Parameters
+    ----------
+    a, b : (n, 3) ndarray
+        Gravity-aligned unit rays.
+
+    Returns
+    -------
+    centre, width : float
+        ``argmax sum a . Rz(psi) b`` [rad], and the rms distance of the aligned rays, in
+        [1e-3, 1].
+    """
+    n = a.shape[0]
+    along, across = 0.0, 0.0
+    for k in range(n):
+        along += a[k, 0] * b[k, 0] + a[k, 1] * b[k, 1]
+        across += a[k, 1] * b[k, 0] - a[k, 0] * b[k, 1]
+    centre = math.atan2(across, along)
+    c, s = math.cos(centre), math.sin(centre)
+    total = 0.0
+    for k in range(n):
+        total += (a[k, 0] - c * b[k, 0] + s * b[k, 1]) ** 2
+        total += (a[k, 1] - s * b[k, 0] - c * b[k, 1]) ** 2
+        total += (a[k, 2] - b[k, 2]) ** 2
+    return centre, min(max(math.sqrt(total / n), 1e-3), 1.0)

@@ -62,19 +62,19 @@ def _root_between(p: Array, degree: int, low: float, high: float, at_low: float,
 
 
 @_jit
-def roots_in_unit_interval(p: Array, pair_tolerance: float, roots: Array,
-                           is_pair: NDArray[np.bool_], work: Array) -> int:
+def roots_in_unit_interval(p: Array, pair_tolerance: float, zoom: float, roots: Array,
+                           half_gaps: Array, work: Array) -> int:
     """All real roots in [-1, 1], ascending.
 
     Parameters
     ----------
     p : (n + 1,) ndarray
         Ascending coefficients, n >= 1.
-    pair_tolerance : float
-        A conjugate pair ``c +- ih`` with ``2 h / (1 + c^2)`` below it counts as the root c: the
-        pair of half-angle tangents is then that near to the real *angle* ``2 atan(c)``.
-    roots, is_pair : (n,) ndarray
-        Receive the roots, and whether each stands for a conjugate pair.
+    pair_tolerance, zoom : float
+        A conjugate pair ``c +- ih`` counts as the root c if the *angle* ``2 atan(zoom x)`` has an
+        imaginary part below the tolerance there: ``2 zoom h / (1 + zoom^2 c^2)``.
+    roots, half_gaps : (n,) ndarray
+        Receive the roots, and h of those that stand for a pair (else 0).
     work : (n + 3, n + 1) ndarray
         Overwritten.
 
@@ -109,17 +109,17 @@ def roots_in_unit_interval(p: Array, pair_tolerance: float, roots: Array,
                 # Exactly 0 counts as negative: a root at a cut is then found once.
                 found[count] = _root_between(work[m], m, left, right, at_left, last_step)
                 if m == n:
-                    is_pair[count] = False
+                    half_gaps[count] = 0.0
                 count += 1
             elif m == n and k < cut_count:
                 # An extremum that nearly touches zero: p'' = 2 work[n - 2].
                 following = value(work[m], m, cuts[k + 1] if k + 1 < cut_count else 1.0)
                 bend = value(work[n - 2], n - 2, right) if n >= 2 else 0.0
                 h2 = at_right / bend
-                if (following > 0.0) == (at_right > 0.0) and 0.0 <= h2 and (
-                        4.0 * h2 < (pair_tolerance * (1.0 + right * right)) ** 2):
+                limit = 0.5 * pair_tolerance * (1.0 / zoom + zoom * right * right)
+                if (following > 0.0) == (at_right > 0.0) and 0.0 <= h2 < limit * limit:
                     found[count] = right
-                    is_pair[count] = True
+                    half_gaps[count] = math.sqrt(h2)
                     count += 1
             left, at_left = right, at_right
         if m == n:
@@ -160,40 +160,59 @@ def half_angle_matrix(degree: int) -> Array:
 
 
 @_jit
-def _append_angles(p: Array, offset: float, pair_tolerance: float, roots: Array,
-                   flags: NDArray[np.bool_], work: Array, angles: Array,
-                   is_pair: NDArray[np.bool_], count: int) -> int:
-    found = roots_in_unit_interval(p, pair_tolerance, roots, flags, work)
+def node_angle(k: int, degree: int, zoom: float) -> float:
+    """Angle [rad] relative to the centre at which `angles_of_zeros` wants sample k."""
+    half = math.pi * k / (2 * degree + 1)
+    return 2.0 * math.atan2(zoom * math.sin(half), math.cos(half))
+
+
+@_jit
+def _append_angles(p: Array, outside: bool, pair_tolerance: float, zoom: float, angles: Array,
+                   half_gaps: Array, count: int) -> int:
+    """Add the zeros with ``|x| <= 1``, or with ``x = -1 / y``, ``|y| <= 1``, of `outside`."""
+    size = p.shape[0]
+    roots, gaps = np.empty(size - 1), np.empty(size - 1)
+    work = np.empty((size + 2, size))
+    # 2 atan(zoom x) = 2 atan(y / zoom) - pi: outside, a step of y turns by 1 / zoom.
+    scale = 1.0 / zoom if outside else zoom
+    found = roots_in_unit_interval(p, pair_tolerance, scale, roots, gaps, work)
     for k in range(found):
+        angle = 2.0 * math.atan(scale * roots[k])
+        if outside:
+            angle += math.pi
         # A root on the border of both halves is found twice.
-        angle = offset + 2.0 * math.atan(roots[k])
         repeated = False
         for j in range(count):
             gap = abs(angle - angles[j])
-            if gap < 1e-9 or abs(gap - 2.0 * math.pi) < 1e-9:
+            if gap < 1e-12 or abs(gap - 2.0 * math.pi) < 1e-12:
                 repeated = True
         if not repeated and count < angles.shape[0]:
             angles[count] = angle
-            is_pair[count] = flags[k]
+            half_gaps[count] = 2.0 * gaps[k] / (1.0 / scale + scale * roots[k] * roots[k])
             count += 1
     return count
 
 
 @_jit
-def angles_of_zeros(samples: Array, matrix: Array, pair_tolerance: float, angles: Array,
-                    is_pair: NDArray[np.bool_]) -> int:
-    """All zeros of a real trigonometric polynomial of degree n.
+def angles_of_zeros(samples: Array, matrix: Array, zoom: float, pair_tolerance: float,
+                    angles: Array, half_gaps: Array) -> int:
+    """All zeros of a real trigonometric polynomial D of degree n.
+
+    With ``x = tan(psi / 2) / zoom``, ``(1 + zoom^2 x^2)^n D`` is a polynomial of degree 2n in x,
+    sampled at the tangents of equally spaced half angles. A zoom below 1 crowds the samples around
+    angle 0: zeros that are clustered there within about `zoom`, where D is smaller by many orders
+    of magnitude than on the rest of the circle, are then resolved as well as any others.
 
     Parameters
     ----------
     samples : (2n + 1,) ndarray
-        Its values at ``2 pi k / (2n + 1)``.
+        ``D(node_angle(k, n, zoom))``; overwritten.
     matrix : (2n + 1, 2n + 1) ndarray
         Of `half_angle_matrix`.
     pair_tolerance : float
         A pair of roots in ``exp(i psi)`` that near to the unit circle counts as its angle.
-    angles, is_pair : (2n,) ndarray
-        Receive the zeros [rad] and whether each stands for such a pair.
+    angles, half_gaps : (2n,) ndarray
+        Receive the zeros [rad], and for those that stand for such a pair its distance.
 
     Returns
     -------
@@ -201,8 +220,15 @@ def angles_of_zeros(samples: Array, matrix: Array, pair_tolerance: float, angles
         Number of zeros.
     """
     size = samples.shape[0]
+    degree = size // 2
     largest = 0.0
     for k in range(size):
+        # ((1 + zoom^2 x^2) / (1 + x^2))^n makes it a trigonometric polynomial in 2 atan(x).
+        half = math.pi * k / size
+        c, s = math.cos(half), zoom * math.sin(half)
+        weight = c * c + s * s
+        for _ in range(degree):
+            samples[k] *= weight
         largest = max(largest, abs(samples[k]))
     if not 0.0 < largest < math.inf:
         return 0
@@ -212,18 +238,13 @@ def angles_of_zeros(samples: Array, matrix: Array, pair_tolerance: float, angles
         for k in range(size):
             total += matrix[i, k] * samples[k]
         p[i] = total / largest
-    roots = np.empty(size - 1)
-    flags = np.empty(size - 1, dtype=np.bool_)
-    work = np.empty((size + 2, size))
-    count = _append_angles(p, 0.0, pair_tolerance, roots, flags, work, angles, is_pair, 0)
-    # The other half of the circle: tan(psi / 2) = -1 / tan((psi - pi) / 2).
-    sign = 1.0
-    for i in range(size // 2):
+    count = _append_angles(p, False, pair_tolerance, zoom, angles, half_gaps, 0)
+    # p(-1 / y) y^2n
+    for i in range(degree):
         p[i], p[size - 1 - i] = p[size - 1 - i], p[i]
-    for i in range(size):
-        p[i] *= sign
-        sign = -sign
-    return _append_angles(p, math.pi, pair_tolerance, roots, flags, work, angles, is_pair, count)
+    for i in range(1, size, 2):
+        p[i] = -p[i]
+    return _append_angles(p, True, pair_tolerance, zoom, angles, half_gaps, count)
 
 
 @_jit
@@ -233,13 +254,12 @@ def real_roots(p: Array, pair_tolerance: float, roots: Array) -> int:
     Conjugate pairs within `pair_tolerance` (see `roots_in_unit_interval`) count as one root.
     """
     size = p.shape[0]
-    found = np.empty(size - 1)
-    flags = np.empty(size - 1, dtype=np.bool_)
+    found, gaps = np.empty(size - 1), np.empty(size - 1)
     work = np.empty((size + 2, size))
-    count = roots_in_unit_interval(p, pair_tolerance, found, flags, work)
+    count = roots_in_unit_interval(p, pair_tolerance, 1.0, found, gaps, work)
     for k in range(count):
         roots[k] = found[k]
-    outside = roots_in_unit_interval(p[::-1].copy(), pair_tolerance, found, flags, work)
+    outside = roots_in_unit_interval(p[::-1].copy(), pair_tolerance, 1.0, found, gaps, work)
     for k in range(outside):
         # +-1 belongs to the inner part; 0 is a root at infinity.
         if 0.0 < abs(found[k]) < 1.0 and count < size - 1:

@@ -1,0 +1,106 @@
+"""Small dense factorisations without allocation, for compiled code."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
+
+
+@_jit
+def lu_factor(A: Array, pivots: NDArray[np.int64]) -> float:
+    """LU factorisation of `A` (n, n) in place, with row pivoting; the determinant.
+
+    A pivot that is exactly zero is replaced by a tiny one, as inverse iteration wants it; the
+    determinant is then zero.
+    """
+    n = A.shape[0]
+    determinant = 1.0
+    tiny = 0.0
+    for i in range(n):
+        for j in range(n):
+            tiny = max(tiny, abs(A[i, j]))
+    tiny = max(1e-18 * tiny, 1e-280)
+    for k in range(n):
+        pivot = k
+        largest = abs(A[k, k])
+        for i in range(k + 1, n):
+            size = abs(A[i, k])
+            if size > largest:
+                largest = size
+                pivot = i
+        pivots[k] = pivot
+        if pivot != k:
+            for j in range(n):
+                swap = A[k, j]
+                A[k, j] = A[pivot, j]
+                A[pivot, j] = swap
+            determinant = -determinant
+        determinant *= A[k, k]
+        if A[k, k] == 0.0:
+            A[k, k] = tiny
+        inverse = 1.0 / A[k, k]
+        for i in range(k + 1, n):
+            factor = A[i, k] * inverse
+            A[i, k] = factor
+            for j in range(k + 1, n):
+                A[i, j] -= factor * A[k, j]
+    return determinant
+
+
+@_jit
+def lu_solve(LU: Array, pivots: NDArray[np.int64], b: Array) -> None:
+    """Solve ``A x = b`` in place of `b` (n,), with the result of `lu_factor`."""
+    n = LU.shape[0]
+    for k in range(n):
+        swap = b[k]
+        b[k] = b[pivots[k]]
+        b[pivots[k]] = swap
+    for k in range(n):
+        for j in range(k):
+            b[k] -= LU[k, j] * b[j]
+    for k in range(n - 1, -1, -1):
+        for j in range(k + 1, n):
+            b[k] -= LU[k, j] * b[j]
+        b[k] /= LU[k, k]
+
+
+@_jit
+def lu_solve_transposed(LU: Array, pivots: NDArray[np.int64], b: Array) -> None:
+    """Solve ``A^T x = b`` in place of `b` (n,), with the result of `lu_factor`."""
+    n = LU.shape[0]
+    for k in range(n):
+        b[k] /= LU[k, k]
+        for j in range(k + 1, n):
+            b[j] -= LU[k, j] * b[k]
+    for k in range(n - 1, -1, -1):
+        for j in range(k):
+            b[j] -= LU[k, j] * b[k]
+    for k in range(n - 1, -1, -1):
+        swap = b[k]
+        b[k] = b[pivots[k]]
+        b[pivots[k]] = swap
+
+
+@_jit
+def normalise(v: Array) -> float:
+    """Scale `v` (n,) to unit length in place; its former length."""
+    largest = 0.0
+    for k in range(v.shape[0]):
+        largest = max(largest, abs(v[k]))
+    if not 0.0 < largest < math.inf:
+        return largest
+    total = 0.0
+    for k in range(v.shape[0]):
+        v[k] /= largest
+        total += v[k] * v[k]
+    total = math.sqrt(total)
+    for k in range(v.shape[0]):
+        v[k] /= total
+    return largest * total

@@ -1,0 +1,172 @@
+"""Uniform and linear 9-point solvers: gravity known; yaw, translation and velocities unknown."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.solvers.cheirality import cheirality_votes
+from rs_relpose_ros.solvers.gravity import (
+    normals_at_yaw, rotate_rows, rotation_from_yaw, yaw_window)
+from rs_relpose_ros.solvers.linear_algebra import (
+    lu_factor, lu_solve, lu_solve_transposed, normalise)
+from rs_relpose_ros.solvers.polynomial import angles_of_zeros, half_angle_matrix, node_angle
+from rs_relpose_ros.solvers.uniform_columns import (
+    fill_columns, row_time_factors, translation_and_velocities)
+
+Array = NDArray[np.float64]
+
+_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
+
+MAX_SOLUTIONS = 12
+# A pair of roots of the polynomial in exp(i psi) that near to the unit circle is one real angle.
+PAIR_TOLERANCE = 1e-3
+
+# Not 9: the leading complex coefficient matrix of A(psi) loses rank (docs/conventions.md).
+_DEGREE = 6
+_HALF_ANGLE = half_angle_matrix(_DEGREE)
+_SAMPLES = 2 * _DEGREE + 1
+_POLISH_STEPS = 8
+# The null vector is that of the angle before the last step.
+_LAST_STEP = 1e-13
+_FARTHEST = 1e-2
+
+
+@_jit
+def _null_vectors(A: Array, pivots: NDArray[np.int64], u: Array, v: Array) -> float:
+    """Left and right singular vectors of the smallest singular value, by inverse iteration.
+
+    `A` (n, n) is overwritten by its factors. Returns the singular value.
+    """
+    lu_factor(A, pivots)
+    for k in range(v.shape[0]):
+        v[k] = 1.0
+    lu_solve(A, pivots, v)
+    normalise(v)
+    length = 1.0
+    for _ in range(2):
+        u[:] = v
+        lu_solve_transposed(A, pivots, u)
+        normalise(u)
+        v[:] = u
+        lu_solve(A, pivots, v)
+        length = normalise(v)
+    return 1.0 / length
+
+
+@_jit
+def _polish(a: Array, b: Array, p: Array, q: Array, psi: float, work: Array,
+            pivots: NDArray[np.int64], y: Array) -> tuple[float, bool]:
+    """Newton's method on the determinant, and the null vector `y` (9,) there.
+
+    The factors of A itself give its step, so that nothing is lost to a polynomial's rounding.
+
+    Parameters
+    ----------
+    work : (16, 9) ndarray
+        Overwritten.
+
+    Returns
+    -------
+    psi, converged : float, bool
+    """
+    A, u = work[:9], work[9]
+    n, dn = work[10:13].reshape((9, 3)), work[13:16].reshape((9, 3))
+    start = psi
+    for _ in range(_POLISH_STEPS):
+        normals_at_yaw(a, b, psi, n, dn)
+        fill_columns(n, p, q, A)
+        sigma = _null_vectors(A, pivots, u, y)
+        # d(log det) = trace(A^-1 dA) ~ u . (dA y) / sigma
+        slope = 0.0
+        for r in range(9):
+            for i in range(3):
+                slope += u[r] * dn[r, i] * (y[i] + p[r] * y[3 + i] + q[r] * y[6 + i])
+        step = sigma / slope
+        if abs(step) < _LAST_STEP:
+            return psi - step, True
+        psi -= step
+        if not abs(psi - start) < _FARTHEST:
+            break
+    return psi, False
+
+
+@_jit
+def _write_solution(psi: float, y: Array, A1: Array, A2: Array, f1: Array, f2: Array,
+                    tau1: Array, tau2: Array, m: float, s_p: float, s_q: float, R: Array,
+                    x: Array) -> bool:
+    """R and x of one yaw and null vector; False where it is no finite solution."""
+    if not (math.isfinite(y[0]) and translation_and_velocities(y, m, s_p, s_q, x)):
+        return False
+    rotation_from_yaw(psi, A1, A2, R)
+    for block in range(0, 9, 3):
+        vx, vy, vz = x[block], x[block + 1], x[block + 2]
+        for i in range(3):
+            x[block + i] = A1[0, i] * vx + A1[1, i] * vy + A1[2, i] * vz
+    front, behind = cheirality_votes(f1, f2, tau1, tau2, R, x)
+    if behind > front:
+        for i in range(9):
+            x[i] = -x[i]
+    return True
+
+
+@_jit
+def uniform_9pt_kernel(f1: Array, f2: Array, tau1: Array, tau2: Array, A1: Array, A2: Array,
+                       R_out: Array, x_out: Array) -> int:
+    """All solutions of `uniform_9pt` (derotated rays) or `linear_9pt` (measured); their number.
+
+    Parameters
+    ----------
+    f1, f2 : (9, 3) ndarray
+        Unit rays.
+    tau1, tau2 : (9,) ndarray
+        Row times [s].
+    A1, A2 : (3, 3) ndarray
+        `gravity_alignment` of the two cameras' gravity.
+    R_out, x_out : (>= 12, 3, 3), (>= 12, 9) ndarray
+        Receive R and ``(t, d_1, d_2)`` in frame 1, t of unit length, the sign by the majority of
+        the nine points.
+    """
+    a, b = np.empty((9, 3)), np.empty((9, 3))
+    rotate_rows(A1, f1, a)
+    rotate_rows(A2, f2, b)
+    p, q = np.empty(9), np.empty(9)
+    m, s_p, s_q = row_time_factors(tau1, tau2, p, q)
+    if s_p == 0.0:
+        return 0
+    centre, zoom = yaw_window(a, b)
+    n, dn = np.empty((9, 3)), np.empty((9, 3))
+    A, pivots = np.empty((9, 9)), np.empty(9, dtype=np.int64)
+    samples = np.empty(_SAMPLES)
+    for k in range(_SAMPLES):
+        normals_at_yaw(a, b, centre + node_angle(k, _DEGREE, zoom), n, dn)
+        fill_columns(n, p, q, A)
+        samples[k] = lu_factor(A, pivots)
+    angles, half_gaps = np.empty(MAX_SOLUTIONS), np.empty(MAX_SOLUTIONS)
+    found = angles_of_zeros(samples, _HALF_ANGLE, zoom, PAIR_TOLERANCE, angles, half_gaps)
+    work, y = np.empty((16, 9)), np.empty(9)
+    count = 0
+    for k in range(found):
+        middle, gap = centre + angles[k], half_gaps[k]
+        psi, converged = _polish(a, b, p, q, middle - gap, work, pivots, y)
+        if not converged:
+            # A pair of roots off the real line: the nearest angle and its smallest singular value.
+            normals_at_yaw(a, b, middle, n, dn)
+            fill_columns(n, p, q, A)
+            _null_vectors(A, pivots, work[9], y)
+            psi = middle
+        if count < MAX_SOLUTIONS and _write_solution(
+                psi, y, A1, A2, f1, f2, tau1, tau2, m, s_p, s_q, R_out[count], x_out[count]):
+            count += 1
+        if gap > 0.0 and converged:
+            # The pair was two real roots, closer than the polynomial can tell.
+            first = psi
+            psi, converged = _polish(a, b, p, q, middle + gap, work, pivots, y)
+            if converged and abs(psi - first) > 1e-12 and count < MAX_SOLUTIONS and (
+                    _write_solution(psi, y, A1, A2, f1, f2, tau1, tau2, m, s_p, s_q,
+                                    R_out[count], x_out[count])):
+                count += 1
+    return count

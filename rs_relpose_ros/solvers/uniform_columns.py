@@ -1,0 +1,78 @@
+"""The nine columns of the uniform and linear models, well conditioned.
+
+A row of the paper's ``A x = 0`` is ``[n, -tau_1 n, tau_2 n]`` with ``n = f_1 x R f_2`` and
+``x = (t, d_1, d_2)`` (docs/conventions.md, equation 4). Matched points lie in similar rows, and row
+times are 1e-2 s: as they stand, the three blocks are nearly parallel and badly scaled. The kernels
+therefore use
+
+    t - tau_1 d_1 + tau_2 d_2 = y_1 + p y_2 + q y_3,    p = (tau_1 - m) / s_p, q = (tau_2 - tau_1) / s_q
+
+with the mean row time m and p, q of size 1; the two sets of columns span the same space for every
+rotation, so that determinants differ by a constant factor and solutions by the linear map below.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
+
+# Row times closer than this cannot tell a velocity from a translation.
+_LEAST_SPREAD = 1e-12
+
+
+@_jit
+def row_time_factors(tau1: Array, tau2: Array, p: Array, q: Array) -> tuple[float, float, float]:
+    """Write p and q (n,); ``m, s_p, s_q``, the scales 0 where the row times do not differ."""
+    n = tau1.shape[0]
+    m = 0.0
+    for k in range(n):
+        m += tau1[k] / n
+    s_p = 0.0
+    s_q = 0.0
+    for k in range(n):
+        p[k] = tau1[k] - m
+        q[k] = tau2[k] - tau1[k]
+        s_p = max(s_p, abs(p[k]))
+        s_q = max(s_q, abs(q[k]))
+    if not (_LEAST_SPREAD < s_p < math.inf and _LEAST_SPREAD < s_q < math.inf):
+        return m, 0.0, 0.0
+    for k in range(n):
+        p[k] /= s_p
+        q[k] /= s_q
+    return m, s_p, s_q
+
+
+@_jit
+def fill_columns(normals: Array, p: Array, q: Array, A: Array) -> None:
+    """Write the rows ``[n, p n, q n]`` into `A` (n, 9)."""
+    for k in range(normals.shape[0]):
+        for i in range(3):
+            A[k, i] = normals[k, i]
+            A[k, 3 + i] = p[k] * normals[k, i]
+            A[k, 6 + i] = q[k] * normals[k, i]
+
+
+@_jit
+def translation_and_velocities(y: Array, m: float, s_p: float, s_q: float, x: Array) -> bool:
+    """``x = (t, d_1, d_2)`` with ``|t| = 1`` from `y` (9,); False where t vanishes."""
+    norm2 = 0.0
+    for i in range(3):
+        difference = y[3 + i] / s_p  # d_2 - d_1
+        x[6 + i] = y[6 + i] / s_q
+        x[3 + i] = x[6 + i] - difference
+        x[i] = y[i] - m * difference
+        norm2 += x[i] * x[i]
+    # |y| = 1: a translation of this size is rounding.
+    if not norm2 > 1e-20:
+        return False
+    scale = 1.0 / math.sqrt(norm2)
+    for i in range(9):
+        x[i] *= scale
+    return True
