@@ -38,7 +38,12 @@ from rs_relpose_ros.estimator.problem import (
 )
 from rs_relpose_ros.estimator.rotation_only import fit_rotation, transfer_errors
 from rs_relpose_ros.estimator.sampling import POOL, sample_hypotheses
-from rs_relpose_ros.estimator.velocity_prior import fit_with_evidence, GRID, with_velocity_sigma
+from rs_relpose_ros.estimator.velocity_prior import (
+    fit_with_evidence,
+    GRID,
+    LEAST_VELOCITY_CHANGE,
+    with_velocity_sigma,
+)
 from rs_relpose_ros.motion import FrameMotion
 from rs_relpose_ros.result import RelativePose, Status
 from rs_relpose_ros.so3 import exp_so3, skew
@@ -143,7 +148,7 @@ def estimate_relative_pose(
     problem = build_problem(points1, points2, camera, motion1, motion2, rotation,
                             rotation_covariance, mode.derotate)
     seed = np.array([np.random.default_rng(rng).integers(2**63)], dtype=np.uint64)
-    pose = _Estimation(problem, mode, config, order, seed).run(middle_row_delay(camera))
+    pose = _Estimation(problem, mode, config, order, seed, interval).run(middle_row_delay(camera))
     object.__setattr__(pose, 'duration', time.perf_counter() - started)
     return pose
 
@@ -152,12 +157,14 @@ class _Estimation:
     """The steps of one estimate, in the order of `run`."""
 
     def __init__(self, problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig,
-                 order: NDArray[np.int64], seed: NDArray[np.uint64]) -> None:
+                 order: NDArray[np.int64], seed: NDArray[np.uint64],
+                 interval: float | None) -> None:
         self.problem, self.mode, self.config = problem, mode, config
         self.order = order[problem.valid[order]]
         self.seed = seed
         self.angle_sigma = config.pixel_sigma / problem.focal
-        self.priors = _priors(problem, mode, config)
+        self.priors = _priors(problem, mode, config, interval)
+        self.interval = interval
         self.iterations = 0
 
     def run(self, delay: float) -> RelativePose:
@@ -244,6 +251,8 @@ class _Estimation:
         free = self.mode.velocities or (self.mode.derotate and config.refinement == 'map')
         if config.refinement == 'map':
             grid = GRID if free else np.array([1.0 / np.sqrt(PINNED)])
+            if free and self.interval is not None:
+                grid = GRID[GRID >= LEAST_VELOCITY_CHANGE]
             return fit_with_evidence(
                 problem.observations, problem.valid, state, self.priors, config.pixel_sigma,
                 config.threshold, self.angle_sigma, grid)
@@ -357,9 +366,11 @@ def warm_up() -> None:
                                1e-4 * np.eye(3), config=EstimatorConfig(solver=solver))
 
 
-def _priors(problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig) -> Priors:
+def _priors(problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig,
+            interval: float | None) -> Priors:
     g1, g2 = problem.motion1.gravity, problem.motion2.gravity
     known = g1 is not None and g2 is not None
+    free = mode.velocities or mode.derotate
     unit1 = g1 / np.linalg.norm(g1) if g1 is not None else np.zeros(3)
     unit2 = g2 / np.linalg.norm(g2) if g2 is not None else np.zeros(3)
     rotation = problem.rotation if problem.rotation is not None else np.eye(3)
@@ -367,7 +378,8 @@ def _priors(problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig) 
     return Priors(
         unit1, unit2, config.gravity_sigma**-2 if known else 0.0,
         config.gyro_sigma**-2 if mode.derotate else PINNED,
-        SAMPLING_VELOCITY_SIGMA**-2 if mode.velocities or mode.derotate else PINNED,
+        SAMPLING_VELOCITY_SIGMA**-2 if free else PINNED,
+        1.0 / interval if free and interval is not None else 0.0,
         np.ascontiguousarray(rotation),
         np.ascontiguousarray(information) if information is not None else np.zeros((3, 3)))
 

@@ -3,9 +3,10 @@
 Minimises, over ``R, t`` (unit), ``d_1, d_2, dw_1, dw_2`` (design section 4)::
 
     sum r_i^2 / s^2  +  |g_1 x R g_2|^2 / (2 s_g^2)  +  (|dw_1|^2 + |dw_2|^2) / s_w^2
-        +  (|d_1|^2 + |d_2|^2) / s_d^2  +  theta^T Lambda theta,  theta = Log(R R_gyro^T)
+        +  (|d_1 - c t|^2 + |d_2 - c t|^2) / s_d^2  +  theta^T Lambda theta,  theta = Log(R R_gyro^T)
 
-by Levenberg-Marquardt with the exact Jacobian (the Sampson denominator included: treating it as
+``c`` is 1 / interval where the time between the frames is known (constant velocity), else 0. By
+Levenberg-Marquardt with the exact Jacobian (the Sampson denominator included: treating it as
 constant converges to another point). A weight of `PINNED` holds a block at its start, which is how
 the angular, linear and global models are fitted by the same code.
 """
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.estimator import sampson
-from rs_relpose_ros.estimator.sampson import D1, D2, DW1, DW2, PARAMETERS
+from rs_relpose_ros.estimator.sampson import D1, D2, DW1, DW2, PARAMETERS, TANGENT
 from rs_relpose_ros.so3 import exp_so3, log_so3
 
 Array = NDArray[np.float64]
@@ -38,6 +39,7 @@ class Priors(NamedTuple):
     gravity_weight: float
     rate_weight: float
     velocity_weight: float
+    velocity_rate: float
     rotation: Array
     rotation_information: Array
 
@@ -87,16 +89,29 @@ def _add_priors(state: State, priors: Priors, hessian: Array, gradient: Array) -
         gradient[i] += product
         for j in range(3):
             hessian[i, j] += info[i, j]
+    w, c = priors.velocity_weight, priors.velocity_rate
+    basis = sampson.tangent_basis(state.t)
     for i in range(3):
-        hessian[D1 + i, D1 + i] += priors.velocity_weight
-        hessian[D2 + i, D2 + i] += priors.velocity_weight
-        gradient[D1 + i] += priors.velocity_weight * state.d1[i]
-        gradient[D2 + i] += priors.velocity_weight * state.d2[i]
+        e1, e2 = state.d1[i] - c * state.t[i], state.d2[i] - c * state.t[i]
+        cost += w * (e1 * e1 + e2 * e2)
+        hessian[D1 + i, D1 + i] += w
+        hessian[D2 + i, D2 + i] += w
+        gradient[D1 + i] += w * e1
+        gradient[D2 + i] += w * e2
+        for k in range(2):
+            cross = -c * w * basis[i, k]
+            gradient[TANGENT + k] += cross * (e1 + e2)
+            hessian[TANGENT + k, D1 + i] += cross
+            hessian[D1 + i, TANGENT + k] += cross
+            hessian[TANGENT + k, D2 + i] += cross
+            hessian[D2 + i, TANGENT + k] += cross
+    for k in range(2):
+        hessian[TANGENT + k, TANGENT + k] += 2.0 * c * c * w
+    for i in range(3):
         hessian[DW1 + i, DW1 + i] += priors.rate_weight
         hessian[DW2 + i, DW2 + i] += priors.rate_weight
         gradient[DW1 + i] += priors.rate_weight * state.dw1[i]
         gradient[DW2 + i] += priors.rate_weight * state.dw2[i]
-        cost += priors.velocity_weight * (state.d1[i] ** 2 + state.d2[i] ** 2)
         cost += priors.rate_weight * (state.dw1[i] ** 2 + state.dw2[i] ** 2)
     return cost
 

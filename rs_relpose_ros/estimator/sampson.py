@@ -32,15 +32,14 @@ THETA, TANGENT, D1, D2, DW1, DW2 = 0, 3, 5, 8, 11, 14
 # Fused multiply-add and reordered sums: a fifth faster. NaN and infinity keep their meaning.
 _FAST = {'contract', 'reassoc', 'nsz', 'arcp'}
 _jit = numba.njit(cache=True, nogil=True, error_model='numpy', fastmath=_FAST)
-_inline = numba.njit(cache=True, nogil=True, error_model='numpy', fastmath=_FAST, inline='always')
 
 
-@_inline
+@_jit
 def _cross(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
-@_inline
+@_jit
 def _turned(x, y, z, wx, wy, wz, tau):  # type: ignore[no-untyped-def]
     """``Exp(w tau) v`` to second order: w is a gyro correction, not a rate."""
     cx, cy, cz = _cross(wx, wy, wz, x, y, z)

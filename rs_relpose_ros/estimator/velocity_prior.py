@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 
 # Units of |t| per second.
 GRID = np.array([0.003, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
+# With a known interval the prior is about constant velocity; hand-held cameras and robots change
+# their velocity by at least this share of it per second, however little one pair shows of that.
+LEAST_VELOCITY_CHANGE = 0.3
 ROUNDS = 3
 ITERATIONS = 6
 
@@ -30,13 +33,13 @@ _jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 def with_velocity_sigma(priors: Priors, sigma: float) -> Priors:
     """The priors with another sigma of the linear velocities [baselines per second]."""
     return Priors(priors.gravity1, priors.gravity2, priors.gravity_weight, priors.rate_weight,
-                  1.0 / (sigma * sigma), priors.rotation, priors.rotation_information)
+                  1.0 / (sigma * sigma), priors.velocity_rate, priors.rotation, priors.rotation_information)
 
 
 @_jit
 def noise_sigma(observations_cost: float, count: int, told: float) -> float:
-    """Noise of a match [px] from the residuals, with the told sigma as thirty matches' worth."""
-    told_weight = 30.0
+    """Noise of a match [px] from the residuals, with the told sigma as ten matches' worth."""
+    told_weight = 10.0
     return math.sqrt((told_weight * told * told + observations_cost)
                      / (told_weight + max(count - 11, 0)))
 
@@ -58,11 +61,10 @@ def fit_with_evidence(observations: Array, valid: NDArray[np.bool_], start: Stat
         Noise of a match that the fit used [px].
     """
     state = start
-    sigma = told_sigma
-    best = grid.shape[0] // 2
-    inliers = valid.copy()
+    best = 0
+    inliers = select_inliers(observations, valid, state, threshold, angle_sigma)
+    sigma = _noise(observations, inliers, state, priors, told_sigma)
     for turn in range(ROUNDS):
-        inliers = select_inliers(observations, valid, state, threshold, angle_sigma)
         low, high = 0, grid.shape[0]
         if turn > 0:   # the choice moves little once the inliers stand
             low, high = max(best - 1, 0), min(best + 2, grid.shape[0])
@@ -76,15 +78,22 @@ def fit_with_evidence(observations: Array, valid: NDArray[np.bool_], start: Stat
             if evidence > best_evidence:
                 best_evidence, best_state, best = evidence, candidate, k
         state = best_state
-        _, _, squares = normal_equations(observations, inliers, state, _no_priors(priors), 1.0)
-        sigma = noise_sigma(squares, inliers.sum(), told_sigma)
+        inliers = select_inliers(observations, valid, state, threshold, angle_sigma)
+        sigma = _noise(observations, inliers, state, priors, told_sigma)
     chosen = with_velocity_sigma(priors, grid[best])
-    inliers = select_inliers(observations, valid, state, threshold, angle_sigma)
     state, _ = fit(observations, inliers, state, chosen, sigma, ITERATIONS)
     return state, inliers, grid[best], sigma
 
 
 @_jit
+def _noise(observations: Array, inliers: NDArray[np.bool_], state: State, priors: Priors,
+           told_sigma: float) -> float:
+    """Noise of a match [px] from the residuals of a state."""
+    _, _, squares = normal_equations(observations, inliers, state, _no_priors(priors), 1.0)
+    return noise_sigma(squares, inliers.sum(), told_sigma)
+
+
+@_jit
 def _no_priors(priors: Priors) -> Priors:
-    return Priors(priors.gravity1, priors.gravity2, 0.0, 0.0, 0.0, priors.rotation,
+    return Priors(priors.gravity1, priors.gravity2, 0.0, 0.0, 0.0, 0.0, priors.rotation,
                   np.zeros((3, 3)))
