@@ -140,9 +140,9 @@ def _write_messages(bag: BagWriter, pair: ReplayedPair, reference_frame: str) ->
 
 
 def _better_shown(result: PairResult, shown: PairResult | None) -> bool:
-    """Whether a pair is the better picture: one with a pose, and with more inliers."""
-    def rank(pair: PairResult) -> tuple[bool, int]:
-        return bool(pair.pose), int(pair.pose.inliers.sum())
+    """Whether a pair is the better picture: with a pose, many inliers and much parallax."""
+    def rank(pair: PairResult) -> tuple[bool, float]:
+        return bool(pair.pose), float(pair.pose.inliers.sum() * pair.parallax)
     return shown is None or rank(result) > rank(shown)
 
 

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.pipeline.pair import PairResult
 from rs_relpose_ros.replay.record import PairRecord, rotation_sigmas, translation_sigmas
-from rs_relpose_ros.replay.truth import TrueTrajectory
+from rs_relpose_ros.replay.truth import rotation_angle, TrueTrajectory
 from rs_relpose_ros.result import Status
 from rs_relpose_ros.timing import seconds_between
 
@@ -42,7 +42,7 @@ def draw_matches(result: PairResult, path: Path) -> None:
     height, width = result.image1.shape
     row_times = 1e3 * np.concatenate([result.row_times1, result.row_times2, [0.0]])
     norm = Normalize(row_times.min(), max(row_times.max(), row_times.min() + 1e-3))
-    figure = Figure(figsize=(13.0, 1.2 + 6.1 * height / width), dpi=_DPI, layout='constrained')
+    figure = Figure(figsize=(13.0, 0.75 + 6.1 * height / width), dpi=_DPI, layout='constrained')
     left, right = figure.subplots(1, 2)
     _image(left, result.image1, 'reference keyframe: inliers, coloured by their row time')
     _image(right, result.image2, 'current image: the same, with their way since the keyframe')
@@ -83,8 +83,8 @@ def draw_errors(records: Sequence[PairRecord], path: Path) -> None:
             (axes[0], rotation, rotation_sigma, 'rotation error [deg]'),
             (axes[1], translation, translation_sigma, 'translation direction\nerror [deg]')):
         if known:
-            axis.plot(times, sigmas, '-', color=_ORANGE, linewidth=1.2,
-                      label='1 sigma, as estimated')
+            axis.hlines(sigmas, *_spans(known, start_ns), color=_ORANGE, linewidth=2.2,
+                        label='1 sigma, as estimated')
             axis.plot(times, values, 'o', color=_BLUE, markersize=5, label='error')
             axis.axhline(float(np.median(values)), color=_BLUE, linestyle='--', linewidth=1.0,
                          label=f'median error {np.median(values):.2g} deg')
@@ -114,7 +114,7 @@ def draw_residuals(records: Sequence[PairRecord], path: Path) -> None:
             axis.axhline(median, color=_BLUE, linestyle='--', linewidth=1.0,
                          label=f'median {median:.3g}')
         axis.set_ylabel(label)
-        axis.set_ylim(bottom=0.0)
+        axis.set_ylim(bottom=0.0, top=None if '%' not in label else 105.0)
         _shade_no_pose(axis, records, start_ns)
         axis.legend(loc='upper left', bbox_to_anchor=(1.0, 1.0), fontsize=9)
     axes[-1].set_xlabel('time since the first keyframe [s]')
@@ -123,31 +123,45 @@ def draw_residuals(records: Sequence[PairRecord], path: Path) -> None:
 
 def draw_rotation(records: Sequence[PairRecord], path: Path,
                   truth: TrueTrajectory | None = None) -> None:
-    """Rotation accumulated over the pairs, beside the gyro's and the true one."""
-    estimated = [r.R for r in records]
-    gyro = [np.full((3, 3), np.nan) if r.gyro_rotation is None else r.gyro_rotation
-            for r in records]
+    """Rotation accumulated over the pairs, against the truth or else the gyro."""
+    unknown = np.full((3, 3), np.nan)
+    gyro = [unknown if r.gyro_rotation is None else r.gyro_rotation for r in records]
     # Where a pair has no rotation the gyro bridges it, and the span is shaded.
-    bridged = [g if np.isnan(R).any() else R for R, g in zip(estimated, gyro, strict=True)]
-    curves = [('estimated', _accumulated(bridged), _BLUE, 'o-'),
-              ('gyro alone', _accumulated(gyro), _ORANGE, '-')]
+    chains = {'estimated': _accumulated([g if np.isnan(r.R).any() else r.R
+                                         for r, g in zip(records, gyro, strict=True)]),
+              'gyro alone': _accumulated(gyro)}
+    against = 'gyro alone'
     if truth is not None:
-        true = [truth.relative_pose(r.reference_ns1, r.reference_ns2) for r in records]
-        rotations = [np.full((3, 3), np.nan) if pose is None else pose[0] for pose in true]
-        curves.append(('truth', _accumulated(rotations), 'black', '--'))
+        poses = [truth.relative_pose(r.reference_ns1, r.reference_ns2) for r in records]
+        against = 'truth'
+        chains[against] = _accumulated([unknown if pose is None else pose[0] for pose in poses])
     start_ns = records[0].reference_ns1
     times = [0.0, *(seconds_between(start_ns, r.reference_ns2) for r in records)]
-    figure, axes = _over_time(3, 'orientation against the first keyframe (rotation vector, '
-                              'axes of the camera), pairs chained')
-    for column, axis in enumerate(axes):
-        for label, curve, color, style in curves:
-            axis.plot(times, curve[:, column], style, color=color, label=label, markersize=3,
-                      linewidth=1.4)
-        axis.set_ylabel(f'{"xyz"[column]} ({("right", "down", "forward")[column]}) [deg]')
-        _shade_no_pose(axis, [r for r in records if np.isnan(r.R).any()], start_ns,
-                       'no rotation: gyro')
-    axes[0].legend(loc='upper left', bbox_to_anchor=(1.0, 1.0), fontsize=9)
-    axes[-1].set_xlabel('time since the first keyframe [s]')
+    figure, (above, below) = _over_time(2, 'orientation against the first keyframe: the rotations '
+                                        'of the pairs, chained')
+    for column, color in enumerate((_BLUE, _RED, _GREEN)):
+        for name, style in (('estimated', 'o-'), (against, '--')):
+            curve = [np.degrees(Rotation.from_matrix(R).as_rotvec())[column]
+                     if np.isfinite(R).all() else np.nan for R in chains[name]]
+            last = style == '--'
+            label = f'{"xyz"[column]} ({("right", "down", "forward")[column]})'
+            above.plot(times, curve, style, color='black' if last else color, markersize=3,
+                       linewidth=1.0 if last else 1.6,
+                       label=label if not last else against if column == 2 else None)
+    above.set_ylabel('rotation vector, axes of\nthe camera [deg]')
+    for (name, chain), color in zip(chains.items(), (_BLUE, _ORANGE), strict=False):
+        if name != against:
+            angles = [rotation_angle(R.T @ R_against)
+                      for R, R_against in zip(chain, chains[against], strict=True)]
+            below.plot(times, angles, 'o-', color=color, markersize=3, linewidth=1.4,
+                       label=f'{name} against {against}')
+    below.set_ylabel('difference, accumulated\n[deg]')
+    below.set_ylim(bottom=0.0)
+    _shade_no_pose(below, [r for r in records if np.isnan(r.R).any()], start_ns,
+                   'no rotation: gyro instead')
+    for axis in (above, below):
+        axis.legend(loc='upper left', bbox_to_anchor=(1.0, 1.0), fontsize=9)
+    below.set_xlabel('time since the first keyframe [s]')
     _save(figure, path)
 
 
@@ -177,7 +191,10 @@ def _pair_title(result: PairResult, inliers: int) -> str:
 
 def _image(axes: Axes, image: NDArray[np.uint8], title: str) -> None:
     height, width = image.shape
-    axes.imshow(image, cmap='gray', vmin=0, vmax=320, interpolation='antialiased')
+    # Stretched to what is there, the brightest third left out: the marks must stand out.
+    low, high = np.percentile(image, [1.0, 99.0])
+    axes.imshow(image, cmap='gray', vmin=low, vmax=low + 1.4 * max(high - low, 1.0),
+                interpolation='antialiased')
     axes.set_title(title, fontsize=10)
     axes.set_xlim(-0.5, width - 0.5)
     axes.set_ylim(height - 0.5, -0.5)
@@ -213,20 +230,21 @@ def _shade_no_pose(axis: Axes, records: Sequence[PairRecord], start_ns: int,
         labelled.add(text)
 
 
+def _spans(records: Sequence[PairRecord], start_ns: int) -> tuple[list[float], list[float]]:
+    return ([seconds_between(start_ns, r.reference_ns1) for r in records],
+            [seconds_between(start_ns, r.reference_ns2) for r in records])
+
+
 def _middles(records: Sequence[PairRecord], start_ns: int) -> list[float]:
-    return [0.5 * (seconds_between(start_ns, r.reference_ns1)
-                   + seconds_between(start_ns, r.reference_ns2)) for r in records]
+    return [0.5 * (begin + end) for begin, end in zip(*_spans(records, start_ns), strict=True)]
 
 
-def _accumulated(rotations: Sequence[Array]) -> Array:
-    """Rotation vectors (K + 1, 3) [deg] of the products; NaN from the first unknown one on."""
-    total = np.eye(3)
-    vectors = [np.zeros(3)]
+def _accumulated(rotations: Sequence[Array]) -> list[Array]:
+    """Products (3, 3) of the rotations, the identity first; NaN from the first unknown one on."""
+    products = [np.eye(3)]
     for rotation in rotations:
-        total = total @ rotation
-        vectors.append(np.full(3, np.nan) if np.isnan(total).any()
-                       else np.degrees(Rotation.from_matrix(total).as_rotvec()))
-    return np.array(vectors)
+        products.append(products[-1] @ rotation)
+    return products
 
 
 def _save(figure: Figure, path: Path) -> None:
