@@ -18,13 +18,12 @@ _BLOCK = 5
 _SHORTEST_HALVED = 240
 
 
-def find_corners(pyramid: list[Image], taken: Array, count: int, config: TrackingConfig) -> Array:
+def find_corners(image: Image, taken: Array, count: int, config: TrackingConfig) -> Array:
     """New corners that keep their distance from the points that are there.
 
     Parameters
     ----------
-    pyramid : list of (H, W) ndarray of uint8
-        The image and its halved versions.
+    image : (H, W) ndarray of uint8
     taken : (M, 2) ndarray
         Points that are tracked already [px].
     count : int
@@ -37,10 +36,11 @@ def find_corners(pyramid: list[Image], taken: Array, count: int, config: Trackin
         Whole pixels of the full image, best first. No sub-pixel refinement: a match is as exact
         as the second point follows the first, wherever that lies.
     """
-    height, width = pyramid[0].shape
+    height, width = image.shape
     # Half size: noise counts for less, and the search costs a quarter.
-    scale = 2 if len(pyramid) > 1 and min(height, width) >= _SHORTEST_HALVED else 1
-    image = pyramid[scale - 1]
+    scale = 2 if min(height, width) >= _SHORTEST_HALVED else 1
+    if scale == 2:
+        image = cv2.pyrDown(image)  # type: ignore[assignment]
     margin = -(-(config.klt_window // 2 + 2) // scale)
     if count <= 0 or min(image.shape) <= 2 * margin + _BLOCK:
         return np.empty((0, 2))

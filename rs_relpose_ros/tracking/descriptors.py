@@ -16,6 +16,7 @@ from rs_relpose_ros.tracking.matches import Matches
 from rs_relpose_ros.tracking.tracker import Predict
 
 Array = NDArray[np.float64]
+Descriptors = NDArray[np.uint8] | NDArray[np.float32]
 
 # ORB's patch and its border; below that it has nothing to describe.
 _SMALLEST_SIDE = 32
@@ -27,7 +28,7 @@ class _Keypoints:
 
     ids: NDArray[np.uint32]
     points: Array
-    descriptors: NDArray[np.uint8] | NDArray[np.float32]
+    descriptors: Descriptors
 
 
 class DescriptorTracker:
@@ -40,11 +41,10 @@ class DescriptorTracker:
         self._config = config
         if config.detector == 'sift':
             self._detector: cv2.Feature2D = cv2.SIFT.create(nfeatures=config.max_descriptors)
-            norm = cv2.NORM_L2
+            self._norm, self._depth = cv2.NORM_L2, cv2.CV_32F
         else:
             self._detector = cv2.ORB.create(nfeatures=config.max_descriptors)
-            norm = cv2.NORM_HAMMING
-        self._matcher = cv2.BFMatcher(norm)
+            self._norm, self._depth = cv2.NORM_HAMMING, cv2.CV_32S
         self._next_id = 0
         self.reset()
 
@@ -124,16 +124,24 @@ class DescriptorTracker:
         """Indices into both and quality: 1 - (best / second best distance)."""
         if len(first.ids) < 2 or len(second.ids) < 2:
             return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0)
-        forth = self._matcher.knnMatch(first.descriptors, second.descriptors, k=2)
-        back = self._matcher.match(second.descriptors, first.descriptors)
-        nearest = np.array([m.trainIdx for m in back])
-        rows = []
-        for best, other in forth:
-            ratio = best.distance / other.distance if other.distance > 0.0 else 1.0
-            if ratio < self._config.match_ratio and nearest[best.trainIdx] == best.queryIdx:
-                rows.append((best.queryIdx, best.trainIdx, 1.0 - ratio))
-        table = np.array(rows, dtype=np.float64).reshape(-1, 3)
-        return table[:, 0].astype(np.int64), table[:, 1].astype(np.int64), table[:, 2]
+        distances, nearest = self._nearest(first.descriptors, second.descriptors, 2)
+        best, other = distances[:, 0], distances[:, 1]
+        # Two equally good ones, be they perfect, are no match.
+        ratio = np.divide(best, other, out=np.ones_like(best), where=other > 0.0)
+        matched = np.flatnonzero(ratio < self._config.match_ratio)
+        partners = nearest[matched, 0]
+        if len(matched):
+            _, back = self._nearest(second.descriptors[partners], first.descriptors, 1)
+            mutual = back[:, 0] == matched
+            matched, partners = matched[mutual], partners[mutual]
+        return matched, partners, 1.0 - ratio[matched]
+
+    def _nearest(self, first: Descriptors, second: Descriptors,
+                 count: int) -> tuple[Array, NDArray[np.int64]]:
+        """Distances (N, count) and indices (N, count) of the nearest in `second`."""
+        distances, indices = cv2.batchDistance(first, second, self._depth, normType=self._norm,
+                                               K=count)
+        return distances.astype(np.float64), indices.astype(np.int64)
 
 
 def _no_keypoints() -> _Keypoints:

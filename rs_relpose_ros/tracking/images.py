@@ -30,12 +30,16 @@ def checked(image: Image, shape: tuple[int, ...] | None) -> Image:
     return image
 
 
-def pyramid(image: Image, levels: int, shortest: int) -> list[Image]:
+def pyramid(image: Image, levels: int, padding: int) -> list[Image]:
     """`image` and its halved versions, whose pixel i lies at pixel 2 i of the one before.
 
-    Levels with a side below `shortest` are left out (but for the image itself).
+    The halved ones have a mirrored border of `padding` pixels, so that the large areas that their
+    windows cover need not lie inside of the image. Levels with a side below 4 `padding` are left
+    out, but for the image itself, which has no border.
     """
     images = [image]
-    while len(images) < levels and min(images[-1].shape) >= 2 * shortest:
-        images.append(cv2.pyrDown(images[-1]))  # type: ignore[arg-type]
+    while len(images) < levels and min(image.shape) >= 8 * padding:
+        image = cv2.pyrDown(image)  # type: ignore[assignment]
+        images.append(cv2.copyMakeBorder(  # type: ignore[arg-type]
+            image, padding, padding, padding, padding, cv2.BORDER_REFLECT_101))
     return images

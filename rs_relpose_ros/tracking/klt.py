@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 _ITERATIONS = 10
 _COARSE_TOLERANCE = 0.1
 _FINE_TOLERANCE = 0.01
+# Corrections of the guess [px] that one level makes up for.
+_NEAR = 1.0
 # Correlation with the previous frame; the stricter one is with the reference.
 _MIN_STEP_CORRELATION = 0.6
 # The comparison with the reference corrects drift; what it moves further was lost before.
@@ -37,6 +39,8 @@ class KltTracker:
     def __init__(self, config: TrackingConfig) -> None:
         self._config = config
         self._half = config.klt_window // 2
+        # Room for the margin of the gradient and for the neighbours of the interpolation.
+        self._padding = self._half + 3
         self._next_id = 0
         self.reset()
 
@@ -77,16 +81,16 @@ class KltTracker:
         if predict is not None and len(points):
             guess = np.asarray(predict(points), dtype=np.float64)
             found = np.where(np.isfinite(guess).all(axis=1, keepdims=True), guess, points)
-        correlation = np.empty(0)
-        for level in reversed(range(len(current))):
-            scaled = found / 2.0**level
-            correlation, _ = align(
-                previous[level], current[level], points / 2.0**level, scaled, _NO_WARPS,
-                self._half, _ITERATIONS, _COARSE_TOLERANCE if level else _FINE_TOLERANCE)
-            found = scaled * 2.0**level
-        back = points.copy()
-        back_correlation, _ = align(current[0], previous[0], found, back, _NO_WARPS, self._half,
-                                    _ITERATIONS, _COARSE_TOLERANCE)
+        guess = found.copy()
+        correlation = self._follow(previous, current, points, found, len(current))
+        # The way back starts as far off as the way forth did: the guess must not be the answer.
+        back = points + (found - guess)
+        far = np.linalg.norm(found - guess, axis=1) > _NEAR
+        back_correlation = np.empty(len(points))
+        for mask, levels in ((far, len(current)), (~far, 1)):
+            partial = back[mask]
+            back_correlation[mask] = self._follow(current, previous, found[mask], partial, levels)
+            back[mask] = partial
         first, last = feature_rows(self._config, image.shape[0])
         good = ((correlation >= _MIN_STEP_CORRELATION)
                 & (back_correlation >= _MIN_STEP_CORRELATION)
@@ -124,14 +128,27 @@ class KltTracker:
     # -- inside ------------------------------------------------------------------------------
 
     def _pyramid(self, image: Image) -> list[Image]:
-        return pyramid(image, self._config.klt_levels, 2 * self._config.klt_window)
+        return pyramid(image, self._config.klt_levels, self._padding)
+
+    def _follow(self, first: list[Image], second: list[Image], points1: Array, points2: Array,
+                levels: int) -> Array:
+        """Improve `points2` (N, 2) in place, from coarse to fine; the correlations (N,)."""
+        correlation = np.empty(0)
+        for level in reversed(range(levels)):
+            padding, scale = (self._padding, 2.0**-level) if level else (0, 1.0)
+            scaled = points2 * scale + padding
+            correlation, _ = align(
+                first[level], second[level], points1 * scale + padding, scaled, _NO_WARPS,
+                self._half, _ITERATIONS, _COARSE_TOLERANCE if level else _FINE_TOLERANCE)
+            points2[:] = (scaled - padding) / scale
+        return correlation
 
     def _renew(self) -> None:
         height, width = self._current[0].shape
         # Of tracks that ran together the oldest stays.
         apart = keep_apart(self._points, 0.5 * self._config.min_feature_distance, height, width)
         kept = self._points[apart]
-        new = find_corners(self._current, kept, self._config.max_features - len(kept),
+        new = find_corners(self._current[0], kept, self._config.max_features - len(kept),
                            self._config)
         ids = np.concatenate([self._ids[apart], (
             np.arange(self._next_id, self._next_id + len(new)) % 2**32).astype(np.uint32)])
