@@ -1,0 +1,149 @@
+"""A camera's motion as splines: poses and their exact derivatives at any instant.
+
+World: z up. Position and the angles (yaw, pitch, roll) are quintic B-splines, so acceleration and
+angular acceleration are continuous; where the control points are equal the camera is truly still,
+where they advance evenly it truly moves at constant velocity.
+
+    R_world_cam = Rz(yaw) Ry(pitch) Rx(roll) R_BODY_CAM
+
+The body axes are x forward, y left, z up; the camera looks along x.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import BSpline
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_ros.errors import InputError
+
+Array = NDArray[np.float64]
+
+DEGREE = 5
+
+# Columns: camera x (right), y (down), z (forward) in the body's axes.
+R_BODY_CAM = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """A stretch of one kind of motion, in seconds of the trajectory.
+
+    `kind`: 'walk', 'constant' (constant linear and angular velocity), 'still' or 'rotate' (about
+    the camera centre).
+    """
+
+    kind: str
+    start: float
+    end: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraStates:
+    """Poses of the camera optical frame in the world at N instants, and their derivatives.
+
+    Attributes
+    ----------
+    position, velocity, acceleration : (N, 3) ndarray
+        World frame [m], [m/s], [m/s^2].
+    R_world_cam : (N, 3, 3) ndarray
+        Orientation.
+    angular_velocity, angular_acceleration : (N, 3) ndarray
+        Camera frame [rad/s], [rad/s^2].
+    """
+
+    position: Array
+    R_world_cam: Array
+    velocity: Array
+    acceleration: Array
+    angular_velocity: Array
+    angular_acceleration: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Motion of the camera over an interval.
+
+    Parameters
+    ----------
+    positions : (K, 3) ndarray
+        Control points of the position [m], one every `spacing`.
+    angles : (K, 3) ndarray
+        Control points of yaw, pitch and roll [rad].
+    first_control : float
+        Time of the first control point [s].
+    spacing : float
+        Time between control points [s].
+    segments : tuple of Segment
+        Labels of the stretches; between them one kind passes into the next.
+    """
+
+    positions: Array
+    angles: Array
+    first_control: float
+    spacing: float
+    segments: tuple[Segment, ...] = ()
+    _spline: BSpline = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        count = len(self.positions)
+        knots = self.first_control + self.spacing * (
+            np.arange(count + DEGREE + 1) - (DEGREE + 1) / 2)
+        controls = np.hstack([self.positions, self.angles])
+        object.__setattr__(self, '_spline', BSpline(knots, controls, DEGREE, extrapolate=False))
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """First and last time at which the motion is defined [s]."""
+        knots = self._spline.t
+        return float(knots[DEGREE]), float(knots[len(self.positions)])
+
+    def poses(self, times: ArrayLike) -> tuple[Array, Array]:
+        """Positions (N, 3) [m] and orientations ``R_world_cam`` (N, 3, 3) at `times` (N,) [s]."""
+        values = self._evaluate(times, 0)
+        return values[:, :3], _orientation(values[:, 3:])
+
+    def states(self, times: ArrayLike) -> CameraStates:
+        """Poses and derivatives at `times` (N,) [s]."""
+        value, first, second = (self._evaluate(times, order) for order in range(3))
+        rate, rate_change = _body_rates(value[:, 3:], first[:, 3:], second[:, 3:])
+        return CameraStates(
+            position=value[:, :3], R_world_cam=_orientation(value[:, 3:]),
+            velocity=first[:, :3], acceleration=second[:, :3],
+            angular_velocity=rate @ R_BODY_CAM, angular_acceleration=rate_change @ R_BODY_CAM)
+
+    def _evaluate(self, times: ArrayLike, order: int) -> Array:
+        times = np.atleast_1d(np.asarray(times, dtype=np.float64))
+        values: Array = self._spline(times, order)
+        if np.isnan(values).any():
+            first, last = self.span
+            raise InputError(f'the trajectory is defined from {first:.3f} to {last:.3f} s, asked '
+                             f'for {times.min():.3f} to {times.max():.3f} s')
+        return values
+
+
+def _orientation(angles: Array) -> Array:
+    """``R_world_cam`` (N, 3, 3) of yaw, pitch, roll (N, 3)."""
+    matrices: Array = Rotation.from_euler('ZYX', angles).as_matrix() @ R_BODY_CAM
+    return matrices
+
+
+def _body_rates(angles: Array, first: Array, second: Array) -> tuple[Array, Array]:
+    """Angular velocity and acceleration (N, 3) in body axes from the angles' derivatives.
+
+    ``w = (r' - y' sin p, p' cos r + y' sin r cos p, -p' sin r + y' cos r cos p)`` with yaw y,
+    pitch p, roll r; the second result is its derivative.
+    """
+    _, pitch, roll = angles.T
+    dy, dp, dr = first.T
+    ddy, ddp, ddr = second.T
+    sp, cp, sr, cr = np.sin(pitch), np.cos(pitch), np.sin(roll), np.cos(roll)
+    rate = np.stack([dr - dy * sp, dp * cr + dy * sr * cp, -dp * sr + dy * cr * cp], axis=1)
+    change = np.stack([
+        ddr - ddy * sp - dy * cp * dp,
+        ddp * cr - dp * sr * dr + ddy * sr * cp + dy * (cr * cp * dr - sr * sp * dp),
+        -ddp * sr - dp * cr * dr + ddy * cr * cp - dy * (sr * cp * dr + cr * sp * dp)], axis=1)
+    return rate, change

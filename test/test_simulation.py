@@ -1,0 +1,557 @@
+"""The simulator, against equations that are written out here once more."""
+
+from __future__ import annotations
+
+import argparse
+import functools
+from pathlib import Path
+import re
+import shlex
+
+import cv2
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from scipy.integrate import cumulative_trapezoid
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
+import yaml
+
+from rs_relpose_ros.cli import main as cli
+from rs_relpose_ros.cli import simulate as command
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.pipeline.parameters import Parameters
+from rs_relpose_ros.simulation import simulate, SimulationConfig
+from rs_relpose_ros.simulation.bag import node_parameters, write_bag
+from rs_relpose_ros.simulation.hand_held import hand_held, Plan
+from rs_relpose_ros.simulation.scene import make_scene, Scene, SCENES, Surface
+from rs_relpose_ros.simulation.texture import make_texture
+
+TINY = {'width': 32, 'height': 24, 'fx': 25.0}
+BAGS = Path(__file__).parent.parent / 'bags'
+NOISE_FREE = {'pixel_noise': 0.0, 'gyro_noise_density': 0.0, 'accel_noise_density': 0.0,
+              'gyro_bias': (0.0, 0.0, 0.0), 'accel_bias': (0.0, 0.0, 0.0)}
+
+
+@functools.cache
+def blob_wall():
+    """A wall 7 m ahead with a grid of blobs, and the blobs' centres in the world."""
+    texel, spacing, sigma = 0.02, 0.8, 0.055
+    x, y = np.meshgrid((np.arange(1000) + 0.5) * texel, (np.arange(600) + 0.5) * texel)
+    away = [(c + spacing / 2) % spacing - spacing / 2 for c in (x, y)]
+    gray = 40.0 + 190.0 * np.exp(-(away[0]**2 + away[1]**2) / (2 * sigma**2))
+    wall = Surface(np.array([7.0, 10.0, 7.6]), np.array([0.0, -1.0, 0.0]),
+                   np.array([0.0, 0.0, -1.0]), 20.0, 12.0, np.rint(gray).astype(np.uint8))
+    i, j = np.meshgrid(np.arange(1, 25), np.arange(1, 15))
+    centres = np.stack([np.full(i.size, 7.0), 10.0 - spacing * i.ravel(),
+                        7.6 - spacing * j.ravel()], axis=1)
+    return Scene.of((wall,)), centres
+
+
+def project_by_rows(point, trajectory, reference_time, config, sign=1.0):
+    """Pixel of a world point: the row whose instant projects the point onto that row.
+
+    Pinhole, plumb_bob (REP-104) and row times are written out; a row is sought as a root.
+    """
+    k1, k2, p1, p2, k3 = config.distortion
+    origin = {'first': 0.0, 'middle': (config.height - 1) / 2, 'last': config.height - 1.0}
+    direction = {'down': 1.0, 'up': -1.0}[config.readout_direction]
+
+    def pixel(row):
+        tau = sign * direction * (row - origin[config.stamp_row]) * (
+            config.readout_time / config.height)
+        (position,), (R,) = trajectory.poses([reference_time + tau])
+        X, Y, Z = R.T @ (point - position)
+        x, y = X / Z, Y / Z
+        r2 = x * x + y * y
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        cx = (config.width - 1) / 2 + 0.01 * config.width
+        cy = (config.height - 1) / 2 - 0.01 * config.height
+        return np.array([config.fx * xd + cx, config.fx * yd + cy])
+
+    low, high = -0.3 * config.height, 1.3 * config.height
+    if (pixel(low)[1] - low) * (pixel(high)[1] - high) > 0:
+        return None
+    return pixel(brentq(lambda row: pixel(row)[1] - row, low, high, xtol=1e-9))
+
+
+def blob_centre(image, near, half=13):
+    """Centroid of a bright blob around a pixel; the window follows it."""
+    at = np.asarray(near)
+    for _ in range(5):
+        u, v = np.rint(at).astype(int)
+        window = image[v - half:v + half + 1, u - half:u + half + 1]
+        bright = np.maximum(window.astype(np.float64) - 60.0, 0.0)
+        moments = cv2.moments(bright)
+        at = np.array([u - half + moments['m10'] / moments['m00'],
+                       v - half + moments['m01'] / moments['m00']])
+    return at
+
+
+@pytest.mark.parametrize(('direction', 'stamp_row'), [
+    ('down', 'first'), ('down', 'middle'), ('up', 'first'), ('up', 'last')])
+def test_rendered_rows_are_seen_at_their_instants(direction, stamp_row):
+    scene, centres = blob_wall()
+    config = SimulationConfig(
+        duration=1.0, plan='walk:2', speed=1.8, rotation_rate=1.3, seed=4, readout_time=0.03,
+        readout_direction=direction, stamp_row=stamp_row, **NOISE_FREE)
+    simulation = simulate(config, scene=scene)
+    errors, wrong_sign = [], []
+    for index in (3, 17):
+        frame = simulation.frame(index)
+        time = (frame.reference_ns - config.start_ns) * 1e-9
+        for centre in centres:
+            expected = project_by_rows(centre, simulation.trajectory, time, config)
+            if expected is None or not ((expected > 30).all() and expected[0] < 610
+                                        and expected[1] < 450):
+                continue
+            found = blob_centre(frame.image, expected)
+            errors.append(np.linalg.norm(found - expected))
+            mirrored = project_by_rows(centre, simulation.trajectory, time, config, sign=-1.0)
+            wrong_sign.append(np.linalg.norm(found - mirrored))
+    assert len(errors) > 60
+    assert np.median(errors) < 0.05
+    assert np.max(errors) < 0.2
+    # The same measurement tells the read-out's sign.
+    assert np.median(wrong_sign) > 3.0
+
+
+def test_global_shutter_has_no_skew_and_rolling_shutter_has():
+    scene, _ = blob_wall()
+    pictures = [
+        simulate(SimulationConfig(plan='constant:2', seed=1, readout_time=readout, **NOISE_FREE),
+                 scene=scene).frame(10).image.astype(float) for readout in (0.0, 0.03)]
+    difference = np.abs(pictures[0] - pictures[1]).mean(axis=1)
+    # The first row is the reference of both; the skew grows downwards.
+    assert difference[0] < 1e-6
+    assert difference[400:].mean() > 5 * difference[5:40].mean()
+
+
+def test_trajectory_derivatives_are_exact():
+    trajectory = hand_held(np.random.default_rng(3), -0.2, 6.2,
+                           Plan.drawn(np.random.default_rng(1), 6.0), speed=1.5,
+                           rotation_rate=0.6)
+    times, h = np.linspace(0.0, 6.0, 300), 1e-4
+    here, before, after = (trajectory.states(times + d) for d in (0.0, -h, h))
+    np.testing.assert_allclose(
+        here.velocity, (after.position - before.position) / (2 * h), atol=2e-6)
+    np.testing.assert_allclose(
+        here.acceleration, (after.velocity - before.velocity) / (2 * h), atol=1e-4)
+    turn = np.swapaxes(before.R_world_cam, 1, 2) @ after.R_world_cam
+    rate = Rotation.from_matrix(turn).as_rotvec() / (2 * h)
+    np.testing.assert_allclose(here.angular_velocity, rate, atol=1e-5)
+    np.testing.assert_allclose(
+        here.angular_acceleration, (after.angular_velocity - before.angular_velocity) / (2 * h),
+        atol=1e-3)
+    positions, rotations = trajectory.poses(times)
+    np.testing.assert_array_equal(positions, here.position)
+    np.testing.assert_array_equal(rotations, here.R_world_cam)
+    with pytest.raises(InputError, match='defined from'):
+        trajectory.poses([100.0])
+
+
+def test_stretches_are_what_they_are_called():
+    for seed in range(5):
+        simulation = simulate(SimulationConfig(seed=seed, **TINY),
+                              scene=blob_wall()[0])
+        lengths = {}
+        for segment in simulation.trajectory.segments:
+            if segment.end > 6.0:
+                continue
+            states = simulation.trajectory.states(np.linspace(segment.start, segment.end, 50))
+            lengths[segment.kind] = segment.end - segment.start
+            speed = np.linalg.norm(states.velocity, axis=1)
+            rate = np.degrees(np.linalg.norm(states.angular_velocity, axis=1))
+            if segment.kind == 'still':
+                assert np.ptp(states.position, axis=0).max() < 1e-12
+                assert rate.max() < 1e-9
+            elif segment.kind == 'rotate':
+                assert np.ptp(states.position, axis=0).max() < 1e-12
+                assert np.sqrt((rate**2).mean()) > 5.0
+            elif segment.kind == 'constant':
+                assert np.ptp(states.velocity, axis=0).max() < 1e-9
+                assert np.ptp(states.angular_velocity, axis=0).max() < 1e-9
+                assert speed.min() > 0.5
+                assert rate.min() > 5.0
+            else:
+                assert np.ptp(states.velocity, axis=0).max() > 0.02
+        assert lengths['constant'] >= 0.7
+        assert lengths['still'] >= 0.5
+        assert lengths['rotate'] >= 0.5
+
+
+def test_motion_is_hand_held_like_for_every_seed():
+    times = np.linspace(0.0, 6.0, 200)
+    for seed in range(30):
+        simulation = simulate(SimulationConfig(seed=seed, **TINY),
+                              scene=blob_wall()[0])
+        states = simulation.trajectory.states(times)
+        speed = np.linalg.norm(states.velocity, axis=1)
+        moving = speed > 0.5
+        assert moving.mean() > 0.6
+        assert speed.max() < 2.0
+        rate = np.degrees(np.linalg.norm(states.angular_velocity[moving], axis=1))
+        assert 15.0 < np.sqrt((rate**2).mean()) < 60.0
+        # Clear of everything that stands around.
+        assert np.linalg.norm(states.position[:, :2], axis=1).max() < 3.3
+        assert np.abs(states.position[:, 2] - 1.6).max() < 0.2
+
+
+def test_long_walks_stay_in_the_scene():
+    trajectory = hand_held(np.random.default_rng(0), 0.0, 60.0,
+                           Plan.drawn(np.random.default_rng(0), 60.0), speed=1.7,
+                           rotation_rate=0.5)
+    positions, _ = trajectory.poses(np.linspace(0.0, 60.0, 1000))
+    assert np.linalg.norm(positions[:, :2], axis=1).max() < 4.8
+
+
+def test_gyro_integrates_to_the_true_rotation():
+    simulation = simulate(SimulationConfig(seed=2, duration=2.0, **TINY, **NOISE_FREE),
+                          scene=blob_wall()[0])
+    imu, config = simulation.imu, simulation.config
+    R_cam_imu = Rotation.from_quat(config.quat_cam_imu_xyzw).as_matrix()
+    middle = (imu.angular_velocities[:-1] + imu.angular_velocities[1:]) / 2
+    steps = Rotation.from_rotvec(middle * np.diff(imu.stamps_ns)[:, None] * 1e-9)
+    turn = Rotation.identity()
+    for step in steps:
+        turn = turn * step
+    states = simulation.states(imu.stamps_ns[[0, -1]])
+    R_imu = states.R_world_cam @ R_cam_imu
+    error = Rotation.from_matrix(R_imu[0].T @ R_imu[1]).inv() * turn
+    assert np.degrees(turn.magnitude()) > 5.0
+    assert np.degrees(error.magnitude()) < 0.02
+
+
+def test_accelerometer_integrates_to_the_true_path_of_the_imu():
+    config = SimulationConfig(seed=2, duration=1.0, lever_arm=(0.2, -0.1, 0.15), **TINY,
+                              **NOISE_FREE)
+    simulation = simulate(config, scene=blob_wall()[0])
+    imu = simulation.imu
+    states = simulation.states(imu.stamps_ns)
+    R_cam_imu = Rotation.from_quat(config.quat_cam_imu_xyzw).as_matrix()
+    acceleration = np.einsum('nij,jk,nk->ni', states.R_world_cam, R_cam_imu,
+                             imu.linear_accelerations) - np.array([0.0, 0.0, 9.80665])
+    seconds = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
+    path = states.position + states.R_world_cam @ np.array(config.lever_arm)
+    start_velocity = (path[1] - path[0]) / seconds[1] - acceleration[0] * seconds[1] / 2
+    velocity = start_velocity + cumulative_trapezoid(acceleration, seconds, axis=0, initial=0)
+    integrated = path[0] + cumulative_trapezoid(velocity, seconds, axis=0, initial=0)
+    assert np.linalg.norm(path[-1] - path[0]) > 0.5
+    assert np.abs(integrated - path).max() < 3e-3
+
+
+def test_imu_at_rest_feels_gravity_upwards():
+    config = SimulationConfig(plan='still:1', duration=1.0, seed=5, **TINY, **NOISE_FREE)
+    simulation = simulate(config, scene=blob_wall()[0])
+    assert np.abs(simulation.imu.angular_velocities).max() < 1e-12
+    R_world_imu = simulation.states([config.start_ns]).R_world_cam[0] @ config.R_cam_imu
+    np.testing.assert_allclose(
+        simulation.imu.linear_accelerations,
+        np.broadcast_to(R_world_imu.T @ (0.0, 0.0, 9.80665),
+                        simulation.imu.linear_accelerations.shape), atol=1e-9)
+
+
+def test_imu_noise_and_bias_are_as_configured():
+    exact, noisy = (simulate(SimulationConfig(seed=1, duration=20.0, **TINY, **changes),
+                             scene=blob_wall()[0]) for changes in (NOISE_FREE, {}))
+    config = noisy.config
+    for name, bias, density in (
+            ('angular_velocities', config.gyro_bias, config.gyro_noise_density),
+            ('linear_accelerations', config.accel_bias, config.accel_noise_density)):
+        error = getattr(noisy.imu, name) - getattr(exact.imu, name)
+        sigma = density * np.sqrt(200.0)
+        np.testing.assert_allclose(error.std(axis=0), sigma, rtol=0.06)
+        np.testing.assert_allclose(error.mean(axis=0), bias, atol=5 * sigma / np.sqrt(len(error)))
+    calibration = noisy.calibrated_gyro_bias - config.gyro_bias
+    assert 0.0 < np.abs(calibration).max() < 4 * config.gyro_bias_error
+
+
+def test_clocks_and_coverage():
+    config = SimulationConfig(duration=0.2, time_offset=0.0123, stamp_row='last', seed=1, **TINY)
+    simulation = simulate(config, scene=blob_wall()[0])
+    for index in (0, 5):
+        assert (simulation.stamp_ns(index) + 12_300_000 == simulation.reference_ns(index)
+                == config.start_ns + round(index / 30 * 1e9))
+    imu_ns = simulation.imu.stamps_ns
+    assert set(np.diff(imu_ns)) == {5_000_000}
+    # From the first row of the first frame to the last row of the last one, and some more.
+    assert imu_ns[0] < config.start_ns - 30_000_000 - 50_000_000
+    assert imu_ns[-1] > simulation.reference_ns(5) + 50_000_000
+
+
+def test_true_pose_relates_the_frames():
+    simulation = simulate(SimulationConfig(seed=3, **TINY), scene=blob_wall()[0])
+    first_ns, second_ns = simulation.reference_ns(10), simulation.reference_ns(25)
+    pose = simulation.true_pose(first_ns, second_ns)
+    states = simulation.states([first_ns, second_ns])
+    world = np.random.default_rng(0).normal((8.0, 0.0, 1.0), size=(10, 3))
+    in1, in2 = ((world - p) @ R for p, R in zip(states.position, states.R_world_cam, strict=True))
+    np.testing.assert_allclose(in2 @ pose.R.T + pose.t, in1, atol=1e-12)
+    later = simulation.true_pose(first_ns, first_ns + 1_000_000)
+    np.testing.assert_allclose(later.t / 1e-3, pose.linear_velocity1, atol=0.02)
+    np.testing.assert_allclose(Rotation.from_matrix(later.R).as_rotvec() / 1e-3,
+                               pose.angular_velocity1, atol=0.02)
+    back = simulation.true_pose(second_ns, second_ns - 1_000_000)
+    np.testing.assert_allclose(-back.t / 1e-3, pose.linear_velocity2, atol=0.02)
+
+
+@pytest.fixture(scope='module')
+def bundled():
+    """Arguments in bags/README.md and the simulation that they describe."""
+    line = re.search(r'^ +rs_relpose simulate (.*)$', (BAGS / 'README.md').read_text(), re.M)
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    args = parser.parse_args(shlex.split(line.group(1)))
+    return args, simulate(command.configuration(args))
+
+
+@pytest.fixture(scope='module')
+def hall(bundled):
+    return bundled[1]
+
+
+def test_features_can_be_tracked_to_where_they_truly_went(hall):
+    images = [hall.frame(index).image for index in (5, 7)]
+    corners = cv2.goodFeaturesToTrack(images[0], 600, 0.005, 9)
+    truth = hall.true_matches(5, 7, corners[:, 0])
+    tracked, found, _ = cv2.calcOpticalFlowPyrLK(images[0], images[1], corners, None)
+    errors = np.linalg.norm(tracked[:, 0] - truth, axis=1)[found[:, 0] == 1]
+    errors = errors[~np.isnan(errors)]
+    assert np.nanmedian(np.linalg.norm(truth - corners[:, 0], axis=1)) > 10.0
+    assert len(errors) > 400
+    assert np.median(errors) < 0.2
+    assert np.percentile(errors, 80) < 0.5
+
+
+def test_sift_finds_the_same_points_across_a_wide_baseline(hall):
+    sift = cv2.SIFT_create(800)
+    (points1, words1), (points2, words2) = (
+        sift.detectAndCompute(hall.frame(index).image, None) for index in (105, 125))
+    pairs = cv2.BFMatcher().knnMatch(words1, words2, 2)
+    good = [a for a, b in pairs if a.distance < 0.75 * b.distance]
+    found1 = np.array([points1[m.queryIdx].pt for m in good])
+    found2 = np.array([points2[m.trainIdx].pt for m in good])
+    truth = hall.true_matches(105, 125, found1)
+    right = np.linalg.norm(truth - found2, axis=1) < 2.0
+    assert len(good) > 100
+    assert right.mean() > 0.7
+
+
+def test_hidden_and_departed_points_have_no_match(hall):
+    grid = np.stack(np.meshgrid(np.arange(5.0, 640, 15), np.arange(5.0, 480, 15)),
+                    axis=-1).reshape(-1, 2)
+    matches = hall.true_matches(100, 130, grid)
+    gone = np.isnan(matches[:, 0])
+    assert 0.02 < gone.mean() < 0.9
+    there, back = matches[~gone], hall.true_matches(130, 100, matches[~gone])
+    assert there.min() > -0.5
+    # What is seen in both is found again.
+    np.testing.assert_allclose(back, grid[~gone], atol=1e-6)
+    assert np.isnan(hall.renderer.project(0.5, [[-50.0, 0.0, 1.6]])).all()
+
+
+@pytest.mark.parametrize('kind', SCENES)
+def test_scenes_have_many_depths_and_no_holes(kind):
+    scene = make_scene(kind, np.random.default_rng(5), 112.0)
+    simulation = simulate(SimulationConfig(width=160, height=120, fx=112.0, seed=5), scene=scene)
+    grid = np.stack(np.meshgrid(np.arange(160.0), np.arange(120.0)), axis=-1).reshape(-1, 2)
+    for index in (0, 60, 120):
+        time = simulation.seconds(simulation.reference_ns(index))
+        world, hits = simulation.renderer.locate(time, grid)
+        assert hits.min() >= 0
+        position, _ = simulation.trajectory.poses([time])
+        distances = np.linalg.norm(world - position, axis=1)
+        near, far = np.percentile(distances, [10, 75])
+        assert near > 1.5
+        assert far < 16.0
+        assert far > 1.7 * near
+        assert len(np.unique(hits)) > 5
+        image = simulation.renderer.render(time)
+        assert image.std() > 8.0
+
+
+def test_renderer_reads_texels_where_they_are():
+    # Far sharper than a pixel: a ramp, whose mean over a footprint is its value in the middle.
+    ramp = np.tile(np.linspace(20, 220, 400).round().astype(np.uint8), (300, 1))
+    wall = Surface(np.array([7.0, 10.0, 7.6]), np.array([0.0, -1.0, 0.0]),
+                   np.array([0.0, 0.0, -1.0]), 20.0, 12.0, ramp)
+    config = SimulationConfig(seed=1, **NOISE_FREE)
+    simulation = simulate(config, scene=Scene.of((wall,)))
+    image = simulation.renderer.render(1.0)
+    points = np.array([[100.0, 50.0], [320.0, 240.0], [500.0, 400.0]])
+    world, _ = simulation.renderer.locate(1.0, points)
+    place = (10.0 - world[:, 1]) / 20.0 * 400 - 0.5
+    seen = image[points[:, 1].astype(int), points[:, 0].astype(int)]
+    np.testing.assert_allclose(seen, 20 + 200 * place / 399, atol=0.7)
+
+
+def test_texture_has_detail_at_all_scales():
+    texture = make_texture(np.random.default_rng(0), (512, 512)).astype(np.float32)
+    assert texture.shape == (512, 512)
+    fine = texture
+    for _ in range(6):
+        coarse = cv2.resize(fine, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        lost = fine - cv2.resize(coarse, fine.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        assert lost.std() > 1.0
+        fine = coarse
+
+
+@pytest.mark.parametrize(('changes', 'message'), [
+    ({'readout_time': -0.01}, 'readout_time'), ({'scene': 'moon'}, 'scene'),
+    ({'plan': 'walk'}, 'plan'), ({'plan': 'fly:1'}, 'plan'), ({'plan': 'walk:nan'}, 'plan'),
+    ({'quat_cam_imu_xyzw': (0.0, 0.0, 0.0, 0.5)}, 'length 1'), ({'fps': 0.0}, 'fps')])
+def test_impossible_configurations_are_refused(changes, message):
+    with pytest.raises(InputError, match=message):
+        SimulationConfig(**changes)
+
+
+def test_distortion_that_folds_the_image_is_refused():
+    with pytest.raises(InputError, match='distortion'):
+        simulate(SimulationConfig(distortion=(-0.9, 0.0, 0.0, 0.0, 0.0), **TINY),
+                 scene=blob_wall()[0])
+
+
+# -- bags ------------------------------------------------------------------------------------
+
+SMALL = ['--duration', '0.2', '--width', '160', '--height', '120', '--fx', '110',
+         '--readout-time', '0.02', '--seed', '7']
+
+
+def messages(path):
+    """Messages of a bag by topic, each with its bag time."""
+    found = {}
+    with AnyReader([path]) as reader:
+        for connection, time_ns, data in reader.messages():
+            found.setdefault(connection.topic, []).append(
+                (time_ns, reader.deserialize(data, connection.msgtype)))
+    return found
+
+
+def stamp_ns(message):
+    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+
+
+def test_command_writes_a_bag_and_its_parameters(tmp_path, capsys):
+    out = tmp_path / 'bag'
+    assert cli.main(['simulate', str(out), *SMALL, '--time-offset', '0.004']) == 0
+    captured = capsys.readouterr()
+    assert '6 images' in captured.out
+    assert captured.err == ''  # no progress bar unless on a terminal
+    found = messages(out)
+    images, infos = found['/camera/image_raw/compressed'], found['/camera/camera_info']
+    imu, truth = found['/imu/data_raw'], found['/ground_truth/pose']
+    assert len(found) == 4
+    assert len(images) == len(infos) == 6
+    assert [stamp_ns(m) for _, m in images] == [stamp_ns(m) for _, m in infos]
+    assert {m.header.frame_id for _, m in images + infos} == {'camera_optical_frame'}
+    assert {m.header.frame_id for _, m in imu} == {'imu_link'}
+    assert {m.header.frame_id for _, m in truth} == {'world'}
+    assert {time - stamp_ns(m) for time, m in images} == {25_000_000}
+    assert {time - stamp_ns(m) for time, m in imu + truth} == {2_000_000}
+    assert {b - a for a, b in zip([stamp_ns(m) for _, m in imu],
+                                  [stamp_ns(m) for _, m in imu][1:], strict=False)} == {5_000_000}
+    simulation = simulate(SimulationConfig(
+        duration=0.2, width=160, height=120, fx=110.0, readout_time=0.02, seed=7,
+        time_offset=0.004))
+    decoded = cv2.imdecode(images[2][1].data, cv2.IMREAD_UNCHANGED)
+    assert decoded.shape == (120, 160)
+    difference = decoded.astype(float) - simulation.frame(2).image
+    assert np.abs(difference).mean() < 4.0
+    assert stamp_ns(images[2][1]) == simulation.stamp_ns(2)
+    pose = truth[30][1].pose
+    state = simulation.states([stamp_ns(truth[30][1])])
+    np.testing.assert_allclose((pose.position.x, pose.position.y, pose.position.z),
+                               state.position[0])
+    q = pose.orientation
+    np.testing.assert_allclose(Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix(),
+                               state.R_world_cam[0], atol=1e-12)
+    values = yaml.safe_load((tmp_path / 'bag.yaml').read_text())['/**']['ros__parameters']
+    parameters = Parameters.from_mapping(values)
+    assert parameters.sensor.readout_time == 0.02
+    assert parameters.sensor.time_offset == 0.004
+    assert parameters.pair.image_transport == 'compressed'
+    np.testing.assert_allclose(parameters.sensor.R_cam_imu, simulation.config.R_cam_imu,
+                               atol=1e-12)
+    np.testing.assert_allclose(values['gyro_bias'], simulation.calibrated_gyro_bias, atol=1e-6)
+
+
+def test_same_arguments_same_bag_other_seed_other_bag(tmp_path):
+    for name, arguments in (('a', SMALL), ('b', SMALL), ('c', [*SMALL[:-1], '8'])):
+        assert cli.main(['simulate', str(tmp_path / name), *arguments]) == 0
+    a, b, c = (messages(tmp_path / name)['/camera/image_raw/compressed'] for name in 'abc')
+    assert all(x.data.tobytes() == y.data.tobytes() for (_, x), (_, y) in zip(a, b, strict=True))
+    assert not any(
+        x.data.tobytes() == y.data.tobytes() for (_, x), (_, y) in zip(a, c, strict=True))
+
+
+def test_raw_images(tmp_path):
+    assert cli.main(['simulate', str(tmp_path / 'bag'), *SMALL, '--raw']) == 0
+    found = messages(tmp_path / 'bag')
+    image = found['/camera/image_raw'][0][1]
+    assert (image.encoding, image.width, image.height, image.step) == ('mono8', 160, 120, 160)
+    text = (tmp_path / 'bag.yaml').read_text()
+    assert yaml.safe_load(text)['/**']['ros__parameters']['image_transport'] == 'raw'
+
+
+def test_command_refuses_what_exists_and_what_is_impossible(tmp_path, capsys):
+    (tmp_path / 'bag.yaml').write_text('mine')
+    for arguments, words in (
+            ([str(tmp_path / 'bag')], 'bag.yaml exists already'),
+            ([str(tmp_path)], 'exists already'),
+            ([str(tmp_path / 'new'), '--fps', '0'], 'fps must be'),
+            ([str(tmp_path / 'new'), '--jpeg-quality', '0'], 'jpeg_quality')):
+        assert cli.main(['simulate', *arguments, *SMALL]) == 2
+        assert words in capsys.readouterr().err
+    assert (tmp_path / 'bag.yaml').read_text() == 'mine'
+    assert not (tmp_path / 'new').exists()
+
+
+def test_interrupted_work_leaves_no_bag(tmp_path):
+    simulation = simulate(SimulationConfig(duration=0.2, width=64, height=48, fx=45.0),
+                          scene=blob_wall()[0])
+
+    def stop():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_bag(simulation, tmp_path / 'bag', on_frame=stop)
+    assert not (tmp_path / 'bag').exists()
+
+
+def test_bundled_bag_is_small_and_complete(bundled):
+    args, simulation = bundled
+    assert args.out_bag == Path('bags/hand_held')
+    bag = BAGS / 'hand_held'
+    assert sum(file.stat().st_size for file in bag.iterdir()) < 10e6
+    with AnyReader([bag]) as reader:
+        counts = {connection.topic: connection.msgcount for connection in reader.connections}
+        assert 5e9 <= reader.duration <= 6.4e9
+    assert counts == {'/camera/image_raw/compressed': 180, '/camera/camera_info': 180,
+                      '/imu/data_raw': len(simulation.imu.stamps_ns),
+                      '/ground_truth/pose': len(simulation.imu.stamps_ns)}
+
+
+def test_bundled_bag_is_what_its_command_makes(bundled):
+    args, simulation = bundled
+    found = messages(BAGS / 'hand_held')
+    for index in (0, 100):
+        _, message = found['/camera/image_raw/compressed'][index]
+        assert stamp_ns(message) == simulation.stamp_ns(index)
+        image = simulation.frame(index).image
+        jpeg = cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, args.jpeg_quality])[1]
+        again, bundled_image = (cv2.imdecode(data, cv2.IMREAD_UNCHANGED).astype(float)
+                                for data in (jpeg, message.data))
+        # Other versions of NumPy and OpenCV may round differently, no more.
+        assert np.abs(again - bundled_image).mean() < 0.5
+    imu = [message for _, message in found['/imu/data_raw']]
+    assert [stamp_ns(message) for message in imu] == simulation.imu.stamps_ns.tolist()
+    np.testing.assert_allclose(
+        [(m.angular_velocity.x, m.angular_velocity.y, m.angular_velocity.z) for m in imu],
+        simulation.imu.angular_velocities, atol=1e-9)
+    positions = [m.pose.position for _, m in found['/ground_truth/pose']]
+    np.testing.assert_allclose([(p.x, p.y, p.z) for p in positions],
+                               simulation.states(simulation.imu.stamps_ns).position, atol=1e-9)
+    values = yaml.safe_load((BAGS / 'hand_held.yaml').read_text())['/**']['ros__parameters']
+    assert values == node_parameters(simulation, raw=args.raw)
