@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection
 from rosbags.typesys import get_typestore, Stores
 
 from rs_relpose_ros.bags.mcap_check import check_mcap
@@ -73,6 +74,16 @@ class BagMessage:
     message: Any
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class RawMessage:
+    """A message as CDR bytes, with its topic and the time at which it was recorded [ns]."""
+
+    topic: str
+    msgtype: str
+    bag_time_ns: int
+    data: bytes
+
+
 class Bag:
     """An open bag; made by `open_bag`."""
 
@@ -109,15 +120,35 @@ class Bag:
                             self._find_truth(options))
 
     def messages(self, topics: Sequence[Topic]) -> Iterator[BagMessage]:
-        """Messages of `topics` in the order of bag time.
+        """Messages of `topics` in the order of bag time; their arrays are read-only.
 
         Raises
         ------
         InputError
             The bag is damaged, or a message cannot be decoded.
         """
-        names = {topic.name for topic in topics}
-        connections = [c for c in self._reader.connections if c.topic in names]
+        for connection, bag_time_ns, data in self._raw(topics):
+            with self._decoding(connection):
+                message = self._reader.deserialize(data, connection.msgtype)
+            yield BagMessage(connection.topic, bag_time_ns, message)
+
+    def raw_messages(self, topics: Sequence[Topic]) -> Iterator[RawMessage]:
+        """Messages of `topics` in the order of bag time, in CDR as publishers take them.
+
+        Raises
+        ------
+        InputError
+            The bag is damaged, or a ROS 1 message cannot be converted to CDR.
+        """
+        for connection, bag_time_ns, data in self._raw(topics):
+            if not self._reader.is2:
+                with self._decoding(connection):
+                    data = self._reader.typestore.ros1_to_cdr(data, connection.msgtype)
+            yield RawMessage(connection.topic, connection.msgtype, bag_time_ns, bytes(data))
+
+    def _raw(self, topics: Sequence[Topic]) -> Iterator[tuple[Connection, int, bytes]]:
+        chosen = {(topic.name, topic.msgtype) for topic in topics}
+        connections = [c for c in self._reader.connections if (c.topic, c.msgtype) in chosen]
         if not connections:
             return
         messages = self._reader.messages(connections)
@@ -132,13 +163,16 @@ class Bag:
             if len(data) > _MAX_MESSAGE_BYTES:
                 raise InputError(f'a message of {connection.topic} in {self.path} has {len(data)} '
                                  f'bytes; at most {_MAX_MESSAGE_BYTES} are read')
-            try:
-                message = self._reader.deserialize(data, connection.msgtype)
-            except Exception as error:
-                raise InputError(
-                    f'a message of {connection.topic} in {self.path} is corrupt, it is no '
-                    f'{connection.msgtype}: {_sentence(error)}') from error
-            yield BagMessage(connection.topic, bag_time_ns, message)
+            yield connection, bag_time_ns, data
+
+    @contextmanager
+    def _decoding(self, connection: Connection) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:
+            raise InputError(
+                f'a message of {connection.topic} in {self.path} is corrupt, it is no '
+                f'{connection.msgtype}: {_sentence(error)}') from error
 
     # -- finding topics ----------------------------------------------------------------------
 
