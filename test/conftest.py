@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-import fcntl
-import itertools
 import os
 from pathlib import Path
 import sys
-import tempfile
 
 import pytest
+from ros_domain import own_ros_domain
 
 ROOT = Path(__file__).resolve().parent.parent
-DOMAIN_IDS = range(1, 101)  # above 101, DDS ports run into the range of ephemeral ports
 
 # For a bare `pytest` as well as for `make test`, and inherited by the processes that tests start.
 os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
-
-# Two runs at once start at different ids, so that they rarely try for the same lock.
-_next_domain_id = itertools.count(os.getpid())
 
 
 def _recordings() -> Path:
@@ -54,22 +48,14 @@ def bundled_bag() -> Path:
 
 
 @pytest.fixture
-def ros_domain_id(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[int]:
+def ros_domain_id(tmp_path: Path) -> Iterator[int]:
     """A DDS domain that no other test on this machine uses meanwhile, set in the environment."""
-    locks = Path(tempfile.gettempdir())
-    for _ in DOMAIN_IDS:
-        domain_id = DOMAIN_IDS[next(_next_domain_id) % len(DOMAIN_IDS)]
-        try:
-            lock = (locks / f'rs_relpose_ros_domain_{domain_id}.lock').open('w')
-        except PermissionError:  # somebody else's
-            continue
-        with lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                continue
-            monkeypatch.setenv('ROS_DOMAIN_ID', str(domain_id))
-            monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'ros_log'))
-            yield domain_id
-            return
-    pytest.fail('all ROS domain ids are in use')
+    with own_ros_domain(tmp_path) as domain_id:
+        yield domain_id
+
+
+@pytest.fixture(scope='module')
+def module_ros_domain_id(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
+    """The same for all tests of a module, which then share processes."""
+    with own_ros_domain(tmp_path_factory.mktemp('ros')) as domain_id:
+        yield domain_id

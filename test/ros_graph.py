@@ -20,8 +20,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import qos_profile_sensor_data, QoSProfile
 
 ROOT = Path(__file__).resolve().parent.parent
-# Longest wait for anything; compiling all kernels on a busy machine takes most of it.
-PATIENCE = 90.0
+# Longest wait for anything: compiling all kernels on a busy machine takes most of it.
+PATIENCE = 300.0
 
 
 def wait_until(condition: Callable[[], Any], what: str, timeout: float = PATIENCE) -> Any:

@@ -28,7 +28,7 @@ from rs_relpose_ros.timing import ImageClock, NANOSECONDS, seconds_between, to_n
 # A stamp that lies further back than this is a bag that starts anew, not a late message.
 CLOCK_JUMP_NS = NANOSECONDS
 # Frames that wait for the worker; bounds the latency of an overloaded node.
-MAILBOX_FRAMES = 3
+MAILBOX_FRAMES = 5
 # Frames that wait for the IMU; bounds the memory.
 WAITING_FRAMES = 16
 # How long a frame waits for the IMU.

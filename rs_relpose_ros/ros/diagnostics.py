@@ -113,7 +113,7 @@ class Statistics:
             refused = {} if counts is None else dict(counts.refused)
             dropped = sum(refused.values()) - self._refused_before
             self._refused_before = sum(refused.values())
-            level, text = self._judge(problem, dropped, rates)
+            level, text = self._judge(problem, dropped)
             last, pose = self._last_pair, self._last_pose
             latency = [f'{1e3 * np.percentile(self._latencies, p):.1f}' if self._latencies else ''
                        for p in (50, 99)]
@@ -146,7 +146,7 @@ class Statistics:
             ]
         return Report(level, text, tuple(values))
 
-    def _judge(self, problem: str, dropped: int, rates: dict[str, float]) -> tuple[int, str]:
+    def _judge(self, problem: str, dropped: int) -> tuple[int, str]:
         if problem:
             return ERROR, problem
         if dropped > 0:
@@ -156,7 +156,7 @@ class Statistics:
             return OK, 'no keyframe pair yet'
         if not last.pose:
             return WARN, f'no pose of the last pair: {self._last_no_pose}'
-        return OK, f'estimating at {rates["images"]:.0f} images/s'
+        return OK, f'estimating: {self._poses} poses of {self._pairs} pairs'
 
 
 def _inlier_ratio(result: PairResult) -> float:

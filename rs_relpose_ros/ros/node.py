@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
+import gc
 import logging
 import os
 from pathlib import Path
@@ -45,7 +46,9 @@ IMU_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000,
                      reliability=ReliabilityPolicy.BEST_EFFORT)
 
 # The worker ends within a frame, unless it compiles.
-_JOIN_TIMEOUT = 0.7
+_JOIN_TIMEOUT = 0.4
+# Loading kernels from the cache takes less than this [s].
+_TELL_COMPILING = 4.0
 
 
 class RelposeNode(Node):
@@ -61,6 +64,7 @@ class RelposeNode(Node):
 
     def __init__(self) -> None:
         super().__init__('relpose_node')
+        self._info = CauseLog(self.get_logger().info)
         self._warn = CauseLog(self.get_logger().warning)
         self._error = CauseLog(self.get_logger().error)
         self._settings = NodeParameters(self, self._on_parameters)
@@ -113,12 +117,16 @@ class RelposeNode(Node):
         self._worker = Worker(parameters, self._sequencer, self._on_frame, self._on_refused,
                               self._on_failure)
         self._worker.start()
+        self._started_ns = self._now_ns()
         # Subscribed only when ready: what comes earlier would be dropped.
         self._warm_timer = self.create_timer(0.02, self._subscribe_when_warm, clock=self._steady)
 
     def _subscribe_when_warm(self) -> None:
         assert self._worker is not None and self._intake is not None
         if not self._worker.warm:
+            if self._now_ns() - self._started_ns > _TELL_COMPILING * NANOSECONDS:
+                self._info('compiling kernels: the first start takes a minute or two, the later '
+                           'ones some seconds')
             return
         self.destroy_timer(self._warm_timer)
         intake = self._intake
@@ -137,6 +145,9 @@ class RelposeNode(Node):
                 ('accelerometer', Imu, 'accel', IMU_QOS, intake.add_accelerometer)):
             self.create_subscription(msgtype, topic, self._receiver(kind, add), qos,
                                      qos_overriding_options=overriding)
+        # All that exists by now lives to the end: collections need not look at it again.
+        gc.collect()
+        gc.freeze()
         self._ready_ns = self._now_ns()
         self.get_logger().info(
             f'ready: {image_topic}, {self.resolve_topic_name("camera_info")} and '
@@ -311,6 +322,8 @@ def _finish(node: RelposeNode | None) -> None:
             os._exit(0)
         node.destroy_node()
     rclpy.try_shutdown()
+    # The interpreter's last collection would visit every object of every module: up to a second.
+    gc.freeze()
 
 
 if __name__ == '__main__':
