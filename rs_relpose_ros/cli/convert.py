@@ -1,0 +1,68 @@
+"""``rs_relpose convert``: a public recording as a bag."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+import sys
+
+from tqdm import tqdm
+
+from rs_relpose_ros.datasets import realsense, xiaomi
+from rs_relpose_ros.datasets.parameter_file import Figure, write_parameters
+from rs_relpose_ros.datasets.recording import Recording, write_bag
+from rs_relpose_ros.errors import InputError, MissingInputError
+
+HELP = ('Turn a public recording into a rosbag2 directory (MCAP) with the topics '
+        '/camera/image_raw/compressed, /camera/camera_info and /imu/data_raw, and write '
+        'OUT_BAG.yaml beside it: the parameters of relpose_node, each with its source. Stamps and '
+        'JPEG images stay as recorded; the IMU keeps its own axes. realsense_rgb_rs: colour '
+        'camera, gyro and accelerometer of a RealSense, from github.com/Zoltan3057/DM-VIO-dataset '
+        '(imu.txt, frames.csv, camera.txt, images/). xiaomi_cc9_rs: phone with gyro, from '
+        'github.com/lhaippp/gyro-video-stabilization (gyro.txt, framestamp.txt, images/).')
+
+
+@dataclass(frozen=True, slots=True)
+class Dataset:
+    """How the recordings of one source are read, and what the node must know of them."""
+
+    read: Callable[[Path], Recording]
+    title: str
+    parameters: tuple[Figure, ...]
+
+
+DATASETS: Mapping[str, Dataset] = {
+    'realsense_rgb_rs': Dataset(realsense.read_recording, realsense.TITLE, realsense.PARAMETERS),
+    'xiaomi_cc9_rs': Dataset(xiaomi.read_recording, xiaomi.TITLE, xiaomi.PARAMETERS),
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument('dataset', choices=DATASETS, help='source of the recording')
+    parser.add_argument('folder', metavar='FOLDER', type=Path, help='folder of the recording')
+    parser.add_argument('out_bag', metavar='OUT_BAG', type=Path,
+                        help='bag directory to create; OUT_BAG.yaml is written beside it')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the bag and its parameter file."""
+    dataset: Dataset = DATASETS[args.dataset]
+    folder: Path = args.folder
+    parameters = args.out_bag.with_name(args.out_bag.name + '.yaml')
+    if not folder.is_dir():
+        raise MissingInputError(f'there is no folder {folder}')
+    for path in (args.out_bag, parameters):
+        if path.exists():
+            raise InputError(f'{path} exists already: remove it or choose another path')
+    recording = dataset.read(folder)
+    with tqdm(total=len(recording.images), unit='image', desc=args.out_bag.name, leave=False,
+              disable=not sys.stderr.isatty()) as bar:
+        write_bag(recording, args.out_bag, on_image=bar.update)
+    write_parameters(parameters, dataset.title, dataset.parameters)
+    size = sum(file.stat().st_size for file in args.out_bag.iterdir())
+    print(f'{args.out_bag}: {len(recording.images)} images, {len(recording.cropped_imu())} IMU '
+          f'samples, {size / 1e6:.1f} MB; parameters of the node: {parameters}')
+    return 0

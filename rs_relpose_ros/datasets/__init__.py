@@ -1,0 +1,1 @@
+"""Public recordings in their own formats, to be converted to bags."""
