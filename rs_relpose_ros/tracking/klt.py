@@ -17,7 +17,9 @@ from rs_relpose_ros.tracking.tracker import Predict
 Array = NDArray[np.float64]
 
 _ITERATIONS = 10
+# Last step [px]: of coarse levels, from frame to frame, and against the reference.
 _COARSE_TOLERANCE = 0.1
+_FOLLOW_TOLERANCE = 0.03
 _FINE_TOLERANCE = 0.01
 # Corrections of the guess [px] that one level makes up for.
 _NEAR = 1.0
@@ -139,7 +141,7 @@ class KltTracker:
             scaled = points2 * scale + padding
             correlation, _ = align(
                 first[level], second[level], points1 * scale + padding, scaled, _NO_WARPS,
-                self._half, _ITERATIONS, _COARSE_TOLERANCE if level else _FINE_TOLERANCE)
+                self._half, _ITERATIONS, _COARSE_TOLERANCE if level else _FOLLOW_TOLERANCE)
             points2[:] = (scaled - padding) / scale
         return correlation
 
