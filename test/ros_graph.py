@@ -40,7 +40,7 @@ class Process:
 
     def __init__(self, module: str, *arguments: str) -> None:
         # A pipe that nobody reads would block it.
-        self._output = tempfile.TemporaryFile()
+        self._output = tempfile.TemporaryFile()  # noqa: SIM115 - closed on exit
         self._process = subprocess.Popen(
             [sys.executable, '-m', module, *arguments], cwd=ROOT, stdout=self._output,
             stderr=subprocess.STDOUT, env={**os.environ, 'PYTHONUNBUFFERED': '1'})
@@ -135,8 +135,17 @@ class Graph:
     def listen(self, message_type: type, topic: str, depth: int = 1000) -> list[Any]:
         """A list that fills with the messages of a topic."""
         messages: list[Any] = []
-        self.node.create_subscription(message_type, topic, messages.append, QoSProfile(depth=depth))
+        self.node.create_subscription(
+            message_type, topic, messages.append, QoSProfile(depth=depth))
         return messages
+
+    def call(self, service_type: type, service: str, request: Any) -> Any:
+        """The response of a service."""
+        client = self.node.create_client(service_type, service)
+        wait_until(client.service_is_ready, f'service {service}')
+        future = client.call_async(request)
+        wait_until(future.done, f'an answer of {service}')
+        return future.result()
 
     def publisher(self, message_type: type, topic: str, best_effort: bool = False) -> Any:
         """A publisher that somebody has subscribed to."""

@@ -47,6 +47,8 @@ IMU_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000,
 
 # The worker ends within a frame, unless it compiles.
 _JOIN_TIMEOUT = 0.4
+# No IMU is silent for so long [s] while it works.
+_SUSPICIOUS_SILENCE = 0.3
 # Loading kernels from the cache takes less than this [s].
 _TELL_COMPILING = 4.0
 
@@ -198,7 +200,11 @@ class RelposeNode(Node):
         self._statistics.add_pair(result, ready.ready_ns)
 
     def _on_refused(self, refused: FrameRefused) -> None:
+        if refused.cause is Refusal.NO_CALIBRATION:
+            return   # told where the CameraInfo is missed or refused
         if refused.cause is Refusal.NO_IMU:
+            if self._silent('imu', _SUSPICIOUS_SILENCE):
+                return   # told once it lasts
             self._warn(f'a frame was not used: {refused.reason}; is '
                        f'{self.resolve_topic_name("imu")} published, with a gyro, and are its '
                        'stamps on the clock of the images (time_offset)?')
@@ -257,9 +263,9 @@ class RelposeNode(Node):
             return text, missing
         return '', ()
 
-    def _silent(self, kind: str) -> bool:
+    def _silent(self, kind: str, seconds: float = SILENCE) -> bool:
         heard_ns = self._heard_ns.get(kind, self._ready_ns)
-        return self._now_ns() - heard_ns > SILENCE * NANOSECONDS
+        return self._now_ns() - heard_ns > seconds * NANOSECONDS
 
     def _now_ns(self) -> int:
         return int(self._steady.now().nanoseconds)
