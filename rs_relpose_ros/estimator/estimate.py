@@ -302,8 +302,12 @@ class _Estimation:
                          sigma: float) -> PairState:
         """Covariance of (dt, dtheta, dv_1, dv_2, dw_1, dw_2) from the regularised Hessian."""
         priors = with_velocity_sigma(self.priors, velocity_sigma)
-        hessian, _, _ = normal_equations(self.problem.observations, inliers, state, priors, sigma)
+        hessian, gradient, _ = normal_equations(
+            self.problem.observations, inliers, state, priors, sigma)
         local = np.linalg.inv(hessian)
+        # Zero after the MAP fit; a state that stopped elsewhere is off by about this step.
+        step = local @ gradient
+        local += np.outer(step, step)
         # Local parameters (theta, tangent, d1, d2, dw1, dw2 in frame 1) to the state's.
         jacobian = np.zeros((18, 17))
         jacobian[0:3, 3:5] = sampson.tangent_basis(state.t)

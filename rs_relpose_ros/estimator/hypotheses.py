@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.solvers.angular_3pt import angular_3pt_kernel
 from rs_relpose_ros.solvers.five_point import five_point_kernel
+from rs_relpose_ros.solvers.uniform_9pt import uniform_9pt_kernel
 
 Array = NDArray[np.float64]
 
@@ -83,4 +84,7 @@ def generate(generator: int, points: Array, sample: NDArray[np.int64], knowledge
         return angular_3pt_kernel(f1, f2, knowledge.align1, knowledge.align2, R_out, x_out)
     if generator == ANGULAR_5PT:
         return five_point_kernel(f1, f2, R_out, x_out)
+    if generator == UNIFORM_9PT:
+        return uniform_9pt_kernel(f1, f2, tau1, tau2, knowledge.align1, knowledge.align2, R_out,
+                                  x_out)
     return 0
