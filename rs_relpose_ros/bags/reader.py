@@ -138,12 +138,18 @@ class Bag:
         Raises
         ------
         InputError
-            The bag is damaged, or a ROS 1 message cannot be converted to CDR.
+            The bag is damaged, or a ROS 1 message has no counterpart in ROS 2.
         """
+        # Of ROS 2, not of the bag: headers of ROS 1 have a number more.
+        typestore = get_typestore(Stores.ROS2_JAZZY)
         for connection, bag_time_ns, data in self._raw(topics):
             if not self._reader.is2:
+                if connection.msgtype not in typestore.fielddefs:
+                    raise InputError(f'topic {connection.topic} of {self.path} is of type '
+                                     f'{connection.msgtype}, which ROS 2 does not have: leave it '
+                                     'out')
                 with self._decoding(connection):
-                    data = self._reader.typestore.ros1_to_cdr(data, connection.msgtype)
+                    data = typestore.ros1_to_cdr(data, connection.msgtype)
             yield RawMessage(connection.topic, connection.msgtype, bag_time_ns, bytes(data))
 
     def _raw(self, topics: Sequence[Topic]) -> Iterator[tuple[Connection, int, bytes]]:
