@@ -66,7 +66,7 @@ class Plan:
         while total < duration:
             pause = [('still', 0.52), ('rotate', 0.52)]
             blocks = [[('constant', 0.75)], pause[::rng.choice((1, -1))]]
-            rng.shuffle(blocks)  # type: ignore[arg-type]
+            rng.shuffle(blocks)
             cycle = [('walk', 0.55), *blocks[0], ('walk', 0.55), *blocks[1], ('walk', 0.4)]
             parts += cycle
             total += sum(seconds + _TRANSITION for _, seconds in cycle)
@@ -101,7 +101,7 @@ def hand_held(rng: np.random.Generator, start: float, end: float, plan: Plan, *,
     """
     margin = 6 * CONTROL_SPACING
     count = math.ceil((end - start + 2 * margin) / CONTROL_SPACING) + 1
-    times = start - margin + CONTROL_SPACING * np.arange(count)
+    times: Array = start - margin + CONTROL_SPACING * np.arange(count, dtype=np.float64)
     segments = _segments(plan)
     levels = _levels(times, segments)
     return Trajectory(_walk(rng, times, levels, speed),
@@ -131,9 +131,9 @@ def _levels(times: Array, segments: tuple[Segment, ...]) -> _Levels:
 
     def level(**by_kind: float) -> Array:
         steps = np.array([by_kind.get(segment.kind, 0.0) for segment in segments])[index]
-        smooth = np.convolve(steps, window, mode='valid')
+        smooth: Array = np.convolve(steps, window, mode='valid')
         # The weights add up to 1 only nearly.
-        return np.round(smooth, 12)
+        return smooth.round(12)
 
     return _Levels(travel=level(walk=1.0, constant=1.0), gait=level(walk=1.0),
                    turning=level(walk=1.0, rotate=1.0), panning=level(constant=1.0))

@@ -25,6 +25,12 @@ _MAX_TAPS = 6
 _LEVEL_BIAS = -0.35
 _NOTHING = 128.0
 
+# Nothing here lets the compiler fuse operations: the same image on every processor.
+_jit = numba.njit(cache=True, nogil=True, error_model='numpy',
+                  fastmath={'arcp', 'nsz'})
+_inline = numba.njit(cache=True, nogil=True, error_model='numpy', forceinline=True,
+                     fastmath={'arcp', 'nsz'})
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Renderer:
@@ -151,21 +157,21 @@ _NORMAL, _HEIGHT, _ACROSS, _A, _DOWN, _B, _SIZE, _INDEX, _TOWARDS, _ANGLE = (
 _FACE_COLUMNS = 19
 
 
-@numba.njit(cache=True, nogil=True, error_model='numpy')
-def _dot(x, y, z, faces, i, column):
+@_inline
+def _dot(x, y, z, faces, i, column):  # type: ignore[no-untyped-def]
     # Indices, not rows: a view of a row in the innermost loop costs more than the product.
     return x * faces[i, column] + y * faces[i, column + 1] + z * faces[i, column + 2]
 
 
-@numba.njit(cache=True, nogil=True, error_model='numpy')
-def _turned(rotation, x, y, z):
+@_inline
+def _turned(rotation, x, y, z):  # type: ignore[no-untyped-def]
     return (rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,
             rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z,
             rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z)
 
 
-@numba.njit(cache=True, nogil=True, error_model='numpy')
-def _find_faces(position, corners, across, down, sizes, faces):
+@_jit
+def _find_faces(position, corners, across, down, sizes, faces):  # type: ignore[no-untyped-def]
     """Surfaces that turn their face to `position`; fills `faces` and returns their number."""
     count = 0
     for s in range(len(corners)):
@@ -200,8 +206,8 @@ def _find_faces(position, corners, across, down, sizes, faces):
     return count
 
 
-@numba.njit(cache=True, nogil=True, error_model='numpy')
-def _shortlist(rotation, ray, half_angle, faces, face_count, chosen):
+@_jit
+def _shortlist(rotation, ray, half_angle, faces, face_count, chosen):  # type: ignore[no-untyped-def]
     """Faces that a cone around a ray may hit; fills `chosen` and returns their number."""
     x, y, z = _turned(rotation, ray[0], ray[1], ray[2])
     count = 0
@@ -213,8 +219,8 @@ def _shortlist(rotation, ray, half_angle, faces, face_count, chosen):
     return count
 
 
-@numba.njit(cache=True, nogil=True, error_model='numpy')
-def _trace(x, y, z, faces, chosen, count):
+@_inline
+def _trace(x, y, z, faces, chosen, count):  # type: ignore[no-untyped-def]
     """Nearest hit of a ray (x, y, z): face (-1 for none), distance, texture place a, b [m]."""
     best = np.inf
     hit = -1
@@ -241,25 +247,28 @@ def _trace(x, y, z, faces, chosen, count):
     return hit, best, hit_a, hit_b
 
 
-@numba.njit(cache=True, nogil=True, error_model='numpy')
-def _bilinear(pixels, offset, height, width, x, y):
+@_inline
+def _bilinear(pixels, offset, height, width, x, y):  # type: ignore[no-untyped-def]
     """Gray value between texels, clamped at the border."""
     x = min(max(x, 0.0), width - 1.0)
     y = min(max(y, 0.0), height - 1.0)
-    j = min(int(x), max(width - 2, 0))
-    i = min(int(y), max(height - 2, 0))
+    j = min(int(x), width - 2)
+    i = min(int(y), height - 2)
     fx = x - j
     fy = y - i
-    right = 1 if width > 1 else 0
-    below = width if height > 1 else 0
-    at = offset + i * width + j
-    upper = pixels[at] * (1.0 - fx) + pixels[at + right] * fx
-    lower = pixels[at + below] * (1.0 - fx) + pixels[at + below + right] * fx
-    return upper * (1.0 - fy) + lower * fy
+    # Unsigned, or every access asks whether the index counts from the end.
+    upper_left = np.uintp(offset + i * width + j)
+    lower_left = np.uintp(offset + i * width + j + width)
+    one = np.uintp(1)
+    left = np.float64(pixels[upper_left])
+    upper = left + fx * (pixels[upper_left + one] - left)
+    left = np.float64(pixels[lower_left])
+    lower = left + fx * (pixels[lower_left + one] - left)
+    return upper + fy * (lower - upper)
 
 
-@numba.njit(cache=True, nogil=True, error_model='numpy')
-def _shade(faces, i, distance, a, b, x, y, z, pixel_angle, texels, pixels, offsets, shapes,
+@_inline
+def _shade(faces, i, distance, a, b, x, y, z, pixel_angle, texels, pixels, offsets, shapes,  # type: ignore[no-untyped-def]
            levels):
     """Gray value of a pixel's footprint: trilinear lookups along its longer axis."""
     s = int(faces[i, _INDEX])
@@ -297,8 +306,8 @@ def _shade(faces, i, distance, a, b, x, y, z, pixel_angle, texels, pixels, offse
     return total / taps
 
 
-@numba.njit(cache=True, nogil=True, error_model='numpy')
-def _render(rays, tile_angles, positions, rotations, corners, across, down, sizes, texels, pixels,
+@_jit
+def _render(rays, tile_angles, positions, rotations, corners, across, down, sizes, texels, pixels,  # type: ignore[no-untyped-def]
             offsets, shapes, levels, pixel_angle, image, hits):
     """Fill `image` and the index of the surface that every pixel shows."""
     height, width = image.shape
@@ -325,8 +334,8 @@ def _render(rays, tile_angles, positions, rotations, corners, across, down, size
                                          shapes, levels)
 
 
-@numba.njit(cache=True, nogil=True, error_model='numpy')
-def _smooth_edges(rays, tile_angles, positions, rotations, corners, across, down, sizes, texels,
+@_jit
+def _smooth_edges(rays, tile_angles, positions, rotations, corners, across, down, sizes, texels,  # type: ignore[no-untyped-def]
                   pixels, offsets, shapes, levels, pixel_angle, samples, image, hits):
     """Replace pixels on outlines by the mean of samples within them, at their row's instant."""
     height, width = image.shape
@@ -374,8 +383,8 @@ def _smooth_edges(rays, tile_angles, positions, rotations, corners, across, down
             image[v, u] = total / (samples * samples)
 
 
-@numba.njit(cache=True, nogil=True, error_model='numpy')
-def _trace_all(positions, rays, corners, across, down, sizes, distances, hits):
+@_jit
+def _trace_all(positions, rays, corners, across, down, sizes, distances, hits):  # type: ignore[no-untyped-def]
     """Nearest hits of rays (N, 3) in the world from positions (N, 3)."""
     faces = np.empty((len(corners) + 1, _FACE_COLUMNS))
     every = np.arange(len(corners))

@@ -155,8 +155,8 @@ class Simulation:
         first, second = (self.seconds(self.reference_ns(i)) for i in (index1, index2))
         world, _ = self.renderer.locate(first, points1)
         points2 = self.renderer.project(second, world)
-        inside = ((points2 > -0.5) & (points2 < (self.camera.width - 0.5,
-                                                 self.camera.height - 0.5))).all(axis=1)
+        size = (self.camera.width, self.camera.height)
+        inside = np.all((points2 > -0.5) & (points2 < np.subtract(size, 0.5)), axis=1)
         seen, _ = self.renderer.locate(second, np.where(inside[:, None], points2, 0.0))
         visible = inside & (np.linalg.norm(seen - world, axis=1) < 1e-3)
         points2[~visible] = np.nan
