@@ -75,6 +75,8 @@ MODES = {
 
 # Prior sigma of the velocities while hypotheses are compared [baselines per second].
 SAMPLING_VELOCITY_SIGMA = 3.0
+# Noise of |f_1 - R f_2| is 1.67 sigma in the median (Rayleigh, two images).
+ROTATION_ONLY_SIGMAS = 2.5
 # A translation direction less certain than this says nothing.
 MAX_TRANSLATION_SIGMA = 0.5
 
@@ -188,7 +190,7 @@ class _Estimation:
                 Status.NO_CONSENSUS, f'{count} of {len(self.order)} matches agree, fewer than '
                 f'max(min_inliers = {config.min_inliers}, {chance} expected by chance)')
         # 4. Is there a translation at all?
-        turned = self._rotation_only(state, inliers, delay)
+        turned = self._rotation_only(state, inliers, sigma, delay)
         if turned is not None:
             return turned
         # 5. Covariance at the optimum, then from the middle to the reference row.
@@ -272,31 +274,37 @@ class _Estimation:
         expected = len(self.order) * min(4.0 * self.config.threshold / size, 0.5)
         return int(expected + 5.0 * np.sqrt(expected)) + 6
 
-    def _rotation_only(self, state: State, inliers: NDArray[np.bool_],
+    def _rotation_only(self, state: State, inliers: NDArray[np.bool_], sigma: float,
                        delay: float) -> RelativePose | None:
+        """The result without a translation, where none can be seen; None where one can.
+
+        A rotation alone may absorb nearly all of the motion in front of a far plane, so it must
+        explain the matches to within their noise, not to within some pixels.
+        """
         problem, config = self.problem, self.config
+        parallax = float(np.median(transfer_errors(
+            problem.observations, np.ascontiguousarray(state.R), problem.focal)[inliers]))
         R, information = fit_rotation(
             problem.observations, inliers, np.ascontiguousarray(state.R), self.priors,
-            problem.focal, config.pixel_sigma)
-        left = float(np.median(transfer_errors(problem.observations, R, problem.focal)[inliers]))
-        if left > max(config.min_parallax, 2.5 * config.pixel_sigma):
+            problem.focal, sigma)
+        left = transfer_errors(problem.observations, R, problem.focal)[inliers]
+        turned_only = float(np.median(left)) < ROTATION_ONLY_SIGMAS * sigma
+        if not turned_only and parallax >= config.min_parallax:
             return None
+        reason = (f'a rotation alone leaves {np.median(left):.2f} px in the median, the noise of '
+                  'the matches: no translation can be seen') if turned_only else (
+                  f'median parallax of {parallax:.2f} px is below min_parallax = '
+                  f'{config.min_parallax:g} px')
         # Turned back to the reference row; the translation takes no part.
-        turn1, turn2 = self._turns(state, -delay)
+        turn1, turn2 = self._turns(state._replace(R=R, dw1=np.zeros(3), dw2=np.zeros(3)), -delay)
         covariance = np.full((6, 6), np.nan)
         covariance[3:, 3:] = turn1.T @ np.linalg.inv(information) @ turn1
-        noise = 2.5 * config.pixel_sigma
-        status = Status.PURE_ROTATION if left < noise else Status.LOW_PARALLAX
         return RelativePose(
-            status=status,
-            reason=f'median parallax after the best rotation is {left:.2f} px: no translation can '
-                   'be seen',
+            status=Status.PURE_ROTATION if turned_only else Status.LOW_PARALLAX, reason=reason,
             R=turn1.T @ R @ turn2, covariance=covariance, inliers=inliers,
             angular_velocity1=problem.motion1.angular_velocity,
             angular_velocity2=problem.motion2.angular_velocity, model='angular',
-            iterations=self.iterations,
-            residual_rms=float(np.sqrt(np.mean(
-                transfer_errors(problem.observations, R, problem.focal)[inliers]**2))))
+            iterations=self.iterations, residual_rms=float(np.sqrt(np.mean(left**2))))
 
     def _with_covariance(self, state: State, inliers: NDArray[np.bool_], velocity_sigma: float,
                          sigma: float) -> PairState:
