@@ -149,8 +149,8 @@ class Bag:
                                      f'{connection.msgtype}, which ROS 2 does not have: leave it '
                                      'out')
                 with self._decoding(connection):
-                    data = typestore.ros1_to_cdr(data, connection.msgtype)
-            yield RawMessage(connection.topic, connection.msgtype, bag_time_ns, bytes(data))
+                    data = bytes(typestore.ros1_to_cdr(data, connection.msgtype))
+            yield RawMessage(connection.topic, connection.msgtype, bag_time_ns, data)
 
     def _raw(self, topics: Sequence[Topic]) -> Iterator[tuple[Connection, int, bytes]]:
         chosen = {(topic.name, topic.msgtype) for topic in topics}

@@ -44,7 +44,7 @@ PARAMETERS = (
     Figure('time_offset', -0.0024,
            'Estimated with readout_time; about minus half the exposure of 5.2 ms.'),
     Figure('quat_cam_imu_xyzw', (0.71311442, -0.70096593, -0.00143244, 0.01060837),
-           'Rotation vector (2.22531, -2.18740, -0.00447) rad, refined with readout_time; 1.3 deg '
+           'Rotation vector (2.22531, -2.18740, -0.00447) rad, refined with readout_time; 1.6 deg '
            'from the axis map cam_x = -imu_y, cam_y = -imu_x, cam_z = -imu_z of the repository.'),
     Figure('gyro_bias', (0.0, 0.0, 0.0),
            'Not known: the phone is never at rest, and its mean rate is that of the car.'),
