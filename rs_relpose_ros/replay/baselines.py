@@ -6,7 +6,7 @@ OpenCV has ``X_2 = R' X_1 + t'``, here it is ``X_1 = R X_2 + t``: so ``R = R'^T`
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -14,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.camera import RollingShutterCamera
-from rs_relpose_ros.pipeline.pair import PairResult
-from rs_relpose_ros.replay.truth import median_and_p90, TrueTrajectory
+from rs_relpose_ros.pipeline.calibration import Calibration
+from rs_relpose_ros.replay.comparison import Score, score
+from rs_relpose_ros.replay.run import ReplayedPair
+from rs_relpose_ros.replay.truth import TrueTrajectory
 
 Array = NDArray[np.float64]
 
@@ -33,25 +35,6 @@ class GlobalPose:
     R: Array
     t: Array
     inliers: NDArray[np.bool_]
-
-
-@dataclass(frozen=True, slots=True)
-class Score:
-    """Errors of a method over pairs, in degrees.
-
-    Attributes
-    ----------
-    name : str
-    pairs, answered : int
-    rotation, translation : (float, float)
-        Median and 90th percentile over the answered pairs; NaN without any.
-    """
-
-    name: str
-    pairs: int
-    answered: int
-    rotation: tuple[float, float]
-    translation: tuple[float, float]
 
 
 def opencv_five_point(points1: Array, points2: Array, camera: RollingShutterCamera, method: str,
@@ -99,10 +82,9 @@ def opencv_five_point(points1: Array, points2: Array, camera: RollingShutterCame
     return GlobalPose(np.asarray(R.T), np.asarray(-R.T @ t).ravel(), inliers)
 
 
-def best_opencv_score(method: str, pairs: Sequence[tuple[PairResult, int, int]],
-                      camera: RollingShutterCamera, to_sensor: Callable[[Array], Array],
-                      truth: TrueTrajectory) -> tuple[Score, float]:
-    """Score of a method at that of `THRESHOLDS` which suits it best, and this threshold [px].
+def best_opencv_score(method: str, pairs: Sequence[ReplayedPair], calibration: Calibration,
+                      truth: TrueTrajectory) -> Score:
+    """Score of a method at that of `THRESHOLDS` which suits it best.
 
     Best in the median rotation error against the truth: a choice that no user could make, in the
     baseline's favour.
@@ -110,24 +92,24 @@ def best_opencv_score(method: str, pairs: Sequence[tuple[PairResult, int, int]],
     Parameters
     ----------
     method : {'RANSAC', 'USAC_MAGSAC'}
-    pairs : sequence of (PairResult, int, int)
-        With the instants of their two stamped rows on the IMU clock.
-    camera : RollingShutterCamera
-    to_sensor : callable
-        Sensor pixels of pixels of the published image.
+    pairs : sequence of ReplayedPair
+        Those that the pipeline answered: the same matches, and none of a camera that stands.
+    calibration : Calibration
     truth : TrueTrajectory
     """
-    scored = []
+    camera = RollingShutterCamera(
+        width=calibration.width, height=calibration.height, fx=calibration.fx, fy=calibration.fy,
+        cx=calibration.cx, cy=calibration.cy, distortion_model=calibration.distortion_model,
+        distortion=calibration.distortion, readout_time=0.0)
+    scores = []
     for threshold in THRESHOLDS:
         errors = []
-        for result, ns1, ns2 in pairs:
-            pose = opencv_five_point(to_sensor(result.matches.points1),
-                                     to_sensor(result.matches.points2), camera, method, threshold)
-            if pose is not None:
-                errors.append(truth.errors(pose.R, pose.t, ns1, ns2))
-        known = [e for e in errors if e is not None]
-        score = Score(f'OpenCV 5-point, {method}', len(pairs), len(errors),
-                      median_and_p90([e.rotation_error for e in known]),
-                      median_and_p90([e.translation_error for e in known]))
-        scored.append((score, threshold))
-    return min(scored, key=lambda item: np.nan_to_num(item[0].rotation[0], nan=np.inf))
+        for pair in pairs:
+            matches = pair.result.matches
+            pose = opencv_five_point(
+                calibration.to_sensor(matches.points1), calibration.to_sensor(matches.points2),
+                camera, method, threshold)
+            errors.append(None if pose is None else truth.errors(
+                pose.R, pose.t, pair.reference_ns1, pair.reference_ns2))
+        scores.append(score(f'OpenCV 5-point, {method}, {threshold:g} px', len(pairs), errors))
+    return min(scores, key=lambda s: np.nan_to_num(s.rotation[0], nan=np.inf))

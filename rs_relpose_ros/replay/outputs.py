@@ -12,6 +12,7 @@ from rs_relpose_ros.bags.reader import Bag, SensorTopics
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.messages.outgoing import pair_messages
+from rs_relpose_ros.pipeline.calibration import Calibration
 from rs_relpose_ros.pipeline.pair import PairResult
 from rs_relpose_ros.pipeline.parameters import Parameters
 from rs_relpose_ros.replay.record import pair_record, PairRecord
@@ -46,6 +47,8 @@ class ReplayOutcome:
     ----------
     records : list of PairRecord
     counts : ReplayCounts
+    calibration : Calibration or None
+        In force at the end.
     figures : dict
         As in summary.json, without provenance.
     files : list of Path
@@ -54,6 +57,7 @@ class ReplayOutcome:
 
     records: list[PairRecord]
     counts: ReplayCounts
+    calibration: Calibration | None
     figures: dict[str, Any]
     files: list[Path]
 
@@ -61,7 +65,7 @@ class ReplayOutcome:
 def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parameters, *,
                 stamps: frozenset[int] | None = None, pictures: bool = True,
                 with_bag: bool = False, on_image: Callable[[], object] = lambda: None,
-                on_pair: Callable[[PairResult], object] = lambda result: None) -> ReplayOutcome:
+                on_pair: Callable[[ReplayedPair], object] = lambda pair: None) -> ReplayOutcome:
     """Run `bag` through the pipeline and write tables, pictures and a bag into `folder`.
 
     Files of an earlier run in `folder` are replaced.
@@ -80,7 +84,7 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
     on_image : callable
         Called after each image.
     on_pair : callable
-        Called with each pair; it carries images where `pictures` are drawn.
+        Called with each pair; its result carries images where `pictures` are drawn.
 
     Raises
     ------
@@ -108,7 +112,7 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
                 errors.write(error_cells(record))
             if out_bag is not None and pair.result.pose:
                 _write_messages(out_bag, pair, parameters.pair.reference_frame)
-            on_pair(pair.result)
+            on_pair(pair)
             if pictures and _better_shown(pair.result, shown):
                 shown = pair.result
     if with_bag:
@@ -116,7 +120,7 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
     if pictures and records and shown is not None:
         files += _draw(folder, records, shown, truth)
     counts = run.counts()
-    return ReplayOutcome(records, counts, summarize(records, counts), files)
+    return ReplayOutcome(records, counts, run.calibration, summarize(records, counts), files)
 
 
 def _prepare(folder: Path, with_bag: bool) -> None:

@@ -2,8 +2,8 @@
 
     python -m rs_relpose_ros.ros.recorder live.csv
 
-Says "ready" on standard output once the node's publishers are matched. Ends on SIGINT or SIGTERM,
-or when nothing has come for ``--idle`` seconds since the last message.
+Says "ready" on standard output once the node's publishers are matched. Writes the table and ends
+on SIGINT or SIGTERM.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 import sys
-import time
 from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
@@ -44,7 +43,6 @@ class Recorder(Node):
 
     def __init__(self, target: str) -> None:
         super().__init__('relpose_recorder')
-        self.last_message = 0.0
         self._received: dict[str, dict[int, Any]] = {}
         self._topics = {}
         for name, msgtype in (('relative_pose', PoseWithCovarianceStamped),
@@ -75,7 +73,6 @@ class Recorder(Node):
     def _receiver(self, name: str) -> Any:
         def receive(msg: Any) -> None:
             self._received[name][stamp_ns(msg.header)] = msg
-            self.last_message = time.monotonic()
         return receive
 
     def _cells(self, stamp: int, msg: Any) -> list[str]:
@@ -99,8 +96,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prog='recorder', description='Record the relative poses of a running relpose_node.')
     parser.add_argument('table', type=Path, help='CSV file to write')
     parser.add_argument('--node', default='/relpose_node', help='name of the node')
-    parser.add_argument('--idle', type=float, default=0.0, metavar='SECONDS',
-                        help='end when nothing has come for so long; 0 waits for a signal')
     options = parser.parse_args(remove_ros_args(given)[1:])
     rclpy.init(args=list(given))
     recorder = Recorder(options.node)
@@ -112,9 +107,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 ready = True
                 sys.stdout.write('ready\n')
                 sys.stdout.flush()
-            if (options.idle and recorder.last_message
-                    and time.monotonic() - recorder.last_message > options.idle):
-                break
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:

@@ -1,0 +1,243 @@
+"""The demo: the real node, live over Fast DDS, against the truth of the bundled bag.
+
+    make demo
+
+Starts relpose_node, a recorder and a player as processes of their own, plays bags/hand_held in
+real time, replays the same bag offline with several methods, and prints a table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.errors import RsRelposeError
+from rs_relpose_ros.replay.baselines import best_opencv_score, METHODS
+from rs_relpose_ros.replay.comparison import (
+    differing_poses,
+    PAPER_METHODS,
+    replay_records,
+    Score,
+    score_of_records,
+    score_of_table,
+    score_table,
+)
+from rs_relpose_ros.replay.outputs import POSES_FILE, replay_into, ReplayOutcome
+from rs_relpose_ros.replay.parameter_file import read_parameters
+from rs_relpose_ros.replay.record import PairRecord
+from rs_relpose_ros.replay.run import read_truth, ReplayedPair
+from rs_relpose_ros.replay.stamps import read_stamps
+from rs_relpose_ros.result import Status
+
+ROOT = Path(__file__).resolve().parent.parent
+BAG = ROOT / 'bags' / 'hand_held'
+PARAMETERS = ROOT / 'bags' / 'hand_held.yaml'
+OUT = ROOT / 'demo_out'
+
+STARTED = time.monotonic()
+# The camera stands if it moved less than this between two keyframes [m].
+STILL_BASELINE = 0.03
+# Compiling all kernels takes a minute on a slow machine.
+START_TIMEOUT = 150.0
+# The node is done when it has taken no frame for so long.
+QUIET = 1.0
+
+
+class DemoError(Exception):
+    """The demo could not be run; the text says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Live:
+    """Files of the live run."""
+
+    table: Path
+    stamps: Path
+
+
+class Process:
+    """A Python process of the project with its log file."""
+
+    def __init__(self, name: str, module: str, *arguments: str) -> None:
+        self.name, self.log = name, OUT / f'{name}.log'
+        # Nothing leaves this machine, and nobody else's nodes take part: an id of this process,
+        # below 102, as the DDS ports of higher ones run into those of other programs.
+        environment = {**os.environ, 'PYTHONUNBUFFERED': '1',
+                       'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+                       'ROS_DOMAIN_ID': str(1 + os.getpid() % 100),
+                       'AMENT_PREFIX_PATH': os.environ.get('AMENT_PREFIX_PATH', sys.prefix)}
+        with self.log.open('wb') as log:
+            self._process = subprocess.Popen(
+                [sys.executable, '-m', module, *arguments], cwd=ROOT, env=environment, stdout=log,
+                stderr=subprocess.STDOUT)
+
+    def __enter__(self) -> Process:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process.poll() is None:
+            self._process.kill()
+            self._process.wait()
+
+    @property
+    def text(self) -> str:
+        """What it has said so far."""
+        return self.log.read_text(encoding='utf-8', errors='replace')
+
+    def check(self) -> None:
+        """Raise if it has ended with an error."""
+        if self._process.poll() not in (None, 0):
+            raise self._failure(f'ended with code {self._process.returncode}')
+
+    def wait(self, timeout: float) -> None:
+        """Wait for its end."""
+        try:
+            self._process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            raise self._failure(f'did not end within {timeout:g} s') from None
+        self.check()
+
+    def stop(self) -> None:
+        """Ask it to end, as Ctrl-C does."""
+        self._process.send_signal(signal.SIGINT)
+        self.wait(15.0)
+
+    def _failure(self, what: str) -> DemoError:
+        tail = '\n'.join(self.text.splitlines()[-15:])
+        return DemoError(f'{self.name} {what}; the end of {self.log}:\n{tail}')
+
+
+def run_live() -> Live:
+    """Node, recorder and player as three processes; real time."""
+    live = Live(OUT / 'live.csv', OUT / 'live_stamps.txt')
+    with ExitStack() as stack:
+        node = stack.enter_context(Process(
+            'relpose_node', 'rs_relpose_ros.ros.node', '--ros-args', '--params-file',
+            str(PARAMETERS), '-p', f'stamps_file:={live.stamps}', '-r',
+            'image:=/camera/image_raw', '-r', 'camera_info:=/camera/camera_info', '-r',
+            'imu:=/imu/data_raw'))
+        recorder = stack.enter_context(Process(
+            'recorder', 'rs_relpose_ros.ros.recorder', str(live.table)))
+        wait_for(lambda: 'ready' in recorder.text, 'the recorder found no node', node, recorder)
+        # The player waits until the node subscribes, which it does once its kernels are compiled.
+        player = stack.enter_context(Process(
+            'player', 'rs_relpose_ros.ros.player', str(BAG), '--wait-for-subscribers',
+            str(START_TIMEOUT)))
+        player.wait(START_TIMEOUT + 60.0)
+        wait_until_quiet(live.stamps)
+        recorder.stop()
+        node.stop()
+    return live
+
+
+def wait_for(condition: Callable[[], bool], complaint: str, *processes: Process) -> None:
+    """Wait until `condition()` holds."""
+    deadline = time.monotonic() + START_TIMEOUT
+    while not condition():
+        for process in processes:
+            process.check()
+        if time.monotonic() > deadline:
+            raise DemoError(f'{complaint} within {START_TIMEOUT:g} s')
+        time.sleep(0.05)
+
+
+def wait_until_quiet(path: Path) -> None:
+    """Wait until a file has not grown for some time."""
+    size, since = -1, time.monotonic()
+    while time.monotonic() - since < QUIET:
+        now = path.stat().st_size
+        if now != size:
+            size, since = now, time.monotonic()
+        time.sleep(0.05)
+
+
+def compare(live: Live) -> list[str]:
+    """Replay the bag with all methods; the lines to print."""
+    parameters = read_parameters(PARAMETERS)
+    with open_bag(BAG) as bag:
+        topics = bag.find_topics()
+        truth = read_truth(bag, topics)
+        if truth is None:
+            raise DemoError(f'{BAG} has no ground truth')
+        say('replaying it offline: the pipeline of the node ...')
+        pairs: list[ReplayedPair] = []
+        outcome = replay_into(OUT, bag, topics, parameters, on_pair=pairs.append)
+        # Where the live node dropped frames, its pairs are others: compare on the same frames.
+        same_frames = replay_into(OUT / 'frames_of_the_live_run', bag, topics, parameters,
+                                  stamps=read_stamps(live.stamps), pictures=False)
+        scores = [score_of_table('relpose_node, live', live.table, same_frames.records, truth),
+                  score_of_records('the same, replayed', outcome.records)]
+        for name, settings in PAPER_METHODS.items():
+            say(f'replaying it offline: {name} ...')
+            records = replay_records(bag, topics, parameters.updated(settings), truth)
+            scores.append(score_of_records(name, records))
+    say("OpenCV's 5-point on the same matches ...")
+    answered = [pair for pair in pairs if pair.result.pose]
+    assert outcome.calibration is not None
+    scores += [best_opencv_score(method, answered, outcome.calibration, truth)
+               for method in METHODS]
+    return [*score_table(scores), '', *remarks(scores, outcome, live, same_frames)]
+
+
+def remarks(scores: list[Score], outcome: ReplayOutcome, live: Live,
+            same_frames: ReplayOutcome) -> list[str]:
+    """What the table does not say."""
+    without = [record for record in same_frames.records if record.status is not Status.OK]
+    still = sum(map(_is_still, without))
+    statuses = ', '.join(sorted({record.status.value for record in without}))
+    lines = [f'no pose: {len(without)} pairs ({statuses}); in {still} of them the camera stands '
+             'or only turns']
+    differing, compared = differing_poses(live.table, same_frames.files[0])
+    processed = len(read_stamps(live.stamps))
+    lines.append(f'live: {processed} of {outcome.counts.images} frames processed; {compared} '
+                 'poses, ' + ('bit-equal to the replay of the same frames' if not differing else
+                              f'{differing} of them not equal to the replay of the same frames'))
+    opencv = [s for s in scores if s.name.startswith('OpenCV')]
+    best = min(opencv, key=lambda s: s.rotation[0])
+    if scores[0].rotation[0] > 0.0 and best.answered:
+        lines.append(f'rotation: {best.rotation[0] / scores[0].rotation[0]:.0f} times better than '
+                     f'the better OpenCV row, which ignores the rolling shutter and the IMU')
+    return lines
+
+
+def _is_still(record: PairRecord) -> bool:
+    """Whether the camera hardly moved from one keyframe to the other."""
+    return record.errors is not None and record.errors.baseline < STILL_BASELINE
+
+
+def say(text: str) -> None:
+    """Progress, with the seconds since the start."""
+    print(f'[{time.monotonic() - STARTED:5.1f} s] {text}', flush=True)
+
+
+def main() -> int:
+    """Run the demo; its exit code."""
+    OUT.mkdir(exist_ok=True)
+    try:
+        say(f'playing {BAG.relative_to(ROOT)} to relpose_node over Fast DDS, in real time (the '
+            'first time, compiling takes up to a minute) ...')
+        lines = compare(run_live())
+    except (DemoError, RsRelposeError) as error:
+        print(f'demo: {error}', file=sys.stderr)
+        return 1
+    print()
+    print('errors against the truth of the bag (simulated, hand-held, read-out 30 ms):')
+    print('\n'.join(lines))
+    print()
+    print('pictures and tables:')
+    for name in ('matches.png', 'errors.png', 'residuals.png', 'rotation.png', POSES_FILE,
+                 'live.csv'):
+        print(f'  {(OUT / name).relative_to(ROOT)}')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
