@@ -127,7 +127,7 @@ def test_history_is_bounded():
     buffer = filled(samples(wobble, 3000), imu_buffer_seconds=2.0)
     newest = START + 2999 * PERIOD
     assert buffer.coverage(newest - 1_900_000_000, newest) is Coverage.AVAILABLE
-    assert buffer.coverage(newest - 2_100_000_000, newest) is Coverage.NEVER
+    assert buffer.coverage(newest - 2_300_000_000, newest) is Coverage.NEVER
 
 
 def test_covariance_equals_the_spread_of_noisy_integrations():
@@ -169,3 +169,63 @@ def test_frame_imu_of_a_global_shutter():
     answer = frame_imu(buffer, (START + 7, START + 7), START + 7, np.eye(3))
     np.testing.assert_allclose(answer.motion.angular_velocity, [0.1, 0.2, 0.3], atol=1e-12)
     assert answer.since_previous is None
+
+
+def test_integration_agrees_with_a_dense_one_by_scipy():
+    """Rate linear between samples, integrated in 2000 steps each."""
+    rng = np.random.default_rng(3)
+    stamps = START + np.cumsum(rng.integers(2_000_000, 8_000_000, 12))
+    rates = 3.0 * rng.normal(size=(12, 3)).cumsum(axis=0) / 3.0
+    rotation, _ = integrate_rotation(stamps, rates, ImuConfig())
+    expected = Rotation.identity()
+    for k in range(11):
+        dt = (stamps[k + 1] - stamps[k]) * 1e-9
+        fractions = (np.arange(2000) + 0.5) / 2000
+        steps = (rates[k] + fractions[:, None] * (rates[k + 1] - rates[k])) * dt / 2000
+        for step in Rotation.from_rotvec(steps):
+            expected = expected * step
+    error = (Rotation.from_matrix(rotation).inv() * expected).magnitude()
+    turned = sum(np.linalg.norm(rates[k]) * (stamps[k + 1] - stamps[k]) for k in range(11)) * 1e-9
+    assert error < 1e-3 * turned
+
+
+def test_borders_are_interpolated_between_the_neighbouring_samples():
+    buffer = filled([ImuSample(START + k * PERIOD, (float(k), -2.0 * k, 0.5), UP)
+                     for k in range(10)])
+    stamps, rates = buffer.angular_velocity(START + 1_250_000, START + 3 * PERIOD + 4_000_000)
+    assert stamps.tolist() == [START + 1_250_000, START + PERIOD, START + 2 * PERIOD,
+                               START + 3 * PERIOD, START + 3 * PERIOD + 4_000_000]
+    np.testing.assert_allclose(rates[:, 0], [0.25, 1.0, 2.0, 3.0, 3.8], atol=1e-12)
+    np.testing.assert_allclose(rates[:, 1], -2.0 * rates[:, 0], atol=1e-12)
+    # A border on a sample is that sample, once.
+    stamps, _ = buffer.angular_velocity(START + PERIOD, START + 2 * PERIOD)
+    assert stamps.tolist() == [START + PERIOD, START + 2 * PERIOD]
+
+
+def test_an_interval_that_ends_before_it_starts_is_refused():
+    buffer = filled(samples(wobble))
+    with pytest.raises(InputError, match='must not end'):
+        buffer.angular_velocity(START + 2 * PERIOD, START + PERIOD)
+
+
+@pytest.mark.parametrize('stamps, rates, message', [
+    ([0, 5, 5], np.zeros((3, 3)), 'increasing'), ([0, 5], np.zeros((3, 3)), 'shape'),
+    ([], np.zeros((0, 3)), 'shape'),
+])
+def test_integration_refuses_what_is_no_series(stamps, rates, message):
+    with pytest.raises(InputError, match=message):
+        integrate_rotation(np.array(stamps, dtype=np.int64), rates, ImuConfig())
+
+
+def test_a_single_instant_is_no_rotation():
+    rotation, covariance = integrate_rotation(np.array([START]), np.ones((1, 3)), ImuConfig())
+    np.testing.assert_array_equal(rotation, np.eye(3))
+    np.testing.assert_array_equal(covariance, np.zeros((3, 3)))
+
+
+def test_clear_forgets_everything():
+    buffer = filled(samples(wobble, 400))
+    buffer.clear()
+    assert buffer.newest_ns is None and buffer.gravity(START + PERIOD) is None
+    assert buffer.coverage(START, START + PERIOD) is Coverage.NOT_YET
+    assert buffer.add(ImuSample(0, (0.0, 0.0, 0.0), UP)) is AddResult.ADDED

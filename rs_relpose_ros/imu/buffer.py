@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import Enum
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,6 +105,7 @@ class ImuBuffer:
         """Forget everything."""
         self._gyro, self._force = _Series(), _Series()
         self._filter = GravityFilter(self._config)
+        self._filtered_ns = self._pruned_ns = int(np.iinfo(np.int64).min)
 
     @property
     def newest_ns(self) -> int | None:
@@ -121,7 +123,7 @@ class ImuBuffer:
         """
         for name, value in (('angular_velocity', sample.angular_velocity),
                             ('linear_acceleration', sample.linear_acceleration)):
-            if value is not None and not np.isfinite(value).all():
+            if value is not None and not all(map(math.isfinite, value)):
                 raise InputError(f'IMU sample at {sample.stamp_ns} ns: {name} must be finite, '
                                  f'got {list(value)}')
         newest = max((int(s.stamps[-1]) for s in (self._gyro, self._force) if len(s.stamps)),
@@ -135,14 +137,16 @@ class ImuBuffer:
                 added |= series.insert(sample.stamp_ns, value)
         if not added:
             return AddResult.DUPLICATE
-        if sample.stamp_ns > newest:
-            # The filter takes in what is about to be forgotten.
-            self._run_filter(newest - self._keep_ns)
-            self.prune(newest - self._keep_ns)
+        # A tenth late, so that not each sample costs a search.
+        if newest - self._pruned_ns > self._keep_ns * 11 // 10:
+            self._pruned_ns = newest - self._keep_ns
+            self.prune(self._pruned_ns)
         return AddResult.LATE if sample.stamp_ns < newest else AddResult.ADDED
 
     def prune(self, before_ns: int) -> None:
         """Forget what is older than `before_ns`."""
+        # The filter takes in what is about to be forgotten.
+        self._run_filter(before_ns)
         self._gyro.prune(before_ns)
         self._force.prune(before_ns)
 
@@ -195,7 +199,12 @@ class ImuBuffer:
         return integrate_rotation(*self.angular_velocity(start_ns, end_ns), self._config)
 
     def gravity(self, at_ns: int) -> GravityEstimate | None:
-        """Direction of gravity at an instant that the gyro covers, from samples up to it."""
+        """Direction of gravity at an instant that the gyro covers, from samples up to it.
+
+        None where there is no accelerometer, or where the gyro does not cover the instant. Ask in
+        the order of time: an instant before one that was asked for gets that one's estimate,
+        turned back by the gyro.
+        """
         if self._config.gravity_filter == 'mean':
             stamps = self._force.stamps
             window = slice(int(np.searchsorted(stamps, at_ns - MEAN_WINDOW_NS)),
@@ -203,12 +212,14 @@ class ImuBuffer:
             return mean_gravity(self._force.values[window])
         self._run_filter(at_ns)
         estimate, stamp_ns = self._filter.estimate(), self._filter.stamp_ns
-        if estimate is None or stamp_ns is None or stamp_ns >= at_ns:
-            return estimate
-        if self.coverage(stamp_ns, at_ns) is not Coverage.AVAILABLE:
+        if estimate is None or stamp_ns is None:
             return None
-        turn, _ = self.rotation(stamp_ns, at_ns)
-        return GravityEstimate(turn.T @ estimate.direction, estimate.sigma)
+        start_ns, end_ns = sorted((stamp_ns, at_ns))
+        if self.coverage(start_ns, end_ns) is not Coverage.AVAILABLE:
+            return None
+        turn, _ = self.rotation(start_ns, end_ns)
+        return GravityEstimate((turn.T if stamp_ns < at_ns else turn) @ estimate.direction,
+                               estimate.sigma)
 
     # -- inside ------------------------------------------------------------------------------
 
@@ -222,18 +233,23 @@ class ImuBuffer:
         return np.asarray(values[before] + fraction * (values[after] - values[before]))
 
     def _run_filter(self, until_ns: int) -> None:
+        """Filter the samples up to an instant that were not filtered yet."""
+        if self._config.gravity_filter != 'complementary':
+            return
         stamps = self._gyro.stamps
-        done = self._filter.stamp_ns
-        first = 0 if done is None else int(np.searchsorted(stamps, done, side='right'))
+        first = int(np.searchsorted(stamps, self._filtered_ns, side='right'))
         last = int(np.searchsorted(stamps, until_ns, side='right'))
-        for k in range(first, last):
-            stamp_ns = int(stamps[k])
-            self._filter.add(stamp_ns, self._gyro.values[k] - self._bias, self._force_at(stamp_ns))
+        if first < last:
+            self._filter.run(stamps[first:last], self._gyro.values[first:last] - self._bias,
+                             self._forces_at(stamps[first:last]))
+            self._filtered_ns = int(stamps[last - 1])
 
-    def _force_at(self, stamp_ns: int) -> Array:
-        """Latest specific force not after `stamp_ns`; NaN where it is older than a gap."""
+    def _forces_at(self, stamps_ns: NDArray[np.int64]) -> Array:
+        """Latest specific forces (K, 3) not after these stamps; NaN where older than a gap."""
         stamps = self._force.stamps
-        k = int(np.searchsorted(stamps, stamp_ns, side='right')) - 1
-        if k < 0 or stamp_ns - stamps[k] > self._gap_ns:
-            return np.full(3, np.nan)
-        return self._force.values[k]
+        forces = np.full((len(stamps_ns), 3), np.nan)
+        k = np.searchsorted(stamps, stamps_ns, side='right') - 1
+        fresh = k >= 0
+        fresh[fresh] = stamps_ns[fresh] - stamps[k[fresh]] <= self._gap_ns
+        forces[fresh] = self._force.values[k[fresh]]
+        return forces

@@ -14,22 +14,34 @@ Array = NDArray[np.float64]
 
 
 @numba.njit(cache=True, nogil=True)
+def _product(a: Array, b: Array, out: Array) -> None:
+    # By hand: a call of BLAS costs more than nine sums of three products.
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
+
+
+@numba.njit(cache=True, nogil=True)
 def _integrate(seconds: Array, rates: Array) -> tuple[Array, Array, Array]:
     """Rotation ``R_start^T R_end``, its derivative by a constant rate error, and noise growth.
 
     ``R <- R Exp(w dt)`` with the midpoint rate. An error dw of a step's rate turns the result by
     ``R J_l(w dt) dw dt`` on the left (in the start frame).
     """
-    rotation = np.eye(3)
-    by_bias = np.zeros((3, 3))
-    noise = np.zeros((3, 3))
+    rotation, by_bias, noise = np.eye(3), np.zeros((3, 3)), np.zeros((3, 3))
+    turn, left, turned = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     for k in range(seconds.shape[0] - 1):
         dt = seconds[k + 1] - seconds[k]
-        turn = 0.5 * (rates[k] + rates[k + 1]) * dt
-        left = rotation @ left_jacobian_so3(turn)
-        by_bias += left * dt
-        noise += left @ left.T * dt
-        rotation = rotation @ exp_so3(turn)
+        for i in range(3):
+            turn[i] = 0.5 * (rates[k, i] + rates[k + 1, i]) * dt
+        _product(rotation, left_jacobian_so3(turn), left)
+        for i in range(3):
+            for j in range(3):
+                by_bias[i, j] += left[i, j] * dt
+                noise[i, j] += (left[i, 0] * left[j, 0] + left[i, 1] * left[j, 1]
+                                + left[i, 2] * left[j, 2]) * dt
+        _product(rotation, exp_so3(turn), turned)
+        rotation, turned = turned, rotation
     return rotation, by_bias, noise
 
 
