@@ -22,7 +22,7 @@ _COARSE_TOLERANCE = 0.1
 _FOLLOW_TOLERANCE = 0.03
 _FINE_TOLERANCE = 0.01
 # Corrections of the guess [px] that one level makes up for.
-_NEAR = 1.0
+_NEAR = 2.0
 # Correlation with the previous frame; the stricter one is with the reference.
 _MIN_STEP_CORRELATION = 0.6
 # The comparison with the reference corrects drift; what it moves further was lost before.
