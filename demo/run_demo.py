@@ -193,7 +193,7 @@ def remarks(scores: list[Score], outcome: ReplayOutcome, live: Live,
     without = [record for record in same_frames.records if record.status is not Status.OK]
     still = sum(map(_is_still, without))
     statuses = ', '.join(sorted({record.status.value for record in without}))
-    lines = [f'no pose: {len(without)} pairs ({statuses}); the camera stands or only turns in {still}']
+    lines = [f'no pose: {len(without)} pairs ({statuses}); in {still} the camera hardly moves']
     differing, compared = differing_poses(live.table, same_frames.files[0])
     processed = len(read_stamps(live.stamps))
     lines.append(f'live: {processed} of {outcome.counts.images} frames processed; {compared} '
