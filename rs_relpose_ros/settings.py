@@ -84,7 +84,8 @@ def check_settings(config: Any) -> None:
                 object.__setattr__(config, field.name, value)
             if kind is float and type(value) is int:
                 object.__setattr__(config, field.name, float(value))
-            elif kind in (bool, int, str, tuple) and type(value) is not kind:
+            elif (not isinstance(value, float) if kind is float
+                  else kind in (bool, int, str, tuple) and type(value) is not kind):
                 raise InputError(
                     f'{field.name} must be of type {kind.__name__}, got {value!r}')
             declared(field).check(field.name, value)
