@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 import signal
@@ -217,10 +216,10 @@ def test_a_signal_ends_a_node_that_compiles(module_ros_domain_id, tmp_path, monk
 
 
 @pytest.fixture
-def no_bag(tmp_path: Path) -> Iterator[Path]:
+def no_bag(tmp_path: Path) -> Path:
     path = tmp_path / 'no_bag.mcap'
     path.write_bytes(b'this is no bag')
-    yield path
+    return path
 
 
 @pytest.mark.parametrize(('arguments', 'sentence'), [

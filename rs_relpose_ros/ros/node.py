@@ -66,9 +66,11 @@ class RelposeNode(Node):
 
     def __init__(self) -> None:
         super().__init__('relpose_node')
-        self._info = CauseLog(self.get_logger().info)
-        self._warn = CauseLog(self.get_logger().warning)
-        self._error = CauseLog(self.get_logger().error)
+        # rclpy ties the severity to the line that logs: a line each.
+        logger = self.get_logger()
+        self._info = CauseLog(lambda text: logger.info(text))
+        self._warn = CauseLog(lambda text: logger.warning(text))
+        self._error = CauseLog(lambda text: logger.error(text))
         self._settings = NodeParameters(self, self._on_parameters)
         for sentence in unknown_overrides(self):
             self._warn(sentence)
@@ -116,8 +118,8 @@ class RelposeNode(Node):
             self._stamps = _opened(parameters.pair.stamps_file)
         self._sequencer = Sequencer(parameters)
         self._intake = MessageIntake(self._sequencer)
-        self._worker = Worker(parameters, self._sequencer, self._on_frame, self._on_refused,
-                              self._on_failure)
+        self._worker = Worker(parameters, self._sequencer, self._on_taken, self._on_result,
+                              self._on_refused, self._on_failure)
         self._worker.start()
         self._started_ns = self._now_ns()
         # Subscribed only when ready: what comes earlier would be dropped.
@@ -181,9 +183,11 @@ class RelposeNode(Node):
 
     # -- results out (called by the worker) --------------------------------------------------
 
-    def _on_frame(self, ready: ReadyFrame, result: PairResult | None) -> None:
+    def _on_taken(self, ready: ReadyFrame) -> None:
         if self._stamps is not None:
             self._stamps.write(f'{ready.frame.stamp_ns}\n')
+
+    def _on_result(self, ready: ReadyFrame, result: PairResult | None) -> None:
         if result is None:
             return
         if result.pose:
@@ -237,9 +241,9 @@ class RelposeNode(Node):
         if self._refused:
             return self._refused, tuple(self._settings.current.sensor.missing())
         assert self._worker is not None and self._intake is not None
+        if not self._worker.is_alive():
+            return 'not estimating: the worker ended, see the log', ()
         if not self._ready_ns:
-            if not self._worker.is_alive():
-                return 'not estimating: the worker ended, see the log', ()
             return 'starting: kernels are compiled or loaded', ()
         silent = {kind: self._silent(kind) for kind in ('images', 'camera_infos', 'imu')}
         topics = {'images': self._image_topic,

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 import threading
 
-from rs_relpose_ros.estimator.estimate import warm_up
 from rs_relpose_ros.pipeline.pair import PairResult
 from rs_relpose_ros.pipeline.parameters import Parameters
 from rs_relpose_ros.pipeline.pipeline import Pipeline
 from rs_relpose_ros.pipeline.sequencer import FrameRefused, ReadyFrame, Sequencer
+from rs_relpose_ros.pipeline.warm_up import warm_up_pipeline
 
 _TAKE_TIMEOUT = 0.1
 
@@ -21,8 +21,10 @@ class Worker(threading.Thread):
     ----------
     parameters : Parameters
     sequencer : Sequencer
-    on_frame : callable
-        Called with the frame and its pair or None, after the frame was processed.
+    on_taken : callable
+        Called with every frame before it is processed.
+    on_result : callable
+        Called with the frame and its pair or None, after it was processed.
     on_refused : callable
         Called with every frame that was refused.
     on_error : callable
@@ -30,15 +32,18 @@ class Worker(threading.Thread):
     """
 
     def __init__(self, parameters: Parameters, sequencer: Sequencer,
-                 on_frame: Callable[[ReadyFrame, PairResult | None], None],
+                 on_taken: Callable[[ReadyFrame], None],
+                 on_result: Callable[[ReadyFrame, PairResult | None], None],
                  on_refused: Callable[[FrameRefused], None],
                  on_error: Callable[[str, Exception], None]) -> None:
         # A thread that compiles cannot be stopped; a daemon does not hold up the exit.
         super().__init__(name='relpose_worker', daemon=True)
         self._sequencer = sequencer
-        self._on_frame = on_frame
+        self._on_taken = on_taken
+        self._on_result = on_result
         self._on_refused = on_refused
         self._on_error = on_error
+        self._parameters = parameters
         self._pipeline = Pipeline(parameters)
         self._changed_parameters: Parameters | None = None
         self._stopping = threading.Event()
@@ -63,28 +68,27 @@ class Worker(threading.Thread):
     def run(self) -> None:
         """Work until `stop`."""
         try:
-            warm_up()
+            warm_up_pipeline(self._parameters)
         except Exception as error:  # noqa: BLE001 - the node shows it; a silent thread is worse
             self._on_error('the kernels cannot be compiled', error)
             return
         self._warm.set()
         while not self._stopping.is_set():
-            taken = self._sequencer.take(_TAKE_TIMEOUT)
-            if isinstance(taken, FrameRefused):
-                self._on_refused(taken)
-            elif taken is not None and not self._stopping.is_set():
-                self._process(taken)
+            try:
+                self._step()
+            except Exception as error:  # noqa: BLE001 - told with its traceback by the node
+                self._pipeline.reset()
+                self._on_error('a frame failed and tracking starts anew', error)
 
-    def _process(self, ready: ReadyFrame) -> None:
-        try:
+    def _step(self) -> None:
+        taken = self._sequencer.take(_TAKE_TIMEOUT)
+        if isinstance(taken, FrameRefused):
+            self._on_refused(taken)
+        elif taken is not None and not self._stopping.is_set():
             if self._changed_parameters is not None:
                 self._pipeline.update(self._changed_parameters)
                 self._changed_parameters = None
-            if ready.restart:
+            if taken.restart:
                 self._pipeline.reset()
-            result = self._pipeline.process(ready.frame, ready.imu)
-        except Exception as error:  # noqa: BLE001 - told with its traceback by the node
-            self._pipeline.reset()
-            self._on_error('a frame failed and tracking starts anew', error)
-            result = None
-        self._on_frame(ready, result)
+            self._on_taken(taken)
+            self._on_result(taken, self._pipeline.process(taken.frame, taken.imu))

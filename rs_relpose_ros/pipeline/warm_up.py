@@ -1,0 +1,59 @@
+"""Compiles (or loads from the cache) every kernel that a run with given parameters needs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.imu.samples import ImuSample
+from rs_relpose_ros.pipeline.calibration import Calibration
+from rs_relpose_ros.pipeline.frame import Frame
+from rs_relpose_ros.pipeline.parameters import Parameters
+from rs_relpose_ros.pipeline.pipeline import Pipeline
+from rs_relpose_ros.pipeline.sequencer import ReadyFrame, Sequencer
+from rs_relpose_ros.timing import NANOSECONDS
+
+_WIDTH, _HEIGHT = 320, 240
+_CALIBRATION = Calibration(width=_WIDTH, height=_HEIGHT, fx=250.0, fy=250.0, cx=159.5, cy=119.5,
+                           image_width=_WIDTH, image_height=_HEIGHT)
+_FRAME_NS = NANOSECONDS // 30
+_IMU_NS = NANOSECONDS // 200
+
+
+def warm_up_pipeline(parameters: Parameters) -> None:
+    """Run the pipeline over a few made-up frames, once with all of the IMU, once with its gyro.
+
+    Parameters
+    ----------
+    parameters : Parameters
+        Detector, solver and filters are those that will be used; what would keep the made-up
+        frames from being processed is replaced.
+    """
+    parameters = parameters.updated({
+        'readout_time': 0.02, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0], 'time_offset': 0.0,
+        'stamp_exposure': 'middle', 'feature_rows': [0.0, 0.0], 'max_keyframe_frames': 1})
+    for force in ((0.0, -9.81, 0.0), None):
+        sequencer = Sequencer(parameters, offline=True)
+        pipeline = Pipeline(parameters)
+        images = list(_images())
+        for stamp_ns in range(NANOSECONDS, NANOSECONDS + (len(images) + 3) * _FRAME_NS, _IMU_NS):
+            sequencer.add_imu(ImuSample(stamp_ns, (0.01, 0.02, 0.03), force))
+        for k, image in enumerate(images):
+            sequencer.add_frame(Frame(NANOSECONDS + (k + 1) * _FRAME_NS, image, '', _CALIBRATION))
+            taken = sequencer.take()
+            assert isinstance(taken, ReadyFrame)
+            pipeline.process(taken.frame, taken.imu)
+
+
+def _images() -> Iterator[NDArray[np.uint8]]:
+    """A wall far away behind a near one, seen from a camera that moves, then stands."""
+    noise = np.random.default_rng(0).integers(0, 256, (2, _HEIGHT, _WIDTH), dtype=np.uint8)
+    far, near = (cv2.normalize(cv2.GaussianBlur(layer, (0, 0), 2.0), None, 0, 255, cv2.NORM_MINMAX)
+                 for layer in noise)
+    for shift in (0, 4, 8, 8):
+        image = np.roll(far, -shift, axis=1)
+        image[80:160] = np.roll(near, -3 * shift, axis=1)[80:160]
+        yield image

@@ -1,0 +1,339 @@
+"""Bad input to the running node: one clear message each, no traceback, no pose made up.
+
+One node takes one fault after the other, as it would in the field, and works again after them.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Iterator
+import copy
+from dataclasses import dataclass, field
+import itertools
+from pathlib import Path
+import re
+import signal
+from typing import Any
+
+import cv2
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
+import numpy as np
+import pytest
+from rcl_interfaces.msg import Parameter, ParameterDescriptor, ParameterType, ParameterValue
+from rcl_interfaces.srv import DescribeParameters, SetParameters
+import rclpy.serialization
+import ros_graph
+from rosbags.highlevel import AnyReader
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
+
+from rs_relpose_ros.estimator.estimate import warm_up
+
+# Whoever comes first compiles the kernels.
+pytestmark = pytest.mark.timeout(600)
+
+SECOND = 10**9
+TYPES = {'/imu/data_raw': Imu, '/camera/camera_info': CameraInfo,
+         '/camera/image_raw/compressed': CompressedImage}
+# Of the bag, and between one phase and the next on the camera's clock.
+PHASE_SECONDS = 2.6
+PAUSE_SECONDS = 1.0
+
+Edit = Callable[[Any, float], Any]
+
+
+@dataclass
+class Field:
+    """The node under test, and the drivers that feed it."""
+
+    graph: ros_graph.Graph
+    node: ros_graph.Process
+    publishers: dict[type, Any]
+    messages: list[tuple[int, Any]]
+    poses: list[PoseWithCovarianceStamped]
+    diagnostics: list[DiagnosticArray]
+    phase: Iterator[int] = field(default_factory=itertools.count)
+
+    def play(self, edit: Edit) -> tuple[list[str], int]:
+        """Play the bag's beginning at real time.
+
+        `edit` gets each message with its time [s] since the start and gives the one to publish or
+        None. Returns the warnings and errors that the node logged meanwhile, and the number of
+        poses.
+        """
+        written, poses = len(self.node.output), len(self.poses)
+        later_ns = round(next(self.phase) * (PHASE_SECONDS + PAUSE_SECONDS) * SECOND)
+        first_ns = self.messages[0][0]
+
+        def edited() -> Iterator[tuple[Any, int, Any]]:
+            for bag_time_ns, message in self.messages:
+                out = edit(copy.deepcopy(message), (bag_time_ns - first_ns) / SECOND)
+                if out is not None:
+                    stamp_ns = out.header.stamp.sec * SECOND + out.header.stamp.nanosec + later_ns
+                    out.header.stamp.sec, out.header.stamp.nanosec = divmod(stamp_ns, SECOND)
+                    yield self.publishers[type(out)], bag_time_ns, out
+
+        ros_graph.publish_in_time(edited())
+        # Two reports later everything has been processed and told.
+        count = len(self.diagnostics)
+        ros_graph.wait_until(lambda: len(self.diagnostics) >= count + 2, 'diagnostics')
+        output = self.node.output[written:]
+        assert 'Traceback' not in output
+        lines = [line for line in output.splitlines() if re.match(r'\[(WARN|ERROR|FATAL)\]', line)]
+        # A busy machine is no fault of the input.
+        print(output, ros_graph.diagnostic_values(self.diagnostics[-1]))
+        return [line for line in lines if '(overload)' not in line], len(self.poses) - poses
+
+    @property
+    def status(self) -> Any:
+        return self.diagnostics[-1].status[0]
+
+
+def read_messages(bag: Path) -> list[tuple[int, Any]]:
+    """Bag time [ns] and message of the bag's first seconds, images decoded."""
+    messages = []
+    with AnyReader([bag]) as reader:
+        connections = [c for c in reader.connections if c.topic in TYPES]
+        for connection, bag_time_ns, raw in reader.messages(connections):
+            if messages and bag_time_ns - messages[0][0] > PHASE_SECONDS * SECOND:
+                break
+            message = rclpy.serialization.deserialize_message(
+                bytes(raw), TYPES[connection.topic])
+            if isinstance(message, CompressedImage):
+                pixels = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_GRAYSCALE)
+                message = gray_image(message.header, pixels)
+            messages.append((bag_time_ns, message))
+    return messages
+
+
+def gray_image(header: Any, pixels: np.ndarray) -> Image:
+    data = array('B')
+    data.frombytes(pixels.tobytes())
+    return Image(header=header, height=pixels.shape[0], width=pixels.shape[1], encoding='mono8',
+                 step=pixels.shape[1], data=data)
+
+
+@pytest.fixture(scope='module')
+def field_(module_ros_domain_id: int, bundled_bag: Path) -> Iterator[Field]:
+    warm_up()
+    with ros_graph.Graph() as graph, ros_graph.node_process(
+            ros_graph.ROOT / 'bags' / 'hand_held.yaml', remap=ros_graph.BAG_TOPICS,
+            parameters={'image_transport': 'raw'}) as node:
+        poses = graph.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
+        diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
+        node.wait_for('ready')
+        publishers = {
+            Image: graph.publisher(Image, '/camera/image_raw'),
+            # Either kind of publisher will do.
+            CameraInfo: graph.publisher(CameraInfo, '/camera/camera_info', best_effort=True),
+            Imu: graph.publisher(Imu, '/imu/data_raw', best_effort=True)}
+        yield Field(graph, node, publishers, read_messages(bundled_bag), poses, diagnostics)
+        code, seconds = node.signal(signal.SIGINT)
+        assert code == 0, node.output
+        assert seconds <= 1.0
+
+
+def edit_only(kind: type, edit: Callable[[Any], None]) -> Edit:
+    """Change every message of one type in place."""
+    def edited(message: Any, _: float) -> Any:
+        if isinstance(message, kind):
+            edit(message)
+        return message
+    return edited
+
+
+def is_like(lines: list[str], sentence: str) -> bool:
+    return len(lines) == 1 and sentence in lines[0]
+
+
+def test_no_camera_info(field_):
+    # The first test: once there was one, it stays in force.
+    lines, poses = field_.play(lambda m, _: None if isinstance(m, CameraInfo) else m)
+    assert is_like(lines, 'no CameraInfo on /camera/camera_info'), lines
+    assert poses == 0
+    values = ros_graph.diagnostic_values(field_.diagnostics[-1])
+    assert '/camera/camera_info' in values['missing']
+    assert int(values['frames_refused_no_calibration']) > 50
+
+
+def test_uncalibrated(field_):
+    lines, poses = field_.play(edit_only(
+        CameraInfo, lambda m: setattr(m, 'k', np.zeros(9))))
+    assert is_like(lines, 'uncalibrated (k[0] of its CameraInfo is 0)'), lines
+    assert poses == 0
+    assert field_.status.level == b'\x02'
+    assert 'uncalibrated' in field_.status.message
+    assert ros_graph.diagnostic_values(field_.diagnostics[-1])['missing'] == 'calibration'
+
+
+def test_unknown_distortion_model(field_):
+    lines, poses = field_.play(edit_only(
+        CameraInfo, lambda m: setattr(m, 'distortion_model', 'double_sphere')))
+    assert is_like(lines, "distortion_model must be one of ('plumb_bob', 'rational_polynomial', "
+                          "'equidistant'), got 'double_sphere'"), lines
+    assert poses == 0
+
+
+def test_no_imu(field_):
+    lines, poses = field_.play(lambda m, _: None if isinstance(m, Imu) else m)
+    assert is_like(lines, 'no IMU message on /imu/data_raw'), lines
+    assert poses == 0
+    assert 'no I' in field_.status.message
+
+
+def test_unknown_encoding(field_):
+    lines, poses = field_.play(edit_only(Image, lambda m: setattr(m, 'encoding', 'mono12')))
+    assert is_like(lines, "image encoding 'mono12' is not known; publish one of mono8"), lines
+    assert poses == 0
+
+
+def test_image_size_changes_in_mid_stream(field_):
+    def edit(message: Any, seconds: float) -> Any:
+        if isinstance(message, Image) and seconds > 1.5:
+            pixels = np.frombuffer(message.data, np.uint8).reshape(480, 640)[::2, ::2]
+            return gray_image(message.header, pixels)
+        return message
+
+    lines, _ = field_.play(edit)
+    assert is_like(lines, 'image is 320x240, but its CameraInfo tells 640x480'), lines
+    first = field_.poses[-1].header.stamp if field_.poses else None
+    # Back at the right size it goes on.
+    lines, poses = field_.play(lambda m, _: m)
+    assert lines == []
+    assert poses > 0
+    assert field_.poses[-1].header.stamp != first
+
+
+def test_image_and_camera_info_change_together(field_):
+    def edit(message: Any, seconds: float) -> Any:
+        if seconds > 1.0 and isinstance(message, Image):
+            pixels = np.frombuffer(message.data, np.uint8).reshape(480, 640)[100:, 40:]
+            return gray_image(message.header, np.ascontiguousarray(pixels))
+        if seconds > 1.0 and isinstance(message, CameraInfo):
+            roi = message.roi
+            roi.x_offset, roi.y_offset, roi.width, roi.height = 40, 100, 600, 380
+        return message
+
+    lines, poses = field_.play(edit)
+    # One image may cross the CameraInfo that belongs to it, and is refused for its size.
+    assert len(lines) <= 1, lines
+    assert poses > 0
+
+
+def test_nan_in_imu(field_):
+    count = itertools.count()
+
+    def edit(message: Imu) -> None:
+        if next(count) % 20 == 0:
+            message.angular_velocity.y = float('nan')
+
+    lines, poses = field_.play(edit_only(Imu, edit))
+    assert is_like(lines, 'angular_velocity of an IMU message must be finite'), lines
+    # A sample that is missing now and then is bridged.
+    assert poses > 0
+    assert int(ros_graph.diagnostic_values(field_.diagnostics[-1])['messages_invalid']) >= 20
+
+
+def test_a_bag_that_starts_again(field_):
+    lines, poses = field_.play(lambda m, _: m)
+    assert (lines, poses > 0) == ([], True)
+    jumps = int(ros_graph.diagnostic_values(field_.diagnostics[-1])['clock_jumps'])
+    field_.phase = itertools.count()
+    lines, poses = field_.play(lambda m, _: m)
+    assert poses > 0
+    after = int(ros_graph.diagnostic_values(field_.diagnostics[-1])['clock_jumps'])
+    # IMU and images jump one after the other.
+    assert jumps < after <= jumps + 2
+    assert field_.status.level in (b'\x00', b'\x01')
+
+
+# -- settings --------------------------------------------------------------------------------
+
+
+def set_parameter(graph: ros_graph.Graph, name: str, **value: Any) -> Any:
+    kind = {'double_value': ParameterType.PARAMETER_DOUBLE,
+            'string_value': ParameterType.PARAMETER_STRING}[next(iter(value))]
+    request = SetParameters.Request(parameters=[
+        Parameter(name=name, value=ParameterValue(type=kind, **value))])
+    [result] = graph.call(SetParameters, '/relpose_node/set_parameters', request).results
+    return result
+
+
+def test_live_parameters(field_):
+    """Each legal change takes effect, each other one is refused with its reason."""
+    refused = set_parameter(field_.graph, 'threshold', double_value=-1.0)
+    assert not refused.successful
+    assert 'threshold' in refused.reason
+    refused = set_parameter(field_.graph, 'threshold', string_value='wide')
+    assert not refused.successful
+    assert refused.reason == "threshold must be of type float, got 'wide'"
+    refused = set_parameter(field_.graph, 'readout_time', double_value=0.02)
+    assert not refused.successful
+    assert 'read-only' in refused.reason
+    # Pairs that close at a parallax that is not reached, and by age only.
+    assert set_parameter(field_.graph, 'min_keyframe_parallax', double_value=900.0).successful
+    assert set_parameter(field_.graph, 'max_keyframe_interval', double_value=0.9).successful
+    before = ros_graph.diagnostic_values(field_.diagnostics[-1])
+    field_.play(lambda m, _: m)
+    after = ros_graph.diagnostic_values(field_.diagnostics[-1])
+    # 2.5 s of images.
+    assert 1 <= int(after['pairs']) - int(before['pairs']) <= 4
+
+
+def test_parameters_are_described(field_):
+    [threshold, readout] = field_.graph.call(
+        DescribeParameters, '/relpose_node/describe_parameters',
+        DescribeParameters.Request(names=['threshold', 'readout_time'])).descriptors
+    assert isinstance(threshold, ParameterDescriptor)
+    assert (threshold.read_only, readout.read_only) == (False, True)
+    assert threshold.description.endswith('[px]')
+    [bounds] = threshold.floating_point_range
+    assert (bounds.from_value, bounds.to_value) == (0.05, 50.0)
+
+
+@pytest.mark.parametrize(('parameters', 'remap', 'sentence', 'missing'), [
+    ({'quat_cam_imu_xyzw': '[0.0, 0.0, 0.0, 1.0]'}, {},
+     'not estimating: readout_time must be given as parameter', 'readout_time'),
+    ({'readout_time': 0.03}, {},
+     'not estimating: quat_cam_imu_xyzw must be given as parameter', 'quat_cam_imu_xyzw'),
+    ({'readout_time': 0, 'quat_cam_imu_xyzw': '[0, 0, 0, 1]'},
+     {'image': '/camera/image_rect'}, '/camera/image_rect is a rectified image', ''),
+])
+def test_what_is_needed_is_told_and_the_node_stays(ros_domain_id, parameters, remap, sentence,
+                                                   missing):
+    with ros_graph.Graph() as graph, ros_graph.node_process(
+            parameters=parameters, remap=remap) as node:
+        diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
+        ros_graph.wait_until(lambda: len(diagnostics) >= 2, 'diagnostics')
+        [status] = diagnostics[-1].status
+        assert status.level == b'\x02'
+        assert sentence in status.message
+        assert ros_graph.diagnostic_values(diagnostics[-1])['missing'] == missing
+        code, _ = node.signal(signal.SIGTERM)
+        assert code == 0
+        assert node.output.count(sentence) == 1
+        assert 'Traceback' not in node.output
+
+
+@pytest.mark.parametrize(('parameters', 'sentence'), [
+    ({'readout_time': 3.0}, 'readout_time'),
+    ({'readout_time': 'fast'}, 'readout_time must be of type float'),
+    ({'solver': '7pt'}, 'solver must be one of auto, uniform_9pt'),
+    ({'quat_cam_imu_xyzw': '[0.0, 0.0, 0.0, 2.0]'}, 'quat_cam_imu_xyzw'),
+    ({'quat_cam_imu_xyzw': '[0.0, 0.0, 1.0]'}, 'quat_cam_imu_xyzw must be 4 values'),
+    ({'readout_time': 0.03, 'quat_cam_imu_xyzw': '[0.0, 0.0, 0.0, 1.0]',
+      'stamps_file': '/nowhere/stamps.txt'}, 'stamps_file /nowhere/stamps.txt cannot be written'),
+])
+def test_an_illegal_parameter_ends_the_node_with_one_line(ros_domain_id, parameters, sentence):
+    with ros_graph.node_process(parameters=parameters) as node:
+        assert node.wait() == 2
+        lines = node.output.strip().splitlines()
+        assert len(lines) == 1, lines
+        assert '[FATAL]' in lines[0]
+        assert sentence in lines[0]
+
+
+def test_a_misspelt_parameter_is_told(ros_domain_id):
+    with ros_graph.node_process(parameters={'readout_tme': 0.03}) as node:
+        node.wait_for("there is no parameter 'readout_tme'; did you mean readout_time")
+        assert node.signal(signal.SIGINT)[0] == 0
