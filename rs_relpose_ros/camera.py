@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rs_relpose_ros.distortion import distort_points, RATIONAL_COEFFICIENTS, undistort_points
 from rs_relpose_ros.errors import InputError
 
 REFERENCE_ROWS = ('first', 'middle', 'last')
@@ -20,7 +20,7 @@ READOUT_DIRECTIONS = ('down', 'up')
 # Legal numbers of coefficients of each model, in the order of sensor_msgs/CameraInfo and OpenCV.
 DISTORTION_COEFFICIENTS = {
     'plumb_bob': (0, 4, 5, 8),
-    'rational_polynomial': (8, 12, 14),
+    'rational_polynomial': (8, 12),
     'equidistant': (4,),
 }
 
@@ -142,9 +142,10 @@ class RollingShutterCamera:
         points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
         pixels = np.full((len(points), 2), np.nan)
         front = points[:, 2] > 1e-9
-        if front.any():
-            normalized = points[front, :2] / points[front, 2:]
-            pixels[front] = self._distort(normalized)[0]
+        normalized = points[front, :2] / points[front, 2:]
+        if not self.is_undistorted:
+            normalized = distort_points(normalized, *self._distortion_arguments)
+        pixels[front] = normalized * (self.fx, self.fy) + (self.cx, self.cy)
         return pixels
 
     def unproject(self, points: ArrayLike) -> NDArray[np.float64]:
@@ -174,75 +175,18 @@ class RollingShutterCamera:
             inverse = np.broadcast_to(
                 np.diag([1.0 / self.fx, 1.0 / self.fy]), (len(points), 2, 2))
         else:
-            normalized, inverse = self._undistort(points, normalized)
+            normalized, inverse = undistort_points(normalized, *self._distortion_arguments)
+            inverse = inverse / (self.fx, self.fy)
         scale = 1.0 / np.sqrt(1.0 + (normalized**2).sum(axis=1))
         rays = np.empty((len(points), 3))
         rays[:, :2] = normalized * scale[:, None]
         rays[:, 2] = scale
         return rays, inverse, scale
 
-    def _undistort(
-            self, points: NDArray[np.float64], start: NDArray[np.float64],
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Newton's method on OpenCV's forward model.
-
-        cv2.undistortPoints stops after five fixed-point steps, which leaves pixels of error on
-        strong distortion, and the calls that iterate longer differ between OpenCV 4 and 5.
-        """
-        if len(points) == 0:
-            return start, np.empty((0, 2, 2))
-        if self.distortion_model == 'equidistant':
-            # The fixed point overshoots far off the axis; the ideal fisheye is a safe start.
-            angle = np.linalg.norm(start, axis=1)
-            bounded = np.minimum(angle, 1.5)
-            start = start * (np.tan(bounded) / np.maximum(angle, 1e-12))[:, None]
-        normalized = start
-        with np.errstate(all='ignore'):
-            for _ in range(_NEWTON_ITERATIONS):
-                projected, jacobian = self._distort(normalized)
-                error = points - projected
-                step = np.einsum('nij,nj->ni', _inverse_2x2(jacobian), error)
-                # A step may not leave the cell in which the model is monotonic.
-                length = np.linalg.norm(step, axis=1, keepdims=True)
-                limit = 0.5 * (1.0 + np.linalg.norm(normalized, axis=1, keepdims=True))
-                normalized = normalized + step * np.minimum(
-                    1.0, limit / np.maximum(length, 1e-300))
-                if not np.any(length > 1e-12):
-                    break
-            projected, jacobian = self._distort(normalized)
-            failed = ~(np.linalg.norm(points - projected, axis=1) < 1e-6)
-            # Past the turning point of the polynomial a root exists but is a mirror image.
-            failed |= ~(np.linalg.det(jacobian) > 0.0)
-        normalized = np.where(failed[:, None], np.nan, normalized)
-        return normalized, _inverse_2x2(jacobian)
-
-    def _distort(
-            self, normalized: NDArray[np.float64],
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Raw pixels (N, 2) of normalised points (N, 2), and the derivative (N, 2, 2)."""
-        homogeneous = np.ones((len(normalized), 1, 3))
-        homogeneous[:, 0, :2] = normalized
-        zero = np.zeros(3)
-        coefficients = np.array(self.distortion or (0.0,) * 4)
-        # The derivative by the translation is the derivative by the point itself.
-        if self.distortion_model == 'equidistant':
-            pixels, jacobian = cv2.fisheye.projectPoints(
-                homogeneous, zero, zero, self.camera_matrix, coefficients)
-            first = 11
-        else:
-            pixels, jacobian = cv2.projectPoints(
-                homogeneous, zero, zero, self.camera_matrix, coefficients)
-            first = 3
-        by_point = jacobian.reshape(-1, 2, jacobian.shape[-1])[:, :, first:first + 2]
-        return np.asarray(pixels.reshape(-1, 2), np.float64), np.asarray(by_point, np.float64)
-
-
-_NEWTON_ITERATIONS = 30
-
-
-def _inverse_2x2(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Inverses of (N, 2, 2) matrices; inf or NaN where singular, never an exception."""
-    a, b, c, d = (matrices[:, i, j] for i in (0, 1) for j in (0, 1))
-    with np.errstate(all='ignore'):
-        determinant = a * d - b * c
-        return np.stack([d, -b, -c, a], axis=1).reshape(-1, 2, 2) / determinant[:, None, None]
+    @property
+    def _distortion_arguments(self) -> tuple[NDArray[np.float64], bool]:
+        """Coefficients as the compiled models take them, and whether it is the fisheye."""
+        fisheye = self.distortion_model == 'equidistant'
+        coefficients = np.zeros(4 if fisheye else RATIONAL_COEFFICIENTS)
+        coefficients[:len(self.distortion)] = self.distortion
+        return coefficients, fisheye

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.so3 import exp_so3, log_so3
 
 Array = NDArray[np.float64]
 
@@ -38,6 +40,9 @@ class FrameMotion:
     knot_rotations: Array | None = None
 
     def __post_init__(self) -> None:
+        for name in ('knot_times', 'knot_rotations'):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name)))
         object.__setattr__(self, 'angular_velocity',
                            _vector3('angular_velocity', self.angular_velocity))
         if self.gravity is not None:
@@ -98,9 +103,9 @@ class FrameMotion:
         InputError
             A row time lies outside the gyro samples: nothing is extrapolated.
         """
-        tau = np.asarray(row_times, dtype=np.float64)
+        tau = np.ascontiguousarray(row_times, dtype=np.float64)
         if self.knot_times is None or self.knot_rotations is None:
-            return Rotation.from_rotvec(tau[:, None] * self.angular_velocity).as_matrix()
+            return rotations_at_rate(self.angular_velocity, tau)
         times = self.knot_times
         tolerance = 1e-6
         if len(tau) and not (times[0] - tolerance <= tau.min()
@@ -108,13 +113,7 @@ class FrameMotion:
             raise InputError(
                 f'row times [{tau.min():.6f}, {tau.max():.6f}] s are not covered by the gyro '
                 f'samples, [{times[0]:.6f}, {times[-1]:.6f}] s')
-        k = np.clip(np.searchsorted(times, tau, side='right') - 1, 0, len(times) - 2)
-        # Constant rate between two knots (their rotation is already the exact integral).
-        steps = Rotation.from_matrix(
-            np.swapaxes(self.knot_rotations[:-1], 1, 2) @ self.knot_rotations[1:]).as_rotvec()
-        fraction = (tau - times[k]) / (times[k + 1] - times[k])
-        turns = Rotation.from_rotvec(fraction[:, None] * steps[k]).as_matrix()
-        return np.asarray(self.knot_rotations[k] @ turns)
+        return rotations_between(times, self.knot_rotations, np.clip(tau, times[0], times[-1]))
 
     def derotate(self, rays: ArrayLike, row_times: ArrayLike) -> Array:
         """Rays (N, 3) measured at `row_times` (N,) [s], turned into the reference row's frame."""
@@ -129,6 +128,30 @@ class FrameMotion:
             return replace(self, gravity=moved)
         return replace(self, gravity=moved, knot_times=self.knot_times - delay,
                        knot_rotations=turn.T @ self.knot_rotations)
+
+
+@numba.njit(cache=True, nogil=True)
+def rotations_at_rate(rate: Array, times: Array) -> Array:
+    """``Exp(w t)`` (N, 3, 3) at the times (N,) [s]."""
+    out = np.empty((len(times), 3, 3))
+    for i in range(len(times)):
+        out[i] = exp_so3(times[i] * rate)
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def rotations_between(knot_times: Array, knot_rotations: Array, times: Array) -> Array:
+    """Orientations (N, 3, 3) at times (N,) within the knots, at a constant rate between two."""
+    out = np.empty((len(times), 3, 3))
+    steps = np.empty((len(knot_times) - 1, 3))
+    for k in range(len(steps)):
+        steps[k] = log_so3(knot_rotations[k].T @ knot_rotations[k + 1])
+    after = np.searchsorted(knot_times, times, side='right')
+    for i in range(len(times)):
+        k = min(max(after[i] - 1, 0), len(steps) - 1)
+        fraction = (times[i] - knot_times[k]) / (knot_times[k + 1] - knot_times[k])
+        out[i] = knot_rotations[k] @ exp_so3(fraction * steps[k])
+    return out
 
 
 def _vector3(name: str, value: ArrayLike) -> Array:
