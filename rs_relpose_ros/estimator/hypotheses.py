@@ -9,9 +9,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.solvers.angular_3pt import angular_3pt_kernel
+from rs_relpose_ros.solvers.eleven_point import uniform_11pt_kernel
 from rs_relpose_ros.solvers.five_point import five_point_kernel
-from rs_relpose_ros.solvers.uniform_9pt import uniform_9pt_kernel
+from rs_relpose_ros.solvers.nine_point import uniform_9pt_kernel
+from rs_relpose_ros.solvers.three_point import angular_3pt_kernel
 
 Array = NDArray[np.float64]
 
@@ -23,11 +24,15 @@ _jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 
 
 class Knowledge(NamedTuple):
-    """What the IMU gives to the generators: gravity-aligning rotations, predicted rotation."""
+    """What the IMU gives to the generators: gravity-aligning rotations, predicted rotation.
+
+    `predicted`: whether `rotation` comes from the gyro; else the 11-point starts from 5 points.
+    """
 
     align1: Array
     align2: Array
     rotation: Array
+    predicted: bool
 
 
 @_jit
@@ -51,6 +56,22 @@ def _gyro_2pt(f1: Array, f2: Array, rotation: Array, R_out: Array, x_out: Array)
     x_out[0] = 0.0
     x_out[0, 0], x_out[0, 1], x_out[0, 2] = tx / norm, ty / norm, tz / norm
     return 1
+
+
+@_jit
+def _uniform_11pt(f1: Array, f2: Array, tau1: Array, tau2: Array, knowledge: Knowledge,
+                  R_out: Array, x_out: Array) -> int:
+    """The 11-point's solutions from the gyro's rotation, or from those of its first 5 points."""
+    starts = 1
+    R_start = np.empty((MAX_SOLUTIONS, 3, 3))
+    R_start[0] = knowledge.rotation
+    if not knowledge.predicted:
+        starts = five_point_kernel(f1[:5], f2[:5], R_start, x_out[:, :3].copy())
+    count = 0
+    for k in range(starts):
+        if uniform_11pt_kernel(f1, f2, tau1, tau2, R_start[k], R_out[count], x_out[count]):
+            count += 1
+    return count
 
 
 @_jit
@@ -87,4 +108,4 @@ def generate(generator: int, points: Array, sample: NDArray[np.int64], knowledge
     if generator == UNIFORM_9PT:
         return uniform_9pt_kernel(f1, f2, tau1, tau2, knowledge.align1, knowledge.align2, R_out,
                                   x_out)
-    return 0
+    return _uniform_11pt(f1, f2, tau1, tau2, knowledge, R_out, x_out)

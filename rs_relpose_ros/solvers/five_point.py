@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.so3 import exp_so3
 from rs_relpose_ros.solvers.cheirality import cheirality_votes
+from rs_relpose_ros.solvers.linear_algebra import reflect, triangularise
 from rs_relpose_ros.solvers.polynomial import real_roots
 
 Array = NDArray[np.float64]
@@ -53,35 +54,16 @@ _TO_CUBIC = _product_table(_QUADRATIC, _CUBIC)
 def _null_space(rows: Array, basis: Array) -> None:
     """Orthonormal basis (4, 9) of the vectors perpendicular to `rows` (5, 9), overwritten.
 
-    Householder reflections of the transposed matrix: the last four columns of its Q.
+    The last four columns of Q of the transposed matrix.
     """
-    scale = np.zeros(5)
-    for k in range(5):
-        norm2 = 0.0
-        for j in range(k, 9):
-            norm2 += rows[k, j] * rows[k, j]
-        if norm2 > 0.0:
-            alpha = math.sqrt(norm2) if rows[k, k] > 0.0 else -math.sqrt(norm2)
-            rows[k, k] += alpha
-            scale[k] = 1.0 / (alpha * rows[k, k])
-        for i in range(k + 1, 5):
-            dot = 0.0
-            for j in range(k, 9):
-                dot += rows[k, j] * rows[i, j]
-            dot *= scale[k]
-            for j in range(k, 9):
-                rows[i, j] -= dot * rows[k, j]
+    diagonal, scales = np.empty(5), np.empty(5)
+    triangularise(rows, 5, diagonal, scales)
     for c in range(4):
         for j in range(9):
             basis[c, j] = 0.0
         basis[c, 5 + c] = 1.0
         for k in range(4, -1, -1):
-            dot = 0.0
-            for j in range(k, 9):
-                dot += rows[k, j] * basis[c, j]
-            dot *= scale[k]
-            for j in range(k, 9):
-                basis[c, j] -= dot * rows[k, j]
+            reflect(rows[k], scales[k], k, basis[c])
 
 
 @_jit

@@ -62,17 +62,19 @@ def rotate_rows(A: Array, rays: Array, out: Array) -> None:
 
 
 @_jit
-def normals_at_yaw(a: Array, b: Array, psi: float, normals: Array, derivatives: Array) -> None:
+def normals_at_yaw(a: Array, b: Array, c: float, s: float, normals: Array,
+                   derivatives: Array) -> None:
     """Epipolar normals ``a x Rz(psi) b`` of gravity-aligned rays, and d/d psi of them.
 
     Parameters
     ----------
     a, b : (n, 3) ndarray
         ``A_1 f_1`` and ``A_2 f_2``.
+    c, s : float
+        Cosine and sine of psi.
     normals, derivatives : (n, 3) ndarray
         Overwritten; normals are in the aligned frame, ``A_1 (f_1 x R f_2)``.
     """
-    c, s = math.cos(psi), math.sin(psi)
     for k in range(a.shape[0]):
         hx = c * b[k, 0] - s * b[k, 1]
         hy = s * b[k, 0] + c * b[k, 1]
@@ -87,8 +89,8 @@ def normals_at_yaw(a: Array, b: Array, psi: float, normals: Array, derivatives: 
 
 
 @_jit
-def yaw_window(a: Array, b: Array) -> tuple[float, float]:
-    """Where the solutions crowd: the yaw that best aligns the rays, and their spread there.
+def centre_yaw(a: Array, b: Array) -> tuple[float, float]:
+    """Turn `b` so that the solutions crowd about yaw 0.
 
     The normals ``a x Rz(psi) b`` of distant points all nearly vanish at the true yaw, so that the
     zeros of a determinant of them crowd there, within about the parallax.
@@ -96,7 +98,7 @@ def yaw_window(a: Array, b: Array) -> tuple[float, float]:
     Parameters
     ----------
     a, b : (n, 3) ndarray
-        Gravity-aligned unit rays.
+        Gravity-aligned unit rays; `b` is turned in place by the yaw that best aligns them.
 
     Returns
     -------
@@ -109,11 +111,10 @@ def yaw_window(a: Array, b: Array) -> tuple[float, float]:
     for k in range(n):
         along += a[k, 0] * b[k, 0] + a[k, 1] * b[k, 1]
         across += a[k, 1] * b[k, 0] - a[k, 0] * b[k, 1]
-    centre = math.atan2(across, along)
-    c, s = math.cos(centre), math.sin(centre)
+    length = math.sqrt(along * along + across * across)
+    c, s = (along / length, across / length) if length > 0.0 else (1.0, 0.0)
     total = 0.0
     for k in range(n):
-        total += (a[k, 0] - c * b[k, 0] + s * b[k, 1]) ** 2
-        total += (a[k, 1] - s * b[k, 0] - c * b[k, 1]) ** 2
-        total += (a[k, 2] - b[k, 2]) ** 2
-    return centre, min(max(math.sqrt(total / n), 1e-3), 1.0)
+        b[k, 0], b[k, 1] = c * b[k, 0] - s * b[k, 1], s * b[k, 0] + c * b[k, 1]
+        total += (a[k, 0] - b[k, 0]) ** 2 + (a[k, 1] - b[k, 1]) ** 2 + (a[k, 2] - b[k, 2]) ** 2
+    return math.atan2(s, c), min(max(math.sqrt(total / n), 1e-3), 1.0)

@@ -17,8 +17,8 @@ _jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 def lu_factor(A: Array, pivots: NDArray[np.int64]) -> float:
     """LU factorisation of `A` (n, n) in place, with row pivoting; the determinant.
 
-    A pivot that is exactly zero is replaced by a tiny one, as inverse iteration wants it; the
-    determinant is then zero.
+    The diagonal receives the reciprocals of the pivots. A pivot that is exactly zero is replaced
+    by a tiny one, as inverse iteration wants it; the determinant is then zero.
     """
     n = A.shape[0]
     determinant = 1.0
@@ -46,6 +46,7 @@ def lu_factor(A: Array, pivots: NDArray[np.int64]) -> float:
         if A[k, k] == 0.0:
             A[k, k] = tiny
         inverse = 1.0 / A[k, k]
+        A[k, k] = inverse
         for i in range(k + 1, n):
             factor = A[i, k] * inverse
             A[i, k] = factor
@@ -63,12 +64,15 @@ def lu_solve(LU: Array, pivots: NDArray[np.int64], b: Array) -> None:
         b[k] = b[pivots[k]]
         b[pivots[k]] = swap
     for k in range(n):
+        total = b[k]
         for j in range(k):
-            b[k] -= LU[k, j] * b[j]
+            total -= LU[k, j] * b[j]
+        b[k] = total
     for k in range(n - 1, -1, -1):
+        total = b[k]
         for j in range(k + 1, n):
-            b[k] -= LU[k, j] * b[j]
-        b[k] /= LU[k, k]
+            total -= LU[k, j] * b[j]
+        b[k] = total * LU[k, k]
 
 
 @_jit
@@ -76,16 +80,58 @@ def lu_solve_transposed(LU: Array, pivots: NDArray[np.int64], b: Array) -> None:
     """Solve ``A^T x = b`` in place of `b` (n,), with the result of `lu_factor`."""
     n = LU.shape[0]
     for k in range(n):
-        b[k] /= LU[k, k]
+        solved = b[k] * LU[k, k]
+        b[k] = solved
         for j in range(k + 1, n):
-            b[j] -= LU[k, j] * b[k]
+            b[j] -= LU[k, j] * solved
     for k in range(n - 1, -1, -1):
+        solved = b[k]
         for j in range(k):
-            b[j] -= LU[k, j] * b[k]
+            b[j] -= LU[k, j] * solved
     for k in range(n - 1, -1, -1):
         swap = b[k]
         b[k] = b[pivots[k]]
         b[pivots[k]] = swap
+
+
+@_jit
+def triangularise(columns: Array, count: int, diagonal: Array, scales: Array) -> None:
+    """Householder reflections that make the first `count` columns of a matrix upper triangular.
+
+    Parameters
+    ----------
+    columns : (n, m) ndarray
+        The n columns, m numbers each, one per row of the array. All are reflected in place: entry
+        ``[j, i]`` is then R's ``[i, j]`` for ``i < j``; the rest of the first `count` holds the
+        reflectors.
+    diagonal, scales : (count,) ndarray
+        Receive R's diagonal and the scales of the reflectors.
+    """
+    n, m = columns.shape
+    for k in range(count):
+        norm2 = 0.0
+        for i in range(k, m):
+            norm2 += columns[k, i] * columns[k, i]
+        if not norm2 > 0.0:
+            diagonal[k], scales[k] = 0.0, 0.0
+            continue
+        alpha = math.sqrt(norm2) if columns[k, k] > 0.0 else -math.sqrt(norm2)
+        columns[k, k] += alpha
+        diagonal[k] = -alpha
+        scales[k] = 1.0 / (alpha * columns[k, k])
+        for j in range(k + 1, n):
+            reflect(columns[k], scales[k], k, columns[j])
+
+
+@_jit
+def reflect(reflector: Array, scale: float, first: int, vector: Array) -> None:
+    """Reflect `vector` (m,) in place; the reflector is zero before element `first`."""
+    dot = 0.0
+    for i in range(first, vector.shape[0]):
+        dot += reflector[i] * vector[i]
+    dot *= scale
+    for i in range(first, vector.shape[0]):
+        vector[i] -= dot * reflector[i]
 
 
 @_jit

@@ -75,7 +75,7 @@ def roots_in_unit_interval(p: Array, pair_tolerance: float, zoom: float, roots: 
         imaginary part below the tolerance there: ``2 zoom h / (1 + zoom^2 c^2)``.
     roots, half_gaps : (n,) ndarray
         Receive the roots, and h of those that stand for a pair (else 0).
-    work : (n + 3, n + 1) ndarray
+    work : (>= n + 3, n + 1) ndarray
         Overwritten.
 
     Returns
@@ -159,20 +159,31 @@ def half_angle_matrix(degree: int) -> Array:
     return matrix
 
 
-@_jit
-def node_angle(k: int, degree: int, zoom: float) -> float:
-    """Angle [rad] relative to the centre at which `angles_of_zeros` wants sample k."""
-    half = math.pi * k / (2 * degree + 1)
-    return 2.0 * math.atan2(zoom * math.sin(half), math.cos(half))
+def half_angle_nodes(degree: int) -> Array:
+    """Cosine and sine (2n + 1, 2) of the half angles at which `angles_of_zeros` wants samples."""
+    half = np.pi * np.arange(2 * degree + 1) / (2 * degree + 1)
+    return np.stack([np.cos(half), np.sin(half)], axis=1)
 
 
 @_jit
-def _append_angles(p: Array, outside: bool, pair_tolerance: float, zoom: float, angles: Array,
-                   half_gaps: Array, count: int) -> int:
-    """Add the zeros with ``|x| <= 1``, or with ``x = -1 / y``, ``|y| <= 1``, of `outside`."""
+def sample_angle(node: Array, zoom: float) -> tuple[float, float, float]:
+    """Cosine and sine of the angle of a sample, and the weight that it gets.
+
+    With ``x = tan(angle / 2) / zoom = sin / cos`` of `node` (2,), a row of `half_angle_nodes`, the
+    weight ``((1 + zoom^2 x^2) / (1 + x^2))^n`` makes a trigonometric polynomial of degree n in the
+    angle one of the same degree in ``2 atan(x)``; it is returned for n = 1.
+    """
+    c, s = node[0], zoom * node[1]
+    weight = c * c + s * s
+    return (c * c - s * s) / weight, 2.0 * c * s / weight, weight
+
+
+@_jit
+def _append_angles(p: Array, outside: bool, pair_tolerance: float, zoom: float, work: Array,
+                   angles: Array, half_gaps: Array, count: int) -> int:
+    """Add the zeros with ``|x| <= 1`` of `p`, or `outside` those with ``x = -1 / y``."""
     size = p.shape[0]
-    roots, gaps = np.empty(size - 1), np.empty(size - 1)
-    work = np.empty((size + 2, size))
+    roots, gaps = work[size + 2], work[size + 3]
     # 2 atan(zoom x) = 2 atan(y / zoom) - pi: outside, a step of y turns by 1 / zoom.
     scale = 1.0 / zoom if outside else zoom
     found = roots_in_unit_interval(p, pair_tolerance, scale, roots, gaps, work)
@@ -206,7 +217,7 @@ def angles_of_zeros(samples: Array, matrix: Array, zoom: float, pair_tolerance: 
     Parameters
     ----------
     samples : (2n + 1,) ndarray
-        ``D(node_angle(k, n, zoom))``; overwritten.
+        D at the angles of `sample_angle`, times its weight to the power n.
     matrix : (2n + 1, 2n + 1) ndarray
         Of `half_angle_matrix`.
     pair_tolerance : float
@@ -220,31 +231,25 @@ def angles_of_zeros(samples: Array, matrix: Array, zoom: float, pair_tolerance: 
         Number of zeros.
     """
     size = samples.shape[0]
-    degree = size // 2
     largest = 0.0
     for k in range(size):
-        # ((1 + zoom^2 x^2) / (1 + x^2))^n makes it a trigonometric polynomial in 2 atan(x).
-        half = math.pi * k / size
-        c, s = math.cos(half), zoom * math.sin(half)
-        weight = c * c + s * s
-        for _ in range(degree):
-            samples[k] *= weight
         largest = max(largest, abs(samples[k]))
     if not 0.0 < largest < math.inf:
         return 0
-    p = np.empty(size)
+    work = np.empty((size + 5, size))
+    p = work[size + 4]
     for i in range(size):
         total = 0.0
         for k in range(size):
             total += matrix[i, k] * samples[k]
         p[i] = total / largest
-    count = _append_angles(p, False, pair_tolerance, zoom, angles, half_gaps, 0)
+    count = _append_angles(p, False, pair_tolerance, zoom, work, angles, half_gaps, 0)
     # p(-1 / y) y^2n
-    for i in range(degree):
+    for i in range(size // 2):
         p[i], p[size - 1 - i] = p[size - 1 - i], p[i]
     for i in range(1, size, 2):
         p[i] = -p[i]
-    return _append_angles(p, True, pair_tolerance, zoom, angles, half_gaps, count)
+    return _append_angles(p, True, pair_tolerance, zoom, work, angles, half_gaps, count)
 
 
 @_jit

@@ -1,11 +1,12 @@
 """The nine columns of the uniform and linear models, well conditioned.
 
 A row of the paper's ``A x = 0`` is ``[n, -tau_1 n, tau_2 n]`` with ``n = f_1 x R f_2`` and
-``x = (t, d_1, d_2)`` (docs/conventions.md, equation 4). Matched points lie in similar rows, and row
-times are 1e-2 s: as they stand, the three blocks are nearly parallel and badly scaled. The kernels
-therefore use
+``x = (t, d_1, d_2)`` (docs/conventions.md, equation 4). Matched points lie in similar rows, and
+row times are 1e-2 s: as they stand, the three blocks are nearly parallel and badly scaled. The
+kernels therefore use
 
-    t - tau_1 d_1 + tau_2 d_2 = y_1 + p y_2 + q y_3,    p = (tau_1 - m) / s_p, q = (tau_2 - tau_1) / s_q
+    t - tau_1 d_1 + tau_2 d_2 = y_1 + p y_2 + q y_3
+    p = (tau_1 - m) / s_p,    q = (tau_2 - tau_1) / s_q
 
 with the mean row time m and p, q of size 1; the two sets of columns span the same space for every
 rotation, so that determinants differ by a constant factor and solutions by the linear map below.

@@ -10,12 +10,28 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.solvers.cheirality import cheirality_votes
 from rs_relpose_ros.solvers.gravity import (
-    normals_at_yaw, rotate_rows, rotation_from_yaw, yaw_window)
+    centre_yaw,
+    normals_at_yaw,
+    rotate_rows,
+    rotation_from_yaw,
+)
 from rs_relpose_ros.solvers.linear_algebra import (
-    lu_factor, lu_solve, lu_solve_transposed, normalise)
-from rs_relpose_ros.solvers.polynomial import angles_of_zeros, half_angle_matrix, node_angle
+    lu_factor,
+    lu_solve,
+    lu_solve_transposed,
+    normalise,
+)
+from rs_relpose_ros.solvers.polynomial import (
+    angles_of_zeros,
+    half_angle_matrix,
+    half_angle_nodes,
+    sample_angle,
+)
 from rs_relpose_ros.solvers.uniform_columns import (
-    fill_columns, row_time_factors, translation_and_velocities)
+    fill_columns,
+    row_time_factors,
+    translation_and_velocities,
+)
 
 Array = NDArray[np.float64]
 
@@ -25,40 +41,35 @@ MAX_SOLUTIONS = 12
 # A pair of roots of the polynomial in exp(i psi) that near to the unit circle is one real angle.
 PAIR_TOLERANCE = 1e-3
 
-# Not 9: the leading complex coefficient matrix of A(psi) loses rank (docs/conventions.md).
+# Not 9: the leading complex coefficient matrix of A(psi) loses rank.
 _DEGREE = 6
 _HALF_ANGLE = half_angle_matrix(_DEGREE)
-_SAMPLES = 2 * _DEGREE + 1
+_NODES = half_angle_nodes(_DEGREE)
 _POLISH_STEPS = 8
-# The null vector is that of the angle before the last step.
+# The null vector is that of the angle before the last step, from at least two iterations.
 _LAST_STEP = 1e-13
-_FARTHEST = 1e-2
+# A root of the polynomial is off by rounding only.
+_FARTHEST = 1e-3
 
 
 @_jit
 def _null_vectors(A: Array, pivots: NDArray[np.int64], u: Array, v: Array) -> float:
-    """Left and right singular vectors of the smallest singular value, by inverse iteration.
+    """One inverse iteration towards the singular vectors of the smallest singular value.
 
-    `A` (n, n) is overwritten by its factors. Returns the singular value.
+    `A` (n, n) is overwritten by its factors; `v` (n,) is the start and receives the right, `u`
+    the left vector. Returns the singular value.
     """
     lu_factor(A, pivots)
-    for k in range(v.shape[0]):
-        v[k] = 1.0
+    u[:] = v
+    lu_solve_transposed(A, pivots, u)
+    normalise(u)
+    v[:] = u
     lu_solve(A, pivots, v)
-    normalise(v)
-    length = 1.0
-    for _ in range(2):
-        u[:] = v
-        lu_solve_transposed(A, pivots, u)
-        normalise(u)
-        v[:] = u
-        lu_solve(A, pivots, v)
-        length = normalise(v)
-    return 1.0 / length
+    return 1.0 / normalise(v)
 
 
 @_jit
-def _polish(a: Array, b: Array, p: Array, q: Array, psi: float, work: Array,
+def _polish(a: Array, b: Array, p: Array, q: Array, psi: float, farthest: float, work: Array,
             pivots: NDArray[np.int64], y: Array) -> tuple[float, bool]:
     """Newton's method on the determinant, and the null vector `y` (9,) there.
 
@@ -66,6 +77,8 @@ def _polish(a: Array, b: Array, p: Array, q: Array, psi: float, work: Array,
 
     Parameters
     ----------
+    farthest : float
+        The root lies within this of `psi`, or the iteration has not converged.
     work : (16, 9) ndarray
         Overwritten.
 
@@ -76,8 +89,9 @@ def _polish(a: Array, b: Array, p: Array, q: Array, psi: float, work: Array,
     A, u = work[:9], work[9]
     n, dn = work[10:13].reshape((9, 3)), work[13:16].reshape((9, 3))
     start = psi
-    for _ in range(_POLISH_STEPS):
-        normals_at_yaw(a, b, psi, n, dn)
+    y[:] = 1.0
+    for iteration in range(_POLISH_STEPS):
+        normals_at_yaw(a, b, math.cos(psi), math.sin(psi), n, dn)
         fill_columns(n, p, q, A)
         sigma = _null_vectors(A, pivots, u, y)
         # d(log det) = trace(A^-1 dA) ~ u . (dA y) / sigma
@@ -86,10 +100,10 @@ def _polish(a: Array, b: Array, p: Array, q: Array, psi: float, work: Array,
             for i in range(3):
                 slope += u[r] * dn[r, i] * (y[i] + p[r] * y[3 + i] + q[r] * y[6 + i])
         step = sigma / slope
-        if abs(step) < _LAST_STEP:
+        if iteration > 0 and abs(step) < _LAST_STEP:
             return psi - step, True
         psi -= step
-        if not abs(psi - start) < _FARTHEST:
+        if not abs(psi - start) < farthest:
             break
     return psi, False
 
@@ -137,36 +151,41 @@ def uniform_9pt_kernel(f1: Array, f2: Array, tau1: Array, tau2: Array, A1: Array
     m, s_p, s_q = row_time_factors(tau1, tau2, p, q)
     if s_p == 0.0:
         return 0
-    centre, zoom = yaw_window(a, b)
+    centre, zoom = centre_yaw(a, b)
     n, dn = np.empty((9, 3)), np.empty((9, 3))
     A, pivots = np.empty((9, 9)), np.empty(9, dtype=np.int64)
-    samples = np.empty(_SAMPLES)
-    for k in range(_SAMPLES):
-        normals_at_yaw(a, b, centre + node_angle(k, _DEGREE, zoom), n, dn)
+    samples = np.empty(_NODES.shape[0])
+    for k in range(_NODES.shape[0]):
+        c, s, weight = sample_angle(_NODES[k], zoom)
+        normals_at_yaw(a, b, c, s, n, dn)
         fill_columns(n, p, q, A)
-        samples[k] = lu_factor(A, pivots)
+        samples[k] = lu_factor(A, pivots) * weight**_DEGREE
     angles, half_gaps = np.empty(MAX_SOLUTIONS), np.empty(MAX_SOLUTIONS)
     found = angles_of_zeros(samples, _HALF_ANGLE, zoom, PAIR_TOLERANCE, angles, half_gaps)
     work, y = np.empty((16, 9)), np.empty(9)
     count = 0
     for k in range(found):
-        middle, gap = centre + angles[k], half_gaps[k]
-        psi, converged = _polish(a, b, p, q, middle - gap, work, pivots, y)
+        middle, gap = angles[k], half_gaps[k]
+        farthest = gap if gap > 0.0 else _FARTHEST
+        psi, converged = _polish(a, b, p, q, middle - gap, farthest, work, pivots, y)
         if not converged:
-            # A pair of roots off the real line: the nearest angle and its smallest singular value.
-            normals_at_yaw(a, b, middle, n, dn)
-            fill_columns(n, p, q, A)
-            _null_vectors(A, pivots, work[9], y)
+            # A pair of roots off the real line: the nearest angle, and its best vector.
+            normals_at_yaw(a, b, math.cos(middle), math.sin(middle), n, dn)
+            y[:] = 1.0
+            for _ in range(2):
+                fill_columns(n, p, q, A)
+                _null_vectors(A, pivots, work[9], y)
             psi = middle
         if count < MAX_SOLUTIONS and _write_solution(
-                psi, y, A1, A2, f1, f2, tau1, tau2, m, s_p, s_q, R_out[count], x_out[count]):
+                centre + psi, y, A1, A2, f1, f2, tau1, tau2, m, s_p, s_q, R_out[count],
+                x_out[count]):
             count += 1
         if gap > 0.0 and converged:
             # The pair was two real roots, closer than the polynomial can tell.
             first = psi
-            psi, converged = _polish(a, b, p, q, middle + gap, work, pivots, y)
+            psi, converged = _polish(a, b, p, q, middle + gap, gap, work, pivots, y)
             if converged and abs(psi - first) > 1e-12 and count < MAX_SOLUTIONS and (
-                    _write_solution(psi, y, A1, A2, f1, f2, tau1, tau2, m, s_p, s_q,
+                    _write_solution(centre + psi, y, A1, A2, f1, f2, tau1, tau2, m, s_p, s_q,
                                     R_out[count], x_out[count])):
                 count += 1
     return count

@@ -10,8 +10,17 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.solvers.cheirality import cheirality_votes
 from rs_relpose_ros.solvers.gravity import (
-    normals_at_yaw, rotate_rows, rotation_from_yaw, yaw_window)
-from rs_relpose_ros.solvers.polynomial import angles_of_zeros, half_angle_matrix, node_angle
+    centre_yaw,
+    normals_at_yaw,
+    rotate_rows,
+    rotation_from_yaw,
+)
+from rs_relpose_ros.solvers.polynomial import (
+    angles_of_zeros,
+    half_angle_matrix,
+    half_angle_nodes,
+    sample_angle,
+)
 
 Array = NDArray[np.float64]
 
@@ -23,7 +32,7 @@ PAIR_TOLERANCE = 1e-3
 
 _DEGREE = 2
 _HALF_ANGLE = half_angle_matrix(_DEGREE)
-_SAMPLES = 2 * _DEGREE + 1
+_NODES = half_angle_nodes(_DEGREE)
 _NO_TIMES = np.zeros(3)
 
 
@@ -48,19 +57,20 @@ def angular_3pt_kernel(f1: Array, f2: Array, A1: Array, A2: Array, R_out: Array,
     a, b = np.empty((3, 3)), np.empty((3, 3))
     rotate_rows(A1, f1, a)
     rotate_rows(A2, f2, b)
-    centre, zoom = yaw_window(a, b)
+    centre, zoom = centre_yaw(a, b)
     n, dn = np.empty((3, 3)), np.empty((3, 3))
-    samples = np.empty(_SAMPLES)
-    for k in range(_SAMPLES):
-        normals_at_yaw(a, b, centre + node_angle(k, _DEGREE, zoom), n, dn)
-        samples[k] = _triple(n[0], n[1], n[2])
+    samples = np.empty(_NODES.shape[0])
+    for k in range(_NODES.shape[0]):
+        c, s, weight = sample_angle(_NODES[k], zoom)
+        normals_at_yaw(a, b, c, s, n, dn)
+        samples[k] = _triple(n[0], n[1], n[2]) * weight**_DEGREE
     angles, half_gaps = np.empty(MAX_SOLUTIONS), np.empty(MAX_SOLUTIONS)
     found = angles_of_zeros(samples, _HALF_ANGLE, zoom, PAIR_TOLERANCE, angles, half_gaps)
     t = np.empty(3)
     count = 0
     for k in range(found):
-        psi = centre + angles[k]
-        normals_at_yaw(a, b, psi, n, dn)
+        psi = angles[k]
+        normals_at_yaw(a, b, math.cos(psi), math.sin(psi), n, dn)
         if half_gaps[k] == 0.0:
             # One Newton step on the determinant itself, free of the polynomial's rounding.
             slope = (_triple(dn[0], n[1], n[2]) + _triple(n[0], dn[1], n[2])
@@ -68,7 +78,7 @@ def angular_3pt_kernel(f1: Array, f2: Array, A1: Array, A2: Array, R_out: Array,
             step = _triple(n[0], n[1], n[2]) / slope
             if abs(step) < 1e-4:
                 psi -= step
-                normals_at_yaw(a, b, psi, n, dn)
+                normals_at_yaw(a, b, math.cos(psi), math.sin(psi), n, dn)
         # t is perpendicular to all three normals: the longest of their cross products.
         longest = 0.0
         for i in range(3):
@@ -82,7 +92,7 @@ def angular_3pt_kernel(f1: Array, f2: Array, A1: Array, A2: Array, R_out: Array,
                 t[0], t[1], t[2] = x, y, z
         if not longest > 1e-28:
             continue
-        rotation_from_yaw(psi, A1, A2, R_out[count])
+        rotation_from_yaw(centre + psi, A1, A2, R_out[count])
         scale = 1.0 / math.sqrt(longest)
         for i in range(3):
             t_out[count, i] = scale * (A1[0, i] * t[0] + A1[1, i] * t[1] + A1[2, i] * t[2])
