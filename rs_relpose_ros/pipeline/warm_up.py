@@ -51,7 +51,7 @@ def warm_up_pipeline(parameters: Parameters) -> None:
 def _images() -> Iterator[NDArray[np.uint8]]:
     """A wall far away behind a near one, seen from a camera that moves, then stands."""
     noise = np.random.default_rng(0).integers(0, 256, (2, _HEIGHT, _WIDTH), dtype=np.uint8)
-    far, near = (cv2.normalize(cv2.GaussianBlur(layer, (0, 0), 2.0), None, 0, 255, cv2.NORM_MINMAX)
+    far, near = (cv2.normalize(cv2.GaussianBlur(layer, (0, 0), 2.0), np.empty_like(layer), 0, 255, cv2.NORM_MINMAX)
                  for layer in noise)
     for shift in (0, 4, 8, 8):
         image = np.roll(far, -shift, axis=1)

@@ -1,0 +1,81 @@
+"""The shipped configuration: parameter template, Fast DDS profile, launch file."""
+
+from __future__ import annotations
+
+import ast
+import py_compile
+from xml.etree import ElementTree
+
+import pytest
+import ros_graph
+import yaml
+
+from rs_relpose_ros.pipeline.parameters import Parameters
+from rs_relpose_ros.replay.parameter_file import read_parameters
+from rs_relpose_ros.ros.parameter_template import parameter_template
+
+CONFIG = ros_graph.ROOT / 'config'
+LAUNCH_FILE = ros_graph.ROOT / 'launch' / 'relpose.launch.py'
+NAMESPACE = '{http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles}'
+
+
+def test_template_is_up_to_date():
+    assert (CONFIG / 'relpose.yaml').read_text(encoding='utf-8') == parameter_template(), (
+        'run python -m rs_relpose_ros.ros.parameter_template config/relpose.yaml')
+
+
+def test_template_holds_every_parameter_at_its_default():
+    text = parameter_template()
+    values = yaml.safe_load(text)['/**']['ros__parameters']
+    for name, default, _ in Parameters.declarations():
+        if default is None:
+            assert f'# {name}:' in text
+            assert name not in values
+        else:
+            assert values.pop(name) == (list(default) if isinstance(default, tuple) else default)
+    assert values == {}
+    assert read_parameters(CONFIG / 'relpose.yaml') == Parameters()
+    assert max(map(len, text.splitlines())) <= 99
+
+
+def test_node_takes_the_template(ros_domain_id):
+    """Rcl's own YAML parser makes of it what ours does."""
+    with ros_graph.node_process(CONFIG / 'relpose.yaml') as node:
+        node.wait_for('readout_time and quat_cam_imu_xyzw must be given')
+        assert 'there is no parameter' not in node.output
+
+
+def test_profile_takes_big_images():
+    profiles = ElementTree.parse(CONFIG / 'fastdds.xml').getroot()
+    assert profiles.tag == f'{NAMESPACE}profiles'
+    shared = [t for t in profiles.iter(f'{NAMESPACE}transport_descriptor')
+              if t.findtext(f'{NAMESPACE}type') == 'SHM']
+    [shared] = shared
+    message = int(shared.findtext(f'{NAMESPACE}maxMessageSize'))
+    segment = int(shared.findtext(f'{NAMESPACE}segment_size'))
+    assert message > 1920 * 1080 * 3
+    # As many images in flight as the node's queue is deep.
+    assert segment >= 10 * 1920 * 1080 * 3
+    [participant] = profiles.iter(f'{NAMESPACE}participant')
+    assert participant.get('is_default_profile') == 'true'
+
+
+def test_launch_file_remaps_what_the_node_subscribes_to():
+    py_compile.compile(str(LAUNCH_FILE), doraise=True, cfile=None)
+    tree = ast.parse(LAUNCH_FILE.read_text(encoding='utf-8'))
+    [node] = [call for call in ast.walk(tree) if isinstance(call, ast.Call)
+              and isinstance(call.func, ast.Name) and call.func.id == 'Node']
+    keywords = {keyword.arg: keyword.value for keyword in node.keywords}
+    assert ast.literal_eval(keywords['package']) == 'rs_relpose_ros'
+    assert ast.literal_eval(keywords['executable']) == 'relpose_node'
+    remapped = [ast.literal_eval(pair.elts[0]) for pair in keywords['remappings'].elts]
+    assert remapped == ['image', 'camera_info', 'imu', 'accel']
+
+
+def test_launch_file_describes_its_arguments():
+    pytest.importorskip('launch_ros', reason='launch is not in the wheels, only on ROS machines')
+    names: dict[str, object] = {}
+    exec(compile(LAUNCH_FILE.read_text(encoding='utf-8'), str(LAUNCH_FILE), 'exec'), names)  # noqa: S102
+    description = names['generate_launch_description']()
+    described = {argument.name for argument in description.get_launch_arguments()}
+    assert {'camera_namespace', 'params_file', 'fastdds_profile'} <= described

@@ -1,0 +1,130 @@
+"""Parts of the node that need no graph."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rs_relpose_ros.pipeline.pair import PairResult
+from rs_relpose_ros.pipeline.sequencer import Refusal, SequencerCounts
+from rs_relpose_ros.result import RelativePose, Status
+from rs_relpose_ros.ros.cause_log import CauseLog
+from rs_relpose_ros.ros.diagnostics import ERROR, Inputs, OK, Statistics, WARN
+from rs_relpose_ros.tracking.matches import Matches
+
+SECOND = 10**9
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 0
+
+    def __call__(self) -> int:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+# -- log lines -------------------------------------------------------------------------------
+
+
+def test_a_cause_is_told_once_and_later_with_its_number(clock):
+    lines: list[str] = []
+    log = CauseLog(lines.append, period=30.0, clock=clock)
+    for k in range(5):
+        log(f'image has {k} bytes')
+    log('something else')
+    assert lines == ['image has 0 bytes', 'something else']
+    clock.now = 31
+    log('image has 7 bytes')
+    assert lines[2] == 'image has 7 bytes (4 more since the last such line)'
+    clock.now = 62
+    log('image has 8 bytes')
+    assert lines[3] == 'image has 8 bytes'
+
+
+def test_made_up_causes_do_not_fill_log_or_memory(clock):
+    lines: list[str] = []
+    log = CauseLog(lines.append, clock=clock)
+    letters = 'abcdefghij'
+    for a in letters:
+        for b in letters:
+            for c in letters:
+                log(f'unknown encoding {a}{b}{c}')
+    assert len(lines) <= 65
+    assert lines[-1] == 'further problems of other kinds (see /diagnostics)'
+
+
+# -- diagnostics -----------------------------------------------------------------------------
+
+
+def pair(status: Status = Status.OK, reason: str = '') -> PairResult:
+    count = 20
+    inliers = np.zeros(count, dtype=bool)
+    inliers[:15] = True
+    zeros2, zeros3 = np.zeros((count, 2)), np.zeros((count, 3))
+    return PairResult(
+        reference_stamp_ns=0, stamp_ns=1, frame_id='', interval=0.1,
+        pose=RelativePose(status=status, reason=reason, inliers=inliers, model='uniform'),
+        matches=Matches(np.arange(count, dtype=np.uint32), zeros2, zeros2, np.ones(count)),
+        row_times1=np.zeros(count), row_times2=np.zeros(count), rays1=zeros3, rays2=zeros3,
+        parallax=3.25)
+
+
+def counts(frames: int = 0, taken: int = 0, **refused: int) -> SequencerCounts:
+    return SequencerCounts(frames=frames, frames_taken=taken,
+                           refused={Refusal(name): n for name, n in refused.items()},
+                           imu_samples=0, imu_gaps=0, clock_jumps=0)
+
+
+def inputs(images: int = 0, imu: int = 0) -> Inputs:
+    return Inputs(images, images, imu, 0, 0)
+
+
+def test_rates_are_those_since_the_last_report(clock):
+    statistics = Statistics(clock)
+    clock.now = 2 * SECOND
+    first = dict(statistics.report(inputs(60, 400), counts(), problem='', missing=()).values)
+    assert (first['image_rate_hz'], first['imu_rate_hz']) == ('30.0', '200.0')
+    clock.now = 3 * SECOND
+    second = dict(statistics.report(inputs(75, 400), counts(), problem='', missing=()).values)
+    assert (second['image_rate_hz'], second['imu_rate_hz']) == ('15.0', '0.0')
+
+
+def test_latency_is_from_ready_to_publication(clock):
+    statistics = Statistics(clock)
+    for milliseconds in range(1, 101):
+        clock.now = SECOND
+        statistics.add_pair(pair(), SECOND - milliseconds * 10**6)
+    values = dict(statistics.report(inputs(), counts(), problem='', missing=()).values)
+    assert float(values['latency_p50_ms']) == pytest.approx(50.5, abs=0.1)
+    assert float(values['latency_p99_ms']) == pytest.approx(99.0, abs=0.1)
+    assert (values['pairs'], values['poses']) == ('100', '100')
+    assert (values['inlier_ratio'], values['inliers'], values['matches']) == ('0.750', '15', '20')
+
+
+def test_level_and_text(clock):
+    statistics = Statistics(clock)
+    report = statistics.report(inputs(), None, problem='not estimating: why', missing=('a', 'b'))
+    assert (report.level, report.text) == (ERROR, 'not estimating: why')
+    assert dict(report.values)['missing'] == 'a, b'
+    assert statistics.report(inputs(), counts(), problem='', missing=()).level == OK
+    dropped = counts(frames=9, taken=7, overload=2)
+    report = statistics.report(inputs(), dropped, problem='', missing=())
+    assert report.level == WARN
+    assert report.text.startswith('2 frames were not used')
+    # Told once: those of the last second.
+    assert statistics.report(inputs(), dropped, problem='', missing=()).level == OK
+    statistics.add_pair(pair(), 0)
+    statistics.add_pair(pair(Status.LOW_PARALLAX, 'it stands'), 0)
+    report = statistics.report(inputs(), dropped, problem='', missing=())
+    assert report.level == WARN
+    assert 'LOW_PARALLAX: it stands' in report.text
+    values = dict(report.values)
+    assert values['last_reason_no_pose'] == 'LOW_PARALLAX: it stands'
+    assert (values['pairs'], values['poses'], values['model']) == ('2', '1', 'uniform')
+    statistics.add_pair(pair(), 0)
+    assert statistics.report(inputs(), dropped, problem='', missing=()).level == OK
