@@ -61,7 +61,7 @@ def test_accuracy(cell, rotation, translation):
     assert errors[1] <= translation
 
 
-@pytest.mark.parametrize('solver', ['uniform_9pt', 'angular_3pt', 'angular_5pt'])
+@pytest.mark.parametrize('solver', ['uniform_9pt', 'uniform_11pt', 'angular_3pt', 'angular_5pt'])
 def test_every_solver_leads_the_map_fit_to_the_same_pose(solver):
     scene = make_scene(3)
     pose = estimate(scene, EstimatorConfig(

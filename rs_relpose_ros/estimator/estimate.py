@@ -208,7 +208,8 @@ class _Estimation:
         if g1 is not None and g2 is not None:
             align1, align2 = gravity_alignment(g1), gravity_alignment(g2)
         start = problem.rotation if problem.rotation is not None else eye
-        knowledge = Knowledge(align1, align2, np.ascontiguousarray(start))
+        knowledge = Knowledge(align1, align2, np.ascontiguousarray(start),
+                              problem.rotation is not None)
         threshold2 = (config.threshold * SCALES / problem.focal)**2
         pool_R, pool_x = np.zeros((POOL, 3, 3)), np.zeros((POOL, 9))
         pool_cost = np.full(POOL, np.inf)
