@@ -1,5 +1,7 @@
 """Start relpose_node beside a camera driver.
 
+::
+
     ros2 launch rs_relpose_ros relpose.launch.py camera_namespace:=/camera imu:=/imu/data_raw \
         params_file:=my_camera.yaml
 """
@@ -24,8 +26,8 @@ ARGUMENTS = {
         PathJoinSubstitution([FindPackageShare('rs_relpose_ros'), 'config', 'relpose.yaml']),
         'parameter file; readout_time and quat_cam_imu_xyzw have no default'),
     'fastdds_profile': (
-        '', 'Fast DDS profile, for images above 512 KB: config/fastdds.xml of this package; the '
-        'driver needs the same'),
+        '', ('Fast DDS profile, for images above 512 KB: config/fastdds.xml of this package; the '
+             'driver needs the same')),
     'use_sim_time': ('false', 'clock of log lines and diagnostics; estimates go by stamps alone'),
 }
 

@@ -41,8 +41,8 @@ class EstimatorConfig:
     min_inliers: int = setting(
         15, 'fewest inliers of a pose', low=6, high=10_000, live=True)
     min_parallax: float = setting(
-        1.0, 'least median parallax after the estimated rotation for a translation', 'px', low=0.0, high=500.0,
-        live=True)
+        1.0, 'least median parallax after the estimated rotation for a translation', 'px',
+        low=0.0, high=500.0, live=True)
 
     def __post_init__(self) -> None:
         check_settings(self)

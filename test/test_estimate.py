@@ -4,8 +4,16 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from two_view_scene import CENTRE, FOCAL, HEIGHT, LINE_DELAY, WIDTH
-from two_view_scene import direction_error, make_scene, rotation_error
+from two_view_scene import (
+    CENTRE,
+    direction_error,
+    FOCAL,
+    HEIGHT,
+    LINE_DELAY,
+    make_scene,
+    rotation_error,
+    WIDTH,
+)
 
 from rs_relpose_ros import (
     estimate_relative_pose,

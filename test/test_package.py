@@ -277,6 +277,7 @@ def test_recordings_skip_only_where_none_are_given(data, outcome, tmp_path):
         'import pytest\n\n\n@pytest.mark.recordings\ndef test_one(recordings):\n'
         '    assert recordings.is_dir()\n')
     environment = {key: value for key, value in os.environ.items() if key != 'RS_RELPOSE_DATA'}
+    environment['PYTHONPATH'] = str(ROOT / 'test')  # what conftest.py imports from beside it
     if data is not None:
         environment['RS_RELPOSE_DATA'] = str(tmp_path / data)
     ended = run(sys.executable, '-m', 'pytest', '-c', ROOT / 'pyproject.toml', '--rootdir',

@@ -1,7 +1,7 @@
 """Random two-view problems by brute force: SciPy only, nothing of the package's geometry.
 
-The paper's set-up: 1920x1080, f = 640 px, 60 us per row, baseline about 2 m, points 6 to 34 m away,
-velocities opposite in the two frames.
+The paper's set-up: 1920x1080, f = 640 px, 60 us per row, baseline about 2 m, points 6 to 34 m
+away, velocities opposite in the two frames.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 WIDTH, HEIGHT, FOCAL, CENTRE = 1920, 1080, 640.0, (959.5, 539.5)
 LINE_DELAY = 60e-6
+GRAVITY_NOISE, GYRO_NOISE = np.radians(0.2), np.radians(0.1)
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ def project(world, R, p, w, v, reference_row):
 
 
 def make_scene(seed, *, n=300, direction='forward', speed=1.0, rate=1.0, pixel_noise=0.5,
-               gravity_noise=np.radians(0.2), gyro_noise=np.radians(0.1), outliers=0.3,
+               gravity_noise=GRAVITY_NOISE, gyro_noise=GYRO_NOISE, outliers=0.3,
                constant_velocity=False, pure_rotation=False, reference='first'):
     """Draw one problem.
 

@@ -3,7 +3,9 @@
 Minimises, over ``R, t`` (unit), ``d_1, d_2, dw_1, dw_2`` (design section 4)::
 
     sum r_i^2 / s^2  +  |g_1 x R g_2|^2 / (2 s_g^2)  +  (|dw_1|^2 + |dw_2|^2) / s_w^2
-        +  (|d_1 - c t|^2 + |d_2 - c t|^2) / s_d^2  +  theta^T Lambda theta,  theta = Log(R R_gyro^T)
+        +  (|d_1 - c t|^2 + |d_2 - c t|^2) / s_d^2  +  theta^T Lambda theta
+
+with ``theta = Log(R R_gyro^T)``.
 
 ``c`` is 1 / interval where the time between the frames is known (constant velocity), else 0. By
 Levenberg-Marquardt with the exact Jacobian (the Sampson denominator included: treating it as
@@ -98,15 +100,15 @@ def _add_priors(state: State, priors: Priors, hessian: Array, gradient: Array) -
         hessian[D2 + i, D2 + i] += w
         gradient[D1 + i] += w * e1
         gradient[D2 + i] += w * e2
-        for k in range(2):
-            cross = -c * w * basis[i, k]
-            gradient[TANGENT + k] += cross * (e1 + e2)
-            hessian[TANGENT + k, D1 + i] += cross
-            hessian[D1 + i, TANGENT + k] += cross
-            hessian[TANGENT + k, D2 + i] += cross
-            hessian[D2 + i, TANGENT + k] += cross
-    for k in range(2):
-        hessian[TANGENT + k, TANGENT + k] += 2.0 * c * c * w
+        for j in range(2):
+            cross = -c * w * basis[i, j]
+            gradient[TANGENT + j] += cross * (e1 + e2)
+            hessian[TANGENT + j, D1 + i] += cross
+            hessian[D1 + i, TANGENT + j] += cross
+            hessian[TANGENT + j, D2 + i] += cross
+            hessian[D2 + i, TANGENT + j] += cross
+    for j in range(2):
+        hessian[TANGENT + j, TANGENT + j] += 2.0 * c * c * w
     for i in range(3):
         hessian[DW1 + i, DW1 + i] += priors.rate_weight
         hessian[DW2 + i, DW2 + i] += priors.rate_weight

@@ -20,7 +20,7 @@ from rs_relpose_ros.pipeline.parameters import Parameters
 from rs_relpose_ros.result import RelativePose, Status
 from rs_relpose_ros.tracking.keyframes import decide_keyframe, KeyframeDecision
 from rs_relpose_ros.tracking.matches import Matches
-from rs_relpose_ros.tracking.tracker import make_tracker
+from rs_relpose_ros.tracking.selection import make_tracker
 
 Array = NDArray[np.float64]
 

@@ -17,8 +17,10 @@ from rs_relpose_ros.pipeline.sequencer import ReadyFrame, Sequencer
 from rs_relpose_ros.timing import NANOSECONDS
 
 _WIDTH, _HEIGHT = 320, 240
+# With a distortion: its kernels, too, must be there before the first frame.
 _CALIBRATION = Calibration(width=_WIDTH, height=_HEIGHT, fx=250.0, fy=250.0, cx=159.5, cy=119.5,
-                           image_width=_WIDTH, image_height=_HEIGHT)
+                           image_width=_WIDTH, image_height=_HEIGHT,
+                           distortion_model='plumb_bob', distortion=(-0.02, 0.01, 0.0, 0.0))
 _FRAME_NS = NANOSECONDS // 30
 _IMU_NS = NANOSECONDS // 200
 
@@ -51,8 +53,8 @@ def warm_up_pipeline(parameters: Parameters) -> None:
 def _images() -> Iterator[NDArray[np.uint8]]:
     """A wall far away behind a near one, seen from a camera that moves, then stands."""
     noise = np.random.default_rng(0).integers(0, 256, (2, _HEIGHT, _WIDTH), dtype=np.uint8)
-    far, near = (cv2.normalize(cv2.GaussianBlur(layer, (0, 0), 2.0), np.empty_like(layer), 0, 255, cv2.NORM_MINMAX)
-                 for layer in noise)
+    far, near = (cv2.normalize(cv2.GaussianBlur(layer, (0, 0), 2.0), np.empty_like(layer), 0, 255,
+                               cv2.NORM_MINMAX) for layer in noise)
     for shift in (0, 4, 8, 8):
         image = np.roll(far, -shift, axis=1)
         image[80:160] = np.roll(near, -3 * shift, axis=1)[80:160]

@@ -26,18 +26,23 @@ from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.utilities import remove_ros_args
-from rosbags.highlevel import AnyReader, AnyReaderError
-from rosbags.interfaces import Connection
-from rosbags.typesys import get_typestore, Stores
 
+from rs_relpose_ros.bags.reader import (
+    Bag,
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    IMU,
+    open_bag,
+    RawMessage,
+    Topic,
+)
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.ros.message_types import message_class
 from rs_relpose_ros.timing import NANOSECONDS
 
-_COMPRESSED = 'sensor_msgs/msg/CompressedImage'
 # What the node subscribes to, and so what is worth waiting for.
-_SENSOR_TYPES = ('sensor_msgs/msg/Image', _COMPRESSED, 'sensor_msgs/msg/CameraInfo',
-                 'sensor_msgs/msg/Imu')
+_SENSOR_TYPES = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, IMU)
 _DEPTH = 1000
 # Best-effort samples are confirmed by nobody; the last ones need this long to be read.
 _LINGER = 0.2
@@ -79,38 +84,34 @@ def play(node: Node, options: PlayerOptions) -> int:
     InputError, MissingInputError
         No bag, no such topic, or no subscriber in time.
     """
-    try:
-        with AnyReader([options.bag],
-                       default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
-            connections = _chosen(reader, options)
-            publishers = {c.id: _publisher(node, c, options) for c in connections}
-            if options.wait_for_subscribers > 0.0:
-                _wait_for_subscribers(
-                    [publishers[c.id] for c in connections if c.msgtype in _SENSOR_TYPES],
-                    options.wait_for_subscribers)
-            return _publish(_messages(reader, connections, options), publishers, options.rate)
-    except (AnyReaderError, OSError) as error:
-        raise InputError(f'cannot play {options.bag}: {error}') from error
+    with open_bag(options.bag) as bag:
+        topics = _chosen(bag, options)
+        publishers = {topic.name: _publisher(node, topic, options) for topic in topics}
+        if options.wait_for_subscribers > 0.0:
+            _wait_for_subscribers(
+                [publishers[topic.name] for topic in topics if topic.msgtype in _SENSOR_TYPES],
+                options.wait_for_subscribers)
+        return _publish(bag.raw_messages(topics), publishers, options)
 
 
-def _chosen(reader: AnyReader, options: PlayerOptions) -> list[Connection]:
-    there = sorted({c.topic for c in reader.connections})
-    for topic in options.topics:
-        if topic not in there:
+def _chosen(bag: Bag, options: PlayerOptions) -> list[Topic]:
+    there = {topic.name for topic in bag.topics}
+    for name in options.topics:
+        if name not in there:
             raise MissingInputError(
-                f'the bag {options.bag} has no topic {topic}; it has {", ".join(there)}')
-    return [c for c in reader.connections if not options.topics or c.topic in options.topics]
+                f'the bag {options.bag} has no topic {name}; it has {", ".join(sorted(there))}')
+    return [topic for topic in bag.topics if not options.topics or topic.name in options.topics]
 
 
-def _publisher(node: Node, connection: Connection, options: PlayerOptions) -> Publisher:
-    topic, msgtype = connection.topic, connection.msgtype
-    if options.decode and msgtype == _COMPRESSED:
-        topic, msgtype = topic.removesuffix('/compressed'), 'sensor_msgs/msg/Image'
+def _publisher(node: Node, topic: Topic, options: PlayerOptions) -> Publisher:
+    name, msgtype = topic.name, topic.msgtype
+    if options.decode and msgtype == COMPRESSED_IMAGE:
+        name, msgtype = name.removesuffix('/compressed'), IMAGE
     reliability = (ReliabilityPolicy.BEST_EFFORT if options.best_effort
                    else ReliabilityPolicy.RELIABLE)
-    depth = _DEPTH if msgtype == 'sensor_msgs/msg/Imu' else 10
-    return node.create_publisher(message_class(msgtype), topic, QoSProfile(
-        history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=reliability))
+    return node.create_publisher(message_class(msgtype), name, QoSProfile(
+        history=HistoryPolicy.KEEP_LAST, depth=_DEPTH if msgtype == IMU else 10,
+        reliability=reliability))
 
 
 def _wait_for_subscribers(publishers: Sequence[Publisher], seconds: float) -> None:
@@ -126,18 +127,12 @@ def _wait_for_subscribers(publishers: Sequence[Publisher], seconds: float) -> No
             'first, and remap its topics to these names')
 
 
-def _messages(reader: AnyReader, connections: list[Connection],
-              options: PlayerOptions) -> Iterator[tuple[int, int, Any]]:
-    """Connection id, bag time [ns] and message (serialised where it goes on as it is)."""
-    for connection, bag_time_ns, raw in reader.messages(connections):
-        if not reader.is2:
-            message: Any = bytes(reader.typestore.ros1_to_cdr(raw, connection.msgtype))
-        else:
-            message = bytes(raw)
-        if options.decode and connection.msgtype == _COMPRESSED:
-            message = _decoded(deserialize_message(message, message_class(_COMPRESSED)),
-                               options.decode)
-        yield connection.id, bag_time_ns, message
+def _to_publish(raw: RawMessage, options: PlayerOptions) -> Any:
+    """The message, serialised where it goes on as it is."""
+    if options.decode and raw.msgtype == COMPRESSED_IMAGE:
+        compressed = deserialize_message(raw.data, message_class(COMPRESSED_IMAGE))
+        return _decoded(compressed, options.decode)
+    return raw.data
 
 
 def _decoded(compressed: Any, encoding: str) -> Any:
@@ -148,25 +143,26 @@ def _decoded(compressed: Any, encoding: str) -> Any:
         raise InputError('a compressed image of the bag cannot be decoded: it is corrupt')
     data = array('B')
     data.frombytes(pixels.tobytes())
-    return message_class('sensor_msgs/msg/Image')(
+    return message_class(IMAGE)(
         header=compressed.header, height=pixels.shape[0], width=pixels.shape[1],
         encoding=encoding, step=pixels.shape[1] * pixels[0, 0].size, data=data)
 
 
-def _publish(messages: Iterator[tuple[int, int, Any]], publishers: dict[int, Publisher],
-             rate: float) -> int:
+def _publish(messages: Iterator[RawMessage], publishers: dict[str, Publisher],
+             options: PlayerOptions) -> int:
     count = 0
     first_ns = start_ns = 0
-    for connection_id, bag_time_ns, message in messages:
+    for raw in messages:
+        message = _to_publish(raw, options)
         if count == 0:
-            first_ns, start_ns = bag_time_ns, time.monotonic_ns()
-        due_ns = start_ns + round((bag_time_ns - first_ns) / rate)
+            first_ns, start_ns = raw.bag_time_ns, time.monotonic_ns()
+        due_ns = start_ns + round((raw.bag_time_ns - first_ns) / options.rate)
         wait_ns = due_ns - time.monotonic_ns()
         if wait_ns > 0:
             time.sleep(wait_ns / NANOSECONDS)
         if not rclpy.ok():
             return count
-        publishers[connection_id].publish(message)
+        publishers[raw.topic].publish(message)
         count += 1
     for publisher in publishers.values():
         publisher.wait_for_all_acked(Duration(seconds=1))

@@ -12,24 +12,22 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 import yaml
 
+from rs_relpose_ros.bags.layout import (
+    CAMERA_FRAME,
+    CAMERA_INFO_TOPIC,
+    COMPRESSED_TOPIC,
+    GROUND_TRUTH_TOPIC,
+    IMAGE_DELAY,
+    IMU_DELAY,
+    IMU_FRAME,
+    IMU_TOPIC,
+    RAW_TOPIC,
+    WORLD_FRAME,
+)
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.simulation.simulation import Simulation
 from rs_relpose_ros.timing import to_nanoseconds
-
-COMPRESSED_TOPIC = '/camera/image_raw/compressed'
-RAW_TOPIC = '/camera/image_raw'
-CAMERA_INFO_TOPIC = '/camera/camera_info'
-IMU_TOPIC = '/imu/data_raw'
-GROUND_TRUTH_TOPIC = '/ground_truth/pose'
-
-CAMERA_FRAME = 'camera_optical_frame'
-IMU_FRAME = 'imu_link'
-WORLD_FRAME = 'world'
-
-# How long after its stamp, and after the read-out of an image, a driver delivers a message [s].
-_IMAGE_DELAY = 0.005
-_IMU_DELAY = 0.002
 
 # Bag time [ns], topic, type and a function that makes the message.
 _Entry = tuple[int, str, str, Callable[[], Any]]
@@ -97,7 +95,7 @@ def write_parameters(simulation: Simulation, path: Path | str, *, raw: bool = Fa
 
 def _images(simulation: Simulation, bag: BagWriter, jpeg_quality: int, raw: bool,
             on_frame: Callable[[], object]) -> Iterator[_Entry]:
-    delay_ns = to_nanoseconds(simulation.config.readout_time + _IMAGE_DELAY)
+    delay_ns = to_nanoseconds(simulation.config.readout_time + IMAGE_DELAY)
     for index in range(simulation.config.frame_count):
         stamp_ns = simulation.stamp_ns(index)
 
@@ -123,7 +121,7 @@ def _images(simulation: Simulation, bag: BagWriter, jpeg_quality: int, raw: bool
 
 def _imu(simulation: Simulation, bag: BagWriter) -> Iterator[_Entry]:
     config, imu = simulation.config, simulation.imu
-    delay_ns = to_nanoseconds(_IMU_DELAY)
+    delay_ns = to_nanoseconds(IMU_DELAY)
     gyro_variance = config.gyro_noise_density**2 * config.imu_rate
     accel_variance = config.accel_noise_density**2 * config.imu_rate
     for stamp_ns, rate, force in zip(imu.stamps_ns.tolist(), imu.angular_velocities,
@@ -140,7 +138,7 @@ def _ground_truth(simulation: Simulation, bag: BagWriter) -> Iterator[_Entry]:
     stamps_ns = simulation.imu.stamps_ns
     states = simulation.states(stamps_ns)
     quaternions = np.atleast_2d(Rotation.from_matrix(states.R_world_cam).as_quat())
-    delay_ns = to_nanoseconds(_IMU_DELAY)
+    delay_ns = to_nanoseconds(IMU_DELAY)
     for stamp_ns, position, quat_xyzw in zip(stamps_ns.tolist(), states.position, quaternions,
                                              strict=True):
         def message(stamp_ns: int = stamp_ns, position: Any = position,

@@ -7,49 +7,43 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.tracking.alignment import align
 from rs_relpose_ros.tracking.config import TrackingConfig
 from rs_relpose_ros.tracking.corners import feature_rows, find_corners, keep_apart
-from rs_relpose_ros.tracking.images import checked, Image, pyramid
+from rs_relpose_ros.tracking.images import checked, Image
 from rs_relpose_ros.tracking.matches import Matches
 from rs_relpose_ros.tracking.tracker import Predict
+from rs_relpose_ros.tracking.windows import correlations, window_homography, with_brightness_of
 
 Array = NDArray[np.float64]
 
-_ITERATIONS = 10
-# Last step [px]: of coarse levels, from frame to frame, and against the reference.
-_COARSE_TOLERANCE = 0.1
-_FOLLOW_TOLERANCE = 0.03
-_FINE_TOLERANCE = 0.01
-# Corrections of the guess [px] that one level makes up for.
+_FOLLOW = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02)
+_REFINE = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.005)
+# OpenCV's eigenvalues are those of Scharr gradients, 32 times the derivative, divided by 2^20.
+_SCHARR = 2.0**20 / 32.0**2
+# Corrections of the guess [px] that the image itself, without its pyramid, makes up for.
 _NEAR = 2.0
-# Correlation with the previous frame; the stricter one is with the reference.
-_MIN_STEP_CORRELATION = 0.6
 # The comparison with the reference corrects drift; what it moves further was lost before.
 _LARGEST_CORRECTION = 3.0
-_NO_WARPS = np.empty((0, 2, 2))
 
 
 class KltTracker:
     """Lucas-Kanade tracking of Shi-Tomasi corners; see `rs_relpose_ros.tracking.tracker.Tracker`.
 
     From frame to frame windows hardly change, so that tracks live long, but errors add up. When a
-    pair closes each window is aligned once more with that of the reference keyframe, turned and
-    scaled as the tracks tell: that leaves the error of a single alignment.
+    pair closes each window is aligned once more with that of the reference keyframe, in the
+    current image turned and scaled as the tracks tell: that leaves the error of a single
+    alignment.
     """
 
     def __init__(self, config: TrackingConfig) -> None:
         self._config = config
-        self._half = config.klt_window // 2
-        # Room for the margin of the gradient and for the neighbours of the interpolation.
-        self._padding = self._half + 3
         self._next_id = 0
         self.reset()
 
     def reset(self) -> None:
         """Forget all images; ids are not used again."""
-        self._reference: list[Image] = []
-        self._current: list[Image] = []
+        self._reference: Image | None = None
+        self._current: Image | None = None
         self._set(np.empty(0, dtype=np.uint32), np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
         self._started = 0
         self._refined = False
@@ -61,9 +55,9 @@ class KltTracker:
 
     def start(self, image: Image) -> None:
         """Make `image` (H, W) the reference keyframe, with new corners only."""
-        image = checked(image, self._current[0].shape if self._current else None)
+        image = checked(image, None if self._current is None else self._current.shape)
         self.reset()
-        self._current = self._pyramid(image)
+        self._current = image
         self._renew()
 
     def track(self, image: Image, predict: Predict | None = None) -> Matches:
@@ -75,82 +69,91 @@ class KltTracker:
         predict : callable, optional
             Maps points of the previous image to where they are expected in this one.
         """
-        if not self._current:
+        if self._current is None:
             raise InputError('the tracker has no reference keyframe: call start() first')
         previous, points = self._current, self._points
-        current = self._pyramid(checked(image, previous[0].shape))
-        found = points.copy()
+        current = checked(image, previous.shape)
+        guess = points
         if predict is not None and len(points):
             guess = np.asarray(predict(points), dtype=np.float64)
-            found = np.where(np.isfinite(guess).all(axis=1, keepdims=True), guess, points)
-        guess = found.copy()
-        correlation = self._follow(previous, current, points, found, len(current))
+            guess = np.where(np.isfinite(guess).all(axis=1, keepdims=True), guess, points)
+        levels = self._config.klt_levels
+        seen = with_brightness_of(previous, current, points, guess, self._config.klt_window)
+        found, good, _ = self._follow(previous, seen, points, guess, levels, _FOLLOW)
         # The way back starts as far off as the way forth did: the guess must not be the answer.
-        back = points + (found - guess)
-        far = np.linalg.norm(found - guess, axis=1) > _NEAR
-        back_correlation = np.empty(len(points))
-        for mask, levels in ((far, len(current)), (~far, 1)):
-            partial = back[mask]
-            back_correlation[mask] = self._follow(current, previous, found[mask], partial, levels)
-            back[mask] = partial
+        offset = found - guess
+        far = np.linalg.norm(offset, axis=1) > _NEAR
+        for mask, depth in ((good & far, levels), (good & ~far, 1)):
+            back, returned, _ = self._follow(
+                seen, previous, found[mask], (points + offset)[mask], depth, _FOLLOW)
+            good[mask] = returned & (np.linalg.norm(back - points[mask], axis=1)
+                                     <= self._config.forward_backward_threshold)
         first, last = feature_rows(self._config, image.shape[0])
-        good = ((correlation >= _MIN_STEP_CORRELATION)
-                & (back_correlation >= _MIN_STEP_CORRELATION)
-                & (np.linalg.norm(back - points, axis=1)
-                   <= self._config.forward_backward_threshold)
-                & (found[:, 1] >= first) & (found[:, 1] <= last))
-        self._set(self._ids[good], self._reference_points[good], found[good],
-                  np.minimum(self._quality, correlation)[good])
+        good &= (found[:, 1] >= first) & (found[:, 1] <= last)
+        self._set(self._ids[good], self._reference_points[good], found[good], self._quality[good])
         self._current = current
         self._refined = False
         return self._matches()
 
     def refined_matches(self) -> Matches:
         """Matches whose windows were aligned with the reference's own."""
-        if not self._refined and len(self._ids) and self._current is not self._reference:
-            found = self._points.copy()
-            correlation, eigenvalue = align(
-                self._reference[0], self._current[0], self._reference_points, found,
-                _warps(self._reference_points, self._points), self._half, _ITERATIONS,
-                _FINE_TOLERANCE)
-            good = ((correlation >= self._config.min_correlation)
-                    & (np.linalg.norm(found - self._points, axis=1) <= _LARGEST_CORRECTION))
+        if (not self._refined and len(self._ids) and self._reference is not None
+                and self._current is not None and self._current is not self._reference):
+            H = window_homography(self._reference_points, self._points)
+            height, width = self._current.shape
+            # As the reference would see it, were all of it one plane.
+            seen: Image = cv2.warpPerspective(  # type: ignore[assignment]
+                self._current, H, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+            guess = _mapped(np.asarray(np.linalg.inv(H), dtype=np.float64), self._points)
+            seen = with_brightness_of(self._reference, seen, self._reference_points, guess,
+                                      self._config.klt_window)
+            aligned, good, strength = self._follow(
+                self._reference, seen, self._reference_points, guess, 1, _REFINE)
+            found = _mapped(H, aligned)
+            correlation = correlations(self._reference, seen, self._reference_points, aligned,
+                                       self._config.klt_window)
+            good &= ((correlation >= self._config.min_correlation)
+                     & (np.linalg.norm(found - self._points, axis=1) <= _LARGEST_CORRECTION))
             # A faint corner is worth less than a strong one of the same correlation.
-            quality = correlation * eigenvalue / (eigenvalue + self._config.feature_quality)
+            quality = correlation * strength / (strength + self._config.feature_quality)
             self._set(self._ids[good], self._reference_points[good], found[good], quality[good])
         self._refined = True
         return self._matches()
 
     def promote(self) -> None:
         """Make the current image the reference; tracks go on, new corners fill the gaps."""
-        if not self._current:
+        if self._current is None:
             raise InputError('the tracker has no current image: call start() first')
         self._renew()
 
     # -- inside ------------------------------------------------------------------------------
 
-    def _pyramid(self, image: Image) -> list[Image]:
-        return pyramid(image, self._config.klt_levels, self._padding)
+    def _follow(self, image1: Image, image2: Image, points1: Array, guess: Array, levels: int,
+                criteria: tuple[int, int, float]) -> tuple[Array, NDArray[np.bool_], Array]:
+        """Points of `image2` that look like `points1` (N, 2), and which of them were found.
 
-    def _follow(self, first: list[Image], second: list[Image], points1: Array, points2: Array,
-                levels: int) -> Array:
-        """Improve `points2` (N, 2) in place, from coarse to fine; the correlations (N,)."""
-        correlation = np.empty(0)
-        for level in reversed(range(levels)):
-            padding, scale = (self._padding, 2.0**-level) if level else (0, 1.0)
-            scaled = points2 * scale + padding
-            correlation, _ = align(
-                first[level], second[level], points1 * scale + padding, scaled, _NO_WARPS,
-                self._half, _ITERATIONS, _COARSE_TOLERANCE if level else _FOLLOW_TOLERANCE)
-            points2[:] = (scaled - padding) / scale
-        return correlation
+        Last, the least eigenvalues (N,) of the windows' structure tensors [gray^2/px^2].
+        """
+        if not len(points1):
+            return points1, np.empty(0, dtype=bool), np.empty(0)
+        side = self._config.klt_window
+        found, status, eigenvalues = cv2.calcOpticalFlowPyrLK(
+            image1, image2, points1.astype(np.float32, order='C'),
+            guess.astype(np.float32, order='C'), winSize=(side, side), maxLevel=levels - 1,
+            criteria=criteria,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW | cv2.OPTFLOW_LK_GET_MIN_EIGENVALS)
+        points2 = np.asarray(found, dtype=np.float64)
+        height, width = image2.shape
+        inside = ((points2 >= 0.0) & (points2 <= (width - 1.0, height - 1.0))).all(axis=1)
+        strength = _SCHARR * np.asarray(eigenvalues, dtype=np.float64)[:, 0]
+        return points2, (np.asarray(status)[:, 0] == 1) & inside, strength
 
     def _renew(self) -> None:
-        height, width = self._current[0].shape
+        assert self._current is not None
         # Of tracks that ran together the oldest stays.
-        apart = keep_apart(self._points, 0.5 * self._config.min_feature_distance, height, width)
+        apart = keep_apart(self._points, 0.5 * self._config.min_feature_distance)
         kept = self._points[apart]
-        new = find_corners(self._current[0], kept, self._config.max_features - len(kept),
+        new = find_corners(self._current, kept, self._config.max_features - len(kept),
                            self._config)
         ids = np.concatenate([self._ids[apart], (
             np.arange(self._next_id, self._next_id + len(new)) % 2**32).astype(np.uint32)])
@@ -172,26 +175,6 @@ class KltTracker:
                        self._quality.copy())
 
 
-def _warps(points1: Array, points2: Array) -> Array:
-    """Derivatives (N, 2, 2) of the homography that fits all tracks; empty where none does."""
-    if len(points1) < 8:
-        return _NO_WARPS
-    # None, where there is none, becomes an array without shape.
-    H = np.asarray(cv2.findHomography(points1, points2, method=0)[0], dtype=np.float64)
-    if H.shape != (3, 3):
-        return _NO_WARPS
-    x, y = points1[:, 0], points1[:, 1]
-    scale = H[2, 0] * x + H[2, 1] * y + H[2, 2]
-    with np.errstate(all='ignore'):
-        u = (H[0, 0] * x + H[0, 1] * y + H[0, 2]) / scale
-        v = (H[1, 0] * x + H[1, 1] * y + H[1, 2]) / scale
-        warps = np.empty((len(points1), 2, 2))
-        for row, value in enumerate((u, v)):
-            for column in range(2):
-                warps[:, row, column] = (H[row, column] - value * H[2, column]) / scale
-        area = np.linalg.det(warps)
-    # A fit that stretches this much is none.
-    wild = ~(np.isfinite(warps).all(axis=(1, 2)) & (area > 0.25) & (area < 4.0)
-             & (np.abs(warps).max(axis=(1, 2)) < 3.0))
-    warps[wild] = np.eye(2)
-    return warps
+def _mapped(H: Array, points: Array) -> Array:
+    """Points (N, 2) under a homography (3, 3)."""
+    return np.asarray(cv2.perspectiveTransform(points[:, None], H), dtype=np.float64)[:, 0]

@@ -1,4 +1,4 @@
-"""What a tracker does, and the choice of one."""
+"""What a tracker does."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.tracking.config import TrackingConfig
 from rs_relpose_ros.tracking.matches import Matches
 
 Array = NDArray[np.float64]
@@ -42,13 +41,3 @@ class Tracker(Protocol):
 
     def reset(self) -> None:
         """Forget all images; ids are not used again."""
-
-
-def make_tracker(config: TrackingConfig) -> Tracker:
-    """The tracker that `config.detector` names."""
-    # Imported here: the other one's kernels need not be loaded.
-    if config.detector == 'klt':
-        from rs_relpose_ros.tracking.klt import KltTracker
-        return KltTracker(config)
-    from rs_relpose_ros.tracking.descriptors import DescriptorTracker
-    return DescriptorTracker(config)
