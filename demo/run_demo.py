@@ -8,13 +8,7 @@ real time, replays the same bag offline with several methods, and prints a table
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import ExitStack
-from dataclasses import dataclass
-import os
 from pathlib import Path
-import signal
-import subprocess
 import sys
 import time
 
@@ -36,6 +30,7 @@ from rs_relpose_ros.replay.record import PairRecord
 from rs_relpose_ros.replay.run import read_truth, ReplayedPair
 from rs_relpose_ros.replay.stamps import read_stamps
 from rs_relpose_ros.result import Status
+from rs_relpose_ros.ros.live_run import LiveRun, run_live
 
 ROOT = Path(__file__).resolve().parent.parent
 BAG = ROOT / 'bags' / 'hand_held'
@@ -45,121 +40,13 @@ OUT = ROOT / 'demo_out'
 STARTED = time.monotonic()
 # The camera stands if it moved less than this between two keyframes [m].
 STILL_BASELINE = 0.03
-# Compiling all kernels takes a minute on a slow machine.
-START_TIMEOUT = 150.0
-# The node is done when it has taken no frame for so long.
-QUIET = 1.0
 
 
 class DemoError(Exception):
     """The demo could not be run; the text says why."""
 
 
-@dataclass(frozen=True, slots=True)
-class Live:
-    """Files of the live run."""
-
-    table: Path
-    stamps: Path
-
-
-class Process:
-    """A Python process of the project with its log file."""
-
-    def __init__(self, name: str, module: str, *arguments: str) -> None:
-        self.name, self.log = name, OUT / f'{name}.log'
-        # Nothing leaves this machine, and nobody else's nodes take part: an id of this process,
-        # below 102, as the DDS ports of higher ones run into those of other programs.
-        environment = {**os.environ, 'PYTHONUNBUFFERED': '1',
-                       'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-                       'ROS_DOMAIN_ID': str(1 + os.getpid() % 100),
-                       'AMENT_PREFIX_PATH': os.environ.get('AMENT_PREFIX_PATH', sys.prefix)}
-        with self.log.open('wb') as log:
-            self._process = subprocess.Popen(
-                [sys.executable, '-m', module, *arguments], cwd=ROOT, env=environment, stdout=log,
-                stderr=subprocess.STDOUT)
-
-    def __enter__(self) -> Process:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._process.poll() is None:
-            self._process.kill()
-            self._process.wait()
-
-    @property
-    def text(self) -> str:
-        """What it has said so far."""
-        return self.log.read_text(encoding='utf-8', errors='replace')
-
-    def check(self) -> None:
-        """Raise if it has ended with an error."""
-        if self._process.poll() not in (None, 0):
-            raise self._failure(f'ended with code {self._process.returncode}')
-
-    def wait(self, timeout: float) -> None:
-        """Wait for its end."""
-        try:
-            self._process.wait(timeout)
-        except subprocess.TimeoutExpired:
-            raise self._failure(f'did not end within {timeout:g} s') from None
-        self.check()
-
-    def stop(self) -> None:
-        """Ask it to end, as Ctrl-C does."""
-        self._process.send_signal(signal.SIGINT)
-        self.wait(15.0)
-
-    def _failure(self, what: str) -> DemoError:
-        tail = '\n'.join(self.text.splitlines()[-15:])
-        return DemoError(f'{self.name} {what}; the end of {self.log}:\n{tail}')
-
-
-def run_live() -> Live:
-    """Node, recorder and player as three processes; real time."""
-    live = Live(OUT / 'live.csv', OUT / 'live_stamps.txt')
-    with ExitStack() as stack:
-        node = stack.enter_context(Process(
-            'relpose_node', 'rs_relpose_ros.ros.node', '--ros-args', '--params-file',
-            str(PARAMETERS), '-p', f'stamps_file:={live.stamps}', '-r',
-            'image:=/camera/image_raw', '-r', 'camera_info:=/camera/camera_info', '-r',
-            'imu:=/imu/data_raw'))
-        recorder = stack.enter_context(Process(
-            'recorder', 'rs_relpose_ros.ros.recorder', str(live.table)))
-        wait_for(lambda: 'ready' in recorder.text, 'the recorder found no node', node, recorder)
-        # The player waits until the node subscribes, which it does once its kernels are compiled.
-        player = stack.enter_context(Process(
-            'player', 'rs_relpose_ros.ros.player', str(BAG), '--wait-for-subscribers',
-            str(START_TIMEOUT)))
-        player.wait(START_TIMEOUT + 60.0)
-        wait_until_quiet(live.stamps)
-        recorder.stop()
-        node.stop()
-    return live
-
-
-def wait_for(condition: Callable[[], bool], complaint: str, *processes: Process) -> None:
-    """Wait until `condition()` holds."""
-    deadline = time.monotonic() + START_TIMEOUT
-    while not condition():
-        for process in processes:
-            process.check()
-        if time.monotonic() > deadline:
-            raise DemoError(f'{complaint} within {START_TIMEOUT:g} s')
-        time.sleep(0.05)
-
-
-def wait_until_quiet(path: Path) -> None:
-    """Wait until a file has not grown for some time."""
-    size, since = -1, time.monotonic()
-    while time.monotonic() - since < QUIET:
-        now = path.stat().st_size
-        if now != size:
-            size, since = now, time.monotonic()
-        time.sleep(0.05)
-
-
-def compare(live: Live) -> list[str]:
+def compare(live: LiveRun) -> list[str]:
     """Replay the bag with all methods; the lines to print."""
     parameters = read_parameters(PARAMETERS)
     with open_bag(BAG) as bag:
@@ -187,7 +74,7 @@ def compare(live: Live) -> list[str]:
     return [*score_table(scores), '', *remarks(scores, outcome, live, same_frames)]
 
 
-def remarks(scores: list[Score], outcome: ReplayOutcome, live: Live,
+def remarks(scores: list[Score], outcome: ReplayOutcome, live: LiveRun,
             same_frames: ReplayOutcome) -> list[str]:
     """What the table does not say."""
     without = [record for record in same_frames.records if record.status is not Status.OK]
@@ -223,7 +110,7 @@ def main() -> int:
     try:
         say(f'playing {BAG.relative_to(ROOT)} to relpose_node over Fast DDS, in real time (the '
             'first time, compiling takes up to a minute) ...')
-        lines = compare(run_live())
+        lines = compare(run_live(BAG, PARAMETERS, OUT))
     except (DemoError, RsRelposeError) as error:
         print(f'demo: {error}', file=sys.stderr)
         return 1

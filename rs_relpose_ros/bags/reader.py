@@ -15,6 +15,7 @@ from rosbags.typesys import get_typestore, Stores
 
 from rs_relpose_ros.bags.mcap_check import check_mcap
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
+from rs_relpose_ros.timing import NANOSECONDS
 
 IMAGE = 'sensor_msgs/msg/Image'
 COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
@@ -96,6 +97,11 @@ class Bag:
             counts[key] = counts.get(key, 0) + connection.msgcount
         self.topics = tuple(Topic(name, msgtype, count)
                             for (name, msgtype), count in sorted(counts.items()))
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last message [s]."""
+        return float(self._reader.duration) / NANOSECONDS
 
     def find_topics(self, options: TopicOptions | None = None) -> SensorTopics:
         """The sensors' topics: as chosen, or by type where only one can be meant.
