@@ -223,7 +223,7 @@ def no_bag(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(('arguments', 'sentence'), [
-    (['{no_bag}'], 'cannot play'),
+    (['{no_bag}'], 'is no MCAP file'),
     (['{bag}', '--topics', '/nothing'], 'has no topic /nothing; it has /camera/camera_info'),
     (['{bag}', '--wait-for-subscribers', '0.2'], 'nobody subscribed to'),
 ])
