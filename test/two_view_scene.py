@@ -36,17 +36,55 @@ class TwoViewScene:
     is_outlier: NDArray[np.bool_]
 
 
-def project(world, R, p, w, v, reference_row):
-    """Pixels and depths of world points (N, 3) seen by a camera that moves while it reads rows."""
+@dataclass(frozen=True)
+class MinimalProblems:
+    """K problems of n exact matches each; the truth in their own units (|t| = 1).
+
+    `rays*` (K, n, 3) as measured; `derotated*` the same in the camera's orientation at tau 0; row
+    times `tau*` (K, n); `gravity*`, `t`, `v*`, `w*` (K, 3); `R` (K, 3, 3).
+    """
+
+    rays1: NDArray[np.float64]
+    rays2: NDArray[np.float64]
+    derotated1: NDArray[np.float64]
+    derotated2: NDArray[np.float64]
+    tau1: NDArray[np.float64]
+    tau2: NDArray[np.float64]
+    gravity1: NDArray[np.float64]
+    gravity2: NDArray[np.float64]
+    R: NDArray[np.float64]
+    t: NDArray[np.float64]
+    v1: NDArray[np.float64]
+    v2: NDArray[np.float64]
+    w1: NDArray[np.float64]
+    w2: NDArray[np.float64]
+
+
+def seen_from(world, R, p, w, v, tau):
+    """World points (N, 3) in the frame of the camera as it is at the row times (N,)."""
+    turn = R * Rotation.from_rotvec(tau[:, None] * w)
+    return turn.inv().apply(world - p - tau[:, None] * R.apply(v))
+
+
+def expose(world, R, p, w, v, reference_row, iterations):
+    """Points (N, 3) in the frame of a camera that moves while it reads rows, and their row times.
+
+    Of one camera, or of N: `R` a rotation or N of them, `p`, `w`, `v` (3,) or (N, 3).
+    """
     rows = np.full(len(world), HEIGHT / 2)
-    for _ in range(60):
+    for _ in range(iterations):
         tau = (rows - reference_row) * LINE_DELAY
-        turn = Rotation.from_matrix(R) * Rotation.from_rotvec(tau[:, None] * w)
-        local = turn.inv().apply(world - p - tau[:, None] * (R @ v))
-        pixels = FOCAL * local[:, :2] / local[:, 2:] + CENTRE
-        settled = np.abs(pixels[:, 1] - rows) < 1e-9
-        rows = pixels[:, 1]
-    return pixels, local[:, 2], settled
+        local = seen_from(world, R, p, w, v, tau)
+        moved = FOCAL * local[:, 1] / local[:, 2] + CENTRE[1]
+        settled = np.abs(moved - rows) < 1e-9
+        rows = moved
+    return local, tau, settled
+
+
+def project(world, R, p, w, v, reference_row):
+    """Pixels and depths of world points (N, 3), and whether their rows were found."""
+    local, _, settled = expose(world, Rotation.from_matrix(R), p, w, v, reference_row, 60)
+    return FOCAL * local[:, :2] / local[:, 2:] + CENTRE, local[:, 2], settled
 
 
 def make_scene(seed, *, n=300, direction='forward', speed=1.0, rate=1.0, pixel_noise=0.5,
@@ -95,6 +133,61 @@ def make_scene(seed, *, n=300, direction='forward', speed=1.0, rate=1.0, pixel_n
         w2 + rng.normal(size=3) * gyro_noise, tilt.apply(R1.T @ down),
         tilt.inv().apply(R2.T @ down), R1.T @ R2, R1.T @ p2 / length, v1 / length, v2 / length,
         w1, w2, is_outlier)
+
+
+def make_minimal_problems(seed, count, n, *, speed=(0.0, 10.0), rate=(0.0, 3.0),
+                          constant_velocity=False, turned=False):
+    """Draw problems of the same set-up, half of them forward and half sideways, without noise.
+
+    `speed` [m/s] and `rate` [rad/s] are ranges of what each axis has. Row times count from the
+    first row. `turned` gives each camera a frame of its own, turned by any rotation: the relative
+    rotation, and gravity in either frame, are then anything. Rays are consistent with their row
+    times to rounding, however far the search for the row has come.
+    """
+    rng = np.random.default_rng(seed)
+    p2 = np.where(np.arange(count)[:, None] % 2, [2.0, 0.0, 0.0], [0.0, 0.0, 2.0])
+    p2 = p2 + rng.normal(size=(count, 3)) * 0.2
+    R1, R2 = (Rotation.from_euler('xyz', rng.uniform(-10, 10, (count, 3)), degrees=True)
+              for _ in range(2))
+    v1, w1 = (rng.uniform(*size, (count, 1)) * rng.choice([-1.0, 1.0], (count, 3))
+              for size in (speed, rate))
+    v2, w2 = -v1, -w1
+    if constant_velocity:
+        velocity = np.linalg.norm(v1, axis=1, keepdims=True) * p2 / np.linalg.norm(
+            p2, axis=1, keepdims=True)
+        v1, v2 = R1.inv().apply(velocity), R2.inv().apply(velocity)
+    rays1, rays2 = np.empty((2, count * n, 3))
+    tau1, tau2 = np.empty((2, count * n))
+    missing, owner = np.arange(count * n), np.repeat(np.arange(count), n)
+    size = [WIDTH - 1, HEIGHT - 1]
+    while len(missing):
+        k = owner[missing]
+        pixels = rng.uniform([0, 0], size, (len(k), 2))
+        a = np.c_[(pixels - CENTRE) / FOCAL, np.ones(len(k))]
+        tau = pixels[:, 1] * LINE_DELAY
+        turn = R1[k] * Rotation.from_rotvec(tau[:, None] * w1[k])
+        world = turn.apply(rng.uniform(6, 34, (len(k), 1)) * a) + (
+            tau[:, None] * R1[k].apply(v1[k]))
+        b, later, _ = expose(world, R2[k], p2[k], w2[k], v2[k], 0.0, 15)
+        pixels = FOCAL * b[:, :2] / b[:, 2:] + CENTRE
+        seen = (b[:, 2] > 1.0) & ((pixels >= 0) & (pixels <= size)).all(axis=1)
+        found = missing[seen]
+        rays1[found], tau1[found] = a[seen], tau[seen]
+        rays2[found], tau2[found] = b[seen], later[seen]
+        missing = missing[~seen]
+    Q1, Q2 = (Rotation.random(count, random_state=rng) if turned else Rotation.identity(count)
+              for _ in range(2))
+    derotated = [Rotation.from_rotvec(tau[:, None] * w[owner]).apply(rays)
+                 for tau, w, rays in ((tau1, w1, rays1), (tau2, w2, rays2))]
+    rays = [Q[owner].apply(f).reshape(count, n, 3) / np.linalg.norm(f, axis=1).reshape(count, n, 1)
+            for Q, f in zip((Q1, Q2, Q1, Q2), (rays1, rays2, *derotated), strict=True)]
+    length = np.linalg.norm(p2, axis=1, keepdims=True)
+    down = np.array([0.0, 1.0, 0.0])
+    return MinimalProblems(
+        *rays, tau1.reshape(count, n), tau2.reshape(count, n), (Q1 * R1.inv()).apply(down),
+        (Q2 * R2.inv()).apply(down), (Q1 * R1.inv() * R2 * Q2.inv()).as_matrix(),
+        (Q1 * R1.inv()).apply(p2 / length), Q1.apply(v1 / length), Q2.apply(v2 / length),
+        Q1.apply(w1), Q2.apply(w2))
 
 
 def rotation_error(R, truth):

@@ -50,6 +50,8 @@ _POLISH_STEPS = 8
 _LAST_STEP = 1e-13
 # A root of the polynomial is off by rounding only.
 _FARTHEST = 1e-3
+# Angles [rad] that are one zero, reached from two roots.
+_SAME_ANGLE = 1e-10
 
 
 @_jit
@@ -109,6 +111,15 @@ def _polish(a: Array, b: Array, p: Array, q: Array, psi: float, farthest: float,
 
 
 @_jit
+def _is_known(psi: float, yaws: Array) -> bool:
+    for yaw in yaws:
+        gap = abs(psi - yaw)
+        if gap < _SAME_ANGLE or abs(gap - 2.0 * math.pi) < _SAME_ANGLE:
+            return True
+    return False
+
+
+@_jit
 def _write_solution(psi: float, y: Array, A1: Array, A2: Array, f1: Array, f2: Array,
                     tau1: Array, tau2: Array, m: float, s_p: float, s_q: float, R: Array,
                     x: Array) -> bool:
@@ -163,6 +174,7 @@ def uniform_9pt_kernel(f1: Array, f2: Array, tau1: Array, tau2: Array, A1: Array
     angles, half_gaps = np.empty(MAX_SOLUTIONS), np.empty(MAX_SOLUTIONS)
     found = angles_of_zeros(samples, _HALF_ANGLE, zoom, PAIR_TOLERANCE, angles, half_gaps)
     work, y = np.empty((16, 9)), np.empty(9)
+    yaws = np.empty(MAX_SOLUTIONS)
     count = 0
     for k in range(found):
         middle, gap = angles[k], half_gaps[k]
@@ -176,16 +188,19 @@ def uniform_9pt_kernel(f1: Array, f2: Array, tau1: Array, tau2: Array, A1: Array
                 fill_columns(n, p, q, A)
                 _null_vectors(A, pivots, work[9], y)
             psi = middle
-        if count < MAX_SOLUTIONS and _write_solution(
+        if not _is_known(psi, yaws[:count]) and _write_solution(
                 centre + psi, y, A1, A2, f1, f2, tau1, tau2, m, s_p, s_q, R_out[count],
                 x_out[count]):
+            yaws[count] = psi
             count += 1
-        if gap > 0.0 and converged:
+        if gap > 0.0 and converged and count < MAX_SOLUTIONS:
             # The pair was two real roots, closer than the polynomial can tell.
-            first = psi
             psi, converged = _polish(a, b, p, q, middle + gap, gap, work, pivots, y)
-            if converged and abs(psi - first) > 1e-12 and count < MAX_SOLUTIONS and (
-                    _write_solution(centre + psi, y, A1, A2, f1, f2, tau1, tau2, m, s_p, s_q,
-                                    R_out[count], x_out[count])):
+            if converged and not _is_known(psi, yaws[:count]) and _write_solution(
+                    centre + psi, y, A1, A2, f1, f2, tau1, tau2, m, s_p, s_q, R_out[count],
+                    x_out[count]):
+                yaws[count] = psi
                 count += 1
+        if count == MAX_SOLUTIONS:
+            break
     return count
