@@ -12,6 +12,7 @@ import argparse
 import csv
 from dataclasses import dataclass
 from pathlib import Path
+import shutil
 import statistics
 import sys
 
@@ -62,6 +63,7 @@ def render(seed: int, scene: str, readout_time: float, folder: Path) -> tuple[Pa
     folder.mkdir(parents=True, exist_ok=True)
     path, parameter_file = folder / 'bag', folder / 'bag.yaml'
     if not parameter_file.exists():
+        shutil.rmtree(path, ignore_errors=True)  # half written by a run that was stopped
         simulation = simulate(SimulationConfig(seed=seed, scene=scene, readout_time=readout_time,
                                                duration=DURATION))
         write_bag(simulation, path)
