@@ -108,8 +108,7 @@ def main() -> int:
     """Run the demo; its exit code."""
     OUT.mkdir(exist_ok=True)
     try:
-        say(f'playing {BAG.relative_to(ROOT)} to relpose_node over Fast DDS, in real time (the '
-            'first time, compiling takes up to a minute) ...')
+        say(f'playing {BAG.relative_to(ROOT)} to relpose_node over Fast DDS, in real time ...')
         lines = compare(run_live(BAG, PARAMETERS, OUT))
     except (DemoError, RsRelposeError) as error:
         print(f'demo: {error}', file=sys.stderr)

@@ -176,7 +176,11 @@ class _Estimation:
                                  f'{len(self.order)} usable matches, fewer than min_inliers = '
                                  f'{config.min_inliers}')
         # 1. Hypotheses from minimal samples, ranked by multi-scale MSAC.
-        hypotheses = self._sample()
+        return self.refine(self._sample(), delay)
+
+    def refine(self, hypotheses: list[State], delay: float) -> RelativePose:
+        """All steps after the first."""
+        config = self.config
         # 2. Local optimisation of each; the best in the cost of the full model.
         state = self._best(hypotheses)
         if state is None:
@@ -367,16 +371,31 @@ class _Estimation:
 
 def warm_up() -> None:
     """Compile (or load from the cache) every kernel, so that the first estimate is not slow."""
-    rng = np.random.default_rng(0)
-    camera = RollingShutterCamera(width=640, height=480, fx=450.0, fy=450.0, cx=319.5, cy=239.5,
-                                  readout_time=0.03)
-    down = np.array([0.0, 1.0, 0.0])
-    motion = FrameMotion(np.array([0.0, 0.1, 0.0]), gravity=down)
-    world = rng.uniform([-4.0, -3.0, 4.0], [4.0, 3.0, 12.0], (100, 3))
-    points1, points2 = camera.project(world), camera.project(world - [0.5, 0.0, 0.0])
+    points1, points2, camera, motion = _sideways()
     for solver in MODES:
         estimate_relative_pose(points1, points2, camera, motion, motion, np.eye(3),
                                1e-4 * np.eye(3), config=EstimatorConfig(solver=solver))
+
+
+def warm_up_refinement() -> None:
+    """Compile the kernels of all steps but the sampling."""
+    points1, points2, camera, motion = _sideways()
+    problem = build_problem(points1, points2, camera, motion, motion, np.eye(3),
+                            1e-4 * np.eye(3))
+    zero = np.zeros(3)
+    start = State(np.eye(3), np.array([1.0, 0.0, 0.0]), zero, zero, zero, zero)
+    _Estimation(problem, MODES['auto'], EstimatorConfig(), np.arange(len(points1)),
+                np.zeros(1, dtype=np.uint64), None).refine([start], middle_row_delay(camera))
+
+
+def _sideways() -> tuple[Array, Array, RollingShutterCamera, FrameMotion]:
+    """Matches of a camera that moves to its right, for the warm-up."""
+    rng = np.random.default_rng(0)
+    camera = RollingShutterCamera(width=640, height=480, fx=450.0, fy=450.0, cx=319.5, cy=239.5,
+                                  readout_time=0.03)
+    motion = FrameMotion(np.array([0.0, 0.1, 0.0]), gravity=np.array([0.0, 1.0, 0.0]))
+    world = rng.uniform([-4.0, -3.0, 4.0], [4.0, 3.0, 12.0], (100, 3))
+    return camera.project(world), camera.project(world - [0.5, 0.0, 0.0]), camera, motion
 
 
 def _priors(problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig,

@@ -1,13 +1,23 @@
-"""Compiles (or loads from the cache) every kernel that a run with given parameters needs."""
+"""Compiles (or loads from the cache) every kernel that a run with given parameters needs.
+
+    python -m rs_relpose_ros.pipeline.warm_up
+
+fills the cache on two cores, in about a minute: the first run then starts at once.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+import multiprocessing
+import sys
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros import solvers
+from rs_relpose_ros.estimator.estimate import warm_up, warm_up_refinement
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.pipeline.calibration import Calibration
 from rs_relpose_ros.pipeline.frame import Frame
@@ -59,3 +69,37 @@ def _images() -> Iterator[NDArray[np.uint8]]:
         image = np.roll(far, -shift, axis=1)
         image[80:160] = np.roll(near, -3 * shift, axis=1)[80:160]
         yield image
+
+
+def fill_cache() -> None:
+    """Compile all kernels, on two cores: in one process Numba compiles one at a time.
+
+    Each half starts with what the other half's last kernels call and find in the cache then.
+    """
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context('spawn')) as pool:
+        other_half = pool.submit(_compile_gravity_solvers_and_refinement)
+        for solver, count in ((solvers.uniform_11pt, 11), (solvers.angular_5pt, 5)):
+            solver(*_rays(count), start_rotations=np.eye(3)[None])
+        warm_up()
+        other_half.result()
+    warm_up_pipeline(Parameters())
+
+
+def _compile_gravity_solvers_and_refinement() -> None:
+    down = np.array([0.0, 1.0, 0.0])
+    for solver, count in ((solvers.uniform_9pt, 9), (solvers.angular_3pt, 3)):
+        solver(*_rays(count), gravity1=down, gravity2=down)
+    warm_up_refinement()
+    # No pair has that many matches: everything but the estimate.
+    warm_up_pipeline(Parameters.from_mapping({'min_inliers': 10_000}))
+
+
+def _rays(count: int) -> list[NDArray[np.float64]]:
+    """Rays and row times of two frames."""
+    rng = np.random.default_rng(0)
+    return [*(rng.normal(size=(2, count, 3)) + [0.0, 0.0, 3.0]), *rng.uniform(0, 0.03, (2, count))]
+
+
+if __name__ == '__main__':
+    fill_cache()
+    sys.exit(0)
