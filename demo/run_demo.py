@@ -8,6 +8,8 @@ real time, replays the same bag offline with several methods, and prints a table
 
 from __future__ import annotations
 
+from concurrent.futures import ProcessPoolExecutor
+import multiprocessing
 from pathlib import Path
 import sys
 import time
@@ -62,16 +64,25 @@ def compare(live: LiveRun) -> list[str]:
                                   stamps=read_stamps(live.stamps), pictures=False)
         scores = [score_of_table('relpose_node, live', live.table, same_frames.records, truth),
                   score_of_records('the same, replayed', outcome.records)]
-        for name, settings in PAPER_METHODS.items():
-            say(f'replaying it offline: {name} ...')
-            records = replay_records(bag, topics, parameters.updated(settings), truth)
-            scores.append(score_of_records(name, records))
-    say("OpenCV's 5-point on the same matches ...")
+    say("replaying it offline: the paper's algorithms, OpenCV's 5-point ...")
     answered = [pair for pair in pairs if pair.result.pose]
     assert outcome.calibration is not None
-    scores += [best_opencv_score(method, answered, outcome.calibration, truth)
-               for method in METHODS]
+    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context('spawn')) as pool:
+        paper = [pool.submit(score_of_method, name) for name in PAPER_METHODS]
+        opencv = [pool.submit(best_opencv_score, method, answered, outcome.calibration, truth)
+                  for method in METHODS]
+        scores += [future.result() for future in paper + opencv]
     return [*score_table(scores), '', *remarks(scores, outcome, live, same_frames)]
+
+
+def score_of_method(name: str) -> Score:
+    """One of `PAPER_METHODS` over the whole bag."""
+    parameters = read_parameters(PARAMETERS).updated(PAPER_METHODS[name])
+    with open_bag(BAG) as bag:
+        topics = bag.find_topics()
+        truth = read_truth(bag, topics)
+        assert truth is not None
+        return score_of_records(name, replay_records(bag, topics, parameters, truth))
 
 
 def remarks(scores: list[Score], outcome: ReplayOutcome, live: LiveRun,

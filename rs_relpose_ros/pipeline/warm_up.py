@@ -97,7 +97,8 @@ def _compile_gravity_solvers_and_refinement() -> None:
 def _rays(count: int) -> list[NDArray[np.float64]]:
     """Rays and row times of two frames."""
     rng = np.random.default_rng(0)
-    return [*(rng.normal(size=(2, count, 3)) + [0.0, 0.0, 3.0]), *rng.uniform(0, 0.03, (2, count))]
+    ahead = np.array([0.0, 0.0, 3.0])
+    return [*(ahead + rng.normal(size=(2, count, 3))), *rng.uniform(0.0, 0.03, (2, count))]
 
 
 if __name__ == '__main__':
