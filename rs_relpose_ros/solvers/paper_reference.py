@@ -116,7 +116,9 @@ def solve_by_determinants(algorithm: str, rays1: ArrayLike, rays2: ArrayLike, ta
 
     def determinants(parameters: Array) -> Array:
         scaled = row_scale * columns(rotation(parameters))
-        return np.array([np.linalg.det(scaled[block]) for block in blocks])
+        # A determinant that underflows to zero is reported as a division by zero.
+        with np.errstate(divide='ignore'):
+            return np.array([np.linalg.det(scaled[block]) for block in blocks])
 
     fit = least_squares(determinants, unknown, method='lm', x_scale=0.01, xtol=1e-15, ftol=1e-15,
                         gtol=1e-15, max_nfev=400)
