@@ -288,7 +288,9 @@ class _Estimation:
         """Inliers that the best of many fits reaches on random matches (about 5 sigma)."""
         size = self.problem.focal
         expected = len(self.order) * min(4.0 * self.config.threshold / size, 0.5)
-        return int(expected + 5.0 * np.sqrt(expected)) + 6
+        # A sample agrees with itself: 9 or 11 points, and the fit of 11 unknowns with some more.
+        own = 14 if {UNIFORM_9PT, UNIFORM_11PT} & set(self.mode.generators) else 6
+        return int(expected + 5.0 * np.sqrt(expected)) + own
 
     def _rotation_only(self, state: State, inliers: NDArray[np.bool_], sigma: float,
                        delay: float) -> RelativePose | None:
