@@ -17,6 +17,10 @@ from rs_relpose_ros.errors import InputError
 REFERENCE_ROWS = ('first', 'middle', 'last')
 READOUT_DIRECTIONS = ('down', 'up')
 
+# Far beyond any camera, and near enough that no square of a pixel or a ray overflows.
+_LARGEST_IMAGE = 1_000_000
+_FARTHEST_PIXEL = 1e9
+
 # Legal numbers of coefficients of each model, in the order of sensor_msgs/CameraInfo and OpenCV.
 DISTORTION_COEFFICIENTS = {
     'plumb_bob': (0, 4, 5, 8),
@@ -63,16 +67,20 @@ class RollingShutterCamera:
     def __post_init__(self) -> None:
         for name in ('width', 'height'):
             value = getattr(self, name)
-            if int(value) != value or value <= 0:
-                raise InputError(f'{name} must be a positive number of pixels, got {value!r}')
+            if not (1 <= value <= _LARGEST_IMAGE and int(value) == value):
+                raise InputError(f'{name} must be a positive number of pixels, at most '
+                                 f'{_LARGEST_IMAGE}, got {value!r}')
         for name in ('fx', 'fy'):
             value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0.0):
-                raise InputError(f'{name} must be finite and > 0 px, got {value!r}')
+            if not 1.0 / _FARTHEST_PIXEL <= value <= _FARTHEST_PIXEL:
+                raise InputError(f'{name} must be finite and > 0 px (within '
+                                 f'[{1.0 / _FARTHEST_PIXEL:g}, {_FARTHEST_PIXEL:g}]), '
+                                 f'got {value!r}')
         for name in ('cx', 'cy'):
             value = getattr(self, name)
-            if not np.isfinite(value):
-                raise InputError(f'{name} must be finite, got {value!r}')
+            if not abs(value) <= _FARTHEST_PIXEL:
+                raise InputError(f'{name} must be finite and within {_FARTHEST_PIXEL:g} px, '
+                                 f'got {value!r}')
         if not (np.isfinite(self.readout_time) and 0.0 <= self.readout_time < 1.0):
             raise InputError(
                 'readout_time must lie in [0, 1) s (it is height times line delay; '

@@ -15,6 +15,10 @@ from rs_relpose_ros.so3 import exp_so3, log_so3
 Array = NDArray[np.float64]
 
 
+# Far beyond any gyro [rad/s]; a larger number is no rate, and its products may overflow.
+_LARGEST_RATE = 1e4
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameMotion:
     """Rotation during the read-out of one frame, and the direction of gravity.
@@ -45,12 +49,15 @@ class FrameMotion:
                 object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name)))
         object.__setattr__(self, 'angular_velocity',
                            _vector3('angular_velocity', self.angular_velocity))
+        if not np.abs(self.angular_velocity).max() <= _LARGEST_RATE:
+            raise InputError(f'angular_velocity must be within {_LARGEST_RATE:g} rad/s, '
+                             f'got {self.angular_velocity.tolist()}')
         if self.gravity is not None:
             gravity = _vector3('gravity', self.gravity)
-            if not np.linalg.norm(gravity) > 1e-6:
+            if not 1e-6 < np.abs(gravity).max() < 1e6:
                 raise InputError(
-                    'gravity must have a direction (or be None where it is not known), '
-                    f'got {gravity.tolist()}')
+                    'gravity must have a direction (or be None where it is not known) and a '
+                    f'length between 1e-6 and 1e6, got {gravity.tolist()}')
             object.__setattr__(self, 'gravity', gravity)
 
     @classmethod

@@ -16,6 +16,7 @@ from rs_relpose_ros.solvers import (
     uniform_9pt,
     uniform_11pt,
 )
+from rs_relpose_ros.solvers.paper_reference import solve_by_determinants
 
 POINTS = {linear_9pt: 9, uniform_9pt: 9, angular_3pt: 3, angular_5pt: 5, global_5pt: 5,
           uniform_11pt: 11}
@@ -427,6 +428,83 @@ def test_linear_and_uniform_9_points_agree_without_angular_velocity():
     for k in range(20):
         for a, b in zip(solve(uniform_9pt, P, k), solve(linear_9pt, P, k), strict=True):
             np.testing.assert_allclose(a.R, b.R, atol=1e-9)
+
+
+# --- the paper's own search
+
+
+# From 1 degree away it still reaches a solution; which one is chance (closed forms have them all).
+@pytest.mark.parametrize(('solver', 'motion', 'off', 'least_reached'), [
+    (linear_9pt, {'rate': (0.0, 0.0)}, 1.0, 0.9),
+    (uniform_9pt, {}, 1.0, 0.9),
+    (angular_3pt, STILL, 1.0, 0.9),
+    (angular_5pt, STILL, 0.1, 0.9),
+    (uniform_11pt, {'speed': (10.0, 10.0)}, 0.1, 0.6),
+], ids=case_name)
+def test_what_the_papers_search_finds_is_a_solution_of_ours(solver, motion, off, least_reached):
+    P = problems(solver, 21, 60, **motion)
+    f1, f2 = rays(solver, P)
+    axes = Rotation.random(60, random_state=1).as_matrix()[:, 0]
+    starts = Rotation.from_rotvec(np.radians(off) * axes).as_matrix() @ P.R
+    reached = 0
+    truth = 0
+    for k in range(60):
+        theirs = solve_by_determinants(
+            solver.__name__, f1[k], f2[k], P.tau1[k], P.tau2[k], starts[k],
+            gravity1=P.gravity1[k], gravity2=P.gravity2[k])
+        if theirs is None:
+            continue
+        reached += 1
+        truth += angle(theirs.R, P.R[k]) < 1e-6
+        # The 11-point solver is a search as well: from there it must stay there.
+        found, error = nearest(solve(solver, P, k, theirs.R[None]), theirs.R)
+        assert error < 1e-6
+        # The sign is a majority's, and may be a tie.
+        sign = 1.0 if found.t @ theirs.t > 0.0 else -1.0
+        size = max(1.0, np.abs(theirs.v1).max())
+        np.testing.assert_allclose(sign * found.t, theirs.t, atol=1e-5)
+        np.testing.assert_allclose(sign * found.v1, theirs.v1, atol=1e-4 * size)
+        np.testing.assert_allclose(sign * found.v2, theirs.v2, atol=1e-4 * size)
+    assert reached >= least_reached * 60
+    assert truth >= 20
+
+
+def test_the_papers_search_from_the_truth_stays_there():
+    for solver, motion in ((uniform_9pt, {}), (uniform_11pt, {'speed': (10.0, 10.0)})):
+        P = problems(solver, 22, 10, **motion)
+        for k in range(10):
+            s = solve_by_determinants(
+                solver.__name__, P.derotated1[k], P.derotated2[k], P.tau1[k], P.tau2[k], P.R[k],
+                gravity1=P.gravity1[k], gravity2=P.gravity2[k])
+            assert angle(s.R, P.R[k]) < 1e-6
+            assert direction_error(s.t, P.t[k]) < 1e-4
+
+
+def test_the_papers_search_says_when_it_ends_beside_a_solution():
+    P = problems(angular_5pt, 23, 30, **STILL)
+    ended = [solve_by_determinants('angular_5pt', P.derotated1[k], P.derotated2[k], P.tau1[k],
+                                   P.tau2[k], np.eye(3)) for k in range(30)]
+    assert any(s is None for s in ended)
+    for k, s in enumerate(ended):
+        if s is not None:
+            assert residual(s, P.derotated1[k], P.derotated2[k], P.tau1[k], P.tau2[k]) < 1e-6
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    ({'algorithm': 'global_7pt'}, '^algorithm must be one of'),
+    ({'rays1': np.ones((8, 3))}, '^rays1 must have shape'),
+    ({'tau2': np.full(9, np.nan)}, '^tau2 must be finite'),
+    ({'start_rotation': np.ones((3, 3))}, r'^start_rotation must '),
+    ({'start_rotation': np.eye(2)}, r'^start_rotation must '),
+    ({'gravity2': None}, '^gravity2 must be given'),
+])
+def test_the_papers_search_refuses_wrong_input_by_name(change, message):
+    P = problems(uniform_9pt, 24, 1)
+    arguments = {'algorithm': 'uniform_9pt', 'rays1': P.rays1[0], 'rays2': P.rays2[0],
+                 'tau1': P.tau1[0], 'tau2': P.tau2[0], 'start_rotation': P.R[0],
+                 'gravity1': P.gravity1[0], 'gravity2': P.gravity2[0], **change}
+    with pytest.raises(InputError, match=message):
+        solve_by_determinants(**arguments)
 
 
 # --- wrong input

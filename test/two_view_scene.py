@@ -89,11 +89,12 @@ def project(world, R, p, w, v, reference_row):
 
 def make_scene(seed, *, n=300, direction='forward', speed=1.0, rate=1.0, pixel_noise=0.5,
                gravity_noise=GRAVITY_NOISE, gyro_noise=GYRO_NOISE, outliers=0.3,
-               constant_velocity=False, pure_rotation=False, reference='first'):
+               constant_velocity=False, pure_rotation=False, on_a_line=False, reference='first'):
     """Draw one problem.
 
     `speed` [m/s] and `rate` [rad/s] are per axis; `gravity_noise` [rad] per axis and opposite in
-    the frames; `gyro_noise` [rad/s] 1 sigma; `reference` the row that pose and motion refer to.
+    the frames; `gyro_noise` [rad/s] 1 sigma; `on_a_line`: all points lie on one line in space;
+    `reference` the row that pose and motion refer to.
     """
     rng = np.random.default_rng(seed)
     reference_row = {'first': 0.0, 'middle': (HEIGHT - 1) / 2, 'last': HEIGHT - 1.0}[reference]
@@ -111,8 +112,11 @@ def make_scene(seed, *, n=300, direction='forward', speed=1.0, rate=1.0, pixel_n
     w1 = rate * rng.choice([-1.0, 1.0], 3)
     w2 = -w1
     found1, found2 = [], []
+    ends = rng.uniform([-4, -2, 8], [4, 2, 20], (2, 3)) if on_a_line else None
     while sum(map(len, found1)) < n:
         world = rng.uniform([-30, -18, 6], [30, 18, 34], (8 * n, 3))
+        if on_a_line:
+            world = ends[0] + rng.uniform(size=(8 * n, 1)) * (ends[1] - ends[0])
         a, za, settled_a = project(world, R1, np.zeros(3), w1, v1, reference_row)
         b, zb, settled_b = project(world, R2, p2, w2, v2, reference_row)
         size = [WIDTH - 1, HEIGHT - 1]

@@ -36,7 +36,11 @@ from rs_relpose_ros.estimator.problem import (
     to_reference_row,
     TwoViewProblem,
 )
-from rs_relpose_ros.estimator.rotation_only import fit_rotation, transfer_errors
+from rs_relpose_ros.estimator.rotation_only import (
+    closed_form_rotation,
+    fit_rotation,
+    transfer_errors,
+)
 from rs_relpose_ros.estimator.sampling import POOL, sample_hypotheses
 from rs_relpose_ros.estimator.velocity_prior import (
     fit_with_evidence,
@@ -77,6 +81,10 @@ MODES = {
 SAMPLING_VELOCITY_SIGMA = 3.0
 # Noise of |f_1 - R f_2| is 1.67 sigma in the median (Rayleigh, two images).
 ROTATION_ONLY_SIGMAS = 2.5
+# Points whose root mean square distance from a line is below so many thresholds lie on it.
+DEGENERATE_THRESHOLDS = 2.0
+# Of a predicted rotation [rad^2]: far beyond "anything is possible", which is 10.
+_LARGEST_COVARIANCE = 1e12
 # A translation direction less certain than this says nothing.
 MAX_TRANSLATION_SIGMA = 0.5
 
@@ -141,8 +149,9 @@ def estimate_relative_pose(
     points1, points2, order = _checked_matches(points1, points2, quality)
     rotation, rotation_covariance = _checked_rotation(
         relative_rotation, relative_rotation_covariance)
-    if interval is not None and not (np.isfinite(interval) and interval > 0.0):
-        raise InputError(f'interval must be a positive number of seconds or None, got {interval}')
+    if interval is not None and not 1e-6 <= interval <= 1e6:
+        raise InputError('interval must be a positive number of seconds in [1e-6, 1e6] or None, '
+                         f'got {interval}')
     mode = MODES[config.solver]
     if mode.needs_gravity and (motion1.gravity is None or motion2.gravity is None):
         raise InputError(f'solver {config.solver!r} needs gravity in both frames; use auto, '
@@ -187,12 +196,18 @@ class _Estimation:
             return self._failure(Status.NO_CONSENSUS, 'no hypothesis explains the matches')
         # 3. Refinement on its inliers.
         state, inliers, velocity_sigma, sigma = self._refine(state)
-        count = int(inliers.sum())
+        rays = [self.problem.observations[inliers, k:k + 3] for k in (0, 9)]
+        cell = config.threshold / self.problem.focal
+        count = min(_distinct(f, cell) for f in rays)
         chance = self._inliers_by_chance()
         if count < max(config.min_inliers, chance):
             return self._failure(
-                Status.NO_CONSENSUS, f'{count} of {len(self.order)} matches agree, fewer than '
-                f'max(min_inliers = {config.min_inliers}, {chance} expected by chance)')
+                Status.NO_CONSENSUS, f'{count} distinct of {len(self.order)} matches agree, fewer '
+                f'than max(min_inliers = {config.min_inliers}, {chance} expected by chance)')
+        if min(_distance_from_a_plane(f) for f in rays) < DEGENERATE_THRESHOLDS * cell:
+            return self._failure(
+                Status.NO_CONSENSUS, f'the {count} matches that agree lie on one line: many poses '
+                'explain them')
         # 4. Is there a translation at all?
         turned = self._rotation_only(state, inliers, sigma, delay)
         if turned is not None:
@@ -277,7 +292,9 @@ class _Estimation:
         """Inliers that the best of many fits reaches on random matches (about 5 sigma)."""
         size = self.problem.focal
         expected = len(self.order) * min(4.0 * self.config.threshold / size, 0.5)
-        return int(expected + 5.0 * np.sqrt(expected)) + 6
+        # A sample agrees with itself: 9 or 11 points, and the fit of 11 unknowns with some more.
+        own = 14 if {UNIFORM_9PT, UNIFORM_11PT} & set(self.mode.generators) else 6
+        return int(expected + 5.0 * np.sqrt(expected)) + own
 
     def _rotation_only(self, state: State, inliers: NDArray[np.bool_], sigma: float,
                        delay: float) -> RelativePose | None:
@@ -289,21 +306,27 @@ class _Estimation:
         problem, config = self.problem, self.config
         parallax = float(np.median(transfer_errors(
             problem.observations, np.ascontiguousarray(state.R), problem.focal)[inliers]))
-        R, information = fit_rotation(
-            problem.observations, inliers, np.ascontiguousarray(state.R), self.priors,
-            problem.focal, sigma)
-        left = transfer_errors(problem.observations, R, problem.focal)[inliers]
-        turned_only = float(np.median(left)) < ROTATION_ONLY_SIGMAS * sigma
+        # Matches that do not move also obey a half turn about any t: from there a fit would stay.
+        fits = []
+        for start in (state.R, closed_form_rotation(problem.observations, inliers)):
+            R, information = fit_rotation(
+                problem.observations, inliers, np.ascontiguousarray(start), self.priors,
+                problem.focal, sigma)
+            left = transfer_errors(problem.observations, R, problem.focal)[inliers]
+            fits.append((float(np.median(left)), R, information, left))
+        median, R, information, left = min(fits, key=lambda fit: fit[0])
+        turned_only = median < ROTATION_ONLY_SIGMAS * sigma
         if not turned_only and parallax >= config.min_parallax:
             return None
-        reason = (f'a rotation alone leaves {np.median(left):.2f} px in the median, the noise of '
+        reason = (f'a rotation alone leaves {median:.2f} px in the median, the noise of '
                   'the matches: no translation can be seen') if turned_only else (
                   f'median parallax of {parallax:.2f} px is below min_parallax = '
                   f'{config.min_parallax:g} px')
         # Turned back to the reference row; the translation takes no part.
         turn1, turn2 = self._turns(state._replace(R=R, dw1=np.zeros(3), dw2=np.zeros(3)), -delay)
         covariance = np.full((6, 6), np.nan)
-        covariance[3:, 3:] = turn1.T @ np.linalg.inv(information) @ turn1
+        # No rotation is less certain than half a turn: points in one place show only two angles.
+        covariance[3:, 3:] = turn1.T @ _inverse(information + np.eye(3) / np.pi**2) @ turn1
         return RelativePose(
             status=Status.PURE_ROTATION if turned_only else Status.LOW_PARALLAX, reason=reason,
             R=turn1.T @ R @ turn2, covariance=covariance, inliers=inliers,
@@ -317,7 +340,7 @@ class _Estimation:
         priors = with_velocity_sigma(self.priors, velocity_sigma)
         hessian, gradient, _ = normal_equations(
             self.problem.observations, inliers, state, priors, sigma)
-        local = np.linalg.inv(hessian)
+        local = _inverse(hessian)
         # Zero after the MAP fit; a state that stopped elsewhere is off by about this step.
         step = local @ gradient
         local += np.outer(step, step)
@@ -398,6 +421,29 @@ def _sideways() -> tuple[Array, Array, RollingShutterCamera, FrameMotion]:
     return camera.project(world), camera.project(world - [0.5, 0.0, 0.0]), camera, motion
 
 
+def _distinct(rays: Array, cell: float) -> int:
+    """Number of different directions (N, 3), to `cell` [rad]: copies of one say nothing new."""
+    x, y = np.round(rays[:, :2].T / cell)
+    return len(np.unique(x + 1e6 * y))
+
+
+def _distance_from_a_plane(rays: Array) -> float:
+    """Root mean square distance [rad] of unit rays (N, 3) from the best plane through the centre.
+
+    Small where the points lie in one place or, in the image, on one line.
+    """
+    return float(np.sqrt(max(np.linalg.eigvalsh(rays.T @ rays / len(rays))[0], 0.0)))
+
+
+def _inverse(information: Array) -> Array:
+    """Covariance of an information matrix (n, n): never indefinite, however badly conditioned."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-30))
+    factor = np.linalg.inv(np.linalg.cholesky(
+        information * np.outer(scale, scale) + 1e-13 * np.eye(len(scale)))) * scale
+    inverse: Array = factor.T @ factor
+    return inverse
+
+
 def _priors(problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig,
             interval: float | None) -> Priors:
     g1, g2 = problem.motion1.gravity, problem.motion2.gravity
@@ -452,12 +498,14 @@ def _checked_rotation(rotation: ArrayLike | None, covariance: ArrayLike | None,
         raise InputError('relative_rotation and relative_rotation_covariance go together: give '
                          'both or neither')
     R = np.array(rotation, dtype=np.float64)
-    if R.shape != (3, 3) or not (np.allclose(R @ R.T, np.eye(3), atol=1e-6)
+    # Bounded first, so that the product cannot overflow.
+    if R.shape != (3, 3) or not (np.abs(R).max() < 2.0
+                                 and np.allclose(R @ R.T, np.eye(3), atol=1e-6)
                                  and np.linalg.det(R) > 0.0):
         raise InputError(f'relative_rotation must be a (3, 3) rotation matrix, got {R.tolist()}')
     C = np.array(covariance, dtype=np.float64)
-    if C.shape != (3, 3) or not np.isfinite(C).all() or not np.allclose(C, C.T, atol=1e-9) \
-            or np.linalg.eigvalsh(C).min() < -1e-12:
+    if C.shape != (3, 3) or not np.abs(C).max() < _LARGEST_COVARIANCE \
+            or not np.allclose(C, C.T, atol=1e-9) or np.linalg.eigvalsh(C).min() < -1e-12:
         raise InputError('relative_rotation_covariance must be a (3, 3) covariance matrix '
                          f'[rad^2], got {C.tolist()}')
     return R, C

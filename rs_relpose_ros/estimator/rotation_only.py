@@ -34,6 +34,14 @@ def transfer_errors(observations: Array, R: Array, focal: float) -> Array:
     return out
 
 
+def closed_form_rotation(observations: Array, use: NDArray[np.bool_]) -> Array:
+    """Rotation (3, 3) of least ``sum |f_1 - R f_2|^2`` (Kabsch), from no start."""
+    U, _, Vt = np.linalg.svd(observations[use, 0:3].T @ observations[use, 9:12])
+    U[:, 2] *= np.sign(np.linalg.det(U @ Vt))
+    rotation: Array = np.ascontiguousarray(U @ Vt)
+    return rotation
+
+
 @_jit
 def fit_rotation(observations: Array, valid: NDArray[np.bool_], start: Array, priors: Priors,
                  focal: float, sigma: float) -> tuple[Array, Array]:
