@@ -133,5 +133,5 @@ def optimise(observations: Array, valid: NDArray[np.bool_], start: State, priors
         if use.sum() < 6:
             return state, math.inf
         # Wide selections hold outliers: their residuals are not pixel noise.
-        state, _ = fit(observations, use, state, priors, sigma * SHRINKING[k], ITERATIONS)
+        state, _, _ = fit(observations, use, state, priors, sigma * SHRINKING[k], ITERATIONS)
     return state, truncated_cost(observations, valid, state, priors, threshold, sigma)

@@ -73,8 +73,8 @@ def fit_with_evidence(observations: Array, valid: NDArray[np.bool_], start: Stat
         best_state = state
         for k in range(low, high):
             chosen = with_velocity_sigma(priors, grid[k])
-            candidate, cost = fit(observations, inliers, state, chosen, sigma, ITERATIONS)
-            hessian, _, _ = normal_equations(observations, inliers, candidate, chosen, sigma)
+            candidate, cost, hessian = fit(
+                observations, inliers, state, chosen, sigma, ITERATIONS)
             evidence = (-0.5 * cost - 0.5 * log_determinant(hessian) - 6.0 * math.log(grid[k]))
             if evidence > best_evidence:
                 best_evidence, best_state, best = evidence, candidate, k
@@ -82,7 +82,7 @@ def fit_with_evidence(observations: Array, valid: NDArray[np.bool_], start: Stat
         inliers = select_inliers(observations, valid, state, threshold, angle_sigma)
         sigma = _noise(observations, inliers, state, priors, told_sigma)
     chosen = with_velocity_sigma(priors, grid[best])
-    state, _ = fit(observations, inliers, state, chosen, sigma, ITERATIONS)
+    state, _, _ = fit(observations, inliers, state, chosen, sigma, ITERATIONS)
     return state, inliers, grid[best], sigma
 
 
