@@ -25,7 +25,9 @@ from rs_relpose_ros.estimator.hypotheses import (
 from rs_relpose_ros.estimator.local_optimisation import (
     cheirality_sign,
     optimise,
+    oriented,
     select_inliers,
+    SHRINKING,
     signed,
 )
 from rs_relpose_ros.estimator.map_fit import normal_equations, PINNED, Priors, State
@@ -79,6 +81,8 @@ MODES = {
 
 # Prior sigma of the velocities while hypotheses are compared [baselines per second].
 SAMPLING_VELOCITY_SIGMA = 3.0
+# Share of the matches that a generator must explain to spare those that know less.
+EXPLAINED = 0.5
 # Noise of |f_1 - R f_2| is 1.67 sigma in the median (Rayleigh, two images).
 ROTATION_ONLY_SIGMAS = 2.5
 # Points whose root mean square distance from a line is below so many thresholds lie on it.
@@ -238,6 +242,8 @@ class _Estimation:
                 continue
             if generator == ANGULAR_3PT and (g1 is None or g2 is None):
                 continue
+            if best_inliers > EXPLAINED * len(self.order):
+                break
             drawn, best_inliers = sample_hypotheses(
                 generator, problem.points, knowledge, self.order, self.seed, threshold2,
                 config.confidence, config.max_iterations, best_inliers, pool_R, pool_x, pool_cost)
@@ -251,16 +257,18 @@ class _Estimation:
         if config.refinement != 'map':
             # The paper's way: the best hypothesis as it is.
             return self._in_front(hypotheses[0]) if hypotheses else None
-        best, best_cost = None, np.inf
         priors = with_velocity_sigma(self.priors, SAMPLING_VELOCITY_SIGMA) \
             if self.mode.velocities or self.mode.derotate else self.priors
-        for start in hypotheses:
-            state, cost = optimise(
-                problem.observations, problem.valid, start, priors, config.pixel_sigma,
-                config.threshold, self.angle_sigma)
-            if cost < best_cost:
-                best, best_cost = state, cost
-        return best
+        candidates = [oriented(problem.observations, problem.valid, start, config.threshold)
+                      for start in hypotheses]
+        for scale in SHRINKING:
+            fitted = [optimise(problem.observations, problem.valid, state, priors,
+                               config.pixel_sigma, config.threshold, scale, self.angle_sigma)
+                      for state in candidates]
+            # The better half goes on: later fits are spent where they may matter.
+            fitted = sorted((f for f in fitted if f[1] < np.inf), key=lambda f: f[1])
+            candidates = [state for state, _ in fitted[:(len(fitted) + 1) // 2]]
+        return candidates[0] if candidates else None
 
     def _in_front(self, state: State) -> State:
         near = np.abs(sampson.residuals(self.problem.observations, *state)) \

@@ -81,7 +81,7 @@ def generate(generator: int, points: Array, sample: NDArray[np.int64], knowledge
 
     Parameters
     ----------
-    points : (N, 6) ndarray
+    points : (6, N) ndarray
         As in `consensus.multi_scale_cost`.
     R_out, x_out : (MAX_SOLUTIONS, 3, 3), (MAX_SOLUTIONS, 9) ndarray
         Receive R and ``(t, d_1, d_2)``, t of unit length, all in frame 1.
@@ -90,14 +90,15 @@ def generate(generator: int, points: Array, sample: NDArray[np.int64], knowledge
     f1, f2 = np.empty((m, 3)), np.empty((m, 3))
     tau1, tau2 = np.empty(m), np.empty(m)
     for k in range(m):
-        p = points[sample[k]]
-        if math.isnan(p[0]):
+        i = sample[k]
+        x1, y1, x2, y2 = points[0, i], points[1, i], points[2, i], points[3, i]
+        if math.isnan(x1):
             return 0
-        s1 = 1.0 / math.sqrt(1.0 + p[0] * p[0] + p[1] * p[1])
-        s2 = 1.0 / math.sqrt(1.0 + p[2] * p[2] + p[3] * p[3])
-        f1[k, 0], f1[k, 1], f1[k, 2] = p[0] * s1, p[1] * s1, s1
-        f2[k, 0], f2[k, 1], f2[k, 2] = p[2] * s2, p[3] * s2, s2
-        tau1[k], tau2[k] = p[4], p[5]
+        s1 = 1.0 / math.sqrt(1.0 + x1 * x1 + y1 * y1)
+        s2 = 1.0 / math.sqrt(1.0 + x2 * x2 + y2 * y2)
+        f1[k, 0], f1[k, 1], f1[k, 2] = x1 * s1, y1 * s1, s1
+        f2[k, 0], f2[k, 1], f2[k, 2] = x2 * s2, y2 * s2, s2
+        tau1[k], tau2[k] = points[4, i], points[5, i]
     if generator == GYRO_2PT:
         return _gyro_2pt(f1, f2, knowledge.rotation, R_out, x_out)
     x_out[:] = 0.0

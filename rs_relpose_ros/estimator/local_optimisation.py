@@ -122,16 +122,25 @@ def truncated_cost(observations: Array, valid: NDArray[np.bool_], state: State, 
 
 
 @_jit
-def optimise(observations: Array, valid: NDArray[np.bool_], start: State, priors: Priors,
-             sigma: float, threshold: float, angle_sigma: float) -> tuple[State, float]:
-    """Fit the uniform model from a hypothesis on a shrinking threshold; state and MSAC cost."""
-    state = start
+def oriented(observations: Array, valid: NDArray[np.bool_], state: State,
+             threshold: float) -> State:
+    """A hypothesis with the sign that puts its matches in front of the cameras."""
     everything = select_inliers(observations, valid, state, SHRINKING[0] * threshold, 1e9)
-    state = signed(state, cheirality_sign(observations, everything, state))
-    for k in range(SHRINKING.shape[0]):
-        use = select_inliers(observations, valid, state, SHRINKING[k] * threshold, angle_sigma)
-        if use.sum() < 6:
-            return state, math.inf
-        # Wide selections hold outliers: their residuals are not pixel noise.
-        state, _ = fit(observations, use, state, priors, sigma * SHRINKING[k], ITERATIONS)
-    return state, truncated_cost(observations, valid, state, priors, threshold, sigma)
+    return signed(state, cheirality_sign(observations, everything, state))
+
+
+@_jit
+def optimise(observations: Array, valid: NDArray[np.bool_], start: State, priors: Priors,
+             sigma: float, threshold: float, scale: float,
+             angle_sigma: float) -> tuple[State, float]:
+    """Fit the uniform model to the matches within `scale` times the threshold.
+
+    Returns the state and its MSAC cost at that scale; infinite for too few matches.
+    """
+    use = select_inliers(observations, valid, start, scale * threshold, angle_sigma)
+    if use.sum() < 6:
+        return start, math.inf
+    # Wide selections hold outliers: their residuals are not pixel noise.
+    state, _, _ = fit(observations, use, start, priors, scale * sigma, ITERATIONS)
+    return state, truncated_cost(observations, valid, state, priors, scale * threshold,
+                                 scale * sigma)

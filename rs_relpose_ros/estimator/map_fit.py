@@ -128,7 +128,7 @@ def prior_cost(state: State, priors: Priors) -> float:
 def normal_equations(observations: Array, use: NDArray[np.bool_], state: State, priors: Priors,
                      sigma: float) -> tuple[Array, Array, float]:
     """Hessian (17, 17), half gradient (17,) and cost of the whole objective at `state`."""
-    hessian, gradient, squares, _ = sampson.normal_equations(
+    hessian, gradient, squares = sampson.normal_equations(
         observations, use, state.R, state.t, state.d1, state.d2, state.dw1, state.dw2)
     weight = 1.0 / (sigma * sigma)
     hessian *= weight
@@ -182,16 +182,14 @@ def cholesky_solve(factor: Array, right: Array) -> Array:
 
 @_jit
 def fit(observations: Array, use: NDArray[np.bool_], start: State, priors: Priors, sigma: float,
-        iterations: int) -> tuple[State, float]:
-    """Levenberg-Marquardt from `start` over the matches in `use`; the state and its cost."""
+        iterations: int) -> tuple[State, float, Array]:
+    """Levenberg-Marquardt from `start` over the matches in `use`; state, cost and Hessian."""
     state = start
     damping = 1e-4
     hessian, gradient, cost = normal_equations(observations, use, state, priors, sigma)
     damped = np.empty((PARAMETERS, PARAMETERS))
     factor = np.zeros((PARAMETERS, PARAMETERS))
-    done = 0
-    while done < iterations:
-        done += 1
+    for _ in range(iterations):
         damped[:] = hessian
         for i in range(PARAMETERS):
             damped[i, i] += damping * hessian[i, i] + 1e-12
@@ -200,15 +198,13 @@ def fit(observations: Array, use: NDArray[np.bool_], start: State, priors: Prior
             if damping > 1e8:
                 break
             continue
-        step = cholesky_solve(factor, -gradient)
-        candidate = moved(state, step)
-        candidate_cost = sampson.sum_of_squares(
-            observations, use, candidate.R, candidate.t, candidate.d1, candidate.d2, candidate.dw1,
-            candidate.dw2) / (sigma * sigma) + prior_cost(candidate, priors)
-        if candidate_cost <= cost:
-            gain = cost - candidate_cost
-            state = candidate
-            hessian, gradient, cost = normal_equations(observations, use, state, priors, sigma)
+        candidate = moved(state, cholesky_solve(factor, -gradient))
+        # Most steps are taken: their derivatives cost little more than the residuals alone.
+        next_hessian, next_gradient, next_cost = normal_equations(
+            observations, use, candidate, priors, sigma)
+        if next_cost <= cost:
+            gain = cost - next_cost
+            state, hessian, gradient, cost = candidate, next_hessian, next_gradient, next_cost
             damping = max(damping * 0.1, 1e-9)
             # Relative to one degree of freedom's worth of chi-square.
             if gain < 1e-6 * (1.0 + cost):
@@ -217,7 +213,7 @@ def fit(observations: Array, use: NDArray[np.bool_], start: State, priors: Prior
             damping *= 10.0
             if not damping < 1e8:
                 break
-    return state, cost
+    return state, cost, hessian
 
 
 @_jit

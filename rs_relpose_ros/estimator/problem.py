@@ -7,8 +7,9 @@ the result back, with its covariance.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,8 +28,8 @@ class TwoViewProblem:
     ----------
     observations : (N, 20) ndarray
         Rows of `sampson`; NaN-free (matches that cannot be unprojected are left out by `valid`).
-    points : (N, 6) ndarray
-        Rows of `consensus.multi_scale_cost`.
+    points : (6, N) ndarray
+        Columns of `consensus.multi_scale_cost`.
     valid : (N,) ndarray of bool
         Matches with finite rays.
     focal : float
@@ -67,7 +68,6 @@ def build_problem(points1: Array, points2: Array, camera: RollingShutterCamera,
         False for the models that know no angular velocity (linear, global): rays stay as measured.
     """
     delay = middle_row_delay(camera)
-    middle = replace(camera, reference_row='middle')
     motion1, motion2 = motion1.shifted(delay), motion2.shifted(delay)
     rotation = information = None
     if relative_rotation is not None and relative_rotation_covariance is not None:
@@ -80,36 +80,44 @@ def build_problem(points1: Array, points2: Array, camera: RollingShutterCamera,
         information = np.linalg.inv(covariance + 1e-14 * np.eye(3))
         information = 0.5 * (information + information.T)
     observations = np.empty((len(points1), 20))
-    _observe(points1, middle, motion1, derotate, observations[:, 0:9], observations[:, 18])
-    _observe(points2, middle, motion2, derotate, observations[:, 9:18], observations[:, 19])
+    for k, (points, motion) in enumerate(((points1, motion1), (points2, motion2))):
+        rays, jacobian = camera.unproject_with_jacobian(points)
+        tau = camera.row_times(points[:, 1]) - delay
+        turns, rate = np.broadcast_to(np.eye(3), (len(points), 3, 3)), np.zeros(3)
+        if derotate:
+            turns, rate = motion.rotations(tau), motion.angular_velocity
+        observations[:, 18 + k] = tau
+        _derotate(rays, jacobian, np.ascontiguousarray(turns), camera.line_delay * rate,
+                  observations[:, 9 * k:9 * k + 9])
     valid = np.asarray(np.isfinite(observations).all(axis=1))
     with np.errstate(all='ignore'):
-        points = np.column_stack([
+        points = np.stack([
             observations[:, 0] / observations[:, 2], observations[:, 1] / observations[:, 2],
             observations[:, 9] / observations[:, 11], observations[:, 10] / observations[:, 11],
             observations[:, 18], observations[:, 19]])
     behind = ~((observations[:, 2] > 1e-6) & (observations[:, 11] > 1e-6))
-    points[behind | ~valid] = np.nan
+    points[:, behind | ~valid] = np.nan
     observations[~valid] = 0.0
     return TwoViewProblem(observations, points, valid, 0.5 * (camera.fx + camera.fy), motion1,
                           motion2, rotation, information)
 
 
-def _observe(points: Array, camera: RollingShutterCamera, motion: FrameMotion, derotate: bool,
-             block: Array, row_times: Array) -> None:
-    """Fill one camera's (N, 9) block: ray and its derivatives by u and v; and its row times."""
-    rays, jacobian = camera.unproject_with_jacobian(points)
-    tau = camera.row_times(points[:, 1])
-    row_times[:] = tau
-    if not derotate:
-        block[:, 0:3], block[:, 3:6], block[:, 6:9] = rays, jacobian[:, :, 0], jacobian[:, :, 1]
-        return
-    turns = motion.rotations(tau)
-    block[:, 0:3] = np.einsum('nij,nj->ni', turns, rays)
-    block[:, 3:6] = np.einsum('nij,nj->ni', turns, jacobian[:, :, 0])
-    # One row further down, the camera has turned on by one line delay.
-    block[:, 6:9] = (np.einsum('nij,nj->ni', turns, jacobian[:, :, 1])
-                     + camera.line_delay * np.cross(motion.angular_velocity, block[:, 0:3]))
+@numba.njit(cache=True, nogil=True)
+def _derotate(rays: Array, jacobian: Array, turns: Array, turn_of_a_row: Array,
+              block: Array) -> None:
+    """Fill one camera's `block` (N, 9): turned ray and its derivatives by u and v."""
+    for i in range(len(rays)):
+        for j in range(3):
+            f = u = v = 0.0
+            for k in range(3):
+                f += turns[i, j, k] * rays[i, k]
+                u += turns[i, j, k] * jacobian[i, k, 0]
+                v += turns[i, j, k] * jacobian[i, k, 1]
+            block[i, j], block[i, 3 + j], block[i, 6 + j] = f, u, v
+        # One row further down, the camera has turned on by one line delay.
+        for j in range(3):
+            k, m = (j + 1) % 3, (j + 2) % 3
+            block[i, 6 + j] += turn_of_a_row[k] * block[i, m] - turn_of_a_row[m] * block[i, k]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -85,6 +85,6 @@ def fit_rotation(observations: Array, valid: NDArray[np.bool_], start: Array, pr
             break
         step = cholesky_solve(factor, -gradient)
         R = exp_so3(step) @ R
-        if np.abs(step).max() < 1e-9:
+        if np.abs(step).max() < 1e-7:
             break
     return R, information

@@ -12,6 +12,10 @@ distortion and the turn of the camera from row to row, so the error is in pixels
 An observation row (20 floats) holds, for one match,
 ``f_1, df_1/du, df_1/dv, f_2, df_2/du, df_2/dv, tau_1, tau_2``.
 
+Matches are evaluated in blocks, each laid out so that neighbours of one quantity are neighbours in
+memory: the compiler then works on several matches at once. For that it must know the strides,
+hence the arrays of fixed shape and the forced inlining.
+
 The state is ``R, t`` (unit), ``d_1, d_2`` and gyro corrections ``dw_1, dw_2``, all in frame 1;
 its 17 local parameters are ``(theta, t tangent, d_1, d_2, dw_1, dw_2)``, ``R <- Exp(theta) R``.
 """
@@ -29,23 +33,19 @@ Array = NDArray[np.float64]
 PARAMETERS = 17
 THETA, TANGENT, D1, D2, DW1, DW2 = 0, 3, 5, 8, 11, 14
 
-# Fused multiply-add and reordered sums: a fifth faster. NaN and infinity keep their meaning.
+# Matches of a block: enough to vectorise, few enough for the nearest cache.
+BLOCK = 64
+
+# Fused multiply-add and reordered sums. NaN and infinity keep their meaning.
 _FAST = {'contract', 'reassoc', 'nsz', 'arcp'}
 _jit = numba.njit(cache=True, nogil=True, error_model='numpy', fastmath=_FAST)
+_inlined = numba.njit(cache=True, nogil=True, error_model='numpy', fastmath=_FAST,
+                      forceinline=True)
 
 
-@_jit
+@_inlined
 def _cross(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-
-
-@_jit
-def _turned(x, y, z, wx, wy, wz, tau):  # type: ignore[no-untyped-def]
-    """``Exp(w tau) v`` to second order: w is a gyro correction, not a rate."""
-    cx, cy, cz = _cross(wx, wy, wz, x, y, z)
-    ex, ey, ez = _cross(wx, wy, wz, cx, cy, cz)
-    s = 0.5 * tau * tau
-    return x + tau * cx + s * ex, y + tau * cy + s * ey, z + tau * cz + s * ez
 
 
 @_jit
@@ -68,32 +68,81 @@ def tangent_basis(t: Array) -> Array:
     return basis
 
 
-@_jit
-def _residual_and_pairs(o, R, t, d1, d2, dw1, dw2, frame):  # type: ignore[no-untyped-def]
-    """Residual of one observation row [px]; `frame` receives the vectors that the Jacobian needs.
+@_inlined
+def _baselines(t: Array, d1: Array, d2: Array) -> Array:
+    """Coefficients (3, 3) of ``b = t - tau_1 d_1 + tau_2 d_2`` in 1, tau_1, tau_2."""
+    out = np.empty((3, 3))
+    for k in range(3):
+        out[0, k], out[1, k], out[2, k] = t[k], -d1[k], d2[k]
+    return out
 
-    frame: b (0:3), f_1 (3:6), h (6:9), p' (9:12), h' (12:15), where ``dr`` is the sum of the
-    variations of the triple products b.(p' x h) and b.(f_1 x h').
+
+@_inlined
+def _turns(rate: Array, R: Array) -> Array:
+    """Coefficients (3, 3, 3) of ``Exp(w tau) R`` in 1, tau, tau^2: w is a gyro correction."""
+    out = np.empty((3, 3, 3))
+    for j in range(3):
+        out[0, 0, j], out[0, 1, j], out[0, 2, j] = R[0, j], R[1, j], R[2, j]
+        for k in range(1, 3):
+            x, y, z = _cross(rate[0], rate[1], rate[2], out[k - 1, 0, j], out[k - 1, 1, j],
+                             out[k - 1, 2, j])
+            out[k, 0, j], out[k, 1, j], out[k, 2, j] = x / k, y / k, z / k
+    return out
+
+
+@_inlined
+def _turned(turns, tau, x, y, z):  # type: ignore[no-untyped-def]
+    """A vector turned by the rotation of `_turns` at tau."""
+    s = tau * tau
+    return (
+        (turns[0, 0, 0] + tau * turns[1, 0, 0] + s * turns[2, 0, 0]) * x
+        + (turns[0, 0, 1] + tau * turns[1, 0, 1] + s * turns[2, 0, 1]) * y
+        + (turns[0, 0, 2] + tau * turns[1, 0, 2] + s * turns[2, 0, 2]) * z,
+        (turns[0, 1, 0] + tau * turns[1, 1, 0] + s * turns[2, 1, 0]) * x
+        + (turns[0, 1, 1] + tau * turns[1, 1, 1] + s * turns[2, 1, 1]) * y
+        + (turns[0, 1, 2] + tau * turns[1, 1, 2] + s * turns[2, 1, 2]) * z,
+        (turns[0, 2, 0] + tau * turns[1, 2, 0] + s * turns[2, 2, 0]) * x
+        + (turns[0, 2, 1] + tau * turns[1, 2, 1] + s * turns[2, 2, 1]) * y
+        + (turns[0, 2, 2] + tau * turns[1, 2, 2] + s * turns[2, 2, 2]) * z)
+
+
+@_inlined
+def _gather(observations, use, first, block):  # type: ignore[no-untyped-def]
+    """Fill `block` (20, BLOCK) with the matches in `use` from number `first` on.
+
+    Returns the number from which to go on, and how many matches there are. The rest of the block
+    is zero: such a match has no residual and no derivative.
     """
-    tau1, tau2 = o[18], o[19]
-    bx = t[0] - tau1 * d1[0] + tau2 * d2[0]
-    by = t[1] - tau1 * d1[1] + tau2 * d2[1]
-    bz = t[2] - tau1 * d1[2] + tau2 * d2[2]
-    fx, fy, fz = _turned(o[0], o[1], o[2], dw1[0], dw1[1], dw1[2], tau1)
-    ux, uy, uz = _turned(o[3], o[4], o[5], dw1[0], dw1[1], dw1[2], tau1)
-    vx, vy, vz = _turned(o[6], o[7], o[8], dw1[0], dw1[1], dw1[2], tau1)
-    hx = R[0, 0] * o[9] + R[0, 1] * o[10] + R[0, 2] * o[11]
-    hy = R[1, 0] * o[9] + R[1, 1] * o[10] + R[1, 2] * o[11]
-    hz = R[2, 0] * o[9] + R[2, 1] * o[10] + R[2, 2] * o[11]
-    hx, hy, hz = _turned(hx, hy, hz, dw2[0], dw2[1], dw2[2], tau2)
-    hux = R[0, 0] * o[12] + R[0, 1] * o[13] + R[0, 2] * o[14]
-    huy = R[1, 0] * o[12] + R[1, 1] * o[13] + R[1, 2] * o[14]
-    huz = R[2, 0] * o[12] + R[2, 1] * o[13] + R[2, 2] * o[14]
-    hux, huy, huz = _turned(hux, huy, huz, dw2[0], dw2[1], dw2[2], tau2)
-    hvx = R[0, 0] * o[15] + R[0, 1] * o[16] + R[0, 2] * o[17]
-    hvy = R[1, 0] * o[15] + R[1, 1] * o[16] + R[1, 2] * o[17]
-    hvz = R[2, 0] * o[15] + R[2, 1] * o[16] + R[2, 2] * o[17]
-    hvx, hvy, hvz = _turned(hvx, hvy, hvz, dw2[0], dw2[1], dw2[2], tau2)
+    count = 0
+    while first < observations.shape[0] and count < BLOCK:
+        if use[first]:
+            for k in range(20):
+                block[k, count] = observations[first, k]
+            count += 1
+        first += 1
+    for i in range(count, BLOCK):
+        for k in range(20):
+            block[k, i] = 0.0
+    return first, count
+
+
+@_inlined
+def _residual(o, i, baselines, turns1, turns2):  # type: ignore[no-untyped-def]
+    """Residual [px] of column i of a block, and the vectors that its derivative needs.
+
+    They are b, f_1, h, p', h', where ``dr`` is the sum of the variations of the triple products
+    b.(p' x h) and b.(f_1 x h').
+    """
+    tau1, tau2 = o[18, i], o[19, i]
+    bx = baselines[0, 0] + tau1 * baselines[1, 0] + tau2 * baselines[2, 0]
+    by = baselines[0, 1] + tau1 * baselines[1, 1] + tau2 * baselines[2, 1]
+    bz = baselines[0, 2] + tau1 * baselines[1, 2] + tau2 * baselines[2, 2]
+    fx, fy, fz = _turned(turns1, tau1, o[0, i], o[1, i], o[2, i])
+    ux, uy, uz = _turned(turns1, tau1, o[3, i], o[4, i], o[5, i])
+    vx, vy, vz = _turned(turns1, tau1, o[6, i], o[7, i], o[8, i])
+    hx, hy, hz = _turned(turns2, tau2, o[9, i], o[10, i], o[11, i])
+    hux, huy, huz = _turned(turns2, tau2, o[12, i], o[13, i], o[14, i])
+    hvx, hvy, hvz = _turned(turns2, tau2, o[15, i], o[16, i], o[17, i])
     # h x b and b x f_1: the gradients of e by f_1 and by h.
     gx, gy, gz = _cross(hx, hy, hz, bx, by, bz)
     kx, ky, kz = _cross(bx, by, bz, fx, fy, fz)
@@ -102,23 +151,66 @@ def _residual_and_pairs(o, R, t, d1, d2, dw1, dw2, frame):  # type: ignore[no-un
     q2 = gx * vx + gy * vy + gz * vz
     q3 = kx * hux + ky * huy + kz * huz
     q4 = kx * hvx + ky * hvy + kz * hvz
-    s2 = q1 * q1 + q2 * q2 + q3 * q3 + q4 * q4
     # Rays on the epipole have no gradient; the floor is far below any real one (1/px).
-    s = math.sqrt(s2 + 1e-30)
-    r = e / s
-    c0 = 1.0 / s
-    c = -r / (s * s)
+    c0 = 1.0 / math.sqrt(q1 * q1 + q2 * q2 + q3 * q3 + q4 * q4 + 1e-30)
+    r = e * c0
+    c = -r * c0 * c0
     c1, c2, c3, c4 = c * q1, c * q2, c * q3, c * q4
-    frame[0], frame[1], frame[2] = bx, by, bz
-    frame[3], frame[4], frame[5] = fx, fy, fz
-    frame[6], frame[7], frame[8] = hx, hy, hz
-    frame[9] = c0 * fx + c1 * ux + c2 * vx
-    frame[10] = c0 * fy + c1 * uy + c2 * vy
-    frame[11] = c0 * fz + c1 * uz + c2 * vz
-    frame[12] = c3 * hux + c4 * hvx
-    frame[13] = c3 * huy + c4 * hvy
-    frame[14] = c3 * huz + c4 * hvz
-    return r
+    return (r, (bx, by, bz), (fx, fy, fz), (hx, hy, hz),
+            (c0 * fx + c1 * ux + c2 * vx, c0 * fy + c1 * uy + c2 * vy,
+             c0 * fz + c1 * uz + c2 * vz),
+            (c3 * hux + c4 * hvx, c3 * huy + c4 * hvy, c3 * huz + c4 * hvz))
+
+
+@_inlined
+def _linearise(o, baselines, turns1, turns2, basis, rows):  # type: ignore[no-untyped-def]
+    """Derivatives and residuals of a block: `rows` (18, BLOCK), the residual last."""
+    for i in range(BLOCK):
+        r, (bx, by, bz), (fx, fy, fz), (hx, hy, hz), (px, py, pz), (jx, jy, jz) = _residual(
+            o, i, baselines, turns1, turns2)
+        # by b: p' x h + f_1 x h'
+        nx, ny, nz = _cross(px, py, pz, hx, hy, hz)
+        mx, my, mz = _cross(fx, fy, fz, jx, jy, jz)
+        nx, ny, nz = nx + mx, ny + my, nz + mz
+        # by a turn of the second rays: h x (b x p') + h' x (b x f_1)
+        sx, sy, sz = _cross(bx, by, bz, px, py, pz)
+        rx, ry, rz = _cross(hx, hy, hz, sx, sy, sz)
+        kx, ky, kz = _cross(bx, by, bz, fx, fy, fz)
+        mx, my, mz = _cross(jx, jy, jz, kx, ky, kz)
+        rx, ry, rz = rx + mx, ry + my, rz + mz
+        # by a turn of the first rays: one of all three vectors, b too, would change nothing
+        mx, my, mz = _cross(bx, by, bz, nx, ny, nz)
+        wx, wy, wz = -rx - mx, -ry - my, -rz - mz
+        tau1, tau2 = o[18, i], o[19, i]
+        rows[0, i], rows[1, i], rows[2, i] = rx, ry, rz
+        rows[3, i] = nx * basis[0, 0] + ny * basis[1, 0] + nz * basis[2, 0]
+        rows[4, i] = nx * basis[0, 1] + ny * basis[1, 1] + nz * basis[2, 1]
+        rows[5, i], rows[6, i], rows[7, i] = -tau1 * nx, -tau1 * ny, -tau1 * nz
+        rows[8, i], rows[9, i], rows[10, i] = tau2 * nx, tau2 * ny, tau2 * nz
+        rows[11, i], rows[12, i], rows[13, i] = tau1 * wx, tau1 * wy, tau1 * wz
+        rows[14, i], rows[15, i], rows[16, i] = tau2 * rx, tau2 * ry, tau2 * rz
+        rows[17, i] = r
+
+
+@_inlined
+def _add_products(rows, j, k, gram):  # type: ignore[no-untyped-def]
+    """Add the inner products of three rows from j on with three from k on to `gram`."""
+    s00 = s01 = s02 = s10 = s11 = s12 = s20 = s21 = s22 = 0.0
+    for i in range(BLOCK):
+        a0, a1, a2 = rows[j, i], rows[j + 1, i], rows[j + 2, i]
+        b0, b1, b2 = rows[k, i], rows[k + 1, i], rows[k + 2, i]
+        s00, s01, s02 = s00 + a0 * b0, s01 + a0 * b1, s02 + a0 * b2
+        s10, s11, s12 = s10 + a1 * b0, s11 + a1 * b1, s12 + a1 * b2
+        s20, s21, s22 = s20 + a2 * b0, s21 + a2 * b1, s22 + a2 * b2
+    gram[j, k] += s00
+    gram[j, k + 1] += s01
+    gram[j, k + 2] += s02
+    gram[j + 1, k] += s10
+    gram[j + 1, k + 1] += s11
+    gram[j + 1, k + 2] += s12
+    gram[j + 2, k] += s20
+    gram[j + 2, k + 1] += s21
+    gram[j + 2, k + 2] += s22
 
 
 @_jit
@@ -126,44 +218,18 @@ def residuals(observations: Array, R: Array, t: Array, d1: Array, d2: Array, dw1
               dw2: Array) -> Array:
     """Signed Sampson errors (N,) [px] of observation rows (N, 20)."""
     n = observations.shape[0]
+    baselines, turns1, turns2 = _baselines(t, d1, d2), _turns(dw1, np.eye(3)), _turns(dw2, R)
+    block, errors = np.empty((20, BLOCK)), np.empty(BLOCK)
+    everything = np.ones(n, dtype=np.bool_)
     out = np.empty(n)
-    frame = np.empty(15)
-    for i in range(n):
-        out[i] = _residual_and_pairs(observations[i], R, t, d1, d2, dw1, dw2, frame)
+    first = 0
+    while first < n:
+        following, count = _gather(observations, everything, first, block)
+        for i in range(BLOCK):
+            errors[i] = _residual(block, i, baselines, turns1, turns2)[0]
+        out[first:following] = errors[:count]
+        first = following
     return out
-
-
-@_jit
-def jacobian_row(frame: Array, tau1: float, tau2: float, basis: Array, row: Array) -> None:
-    """Derivative (17,) of one residual by the local parameters, from `_residual_and_pairs`."""
-    bx, by, bz = frame[0], frame[1], frame[2]
-    fx, fy, fz = frame[3], frame[4], frame[5]
-    hx, hy, hz = frame[6], frame[7], frame[8]
-    px, py, pz = frame[9], frame[10], frame[11]
-    jx, jy, jz = frame[12], frame[13], frame[14]
-    # by b: p' x h + f_1 x h'
-    nx, ny, nz = _cross(px, py, pz, hx, hy, hz)
-    mx, my, mz = _cross(fx, fy, fz, jx, jy, jz)
-    nx, ny, nz = nx + mx, ny + my, nz + mz
-    # by a turn of the second rays: h x (b x p') + h' x (b x f_1)
-    sx, sy, sz = _cross(bx, by, bz, px, py, pz)
-    rx, ry, rz = _cross(hx, hy, hz, sx, sy, sz)
-    kx, ky, kz = _cross(bx, by, bz, fx, fy, fz)
-    mx, my, mz = _cross(jx, jy, jz, kx, ky, kz)
-    rx, ry, rz = rx + mx, ry + my, rz + mz
-    # by a turn of the first rays: p' x (h x b) + f_1 x (h' x b)
-    gx, gy, gz = _cross(hx, hy, hz, bx, by, bz)
-    wx, wy, wz = _cross(px, py, pz, gx, gy, gz)
-    gx, gy, gz = _cross(jx, jy, jz, bx, by, bz)
-    mx, my, mz = _cross(fx, fy, fz, gx, gy, gz)
-    wx, wy, wz = wx + mx, wy + my, wz + mz
-    row[0], row[1], row[2] = rx, ry, rz
-    row[3] = nx * basis[0, 0] + ny * basis[1, 0] + nz * basis[2, 0]
-    row[4] = nx * basis[0, 1] + ny * basis[1, 1] + nz * basis[2, 1]
-    row[5], row[6], row[7] = -tau1 * nx, -tau1 * ny, -tau1 * nz
-    row[8], row[9], row[10] = tau2 * nx, tau2 * ny, tau2 * nz
-    row[11], row[12], row[13] = tau1 * wx, tau1 * wy, tau1 * wz
-    row[14], row[15], row[16] = tau2 * rx, tau2 * ry, tau2 * rz
 
 
 @_jit
@@ -171,55 +237,41 @@ def jacobian(observations: Array, R: Array, t: Array, d1: Array, d2: Array, dw1:
              dw2: Array) -> Array:
     """Derivatives (N, 17) of the Sampson errors by the local parameters."""
     n = observations.shape[0]
-    out = np.empty((n, PARAMETERS))
-    frame = np.empty(15)
+    baselines, turns1, turns2 = _baselines(t, d1, d2), _turns(dw1, np.eye(3)), _turns(dw2, R)
     basis = tangent_basis(t)
-    for i in range(n):
-        _residual_and_pairs(observations[i], R, t, d1, d2, dw1, dw2, frame)
-        jacobian_row(frame, observations[i, 18], observations[i, 19], basis, out[i])
+    block, rows = np.empty((20, BLOCK)), np.empty((PARAMETERS + 1, BLOCK))
+    everything = np.ones(n, dtype=np.bool_)
+    out = np.empty((n, PARAMETERS))
+    first = 0
+    while first < n:
+        following, count = _gather(observations, everything, first, block)
+        _linearise(block, baselines, turns1, turns2, basis, rows)
+        out[first:following] = rows[:PARAMETERS, :count].T
+        first = following
     return out
 
 
 @_jit
 def normal_equations(observations: Array, use: NDArray[np.bool_], R: Array, t: Array, d1: Array,
-                     d2: Array, dw1: Array, dw2: Array) -> tuple[Array, Array, float, int]:
-    """``J^T J`` (17, 17), ``J^T r`` (17,), sum of squares and count over the matches in `use`."""
-    hessian = np.zeros((PARAMETERS, PARAMETERS))
-    gradient = np.zeros(PARAMETERS)
-    row = np.empty(PARAMETERS)
-    frame = np.empty(15)
+                     d2: Array, dw1: Array, dw2: Array) -> tuple[Array, Array, float]:
+    """``J^T J`` (17, 17), ``J^T r`` (17,) and sum of squares over the matches in `use`."""
+    baselines, turns1, turns2 = _baselines(t, d1, d2), _turns(dw1, np.eye(3)), _turns(dw2, R)
     basis = tangent_basis(t)
-    cost = 0.0
-    count = 0
-    for i in range(observations.shape[0]):
-        if not use[i]:
-            continue
-        r = _residual_and_pairs(observations[i], R, t, d1, d2, dw1, dw2, frame)
-        jacobian_row(frame, observations[i, 18], observations[i, 19], basis, row)
-        cost += r * r
-        count += 1
-        for j in range(PARAMETERS):
-            value = row[j]
-            gradient[j] += value * r
-            for k in range(j + 1):
-                hessian[j, k] += value * row[k]
+    block, rows = np.empty((20, BLOCK)), np.empty((PARAMETERS + 1, BLOCK))
+    # The residual as the last column of J: one product holds all three results.
+    gram = np.zeros((PARAMETERS + 1, PARAMETERS + 1))
+    first = 0
+    while first < observations.shape[0]:
+        first, _ = _gather(observations, use, first, block)
+        _linearise(block, baselines, turns1, turns2, basis, rows)
+        for j in range(0, PARAMETERS + 1, 3):
+            for k in range(0, j + 1, 3):
+                _add_products(rows, j, k, gram)
+    hessian = np.empty((PARAMETERS, PARAMETERS))
     for j in range(PARAMETERS):
-        for k in range(j):
-            hessian[k, j] = hessian[j, k]
-    return hessian, gradient, cost, count
-
-
-@_jit
-def sum_of_squares(observations: Array, use: NDArray[np.bool_], R: Array, t: Array, d1: Array,
-                   d2: Array, dw1: Array, dw2: Array) -> float:
-    """Sum of squared Sampson errors [px^2] over the matches in `use`."""
-    frame = np.empty(15)
-    cost = 0.0
-    for i in range(observations.shape[0]):
-        if use[i]:
-            r = _residual_and_pairs(observations[i], R, t, d1, d2, dw1, dw2, frame)
-            cost += r * r
-    return cost
+        for k in range(j + 1):
+            hessian[j, k] = hessian[k, j] = gram[j, k]
+    return hessian, gram[PARAMETERS, :PARAMETERS].copy(), gram[PARAMETERS, PARAMETERS]
 
 
 @_jit

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.estimator.local_optimisation import select_inliers
-from rs_relpose_ros.estimator.map_fit import fit, log_determinant, normal_equations, Priors, State
+from rs_relpose_ros.estimator.map_fit import fit, log_determinant, Priors, State
+from rs_relpose_ros.estimator.sampson import residuals
 
 Array = NDArray[np.float64]
 
@@ -64,7 +65,7 @@ def fit_with_evidence(observations: Array, valid: NDArray[np.bool_], start: Stat
     state = start
     best = 0
     inliers = select_inliers(observations, valid, state, threshold, angle_sigma)
-    sigma = _noise(observations, inliers, state, priors, told_sigma)
+    sigma = _noise(observations, inliers, state, told_sigma)
     for turn in range(ROUNDS):
         low, high = 0, grid.shape[0]
         if turn > 0:   # the choice moves little once the inliers stand
@@ -73,28 +74,29 @@ def fit_with_evidence(observations: Array, valid: NDArray[np.bool_], start: Stat
         best_state = state
         for k in range(low, high):
             chosen = with_velocity_sigma(priors, grid[k])
-            candidate, cost = fit(observations, inliers, state, chosen, sigma, ITERATIONS)
-            hessian, _, _ = normal_equations(observations, inliers, candidate, chosen, sigma)
+            candidate, cost, hessian = fit(
+                observations, inliers, state, chosen, sigma, ITERATIONS)
             evidence = (-0.5 * cost - 0.5 * log_determinant(hessian) - 6.0 * math.log(grid[k]))
             if evidence > best_evidence:
                 best_evidence, best_state, best = evidence, candidate, k
         state = best_state
+        chosen_from = inliers
         inliers = select_inliers(observations, valid, state, threshold, angle_sigma)
-        sigma = _noise(observations, inliers, state, priors, told_sigma)
+        sigma = _noise(observations, inliers, state, told_sigma)
+        if (inliers == chosen_from).all():
+            break
     chosen = with_velocity_sigma(priors, grid[best])
-    state, _ = fit(observations, inliers, state, chosen, sigma, ITERATIONS)
+    state, _, _ = fit(observations, inliers, state, chosen, sigma, ITERATIONS)
     return state, inliers, grid[best], sigma
 
 
 @_jit
-def _noise(observations: Array, inliers: NDArray[np.bool_], state: State, priors: Priors,
+def _noise(observations: Array, inliers: NDArray[np.bool_], state: State,
            told_sigma: float) -> float:
     """Noise of a match [px] from the residuals of a state."""
-    _, _, squares = normal_equations(observations, inliers, state, _no_priors(priors), 1.0)
+    r = residuals(observations, state.R, state.t, state.d1, state.d2, state.dw1, state.dw2)
+    squares = 0.0
+    for i in range(len(r)):
+        if inliers[i]:
+            squares += r[i] * r[i]
     return noise_sigma(squares, inliers.sum(), told_sigma)
-
-
-@_jit
-def _no_priors(priors: Priors) -> Priors:
-    return Priors(priors.gravity1, priors.gravity2, 0.0, 0.0, 0.0, 0.0, priors.rotation,
-                  np.zeros((3, 3)))
