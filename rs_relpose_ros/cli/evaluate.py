@@ -16,7 +16,7 @@ from typing import Any
 from tqdm import tqdm
 
 from rs_relpose_ros.evaluation.methods import METHODS, PAPER_METHODS
-from rs_relpose_ros.evaluation.paper import EXPERIMENTS, PaperRun, run_paper
+from rs_relpose_ros.evaluation.paper import EXPERIMENTS, PAPER_EXPERIMENTS, PaperRun, run_paper
 from rs_relpose_ros.evaluation.plots import draw_boxes
 from rs_relpose_ros.evaluation.results import (
     by_cell,
@@ -59,8 +59,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                                        if not method.continuous_gyro])
     paper.add_argument('--trials', type=int, default=100, metavar='N',
                        help='scenes of each level of each motion (default: 100, as in the paper)')
-    paper.add_argument('--figures', nargs='+', choices=EXPERIMENTS, default=list(EXPERIMENTS),
-                       metavar='FIGURE', help=f'any of {", ".join(EXPERIMENTS)} (default: all)')
+    paper.add_argument('--figures', nargs='+', choices=EXPERIMENTS,
+                       default=list(PAPER_EXPERIMENTS), metavar='FIGURE',
+                       help=f'any of {", ".join(EXPERIMENTS)} (default: those of the paper, all '
+                       'but the last)')
     paper.add_argument('--motions', nargs='+', choices=MOTIONS, default=list(MOTIONS),
                        metavar='MOTION', help=f'any of {", ".join(MOTIONS)} (default: both)')
     paper.add_argument('--jobs', type=int, default=1, metavar='N',

@@ -1,4 +1,4 @@
-"""The paper's five synthetic experiments: what each varies, and its run over all trials."""
+"""The paper's synthetic experiments: what each varies, and its run over all trials."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 import math
 import multiprocessing
+from typing import Any
 
 from rs_relpose_ros.camera import RollingShutterCamera
 from rs_relpose_ros.config import EstimatorConfig
@@ -33,7 +34,7 @@ _LEAST_PIXEL_SIGMA, _LEAST_GRAVITY_SIGMA, _LEAST_GYRO_SIGMA = 0.01, 1e-5, 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Experiment:
-    """One figure of the paper.
+    """One figure.
 
     Attributes
     ----------
@@ -47,6 +48,7 @@ class Experiment:
     unit : float
     fixed : tuple of (str, float)
         Fields of `SceneSettings` that are not at their defaults.
+    in_paper : bool
     """
 
     name: str
@@ -57,14 +59,17 @@ class Experiment:
     levels: tuple[float, ...]
     unit: float = 1.0
     fixed: tuple[tuple[str, float], ...] = ()
+    in_paper: bool = True
 
     def settings(self, level: float, base: SceneSettings) -> SceneSettings:
         """The cell at `level`; noises and outliers that it does not vary are those of `base`."""
-        return replace(base, **dict(self.fixed), **{self.varied: level * self.unit})
+        changes: dict[str, Any] = {**dict(self.fixed), self.varied: level * self.unit}
+        return replace(base, **changes)
 
 
 _DEGREE = math.pi / 180.0
-# In the paper's order. It gives the ends of each range; the steps are read off no figure.
+# In the paper's order, then others. It gives the ends of each range, its figures are not at
+# hand: the steps are ours.
 EXPERIMENTS = {experiment.name: experiment for experiment in (
     Experiment('linear_velocity', 'linear velocity, no angular velocity',
                'linear velocity of each axis [m/s]', 'm/s', 'linear_velocity',
@@ -81,7 +86,13 @@ EXPERIMENTS = {experiment.name: experiment for experiment in (
     Experiment('gyro_noise', 'noise of the gyro, 1 m/s and 1 rad/s',
                'noise of the gyro, 1 sigma [deg/s]', 'deg/s', 'gyro_noise',
                (0.0, 0.6, 1.2, 1.8, 2.4, 3.0), _DEGREE),
+    # The usual motion of a vehicle, in which the linear velocities cannot be observed.
+    Experiment('constant_velocity', 'constant linear velocity along the baseline, 1 rad/s',
+               'linear velocity of each axis [m/s]', 'm/s', 'linear_velocity',
+               (0.0, 2.0, 4.0, 6.0, 8.0, 10.0), fixed=(('constant_velocity', True),),
+               in_paper=False),
 )}
+PAPER_EXPERIMENTS = tuple(name for name, experiment in EXPERIMENTS.items() if experiment.in_paper)
 
 
 @dataclass(frozen=True, slots=True)

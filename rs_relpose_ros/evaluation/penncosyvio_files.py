@@ -3,13 +3,13 @@
 The folder is a checkout of the data set's repository, into which its scripts have downloaded the
 sensors and extracted the frames::
 
-    data/ground_truth/SEQUENCE/pose.txt     stamp [s], then the 3x4 pose of the rig in the world
-    data/CAMERA/SEQUENCE/frames/            frame_0001.png and so on; timestamps.txt [s], one a line
-    data/visensor/SEQUENCE/imu.txt          stamp [s], specific force, angular velocity
-    data/tango_bottom/SEQUENCE/             accelerometer.txt and gyroscope.txt: stamp [s], 3 figures
-    tools/intrinsic_calibration/cc.mat      OCamCalib's models of the wide-angle cameras
-    tools/misc/extrinsic_calibration.txt    number of the sensor, axis, angle [rad], offset [mm] of
-                                            the transform from the rig to the sensor
+    data/ground_truth/SEQUENCE/pose.txt   stamp [s], then the 3x4 pose of the rig in the world
+    data/CAMERA/SEQUENCE/frames/          frame_0001.png, ...; timestamps.txt [s], one a line
+    data/visensor/SEQUENCE/imu.txt        stamp [s], specific force, angular velocity
+    data/tango_bottom/SEQUENCE/           accelerometer.txt, gyroscope.txt: stamp [s], 3 figures
+    tools/intrinsic_calibration/cc.mat    OCamCalib's models of the wide-angle cameras
+    tools/misc/extrinsic_calibration.txt  number of the sensor, axis, angle [rad], offset [mm]
+                                          of the transform from the rig to the sensor
 
 Frames count from 1, as their files do. The rig's axes are those of the GoPro C2.
 """
@@ -159,7 +159,7 @@ class Frames:
         """Gray image (H, W) of a frame, counted from 1."""
         path = self.folder / f'frame_{number:04d}.png'
         if not path.is_file():
-            raise MissingInputError(f'there is no image {path}: the data set\'s '
+            raise MissingInputError(f"there is no image {path}: the data set's "
                                     'tools/extract_frames.bash makes it of the video')
         image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         if image is None or image.shape != (camera.height, camera.width):

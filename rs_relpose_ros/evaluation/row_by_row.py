@@ -45,6 +45,24 @@ class Shutter:
     reference_row: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """A camera, as the simulation needs it.
+
+    Attributes
+    ----------
+    lens : callable
+        Where a still camera sees points.
+    directions : callable
+        Of pixels (N, 2), in the camera frame (N, 3), with z = 1.
+    shutter : Shutter
+    """
+
+    lens: Lens
+    directions: Callable[[Array], Array]
+    shutter: Shutter
+
+
 def see(world: Array, motion: Motion, lens: Lens, shutter: Shutter) -> Array:
     """Pixels of points seen by a camera that moves while it reads its rows.
 

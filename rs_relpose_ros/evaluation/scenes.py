@@ -13,12 +13,13 @@ the camera's own frame, and the opposite signs in the second camera.
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.evaluation.row_by_row import Motion, see, Shutter
+from rs_relpose_ros.evaluation.row_by_row import Motion, see, Shutter, View
 
 Array = NDArray[np.float64]
 
@@ -29,7 +30,6 @@ MATCHES = 300
 
 MOTIONS = {'forward': (0.0, 0.0, 2.0), 'sideways': (2.0, 0.0, 0.0)}
 
-_SHUTTER = Shutter(WIDTH, HEIGHT, LINE_DELAY, 0.0)
 _BASELINE_SPREAD = 0.2
 _HALF_TURN_RANGE = 10.0
 _NEAREST, _FARTHEST = 6.0, 34.0
@@ -57,6 +57,9 @@ class SceneSettings:
         1 sigma of each axis of each frame's rate [rad/s].
     outliers : float
         Share of the matches that are random.
+    constant_velocity : bool
+        Both cameras move along the baseline, as one camera does at constant velocity, instead of
+        opposite to each other.
     """
 
     linear_velocity: float = 1.0
@@ -65,6 +68,7 @@ class SceneSettings:
     gravity_noise: float = 0.0
     gyro_noise: float = 0.0
     outliers: float = 0.0
+    constant_velocity: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,15 +116,16 @@ def make_scene(settings: SceneSettings, motion: str, seed: int, trial: int) -> S
                     cameras.uniform(-_HALF_TURN_RANGE, _HALF_TURN_RANGE, (2, 3)))
     v_signs, w_signs, g_signs = cameras.choice([-1.0, 1.0], (3, 3))
     v1, w1 = settings.linear_velocity * v_signs, settings.angular_velocity * w_signs
-    pixels1, pixels2 = _matches(
-        _uniform_motion(turn1, np.zeros(3), w1, v1), _uniform_motion(turn2, p2, -w1, -v1), turn1,
-        points)
-    pixels1 = pixels1 + settings.pixel_noise * noise.standard_normal(pixels1.shape)
-    pixels2 = pixels2 + settings.pixel_noise * noise.standard_normal(pixels2.shape)
+    v2 = -v1
+    if settings.constant_velocity:
+        along = math.sqrt(3.0) * settings.linear_velocity * p2 / np.linalg.norm(p2)
+        v1, v2 = turn1.inv().apply(along), turn2.inv().apply(along)
+    pixels1, pixels2 = measured(
+        seen_by_both(_uniform_motion(turn1, np.zeros(3), w1, v1),
+                     _uniform_motion(turn2, p2, -w1, v2), _VIEW, points),
+        _VIEW, settings.pixel_noise, settings.outliers, noise)
     rate1 = w1 + settings.gyro_noise * noise.standard_normal(3)
     rate2 = -w1 + settings.gyro_noise * noise.standard_normal(3)
-    outliers = noise.permutation(MATCHES)[:round(settings.outliers * MATCHES)]
-    pixels2[outliers] = noise.uniform([0.0, 0.0], [WIDTH - 1, HEIGHT - 1], (len(outliers), 2))
     tilt = Rotation.from_rotvec(settings.gravity_noise * g_signs)
     t = turn1.inv().apply(p2)
     return Scene(
@@ -142,23 +147,45 @@ def _pinhole(local: Array) -> Array:
         return FOCAL * local[:, :2] / local[:, 2:] + CENTRE
 
 
-def _matches(motion1: Motion, motion2: Motion, turn1: Rotation,
-             rng: np.random.Generator) -> tuple[Array, Array]:
-    """Pixels (MATCHES, 2) of points that both cameras see, spread over the image of the first."""
+def _directions(pixels: Array) -> Array:
+    return np.hstack([(pixels - CENTRE) / FOCAL, np.ones((len(pixels), 1))])
+
+
+_VIEW = View(_pinhole, _directions, Shutter(WIDTH, HEIGHT, LINE_DELAY, 0.0))
+
+
+def seen_by_both(motion1: Motion, motion2: Motion, view: View,
+                 rng: np.random.Generator) -> tuple[Array, Array]:
+    """Pixels (MATCHES, 2) of points that both cameras see, spread over the image of the first.
+
+    Depths in camera 1 are uniform from 6 to 34 m.
+    """
     found: list[Array] = []
     count = drawn = 0
+    turn1, position1 = motion1(np.zeros(1))
+    size = (view.shutter.width - 1, view.shutter.height - 1)
     while count < MATCHES:
         if drawn > _MAX_CANDIDATES:
             raise RuntimeError(f'{count} of {drawn} points are seen by both cameras')
         candidates = 2 * MATCHES
         drawn += candidates
         depth = rng.uniform(_NEAREST, _FARTHEST, (candidates, 1))
-        plane = (rng.uniform([0.0, 0.0], [WIDTH - 1, HEIGHT - 1], (candidates, 2)) - CENTRE)
-        world = turn1.apply(depth * np.hstack([plane / FOCAL, np.ones((candidates, 1))]))
-        both = np.hstack([see(world, motion1, _pinhole, _SHUTTER),
-                          see(world, motion2, _pinhole, _SHUTTER)])
+        pixels = rng.uniform([0.0, 0.0], size, (candidates, 2))
+        world = turn1.apply(depth * view.directions(pixels)) + position1
+        both = np.hstack([see(world, motion, view.lens, view.shutter)
+                          for motion in (motion1, motion2)])
         both = both[np.isfinite(both).all(axis=1)]
         found.append(both)
         count += len(both)
     together = np.concatenate(found)[:MATCHES]
     return together[:, :2], together[:, 2:]
+
+
+def measured(points: tuple[Array, Array], view: View, pixel_noise: float, outliers: float,
+             rng: np.random.Generator) -> tuple[Array, Array]:
+    """Matches with noise, 1 sigma of each coordinate [px]; a share of them are random."""
+    points1, points2 = (p + pixel_noise * rng.standard_normal(p.shape) for p in points)
+    wrong = rng.permutation(len(points1))[:round(outliers * len(points1))]
+    size = (view.shutter.width - 1, view.shutter.height - 1)
+    points2[wrong] = rng.uniform([0.0, 0.0], size, (len(wrong), 2))
+    return points1, points2
