@@ -33,12 +33,16 @@ class Method:
         As in `EstimatorConfig`; no solver stands for OpenCV's estimator.
     continuous_gyro : bool
         Whether it is given the gyro over the rows and between the frames, too.
+    derotated : bool
+        Whether OpenCV's estimator gets the points as if all rows had been read with the middle
+        one, as far as the gyro knows.
     """
 
     label: str
     solver: str = ''
     refinement: str = 'alternating'
     continuous_gyro: bool = False
+    derotated: bool = False
 
 
 # The paper's algorithms have the paper's refinement, as in its experiments; auto is the default.
@@ -48,12 +52,14 @@ METHODS: Mapping[str, Method] = {
     'uniform_11pt': Method('11-point', 'uniform_11pt'),
     'auto': Method('auto', 'auto', 'map'),
     'auto_gyro': Method('auto + gyro', 'auto', 'map', continuous_gyro=True),
-    'angular_5pt': Method('angular 5-pt', 'angular_5pt'),
+    'angular_5pt': Method('5-pt derotated', 'angular_5pt'),
     'angular_3pt': Method('angular 3-pt', 'angular_3pt'),
     'linear_9pt': Method('linear 9-pt', 'linear_9pt'),
     'opencv': Method('OpenCV'),
+    'opencv_derotated': Method('OpenCV derotated', derotated=True),
 }
 PAPER_METHODS = ('global_5pt', 'uniform_9pt', 'uniform_11pt', 'auto')
+PENNCOSYVIO_METHODS = (*PAPER_METHODS, 'auto_gyro', 'angular_5pt', 'opencv_derotated')
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,6 +74,8 @@ class ContinuousGyro:
         ``R_1^T R_2`` between the reference rows, and the covariance of its error [rad^2].
     interval : float
         Between the reference rows [s].
+    gravity_sigma : float or None
+        Of the motions' gravity, per axis [rad].
     """
 
     motion1: FrameMotion
@@ -75,6 +83,7 @@ class ContinuousGyro:
     rotation: Array
     covariance: Array
     interval: float
+    gravity_sigma: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,27 +142,49 @@ def run_method(name: str, problem: PairProblem, seed: int) -> Outcome:
     """Estimate a pair by the method `name` of `METHODS`; `seed` is that of its sampling."""
     method = METHODS[name]
     if not method.solver:
-        return _opencv(problem)
+        return _opencv(problem, method.derotated)
     motion1, motion2, gyro = problem.motion1, problem.motion2, None
+    config = replace(problem.told, solver=method.solver, refinement=method.refinement)
     if method.continuous_gyro:
         gyro = problem.gyro
         assert gyro is not None, f'{name} needs a pair with a continuous gyro'
         motion1, motion2 = gyro.motion1, gyro.motion2
+        if gyro.gravity_sigma is not None:
+            config = replace(config, gravity_sigma=min(gyro.gravity_sigma, 1.5))
     pose = estimate_relative_pose(
         problem.points1, problem.points2, problem.camera, motion1, motion2,
         relative_rotation=gyro.rotation if gyro else None,
         relative_rotation_covariance=gyro.covariance if gyro else None,
         interval=gyro.interval if gyro else None,
-        config=replace(problem.told, solver=method.solver, refinement=method.refinement),
-        rng=seed, quality=problem.quality)
+        config=config, rng=seed, quality=problem.quality)
     return Outcome.of_pose(pose.R, pose.t, problem) if pose \
         else Outcome.without_pose(pose.status)
 
 
-def _opencv(problem: PairProblem) -> Outcome:
+def _opencv(problem: PairProblem, derotated: bool) -> Outcome:
     # Imported here: it brings the whole replay along.
     from rs_relpose_ros.replay.baselines import opencv_five_point
-    pose = opencv_five_point(problem.points1, problem.points2, problem.camera, 'USAC_MAGSAC',
-                             _OPENCV_THRESHOLD)
-    return Outcome.without_pose(Status.NO_CONSENSUS) if pose is None \
-        else Outcome.of_pose(pose.R, pose.t, problem)
+    points1, points2, camera = problem.points1, problem.points2, problem.camera
+    turns = np.eye(3), np.eye(3)
+    if derotated:
+        delay = float(camera.row_times((camera.height - 1) / 2))
+        motions = problem.motion1, problem.motion2
+        turn1, turn2 = (motion.rotations([delay])[0] for motion in motions)
+        points1, points2 = (
+            _derotated(points, camera, motion, turn) for points, motion, turn in
+            zip((points1, points2), motions, (turn1, turn2), strict=True))
+        seen = np.isfinite(points1).all(axis=1) & np.isfinite(points2).all(axis=1)
+        points1, points2 = points1[seen], points2[seen]
+        turns = turn1, turn2
+    pose = opencv_five_point(points1, points2, camera, 'USAC_MAGSAC', _OPENCV_THRESHOLD)
+    if pose is None:
+        return Outcome.without_pose(Status.NO_CONSENSUS)
+    # From the middle rows to the reference rows; the camera's own way in between is not known.
+    return Outcome.of_pose(turns[0] @ pose.R @ turns[1].T, turns[0] @ pose.t, problem)
+
+
+def _derotated(points: Array, camera: RollingShutterCamera, motion: FrameMotion,
+               turn: Array) -> Array:
+    """Pixels (N, 2) at which the camera with the orientation of its middle row would see."""
+    rays = motion.derotate(camera.unproject(points), camera.row_times(points[:, 1]))
+    return camera.project(rays @ turn)

@@ -38,6 +38,7 @@ Array = NDArray[np.float64]
 # Place in cc.mat and in the table of extrinsics (from 1). The Tango's lower camera is calibrated
 # as a perspective one, in a format of Matlab's own: its figures are those of the data set's site.
 CAMERAS = {'c1': 1, 'c2': 2, 'c3': 3, 'tango_bottom': 4, 'tango_top': 5}
+GOPROS = ('c1', 'c2', 'c3')
 IMUS = {'visensor': 10, 'tango_bottom': 8, 'tango_top': 9}
 _TANGO_BOTTOM = {'width': 1920, 'height': 1080, 'fx': 1959.84, 'fy': 1959.39, 'cx': 980.87,
                  'cy': 523.94, 'distortion': (0.21253, -0.46023, 0.0, 0.0)}

@@ -20,6 +20,7 @@ CELL_COLUMNS = ('experiment', 'case', 'level', 'method', 'trials', 'poses', *(
     f'{error}_{figure}_deg' for error in ('rotation', 'translation')
     for figure in ('median', 'p25', 'p75', 'p90', 'max')))
 
+ALL_LEVELS = 'all'
 _PERCENTILES = (50, 25, 75, 90, 100)
 
 
@@ -81,6 +82,22 @@ def _cell_errors(outcomes: Sequence[Outcome]) -> CellErrors:
                       np.array([o.translation_error for o in posed]))
 
 
+def with_totals(cells: Mapping[Cell, Mapping[str, CellErrors]],
+                ) -> dict[Cell, Mapping[str, CellErrors]]:
+    """The cells, and after those of each case one of all its levels together."""
+    found: dict[Cell, Mapping[str, CellErrors]] = {}
+    for key in dict.fromkeys((cell.experiment, cell.case) for cell in cells):
+        rows = {cell: methods for cell, methods in cells.items()
+                if (cell.experiment, cell.case) == key}
+        found |= rows
+        found[Cell(*key, ALL_LEVELS)] = {
+            method: CellErrors(sum(row[method].trials for row in rows.values()),
+                               np.concatenate([row[method].rotation for row in rows.values()]),
+                               np.concatenate([row[method].translation for row in rows.values()]))
+            for method in next(iter(rows.values()))}
+    return found
+
+
 def write_trials(records: Iterable[Record], path: Path) -> None:
     """Write every estimate as a row of `TRIAL_COLUMNS`."""
     with TableWriter(path, TRIAL_COLUMNS) as table:
@@ -134,7 +151,8 @@ def table_lines(cells: Mapping[Cell, Mapping[str, CellErrors]],
             lines += [f'{level:>{width}}' + ''.join(
                 f'  {_summary(getattr(row[method], side)):>15}' for method in methods)
                 for level, row in rows.items()]
-        lines += [*_lost_lines(rows), '']
+        parts = {level: row for level, row in rows.items() if level != ALL_LEVELS}
+        lines += [*_lost_lines(parts), '']
     return lines
 
 
