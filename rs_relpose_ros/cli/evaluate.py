@@ -232,15 +232,7 @@ def _report(folder: Path, records: list[Record], titles: Mapping[tuple[str, str]
     cells = with_totals(by_cell(records)) if totals else by_cell(records)
     write_trials(records, folder / _TRIALS_FILE)
     write_cells(cells, folder / _CELLS_FILE)
-    files = [_PENNCOSYVIO_HELP = (
-    "The paper's experiment on the data set PennCOSYVIO: of eight stretches of the sequences 'as' "
-    'and \'af\', every fifth frame and the one 30 frames later, SIFT matches, IMU averaged over '
-    '0.1 s. FOLDER is a checkout of github.com/daniilidis-group/penncosyvio with the sensors '
-    'downloaded and the frames extracted by its own scripts. With --trajectory-only its images '
-    'and IMU are not needed: points, or rendered images, and the IMU are simulated on the '
-    'ground-truth trajectories. Writes the same files as evaluate paper.')
-
-_TRIALS_FILE, _CELLS_FILE]
+    files = [_TRIALS_FILE, _CELLS_FILE]
     for sheet in sheets:
         files.append(f'{sheet.experiment}.png')
         part = {cell: methods for cell, methods in cells.items()
