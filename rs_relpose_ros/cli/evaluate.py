@@ -55,7 +55,7 @@ _PAPER_HELP = (
 
 _PENNCOSYVIO_HELP = (
     "The paper's experiment on the data set PennCOSYVIO: of eight stretches of the sequences 'as' "
-    'and \'af\', every fifth frame and the one 30 frames later, SIFT matches, IMU averaged over '
+    "and 'af', every fifth frame and the one 30 frames later, SIFT matches, IMU averaged over "
     '0.1 s. FOLDER is a checkout of github.com/daniilidis-group/penncosyvio with the sensors '
     'downloaded and the frames extracted by its own scripts. With --trajectory-only its images '
     'and IMU are not needed: points, or rendered images, and the IMU are simulated on the '

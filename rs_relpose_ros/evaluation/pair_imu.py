@@ -25,6 +25,8 @@ Array = NDArray[np.float64]
 _HALF_WINDOW_NS = to_nanoseconds(0.05)
 # Gravity is filtered from this long before the first frame on.
 _WARM_UP_NS = to_nanoseconds(5.0)
+# Noise may carry a match a few rows out of the image.
+_EDGE_NS = to_nanoseconds(1e-3)
 # Samples after the last row that interpolation may need.
 _AFTER_NS = to_nanoseconds(0.1)
 
@@ -50,7 +52,6 @@ class PairImu:
         self._stamps = [sample.stamp_ns for sample in samples]
         self._R_cam_imu = R_cam_imu
         self._clock = clock
-        # A history that a pair and what is before it fit into.
         self._config = config
 
     def mean(self, stamp_ns: int) -> tuple[FrameMotion, float]:
@@ -72,7 +73,8 @@ class PairImu:
     def continuous(self, stamp1_ns: int, stamp2_ns: int) -> ContinuousGyro:
         """All that the gyro says of two frames, as the node would ask for it."""
         buffer = ImuBuffer(self._config)
-        spans = [self._clock.row_span_ns(stamp) for stamp in (stamp1_ns, stamp2_ns)]
+        spans = [(start_ns - _EDGE_NS, end_ns + _EDGE_NS) for start_ns, end_ns in
+                 (self._clock.row_span_ns(stamp) for stamp in (stamp1_ns, stamp2_ns))]
         references = [self._clock.reference_ns(stamp) for stamp in (stamp1_ns, stamp2_ns)]
         fed = bisect_left(self._stamps, spans[0][0] - _WARM_UP_NS)
         found = []
