@@ -52,14 +52,16 @@ METHODS: Mapping[str, Method] = {
     'uniform_11pt': Method('11-point', 'uniform_11pt'),
     'auto': Method('auto', 'auto', 'map'),
     'auto_gyro': Method('auto + gyro', 'auto', 'map', continuous_gyro=True),
-    'angular_5pt': Method('5-pt derotated', 'angular_5pt'),
+    'angular_5pt': Method('angular 5-pt', 'angular_5pt'),
     'angular_3pt': Method('angular 3-pt', 'angular_3pt'),
     'linear_9pt': Method('linear 9-pt', 'linear_9pt'),
     'opencv': Method('OpenCV'),
-    'opencv_derotated': Method('OpenCV derotated', derotated=True),
+    'opencv_derotated': Method('OpenCV derot.', derotated=True),
+    'opencv_gyro': Method('OpenCV + gyro', derotated=True, continuous_gyro=True),
 }
 PAPER_METHODS = ('global_5pt', 'uniform_9pt', 'uniform_11pt', 'auto')
-PENNCOSYVIO_METHODS = (*PAPER_METHODS, 'auto_gyro', 'angular_5pt', 'opencv_derotated')
+PENNCOSYVIO_METHODS = (*PAPER_METHODS, 'auto_gyro', 'opencv_derotated',
+                       'opencv_gyro')
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,6 +76,8 @@ class ContinuousGyro:
         ``R_1^T R_2`` between the reference rows, and the covariance of its error [rad^2].
     interval : float
         Between the reference rows [s].
+    rate_sigma : float
+        Of the motions' rates, per axis [rad/s].
     gravity_sigma : float or None
         Of the motions' gravity, per axis [rad].
     """
@@ -83,6 +87,7 @@ class ContinuousGyro:
     rotation: Array
     covariance: Array
     interval: float
+    rate_sigma: float
     gravity_sigma: float | None = None
 
 
@@ -142,13 +147,14 @@ def run_method(name: str, problem: PairProblem, seed: int) -> Outcome:
     """Estimate a pair by the method `name` of `METHODS`; `seed` is that of its sampling."""
     method = METHODS[name]
     if not method.solver:
-        return _opencv(problem, method.derotated)
+        return _opencv(problem, method)
     motion1, motion2, gyro = problem.motion1, problem.motion2, None
     config = replace(problem.told, solver=method.solver, refinement=method.refinement)
     if method.continuous_gyro:
         gyro = problem.gyro
         assert gyro is not None, f'{name} needs a pair with a continuous gyro'
         motion1, motion2 = gyro.motion1, gyro.motion2
+        config = replace(config, gyro_sigma=gyro.rate_sigma)
         if gyro.gravity_sigma is not None:
             config = replace(config, gravity_sigma=min(gyro.gravity_sigma, 1.5))
     pose = estimate_relative_pose(
@@ -161,14 +167,17 @@ def run_method(name: str, problem: PairProblem, seed: int) -> Outcome:
         else Outcome.without_pose(pose.status)
 
 
-def _opencv(problem: PairProblem, derotated: bool) -> Outcome:
+def _opencv(problem: PairProblem, method: Method) -> Outcome:
     # Imported here: it brings the whole replay along.
     from rs_relpose_ros.replay.baselines import opencv_five_point
     points1, points2, camera = problem.points1, problem.points2, problem.camera
     turns = np.eye(3), np.eye(3)
-    if derotated:
+    if method.derotated:
         delay = float(camera.row_times((camera.height - 1) / 2))
         motions = problem.motion1, problem.motion2
+        if method.continuous_gyro:
+            assert problem.gyro is not None, 'a pair without a continuous gyro'
+            motions = problem.gyro.motion1, problem.gyro.motion2
         turn1, turn2 = (motion.rotations([delay])[0] for motion in motions)
         points1, points2 = (
             _derotated(points, camera, motion, turn) for points, motion, turn in

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.config import EstimatorConfig
 from rs_relpose_ros.errors import MissingInputError
 from rs_relpose_ros.evaluation.methods import ContinuousGyro
 from rs_relpose_ros.imu.buffer import Coverage, ImuBuffer
@@ -29,6 +31,24 @@ _WARM_UP_NS = to_nanoseconds(5.0)
 _EDGE_NS = to_nanoseconds(1e-3)
 # Samples after the last row that interpolation may need.
 _AFTER_NS = to_nanoseconds(0.1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeanMotion:
+    """Motion of a frame by the paper's means, at its reference row.
+
+    Attributes
+    ----------
+    motion : FrameMotion
+    gravity_sigma : float
+        Per axis [rad].
+    rate_sigma : float
+        Standard deviation of the averaged rates, per axis [rad/s].
+    """
+
+    motion: FrameMotion
+    gravity_sigma: float
+    rate_sigma: float
 
 
 class PairImu:
@@ -54,8 +74,8 @@ class PairImu:
         self._clock = clock
         self._config = config
 
-    def mean(self, stamp_ns: int) -> tuple[FrameMotion, float]:
-        """The paper's motion of a frame, and the sigma of its gravity per axis [rad]."""
+    def mean(self, stamp_ns: int) -> MeanMotion:
+        """The paper's motion of a frame."""
         start_ns, end_ns = self._clock.row_span_ns(stamp_ns)
         middle_ns = (start_ns + end_ns) // 2
         window = self._samples[bisect_left(self._stamps, middle_ns - _HALF_WINDOW_NS):
@@ -68,7 +88,9 @@ class PairImu:
         rate = np.mean(rates, axis=0) - self._config.gyro_bias
         motion = FrameMotion(self._R_cam_imu @ rate, self._R_cam_imu @ gravity.direction)
         delay = seconds_between(middle_ns, self._clock.reference_ns(stamp_ns))
-        return motion.shifted(delay), gravity.sigma
+        # How far from their mean the rates of the window are, a row's rate is from it, too.
+        spread = float(np.sqrt(np.var(rates, axis=0).mean()))
+        return MeanMotion(motion.shifted(delay), gravity.sigma, spread)
 
     def continuous(self, stamp1_ns: int, stamp2_ns: int) -> ContinuousGyro:
         """All that the gyro says of two frames, as the node would ask for it."""
@@ -95,7 +117,7 @@ class PairImu:
         return ContinuousGyro(
             first.motion, second.motion, self._R_cam_imu @ rotation @ self._R_cam_imu.T,
             self._R_cam_imu @ covariance @ self._R_cam_imu.T, seconds_between(*references),
-            max(sigmas, default=None))
+            EstimatorConfig().gyro_sigma, max(sigmas, default=None))
 
     def _uncovered(self, stamp_ns: int) -> MissingInputError:
         return MissingInputError(

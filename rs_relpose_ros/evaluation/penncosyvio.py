@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+import math
 from pathlib import Path
 from typing import Protocol
 
@@ -53,7 +54,8 @@ DISTANCE, EVERY = 30, 5
 # https://github.com/daniilidis-group/penncosyvio/issues/3
 GOPRO_READOUT = 0.03
 
-_MAX_GRAVITY_SIGMA = 1.5
+# The most that the estimator can be told [rad], [rad/s].
+_MAX_GRAVITY_SIGMA, _MAX_GYRO_SIGMA = 1.5, 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,12 +207,16 @@ def sift_matches(image1: NDArray[np.uint8], image2: NDArray[np.uint8]) -> Matche
 def pair_problem(matches: Matches, camera: RollingShutterCamera, imu: PairImu,
                  stamps_ns: list[int], truth: tuple[Array, Array], told: EstimatorConfig,
                  with_gyro: bool) -> PairProblem:
-    """A pair with the IMU of the paper's protocol; the estimator is told how bad gravity is."""
-    (motion1, sigma1), (motion2, sigma2) = (imu.mean(stamp) for stamp in stamps_ns)
-    told = replace(told, gravity_sigma=min(max(sigma1, sigma2), _MAX_GRAVITY_SIGMA))
+    """A pair with the IMU of the paper's protocol; the estimator is told how bad the means are."""
+    first, second = (imu.mean(stamp) for stamp in stamps_ns)
+    told = replace(
+        told, gravity_sigma=min(max(first.gravity_sigma, second.gravity_sigma),
+                                _MAX_GRAVITY_SIGMA),
+        gyro_sigma=min(math.hypot(told.gyro_sigma, max(first.rate_sigma, second.rate_sigma)),
+                       _MAX_GYRO_SIGMA))
     gyro = imu.continuous(*stamps_ns) if with_gyro else None
-    return PairProblem(matches.points1, matches.points2, camera, motion1, motion2, *truth, told,
-                       matches.quality, gyro)
+    return PairProblem(matches.points1, matches.points2, camera, first.motion, second.motion,
+                       *truth, told, matches.quality, gyro)
 
 
 def camera_poses(folder: Path, sequence: str, camera: str) -> Poses:
