@@ -120,6 +120,34 @@ def test_scene_follows_the_paper_and_its_truth_fits_the_points(motion):
     assert scene.R @ scene.gravity2 == pytest.approx(scene.gravity1)
 
 
+def test_constant_velocity_is_along_the_baseline_and_leaves_the_pose_exact():
+    """Derotated rays then meet the pose without any velocity, though the camera moves."""
+    scene = make_scene(SceneSettings(linear_velocity=5.0, angular_velocity=1.0,
+                                     constant_velocity=True), 'forward', 0, 3)
+    still = make_scene(SceneSettings(linear_velocity=0.0, angular_velocity=1.0), 'forward', 0, 3)
+    assert np.abs(scene.points1 - still.points1[:len(scene.points1)]).max() > 1.0
+    rays = []
+    for points, rate in ((scene.points1, scene.rate1), (scene.points2, scene.rate2)):
+        m = np.column_stack([(points - CENTRE) / FOCAL, np.ones(MATCHES)])
+        rays.append(Rotation.from_rotvec(points[:, 1:] * LINE_DELAY * rate).apply(m))
+    assert np.abs(np.cross(rays[0], rays[1] @ scene.R.T) @ scene.t).max() < 1e-9
+
+
+def test_auto_is_as_good_as_five_points_on_derotated_rays_at_constant_velocity():
+    """The linear velocities cannot be observed then, and must not cost what five points know."""
+    errors = {}
+    for trial in range(12):
+        settings = SceneSettings(linear_velocity=5.0, angular_velocity=1.0, pixel_noise=0.5,
+                                 outliers=0.3, constant_velocity=True)
+        problem = pair_problem(settings, 'forward', 0, trial)
+        for method in ('auto', 'opencv_derotated'):
+            outcome = run_method(method, problem, trial)
+            errors.setdefault(method, []).append(
+                (outcome.rotation_error, outcome.translation_error))
+    ours, theirs = (np.median(errors[method], axis=0) for method in ('auto', 'opencv_derotated'))
+    assert (ours <= 1.05 * theirs).all()
+
+
 def test_scenes_depend_on_nothing_but_their_numbers():
     settings = SceneSettings(pixel_noise=0.5, gyro_noise=0.01, gravity_noise=0.01, outliers=0.3)
     first, again = (make_scene(settings, 'forward', 3, 7) for _ in range(2))
