@@ -308,7 +308,7 @@ def test_mean_of_the_imu_is_taken_about_the_middle_row():
     imu = PairImu(samples, np.eye(3), ImageClock(camera), ImuConfig(gyro_bias=GYRO_BIAS))
     mean = imu.mean(stamp_ns)
     assert mean.motion.angular_velocity == pytest.approx(w)
-    assert mean.motion.gravity == pytest.approx(g0 / np.linalg.norm(g0), abs=1e-4)
+    assert mean.motion.gravity == pytest.approx(g0 / np.linalg.norm(g0), abs=5e-4)
     assert mean.rate_sigma == pytest.approx(0.0, abs=1e-12)
     # What happens more than 50 ms away does not matter; what happens within is in the spread.
     middle = 1.0 + 0.5 * READOUT
@@ -329,7 +329,7 @@ def test_mean_of_the_imu_is_taken_about_the_middle_row():
 def test_recorded_motion_goes_through_the_poses_and_knows_its_derivatives():
     poses = way()
     motion = RecordedMotion(poses)
-    seconds = (poses.stamps_ns - poses.stamps_ns[0]) * 1e-9
+    seconds = [motion.seconds(int(stamp)) for stamp in poses.stamps_ns]
     rotations, positions = motion.at(seconds)
     assert positions == pytest.approx(poses.positions, abs=1e-12)
     assert (rotations.inv() * poses.rotations).magnitude().max() < 1e-12

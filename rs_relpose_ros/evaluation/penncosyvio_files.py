@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.io import loadmat
+from scipy.io.matlab import MatReadError
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.camera import RollingShutterCamera
@@ -103,7 +104,7 @@ def read_camera(folder: Path, name: str, readout_time: float,
         single = {field: value.item() for field, value in values.items() if field != 'ss'}
     # Whatever SciPy and NumPy raise where a file is none or holds something else.
     except (ValueError, KeyError, IndexError, TypeError, NotImplementedError, AttributeError,
-            OSError) as error:
+            MatReadError, OSError) as error:
         raise InputError(f'{path} does not hold the OCamCalib model of {name}: {error}') from error
     focal = -float(values['ss'][0])
     return OmnidirectionalCamera(
