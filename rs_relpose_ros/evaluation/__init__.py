@@ -1,0 +1,1 @@
+"""The experiments of the paper: synthetic figures, and the PennCOSYVIO data set."""
