@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 import multiprocessing
-import sys
 
 import cv2
 import numpy as np
@@ -103,4 +102,3 @@ def _rays(count: int) -> list[NDArray[np.float64]]:
 
 if __name__ == '__main__':
     fill_cache()
-    sys.exit(0)
