@@ -38,7 +38,11 @@ from rs_relpose_ros.estimator.problem import (
     to_reference_row,
     TwoViewProblem,
 )
-from rs_relpose_ros.estimator.rotation_only import fit_rotation, transfer_errors
+from rs_relpose_ros.estimator.rotation_only import (
+    aligning_rotation,
+    fit_rotation,
+    transfer_errors,
+)
 from rs_relpose_ros.estimator.sampling import POOL, sample_hypotheses
 from rs_relpose_ros.estimator.velocity_prior import (
     fit_with_evidence,
@@ -293,8 +297,10 @@ class _Estimation:
         problem, config = self.problem, self.config
         parallax = float(np.median(transfer_errors(
             problem.observations, np.ascontiguousarray(state.R), problem.focal)[inliers]))
+        # Not from the pose's own rotation: on a line of points that may be any.
+        rays1, rays2 = problem.observations[inliers, 0:3], problem.observations[inliers, 9:12]
         R, information = fit_rotation(
-            problem.observations, inliers, np.ascontiguousarray(state.R), self.priors,
+            problem.observations, inliers, aligning_rotation(rays1, rays2), self.priors,
             problem.focal, sigma)
         left = transfer_errors(problem.observations, R, problem.focal)[inliers]
         turned_only = float(np.median(left)) < ROTATION_ONLY_SIGMAS * sigma

@@ -34,6 +34,13 @@ def transfer_errors(observations: Array, R: Array, focal: float) -> Array:
     return out
 
 
+def aligning_rotation(rays1: Array, rays2: Array) -> Array:
+    """The rotation (3, 3) with the least ``sum |f_1 - R f_2|^2`` over rays (N, 3) (Wahba)."""
+    u, _, vt = np.linalg.svd(rays1.T @ rays2)
+    u[:, 2] *= np.linalg.det(u) * np.linalg.det(vt)
+    return np.asarray(u @ vt)
+
+
 @_jit
 def fit_rotation(observations: Array, valid: NDArray[np.bool_], start: Array, priors: Priors,
                  focal: float, sigma: float) -> tuple[Array, Array]:
@@ -70,8 +77,10 @@ def fit_rotation(observations: Array, valid: NDArray[np.bool_], start: Array, pr
             hessian[0, 2] -= w * hx * hz
             hessian[1, 2] -= w * hy * hz
         hessian[1, 0], hessian[2, 0], hessian[2, 1] = hessian[0, 1], hessian[0, 2], hessian[1, 2]
+        # Rays that all coincide say nothing of the turn about them: a floor above the rounding.
+        floor = 1e-9 * (1.0 + hessian[0, 0] + hessian[1, 1] + hessian[2, 2])
         for i in range(3):
-            hessian[i, i] += 1e-9
+            hessian[i, i] += floor
         information = hessian
         if not cholesky(hessian, factor):
             break
