@@ -1,4 +1,4 @@
-"""Rotation kernels for compiled code; everything else uses SciPy's ``Rotation``."""
+"""Rotations: kernels for compiled code; everything else uses SciPy's ``Rotation``."""
 
 from __future__ import annotations
 
@@ -102,3 +102,13 @@ def left_jacobian_so3(v: Array) -> Array:
 def skew(v: Array) -> Array:
     """Cross-product matrix (3, 3) of a vector (3,): ``skew(a) @ b = a x b``."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def aligning_rotation(vectors1: Array, vectors2: Array) -> Array:
+    """The rotation (3, 3) of least ``sum |a - R b|^2`` over vectors a, b (N, 3) (Wahba, Kabsch).
+
+    As SciPy's ``align_vectors``, which warns where the turn about one axis is arbitrary.
+    """
+    u, _, vt = np.linalg.svd(vectors1.T @ vectors2)
+    u[:, 2] *= np.linalg.det(u) * np.linalg.det(vt)
+    return np.ascontiguousarray(u @ vt)

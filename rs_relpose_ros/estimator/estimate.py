@@ -38,11 +38,7 @@ from rs_relpose_ros.estimator.problem import (
     to_reference_row,
     TwoViewProblem,
 )
-from rs_relpose_ros.estimator.rotation_only import (
-    closed_form_rotation,
-    fit_rotation,
-    transfer_errors,
-)
+from rs_relpose_ros.estimator.rotation_only import fit_rotation, transfer_errors
 from rs_relpose_ros.estimator.sampling import POOL, sample_hypotheses
 from rs_relpose_ros.estimator.velocity_prior import (
     fit_with_evidence,
@@ -52,7 +48,7 @@ from rs_relpose_ros.estimator.velocity_prior import (
 )
 from rs_relpose_ros.motion import FrameMotion
 from rs_relpose_ros.result import RelativePose, Status
-from rs_relpose_ros.so3 import exp_so3, skew
+from rs_relpose_ros.so3 import aligning_rotation, exp_so3, skew
 from rs_relpose_ros.solvers.gravity import gravity_alignment
 
 Array = NDArray[np.float64]
@@ -314,15 +310,13 @@ class _Estimation:
         problem, config = self.problem, self.config
         parallax = float(np.median(transfer_errors(
             problem.observations, np.ascontiguousarray(state.R), problem.focal)[inliers]))
-        # Matches that do not move also obey a half turn about any t: from there a fit would stay.
-        fits = []
-        for start in (state.R, closed_form_rotation(problem.observations, inliers)):
-            R, information = fit_rotation(
-                problem.observations, inliers, np.ascontiguousarray(start), self.priors,
-                problem.focal, sigma)
-            left = transfer_errors(problem.observations, R, problem.focal)[inliers]
-            fits.append((float(np.median(left)), R, information, left))
-        median, R, information, left = min(fits, key=lambda fit: fit[0])
+        # Not from the pose's own rotation: on a line of points that may be any.
+        rays1, rays2 = problem.observations[inliers, 0:3], problem.observations[inliers, 9:12]
+        R, information = fit_rotation(
+            problem.observations, inliers, aligning_rotation(rays1, rays2), self.priors,
+            problem.focal, sigma)
+        left = transfer_errors(problem.observations, R, problem.focal)[inliers]
+        median = float(np.median(left))
         turned_only = median < ROTATION_ONLY_SIGMAS * sigma
         if not turned_only and parallax >= config.min_parallax:
             return None

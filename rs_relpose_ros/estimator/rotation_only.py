@@ -34,14 +34,6 @@ def transfer_errors(observations: Array, R: Array, focal: float) -> Array:
     return out
 
 
-def closed_form_rotation(observations: Array, use: NDArray[np.bool_]) -> Array:
-    """Rotation (3, 3) of least ``sum |f_1 - R f_2|^2`` (Kabsch), from no start."""
-    U, _, Vt = np.linalg.svd(observations[use, 0:3].T @ observations[use, 9:12])
-    U[:, 2] *= np.sign(np.linalg.det(U @ Vt))
-    rotation: Array = np.ascontiguousarray(U @ Vt)
-    return rotation
-
-
 @_jit
 def fit_rotation(observations: Array, valid: NDArray[np.bool_], start: Array, priors: Priors,
                  focal: float, sigma: float) -> tuple[Array, Array]:
@@ -78,8 +70,10 @@ def fit_rotation(observations: Array, valid: NDArray[np.bool_], start: Array, pr
             hessian[0, 2] -= w * hx * hz
             hessian[1, 2] -= w * hy * hz
         hessian[1, 0], hessian[2, 0], hessian[2, 1] = hessian[0, 1], hessian[0, 2], hessian[1, 2]
+        # Rays that all coincide say nothing of the turn about them: a floor above the rounding.
+        floor = 1e-9 * (1.0 + hessian[0, 0] + hessian[1, 1] + hessian[2, 2])
         for i in range(3):
-            hessian[i, i] += 1e-9
+            hessian[i, i] += floor
         information = hessian
         if not cholesky(hessian, factor):
             break

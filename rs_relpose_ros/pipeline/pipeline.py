@@ -18,6 +18,7 @@ from rs_relpose_ros.pipeline.frame import Frame
 from rs_relpose_ros.pipeline.pair import PairResult
 from rs_relpose_ros.pipeline.parameters import Parameters
 from rs_relpose_ros.result import RelativePose, Status
+from rs_relpose_ros.so3 import aligning_rotation
 from rs_relpose_ros.tracking.keyframes import decide_keyframe, KeyframeDecision
 from rs_relpose_ros.tracking.matches import Matches
 from rs_relpose_ros.tracking.selection import make_tracker
@@ -160,7 +161,7 @@ class Pipeline:
             rotation, _ = integrate_rotation(
                 self._gyro.stamps_ns, self._gyro.angular_velocities, self._parameters.imu)
         else:
-            rotation = best_rotation(rays1, rays2)
+            rotation = aligning_rotation(rays1, rays2)
         parallax = np.linalg.norm(np.cross(rays1, rays2 @ rotation.T), axis=1)
         return float(camera.fx * np.nanmedian(parallax)), (rays1, rays2, tau1, tau2)
 
@@ -203,12 +204,6 @@ def sensor_camera(calibration: Calibration, parameters: Parameters) -> RollingSh
         readout_direction=sensor.readout_direction, reference_row=sensor.stamp_row)
 
 
-def best_rotation(rays1: Array, rays2: Array) -> Array:
-    """Rotation (3, 3) that best maps unit `rays2` onto `rays1` (Kabsch), for want of a gyro."""
-    u, _, vt = np.linalg.svd(rays1.T @ rays2)
-    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
-
-
 def _extended(gyro: GyroSegment | None, segment: GyroSegment | None,
               first: bool) -> GyroSegment | None:
     """Gyro since the reference, continued by one frame; None as soon as a part is missing."""
@@ -219,4 +214,4 @@ def _extended(gyro: GyroSegment | None, segment: GyroSegment | None,
     return None if gyro is None else gyro.joined(segment)
 
 
-__all__ = ['Pipeline', 'RelativePose', 'Status', 'best_rotation', 'sensor_camera']
+__all__ = ['Pipeline', 'RelativePose', 'Status', 'sensor_camera']
