@@ -6,9 +6,8 @@
         params_file:=my_camera.yaml
 """
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
-from launch.conditions import LaunchConfigurationNotEquals
+from launch import Action, LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
@@ -21,7 +20,7 @@ ARGUMENTS = {
     'camera_info': ('camera_info', 'CameraInfo topic, likewise'),
     'imu': ('/imu/data_raw', 'IMU topic'),
     'accel': ('accel', 'topic of an accelerometer that is published apart from the gyro'),
-    'image_transport': ('raw', 'raw or compressed; this and not the parameter file decides'),
+    'image_transport': ('', 'raw or compressed; empty: as the parameter file has it'),
     'params_file': (
         PathJoinSubstitution([FindPackageShare('rs_relpose_ros'), 'config', 'relpose.yaml']),
         'parameter file; readout_time and quat_cam_imu_xyzw have no default'),
@@ -32,26 +31,30 @@ ARGUMENTS = {
 }
 
 
-def generate_launch_description() -> LaunchDescription:
-    """Arguments, environment and the node."""
+def start_node(context: LaunchContext) -> list[Action]:
+    """The node, with the arguments that were given in place of the file's parameters."""
     argument = {name: LaunchConfiguration(name) for name in ARGUMENTS}
     camera = argument['camera_namespace']
+    overrides = {name: argument[name] for name in ('image_transport', 'use_sim_time')
+                 if argument[name].perform(context)}
+    profile = argument['fastdds_profile']
+    environment = [SetEnvironmentVariable('FASTRTPS_DEFAULT_PROFILES_FILE', profile)]
+    return [*(environment if profile.perform(context) else []), Node(
+        package='rs_relpose_ros', executable='relpose_node', name=argument['name'],
+        namespace=argument['namespace'], output='screen',
+        parameters=[argument['params_file'], overrides],
+        remappings=[
+            # An absolute path swallows what stands before it.
+            ('image', PathJoinSubstitution([camera, argument['image']])),
+            ('camera_info', PathJoinSubstitution([camera, argument['camera_info']])),
+            ('imu', argument['imu']),
+            ('accel', argument['accel'])])]
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Arguments and the node."""
     return LaunchDescription([
         *(DeclareLaunchArgument(name, default_value=default, description=description)
           for name, (default, description) in ARGUMENTS.items()),
-        SetEnvironmentVariable(
-            'FASTRTPS_DEFAULT_PROFILES_FILE', argument['fastdds_profile'],
-            condition=LaunchConfigurationNotEquals('fastdds_profile', '')),
-        Node(
-            package='rs_relpose_ros', executable='relpose_node', name=argument['name'],
-            namespace=argument['namespace'], output='screen',
-            parameters=[argument['params_file'], {
-                'image_transport': argument['image_transport'],
-                'use_sim_time': argument['use_sim_time']}],
-            remappings=[
-                # An absolute path swallows what stands before it.
-                ('image', PathJoinSubstitution([camera, argument['image']])),
-                ('camera_info', PathJoinSubstitution([camera, argument['camera_info']])),
-                ('imu', argument['imu']),
-                ('accel', argument['accel'])]),
+        OpaqueFunction(function=start_node),
     ])

@@ -74,12 +74,17 @@ class Process:
             return text in self.output
         wait_until(written, f'{text!r} in the output')
 
-    def signal(self, number: signal.Signals) -> tuple[int, float]:
-        """Send a signal; the exit code and the seconds until the end."""
+    def signal(self, number: signal.Signals, *, every: float = 30.0) -> tuple[int, float]:
+        """Send a signal, again every so many seconds; the exit code and the seconds until then."""
         started = time.monotonic()
-        self._process.send_signal(number)
-        code = self._process.wait(30.0)
-        return code, time.monotonic() - started
+        while True:
+            self._process.send_signal(number)
+            try:
+                code = self._process.wait(every)
+                return code, time.monotonic() - started
+            except subprocess.TimeoutExpired:
+                if time.monotonic() > started + 30.0:
+                    raise
 
     def wait(self, timeout: float = PATIENCE) -> int:
         """Its exit code."""

@@ -204,6 +204,17 @@ def test_signals_end_a_working_node(module_ros_domain_id, bundled_bag, number):
         assert 'Traceback' not in node.output
 
 
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_signals_that_come_again_and_again(module_ros_domain_id, number):
+    """Ctrl-C under ros2 launch: the terminal signals the whole group, and so does launch."""
+    for every in (0.002, 0.02, 0.1):
+        with ros_graph.node_process(PARAMETER_FILE, remap=REMAP) as node:
+            node.wait_for('ready')
+            code, _ = node.signal(number, every=every)
+            assert code == 0, node.output
+            assert 'Traceback' not in node.output
+
+
 def test_a_signal_ends_a_node_that_compiles(module_ros_domain_id, tmp_path, monkeypatch):
     monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path))
     with ros_graph.node_process(PARAMETER_FILE, remap=REMAP) as node:

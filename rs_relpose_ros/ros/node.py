@@ -8,6 +8,7 @@ import gc
 import logging
 import os
 from pathlib import Path
+import signal
 import sys
 import traceback
 from typing import Any, TextIO
@@ -322,6 +323,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _finish(node: RelposeNode | None) -> None:
+    _ignore_signals()
     if node is not None:
         if not node.stop():
             # Compiling or loading kernels cannot be interrupted, and a thread that still runs
@@ -332,8 +334,16 @@ def _finish(node: RelposeNode | None) -> None:
             os._exit(0)
         node.destroy_node()
     rclpy.try_shutdown()
+    # It brought back the handlers of before.
+    _ignore_signals()
     # The interpreter's last collection would visit every object of every module: up to a second.
     gc.freeze()
+
+
+def _ignore_signals() -> None:
+    """From here on the node ends anyway; Ctrl-C comes twice under ros2 launch."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
 
 
 if __name__ == '__main__':
