@@ -1,0 +1,217 @@
+"""What the data allow: the maximum-a-posteriori estimate of somebody who knows the answer.
+
+The oracle knows which matches are true, every noise figure and how fast the cameras are, and
+starts at the truth. It is written with NumPy and SciPy alone and shares nothing with the
+estimator: not the code, not the parameters (gravity is an unknown of its own, velocities are in
+each camera's own frame), not the derivatives (complex steps).
+
+For a match at pixels ``(u_1, v_1), (u_2, v_2)``, row times ``tau_i = v_i line_delay``::
+
+    f_i = Exp((w_i + dw_i) tau_i) m_i,    m_i = ((u_i - c_u) / f, (v_i - c_v) / f, 1)
+    e = (f_1 x R f_2) . (t + tau_2 R v_2 - tau_1 v_1)
+    r = e / |grad e|,    grad e: by the four pixel coordinates, row times included
+
+and the estimate minimises ``sum r^2 / sigma^2`` plus the priors of both gravities, both gyros and
+the velocities.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from rs_relpose_ros.benchmark.problems import (
+    CENTRE_U,
+    CENTRE_V,
+    FOCAL,
+    LINE_DELAY,
+    TwoViewProblem,
+)
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+# Unknowns, as a step from a start: turn of R (3), tangent of t (2), tangent of gravity (2), gyro
+# corrections (6), velocities (6; left out where both cameras stand).
+_POSE, _GRAVITY, _GYRO, _VELOCITY = slice(0, 5), slice(5, 7), slice(7, 13), slice(13, 19)
+_STEP = 1e-30
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OracleEstimate:
+    """Pose ``X1 = R X2 + t`` and its covariance.
+
+    Attributes
+    ----------
+    R, t : (3, 3) and (3,) ndarray
+    covariance : (6, 6) ndarray
+        Of ``(dt, dtheta)``, ``t_true = t + dt``, ``R_true = Exp(dtheta) R``, both in camera 1.
+    """
+
+    R: Array
+    t: Array
+    covariance: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Start:
+    """The point from which the unknowns count."""
+
+    R: Array
+    t: Array
+    tangent: Array
+    gravity: Array
+    gravity_tangent: Array
+
+
+def oracle_estimate(problem: TwoViewProblem, pixel_sigma: float, gravity_sigma: float,
+                    gyro_sigma: float, start: tuple[Array, Array] | None = None) -> OracleEstimate:
+    """The oracle's estimate of a problem.
+
+    Parameters
+    ----------
+    problem : TwoViewProblem
+    pixel_sigma : float
+        [px] per coordinate.
+    gravity_sigma : float
+        [rad] per axis of one frame's direction.
+    gyro_sigma : float
+        [rad/s] per axis of one frame.
+    start : tuple of (3, 3) and (3,) ndarray, optional
+        Pose to start from instead of the truth.
+    """
+    R, t = (problem.R, problem.t) if start is None else start
+    origin = _Start(R, t, _tangent(t), problem.gravity1, _tangent(problem.gravity1))
+    spread = float(np.sqrt((problem.v1 @ problem.v1 + problem.v2 @ problem.v2) / 6.0))
+    use = ~problem.is_outlier
+    points1, points2 = problem.points1[use], problem.points2[use]
+    tangents = _tangent(problem.measured_gravity1), _tangent(problem.measured_gravity2)
+
+    def residuals(x: Array | Complex) -> Array | Complex:
+        """Residuals (M, K) in sigmas at each column of x (P, K)."""
+        turned, direction, gravity = _pose(origin, x)
+        gyro = x[_GYRO]
+        velocity = x[_VELOCITY] if spread > 0.0 else np.zeros_like(gyro)
+        sampson = _sampson(
+            points1, points2, turned, direction, problem.measured_rate1[:, None] + gyro[:3],
+            problem.measured_rate2[:, None] + gyro[3:], velocity[:3], velocity[3:])
+        gravity2 = np.einsum('jik,jk->ik', turned, gravity)
+        parts = [sampson / pixel_sigma,
+                 tangents[0].T @ gravity / gravity_sigma,
+                 tangents[1].T @ gravity2 / gravity_sigma,
+                 gyro / gyro_sigma]
+        if spread > 0.0:
+            parts.append(velocity / spread)
+        return np.concatenate(parts)
+
+    def jacobian(x: Array) -> Array:
+        # Exact to the last digits: no difference is formed.
+        columns = x[:, None] + 1j * _STEP * np.eye(len(x))
+        return np.imag(residuals(columns)) / _STEP
+
+    x = np.zeros(19 if spread > 0.0 else 13)
+    x[_GYRO] = np.concatenate([problem.w1 - problem.measured_rate1,
+                               problem.w2 - problem.measured_rate2])
+    if spread > 0.0:
+        x[_VELOCITY] = np.concatenate([problem.v1, problem.v2])
+    found = least_squares(lambda x: residuals(x[:, None])[:, 0], x, jac=jacobian, method='lm',
+                          x_scale='jac', xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    turned, direction, _ = _pose(origin, found.x[:, None])
+    # Once more about the optimum, where the unknowns of the pose are a turn and a tangent of it.
+    estimate = _Start(turned[:, :, 0], direction[:, 0], _tangent(direction[:, 0]), origin.gravity,
+                      origin.gravity_tangent)
+    origin, x = estimate, np.concatenate([np.zeros(5), found.x[5:]])
+    slopes = jacobian(x)
+    pose = np.linalg.inv(slopes.T @ slopes)[_POSE, _POSE]
+    lift = np.zeros((6, 5))
+    lift[:3, 3:] = estimate.tangent
+    lift[3:, :3] = np.eye(3)
+    return OracleEstimate(estimate.R, estimate.t, lift @ pose @ lift.T)
+
+
+def _pose(origin: _Start, x: Array | Complex,
+          ) -> tuple[Array | Complex, Array | Complex, Array | Complex]:
+    """R (3, 3, K), t (3, K) and gravity in camera 1 (3, K) at each column of x (P, K)."""
+    series = _series(x[:3], np.ones(1))
+    R = np.stack([_turn(x[:3], column[:, None, None], series)[:, :, 0] for column in origin.R.T],
+                 axis=1)
+    t = origin.t[:, None] + origin.tangent @ x[3:5]
+    gravity = origin.gravity[:, None] + origin.gravity_tangent @ x[_GRAVITY]
+    return R, t / np.sqrt((t * t).sum(axis=0)), gravity / np.sqrt((gravity * gravity).sum(axis=0))
+
+
+def _sampson(points1: Array, points2: Array, R: Array | Complex, t: Array | Complex,
+             w1: Array | Complex, w2: Array | Complex, v1: Array | Complex, v2: Array | Complex,
+             ) -> Array | Complex:
+    """Signed Sampson errors (N, K) [px] of the uniform rolling-shutter model.
+
+    `R` is (3, 3, K); `t`, `w1`, `w2`, `v1`, `v2` are (3, K).
+    """
+    (f1, f1_u, f1_v), tau1 = _derotated(points1, w1)
+    (f2, f2_u, f2_v), tau2 = _derotated(points2, w2)
+    f2, f2_u, f2_v = (np.einsum('ijk,jkn->ikn', R, f) for f in (f2, f2_u, f2_v))
+    d1, d2 = v1[:, :, None], np.einsum('ijk,jk->ik', R, v2)[:, :, None]
+    baseline = t[:, :, None] + tau2 * d2 - tau1 * d1
+    normal = _cross(f1, f2)
+    e = _dot(normal, baseline)
+    towards1, towards2 = _cross(f2, baseline), _cross(baseline, f1)
+    e_u1 = _dot(towards1, f1_u)
+    e_v1 = _dot(towards1, f1_v) - LINE_DELAY * _dot(normal, d1)
+    e_u2 = _dot(towards2, f2_u)
+    e_v2 = _dot(towards2, f2_v) + LINE_DELAY * _dot(normal, d2)
+    return (e / np.sqrt(e_u1 * e_u1 + e_v1 * e_v1 + e_u2 * e_u2 + e_v2 * e_v2)).T
+
+
+def _derotated(points: Array, w: Array | Complex,
+               ) -> tuple[tuple[Array | Complex, Array | Complex, Array | Complex], Array]:
+    """Derotated rays (3, K, N), their derivatives by u and v, and row times (N,)."""
+    tau = LINE_DELAY * points[:, 1]
+    m = np.stack([(points[:, 0] - CENTRE_U) / FOCAL, (points[:, 1] - CENTRE_V) / FOCAL,
+                  np.ones(len(points))])[:, None]
+    along_u, along_v = np.array([1.0, 0.0, 0.0]) / FOCAL, np.array([0.0, 1.0, 0.0]) / FOCAL
+    series = _series(w, tau)
+    f = _turn(w, m, series)
+    f_u = _turn(w, along_u[:, None, None], series)
+    # A row further down is a line delay later: d/dtau Exp(w tau) m = w x Exp(w tau) m.
+    f_v = _turn(w, along_v[:, None, None], series) + LINE_DELAY * _cross(w[:, :, None], f)
+    return (f, f_u, f_v), tau
+
+
+def _series(w: Array | Complex, tau: Array) -> tuple[Array | Complex, Array | Complex]:
+    """``sin(|w| tau) / |w|`` and ``(1 - cos(|w| tau)) / |w|^2`` (K, N) for w (3, K), tau (N,).
+
+    As power series: analytic for a complex step, and exact to rounding below 1 rad.
+    """
+    square = (w * w).sum(axis=0)[:, None] * (tau * tau)
+    sine_term = np.broadcast_to(tau, square.shape)
+    cosine_term = 0.5 * tau * sine_term
+    sine, cosine = sine_term, cosine_term
+    for k in range(1, 9):
+        sine_term = -sine_term * square / ((2 * k) * (2 * k + 1))
+        cosine_term = -cosine_term * square / ((2 * k + 1) * (2 * k + 2))
+        sine, cosine = sine + sine_term, cosine + cosine_term
+    return sine, cosine
+
+
+def _turn(w: Array | Complex, m: Array, series: tuple[Array | Complex, Array | Complex],
+          ) -> Array | Complex:
+    """``Exp(w tau) m`` (3, K, N) for w (3, K), m (3, 1, 1 or N) and the `_series` of w and tau."""
+    once = _cross(w[:, :, None], m)
+    return m + series[0] * once + series[1] * _cross(w[:, :, None], once)
+
+
+def _cross(a: Array | Complex, b: Array | Complex) -> Array | Complex:
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2],
+                     a[0] * b[1] - a[1] * b[0]])
+
+
+def _dot(a: Array | Complex, b: Array | Complex) -> Array | Complex:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _tangent(direction: Array) -> Array:
+    """Two orthonormal columns (3, 2) perpendicular to a direction."""
+    return np.linalg.svd(direction[None])[2][1:].T

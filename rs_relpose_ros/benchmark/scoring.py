@@ -1,0 +1,64 @@
+"""Errors of a pose against the truth, in degrees and in the estimate's own sigmas."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+POSE_FREEDOM = 5
+
+
+@dataclass(frozen=True, slots=True)
+class PoseError:
+    """Of one estimate.
+
+    Attributes
+    ----------
+    rotation, translation : float
+        Angles [deg]; infinite where there is no pose.
+    nees : float
+        Normalised estimation error squared over rotation (3) and direction of translation (2);
+        NaN where there is no covariance.
+    """
+
+    rotation: float
+    translation: float
+    nees: float
+
+
+NO_POSE = PoseError(float('inf'), float('inf'), float('nan'))
+
+
+def pose_error(R: Array, t: Array, true_R: Array, true_t: Array, covariance: Array | None = None,
+               ) -> PoseError:
+    """Error of a pose ``X1 = R X2 + t``.
+
+    Parameters
+    ----------
+    R, true_R : (3, 3) ndarray
+    t, true_t : (3,) ndarray
+        Unit vectors.
+    covariance : (6, 6) ndarray, optional
+        Of ``(dt, dtheta)`` with ``t_true = t + dt`` (dt perpendicular to t) and
+        ``R_true = Exp(dtheta) R``, both in camera 1.
+    """
+    turn = Rotation.from_matrix(true_R @ R.T).as_rotvec()
+    away = true_t - (true_t @ t) * t
+    sine = float(np.linalg.norm(away))
+    angle = float(np.arctan2(sine, true_t @ t))
+    rotation, translation = np.degrees([np.linalg.norm(turn), angle])
+    if covariance is None:
+        return PoseError(rotation, translation, float('nan'))
+    # Along the great circle: the direction of t is no vector space once the error is large.
+    shift = away * (angle / sine) if sine > 0.0 else away
+    basis = np.zeros((6, POSE_FREEDOM))
+    basis[:3, :2] = np.linalg.svd(t[None])[2][1:].T
+    basis[3:, 2:] = np.eye(3)
+    error = basis.T @ np.concatenate([shift, turn])
+    nees = error @ np.linalg.solve(basis.T @ covariance @ basis, error)
+    return PoseError(rotation, translation, float(nees))
