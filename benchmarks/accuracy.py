@@ -1,7 +1,4 @@
-"""Accuracy and covariance of the estimator against an oracle: see docs/benchmarks.md.
-
-    python benchmarks/accuracy.py --trials 200 --cells all --output DIR
-"""
+"""Accuracy and covariance of the estimator against an oracle; `docs/benchmarks.md`, --help."""
 
 import sys
 

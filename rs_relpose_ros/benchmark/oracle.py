@@ -18,6 +18,7 @@ the velocities.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,7 @@ from rs_relpose_ros.benchmark.problems import (
 )
 
 Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+Values = NDArray[Any]  # real, or complex under a complex step
 
 # Unknowns, as a step from a start: turn of R (3), tangent of t (2), tangent of gravity (2), gyro
 # corrections (6), velocities (6; left out where both cameras stand).
@@ -90,7 +91,7 @@ def oracle_estimate(problem: TwoViewProblem, pixel_sigma: float, gravity_sigma: 
     points1, points2 = problem.points1[use], problem.points2[use]
     tangents = _tangent(problem.measured_gravity1), _tangent(problem.measured_gravity2)
 
-    def residuals(x: Array | Complex) -> Array | Complex:
+    def residuals(x: Values) -> Values:
         """Residuals (M, K) in sigmas at each column of x (P, K)."""
         turned, direction, gravity = _pose(origin, x)
         gyro = x[_GYRO]
@@ -132,8 +133,8 @@ def oracle_estimate(problem: TwoViewProblem, pixel_sigma: float, gravity_sigma: 
     return OracleEstimate(estimate.R, estimate.t, lift @ pose @ lift.T)
 
 
-def _pose(origin: _Start, x: Array | Complex,
-          ) -> tuple[Array | Complex, Array | Complex, Array | Complex]:
+def _pose(origin: _Start, x: Values,
+          ) -> tuple[Values, Values, Values]:
     """R (3, 3, K), t (3, K) and gravity in camera 1 (3, K) at each column of x (P, K)."""
     series = _series(x[:3], np.ones(1))
     R = np.stack([_turn(x[:3], column[:, None, None], series)[:, :, 0] for column in origin.R.T],
@@ -143,9 +144,9 @@ def _pose(origin: _Start, x: Array | Complex,
     return R, t / np.sqrt((t * t).sum(axis=0)), gravity / np.sqrt((gravity * gravity).sum(axis=0))
 
 
-def _sampson(points1: Array, points2: Array, R: Array | Complex, t: Array | Complex,
-             w1: Array | Complex, w2: Array | Complex, v1: Array | Complex, v2: Array | Complex,
-             ) -> Array | Complex:
+def _sampson(points1: Array, points2: Array, R: Values, t: Values,
+             w1: Values, w2: Values, v1: Values, v2: Values,
+             ) -> Values:
     """Signed Sampson errors (N, K) [px] of the uniform rolling-shutter model.
 
     `R` is (3, 3, K); `t`, `w1`, `w2`, `v1`, `v2` are (3, K).
@@ -165,8 +166,8 @@ def _sampson(points1: Array, points2: Array, R: Array | Complex, t: Array | Comp
     return (e / np.sqrt(e_u1 * e_u1 + e_v1 * e_v1 + e_u2 * e_u2 + e_v2 * e_v2)).T
 
 
-def _derotated(points: Array, w: Array | Complex,
-               ) -> tuple[tuple[Array | Complex, Array | Complex, Array | Complex], Array]:
+def _derotated(points: Array, w: Values,
+               ) -> tuple[tuple[Values, Values, Values], Array]:
     """Derotated rays (3, K, N), their derivatives by u and v, and row times (N,)."""
     tau = LINE_DELAY * points[:, 1]
     m = np.stack([(points[:, 0] - CENTRE_U) / FOCAL, (points[:, 1] - CENTRE_V) / FOCAL,
@@ -180,7 +181,7 @@ def _derotated(points: Array, w: Array | Complex,
     return (f, f_u, f_v), tau
 
 
-def _series(w: Array | Complex, tau: Array) -> tuple[Array | Complex, Array | Complex]:
+def _series(w: Values, tau: Array) -> tuple[Values, Values]:
     """``sin(|w| tau) / |w|`` and ``(1 - cos(|w| tau)) / |w|^2`` (K, N) for w (3, K), tau (N,).
 
     As power series: analytic for a complex step, and exact to rounding below 1 rad.
@@ -196,19 +197,19 @@ def _series(w: Array | Complex, tau: Array) -> tuple[Array | Complex, Array | Co
     return sine, cosine
 
 
-def _turn(w: Array | Complex, m: Array, series: tuple[Array | Complex, Array | Complex],
-          ) -> Array | Complex:
+def _turn(w: Values, m: Array, series: tuple[Values, Values],
+          ) -> Values:
     """``Exp(w tau) m`` (3, K, N) for w (3, K), m (3, 1, 1 or N) and the `_series` of w and tau."""
     once = _cross(w[:, :, None], m)
     return m + series[0] * once + series[1] * _cross(w[:, :, None], once)
 
 
-def _cross(a: Array | Complex, b: Array | Complex) -> Array | Complex:
+def _cross(a: Values, b: Values) -> Values:
     return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2],
                      a[0] * b[1] - a[1] * b[0]])
 
 
-def _dot(a: Array | Complex, b: Array | Complex) -> Array | Complex:
+def _dot(a: Values, b: Values) -> Values:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 

@@ -51,7 +51,8 @@ def pose_error(R: Array, t: Array, true_R: Array, true_t: Array, covariance: Arr
     away = true_t - (true_t @ t) * t
     sine = float(np.linalg.norm(away))
     angle = float(np.arctan2(sine, true_t @ t))
-    rotation, translation = np.degrees([np.linalg.norm(turn), angle])
+    rotation = float(np.degrees(np.linalg.norm(turn)))
+    translation = float(np.degrees(angle))
     if covariance is None:
         return PoseError(rotation, translation, float('nan'))
     # Along the great circle: the direction of t is no vector space once the error is large.

@@ -1,8 +1,12 @@
-"""Tables in Markdown."""
+"""Tables in Markdown and CSV."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+import csv
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -17,3 +21,20 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
     rule = ['-' * widths[0], *('-' * (width - 1) + ':' for width in widths[1:])]
     return '\n'.join([padded(lines[0]), padded(rule), *map(padded, lines[1:])]) + '\n'
+
+
+def write_csv(path: Path, records: Sequence[Any]) -> None:
+    """One line for each dataclass; one inside of another gives columns `outer_inner`."""
+    rows = [dict(_flat(asdict(record))) for record in records]
+    with path.open('w', newline='') as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _flat(values: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f'{prefix}{name}_')
+        else:
+            yield prefix + name, value

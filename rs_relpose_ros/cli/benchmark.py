@@ -10,8 +10,8 @@ from rs_relpose_ros.config import SOLVERS
 from rs_relpose_ros.errors import InputError
 
 HELP = ('Measure the estimator on simulated frame pairs, one thread each: "accuracy" against an '
-        'oracle that knows the true matches and starts at the truth. Writes tables (CSV, Markdown) and '
-        'plots into a folder.')
+        'oracle that knows the true matches and starts at the truth. Writes tables (CSV, '
+        'Markdown) and plots into a folder.')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -56,10 +56,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run_accuracy(args: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
     from rs_relpose_ros.benchmark.accuracy import Experiment, run_experiment, select_cells
     from rs_relpose_ros.benchmark.accuracy_report import write_report
     from rs_relpose_ros.benchmark.oracle_cache import OracleCache
-    from tqdm import tqdm
 
     for name in ('trials', 'jobs'):
         if getattr(args, name) < 1:
