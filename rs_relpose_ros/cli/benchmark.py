@@ -1,4 +1,4 @@
-"""``rs_relpose benchmark``: accuracy against an oracle."""
+"""``rs_relpose benchmark``: accuracy against an oracle, speed against OpenCV and PoseLib."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from rs_relpose_ros.config import SOLVERS
 from rs_relpose_ros.errors import InputError
 
 HELP = ('Measure the estimator on simulated frame pairs, one thread each: "accuracy" against an '
-        'oracle that knows the true matches and starts at the truth. Writes tables (CSV, '
-        'Markdown) and plots into a folder.')
+        'oracle that knows the true matches and starts at the truth, "speed" beside OpenCV and '
+        'PoseLib. Writes tables (CSV, Markdown) and plots into a folder.')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -21,6 +21,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'accuracy', help='errors, covariance and lost poses in every cell of the experiment',
         description='Errors by those of the oracle, normalised errors and lost poses, over many '
                     'random problems (300 matches) in every cell of the experiment.'))
+    _add_speed_arguments(benchmarks.add_parser(
+        'speed', help='time and accuracy beside OpenCV and PoseLib',
+        description='Time and accuracy of this library, OpenCV (USAC_MAGSAC) and PoseLib on the '
+                    'same problems, how time grows with matches, and the first estimate of a new '
+                    'process.'))
 
 
 def _add_accuracy_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,11 +53,43 @@ def _add_accuracy_arguments(parser: argparse.ArgumentParser) -> None:
                         help="folder that keeps the oracle's results (default: OUTPUT/oracle)")
 
 
+def _add_speed_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('--trials', type=int, default=50, metavar='N',
+                        help='problems a cell (default: 50)')
+    parser.add_argument('--cells', nargs='+', metavar='NAME',
+                        default=['*-base', '*-v0-w0', '*-outliers-60'],
+                        help='cells by name, with * as in file names (default: the base cells, '
+                             'cameras at rest, 60 %% outliers)')
+    parser.add_argument('--matches', nargs='+', type=int, default=[300, 1000, 3000, 10000],
+                        metavar='N',
+                        help='numbers of matches over which time is shown (default: 300 1000 '
+                             '3000 10000)')
+    parser.add_argument('--repeats', type=int, default=3, metavar='N',
+                        help='the shortest of so many repeats counts (default: 3)')
+    parser.add_argument('--processes', type=int, default=3, metavar='N',
+                        help='new processes whose first estimate is timed (default: 3)')
+    parser.add_argument('--soak', type=int, default=0, metavar='N',
+                        help='see whether memory grows over N estimates (default: 0, do not)')
+    parser.add_argument('--seed', type=int, default=0, metavar='N',
+                        help='seed of the first problem (default: 0)')
+    parser.add_argument('--output', type=Path, default=Path('out/speed'), metavar='DIR',
+                        help='folder of the tables (default: out/speed)')
+
+
 def run(args: argparse.Namespace) -> int:
     """Run the benchmark that was asked for."""
     from rs_relpose_ros.benchmark.threads import use_one_thread
     use_one_thread()
-    return _run_accuracy(args)
+    if args.seed < 0:
+        raise InputError(f'--seed must not be negative, got {args.seed}')
+    return {'accuracy': _run_accuracy, 'speed': _run_speed}[args.benchmark](args)
+
+
+def _check_at_least(low: int, args: argparse.Namespace, *names: str) -> None:
+    for name in names:
+        value = getattr(args, name)
+        if min(value) < low if isinstance(value, list) else value < low:
+            raise InputError(f'--{name} must be at least {low}, got {value}')
 
 
 def _run_accuracy(args: argparse.Namespace) -> int:
@@ -62,11 +99,7 @@ def _run_accuracy(args: argparse.Namespace) -> int:
     from rs_relpose_ros.benchmark.accuracy_report import write_report
     from rs_relpose_ros.benchmark.oracle_cache import OracleCache
 
-    for name in ('trials', 'jobs'):
-        if getattr(args, name) < 1:
-            raise InputError(f'--{name} must be at least 1, got {getattr(args, name)}')
-    if args.seed < 0:
-        raise InputError(f'--seed must not be negative, got {args.seed}')
+    _check_at_least(1, args, 'trials', 'jobs')
     if min(args.sigma_factor) <= 0.0:
         raise InputError(f'--sigma-factor must be positive, got {min(args.sigma_factor)}')
     experiment = Experiment(
@@ -78,5 +111,37 @@ def _run_accuracy(args: argparse.Namespace) -> int:
         trials = run_experiment(experiment, OracleCache(args.cache or args.output / 'oracle'),
                                 args.jobs, bar.update)
     print(write_report(args.output, experiment, trials))
+    print(f'written to {args.output}')
+    return 0
+
+
+def _run_speed(args: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
+    from rs_relpose_ros.benchmark.accuracy import select_cells
+    from rs_relpose_ros.benchmark.problems import Cell
+    from rs_relpose_ros.benchmark.speed import compare, first_estimates, soak
+    from rs_relpose_ros.benchmark.speed_report import write_report
+
+    _check_at_least(1, args, 'trials', 'repeats')
+    _check_at_least(0, args, 'processes', 'soak')
+    _check_at_least(50, args, 'matches')
+    cells = select_cells(args.cells)
+    # Large problems need fewer: their times scatter less.
+    few = max(args.trials // 5, 1)
+    quiet = not sys.stderr.isatty()
+    # First, so that nothing else of this process holds the processor's caches.
+    first = first_estimates(args.processes)
+    with tqdm(total=len(cells) * args.trials + len(args.matches) * few, unit='problem',
+              disable=quiet) as bar:
+        comparison = [run for cell in cells for run in compare(
+            cell, Cell().matches, args.trials, args.repeats, args.seed, bar.update)]
+        scaling = [run for count in sorted(set(args.matches)) for run in compare(
+            cells[0], count, few, args.repeats, args.seed, bar.update)]
+    soaked = None
+    if args.soak:
+        with tqdm(total=args.soak + args.soak // 10, unit='estimate', disable=quiet) as bar:
+            soaked = soak(args.soak, bar.update)
+    print(write_report(args.output, comparison, scaling, first, soaked))
     print(f'written to {args.output}')
     return 0
