@@ -17,7 +17,7 @@ the velocities.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -58,14 +58,79 @@ class OracleEstimate:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Start:
-    """The point from which the unknowns count."""
+class Start:
+    """The point from which the unknowns count: pose, gravity in camera 1, and their tangents."""
 
     R: Array
     t: Array
     tangent: Array
     gravity: Array
     gravity_tangent: Array
+
+
+def start_at(R: Array, t: Array, gravity: Array) -> Start:
+    """The start at a pose and a direction of gravity in camera 1."""
+    return Start(R, t, _tangent(t), gravity, _tangent(gravity))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Objective:
+    """Residuals, of which the oracle minimises the sum of squares, over a step x from `start`.
+
+    Attributes
+    ----------
+    problem : TwoViewProblem
+    pixel_sigma, gravity_sigma, gyro_sigma : float
+        [px] per coordinate, [rad] per axis of one frame's direction, [rad/s] per axis of one frame.
+    start : Start
+    """
+
+    problem: TwoViewProblem
+    pixel_sigma: float
+    gravity_sigma: float
+    gyro_sigma: float
+    start: Start
+
+    @property
+    def velocity_spread(self) -> float:
+        """Root mean square of the true velocities' components [baselines per second]."""
+        return float(np.sqrt((self.problem.v1 @ self.problem.v1
+                              + self.problem.v2 @ self.problem.v2) / 6.0))
+
+    def truth(self) -> Array:
+        """The unknowns (P,) of the true gyro corrections and velocities, at the start's pose."""
+        problem = self.problem
+        x = np.zeros(19 if self.velocity_spread > 0.0 else 13)
+        x[_GYRO] = np.concatenate([problem.w1 - problem.measured_rate1,
+                                   problem.w2 - problem.measured_rate2])
+        if self.velocity_spread > 0.0:
+            x[_VELOCITY] = np.concatenate([problem.v1, problem.v2])
+        return x
+
+    def residuals(self, x: Values) -> Values:
+        """Residuals (M, K) in sigmas at each column of x (P, K)."""
+        problem, spread = self.problem, self.velocity_spread
+        use = ~problem.is_outlier
+        turned, direction, gravity = pose_at(self.start, x)
+        gyro = x[_GYRO]
+        velocity = x[_VELOCITY] if spread > 0.0 else np.zeros_like(gyro)
+        sampson = _sampson(
+            problem.points1[use], problem.points2[use], turned, direction,
+            problem.measured_rate1[:, None] + gyro[:3],
+            problem.measured_rate2[:, None] + gyro[3:], velocity[:3], velocity[3:])
+        gravity2 = np.einsum('jik,jk->ik', turned, gravity)
+        parts = [sampson / self.pixel_sigma,
+                 _tangent(problem.measured_gravity1).T @ gravity / self.gravity_sigma,
+                 _tangent(problem.measured_gravity2).T @ gravity2 / self.gravity_sigma,
+                 gyro / self.gyro_sigma]
+        if spread > 0.0:
+            parts.append(velocity / spread)
+        return np.concatenate(parts)
+
+    def jacobian(self, x: Array) -> Array:
+        """Derivatives (M, P) at x (P,), exact to the last digits: no difference is formed."""
+        columns = x[:, None] + 1j * _STEP * np.eye(len(x))
+        return np.imag(self.residuals(columns)) / _STEP
 
 
 def oracle_estimate(problem: TwoViewProblem, pixel_sigma: float, gravity_sigma: float,
@@ -85,56 +150,25 @@ def oracle_estimate(problem: TwoViewProblem, pixel_sigma: float, gravity_sigma: 
         Pose to start from instead of the truth.
     """
     R, t = (problem.R, problem.t) if start is None else start
-    origin = _Start(R, t, _tangent(t), problem.gravity1, _tangent(problem.gravity1))
-    spread = float(np.sqrt((problem.v1 @ problem.v1 + problem.v2 @ problem.v2) / 6.0))
-    use = ~problem.is_outlier
-    points1, points2 = problem.points1[use], problem.points2[use]
-    tangents = _tangent(problem.measured_gravity1), _tangent(problem.measured_gravity2)
-
-    def residuals(x: Values) -> Values:
-        """Residuals (M, K) in sigmas at each column of x (P, K)."""
-        turned, direction, gravity = _pose(origin, x)
-        gyro = x[_GYRO]
-        velocity = x[_VELOCITY] if spread > 0.0 else np.zeros_like(gyro)
-        sampson = _sampson(
-            points1, points2, turned, direction, problem.measured_rate1[:, None] + gyro[:3],
-            problem.measured_rate2[:, None] + gyro[3:], velocity[:3], velocity[3:])
-        gravity2 = np.einsum('jik,jk->ik', turned, gravity)
-        parts = [sampson / pixel_sigma,
-                 tangents[0].T @ gravity / gravity_sigma,
-                 tangents[1].T @ gravity2 / gravity_sigma,
-                 gyro / gyro_sigma]
-        if spread > 0.0:
-            parts.append(velocity / spread)
-        return np.concatenate(parts)
-
-    def jacobian(x: Array) -> Array:
-        # Exact to the last digits: no difference is formed.
-        columns = x[:, None] + 1j * _STEP * np.eye(len(x))
-        return np.imag(residuals(columns)) / _STEP
-
-    x = np.zeros(19 if spread > 0.0 else 13)
-    x[_GYRO] = np.concatenate([problem.w1 - problem.measured_rate1,
-                               problem.w2 - problem.measured_rate2])
-    if spread > 0.0:
-        x[_VELOCITY] = np.concatenate([problem.v1, problem.v2])
-    found = least_squares(lambda x: residuals(x[:, None])[:, 0], x, jac=jacobian, method='lm',
-                          x_scale='jac', xtol=1e-12, ftol=1e-12, gtol=1e-12)
-    turned, direction, _ = _pose(origin, found.x[:, None])
+    objective = Objective(problem, pixel_sigma, gravity_sigma, gyro_sigma,
+                          start_at(R, t, problem.gravity1))
+    found = least_squares(lambda x: objective.residuals(x[:, None])[:, 0], objective.truth(),
+                          jac=objective.jacobian, method='lm', x_scale='jac', xtol=1e-12,
+                          ftol=1e-12, gtol=1e-12)
+    turned, direction, gravity = pose_at(objective.start, found.x[:, None])
     # Once more about the optimum, where the unknowns of the pose are a turn and a tangent of it.
-    estimate = _Start(turned[:, :, 0], direction[:, 0], _tangent(direction[:, 0]), origin.gravity,
-                      origin.gravity_tangent)
-    origin, x = estimate, np.concatenate([np.zeros(5), found.x[5:]])
-    slopes = jacobian(x)
+    optimum = start_at(turned[:, :, 0], direction[:, 0], gravity[:, 0])
+    x = found.x.copy()
+    x[_POSE], x[_GRAVITY] = 0.0, 0.0
+    slopes = replace(objective, start=optimum).jacobian(x)
     pose = np.linalg.inv(slopes.T @ slopes)[_POSE, _POSE]
     lift = np.zeros((6, 5))
-    lift[:3, 3:] = estimate.tangent
+    lift[:3, 3:] = optimum.tangent
     lift[3:, :3] = np.eye(3)
-    return OracleEstimate(estimate.R, estimate.t, lift @ pose @ lift.T)
+    return OracleEstimate(optimum.R, optimum.t, lift @ pose @ lift.T)
 
 
-def _pose(origin: _Start, x: Values,
-          ) -> tuple[Values, Values, Values]:
+def pose_at(origin: Start, x: Values) -> tuple[Values, Values, Values]:
     """R (3, 3, K), t (3, K) and gravity in camera 1 (3, K) at each column of x (P, K)."""
     series = _series(x[:3], np.ones(1))
     R = np.stack([_turn(x[:3], column[:, None, None], series)[:, :, 0] for column in origin.R.T],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+import functools
 import hashlib
 import json
 from pathlib import Path
@@ -47,7 +48,11 @@ class OracleCache:
     def _path(self, cell: Cell, noise: Noise) -> Path | None:
         if self.folder is None:
             return None
-        digest = hashlib.sha256(json.dumps([asdict(cell), noise]).encode())
-        for module in (problems, oracle):
-            digest.update(Path(str(module.__file__)).read_bytes())
+        digest = hashlib.sha256(json.dumps([asdict(cell), noise]).encode() + _source())
         return self.folder / f'{digest.hexdigest()[:24]}.json'
+
+
+@functools.cache
+def _source() -> bytes:
+    """Of the generator and the oracle, as they were when first asked for."""
+    return b''.join(Path(str(module.__file__)).read_bytes() for module in (problems, oracle))

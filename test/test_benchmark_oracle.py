@@ -1,0 +1,147 @@
+"""The oracle of the accuracy benchmark: right by itself, and independent of the estimator."""
+
+import ast
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.optimize import approx_fprime
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_ros.benchmark import oracle, problems
+from rs_relpose_ros.benchmark.oracle import Objective, oracle_estimate, start_at
+from rs_relpose_ros.benchmark.oracle_cache import OracleCache
+from rs_relpose_ros.benchmark.problems import Cell, CELLS, make_problem
+from rs_relpose_ros.benchmark.scoring import pose_error, PoseError
+
+NO_NOISE = {'pixel_noise': 0.0, 'gravity_noise': 0.0, 'gyro_noise': 0.0, 'outliers': 0.0}
+SIGMAS = 0.5, np.radians(0.2), np.radians(0.1)
+
+
+@pytest.mark.parametrize('module', [oracle, problems])
+def test_it_uses_nothing_of_the_package(module):
+    with open(module.__file__, encoding='utf-8') as file:
+        tree = ast.parse(file.read())
+    imported = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import)
+                for alias in node.names}
+    imported |= {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    assert {name for name in imported if name.startswith('rs_relpose')} <= {
+        'rs_relpose_ros.benchmark.problems'}
+
+
+@pytest.mark.parametrize('cell', ['forward-base', 'sideways-v10-w3', 'forward-v0-w3'])
+def test_jacobian_equals_finite_differences(cell):
+    problem = make_problem(CELLS[cell], 1)
+    objective = Objective(problem, *SIGMAS, start_at(problem.R, problem.t, problem.gravity1))
+    rng = np.random.default_rng(0)
+    x = objective.truth()
+    x += 0.01 * rng.normal(size=len(x))
+    exact = objective.jacobian(x)
+    differences = approx_fprime(x, lambda y: objective.residuals(y[:, None])[:, 0], 1e-7)
+    scale = np.abs(exact).max(axis=0)
+    assert scale.min() > 0.0
+    assert (np.abs(exact - differences).max(axis=0) < 1e-5 * scale).all()
+
+
+@pytest.mark.parametrize('cell', ['forward-base', 'sideways-v10-w3'])
+def test_the_simulated_camera_obeys_its_model(cell):
+    # Points projected by brute force, each at its own row's instant, lie on the constraint.
+    problem = make_problem(replace(CELLS[cell], **NO_NOISE), 2)
+    objective = Objective(problem, *SIGMAS, start_at(problem.R, problem.t, problem.gravity1))
+    residuals = objective.residuals(objective.truth()[:, None])[:, 0]
+    # First those of the matches; those of the priors follow.
+    assert np.abs(SIGMAS[0] * residuals[:len(problem.points1)]).max() < 1e-6
+
+
+def test_without_noise_it_finds_the_truth_from_elsewhere():
+    problem = make_problem(Cell(**NO_NOISE), 3)
+    tilted = Rotation.from_rotvec(np.radians([1.0, -2.0, 1.0])).as_matrix()
+    found = oracle_estimate(problem, 1e-3, 1e-5, 1e-5, start=(tilted @ problem.R,
+                                                              tilted @ problem.t))
+    error = pose_error(found.R, found.t, problem.R, problem.t)
+    assert error.rotation < 1e-4
+    assert error.translation < 1e-3
+
+
+def test_the_optimum_does_not_depend_on_the_start():
+    problem = make_problem(Cell(), 4)
+    tilted = Rotation.from_rotvec(np.radians([0.2, -0.1, 0.2])).as_matrix()
+    best = oracle_estimate(problem, *SIGMAS)
+    again = oracle_estimate(problem, *SIGMAS, start=(tilted @ problem.R, tilted @ problem.t))
+    assert pose_error(again.R, again.t, best.R, best.t).rotation < 1e-4
+    np.testing.assert_allclose(again.covariance, best.covariance, rtol=0.02, atol=1e-9)
+
+
+def test_its_covariance_describes_its_errors():
+    cell = Cell()
+    nees = []
+    for seed in range(30):
+        problem = make_problem(cell, seed, 'gaussian')
+        best = oracle_estimate(problem, *SIGMAS)
+        nees.append(pose_error(best.R, best.t, problem.R, problem.t, best.covariance).nees)
+    # The mean of 30 chi-square(5) is 5 +- 0.58.
+    assert np.mean(nees) == pytest.approx(5.0, abs=1.8)
+
+
+def test_true_pose_agrees_with_opencv_on_a_global_shutter():
+    problem = make_problem(Cell(speed=0.0, rate=0.0, **NO_NOISE), 5)
+    K = np.array([[problems.FOCAL, 0.0, problems.CENTRE_U],
+                  [0.0, problems.FOCAL, problems.CENTRE_V], [0.0, 0.0, 1.0]])
+    essential, mask = cv2.findEssentialMat(problem.points1, problem.points2, K, cv2.RANSAC,
+                                           0.999, 0.1)
+    _, R, t, _ = cv2.recoverPose(essential, problem.points1, problem.points2, K, mask=mask)
+    error = pose_error(R.T, -R.T @ t.ravel(), problem.R, problem.t)
+    assert error.rotation < 1e-3
+    assert error.translation < 1e-2
+
+
+@pytest.mark.parametrize('name', CELLS)
+def test_problems_of_a_cell_are_what_it_says(name):
+    cell = CELLS[name]
+    problem = make_problem(cell, 6)
+    assert problem.points1.shape == problem.points2.shape == (cell.matches, 2)
+    assert problem.is_outlier.sum() == round(cell.outliers * cell.matches)
+    assert np.linalg.norm(problem.t) == pytest.approx(1.0)
+    axis = {'forward': 2, 'sideways': 0}[cell.direction]
+    assert problem.t[axis] > 0.8
+    np.testing.assert_allclose(np.abs(problem.w1), cell.rate)
+    np.testing.assert_allclose(problem.w2, -problem.w1)
+    if cell.constant_velocity:
+        np.testing.assert_allclose(problem.R @ problem.v2, problem.v1)
+        np.testing.assert_allclose(np.cross(problem.v1, problem.t), 0.0, atol=1e-12)
+    else:
+        np.testing.assert_allclose(problem.v2, -problem.v1)
+    # The paper's error of gravity: equally large about each axis, opposite in the frames.
+    assert problem.measured_gravity1 @ problem.gravity1 == pytest.approx(
+        np.cos(np.radians(cell.gravity_noise) * np.linalg.norm(
+            np.cross(problem.gravity1, [1, 1, 1]))), abs=1e-3)
+
+
+def test_equal_seeds_give_equal_problems():
+    first, second = make_problem(Cell(), 7), make_problem(Cell(), 7)
+    np.testing.assert_array_equal(first.points1, second.points1)
+    np.testing.assert_array_equal(first.points2, second.points2)
+    assert (make_problem(Cell(), 8).points1 != first.points1).any()
+
+
+def test_error_in_sigmas_is_that_of_the_told_covariance():
+    R, t = np.eye(3), np.array([0.0, 0.0, 1.0])
+    true_R = Rotation.from_rotvec([0.01, 0.0, 0.0]).as_matrix()
+    true_t = np.array([0.0, np.sin(0.02), np.cos(0.02)])
+    covariance = np.diag([0.01, 0.01, 0.0, 0.005, 1.0, 1.0])**2
+    error = pose_error(R, t, true_R, true_t, covariance)
+    assert error.rotation == pytest.approx(np.degrees(0.01))
+    assert error.translation == pytest.approx(np.degrees(0.02))
+    assert error.nees == pytest.approx(2.0**2 + 2.0**2)
+
+
+def test_kept_errors_come_back_for_their_own_cell_only(tmp_path):
+    cache = OracleCache(tmp_path)
+    cache.add(Cell(), 'paper', {3: PoseError(0.1, 0.2, 4.0)})
+    cache.add(Cell(), 'paper', {1: PoseError(0.3, 0.4, 5.0)})
+    assert cache.load(Cell(), 'paper') == {1: PoseError(0.3, 0.4, 5.0),
+                                           3: PoseError(0.1, 0.2, 4.0)}
+    assert cache.load(Cell(), 'gaussian') == {}
+    assert cache.load(Cell(speed=2.0), 'paper') == {}
+    assert OracleCache(None).load(Cell(), 'paper') == {}
