@@ -2,6 +2,7 @@
 
 import ast
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -21,8 +22,7 @@ SIGMAS = 0.5, np.radians(0.2), np.radians(0.1)
 
 @pytest.mark.parametrize('module', [oracle, problems])
 def test_it_uses_nothing_of_the_package(module):
-    with open(module.__file__, encoding='utf-8') as file:
-        tree = ast.parse(file.read())
+    tree = ast.parse(Path(module.__file__).read_text(encoding='utf-8'))
     imported = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import)
                 for alias in node.names}
     imported |= {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}

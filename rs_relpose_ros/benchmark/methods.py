@@ -74,7 +74,9 @@ def opencv_magsac(points1: Array, points2: Array, seed: int) -> Callable[[], Pos
         if np.shape(essential) != (3, 3):
             return None
         count, R, t, _ = cv2.recoverPose(essential, points1, points2, K, mask=mask)
-        return _inverted(np.asarray(R), np.asarray(t).ravel()) if count else None
+        if not count:
+            return None
+        return _inverted(np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64).ravel())
     return call
 
 

@@ -81,7 +81,7 @@ class Objective:
     ----------
     problem : TwoViewProblem
     pixel_sigma, gravity_sigma, gyro_sigma : float
-        [px] per coordinate, [rad] per axis of one frame's direction, [rad/s] per axis of one frame.
+        As in `oracle_estimate`.
     start : Start
     """
 
