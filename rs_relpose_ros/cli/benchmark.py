@@ -11,7 +11,8 @@ from rs_relpose_ros.errors import InputError
 
 HELP = ('Measure the estimator on simulated frame pairs, one thread each: "accuracy" against an '
         'oracle that knows the true matches and starts at the truth, "speed" beside OpenCV and '
-        'PoseLib. Writes tables (CSV, Markdown) and plots into a folder.')
+        'PoseLib, "all" both as the project reports them. Writes tables (CSV, Markdown) and plots '
+        'into a folder.')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -26,6 +27,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         description='Time and accuracy of this library, OpenCV (USAC_MAGSAC) and PoseLib on the '
                     'same problems, how time grows with matches, and the first estimate of a new '
                     'process.'))
+    _add_all_arguments(benchmarks.add_parser(
+        'all', help='both, as the project reports them',
+        description='Both benchmarks with their defaults, told sigmas also half and twice the '
+                    'true ones, and memory over 100,000 estimates: some hours on one core.'))
+
+
+def _add_all_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('--trials', type=int, default=200, metavar='N',
+                        help='problems a cell of the accuracy benchmark (default: 200)')
+    parser.add_argument('--soak', type=int, default=100_000, metavar='N',
+                        help='see whether memory grows over N estimates (default: 100000)')
+    parser.add_argument('--jobs', type=int, default=1, metavar='N',
+                        help='processes of the accuracy benchmark (default: 1)')
+    parser.add_argument('--output', type=Path, default=Path('out/benchmark'), metavar='DIR',
+                        help='folder of the tables (default: out/benchmark)')
 
 
 def _add_accuracy_arguments(parser: argparse.ArgumentParser) -> None:
@@ -80,9 +96,18 @@ def run(args: argparse.Namespace) -> int:
     """Run the benchmark that was asked for."""
     from rs_relpose_ros.benchmark.threads import use_one_thread
     use_one_thread()
-    if args.seed < 0:
-        raise InputError(f'--seed must not be negative, got {args.seed}')
-    return {'accuracy': _run_accuracy, 'speed': _run_speed}[args.benchmark](args)
+    return {'accuracy': _run_accuracy, 'speed': _run_speed, 'all': _run_all}[args.benchmark](args)
+
+
+def _run_all(args: argparse.Namespace) -> int:
+    """Each benchmark as its own command line would run it."""
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    accuracy = ['--trials', str(args.trials), '--jobs', str(args.jobs), '--sigma-factor', '1',
+                '0.5', '2', '--output', str(args.output / 'accuracy')]
+    speed = ['--soak', str(args.soak), '--output', str(args.output / 'speed')]
+    parsed = [parser.parse_args(['accuracy', *accuracy]), parser.parse_args(['speed', *speed])]
+    return max(run(one) for one in parsed)
 
 
 def _check_at_least(low: int, args: argparse.Namespace, *names: str) -> None:
@@ -100,6 +125,7 @@ def _run_accuracy(args: argparse.Namespace) -> int:
     from rs_relpose_ros.benchmark.oracle_cache import OracleCache
 
     _check_at_least(1, args, 'trials', 'jobs')
+    _check_at_least(0, args, 'seed')
     if min(args.sigma_factor) <= 0.0:
         raise InputError(f'--sigma-factor must be positive, got {min(args.sigma_factor)}')
     experiment = Experiment(
@@ -124,7 +150,7 @@ def _run_speed(args: argparse.Namespace) -> int:
     from rs_relpose_ros.benchmark.speed_report import write_report
 
     _check_at_least(1, args, 'trials', 'repeats')
-    _check_at_least(0, args, 'processes', 'soak')
+    _check_at_least(0, args, 'processes', 'soak', 'seed')
     _check_at_least(50, args, 'matches')
     cells = select_cells(args.cells)
     # Large problems need fewer: their times scatter less.
