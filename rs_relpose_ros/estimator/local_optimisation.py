@@ -19,8 +19,10 @@ ITERATIONS = 2
 
 # A depth is judged only where the parallax is this many times its noise.
 SIGNIFICANT_PARALLAX = 4.0
-# Robust sigmas of the logarithm of depth beyond which a match is taken for an outlier.
+# A match is taken for an outlier where the logarithm of its depth is so many times as far from the
+# median as the quantile of one sigma on that side.
 DEPTH_GATE = 4.0
+DEPTH_QUANTILES = np.array([0.16, 0.5, 0.84])
 # Scenes are never flatter than this (log units): keeps the gate open on planar scenes.
 MIN_DEPTH_SPREAD = 0.25
 
@@ -89,12 +91,15 @@ def gate_depths(observations: Array, use: NDArray[np.bool_], state: State,
         count += 1
     if count < 8:
         return
-    centre = np.median(logs[:count])
-    spread = max(1.4826 * np.median(np.abs(logs[:count] - centre)), MIN_DEPTH_SPREAD)
+    # Near and far side apart: a scene is denser far away, and its few near points, which look like
+    # outliers beside the rest, know most of the translation.
+    near, centre, far = np.quantile(logs[:count], DEPTH_QUANTILES)
+    lowest = centre - DEPTH_GATE * max(centre - near, MIN_DEPTH_SPREAD)
+    highest = centre + DEPTH_GATE * max(far - centre, MIN_DEPTH_SPREAD)
     k = 0
     for i in range(n):
         if significant[i]:
-            if abs(logs[k] - centre) > DEPTH_GATE * spread:
+            if not lowest <= logs[k] <= highest:
                 use[i] = False
             k += 1
 
