@@ -18,7 +18,7 @@ from rs_relpose_ros.benchmark.speed_report import method_statistics, write_repor
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.errors import InputError
 
-STILL = Cell(speed=0.0, rate=0.0, pixel_noise=1e-4, gravity_noise=1e-3, gyro_noise=1e-3,
+STILL = Cell(speed=0.0, rate=0.0, pixel_noise=1e-2, gravity_noise=1e-3, gyro_noise=1e-3,
              outliers=0.2)
 
 

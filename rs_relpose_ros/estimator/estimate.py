@@ -30,7 +30,7 @@ from rs_relpose_ros.estimator.local_optimisation import (
     SHRINKING,
     signed,
 )
-from rs_relpose_ros.estimator.map_fit import normal_equations, PINNED, Priors, State
+from rs_relpose_ros.estimator.map_fit import inverse, normal_equations, PINNED, Priors, State
 from rs_relpose_ros.estimator.problem import (
     build_problem,
     middle_row_delay,
@@ -195,7 +195,7 @@ class _Estimation:
         if state is None:
             return self._failure(Status.NO_CONSENSUS, 'no hypothesis explains the matches')
         # 3. Refinement on its inliers.
-        state, inliers, velocity_sigma, sigma = self._refine(state)
+        state, inliers, velocity_sigma, sigma, local = self._refine(state)
         rays = [self.problem.observations[inliers, k:k + 3] for k in (0, 9)]
         cell = config.threshold / self.problem.focal
         count = min(_distinct(f, cell) for f in rays)
@@ -213,7 +213,9 @@ class _Estimation:
         if turned is not None:
             return turned
         # 5. Covariance at the optimum, then from the middle to the reference row.
-        final = self._with_covariance(state, inliers, velocity_sigma, sigma)
+        if local is None:
+            local = self._local_covariance(state, inliers, velocity_sigma, sigma)
+        final = self._with_covariance(state, local)
         pose = to_reference_row(final, -delay, *self._turns(state, -delay))
         return self._result(pose, state, inliers, velocity_sigma)
 
@@ -272,7 +274,9 @@ class _Estimation:
         return signed(state, cheirality_sign(
             self.problem.observations, near & self.problem.valid, state))
 
-    def _refine(self, state: State) -> tuple[State, NDArray[np.bool_], float, float]:
+    def _refine(self, state: State,
+                ) -> tuple[State, NDArray[np.bool_], float, float, Array | None]:
+        """State, inliers, sigma of velocities and of matches [px], and covariance if known."""
         config, problem = self.config, self.problem
         free = self.mode.velocities or (self.mode.derotate and config.refinement == 'map')
         if config.refinement == 'map':
@@ -290,7 +294,7 @@ class _Estimation:
             inliers = select_inliers(problem.observations, problem.valid, state, config.threshold,
                                      self.angle_sigma)
         sigma = SAMPLING_VELOCITY_SIGMA if free else 1.0 / np.sqrt(PINNED)
-        return state, inliers, sigma, config.pixel_sigma
+        return state, inliers, sigma, config.pixel_sigma, None
 
     def _inliers_by_chance(self) -> int:
         """Inliers that the best of many fits reaches on random matches (about 5 sigma)."""
@@ -328,7 +332,7 @@ class _Estimation:
         turn1, turn2 = self._turns(state._replace(R=R, dw1=np.zeros(3), dw2=np.zeros(3)), -delay)
         covariance = np.full((6, 6), np.nan)
         # No rotation is less certain than half a turn: points in one place show only two angles.
-        covariance[3:, 3:] = turn1.T @ _inverse(information + np.eye(3) / np.pi**2) @ turn1
+        covariance[3:, 3:] = turn1.T @ inverse(information + np.eye(3) / np.pi**2) @ turn1
         return RelativePose(
             status=Status.PURE_ROTATION if turned_only else Status.LOW_PARALLAX, reason=reason,
             R=turn1.T @ R @ turn2, covariance=covariance, inliers=inliers,
@@ -336,16 +340,19 @@ class _Estimation:
             angular_velocity2=problem.motion2.angular_velocity, model='angular',
             iterations=self.iterations, residual_rms=float(np.sqrt(np.mean(left**2))))
 
-    def _with_covariance(self, state: State, inliers: NDArray[np.bool_], velocity_sigma: float,
-                         sigma: float) -> PairState:
-        """Covariance of (dt, dtheta, dv_1, dv_2, dw_1, dw_2) from the regularised Hessian."""
+    def _local_covariance(self, state: State, inliers: NDArray[np.bool_], velocity_sigma: float,
+                          sigma: float) -> Array:
+        """Covariance (17, 17) of the local parameters from the regularised Hessian."""
         priors = with_velocity_sigma(self.priors, velocity_sigma)
         hessian, gradient, _ = normal_equations(
             self.problem.observations, inliers, state, priors, sigma)
-        local = _inverse(hessian)
-        # Zero after the MAP fit; a state that stopped elsewhere is off by about this step.
+        local = inverse(hessian)
+        # A state that is not the optimum is off by about this step.
         step = local @ gradient
-        local += np.outer(step, step)
+        return local + np.outer(step, step)
+
+    def _with_covariance(self, state: State, local: Array) -> PairState:
+        """The state with the covariance of (dt, dtheta, dv_1, dv_2, dw_1, dw_2)."""
         # Local parameters (theta, tangent, d1, d2, dw1, dw2 in frame 1) to the state's.
         jacobian = np.zeros((18, 17))
         jacobian[0:3, 3:5] = sampson.tangent_basis(state.t)
@@ -435,15 +442,6 @@ def _distance_from_a_plane(rays: Array) -> float:
     Small where the points lie in one place or, in the image, on one line.
     """
     return float(np.sqrt(max(np.linalg.eigvalsh(rays.T @ rays / len(rays))[0], 0.0)))
-
-
-def _inverse(information: Array) -> Array:
-    """Covariance of an information matrix (n, n): never indefinite, however badly conditioned."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-30))
-    factor = np.linalg.inv(np.linalg.cholesky(
-        information * np.outer(scale, scale) + 1e-13 * np.eye(len(scale)))) * scale
-    inverse: Array = factor.T @ factor
-    return inverse
 
 
 def _priors(problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig,

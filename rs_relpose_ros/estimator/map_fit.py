@@ -147,6 +147,22 @@ def moved(state: State, step: Array) -> State:
 
 
 @_jit
+def step_between(state: State, other: State) -> Array:
+    """The step (17,) of local parameters from `state` to `other`: the inverse of `moved`."""
+    step = np.empty(PARAMETERS)
+    step[:3] = log_so3(other.R @ state.R.T)
+    basis = sampson.tangent_basis(state.t)
+    along = (state.t * other.t).sum()
+    for k in range(2):
+        step[TANGENT + k] = (basis[:, k] * other.t).sum() / along
+    step[D1:D1 + 3] = other.d1 - state.d1
+    step[D2:D2 + 3] = other.d2 - state.d2
+    step[DW1:DW1 + 3] = other.dw1 - state.dw1
+    step[DW2:DW2 + 3] = other.dw2 - state.dw2
+    return step
+
+
+@_jit
 def cholesky(matrix: Array, factor: Array) -> bool:
     """Lower Cholesky factor of a symmetric matrix; False unless it is positive definite."""
     n = matrix.shape[0]
@@ -217,12 +233,46 @@ def fit(observations: Array, use: NDArray[np.bool_], start: State, priors: Prior
 
 
 @_jit
+def _scaled_factor(information: Array) -> tuple[Array, Array]:
+    """Scales (n,) that make the diagonal 1, and the Cholesky factor of the matrix so scaled.
+
+    A floor of rounding on the diagonal keeps it positive definite, however badly conditioned.
+    """
+    n = information.shape[0]
+    scale = np.empty(n)
+    for i in range(n):
+        scale[i] = 1.0 / math.sqrt(max(information[i, i], 1e-30))
+    scaled = information * scale * scale.reshape(n, 1)
+    for i in range(n):
+        scaled[i, i] += 1e-13
+    factor = np.zeros((n, n))
+    if not cholesky(scaled, factor):
+        factor[:] = np.nan
+    return scale, factor
+
+
+@_jit
+def inverse(information: Array) -> Array:
+    """Covariance (n, n) of an information matrix: never indefinite."""
+    scale, factor = _scaled_factor(information)
+    n = len(scale)
+    rows = np.zeros((n, n))
+    for j in range(n):   # the inverse of the factor, column by column
+        rows[j, j] = 1.0 / factor[j, j]
+        for i in range(j + 1, n):
+            value = 0.0
+            for k in range(j, i):
+                value -= factor[i, k] * rows[k, j]
+            rows[i, j] = value / factor[i, i]
+    rows *= scale
+    return rows.T @ rows
+
+
+@_jit
 def log_determinant(hessian: Array) -> float:
-    """Log-determinant of a positive definite matrix; infinite where it is not."""
-    factor = np.zeros(hessian.shape)
-    if not cholesky(hessian, factor):
-        return math.inf
+    """Log-determinant of a positive definite matrix."""
+    scale, factor = _scaled_factor(hessian)
     value = 0.0
-    for i in range(hessian.shape[0]):
-        value += 2.0 * math.log(factor[i, i])
+    for i in range(len(scale)):
+        value += 2.0 * math.log(factor[i, i] / scale[i])
     return value

@@ -2,7 +2,7 @@
 
 How fast the camera moves is not known in advance. A wide prior lets the velocities soak up noise
 where they are zero (the normal case: they are then not even observable), a narrow one biases the
-pose where they are large. The Laplace evidence ``-cost/2 - logdet(H)/2 - 6 log s_d`` decides.
+pose where they are large. The Laplace evidence ``-cost/2 - logdet(H)/2 - 6 log s_d`` weighs them.
 """
 
 from __future__ import annotations
@@ -13,9 +13,17 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.estimator.local_optimisation import select_inliers
-from rs_relpose_ros.estimator.map_fit import fit, log_determinant, Priors, State
-from rs_relpose_ros.estimator.sampson import residuals
+from rs_relpose_ros.estimator.local_optimisation import gate_depths, select_inliers
+from rs_relpose_ros.estimator.map_fit import (
+    fit,
+    inverse,
+    log_determinant,
+    moved,
+    Priors,
+    State,
+    step_between,
+)
+from rs_relpose_ros.estimator.sampson import PARAMETERS, residuals
 
 Array = NDArray[np.float64]
 
@@ -24,8 +32,19 @@ GRID = np.array([0.003, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
 # With a known interval the prior is about constant velocity; hand-held cameras and robots change
 # their velocity by at least this share of it per second, however little one pair shows of that.
 LEAST_VELOCITY_CHANGE = 0.3
+# Exponent of the prior of the sigma, as its inverse: where the data cannot tell (sideways motion,
+# cameras at rest), a wide prior would turn noise into velocity and degrees of translation.
+SMALL_IS_LIKELIER = 0.5
 ROUNDS = 3
 ITERATIONS = 6
+# On the inliers of the last round, from each prior's own optimum on nearly the same ones.
+LAST_ITERATIONS = 2
+# The inlier threshold reaches so many sigmas of the noise that is found, if it has to, but at most
+# so many times as far as told.
+REACH = 4.0
+WIDEST = 2.0
+# A prior whose evidence is below the best by more than this (logarithm) takes no part.
+LEAST_EVIDENCE = 6.0
 
 _jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 
@@ -49,45 +68,113 @@ def noise_sigma(observations_cost: float, count: int, told: float) -> float:
 @_jit
 def fit_with_evidence(observations: Array, valid: NDArray[np.bool_], start: State, priors: Priors,
                       told_sigma: float, threshold: float, angle_sigma: float, grid: Array,
-                      ) -> tuple[State, NDArray[np.bool_], float, float]:
-    """Select inliers, choose the velocity prior and fit, repeatedly.
+                      ) -> tuple[State, NDArray[np.bool_], float, float, Array]:
+    """Select inliers and fit repeatedly; average over the velocity priors at the end.
 
     Returns
     -------
     state : State
+        Mean over the priors of the grid, weighted by their evidence.
     inliers : (N,) ndarray of bool
-        The matches that the last fit used.
+        The matches that the last fits used.
     velocity_sigma : float
-        The prior sigma that was chosen [baselines per second].
+        The prior sigma of the most evidence [baselines per second].
     sigma : float
         Noise of a match that the fit used [px].
+    covariance : (17, 17) ndarray
+        Of the local parameters: within the fits and between them.
     """
+    size = grid.shape[0]
     state = start
-    best = 0
     inliers = select_inliers(observations, valid, state, threshold, angle_sigma)
     sigma = _noise(observations, inliers, state, told_sigma)
+    # Optimum of each prior as a step from `start`, and its evidence in its last round.
+    steps = np.zeros((size, PARAMETERS))
+    lacking = np.zeros(size)
+    evidences = np.full(size, -math.inf)
+    best = 0
     for turn in range(ROUNDS):
-        low, high = 0, grid.shape[0]
+        low, high = 0, size
         if turn > 0:   # the choice moves little once the inliers stand
-            low, high = max(best - 1, 0), min(best + 2, grid.shape[0])
-        best_evidence = -math.inf
-        best_state = state
+            low, high = max(best - 1, 0), min(best + 2, size)
         for k in range(low, high):
-            chosen = with_velocity_sigma(priors, grid[k])
-            candidate, cost, hessian = fit(
-                observations, inliers, state, chosen, sigma, ITERATIONS)
-            evidence = (-0.5 * cost - 0.5 * log_determinant(hessian) - 6.0 * math.log(grid[k]))
-            if evidence > best_evidence:
-                best_evidence, best_state, best = evidence, candidate, k
-        state = best_state
+            candidate, _, evidences[k] = _candidate(
+                observations, inliers, state, priors, sigma, grid[k], threshold, angle_sigma,
+                ITERATIONS)
+            steps[k] = step_between(start, candidate)
+        best = low + int(np.argmax(evidences[low:high]))
+        lacking[low:high] = evidences[best] - evidences[low:high]
+        state = moved(start, steps[best])
         chosen_from = inliers
-        inliers = select_inliers(observations, valid, state, threshold, angle_sigma)
+        inliers = select_inliers(observations, valid, state, _reach(threshold, sigma), angle_sigma)
         sigma = _noise(observations, inliers, state, told_sigma)
         if (inliers == chosen_from).all():
             break
-    chosen = with_velocity_sigma(priors, grid[best])
-    state, _, _ = fit(observations, inliers, state, chosen, sigma, ITERATIONS)
-    return state, inliers, grid[best], sigma
+    state, covariance, best = _average(
+        observations, inliers, start, steps, lacking < LEAST_EVIDENCE, priors, sigma, grid,
+        threshold, angle_sigma)
+    return state, inliers, grid[best], sigma, covariance
+
+
+@_jit
+def _reach(threshold: float, sigma: float) -> float:
+    """Inlier threshold [px] for matches of a noise that turned out to be `sigma`."""
+    return min(max(threshold, REACH * sigma), WIDEST * threshold)
+
+
+@_jit
+def _candidate(observations: Array, inliers: NDArray[np.bool_], start: State, priors: Priors,
+               sigma: float, velocity_sigma: float, threshold: float, angle_sigma: float,
+               iterations: int) -> tuple[State, Array, float]:
+    """Fit with one velocity prior; the state, its Hessian, and the logarithm of its evidence."""
+    state, cost, hessian = fit(observations, inliers, start,
+                               with_velocity_sigma(priors, velocity_sigma), sigma, iterations)
+    # Velocities that carry the camera past its own baseline within a frame explain any residual,
+    # with points behind the cameras: those count as outliers.
+    plausible = inliers.copy()
+    gate_depths(observations, plausible, state, angle_sigma)
+    cost += (inliers.sum() - plausible.sum()) * (threshold / sigma) ** 2
+    evidence = (-0.5 * cost - 0.5 * log_determinant(hessian)
+                - (6.0 + SMALL_IS_LIKELIER) * math.log(velocity_sigma))
+    return state, hessian, evidence
+
+
+@_jit
+def _average(observations: Array, inliers: NDArray[np.bool_], start: State, steps: Array,
+             likely: NDArray[np.bool_], priors: Priors, sigma: float, grid: Array,
+             threshold: float, angle_sigma: float) -> tuple[State, Array, int]:
+    """Mean state, its covariance (17, 17), and the number of the prior of the most evidence.
+
+    Where the data cannot tell which prior is right, one of them alone would be overconfident. The
+    fits go on from `steps` (K, 17) from `start`, for the `likely` (K,) priors.
+    """
+    size = grid.shape[0]
+    evidences = np.full(size, -math.inf)
+    covariances = np.zeros((size, PARAMETERS, PARAMETERS))
+    for k in range(size):
+        if likely[k]:
+            state, hessian, evidences[k] = _candidate(
+                observations, inliers, moved(start, steps[k]), priors, sigma, grid[k], threshold,
+                angle_sigma, LAST_ITERATIONS)
+            steps[k] = step_between(start, state)
+            covariances[k] = inverse(hessian)
+    best = int(np.argmax(evidences))
+    # Around the best one, where the local parameters of all of them are small.
+    origin = moved(start, steps[best])
+    weights = np.exp(evidences - evidences[best])
+    weights /= weights.sum()
+    mean = np.zeros(PARAMETERS)
+    away = np.zeros((size, PARAMETERS))
+    for k in range(size):
+        if likely[k]:
+            away[k] = step_between(origin, moved(start, steps[k]))
+            mean += weights[k] * away[k]
+    covariance = np.zeros((PARAMETERS, PARAMETERS))
+    for k in range(size):
+        if likely[k]:
+            rest = away[k] - mean
+            covariance += weights[k] * (covariances[k] + np.outer(rest, rest))
+    return moved(origin, mean), covariance, best
 
 
 @_jit
