@@ -24,9 +24,7 @@ SCALES = np.array([1.0, 4.0, 12.0])
 # Matches that are scored at once, in vector instructions, before the next look at the limit.
 BLOCK = 64
 
-# Reordered sums are what lets the loop vectorise; NaN keeps its meaning.
-_jit = numba.njit(cache=True, nogil=True, error_model='numpy',
-                  fastmath={'contract', 'reassoc', 'nsz', 'arcp'})
+_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 
 
 @_jit

@@ -36,11 +36,11 @@ THETA, TANGENT, D1, D2, DW1, DW2 = 0, 3, 5, 8, 11, 14
 # Matches of a block: enough to vectorise, few enough for the nearest cache.
 BLOCK = 64
 
-# Fused multiply-add and reordered sums. NaN and infinity keep their meaning.
-_FAST = {'contract', 'reassoc', 'nsz', 'arcp'}
-_jit = numba.njit(cache=True, nogil=True, error_model='numpy', fastmath=_FAST)
-_inlined = numba.njit(cache=True, nogil=True, error_model='numpy', fastmath=_FAST,
-                      forceinline=True)
+# No `fastmath` here nor in any kernel that poses depend on: a function is compiled anew into each
+# of its callers, and with reordered sums the copies would differ in the last bit, so that a
+# process's results would depend on which caller it ran first.
+_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
+_inlined = numba.njit(cache=True, nogil=True, error_model='numpy', forceinline=True)
 
 
 @_inlined
