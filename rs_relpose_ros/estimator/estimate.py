@@ -185,7 +185,7 @@ class _Estimation:
                                  f'{len(self.order)} usable matches, fewer than min_inliers = '
                                  f'{config.min_inliers}')
         # 1. Hypotheses from minimal samples, ranked by multi-scale MSAC.
-        return self.refine(self._sample(), delay)
+        return self.refine(self.sample(), delay)
 
     def refine(self, hypotheses: list[State], delay: float) -> RelativePose:
         """All steps after the first."""
@@ -221,7 +221,8 @@ class _Estimation:
 
     # -- steps -------------------------------------------------------------------------------
 
-    def _sample(self) -> list[State]:
+    def sample(self) -> list[State]:
+        """The first step: the best few distinct hypotheses."""
         problem, config = self.problem, self.config
         eye, zero = np.eye(3), np.zeros(3)
         align1, align2 = eye, eye
@@ -409,15 +410,24 @@ def warm_up() -> None:
                                1e-4 * np.eye(3), config=EstimatorConfig(solver=solver))
 
 
+def warm_up_sampling() -> None:
+    """Compile the kernels of the first step alone."""
+    _warm_estimation().sample()
+
+
 def warm_up_refinement() -> None:
-    """Compile the kernels of all steps but the sampling."""
+    """Compile the kernels of all steps but the first."""
+    zero = np.zeros(3)
+    start = State(np.eye(3), np.array([1.0, 0.0, 0.0]), zero, zero, zero, zero)
+    _warm_estimation().refine([start], 0.0)
+
+
+def _warm_estimation() -> _Estimation:
     points1, points2, camera, motion = _sideways()
     problem = build_problem(points1, points2, camera, motion, motion, np.eye(3),
                             1e-4 * np.eye(3))
-    zero = np.zeros(3)
-    start = State(np.eye(3), np.array([1.0, 0.0, 0.0]), zero, zero, zero, zero)
-    _Estimation(problem, MODES['auto'], EstimatorConfig(), np.arange(len(points1)),
-                np.zeros(1, dtype=np.uint64), None).refine([start], middle_row_delay(camera))
+    return _Estimation(problem, MODES['auto'], EstimatorConfig(), np.arange(len(points1)),
+                       np.zeros(1, dtype=np.uint64), None)
 
 
 def _sideways() -> tuple[Array, Array, RollingShutterCamera, FrameMotion]:

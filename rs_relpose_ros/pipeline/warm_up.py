@@ -16,7 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros import solvers
-from rs_relpose_ros.estimator.estimate import warm_up, warm_up_refinement
+from rs_relpose_ros.estimator.estimate import (
+    warm_up,
+    warm_up_refinement,
+    warm_up_sampling,
+)
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.pipeline.calibration import Calibration
 from rs_relpose_ros.pipeline.frame import Frame
@@ -71,23 +75,20 @@ def _images() -> Iterator[NDArray[np.uint8]]:
 
 
 def fill_cache() -> None:
-    """Compile all kernels, on two cores: in one process Numba compiles one at a time.
-
-    Each half starts with what the other half's last kernels call and find in the cache then.
-    """
+    """Compile all kernels, on two cores: in one process Numba compiles one at a time."""
+    down = np.array([0.0, 1.0, 0.0])
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context('spawn')) as pool:
-        other_half = pool.submit(_compile_gravity_solvers_and_refinement)
-        for solver, count in ((solvers.uniform_11pt, 11), (solvers.angular_5pt, 5)):
-            solver(*_rays(count), start_rotations=np.eye(3)[None])
-        warm_up()
+        other_half = pool.submit(_compile_all_but_sampling)
+        for solver, count in ((solvers.uniform_11pt, 11), (solvers.angular_5pt, 5),
+                              (solvers.uniform_9pt, 9), (solvers.angular_3pt, 3)):
+            solver(*_rays(count), gravity1=down, gravity2=down, start_rotations=np.eye(3)[None])
+        warm_up_sampling()
         other_half.result()
+    warm_up()
     warm_up_pipeline(Parameters())
 
 
-def _compile_gravity_solvers_and_refinement() -> None:
-    down = np.array([0.0, 1.0, 0.0])
-    for solver, count in ((solvers.uniform_9pt, 9), (solvers.angular_3pt, 3)):
-        solver(*_rays(count), gravity1=down, gravity2=down)
+def _compile_all_but_sampling() -> None:
     warm_up_refinement()
     # No pair has that many matches: everything but the estimate.
     warm_up_pipeline(Parameters.from_mapping({'min_inliers': 10_000}))
