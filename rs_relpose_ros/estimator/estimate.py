@@ -177,6 +177,7 @@ class _Estimation:
         self.priors = _priors(problem, mode, config, interval)
         self.interval = interval
         self.iterations = 0
+        self.unasked = False
 
     def run(self, delay: float) -> RelativePose:
         config = self.config
@@ -192,6 +193,9 @@ class _Estimation:
         config = self.config
         # 2. Local optimisation of each; the best in the cost of the full model.
         state = self._best(hypotheses)
+        if self.unasked and (state is None or self._explained(state) <= EXPLAINED):
+            # Angular hypotheses may explain matches by chance that the uniform model then loses.
+            state = self._best(self.sample(enough=1.0))
         if state is None:
             return self._failure(Status.NO_CONSENSUS, 'no hypothesis explains the matches')
         # 3. Refinement on its inliers.
@@ -221,8 +225,8 @@ class _Estimation:
 
     # -- steps -------------------------------------------------------------------------------
 
-    def sample(self) -> list[State]:
-        """The first step: the best few distinct hypotheses."""
+    def sample(self, enough: float = EXPLAINED) -> list[State]:
+        """The best hypotheses, of generators asked until one explains `enough` of the matches."""
         problem, config = self.problem, self.config
         eye, zero = np.eye(3), np.zeros(3)
         align1, align2 = eye, eye
@@ -241,7 +245,8 @@ class _Estimation:
                 continue
             if generator == ANGULAR_3PT and (g1 is None or g2 is None):
                 continue
-            if best_inliers > EXPLAINED * len(self.order):
+            self.unasked = best_inliers > enough * len(self.order)
+            if self.unasked:
                 break
             drawn, best_inliers = sample_hypotheses(
                 generator, problem.points, knowledge, self.order, self.seed, threshold2,
@@ -268,6 +273,12 @@ class _Estimation:
             fitted = sorted((f for f in fitted if f[1] < np.inf), key=lambda f: f[1])
             candidates = [state for state, _ in fitted[:(len(fitted) + 1) // 2]]
         return candidates[0] if candidates else None
+
+    def _explained(self, state: State) -> float:
+        """Share of the matches that are inliers of the uniform model."""
+        inliers = select_inliers(self.problem.observations, self.problem.valid, state,
+                                 self.config.threshold, self.angle_sigma)
+        return float(inliers.sum()) / len(self.order)
 
     def _in_front(self, state: State) -> State:
         near = np.abs(sampson.residuals(self.problem.observations, *state)) \
