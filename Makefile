@@ -40,7 +40,7 @@ lint: $(stamp)
 $(stamp): requirements/base.txt requirements/test.txt $(CONSTRAINTS) setup.py setup.cfg
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	    { echo '$(PYTHON) is no Python 3.11 or later; choose one: make PYTHON=python3.12 ...' >&2; exit 1; }
-	@echo 'Setting up $(VENV): about two minutes and 1.1 GB.'
+	@echo 'Setting up $(VENV): two to three minutes and 1.1 GB.'
 	@$(bin)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)
 	$(pip) install --no-compile -r requirements/test.txt $(CONSTRAINTS:%=-c %)
 	$(pip) install --no-deps --no-build-isolation --editable .
