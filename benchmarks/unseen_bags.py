@@ -21,7 +21,7 @@ from tqdm import tqdm
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.replay.baselines import best_opencv_score, METHODS
-from rs_relpose_ros.replay.comparison import differing_poses, score_of_table
+from rs_relpose_ros.replay.comparison import differing_poses, is_still, score_of_table
 from rs_relpose_ros.replay.outputs import POSES_FILE, replay_into
 from rs_relpose_ros.replay.parameter_file import read_parameters
 from rs_relpose_ros.replay.run import read_truth, ReplayedPair
@@ -34,8 +34,6 @@ from rs_relpose_ros.simulation.config import SCENES
 
 SHORTEST_READOUT, LONGEST_READOUT = 0.012, 0.035
 DURATION = 6.0
-# Below this baseline [m] between two keyframes the camera stands or only turns.
-STILL_BASELINE = 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +86,7 @@ def measure(seed: int, scene: str, readout_time: float, folder: Path) -> Row:
     opencv = min((best_opencv_score(method, answered, replayed.calibration, truth)
                   for method in METHODS), key=lambda s: s.rotation[0])
     node = score_of_table('', live.table, replayed.records, truth)
-    still = [r for r in replayed.records
-             if r.errors is not None and r.errors.baseline < STILL_BASELINE]
+    still = [record for record in replayed.records if is_still(record)]
     unequal, _ = differing_poses(live.table, folder / POSES_FILE)
     return Row(seed, scene, 1e3 * readout_time, topics.image.count, len(read_stamps(live.stamps)),
                node.pairs, node.pairs - len(still), node.answered,

@@ -19,6 +19,7 @@ from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.replay.baselines import best_opencv_score, METHODS
 from rs_relpose_ros.replay.comparison import (
     differing_poses,
+    is_still,
     PAPER_METHODS,
     replay_records,
     Score,
@@ -28,7 +29,6 @@ from rs_relpose_ros.replay.comparison import (
 )
 from rs_relpose_ros.replay.outputs import POSES_FILE, replay_into, ReplayOutcome
 from rs_relpose_ros.replay.parameter_file import read_parameters
-from rs_relpose_ros.replay.record import PairRecord
 from rs_relpose_ros.replay.run import read_truth, ReplayedPair
 from rs_relpose_ros.replay.stamps import read_stamps
 from rs_relpose_ros.result import Status
@@ -40,8 +40,6 @@ PARAMETERS = ROOT / 'bags' / 'hand_held.yaml'
 OUT = ROOT / 'demo_out'
 
 STARTED = time.monotonic()
-# The camera stands if it moved less than this between two keyframes [m].
-STILL_BASELINE = 0.03
 
 
 class DemoError(Exception):
@@ -89,7 +87,7 @@ def remarks(scores: list[Score], outcome: ReplayOutcome, live: LiveRun,
             same_frames: ReplayOutcome) -> list[str]:
     """What the table does not say."""
     without = [record for record in same_frames.records if record.status is not Status.OK]
-    still = sum(map(_is_still, without))
+    still = sum(map(is_still, without))
     statuses = ', '.join(sorted({record.status.value for record in without}))
     lines = [f'no pose: {len(without)} pairs ({statuses}); in {still} the camera hardly moves']
     differing, compared = differing_poses(live.table, same_frames.files[0])
@@ -103,11 +101,6 @@ def remarks(scores: list[Score], outcome: ReplayOutcome, live: LiveRun,
         lines.append(f'rotation: {best.rotation[0] / scores[0].rotation[0]:.0f} times better than '
                      f'the better OpenCV row, which ignores the rolling shutter and the IMU')
     return lines
-
-
-def _is_still(record: PairRecord) -> bool:
-    """Whether the camera hardly moved from one keyframe to the other."""
-    return record.errors is not None and record.errors.baseline < STILL_BASELINE
 
 
 def say(text: str) -> None:

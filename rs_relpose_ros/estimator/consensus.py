@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 # Multiples of the inlier threshold. The widest still rejects 19 of 20 random matches.
 SCALES = np.array([1.0, 4.0, 12.0])
-# Matches that are scored at once, in vector instructions, before the next look at the limit.
+# Matches that are scored before the next look at the limit.
 BLOCK = 64
 
 _jit = numba.njit(cache=True, nogil=True, error_model='numpy')

@@ -2,7 +2,7 @@
 
     python -m rs_relpose_ros.pipeline.warm_up
 
-fills the cache on two cores, in about a minute: the first run then starts at once.
+fills the cache on two cores, in one to two minutes: the first run then starts at once.
 """
 
 from __future__ import annotations

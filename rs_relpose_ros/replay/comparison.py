@@ -28,6 +28,10 @@ PAPER_METHODS: Mapping[str, Mapping[str, str | bool]] = {
 }
 
 
+# Below this baseline [m] between two keyframes the camera stands or only turns.
+STILL_BASELINE = 0.03
+
+
 @dataclass(frozen=True, slots=True)
 class Score:
     """Errors of a method over pairs, in degrees.
@@ -45,6 +49,11 @@ class Score:
     answered: int
     rotation: tuple[float, float]
     translation: tuple[float, float]
+
+
+def is_still(record: PairRecord) -> bool:
+    """Whether, by the truth, the camera hardly moved from one keyframe to the other."""
+    return record.errors is not None and record.errors.baseline < STILL_BASELINE
 
 
 def score(name: str, pairs: int, errors: Sequence[PairErrors | None]) -> Score:
