@@ -11,7 +11,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rs_relpose_ros.distortion import distort_points, RATIONAL_COEFFICIENTS, undistort_points
+from rs_relpose_ros.distortion import (
+    distort_points,
+    RATIONAL_COEFFICIENTS,
+    rays_with_jacobian,
+    undistort_points,
+)
 from rs_relpose_ros.errors import InputError
 
 REFERENCE_ROWS = ('first', 'middle', 'last')
@@ -161,35 +166,20 @@ class RollingShutterCamera:
 
         A pixel outside the region where the distortion can be inverted gives a row of NaN.
         """
-        return self._unproject(points)[0]
+        return self.unproject_with_jacobian(points)[0]
 
     def unproject_with_jacobian(
             self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Unit rays (N, 3) and their derivatives (N, 3, 2) by the raw pixel coordinates u, v."""
-        rays, normalized_by_pixel, scale = self._unproject(points)
-        # m = n / |n| with n = (x, y, 1): dm = (I - m m^T) dn / |n|.
-        jacobian = np.empty((len(rays), 3, 2))
-        jacobian[:, :2] = normalized_by_pixel
-        jacobian[:, 2] = 0.0
-        along = np.einsum('ni,nij->nj', rays, jacobian)
-        jacobian = (jacobian - rays[:, :, None] * along[:, None, :]) * scale[:, None, None]
-        return rays, jacobian
-
-    def _unproject(self, points: ArrayLike) -> tuple[NDArray[np.float64], ...]:
-        """Rays (N, 3), d(normalised)/d(pixel) (N, 2, 2), and 1 / |(x, y, 1)| (N,)."""
         points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 2)
         normalized = (points - (self.cx, self.cy)) / (self.fx, self.fy)
+        by_pixel = np.empty((len(points), 2, 2))
         if self.is_undistorted:
-            inverse = np.broadcast_to(
-                np.diag([1.0 / self.fx, 1.0 / self.fy]), (len(points), 2, 2))
+            by_pixel[:] = np.diag([1.0 / self.fx, 1.0 / self.fy])
         else:
             normalized, inverse = undistort_points(normalized, *self._distortion_arguments)
-            inverse = inverse / (self.fx, self.fy)
-        scale = 1.0 / np.sqrt(1.0 + (normalized**2).sum(axis=1))
-        rays = np.empty((len(points), 3))
-        rays[:, :2] = normalized * scale[:, None]
-        rays[:, 2] = scale
-        return rays, inverse, scale
+            np.divide(inverse, (self.fx, self.fy), out=by_pixel)
+        return rays_with_jacobian(normalized, by_pixel)
 
     @property
     def _distortion_arguments(self) -> tuple[NDArray[np.float64], bool]:

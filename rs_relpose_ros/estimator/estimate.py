@@ -18,6 +18,7 @@ from rs_relpose_ros.estimator.hypotheses import (
     ANGULAR_3PT,
     ANGULAR_5PT,
     GYRO_2PT,
+    Hypotheses,
     Knowledge,
     UNIFORM_9PT,
     UNIFORM_11PT,
@@ -25,12 +26,17 @@ from rs_relpose_ros.estimator.hypotheses import (
 from rs_relpose_ros.estimator.local_optimisation import (
     cheirality_sign,
     optimise,
-    oriented,
     select_inliers,
-    SHRINKING,
     signed,
 )
-from rs_relpose_ros.estimator.map_fit import inverse, normal_equations, PINNED, Priors, State
+from rs_relpose_ros.estimator.map_fit import (
+    inverse,
+    linearised,
+    normal_equations,
+    PINNED,
+    Priors,
+    State,
+)
 from rs_relpose_ros.estimator.problem import (
     build_problem,
     middle_row_delay,
@@ -188,7 +194,7 @@ class _Estimation:
         # 1. Hypotheses from minimal samples, ranked by multi-scale MSAC.
         return self.refine(self.sample(), delay)
 
-    def refine(self, hypotheses: list[State], delay: float) -> RelativePose:
+    def refine(self, hypotheses: Hypotheses, delay: float) -> RelativePose:
         """All steps after the first."""
         config = self.config
         # 2. Local optimisation of each; the best in the cost of the full model.
@@ -225,10 +231,10 @@ class _Estimation:
 
     # -- steps -------------------------------------------------------------------------------
 
-    def sample(self, enough: float = EXPLAINED) -> list[State]:
+    def sample(self, enough: float = EXPLAINED) -> Hypotheses:
         """The best hypotheses, of generators asked until one explains `enough` of the matches."""
         problem, config = self.problem, self.config
-        eye, zero = np.eye(3), np.zeros(3)
+        eye = np.eye(3)
         align1, align2 = eye, eye
         g1, g2 = problem.motion1.gravity, problem.motion2.gravity
         if g1 is not None and g2 is not None:
@@ -253,26 +259,21 @@ class _Estimation:
                 config.confidence, config.max_iterations, best_inliers, pool_R, pool_x, pool_cost)
             self.iterations += drawn
         found = np.argsort(pool_cost)[:np.isfinite(pool_cost).sum()]
-        return [State(pool_R[k].copy(), pool_x[k, :3] / np.linalg.norm(pool_x[k, :3]),
-                      pool_x[k, 3:6].copy(), pool_x[k, 6:9].copy(), zero, zero) for k in found]
+        return Hypotheses(pool_R[found], pool_x[found])
 
-    def _best(self, hypotheses: list[State]) -> State | None:
+    def _best(self, hypotheses: Hypotheses) -> State | None:
         config, problem = self.config, self.problem
+        if not len(hypotheses.R):
+            return None
         if config.refinement != 'map':
             # The paper's way: the best hypothesis as it is.
-            return self._in_front(hypotheses[0]) if hypotheses else None
+            R, x, zero = hypotheses.R[0], hypotheses.x[0], np.zeros(3)
+            return self._in_front(State(R, x[:3], x[3:6], x[6:], zero, zero))
         priors = with_velocity_sigma(self.priors, SAMPLING_VELOCITY_SIGMA) \
             if self.mode.velocities or self.mode.derotate else self.priors
-        candidates = [oriented(problem.observations, problem.valid, start, config.threshold)
-                      for start in hypotheses]
-        for scale in SHRINKING:
-            fitted = [optimise(problem.observations, problem.valid, state, priors,
-                               config.pixel_sigma, config.threshold, scale, self.angle_sigma)
-                      for state in candidates]
-            # The better half goes on: later fits are spent where they may matter.
-            fitted = sorted((f for f in fitted if f[1] < np.inf), key=lambda f: f[1])
-            candidates = [state for state, _ in fitted[:(len(fitted) + 1) // 2]]
-        return candidates[0] if candidates else None
+        state, found = optimise(problem.observations, problem.valid, hypotheses.R, hypotheses.x,
+                                priors, config.pixel_sigma, config.threshold, self.angle_sigma)
+        return state if found else None
 
     def _explained(self, state: State) -> float:
         """Share of the matches that are inliers of the uniform model."""
@@ -357,7 +358,7 @@ class _Estimation:
         """Covariance (17, 17) of the local parameters from the regularised Hessian."""
         priors = with_velocity_sigma(self.priors, velocity_sigma)
         hessian, gradient, _ = normal_equations(
-            self.problem.observations, inliers, state, priors, sigma)
+            linearised(self.problem.observations, inliers, state, sigma), state, priors)
         local = inverse(hessian)
         # A state that is not the optimum is off by about this step.
         step = local @ gradient
@@ -428,9 +429,7 @@ def warm_up_sampling() -> None:
 
 def warm_up_refinement() -> None:
     """Compile the kernels of all steps but the first."""
-    zero = np.zeros(3)
-    start = State(np.eye(3), np.array([1.0, 0.0, 0.0]), zero, zero, zero, zero)
-    _warm_estimation().refine([start], 0.0)
+    _warm_estimation().refine(Hypotheses(np.eye(3)[None], np.eye(1, 9)), 0.0)
 
 
 def _warm_estimation() -> _Estimation:

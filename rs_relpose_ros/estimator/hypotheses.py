@@ -23,6 +23,13 @@ MAX_SOLUTIONS = 12
 _jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 
 
+class Hypotheses(NamedTuple):
+    """Rotations R (K, 3, 3), and x (K, 9): ``t`` (unit), ``d_1, d_2`` up to a common sign."""
+
+    R: Array
+    x: Array
+
+
 class Knowledge(NamedTuple):
     """What the IMU gives to the generators: gravity-aligning rotations, predicted rotation.
 

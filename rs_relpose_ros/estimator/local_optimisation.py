@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.estimator import sampson
-from rs_relpose_ros.estimator.map_fit import fit, prior_cost, Priors, State
+from rs_relpose_ros.estimator.map_fit import fit, linearised, prior_cost, Priors, State
 
 Array = NDArray[np.float64]
 
@@ -105,47 +105,85 @@ def gate_depths(observations: Array, use: NDArray[np.bool_], state: State,
 
 
 @_jit
-def select_inliers(observations: Array, valid: NDArray[np.bool_], state: State, threshold: float,
-                   angle_sigma: float) -> NDArray[np.bool_]:
-    """Matches within `threshold` [px] whose depths are plausible."""
-    r = sampson.residuals(observations, state.R, state.t, state.d1, state.d2, state.dw1, state.dw2)
+def within(r: Array, observations: Array, valid: NDArray[np.bool_], state: State,
+           threshold: float, angle_sigma: float) -> NDArray[np.bool_]:
+    """Matches whose residuals `r` (N,) at `state` are below `threshold`, of plausible depths."""
     use = valid & (np.abs(r) < threshold)
     gate_depths(observations, use, state, angle_sigma)
     return use
 
 
 @_jit
-def truncated_cost(observations: Array, valid: NDArray[np.bool_], state: State, priors: Priors,
-                   threshold: float, sigma: float) -> float:
-    """MSAC cost of the uniform model in units of sigma, priors included."""
+def select_inliers(observations: Array, valid: NDArray[np.bool_], state: State, threshold: float,
+                   angle_sigma: float) -> NDArray[np.bool_]:
+    """Matches within `threshold` [px] whose depths are plausible."""
     r = sampson.residuals(observations, state.R, state.t, state.d1, state.d2, state.dw1, state.dw2)
+    return within(r, observations, valid, state, threshold, angle_sigma)
+
+
+@_jit
+def _truncated_cost(r: Array, valid: NDArray[np.bool_], threshold: float, sigma: float) -> float:
+    """MSAC cost of residuals (N,) in units of sigma."""
     cost = 0.0
-    for i in range(observations.shape[0]):
+    for i in range(r.shape[0]):
         if valid[i]:
             cost += min(r[i] * r[i], threshold * threshold)
-    return cost / (sigma * sigma) + prior_cost(state, priors)
+    return cost / (sigma * sigma)
 
 
 @_jit
-def oriented(observations: Array, valid: NDArray[np.bool_], state: State,
-             threshold: float) -> State:
-    """A hypothesis with the sign that puts its matches in front of the cameras."""
-    everything = select_inliers(observations, valid, state, SHRINKING[0] * threshold, 1e9)
-    return signed(state, cheirality_sign(observations, everything, state))
+def optimise(observations: Array, valid: NDArray[np.bool_], R: Array, x: Array, priors: Priors,
+             sigma: float, threshold: float, angle_sigma: float) -> tuple[State, bool]:
+    """Fit the uniform model to each hypothesis; the one of the least MSAC cost, priors included.
 
+    The threshold shrinks from round to round, and the better half goes on: later fits are spent
+    where they may matter.
 
-@_jit
-def optimise(observations: Array, valid: NDArray[np.bool_], start: State, priors: Priors,
-             sigma: float, threshold: float, scale: float,
-             angle_sigma: float) -> tuple[State, float]:
-    """Fit the uniform model to the matches within `scale` times the threshold.
+    Parameters
+    ----------
+    R, x : (K, 3, 3), (K, 9) ndarray
+        Hypotheses: rotation, and ``t, d_1, d_2`` up to a common sign.
+    sigma, threshold : float
+        Noise of a match and inlier threshold [px].
+    angle_sigma : float
+        Noise of a match [rad].
 
-    Returns the state and its MSAC cost at that scale; infinite for too few matches.
+    Returns
+    -------
+    state : State
+    found : bool
+        False where no hypothesis explains enough matches; then the state means nothing.
     """
-    use = select_inliers(observations, valid, start, scale * threshold, angle_sigma)
-    if use.sum() < 6:
-        return start, math.inf
-    # Wide selections hold outliers: their residuals are not pixel noise.
-    state, _, _ = fit(observations, use, start, priors, scale * sigma, ITERATIONS)
-    return state, truncated_cost(observations, valid, state, priors, scale * threshold,
-                                 scale * sigma)
+    # What goes on, with its residuals.
+    states, r = [], []
+    for k in range(R.shape[0]):
+        state = State(R[k].copy(), x[k, 0:3].copy(), x[k, 3:6].copy(), x[k, 6:9].copy(),
+                      np.zeros(3), np.zeros(3))
+        r.append(sampson.residuals(observations, state.R, state.t, state.d1, state.d2, state.dw1,
+                                   state.dw2))
+        # The sign that puts its matches in front of the cameras; residuals change theirs with it.
+        near = within(r[k], observations, valid, state, SHRINKING[0] * threshold, 1e9)
+        states.append(signed(state, cheirality_sign(observations, near, state)))
+    for scale in SHRINKING:
+        costs = np.full(len(states), math.inf)
+        for k in range(len(states)):
+            use = within(r[k], observations, valid, states[k], scale * threshold, angle_sigma)
+            if use.sum() < 6:
+                continue
+            # Wide selections hold outliers: their residuals are not pixel noise.
+            noise = scale * sigma
+            state, _, _, _ = fit(observations, use, states[k],
+                                 linearised(observations, use, states[k], noise), priors, noise,
+                                 ITERATIONS)
+            states[k] = state
+            r[k] = sampson.residuals(observations, state.R, state.t, state.d1, state.d2,
+                                     state.dw1, state.dw2)
+            costs[k] = _truncated_cost(r[k], valid, scale * threshold, noise) \
+                + prior_cost(state, priors)
+        order = np.argsort(costs, kind='mergesort')
+        good = int((costs < math.inf).sum())
+        if good == 0:
+            return states[0], False
+        states = [states[order[k]] for k in range((good + 1) // 2)]
+        r = [r[order[k]] for k in range((good + 1) // 2)]
+    return states[0], True

@@ -29,6 +29,8 @@ from rs_relpose_ros.so3 import exp_so3, log_so3
 Array = NDArray[np.float64]
 
 PINNED = 1e14
+# A fit ends where a step gains less than this share of a cost (chi-square) of one.
+LEAST_GAIN = 1e-7
 
 _jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 
@@ -124,16 +126,35 @@ def prior_cost(state: State, priors: Priors) -> float:
     return _add_priors(state, priors, np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS))
 
 
+class DataTerm(NamedTuple):
+    """The matches' part of the objective about one state, in units of their noise.
+
+    No prior is in it, so that fits with different priors share it.
+    """
+
+    hessian: Array
+    gradient: Array
+    cost: float
+
+
 @_jit
-def normal_equations(observations: Array, use: NDArray[np.bool_], state: State, priors: Priors,
-                     sigma: float) -> tuple[Array, Array, float]:
-    """Hessian (17, 17), half gradient (17,) and cost of the whole objective at `state`."""
+def linearised(observations: Array, use: NDArray[np.bool_], state: State,
+               sigma: float) -> DataTerm:
+    """Hessian (17, 17), half gradient (17,) and cost of the matches in `use` about `state`."""
     hessian, gradient, squares = sampson.normal_equations(
         observations, use, state.R, state.t, state.d1, state.d2, state.dw1, state.dw2)
     weight = 1.0 / (sigma * sigma)
     hessian *= weight
     gradient *= weight
-    return hessian, gradient, squares * weight + _add_priors(state, priors, hessian, gradient)
+    return DataTerm(hessian, gradient, squares * weight)
+
+
+@_jit
+def normal_equations(data: DataTerm, state: State, priors: Priors) -> tuple[Array, Array, float]:
+    """Hessian (17, 17), half gradient (17,) and cost of the whole objective at `state`."""
+    hessian, gradient = data.hessian.copy(), data.gradient.copy()
+    cost = data.cost + _add_priors(state, priors, hessian, gradient)
+    return hessian, gradient, cost
 
 
 @_jit
@@ -197,12 +218,29 @@ def cholesky_solve(factor: Array, right: Array) -> Array:
 
 
 @_jit
-def fit(observations: Array, use: NDArray[np.bool_], start: State, priors: Priors, sigma: float,
-        iterations: int) -> tuple[State, float, Array]:
-    """Levenberg-Marquardt from `start` over the matches in `use`; state, cost and Hessian."""
+def fit(observations: Array, use: NDArray[np.bool_], start: State, data: DataTerm,
+        priors: Priors, sigma: float,
+        iterations: int) -> tuple[State, DataTerm, float, Array]:
+    """Levenberg-Marquardt from `start` over the matches in `use`.
+
+    Parameters
+    ----------
+    data : DataTerm
+        About `start`.
+
+    Returns
+    -------
+    state : State
+    data : DataTerm
+        About that state.
+    cost : float
+        Of the whole objective.
+    hessian : (17, 17) ndarray
+        Of the whole objective.
+    """
     state = start
     damping = 1e-4
-    hessian, gradient, cost = normal_equations(observations, use, state, priors, sigma)
+    hessian, gradient, cost = normal_equations(data, state, priors)
     damped = np.empty((PARAMETERS, PARAMETERS))
     factor = np.zeros((PARAMETERS, PARAMETERS))
     for _ in range(iterations):
@@ -214,22 +252,23 @@ def fit(observations: Array, use: NDArray[np.bool_], start: State, priors: Prior
             if damping > 1e8:
                 break
             continue
-        candidate = moved(state, cholesky_solve(factor, -gradient))
+        step = cholesky_solve(factor, -gradient)
+        # What the step promises to gain (Newton's decrement): too little to look at it.
+        if -(gradient * step).sum() < LEAST_GAIN * (1.0 + cost):
+            break
+        candidate = moved(state, step)
         # Most steps are taken: their derivatives cost little more than the residuals alone.
-        next_hessian, next_gradient, next_cost = normal_equations(
-            observations, use, candidate, priors, sigma)
+        next_data = linearised(observations, use, candidate, sigma)
+        next_hessian, next_gradient, next_cost = normal_equations(next_data, candidate, priors)
         if next_cost <= cost:
-            gain = cost - next_cost
-            state, hessian, gradient, cost = candidate, next_hessian, next_gradient, next_cost
+            state, data = candidate, next_data
+            hessian, gradient, cost = next_hessian, next_gradient, next_cost
             damping = max(damping * 0.1, 1e-9)
-            # Relative to one degree of freedom's worth of chi-square.
-            if gain < 1e-6 * (1.0 + cost):
-                break
         else:
             damping *= 10.0
             if not damping < 1e8:
                 break
-    return state, cost, hessian
+    return state, data, cost, hessian
 
 
 @_jit

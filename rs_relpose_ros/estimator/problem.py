@@ -89,15 +89,7 @@ def build_problem(points1: Array, points2: Array, camera: RollingShutterCamera,
         observations[:, 18 + k] = tau
         _derotate(rays, jacobian, np.ascontiguousarray(turns), camera.line_delay * rate,
                   observations[:, 9 * k:9 * k + 9])
-    valid = np.asarray(np.isfinite(observations).all(axis=1))
-    with np.errstate(all='ignore'):
-        points = np.stack([
-            observations[:, 0] / observations[:, 2], observations[:, 1] / observations[:, 2],
-            observations[:, 9] / observations[:, 11], observations[:, 10] / observations[:, 11],
-            observations[:, 18], observations[:, 19]])
-    behind = ~((observations[:, 2] > 1e-6) & (observations[:, 11] > 1e-6))
-    points[:, behind | ~valid] = np.nan
-    observations[~valid] = 0.0
+    valid, points = _checked_columns(observations)
     return TwoViewProblem(observations, points, valid, 0.5 * (camera.fx + camera.fy), motion1,
                           motion2, rotation, information)
 
@@ -118,6 +110,23 @@ def _derotate(rays: Array, jacobian: Array, turns: Array, turn_of_a_row: Array,
         for j in range(3):
             k, m = (j + 1) % 3, (j + 2) % 3
             block[i, 6 + j] += turn_of_a_row[k] * block[i, m] - turn_of_a_row[m] * block[i, k]
+
+
+@numba.njit(cache=True, nogil=True)
+def _checked_columns(observations: Array) -> tuple[NDArray[np.bool_], Array]:
+    """Which rows are finite (the others become zero), and the points for `consensus`."""
+    n = len(observations)
+    valid, points = np.empty(n, dtype=np.bool_), np.full((6, n), np.nan)
+    for i in range(n):
+        o = observations[i]
+        valid[i] = np.isfinite(o).all()
+        if not valid[i]:
+            o[:] = 0.0
+        elif o[2] > 1e-6 and o[11] > 1e-6:
+            points[0, i], points[1, i] = o[0] / o[2], o[1] / o[2]
+            points[2, i], points[3, i] = o[9] / o[11], o[10] / o[11]
+            points[4, i], points[5, i] = o[18], o[19]
+    return valid, points
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -192,27 +192,6 @@ def _linearise(o, baselines, turns1, turns2, basis, rows):  # type: ignore[no-un
         rows[17, i] = r
 
 
-@_inlined
-def _add_products(rows, j, k, gram):  # type: ignore[no-untyped-def]
-    """Add the inner products of three rows from j on with three from k on to `gram`."""
-    s00 = s01 = s02 = s10 = s11 = s12 = s20 = s21 = s22 = 0.0
-    for i in range(BLOCK):
-        a0, a1, a2 = rows[j, i], rows[j + 1, i], rows[j + 2, i]
-        b0, b1, b2 = rows[k, i], rows[k + 1, i], rows[k + 2, i]
-        s00, s01, s02 = s00 + a0 * b0, s01 + a0 * b1, s02 + a0 * b2
-        s10, s11, s12 = s10 + a1 * b0, s11 + a1 * b1, s12 + a1 * b2
-        s20, s21, s22 = s20 + a2 * b0, s21 + a2 * b1, s22 + a2 * b2
-    gram[j, k] += s00
-    gram[j, k + 1] += s01
-    gram[j, k + 2] += s02
-    gram[j + 1, k] += s10
-    gram[j + 1, k + 1] += s11
-    gram[j + 1, k + 2] += s12
-    gram[j + 2, k] += s20
-    gram[j + 2, k + 1] += s21
-    gram[j + 2, k + 2] += s22
-
-
 @_jit
 def residuals(observations: Array, R: Array, t: Array, d1: Array, d2: Array, dw1: Array,
               dw2: Array) -> Array:
@@ -258,19 +237,17 @@ def normal_equations(observations: Array, use: NDArray[np.bool_], R: Array, t: A
     baselines, turns1, turns2 = _baselines(t, d1, d2), _turns(dw1, np.eye(3)), _turns(dw2, R)
     basis = tangent_basis(t)
     block, rows = np.empty((20, BLOCK)), np.empty((PARAMETERS + 1, BLOCK))
-    # The residual as the last column of J: one product holds all three results.
+    # The residual as the last column of J: one product holds all three results. By BLAS, whose
+    # sums are in one order whoever calls; a block is too small for it to start threads.
     gram = np.zeros((PARAMETERS + 1, PARAMETERS + 1))
+    product = np.empty((PARAMETERS + 1, PARAMETERS + 1))
     first = 0
     while first < observations.shape[0]:
         first, _ = _gather(observations, use, first, block)
         _linearise(block, baselines, turns1, turns2, basis, rows)
-        for j in range(0, PARAMETERS + 1, 3):
-            for k in range(0, j + 1, 3):
-                _add_products(rows, j, k, gram)
-    hessian = np.empty((PARAMETERS, PARAMETERS))
-    for j in range(PARAMETERS):
-        for k in range(j + 1):
-            hessian[j, k] = hessian[k, j] = gram[j, k]
+        np.dot(rows, rows.T, product)
+        gram += product
+    hessian = gram[:PARAMETERS, :PARAMETERS].copy()
     return hessian, gram[PARAMETERS, :PARAMETERS].copy(), gram[PARAMETERS, PARAMETERS]
 
 

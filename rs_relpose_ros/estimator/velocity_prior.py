@@ -13,10 +13,12 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.estimator.local_optimisation import gate_depths, select_inliers
+from rs_relpose_ros.estimator.local_optimisation import gate_depths, within
 from rs_relpose_ros.estimator.map_fit import (
+    DataTerm,
     fit,
     inverse,
+    linearised,
     log_determinant,
     moved,
     Priors,
@@ -86,28 +88,36 @@ def fit_with_evidence(observations: Array, valid: NDArray[np.bool_], start: Stat
     """
     size = grid.shape[0]
     state = start
-    inliers = select_inliers(observations, valid, state, threshold, angle_sigma)
-    sigma = _noise(observations, inliers, state, told_sigma)
+    inliers, sigma = _selected(observations, valid, state, threshold, angle_sigma, told_sigma)
     # Optimum of each prior as a step from `start`, and its evidence in its last round.
     steps = np.zeros((size, PARAMETERS))
     lacking = np.zeros(size)
     evidences = np.full(size, -math.inf)
-    best = 0
+    # The prior that `start` comes from, or the one next to it.
+    best = int(np.argmin(np.abs(np.log(grid * math.sqrt(priors.velocity_weight)))))
     for turn in range(ROUNDS):
         low, high = 0, size
         if turn > 0:   # the choice moves little once the inliers stand
             low, high = max(best - 1, 0), min(best + 2, size)
-        for k in range(low, high):
-            candidate, _, evidences[k] = _candidate(
-                observations, inliers, state, priors, sigma, grid[k], threshold, angle_sigma,
-                ITERATIONS)
-            steps[k] = step_between(start, candidate)
+        # From the best prior down and from it up, each fit from its neighbour's optimum.
+        data = linearised(observations, inliers, state, sigma)
+        upwards, upwards_data = state, data
+        for turned in range(high - low):
+            k = best - turned if turned <= best - low else low + turned
+            if k == best + 1:
+                state, data = upwards, upwards_data
+            state, data, _, evidences[k] = _candidate(
+                observations, inliers, state, data, priors, sigma, grid[k], threshold,
+                angle_sigma, ITERATIONS)
+            if k == best:
+                upwards, upwards_data = state, data
+            steps[k] = step_between(start, state)
         best = low + int(np.argmax(evidences[low:high]))
         lacking[low:high] = evidences[best] - evidences[low:high]
         state = moved(start, steps[best])
         chosen_from = inliers
-        inliers = select_inliers(observations, valid, state, _reach(threshold, sigma), angle_sigma)
-        sigma = _noise(observations, inliers, state, told_sigma)
+        inliers, sigma = _selected(observations, valid, state, _reach(threshold, sigma),
+                                   angle_sigma, told_sigma)
         if (inliers == chosen_from).all():
             break
     state, covariance, best = _average(
@@ -123,12 +133,26 @@ def _reach(threshold: float, sigma: float) -> float:
 
 
 @_jit
-def _candidate(observations: Array, inliers: NDArray[np.bool_], start: State, priors: Priors,
-               sigma: float, velocity_sigma: float, threshold: float, angle_sigma: float,
-               iterations: int) -> tuple[State, Array, float]:
-    """Fit with one velocity prior; the state, its Hessian, and the logarithm of its evidence."""
-    state, cost, hessian = fit(observations, inliers, start,
-                               with_velocity_sigma(priors, velocity_sigma), sigma, iterations)
+def _selected(observations: Array, valid: NDArray[np.bool_], state: State, threshold: float,
+              angle_sigma: float, told_sigma: float) -> tuple[NDArray[np.bool_], float]:
+    """Inliers of a state, and their noise [px]."""
+    r = residuals(observations, state.R, state.t, state.d1, state.d2, state.dw1, state.dw2)
+    inliers = within(r, observations, valid, state, threshold, angle_sigma)
+    squares = 0.0
+    for i in range(len(r)):
+        if inliers[i]:
+            squares += r[i] * r[i]
+    return inliers, noise_sigma(squares, inliers.sum(), told_sigma)
+
+
+@_jit
+def _candidate(observations: Array, inliers: NDArray[np.bool_], start: State, data: DataTerm,
+               priors: Priors, sigma: float, velocity_sigma: float, threshold: float,
+               angle_sigma: float, iterations: int) -> tuple[State, DataTerm, Array, float]:
+    """Fit with one velocity prior: state, its data term and Hessian, and its log-evidence."""
+    state, data, cost, hessian = fit(
+        observations, inliers, start, data, with_velocity_sigma(priors, velocity_sigma), sigma,
+        iterations)
     # Velocities that carry the camera past its own baseline within a frame explain any residual,
     # with points behind the cameras: those count as outliers.
     plausible = inliers.copy()
@@ -136,7 +160,7 @@ def _candidate(observations: Array, inliers: NDArray[np.bool_], start: State, pr
     cost += (inliers.sum() - plausible.sum()) * (threshold / sigma) ** 2
     evidence = (-0.5 * cost - 0.5 * log_determinant(hessian)
                 - (6.0 + SMALL_IS_LIKELIER) * math.log(velocity_sigma))
-    return state, hessian, evidence
+    return state, data, hessian, evidence
 
 
 @_jit
@@ -153,9 +177,10 @@ def _average(observations: Array, inliers: NDArray[np.bool_], start: State, step
     covariances = np.zeros((size, PARAMETERS, PARAMETERS))
     for k in range(size):
         if likely[k]:
-            state, hessian, evidences[k] = _candidate(
-                observations, inliers, moved(start, steps[k]), priors, sigma, grid[k], threshold,
-                angle_sigma, LAST_ITERATIONS)
+            own = moved(start, steps[k])
+            state, _, hessian, evidences[k] = _candidate(
+                observations, inliers, own, linearised(observations, inliers, own, sigma),
+                priors, sigma, grid[k], threshold, angle_sigma, LAST_ITERATIONS)
             steps[k] = step_between(start, state)
             covariances[k] = inverse(hessian)
     best = int(np.argmax(evidences))
@@ -175,15 +200,3 @@ def _average(observations: Array, inliers: NDArray[np.bool_], start: State, step
             rest = away[k] - mean
             covariance += weights[k] * (covariances[k] + np.outer(rest, rest))
     return moved(origin, mean), covariance, best
-
-
-@_jit
-def _noise(observations: Array, inliers: NDArray[np.bool_], state: State,
-           told_sigma: float) -> float:
-    """Noise of a match [px] from the residuals of a state."""
-    r = residuals(observations, state.R, state.t, state.d1, state.d2, state.dw1, state.dw2)
-    squares = 0.0
-    for i in range(len(r)):
-        if inliers[i]:
-            squares += r[i] * r[i]
-    return noise_sigma(squares, inliers.sum(), told_sigma)
