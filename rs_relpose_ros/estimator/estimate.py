@@ -475,7 +475,7 @@ def _priors(problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig,
     information = problem.rotation_information
     return Priors(
         unit1, unit2, config.gravity_sigma**-2 if known else 0.0,
-        config.gyro_sigma**-2 if mode.derotate else PINNED,
+        problem.reference_row_time, config.gyro_sigma**-2 if mode.derotate else PINNED,
         SAMPLING_VELOCITY_SIGMA**-2 if free else PINNED,
         1.0 / interval if free and interval is not None else 0.0,
         np.ascontiguousarray(rotation),

@@ -2,10 +2,11 @@
 
 Minimises, over ``R, t`` (unit), ``d_1, d_2, dw_1, dw_2`` (design section 4)::
 
-    sum r_i^2 / s^2  +  |g_1 x R g_2|^2 / (2 s_g^2)  +  (|dw_1|^2 + |dw_2|^2) / s_w^2
+    sum r_i^2 / s^2  +  |g x k|^2 / (2 s_g^2)  +  (|dw_1|^2 + |dw_2|^2) / s_w^2
         +  (|d_1 - c t|^2 + |d_2 - c t|^2) / s_d^2  +  theta^T Lambda theta
 
-with ``theta = Log(R R_gyro^T)``.
+with ``theta = Log(R R_gyro^T)``, and ``g = Exp(T dw_1) g_1``, ``k = Exp(T dw_2) R g_2``: gravity
+was measured T after the middle row, and the error of the rate is in what turned it from there.
 
 ``c`` is 1 / interval where the time between the frames is known (constant velocity), else 0. By
 Levenberg-Marquardt with the exact Jacobian (the Sampson denominator included: treating it as
@@ -23,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.estimator import sampson
-from rs_relpose_ros.estimator.sampson import D1, D2, DW1, DW2, PARAMETERS, TANGENT
+from rs_relpose_ros.estimator.sampson import D1, D2, DW1, DW2, PARAMETERS, TANGENT, THETA
 from rs_relpose_ros.so3 import exp_so3, log_so3
 
 Array = NDArray[np.float64]
@@ -36,11 +37,15 @@ _jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 
 
 class Priors(NamedTuple):
-    """Weights are inverse variances; 0 where nothing is known. All at the middle row."""
+    """Weights are inverse variances; 0 where nothing is known. All at the middle row.
+
+    Gravity was measured `gravity_row_time` [s] after that and turned there by the gyro.
+    """
 
     gravity1: Array
     gravity2: Array
     gravity_weight: float
+    gravity_row_time: float
     rate_weight: float
     velocity_weight: float
     velocity_rate: float
@@ -60,31 +65,42 @@ class State(NamedTuple):
 
 
 @_jit
+def _add_gravity_prior(state: State, priors: Priors, hessian: Array, gradient: Array) -> float:
+    """``r = g x k`` of the two directions in frame 1; each is off by as much as one frame's."""
+    # Gravity is known at a row from which the gyro, errors included, leads to the middle row.
+    tau = priors.gravity_row_time
+    g = exp_so3(tau * state.dw1) @ priors.gravity1
+    k = exp_so3(tau * state.dw2) @ (state.R @ priors.gravity2)
+    dot = (g * k).sum()
+    # dr = ((g.k) I - k g^T) (dtheta + tau ddw_2) + tau (g k^T - (g.k) I) ddw_1
+    blocks = (THETA, DW1, DW2)
+    jac = np.zeros((3, 9))
+    for i in range(3):
+        for j in range(3):
+            same = dot if i == j else 0.0
+            jac[i, j] = same - k[i] * g[j]
+            jac[i, 3 + j] = tau * (g[i] * k[j] - same)
+            jac[i, 6 + j] = tau * jac[i, j]
+    r = np.empty(3)
+    r[0] = g[1] * k[2] - g[2] * k[1]
+    r[1] = g[2] * k[0] - g[0] * k[2]
+    r[2] = g[0] * k[1] - g[1] * k[0]
+    # Each of the two directions carries the error: twice the variance of one.
+    w = 0.5 * priors.gravity_weight
+    for a in range(9):
+        row = blocks[a // 3] + a % 3
+        gradient[row] += w * (jac[:, a] * r).sum()
+        for b in range(9):
+            hessian[row, blocks[b // 3] + b % 3] += w * (jac[:, a] * jac[:, b]).sum()
+    return w * (r * r).sum()
+
+
+@_jit
 def _add_priors(state: State, priors: Priors, hessian: Array, gradient: Array) -> float:
     """Add the priors to the normal equations; their part of the cost."""
     cost = 0.0
     if priors.gravity_weight > 0.0:
-        # r = g_1 x k, k = R g_2;  dr/dtheta = (g_1.k) I - k g_1^T
-        g = priors.gravity1
-        k = state.R @ priors.gravity2
-        r = np.empty(3)
-        r[0] = g[1] * k[2] - g[2] * k[1]
-        r[1] = g[2] * k[0] - g[0] * k[2]
-        r[2] = g[0] * k[1] - g[1] * k[0]
-        dot = g[0] * k[0] + g[1] * k[1] + g[2] * k[2]
-        jac = np.empty((3, 3))
-        for i in range(3):
-            for j in range(3):
-                jac[i, j] = -k[i] * g[j]
-            jac[i, i] += dot
-        # Each of the two directions carries the error: twice the variance of one.
-        w = 0.5 * priors.gravity_weight
-        for i in range(3):
-            cost += w * r[i] * r[i]
-            for j in range(3):
-                gradient[j] += w * jac[i, j] * r[i]
-                for m in range(3):
-                    hessian[j, m] += w * jac[i, j] * jac[i, m]
+        cost += _add_gravity_prior(state, priors, hessian, gradient)
     theta = log_so3(state.R @ priors.rotation.T)
     info = priors.rotation_information
     for i in range(3):

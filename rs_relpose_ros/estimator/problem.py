@@ -36,6 +36,8 @@ class TwoViewProblem:
         Mean focal length [px]: pixels per radian at the image centre.
     motion1, motion2 : FrameMotion
         At the middle row.
+    reference_row_time : float
+        Row time [s] of the user's reference row, where gravity was measured, from the middle row.
     rotation, rotation_information : (3, 3) ndarray or None
         Gyro-predicted ``R_1^T R_2`` between the middle rows, and the inverse covariance of its
         error in frame 1.
@@ -47,6 +49,7 @@ class TwoViewProblem:
     focal: float
     motion1: FrameMotion
     motion2: FrameMotion
+    reference_row_time: float
     rotation: Array | None
     rotation_information: Array | None
 
@@ -91,7 +94,7 @@ def build_problem(points1: Array, points2: Array, camera: RollingShutterCamera,
                   observations[:, 9 * k:9 * k + 9])
     valid, points = _checked_columns(observations)
     return TwoViewProblem(observations, points, valid, 0.5 * (camera.fx + camera.fy), motion1,
-                          motion2, rotation, information)
+                          motion2, -delay, rotation, information)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -54,9 +54,9 @@ _jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 @_jit
 def with_velocity_sigma(priors: Priors, sigma: float) -> Priors:
     """The priors with another sigma of the linear velocities [baselines per second]."""
-    return Priors(priors.gravity1, priors.gravity2, priors.gravity_weight, priors.rate_weight,
-                  1.0 / (sigma * sigma), priors.velocity_rate, priors.rotation,
-                  priors.rotation_information)
+    return Priors(priors.gravity1, priors.gravity2, priors.gravity_weight,
+                  priors.gravity_row_time, priors.rate_weight, 1.0 / (sigma * sigma),
+                  priors.velocity_rate, priors.rotation, priors.rotation_information)
 
 
 @_jit
