@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from rs_relpose_ros.compiled import kernel
 
 Array = NDArray[np.float64]
 
@@ -22,10 +23,8 @@ _ITERATIONS = 50
 # Step [1] below which Newton has converged: 1e-9 px at any focal length.
 _CONVERGED = 1e-13
 
-_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 
-
-@_jit
+@kernel
 def distort(x: float, y: float, k: Array, fisheye: bool, out: Array) -> None:
     """Distorted normalised point and its derivative: `out` (6,) = x', y', and d(x', y')/d(x, y).
 
@@ -66,7 +65,7 @@ def distort(x: float, y: float, k: Array, fisheye: bool, out: Array) -> None:
     out[5] = radial + 2.0 * slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x + 2.0 * y * prism_y
 
 
-@_jit
+@kernel
 def distort_points(points: Array, k: Array, fisheye: bool) -> Array:
     """Distorted normalised points (N, 2)."""
     out = np.empty(points.shape)
@@ -77,7 +76,7 @@ def distort_points(points: Array, k: Array, fisheye: bool) -> Array:
     return out
 
 
-@_jit
+@kernel
 def undistort_points(points: Array, k: Array, fisheye: bool) -> tuple[Array, Array]:
     """Undistorted normalised points (N, 2) and their derivatives (N, 2, 2) by the distorted ones.
 
@@ -122,7 +121,7 @@ def undistort_points(points: Array, k: Array, fisheye: bool) -> tuple[Array, Arr
     return out, inverse
 
 
-@_jit
+@kernel
 def rays_with_jacobian(normalized: Array, by_pixel: Array) -> tuple[Array, Array]:
     """Unit rays (N, 3) through points (N, 2) at z = 1, and their derivatives (N, 3, 2).
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.so3 import exp_so3, log_so3
 
@@ -137,7 +137,7 @@ class FrameMotion:
                        knot_rotations=turn.T @ self.knot_rotations)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def rotations_at_rate(rate: Array, times: Array) -> Array:
     """``Exp(w t)`` (N, 3, 3) at the times (N,) [s]."""
     out = np.empty((len(times), 3, 3))
@@ -146,7 +146,7 @@ def rotations_at_rate(rate: Array, times: Array) -> Array:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def rotations_between(knot_times: Array, knot_rotations: Array, times: Array) -> Array:
     """Orientations (N, 3, 3) at times (N,) within the knots, at a constant rate between two."""
     out = np.empty((len(times), 3, 3))

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from rs_relpose_ros.compiled import kernel
 
 Array = NDArray[np.float64]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def exp_so3(v: Array) -> Array:
     """Rotation matrix of the rotation vector `v` (3,) [rad] (Rodrigues' formula)."""
     x, y, z = v[0], v[1], v[2]
@@ -36,7 +37,7 @@ def exp_so3(v: Array) -> Array:
     return rotation
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def log_so3(rotation: Array) -> Array:
     """Rotation vector (3,) [rad], of length at most pi, of a rotation matrix."""
     # Through the quaternion: exact near 0 and near pi, where the trace formula loses digits.
@@ -74,7 +75,7 @@ def log_so3(rotation: Array) -> Array:
     return vector
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def left_jacobian_so3(v: Array) -> Array:
     """Left Jacobian (3, 3) of SO(3): ``Exp(v + dv) = Exp(J dv) Exp(v)`` to first order."""
     x, y, z = v[0], v[1], v[2]

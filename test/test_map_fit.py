@@ -14,10 +14,9 @@ from rs_relpose_ros.estimator import map_fit, sampson
 
 
 def some_state(rng, rate):
-    unit = rng.normal(size=3)
-    return map_fit.State(Rotation.from_rotvec(rng.normal(size=3)).as_matrix(), unit / np.linalg.norm(unit),
-                         rng.normal(size=3), rng.normal(size=3), rate * rng.normal(size=3),
-                         rate * rng.normal(size=3))
+    R = Rotation.from_rotvec(rng.normal(size=3)).as_matrix()
+    t, d1, d2, dw1, dw2 = rng.normal(size=(5, 3))
+    return map_fit.State(R, t / np.linalg.norm(t), d1, d2, rate * dw1, rate * dw2)
 
 
 def some_priors(rng, state, **weights):

@@ -13,9 +13,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from rs_relpose_ros.compiled import kernel
 
 Array = NDArray[np.float64]
 
@@ -24,10 +25,8 @@ SCALES = np.array([1.0, 4.0, 12.0])
 # Matches that are scored before the next look at the limit.
 BLOCK = 64
 
-_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 
-
-@_jit
+@kernel
 def multi_scale_cost(points: Array, R: Array, x: Array, threshold2: Array,
                      limit: float) -> tuple[float, int]:
     """Sum over matches and scales of ``min(r^2 / T^2, 1)``, and the inliers of the middle scale.

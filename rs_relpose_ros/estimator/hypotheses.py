@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.solvers.eleven_point import uniform_11pt_kernel
 from rs_relpose_ros.solvers.five_point import five_point_kernel
 from rs_relpose_ros.solvers.nine_point import uniform_9pt_kernel
@@ -19,8 +19,6 @@ Array = NDArray[np.float64]
 GYRO_2PT, ANGULAR_3PT, ANGULAR_5PT, UNIFORM_9PT, UNIFORM_11PT = range(5)
 SAMPLE_SIZES = np.array([2, 3, 5, 9, 11])
 MAX_SOLUTIONS = 12
-
-_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 
 
 class Hypotheses(NamedTuple):
@@ -42,7 +40,7 @@ class Knowledge(NamedTuple):
     predicted: bool
 
 
-@_jit
+@kernel
 def _gyro_2pt(f1: Array, f2: Array, rotation: Array, R_out: Array, x_out: Array) -> int:
     """The gyro's rotation, and t perpendicular to both normals ``n = f_1 x R f_2``."""
     n = np.empty((2, 3))
@@ -65,7 +63,7 @@ def _gyro_2pt(f1: Array, f2: Array, rotation: Array, R_out: Array, x_out: Array)
     return 1
 
 
-@_jit
+@kernel
 def _uniform_11pt(f1: Array, f2: Array, tau1: Array, tau2: Array, knowledge: Knowledge,
                   R_out: Array, x_out: Array) -> int:
     """The 11-point's solutions from the gyro's rotation, or from those of its first 5 points."""
@@ -81,7 +79,7 @@ def _uniform_11pt(f1: Array, f2: Array, tau1: Array, tau2: Array, knowledge: Kno
     return count
 
 
-@_jit
+@kernel
 def generate(generator: int, points: Array, sample: NDArray[np.int64], knowledge: Knowledge,
              R_out: Array, x_out: Array) -> int:
     """Hypotheses of one minimal sample; their number.

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.estimator import sampson
 from rs_relpose_ros.estimator.map_fit import fit, linearised, prior_cost, Priors, State
 
@@ -26,10 +26,8 @@ DEPTH_QUANTILES = np.array([0.16, 0.5, 0.84])
 # Scenes are never flatter than this (log units): keeps the gate open on planar scenes.
 MIN_DEPTH_SPREAD = 0.25
 
-_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 
-
-@_jit
+@kernel
 def cheirality_sign(observations: Array, use: NDArray[np.bool_], state: State) -> float:
     """+1 or -1: the sign of (t, d_1, d_2) that puts more of the matches in front, weighted.
 
@@ -45,13 +43,13 @@ def cheirality_sign(observations: Array, use: NDArray[np.bool_], state: State) -
     return 1.0 if vote >= 0.0 else -1.0
 
 
-@_jit
+@kernel
 def signed(state: State, sign: float) -> State:
     """The state with its translation and velocities multiplied by `sign`."""
     return State(state.R, sign * state.t, sign * state.d1, sign * state.d2, state.dw1, state.dw2)
 
 
-@_jit
+@kernel
 def gate_depths(observations: Array, use: NDArray[np.bool_], state: State,
                 angle_sigma: float) -> None:
     """Remove from `use` what lies behind a camera or far from the others' depths.
@@ -104,7 +102,7 @@ def gate_depths(observations: Array, use: NDArray[np.bool_], state: State,
             k += 1
 
 
-@_jit
+@kernel
 def within(r: Array, observations: Array, valid: NDArray[np.bool_], state: State,
            threshold: float, angle_sigma: float) -> NDArray[np.bool_]:
     """Matches whose residuals `r` (N,) at `state` are below `threshold`, of plausible depths."""
@@ -113,7 +111,7 @@ def within(r: Array, observations: Array, valid: NDArray[np.bool_], state: State
     return use
 
 
-@_jit
+@kernel
 def select_inliers(observations: Array, valid: NDArray[np.bool_], state: State, threshold: float,
                    angle_sigma: float) -> NDArray[np.bool_]:
     """Matches within `threshold` [px] whose depths are plausible."""
@@ -121,7 +119,7 @@ def select_inliers(observations: Array, valid: NDArray[np.bool_], state: State, 
     return within(r, observations, valid, state, threshold, angle_sigma)
 
 
-@_jit
+@kernel
 def _truncated_cost(r: Array, valid: NDArray[np.bool_], threshold: float, sigma: float) -> float:
     """MSAC cost of residuals (N,) in units of sigma."""
     cost = 0.0
@@ -131,7 +129,7 @@ def _truncated_cost(r: Array, valid: NDArray[np.bool_], threshold: float, sigma:
     return cost / (sigma * sigma)
 
 
-@_jit
+@kernel
 def optimise(observations: Array, valid: NDArray[np.bool_], R: Array, x: Array, priors: Priors,
              sigma: float, threshold: float, angle_sigma: float) -> tuple[State, bool]:
     """Fit the uniform model to each hypothesis; the one of the least MSAC cost, priors included.

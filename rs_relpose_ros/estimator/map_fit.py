@@ -19,10 +19,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.estimator import sampson
 from rs_relpose_ros.estimator.sampson import D1, D2, DW1, DW2, PARAMETERS, TANGENT, THETA
 from rs_relpose_ros.so3 import exp_so3, log_so3
@@ -32,8 +32,6 @@ Array = NDArray[np.float64]
 PINNED = 1e14
 # A fit ends where a step gains less than this share of a cost (chi-square) of one.
 LEAST_GAIN = 1e-7
-
-_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 
 
 class Priors(NamedTuple):
@@ -64,7 +62,7 @@ class State(NamedTuple):
     dw2: Array
 
 
-@_jit
+@kernel
 def _add_gravity_prior(state: State, priors: Priors, hessian: Array, gradient: Array) -> float:
     """``r = g x k`` of the two directions in frame 1; each is off by as much as one frame's."""
     # Gravity is known at a row from which the gyro, errors included, leads to the middle row.
@@ -95,7 +93,7 @@ def _add_gravity_prior(state: State, priors: Priors, hessian: Array, gradient: A
     return w * (r * r).sum()
 
 
-@_jit
+@kernel
 def _add_priors(state: State, priors: Priors, hessian: Array, gradient: Array) -> float:
     """Add the priors to the normal equations; their part of the cost."""
     cost = 0.0
@@ -136,7 +134,7 @@ def _add_priors(state: State, priors: Priors, hessian: Array, gradient: Array) -
     return cost
 
 
-@_jit
+@kernel
 def prior_cost(state: State, priors: Priors) -> float:
     """The priors' part of the cost."""
     return _add_priors(state, priors, np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS))
@@ -153,7 +151,7 @@ class DataTerm(NamedTuple):
     cost: float
 
 
-@_jit
+@kernel
 def linearised(observations: Array, use: NDArray[np.bool_], state: State,
                sigma: float) -> DataTerm:
     """Hessian (17, 17), half gradient (17,) and cost of the matches in `use` about `state`."""
@@ -165,7 +163,7 @@ def linearised(observations: Array, use: NDArray[np.bool_], state: State,
     return DataTerm(hessian, gradient, squares * weight)
 
 
-@_jit
+@kernel
 def normal_equations(data: DataTerm, state: State, priors: Priors) -> tuple[Array, Array, float]:
     """Hessian (17, 17), half gradient (17,) and cost of the whole objective at `state`."""
     hessian, gradient = data.hessian.copy(), data.gradient.copy()
@@ -173,7 +171,7 @@ def normal_equations(data: DataTerm, state: State, priors: Priors) -> tuple[Arra
     return hessian, gradient, cost
 
 
-@_jit
+@kernel
 def moved(state: State, step: Array) -> State:
     """The state after a step (17,) of its local parameters."""
     basis = sampson.tangent_basis(state.t)
@@ -183,7 +181,7 @@ def moved(state: State, step: Array) -> State:
                  state.dw1 + step[DW1:DW1 + 3], state.dw2 + step[DW2:DW2 + 3])
 
 
-@_jit
+@kernel
 def step_between(state: State, other: State) -> Array:
     """The step (17,) of local parameters from `state` to `other`: the inverse of `moved`."""
     step = np.empty(PARAMETERS)
@@ -199,7 +197,7 @@ def step_between(state: State, other: State) -> Array:
     return step
 
 
-@_jit
+@kernel
 def cholesky(matrix: Array, factor: Array) -> bool:
     """Lower Cholesky factor of a symmetric matrix; False unless it is positive definite."""
     n = matrix.shape[0]
@@ -217,7 +215,7 @@ def cholesky(matrix: Array, factor: Array) -> bool:
     return True
 
 
-@_jit
+@kernel
 def cholesky_solve(factor: Array, right: Array) -> Array:
     """Solution of ``L L^T x = right``."""
     n = right.shape[0]
@@ -233,7 +231,7 @@ def cholesky_solve(factor: Array, right: Array) -> Array:
     return x
 
 
-@_jit
+@kernel
 def fit(observations: Array, use: NDArray[np.bool_], start: State, data: DataTerm,
         priors: Priors, sigma: float,
         iterations: int) -> tuple[State, DataTerm, float, Array]:
@@ -287,7 +285,7 @@ def fit(observations: Array, use: NDArray[np.bool_], start: State, data: DataTer
     return state, data, cost, hessian
 
 
-@_jit
+@kernel
 def _scaled_factor(information: Array) -> tuple[Array, Array]:
     """Scales (n,) that make the diagonal 1, and the Cholesky factor of the matrix so scaled.
 
@@ -306,7 +304,7 @@ def _scaled_factor(information: Array) -> tuple[Array, Array]:
     return scale, factor
 
 
-@_jit
+@kernel
 def inverse(information: Array) -> Array:
     """Covariance (n, n) of an information matrix: never indefinite."""
     scale, factor = _scaled_factor(information)
@@ -323,7 +321,7 @@ def inverse(information: Array) -> Array:
     return rows.T @ rows
 
 
-@_jit
+@kernel
 def log_determinant(hessian: Array) -> float:
     """Log-determinant of a positive definite matrix."""
     scale, factor = _scaled_factor(hessian)

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.camera import RollingShutterCamera
+from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.motion import FrameMotion
 from rs_relpose_ros.so3 import skew
 
@@ -97,7 +97,7 @@ def build_problem(points1: Array, points2: Array, camera: RollingShutterCamera,
                           motion2, -delay, rotation, information)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _derotate(rays: Array, jacobian: Array, turns: Array, turn_of_a_row: Array,
               block: Array) -> None:
     """Fill one camera's `block` (N, 9): turned ray and its derivatives by u and v."""
@@ -115,7 +115,7 @@ def _derotate(rays: Array, jacobian: Array, turns: Array, turn_of_a_row: Array,
             block[i, 6 + j] += turn_of_a_row[k] * block[i, m] - turn_of_a_row[m] * block[i, k]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _checked_columns(observations: Array) -> tuple[NDArray[np.bool_], Array]:
     """Which rows are finite (the others become zero), and the points for `consensus`."""
     n = len(observations)

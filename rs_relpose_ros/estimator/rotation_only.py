@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.estimator.map_fit import cholesky, cholesky_solve, Priors
 from rs_relpose_ros.so3 import exp_so3, log_so3
 
@@ -15,10 +15,8 @@ Array = NDArray[np.float64]
 
 ITERATIONS = 12
 
-_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 
-
-@_jit
+@kernel
 def transfer_errors(observations: Array, R: Array, focal: float) -> Array:
     """``|f_1 - R f_2|`` in pixels (N,): what is left of a match's motion after the rotation."""
     n = observations.shape[0]
@@ -34,7 +32,7 @@ def transfer_errors(observations: Array, R: Array, focal: float) -> Array:
     return out
 
 
-@_jit
+@kernel
 def fit_rotation(observations: Array, valid: NDArray[np.bool_], start: Array, priors: Priors,
                  focal: float, sigma: float) -> tuple[Array, Array]:
     """Rotation (3, 3) and the information (3, 3) of its error in frame 1.

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.estimator.consensus import multi_scale_cost
 from rs_relpose_ros.estimator.hypotheses import generate, Knowledge, MAX_SOLUTIONS, SAMPLE_SIZES
 
@@ -26,10 +26,8 @@ MIN_SAMPLES = 40
 SAME_ROTATION = 0.01
 SAME_DIRECTION = 0.1
 
-_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 
-
-@_jit
+@kernel
 def _random(state: NDArray[np.uint64]) -> np.uint64:
     """Next number of splitmix64 (Steele et al., OOPSLA 2014): the state is one word."""
     state[0] += np.uint64(0x9E3779B97F4A7C15)
@@ -39,7 +37,7 @@ def _random(state: NDArray[np.uint64]) -> np.uint64:
     return z ^ (z >> np.uint64(31))
 
 
-@_jit
+@kernel
 def draw(order: NDArray[np.int64], head: int, sample: NDArray[np.int64],
          state: NDArray[np.uint64]) -> None:
     """Fill `sample` with distinct entries of ``order[:head]``."""
@@ -55,7 +53,7 @@ def draw(order: NDArray[np.int64], head: int, sample: NDArray[np.int64],
         sample[k] = candidate
 
 
-@_jit
+@kernel
 def _same(Ra: Array, xa: Array, Rb: Array, xb: Array) -> bool:
     trace = 0.0
     for i in range(3):
@@ -67,7 +65,7 @@ def _same(Ra: Array, xa: Array, Rb: Array, xb: Array) -> bool:
     return abs(dot) > 1.0 - 0.5 * SAME_DIRECTION * SAME_DIRECTION
 
 
-@_jit
+@kernel
 def _offer(R: Array, x: Array, cost: float, pool_R: Array, pool_x: Array,
            pool_cost: Array) -> None:
     """Put a hypothesis into the pool in place of its like or of the worst, if it is better."""
@@ -84,7 +82,7 @@ def _offer(R: Array, x: Array, cost: float, pool_R: Array, pool_x: Array,
         pool_cost[place] = cost
 
 
-@_jit
+@kernel
 def sample_hypotheses(generator: int, points: Array, knowledge: Knowledge,
                       order: NDArray[np.int64], seed: NDArray[np.uint64], threshold2: Array,
                       confidence: float, max_samples: int, best_inliers: int, pool_R: Array,
@@ -135,7 +133,7 @@ def sample_hypotheses(generator: int, points: Array, knowledge: Knowledge,
     return drawn, best_inliers
 
 
-@_jit
+@kernel
 def samples_needed(ratio: float, size: int, confidence: float, max_samples: int) -> float:
     """Samples after which one is free of outliers with probability `confidence`."""
     good = ratio**size

@@ -24,9 +24,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from rs_relpose_ros.compiled import inlined_kernel, kernel
 
 Array = NDArray[np.float64]
 
@@ -36,19 +37,13 @@ THETA, TANGENT, D1, D2, DW1, DW2 = 0, 3, 5, 8, 11, 14
 # Matches of a block: enough to vectorise, few enough for the nearest cache.
 BLOCK = 64
 
-# No `fastmath` here nor in any kernel that poses depend on: a function is compiled anew into each
-# of its callers, and with reordered sums the copies would differ in the last bit, so that a
-# process's results would depend on which caller it ran first.
-_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
-_inlined = numba.njit(cache=True, nogil=True, error_model='numpy', forceinline=True)
 
-
-@_inlined
+@inlined_kernel
 def _cross(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
-@_jit
+@kernel
 def tangent_basis(t: Array) -> Array:
     """Two orthonormal columns (3, 2) perpendicular to the unit vector `t`."""
     basis = np.empty((3, 2))
@@ -68,7 +63,7 @@ def tangent_basis(t: Array) -> Array:
     return basis
 
 
-@_inlined
+@inlined_kernel
 def _baselines(t: Array, d1: Array, d2: Array) -> Array:
     """Coefficients (3, 3) of ``b = t - tau_1 d_1 + tau_2 d_2`` in 1, tau_1, tau_2."""
     out = np.empty((3, 3))
@@ -77,7 +72,7 @@ def _baselines(t: Array, d1: Array, d2: Array) -> Array:
     return out
 
 
-@_inlined
+@inlined_kernel
 def _turns(rate: Array, R: Array) -> Array:
     """Coefficients (3, 3, 3) of ``Exp(w tau) R`` in 1, tau, tau^2: w is a gyro correction."""
     out = np.empty((3, 3, 3))
@@ -90,7 +85,7 @@ def _turns(rate: Array, R: Array) -> Array:
     return out
 
 
-@_inlined
+@inlined_kernel
 def _turned(turns, tau, x, y, z):  # type: ignore[no-untyped-def]
     """A vector turned by the rotation of `_turns` at tau."""
     s = tau * tau
@@ -106,7 +101,7 @@ def _turned(turns, tau, x, y, z):  # type: ignore[no-untyped-def]
         + (turns[0, 2, 2] + tau * turns[1, 2, 2] + s * turns[2, 2, 2]) * z)
 
 
-@_inlined
+@inlined_kernel
 def _gather(observations, use, first, block):  # type: ignore[no-untyped-def]
     """Fill `block` (20, BLOCK) with the matches in `use` from number `first` on.
 
@@ -126,7 +121,7 @@ def _gather(observations, use, first, block):  # type: ignore[no-untyped-def]
     return first, count
 
 
-@_inlined
+@inlined_kernel
 def _residual(o, i, baselines, turns1, turns2):  # type: ignore[no-untyped-def]
     """Residual [px] of column i of a block, and the vectors that its derivative needs.
 
@@ -162,7 +157,7 @@ def _residual(o, i, baselines, turns1, turns2):  # type: ignore[no-untyped-def]
             (c3 * hux + c4 * hvx, c3 * huy + c4 * hvy, c3 * huz + c4 * hvz))
 
 
-@_inlined
+@inlined_kernel
 def _linearise(o, baselines, turns1, turns2, basis, rows):  # type: ignore[no-untyped-def]
     """Derivatives and residuals of a block: `rows` (18, BLOCK), the residual last."""
     for i in range(BLOCK):
@@ -192,7 +187,7 @@ def _linearise(o, baselines, turns1, turns2, basis, rows):  # type: ignore[no-un
         rows[17, i] = r
 
 
-@_jit
+@kernel
 def residuals(observations: Array, R: Array, t: Array, d1: Array, d2: Array, dw1: Array,
               dw2: Array) -> Array:
     """Signed Sampson errors (N,) [px] of observation rows (N, 20)."""
@@ -211,7 +206,7 @@ def residuals(observations: Array, R: Array, t: Array, d1: Array, d2: Array, dw1
     return out
 
 
-@_jit
+@kernel
 def jacobian(observations: Array, R: Array, t: Array, d1: Array, d2: Array, dw1: Array,
              dw2: Array) -> Array:
     """Derivatives (N, 17) of the Sampson errors by the local parameters."""
@@ -230,7 +225,7 @@ def jacobian(observations: Array, R: Array, t: Array, d1: Array, d2: Array, dw1:
     return out
 
 
-@_jit
+@kernel
 def normal_equations(observations: Array, use: NDArray[np.bool_], R: Array, t: Array, d1: Array,
                      d2: Array, dw1: Array, dw2: Array) -> tuple[Array, Array, float]:
     """``J^T J`` (17, 17), ``J^T r`` (17,) and sum of squares over the matches in `use`."""
@@ -251,7 +246,7 @@ def normal_equations(observations: Array, use: NDArray[np.bool_], R: Array, t: A
     return hessian, gram[PARAMETERS, :PARAMETERS].copy(), gram[PARAMETERS, PARAMETERS]
 
 
-@_jit
+@kernel
 def depths(observations: Array, R: Array, t: Array, d1: Array, d2: Array, out: Array) -> None:
     """Depths along both rays (N, 2) in baselines, each match with its own row times.
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.estimator.local_optimisation import gate_depths, within
 from rs_relpose_ros.estimator.map_fit import (
     DataTerm,
@@ -48,10 +48,8 @@ WIDEST = 2.0
 # A prior whose evidence is below the best by more than this (logarithm) takes no part.
 LEAST_EVIDENCE = 6.0
 
-_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 
-
-@_jit
+@kernel
 def with_velocity_sigma(priors: Priors, sigma: float) -> Priors:
     """The priors with another sigma of the linear velocities [baselines per second]."""
     return Priors(priors.gravity1, priors.gravity2, priors.gravity_weight,
@@ -59,7 +57,7 @@ def with_velocity_sigma(priors: Priors, sigma: float) -> Priors:
                   priors.velocity_rate, priors.rotation, priors.rotation_information)
 
 
-@_jit
+@kernel
 def noise_sigma(observations_cost: float, count: int, told: float) -> float:
     """Noise of a match [px] from the residuals, with the told sigma as ten matches' worth."""
     told_weight = 10.0
@@ -67,7 +65,7 @@ def noise_sigma(observations_cost: float, count: int, told: float) -> float:
                      / (told_weight + max(count - 11, 0)))
 
 
-@_jit
+@kernel
 def fit_with_evidence(observations: Array, valid: NDArray[np.bool_], start: State, priors: Priors,
                       told_sigma: float, threshold: float, angle_sigma: float, grid: Array,
                       ) -> tuple[State, NDArray[np.bool_], float, float, Array]:
@@ -126,13 +124,13 @@ def fit_with_evidence(observations: Array, valid: NDArray[np.bool_], start: Stat
     return state, inliers, grid[best], sigma, covariance
 
 
-@_jit
+@kernel
 def _reach(threshold: float, sigma: float) -> float:
     """Inlier threshold [px] for matches of a noise that turned out to be `sigma`."""
     return min(max(threshold, REACH * sigma), WIDEST * threshold)
 
 
-@_jit
+@kernel
 def _selected(observations: Array, valid: NDArray[np.bool_], state: State, threshold: float,
               angle_sigma: float, told_sigma: float) -> tuple[NDArray[np.bool_], float]:
     """Inliers of a state, and their noise [px]."""
@@ -145,7 +143,7 @@ def _selected(observations: Array, valid: NDArray[np.bool_], state: State, thres
     return inliers, noise_sigma(squares, inliers.sum(), told_sigma)
 
 
-@_jit
+@kernel
 def _candidate(observations: Array, inliers: NDArray[np.bool_], start: State, data: DataTerm,
                priors: Priors, sigma: float, velocity_sigma: float, threshold: float,
                angle_sigma: float, iterations: int) -> tuple[State, DataTerm, Array, float]:
@@ -163,7 +161,7 @@ def _candidate(observations: Array, inliers: NDArray[np.bool_], start: State, da
     return state, data, hessian, evidence
 
 
-@_jit
+@kernel
 def _average(observations: Array, inliers: NDArray[np.bool_], start: State, steps: Array,
              likely: NDArray[np.bool_], priors: Priors, sigma: float, grid: Array,
              threshold: float, angle_sigma: float) -> tuple[State, Array, int]:

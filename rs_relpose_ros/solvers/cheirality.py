@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.compiled import kernel
+
 Array = NDArray[np.float64]
 
-_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 
-
-@_jit
+@kernel
 def cheirality_votes(f1: Array, f2: Array, tau1: Array, tau2: Array, R: Array,
                      x: Array) -> tuple[int, int]:
     """Points in front of both cameras for ``x = (t, d_1, d_2)``, and for ``-x``.

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.so3 import exp_so3
 from rs_relpose_ros.solvers.cheirality import cheirality_votes
 from rs_relpose_ros.solvers.linear_algebra import normalise, reflect, triangularise
@@ -23,7 +23,6 @@ from rs_relpose_ros.solvers.uniform_columns import row_time_factors, translation
 
 Array = NDArray[np.float64]
 
-_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 
 _ITERATIONS = 30
 # Damping relative to the squared size of the Jacobian.
@@ -37,14 +36,14 @@ _CONVERGED = 1e-13
 _LAST_STEP = 1e-6
 
 
-@_jit
+@kernel
 def _rotated(R: Array, f2: Array, k: int) -> tuple[float, float, float]:
     return (R[0, 0] * f2[k, 0] + R[0, 1] * f2[k, 1] + R[0, 2] * f2[k, 2],
             R[1, 0] * f2[k, 0] + R[1, 1] * f2[k, 1] + R[1, 2] * f2[k, 2],
             R[2, 0] * f2[k, 0] + R[2, 1] * f2[k, 1] + R[2, 2] * f2[k, 2])
 
 
-@_jit
+@kernel
 def _columns(f1: Array, f2: Array, p: Array, q: Array, R: Array, columns: Array) -> float:
     """Write the nine columns of A(R) into `columns` (9, 11); the Frobenius norm of A."""
     total = 0.0
@@ -60,7 +59,7 @@ def _columns(f1: Array, f2: Array, p: Array, q: Array, R: Array, columns: Array)
     return math.sqrt(total)
 
 
-@_jit
+@kernel
 def _null_vector(columns: Array, y: Array, work: Array) -> float:
     """Right singular vector of the smallest singular value; the singular value.
 
@@ -103,7 +102,7 @@ def _null_vector(columns: Array, y: Array, work: Array) -> float:
     return 1.0 / length
 
 
-@_jit
+@kernel
 def _conditions(f1: Array, f2: Array, p: Array, q: Array, R: Array, columns: Array, y: Array,
                 bordered: Array, diagonal: Array, scales: Array) -> None:
     """The three rank conditions and their derivative by theta, R moving as ``Exp(theta) R``.
@@ -138,7 +137,7 @@ def _conditions(f1: Array, f2: Array, p: Array, q: Array, R: Array, columns: Arr
     triangularise(bordered, 8, diagonal, scales)
 
 
-@_jit
+@kernel
 def _damped_step(bordered: Array, damping: float, step: Array, work: Array, diagonal: Array,
                  scales: Array) -> None:
     """Least-squares solution of ``J step = -r`` and ``sqrt(damping) step = 0``: `step` (3,)."""
@@ -157,7 +156,7 @@ def _damped_step(bordered: Array, damping: float, step: Array, work: Array, diag
         step[k] = total / diagonal[k]
 
 
-@_jit
+@kernel
 def _reach_rank_8(f1: Array, f2: Array, p: Array, q: Array, R: Array, y: Array) -> bool:
     """Move `R` (3, 3) in place to a rotation where A(R) has rank 8, with null vector `y` (9,)."""
     points = f1.shape[0]
@@ -199,7 +198,7 @@ def _reach_rank_8(f1: Array, f2: Array, p: Array, q: Array, R: Array, y: Array) 
     return False
 
 
-@_jit
+@kernel
 def uniform_11pt_kernel(f1: Array, f2: Array, tau1: Array, tau2: Array, R_start: Array,
                         R_out: Array, x_out: Array) -> bool:
     """The solution of `uniform_11pt` that a start rotation reaches; whether it reaches one.

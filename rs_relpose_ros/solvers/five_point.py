@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.so3 import exp_so3
 from rs_relpose_ros.solvers.cheirality import cheirality_votes
 from rs_relpose_ros.solvers.linear_algebra import reflect, triangularise
@@ -22,7 +22,6 @@ from rs_relpose_ros.solvers.polynomial import real_roots
 
 Array = NDArray[np.float64]
 
-_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 
 MAX_SOLUTIONS = 10
 # A double root that rounding has made a conjugate pair; Newton's method decides on it.
@@ -54,7 +53,7 @@ _TO_QUADRATIC = _product_table(list(_ORDER), _QUADRATIC)
 _TO_CUBIC = _product_table(_QUADRATIC, _CUBIC)
 
 
-@_jit
+@kernel
 def _null_space(rows: Array, basis: Array) -> None:
     """Orthonormal basis (4, 9) of the vectors perpendicular to `rows` (5, 9), overwritten.
 
@@ -70,7 +69,7 @@ def _null_space(rows: Array, basis: Array) -> None:
             reflect(rows[k], scales[k], k, basis[c])
 
 
-@_jit
+@kernel
 def _add_quadratic(p: Array, q: Array, factor: float, out: Array) -> None:
     """Add `factor` times the product of two linear polynomials (4,) to `out` (10,)."""
     for i in range(4):
@@ -78,7 +77,7 @@ def _add_quadratic(p: Array, q: Array, factor: float, out: Array) -> None:
             out[_TO_QUADRATIC[i, j]] += factor * p[i] * q[j]
 
 
-@_jit
+@kernel
 def _add_cubic(p: Array, q: Array, out: Array) -> None:
     """Add the product of a quadratic (10,) and a linear (4,) polynomial to `out` (20,)."""
     for i in range(10):
@@ -86,7 +85,7 @@ def _add_cubic(p: Array, q: Array, out: Array) -> None:
             out[_TO_CUBIC[i, j]] += p[i] * q[j]
 
 
-@_jit
+@kernel
 def _cubic_constraints(basis: Array, M: Array) -> None:
     """``det E = 0`` and ``(E E^T - trace(E E^T) / 2) E = 0`` in the 20 monomials: `M` (10, 20).
 
@@ -121,7 +120,7 @@ def _cubic_constraints(basis: Array, M: Array) -> None:
                 _add_cubic(EET[3 * i + k], E[3 * k + j], M[1 + 3 * i + j])
 
 
-@_jit
+@kernel
 def _turn_basis(basis: Array) -> None:
     """Another orthonormal basis (4, 9) of the same space, in place: a turn of 60 degrees.
 
@@ -135,7 +134,7 @@ def _turn_basis(basis: Array) -> None:
         basis[3, m] = 0.5 * (a - b + c + d)
 
 
-@_jit
+@kernel
 def _eliminate(M: Array) -> float:
     """Gauss-Jordan with row pivoting, as far as needed: identity in rows and columns 4 to 9.
 
@@ -170,7 +169,7 @@ def _eliminate(M: Array) -> float:
     return largest
 
 
-@_jit
+@kernel
 def _reduced_constraints(basis: Array, M: Array) -> bool:
     """Constraints in `M` (10, 20) after elimination, `basis` (4, 9) turned if it must be."""
     coefficient = math.inf
@@ -184,7 +183,7 @@ def _reduced_constraints(basis: Array, M: Array) -> bool:
     return coefficient < math.inf
 
 
-@_jit
+@kernel
 def _multiply_add(p: Array, p_size: int, q: Array, q_size: int, factor: float,
                   out: Array) -> None:
     """Add `factor` times the product of two polynomials in z to `out`."""
@@ -193,7 +192,7 @@ def _multiply_add(p: Array, p_size: int, q: Array, q_size: int, factor: float,
             out[i + j] += factor * p[i] * q[j]
 
 
-@_jit
+@kernel
 def _degree_10(M: Array, B: Array, p: Array) -> None:
     """The 3x3 matrix of polynomials in z, `B` (3, 3, 5), with ``B(z) (x, y, 1) = 0``; its det."""
     B[:] = 0.0
@@ -217,7 +216,7 @@ def _degree_10(M: Array, B: Array, p: Array) -> None:
         _multiply_add(minor, 7, B[r, 2], 5, 1.0, p)
 
 
-@_jit
+@kernel
 def _essential_matrix(B: Array, z: float, basis: Array, E: Array) -> bool:
     """E (3, 3) with ``|E| = sqrt(2)`` at a root z: (x, y, 1) is the null vector of B(z)."""
     V = np.zeros((3, 3))
@@ -248,7 +247,7 @@ def _essential_matrix(B: Array, z: float, basis: Array, E: Array) -> bool:
     return True
 
 
-@_jit
+@kernel
 def _orthonormalise(R: Array) -> bool:
     """Nearest rotation by Newton's iteration of the polar decomposition; False if far off."""
     G = np.empty((3, 3))
@@ -273,7 +272,7 @@ def _orthonormalise(R: Array) -> bool:
     return True
 
 
-@_jit
+@kernel
 def _decompose(E: Array, f1: Array, f2: Array, R: Array, t: Array) -> bool:
     """R and t of ``E = [t]x R`` that put most points in front of both cameras.
 
@@ -315,7 +314,7 @@ def _decompose(E: Array, f1: Array, f2: Array, R: Array, t: Array) -> bool:
     return best >= 0
 
 
-@_jit
+@kernel
 def _solve5(J: Array, r: Array) -> bool:
     """Solve ``J x = r`` in place of `r` (5,) by Gauss elimination with row pivoting."""
     for k in range(5):
@@ -341,7 +340,7 @@ def _solve5(J: Array, r: Array) -> bool:
     return True
 
 
-@_jit
+@kernel
 def _polish(f1: Array, f2: Array, R: Array, t: Array) -> bool:
     """Newton's method on ``e = (f_1 x R f_2) . t``, R by ``Exp(theta) R``, t on the sphere."""
     J, step = np.empty((5, 5)), np.empty(5)
@@ -392,7 +391,7 @@ def _polish(f1: Array, f2: Array, R: Array, t: Array) -> bool:
     return False
 
 
-@_jit
+@kernel
 def five_point_kernel(f1: Array, f2: Array, R_out: Array, t_out: Array) -> int:
     """All real solutions of the calibrated 5-point problem; their number.
 

@@ -13,16 +13,15 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.compiled import kernel
+
 Array = NDArray[np.float64]
 
-_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 
-
-@_jit
+@kernel
 def gravity_alignment(gravity: Array) -> Array:
     """Smallest rotation matrix (3, 3) that turns `gravity` (3,), of any length, onto +z."""
     length = math.sqrt(gravity[0] ** 2 + gravity[1] ** 2 + gravity[2] ** 2)
@@ -41,7 +40,7 @@ def gravity_alignment(gravity: Array) -> Array:
     return A
 
 
-@_jit
+@kernel
 def rotation_from_yaw(psi: float, A1: Array, A2: Array, R: Array) -> None:
     """Write ``A_1^T Rz(psi) A_2`` into `R` (3, 3)."""
     c, s = math.cos(psi), math.sin(psi)
@@ -53,7 +52,7 @@ def rotation_from_yaw(psi: float, A1: Array, A2: Array, R: Array) -> None:
             R[i, j] = A1[0, i] * x + A1[1, i] * y + A1[2, i] * z
 
 
-@_jit
+@kernel
 def rotate_rows(A: Array, rays: Array, out: Array) -> None:
     """Write ``A f`` for every row f of `rays` (n, 3) into `out` (n, 3)."""
     for k in range(rays.shape[0]):
@@ -61,7 +60,7 @@ def rotate_rows(A: Array, rays: Array, out: Array) -> None:
             out[k, i] = A[i, 0] * rays[k, 0] + A[i, 1] * rays[k, 1] + A[i, 2] * rays[k, 2]
 
 
-@_jit
+@kernel
 def normals_at_yaw(a: Array, b: Array, c: float, s: float, normals: Array,
                    derivatives: Array) -> None:
     """Epipolar normals ``a x Rz(psi) b`` of gravity-aligned rays, and d/d psi of them.
@@ -88,7 +87,7 @@ def normals_at_yaw(a: Array, b: Array, c: float, s: float, normals: Array,
         derivatives[k, 2] = a[k, 0] * hx + a[k, 1] * hy
 
 
-@_jit
+@kernel
 def centre_yaw(a: Array, b: Array) -> tuple[float, float]:
     """Turn `b` so that the solutions crowd about yaw 0.
 

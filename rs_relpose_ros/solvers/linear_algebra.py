@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.compiled import kernel
+
 Array = NDArray[np.float64]
 
-_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 
-
-@_jit
+@kernel
 def lu_factor(A: Array, pivots: NDArray[np.int64]) -> float:
     """LU factorisation of `A` (n, n) in place, with row pivoting; the determinant.
 
@@ -55,7 +54,7 @@ def lu_factor(A: Array, pivots: NDArray[np.int64]) -> float:
     return determinant
 
 
-@_jit
+@kernel
 def lu_solve(LU: Array, pivots: NDArray[np.int64], b: Array) -> None:
     """Solve ``A x = b`` in place of `b` (n,), with the result of `lu_factor`."""
     n = LU.shape[0]
@@ -75,7 +74,7 @@ def lu_solve(LU: Array, pivots: NDArray[np.int64], b: Array) -> None:
         b[k] = total * LU[k, k]
 
 
-@_jit
+@kernel
 def lu_solve_transposed(LU: Array, pivots: NDArray[np.int64], b: Array) -> None:
     """Solve ``A^T x = b`` in place of `b` (n,), with the result of `lu_factor`."""
     n = LU.shape[0]
@@ -94,7 +93,7 @@ def lu_solve_transposed(LU: Array, pivots: NDArray[np.int64], b: Array) -> None:
         b[pivots[k]] = swap
 
 
-@_jit
+@kernel
 def triangularise(columns: Array, count: int, diagonal: Array, scales: Array) -> None:
     """Householder reflections that make the first `count` columns of a matrix upper triangular.
 
@@ -123,7 +122,7 @@ def triangularise(columns: Array, count: int, diagonal: Array, scales: Array) ->
             reflect(columns[k], scales[k], k, columns[j])
 
 
-@_jit
+@kernel
 def reflect(reflector: Array, scale: float, first: int, vector: Array) -> None:
     """Reflect `vector` (m,) in place; the reflector is zero before element `first`."""
     dot = 0.0
@@ -134,7 +133,7 @@ def reflect(reflector: Array, scale: float, first: int, vector: Array) -> None:
         vector[i] -= dot * reflector[i]
 
 
-@_jit
+@kernel
 def normalise(v: Array) -> float:
     """Scale `v` (n,) to unit length in place; its former length."""
     largest = 0.0

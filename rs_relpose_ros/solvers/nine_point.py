@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.solvers.cheirality import cheirality_votes
 from rs_relpose_ros.solvers.gravity import (
     centre_yaw,
@@ -35,7 +35,6 @@ from rs_relpose_ros.solvers.uniform_columns import (
 
 Array = NDArray[np.float64]
 
-_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 
 MAX_SOLUTIONS = 12
 # A pair of roots of the polynomial in exp(i psi) that near to the unit circle is one real angle.
@@ -54,7 +53,7 @@ _FARTHEST = 1e-3
 _SAME_ANGLE = 1e-10
 
 
-@_jit
+@kernel
 def _null_vectors(A: Array, pivots: NDArray[np.int64], u: Array, v: Array) -> float:
     """One inverse iteration towards the singular vectors of the smallest singular value.
 
@@ -70,7 +69,7 @@ def _null_vectors(A: Array, pivots: NDArray[np.int64], u: Array, v: Array) -> fl
     return 1.0 / normalise(v)
 
 
-@_jit
+@kernel
 def _polish(a: Array, b: Array, p: Array, q: Array, psi: float, farthest: float, work: Array,
             pivots: NDArray[np.int64], y: Array) -> tuple[float, bool]:
     """Newton's method on the determinant, and the null vector `y` (9,) there.
@@ -110,7 +109,7 @@ def _polish(a: Array, b: Array, p: Array, q: Array, psi: float, farthest: float,
     return psi, False
 
 
-@_jit
+@kernel
 def _is_known(psi: float, yaws: Array) -> bool:
     for yaw in yaws:
         gap = abs(psi - yaw)
@@ -119,7 +118,7 @@ def _is_known(psi: float, yaws: Array) -> bool:
     return False
 
 
-@_jit
+@kernel
 def _write_solution(psi: float, y: Array, A1: Array, A2: Array, f1: Array, f2: Array,
                     tau1: Array, tau2: Array, m: float, s_p: float, s_q: float, R: Array,
                     x: Array) -> bool:
@@ -138,7 +137,7 @@ def _write_solution(psi: float, y: Array, A1: Array, A2: Array, f1: Array, f2: A
     return True
 
 
-@_jit
+@kernel
 def uniform_9pt_kernel(f1: Array, f2: Array, tau1: Array, tau2: Array, A1: Array, A2: Array,
                        R_out: Array, x_out: Array) -> int:
     """All solutions of `uniform_9pt` (derotated rays) or `linear_9pt` (measured); their number.

@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.compiled import kernel
+
 Array = NDArray[np.float64]
 
-_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 
 # A step below this is the last one: Newton's iteration squares the error.
 _LAST_STEP = 1e-8
@@ -25,7 +25,7 @@ _LAST_STEP_OF_DERIVATIVES = 1e-5
 _MAX_STEPS = 80
 
 
-@_jit
+@kernel
 def value(p: Array, degree: int, x: float) -> float:
     """Value at `x` of the polynomial with ascending coefficients ``p[:degree + 1]``."""
     y = p[degree]
@@ -34,7 +34,7 @@ def value(p: Array, degree: int, x: float) -> float:
     return y
 
 
-@_jit
+@kernel
 def _root_between(p: Array, degree: int, low: float, high: float, at_low: float,
                   last_step: float) -> float:
     """Root in a bracket on which the polynomial is monotonic: Newton, kept inside by bisection."""
@@ -61,7 +61,7 @@ def _root_between(p: Array, degree: int, low: float, high: float, at_low: float,
     return x
 
 
-@_jit
+@kernel
 def roots_in_unit_interval(p: Array, pair_tolerance: float, zoom: float, roots: Array,
                            half_gaps: Array, work: Array) -> int:
     """All real roots in [-1, 1], ascending.
@@ -165,7 +165,7 @@ def half_angle_nodes(degree: int) -> Array:
     return np.stack([np.cos(half), np.sin(half)], axis=1)
 
 
-@_jit
+@kernel
 def sample_angle(node: Array, zoom: float) -> tuple[float, float, float]:
     """Cosine and sine of the angle of a sample, and the weight that it gets.
 
@@ -178,7 +178,7 @@ def sample_angle(node: Array, zoom: float) -> tuple[float, float, float]:
     return (c * c - s * s) / weight, 2.0 * c * s / weight, weight
 
 
-@_jit
+@kernel
 def _append_angles(p: Array, outside: bool, pair_tolerance: float, zoom: float, work: Array,
                    angles: Array, half_gaps: Array, count: int) -> int:
     """Add the zeros with ``|x| <= 1`` of `p`, or `outside` those with ``x = -1 / y``."""
@@ -204,7 +204,7 @@ def _append_angles(p: Array, outside: bool, pair_tolerance: float, zoom: float, 
     return count
 
 
-@_jit
+@kernel
 def angles_of_zeros(samples: Array, matrix: Array, zoom: float, pair_tolerance: float,
                     angles: Array, half_gaps: Array) -> int:
     """All zeros of a real trigonometric polynomial D of degree n.
@@ -252,7 +252,7 @@ def angles_of_zeros(samples: Array, matrix: Array, zoom: float, pair_tolerance: 
     return _append_angles(p, True, pair_tolerance, zoom, work, angles, half_gaps, count)
 
 
-@_jit
+@kernel
 def real_roots(p: Array, pair_tolerance: float, roots: Array) -> int:
     """All real roots of a polynomial with ascending coefficients `p` (n + 1,) into `roots` (n,).
 

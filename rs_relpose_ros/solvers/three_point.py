@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.solvers.cheirality import cheirality_votes
 from rs_relpose_ros.solvers.gravity import (
     centre_yaw,
@@ -24,7 +24,6 @@ from rs_relpose_ros.solvers.polynomial import (
 
 Array = NDArray[np.float64]
 
-_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 
 MAX_SOLUTIONS = 4
 # A pair of roots of the polynomial in exp(i psi) that near to the unit circle is one real angle.
@@ -36,13 +35,13 @@ _NODES = half_angle_nodes(_DEGREE)
 _NO_TIMES = np.zeros(3)
 
 
-@_jit
+@kernel
 def _triple(a: Array, b: Array, c: Array) -> float:
     return (a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2])
             + a[2] * (b[0] * c[1] - b[1] * c[0]))
 
 
-@_jit
+@kernel
 def angular_3pt_kernel(f1: Array, f2: Array, A1: Array, A2: Array, R_out: Array,
                        t_out: Array) -> int:
     """All solutions of `angular_3pt` for unit rays `f1`, `f2` (3, 3); their number.

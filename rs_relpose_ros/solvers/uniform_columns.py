@@ -16,19 +16,19 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.compiled import kernel
+
 Array = NDArray[np.float64]
 
-_jit = numba.njit(cache=True, nogil=True, error_model='numpy')
 
 # Row times closer than this cannot tell a velocity from a translation.
 _LEAST_SPREAD = 1e-12
 
 
-@_jit
+@kernel
 def row_time_factors(tau1: Array, tau2: Array, p: Array, q: Array) -> tuple[float, float, float]:
     """Write p and q (n,); ``m, s_p, s_q``, the scales 0 where the row times do not differ."""
     n = tau1.shape[0]
@@ -50,7 +50,7 @@ def row_time_factors(tau1: Array, tau2: Array, p: Array, q: Array) -> tuple[floa
     return m, s_p, s_q
 
 
-@_jit
+@kernel
 def fill_columns(normals: Array, p: Array, q: Array, A: Array) -> None:
     """Write the rows ``[n, p n, q n]`` into `A` (n, 9)."""
     for k in range(normals.shape[0]):
@@ -60,7 +60,7 @@ def fill_columns(normals: Array, p: Array, q: Array, A: Array) -> None:
             A[k, 6 + i] = q[k] * normals[k, i]
 
 
-@_jit
+@kernel
 def translation_and_velocities(y: Array, m: float, s_p: float, s_q: float, x: Array) -> bool:
     """``x = (t, d_1, d_2)`` with ``|t| = 1`` from `y` (9,); False where t vanishes."""
     norm2 = 0.0

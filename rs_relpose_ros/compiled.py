@@ -1,0 +1,14 @@
+"""How kernels are compiled: once, kept on disk, without the interpreter's lock.
+
+Division by zero gives inf or NaN as in NumPy. There is no ``fastmath``: a function is compiled
+anew into each of its callers, and with reordered sums the copies would differ in the last bit, so
+that a process's results would depend on which caller it ran first.
+"""
+
+from __future__ import annotations
+
+import numba
+
+kernel = numba.njit(cache=True, nogil=True, error_model='numpy')
+# Put into its callers by Numba: for the innermost loops, whose arrays' shapes must be known there.
+inlined_kernel = numba.njit(cache=True, nogil=True, error_model='numpy', forceinline=True)
