@@ -65,12 +65,15 @@ class ReadyFrame:
     ready_ns : int
         When the later of the image and the IMU sample that covers its last row came, on the
         monotonic clock; 0 offline.
+    taken_ns : int
+        When its turn came, on the same clock: it was decoded after that.
     """
 
     frame: Frame
     imu: FrameImu
     restart: bool
     ready_ns: int
+    taken_ns: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,6 +236,7 @@ class Sequencer:
         taken = self._take_waiting(timeout)
         if not isinstance(taken, _Waiting):
             return taken
+        taken_ns = self._now()
         try:
             frame = taken.frame.decoded()
         except InputError as error:
@@ -255,7 +259,7 @@ class Sequencer:
             self._frames_taken += 1
             restart = self._taken_generation != self._generation
             self._taken_generation = self._generation
-            return ReadyFrame(frame, imu, restart, taken.ready_ns or 0)
+            return ReadyFrame(frame, imu, restart, taken.ready_ns or 0, taken_ns)
 
     def counts(self) -> SequencerCounts:
         """A snapshot of the counters."""
