@@ -220,6 +220,11 @@ class Sequencer:
             self._frames += 1
             self._refuse(stamp_ns, cause, reason)
 
+    def waits_for_imu(self) -> bool:
+        """Whether the newest frame still needs IMU samples."""
+        with self._changed:
+            return bool(self._waiting) and self._waiting[-1].ready_ns is None
+
     def close(self) -> None:
         """End of the input: `take` gives what is there, then None."""
         with self._changed:

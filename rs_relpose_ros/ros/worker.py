@@ -107,3 +107,4 @@ class Worker(threading.Thread):
             self._on_result(taken, result)
             if self._timings is not None:
                 self._timings.add(taken, result)
+            self._pipeline.prepare()
