@@ -15,7 +15,6 @@ Array = NDArray[np.float64]
 
 # Exposure that changes by less is left alone: rounding would cost more than it gains.
 _LEAST_GAIN, _LEAST_OFFSET = 0.03, 3.0
-_WINDOWS_FOR_BRIGHTNESS = 100
 # A fit that stretches or squeezes areas by more than this is none.
 _LARGEST_STRETCH = 4.0
 
@@ -48,10 +47,8 @@ def with_brightness_of(image1: Image, image2: Image, points1: Array, points2: Ar
     """
     if not len(points1):
         return image2
-    # A median needs no more of them.
-    some = slice(None, None, max(len(points1) // _WINDOWS_FOR_BRIGHTNESS, 1))
-    first_mean, first_contrast = _statistics(image1, points1[some], side)
-    mean, contrast = _statistics(image2, points2[some], side)
+    first_mean, first_contrast = _statistics(image1, points1, side)
+    mean, contrast = _statistics(image2, points2, side)
     textured = contrast > 0.0
     if not textured.any():
         return image2
@@ -74,17 +71,37 @@ def correlations(image1: Image, image2: Image, points1: Array, points2: Array,
 
 @numba.njit(cache=True, nogil=True)
 def _statistics(image: Image, points: Array, side: int) -> tuple[Array, Array]:
-    """Mean and standard deviation (N,) of the windows around `points` (N, 2)."""
+    """Mean and standard deviation (N,) of the windows around `points` (N, 2).
+
+    Of whole pixels: interpolation would smooth the noise, and more so in one of two images.
+    """
+    height, width = image.shape
     count, pixels = points.shape[0], side * side
     mean, deviation = np.empty(count), np.empty(count)
-    window = np.empty(pixels, dtype=np.float32)
     for k in range(count):
-        mean[k] = _window(image, points[k, 0], points[k, 1], side, window)
-        power = 0.0
-        for i in range(pixels):
-            off = window[i] - mean[k]
-            power += off * off
-        deviation[k] = math.sqrt(power / pixels)
+        x, y = round(points[k, 0]), round(points[k, 1])
+        left, top = x - side // 2, y - side // 2
+        total, squares = np.int64(0), np.int64(0)
+        if left >= 0 and top >= 0 and left + side <= width and top + side <= height:
+            for i in range(side):
+                row = image[top + i, left:left + side]
+                # Integers of 32 bits, which are summed many at a time.
+                row_total, row_squares = np.uint32(0), np.uint32(0)
+                for j in range(side):
+                    value = np.uint32(row[j])
+                    row_total += value
+                    row_squares += value * value
+                total += np.int64(row_total)
+                squares += np.int64(row_squares)
+        else:
+            for i in range(side):
+                for j in range(side):
+                    inner = np.int64(image[min(max(top + i, 0), height - 1),
+                                           min(max(left + j, 0), width - 1)])
+                    total += inner
+                    squares += inner * inner
+        mean[k] = total / pixels
+        deviation[k] = math.sqrt(max(squares / pixels - mean[k] * mean[k], 0.0))
     return mean, deviation
 
 
