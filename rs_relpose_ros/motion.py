@@ -157,7 +157,13 @@ def rotations_between(knot_times: Array, knot_rotations: Array, times: Array) ->
     for i in range(len(times)):
         k = min(max(after[i] - 1, 0), len(steps) - 1)
         fraction = (times[i] - knot_times[k]) / (knot_times[k + 1] - knot_times[k])
-        out[i] = knot_rotations[k] @ exp_so3(fraction * steps[k])
+        turn = exp_so3(fraction * steps[k])
+        # By hand: a call of BLAS costs more than nine sums of three products.
+        for a in range(3):
+            for b in range(3):
+                out[i, a, b] = (knot_rotations[k, a, 0] * turn[0, b]
+                                + knot_rotations[k, a, 1] * turn[1, b]
+                                + knot_rotations[k, a, 2] * turn[2, b])
     return out
 
 

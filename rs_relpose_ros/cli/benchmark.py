@@ -1,4 +1,4 @@
-"""``rs_relpose benchmark``: accuracy against an oracle, speed against OpenCV and PoseLib."""
+"""``rs_relpose benchmark``: accuracy against an oracle, speed beside others, the live node."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from rs_relpose_ros.errors import InputError
 
 HELP = ('Measure the estimator on simulated frame pairs, one thread each: "accuracy" against an '
         'oracle that knows the true matches and starts at the truth, "speed" beside OpenCV and '
-        'PoseLib, "all" both as the project reports them. Writes tables (CSV, Markdown) and plots '
-        'into a folder.')
+        'PoseLib, "all" both as the project reports them. "live" measures the node: latency, '
+        'dropped frames, processor time and memory at camera rate. Writes tables (CSV, Markdown) '
+        'and plots into a folder.')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,9 +28,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         description='Time and accuracy of this library, OpenCV (USAC_MAGSAC) and PoseLib on the '
                     'same problems, how time grows with matches, and the first estimate of a new '
                     'process.'))
+    _add_live_arguments(benchmarks.add_parser(
+        'live', help='the node at camera rate: latency, drops, processor time, memory',
+        description='Plays simulated recordings at 30 Hz to a relpose_node, two processes over '
+                    'Fast DDS. Needs ROS. A cell is an image size, a format (mono8, bgr8, jpeg) '
+                    'and a rate of the IMU; each is rendered once into OUTPUT/clips.'))
     _add_all_arguments(benchmarks.add_parser(
-        'all', help='both, as the project reports them',
-        description='Both benchmarks with their defaults, told sigmas also half and twice the '
+        'all', help='accuracy and speed, as the project reports them',
+        description='Both with their defaults, told sigmas also half and twice the '
                     'true ones, and memory over 100,000 estimates: some hours on one core.'))
 
 
@@ -92,8 +98,27 @@ def _add_speed_arguments(parser: argparse.ArgumentParser) -> None:
                         help='folder of the tables (default: out/speed)')
 
 
+def _add_live_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('--cells', nargs='+', default=['all'], metavar='NAME',
+                        help='cells by name, with * as in file names, e.g. "640x480-*" or '
+                             '1280x720-mono8-imu400 (default: all)')
+    parser.add_argument('--duration', type=float, default=60.0, metavar='SECONDS',
+                        help='how long each cell is played (default: 60)')
+    parser.add_argument('--soak', type=float, nargs='?', const=10.0, default=0.0,
+                        metavar='MINUTES',
+                        help='play the cells so long instead (default: 10), and show memory and '
+                             'latency over time')
+    parser.add_argument('--profile', type=Path, metavar='FILE',
+                        help='Fast DDS profile for images above 512 KB (default: the shipped '
+                             'config/fastdds.xml)')
+    parser.add_argument('--output', type=Path, default=Path('out/live'), metavar='DIR',
+                        help='folder of the tables (default: out/live)')
+
+
 def run(args: argparse.Namespace) -> int:
     """Run the benchmark that was asked for."""
+    if args.benchmark == 'live':
+        return _run_live(args)
     from rs_relpose_ros.benchmark.threads import use_one_thread
     use_one_thread()
     return {'accuracy': _run_accuracy, 'speed': _run_speed, 'all': _run_all}[args.benchmark](args)
@@ -171,3 +196,45 @@ def _run_speed(args: argparse.Namespace) -> int:
     print(write_report(args.output, comparison, scaling, first, soaked))
     print(f'written to {args.output}')
     return 0
+
+
+def _run_live(args: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
+    from rs_relpose_ros.benchmark.live import run_cell, select_cells
+    from rs_relpose_ros.benchmark.live_clip import FPS, PERIOD, prepare_clip
+    from rs_relpose_ros.benchmark.live_report import write_report, write_soak_report
+
+    # Shorter than a turn of the motion, hardly anything is measured.
+    _check_at_least(5, args, 'duration')
+    _check_at_least(0, args, 'soak')
+    cells = select_cells(args.cells)
+    duration = 60.0 * args.soak or args.duration
+    profile = args.profile or _shipped('fastdds.xml')
+    if not profile.is_file():
+        raise InputError(f'there is no Fast DDS profile {profile}: choose one with --profile')
+    quiet = not sys.stderr.isatty()
+    sizes = sorted({(cell.width, cell.height) for cell in cells})
+    with tqdm(total=len(sizes) * round(FPS * PERIOD), unit='frame', desc='rendering',
+              disable=quiet) as bar:
+        clips = {size: prepare_clip(args.output / 'clips', *size, bar.update) for size in sizes}
+    results = []
+    with tqdm(total=round(len(cells) * duration), unit='s', disable=quiet) as bar:
+        for cell in cells:
+            bar.set_description(cell.name)
+            statistics, course = run_cell(cell, clips[cell.width, cell.height], duration,
+                                          args.output / cell.name, profile.resolve(), bar.update)
+            results.append(statistics)
+            if args.soak:
+                print(write_soak_report(args.output / cell.name, statistics, course))
+    print(write_report(args.output, results))
+    print(f'written to {args.output}')
+    return 0
+
+
+def _shipped(name: str) -> Path:
+    """A file of `config/`: of the checkout, or where it was installed."""
+    package = Path(__file__).resolve().parent.parent
+    installed = package.parents[3] / 'share' / package.name / 'config' / name
+    checkout = package.parent / 'config' / name
+    return checkout if checkout.is_file() else installed

@@ -81,6 +81,9 @@ class PairConfig:
     stamps_file: str = setting(
         '', 'file that receives the stamp of every processed frame, for replay --stamps; empty '
         'for none')
+    timings_file: str = setting(
+        '', 'file that receives, for every processed frame, when it was ready, taken and done '
+        '(CSV); empty for none')
     seed: int = setting(0, 'seed; the random state of a pair comes from it and both stamps',
                         low=0, high=2**31 - 1)
 

@@ -35,6 +35,28 @@ class _View:
     image: NDArray[np.uint8]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _DerotatedRays:
+    """Rays (N, 3) of points (N, 2) of an image turned to its stamped row, with row times (N,)."""
+
+    track_ids: NDArray[np.uint32]
+    points: Array
+    rays: Array
+    row_times: Array
+
+    def hold(self, track_ids: NDArray[np.uint32]) -> bool:
+        """Whether all of these are among them."""
+        return bool(np.isin(track_ids, self.track_ids).all())
+
+    def of(self, track_ids: NDArray[np.uint32]) -> _DerotatedRays:
+        """Those of some of the tracks, in the same order."""
+        if len(track_ids) == len(self.track_ids):
+            return self
+        kept = np.isin(self.track_ids, track_ids)
+        return _DerotatedRays(self.track_ids[kept], self.points[kept], self.rays[kept],
+                              self.row_times[kept])
+
+
 class Pipeline:
     """Tracks frames against a reference keyframe and estimates a pose whenever a pair closes.
 
@@ -57,7 +79,10 @@ class Pipeline:
         self._reference: _View | None = None
         self._previous: _View | None = None
         self._gyro: GyroSegment | None = None
+        self._reference_rays: _DerotatedRays | None = None
+        self._current_rays: _DerotatedRays | None = None
         self._frames = 0
+        self._promotion_due = False
 
     def update(self, parameters: Parameters) -> None:
         """Take over parameters that may change while running (settings declared `live`)."""
@@ -67,7 +92,9 @@ class Pipeline:
         """Forget the reference keyframe: the next frame starts anew."""
         self._tracker.reset()
         self._reference = self._previous = self._gyro = None
+        self._reference_rays = self._current_rays = None
         self._frames = 0
+        self._promotion_due = False
 
     def process(self, frame: Frame, imu: FrameImu) -> PairResult | None:
         """Track `frame`; the estimate of the pair that it closes, or None.
@@ -75,6 +102,7 @@ class Pipeline:
         Frames come in the order of their stamps. A frame whose calibration differs from the last
         one's starts anew.
         """
+        self.prepare()
         if frame.calibration != self._calibration:
             self.reset()
             self._calibration = frame.calibration
@@ -95,9 +123,18 @@ class Pipeline:
         if decision is KeyframeDecision.WAIT:
             return None
         result = self._close_pair(frame, view)
-        self._tracker.promote()
         self._restart_from(view)
+        self._promotion_due = True
         return result
+
+    def prepare(self) -> None:
+        """Do what the next frame needs ahead of it; `process` does it where nobody has.
+
+        New corners are sought in a keyframe after its pair is out: nobody waits for them.
+        """
+        if self._promotion_due:
+            self._promotion_due = False
+            self._tracker.promote()
 
     # -- one pair ----------------------------------------------------------------------------
 
@@ -138,7 +175,7 @@ class Pipeline:
 
     def _restart_from(self, view: _View) -> None:
         self._reference = self._previous = view
-        self._gyro = None
+        self._gyro = self._reference_rays = None
         self._frames = 0
 
     def _interval(self, view: _View) -> float:
@@ -150,11 +187,15 @@ class Pipeline:
         """Median parallax [px] after derotation, and the derotated rays with their row times."""
         camera, calibration, reference = self._camera, self._calibration, self._reference
         assert camera is not None and calibration is not None and reference is not None
-        pixels1 = calibration.to_sensor(matches.points1)
-        pixels2 = calibration.to_sensor(matches.points2)
-        tau1, tau2 = camera.row_times(pixels1[:, 1]), camera.row_times(pixels2[:, 1])
-        rays1 = reference.imu.motion.derotate(camera.unproject(pixels1), tau1)
-        rays2 = view.imu.motion.derotate(camera.unproject(pixels2), tau2)
+        # What is tracked gets fewer from frame to frame, and the reference's points stay.
+        if self._reference_rays is None or not self._reference_rays.hold(matches.track_ids):
+            self._reference_rays = _derotated(camera, calibration, reference, matches.track_ids,
+                                              matches.points1)
+        self._reference_rays = self._reference_rays.of(matches.track_ids)
+        self._current_rays = _derotated(camera, calibration, view, matches.track_ids,
+                                        matches.points2)
+        rays1, tau1 = self._reference_rays.rays, self._reference_rays.row_times
+        rays2, tau2 = self._current_rays.rays, self._current_rays.row_times
         if len(rays1) == 0:
             return 0.0, (rays1, rays2, tau1, tau2)
         if self._gyro is not None:
@@ -175,12 +216,16 @@ class Pipeline:
             current.since_previous.stamps_ns, current.since_previous.angular_velocities,
             self._parameters.imu)
 
+        known = self._current_rays
+
         def predict(points: Array) -> Array:
-            pixels = calibration.to_sensor(points)
-            rays = previous.motion.derotate(camera.unproject(pixels),
-                                            camera.row_times(pixels[:, 1])) @ rotation
+            if known is not None and np.array_equal(known.points, points):
+                rays, row_times = known.rays @ rotation, known.row_times
+            else:
+                pixels = calibration.to_sensor(points)
+                row_times = camera.row_times(pixels[:, 1])
+                rays = previous.motion.derotate(camera.unproject(pixels), row_times) @ rotation
             first, last = camera.row_time_span
-            row_times = camera.row_times(pixels[:, 1])
             for _ in range(2):   # the row that sees the point depends on where the point is
                 turned = current.motion.rotations(np.clip(row_times, first, last))
                 predicted = camera.project(np.einsum('nji,nj->ni', turned, rays))
@@ -189,6 +234,14 @@ class Pipeline:
             return calibration.to_image(predicted)
 
         return predict
+
+
+def _derotated(camera: RollingShutterCamera, calibration: Calibration, view: _View,
+               track_ids: NDArray[np.uint32], points: Array) -> _DerotatedRays:
+    pixels = calibration.to_sensor(points)
+    row_times = camera.row_times(pixels[:, 1])
+    return _DerotatedRays(track_ids, points,
+                          view.imu.motion.derotate(camera.unproject(pixels), row_times), row_times)
 
 
 def sensor_camera(calibration: Calibration, parameters: Parameters) -> RollingShutterCamera:

@@ -65,12 +65,15 @@ class ReadyFrame:
     ready_ns : int
         When the later of the image and the IMU sample that covers its last row came, on the
         monotonic clock; 0 offline.
+    taken_ns : int
+        When its turn came, on the same clock: it was decoded after that.
     """
 
     frame: Frame
     imu: FrameImu
     restart: bool
     ready_ns: int
+    taken_ns: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,6 +220,11 @@ class Sequencer:
             self._frames += 1
             self._refuse(stamp_ns, cause, reason)
 
+    def waits_for_imu(self) -> bool:
+        """Whether the newest frame still needs IMU samples."""
+        with self._changed:
+            return bool(self._waiting) and self._waiting[-1].ready_ns is None
+
     def close(self) -> None:
         """End of the input: `take` gives what is there, then None."""
         with self._changed:
@@ -233,6 +241,7 @@ class Sequencer:
         taken = self._take_waiting(timeout)
         if not isinstance(taken, _Waiting):
             return taken
+        taken_ns = self._now()
         try:
             frame = taken.frame.decoded()
         except InputError as error:
@@ -255,7 +264,7 @@ class Sequencer:
             self._frames_taken += 1
             restart = self._taken_generation != self._generation
             self._taken_generation = self._generation
-            return ReadyFrame(frame, imu, restart, taken.ready_ns or 0)
+            return ReadyFrame(frame, imu, restart, taken.ready_ns or 0, taken_ns)
 
     def counts(self) -> SequencerCounts:
         """A snapshot of the counters."""

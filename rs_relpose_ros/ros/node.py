@@ -36,6 +36,7 @@ from rs_relpose_ros.ros.cause_log import CauseLog
 from rs_relpose_ros.ros.diagnostics import Inputs, SILENCE, Statistics
 from rs_relpose_ros.ros.message_types import message_class
 from rs_relpose_ros.ros.params import NodeParameters, unknown_overrides
+from rs_relpose_ros.ros.polled import PolledSubscription, WhenChanged
 from rs_relpose_ros.ros.worker import Worker
 from rs_relpose_ros.timing import NANOSECONDS
 
@@ -46,6 +47,8 @@ IMAGE_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=5,
 IMU_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000,
                      reliability=ReliabilityPolicy.BEST_EFFORT)
 
+# IMU and CameraInfo are read so often [s] where no image asks for them.
+_DRAIN_PERIOD = 0.1
 # The worker ends within a frame, unless it compiles.
 _JOIN_TIMEOUT = 0.4
 # No IMU is silent for so long [s] while it works.
@@ -127,7 +130,8 @@ class RelposeNode(Node):
         self._warm_timer = self.create_timer(0.02, self._subscribe_when_warm, clock=self._steady)
 
     def _subscribe_when_warm(self) -> None:
-        assert self._worker is not None and self._intake is not None
+        assert self._worker is not None
+        assert self._intake is not None and self._sequencer is not None
         if not self._worker.warm:
             if self._now_ns() - self._started_ns > _TELL_COMPILING * NANOSECONDS:
                 self._info('compiling kernels: the first start takes a minute or two, the later '
@@ -141,15 +145,29 @@ class RelposeNode(Node):
             # As image_transport does: the transport's name follows the remapped one.
             image_type = CompressedImage
             image_topic, add_image = f'{image_topic}/compressed', intake.add_compressed_image
-        overriding = QoSOverridingOptions.with_default_policies()
         self._image_topic = image_topic
-        for kind, msgtype, topic, qos, add in (
-                ('images', image_type, image_topic, IMAGE_QOS, add_image),
-                ('camera_infos', CameraInfo, 'camera_info', IMAGE_QOS, intake.add_camera_info),
-                ('imu', Imu, 'imu', IMU_QOS, intake.add_imu),
-                ('accelerometer', Imu, 'accel', IMU_QOS, intake.add_accelerometer)):
-            self.create_subscription(msgtype, topic, self._receiver(kind, add), qos,
-                                     qos_overriding_options=overriding)
+        waiting = self._sequencer.waits_for_imu
+        self._info_subscription = PolledSubscription(
+            self, CameraInfo, 'camera_info', IMAGE_QOS, self._receiver(
+                'camera_infos', WhenChanged(CameraInfo, intake.add_camera_info)),
+            lambda: intake.calibration is None, raw=True)
+        self._imu_subscriptions = [
+            PolledSubscription(self, Imu, 'imu', IMU_QOS,
+                               self._receiver('imu', intake.add_imu), waiting),
+            PolledSubscription(self, Imu, 'accel', IMU_QOS,
+                               self._receiver('accelerometer', intake.add_accelerometer), waiting)]
+        receive_image = self._receiver('images', add_image)
+
+        def with_all_before(image: Any) -> None:
+            # What came before it counts for it.
+            self._info_subscription.drain()
+            receive_image(image)
+            self._drain_imu()
+
+        self.create_subscription(
+            image_type, image_topic, with_all_before, IMAGE_QOS,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+        self.create_timer(_DRAIN_PERIOD, self._drain, clock=self._steady)
         # All that exists by now lives to the end: collections need not look at it again.
         gc.collect()
         gc.freeze()
@@ -166,6 +184,14 @@ class RelposeNode(Node):
         return stopped
 
     # -- messages in -------------------------------------------------------------------------
+
+    def _drain(self) -> None:
+        self._info_subscription.drain()
+        self._drain_imu()
+
+    def _drain_imu(self) -> None:
+        for subscription in self._imu_subscriptions:
+            subscription.drain()
 
     def _receiver(self, kind: str, add: Callable[[Any], None]) -> Callable[[Any], None]:
         def receive(msg: Any) -> None:

@@ -2,7 +2,8 @@
 
     python -m rs_relpose_ros.ros.player bags/hand_held --wait-for-subscribers 10
 
-For tests, the demo and machines without ``ros2 bag``. Ends by itself after the last message.
+For tests, the demo, the live benchmark and machines without ``ros2 bag``. Ends by itself after the
+last message.
 """
 
 from __future__ import annotations
@@ -11,10 +12,10 @@ import argparse
 from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+import gc
 from pathlib import Path
 import sys
 import time
-from typing import Any
 
 import cv2
 import numpy as np
@@ -24,8 +25,9 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.serialization import deserialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.utilities import remove_ros_args
+from sensor_msgs.msg import CompressedImage, Image
 
 from rs_relpose_ros.bags.reader import (
     Bag,
@@ -38,8 +40,13 @@ from rs_relpose_ros.bags.reader import (
     Topic,
 )
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
+from rs_relpose_ros.ros.loop import in_turns, Outgoing, stamp_of
 from rs_relpose_ros.ros.message_types import message_class
-from rs_relpose_ros.timing import NANOSECONDS
+from rs_relpose_ros.timing import NANOSECONDS, to_nanoseconds
+
+# When a message was due and when it was published, on the monotonic clock [ns].
+LOG_DTYPE = np.dtype([('is_image', '?'), ('stamp_ns', '<i8'), ('due_ns', '<i8'),
+                      ('published_ns', '<i8')])
 
 # What the node subscribes to, and so what is worth waiting for.
 _SENSOR_TYPES = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, IMU)
@@ -66,6 +73,14 @@ class PlayerOptions:
         Only these topics of the bag; empty for all.
     wait_for_subscribers : float
         Longest wait [s] for a subscription to each sensor topic; 0 starts at once.
+    loop : float
+        Repeat a recording without a seam, whose motion has this period [s]: stamps go on from
+        turn to turn. All messages are decoded and serialised ahead. 0 plays the bag as it is.
+    duration : float
+        With `loop`: end after so many seconds.
+    log : Path or None
+        With `loop`: file (NPY) that receives when each image and IMU message was published,
+        records of `LOG_DTYPE`.
     """
 
     bag: Path
@@ -74,6 +89,9 @@ class PlayerOptions:
     decode: str = ''
     topics: tuple[str, ...] = ()
     wait_for_subscribers: float = 0.0
+    loop: float = 0.0
+    duration: float = 60.0
+    log: Path | None = None
 
 
 def play(node: Node, options: PlayerOptions) -> int:
@@ -87,11 +105,18 @@ def play(node: Node, options: PlayerOptions) -> int:
     with open_bag(options.bag) as bag:
         topics = _chosen(bag, options)
         publishers = {topic.name: _publisher(node, topic, options) for topic in topics}
+        messages = _outgoing(bag, topics, options)
+        if options.loop > 0.0:
+            messages = in_turns(list(messages), to_nanoseconds(options.loop),
+                                to_nanoseconds(options.duration))
+            # The sensors' clocks must not stop for a search of so many objects.
+            gc.collect()
+            gc.freeze()
         if options.wait_for_subscribers > 0.0:
             _wait_for_subscribers(
                 [publishers[topic.name] for topic in topics if topic.msgtype in _SENSOR_TYPES],
                 options.wait_for_subscribers)
-        return _publish(bag.raw_messages(topics), publishers, options)
+        return _publish(messages, publishers, options)
 
 
 def _chosen(bag: Bag, options: PlayerOptions) -> list[Topic]:
@@ -127,15 +152,23 @@ def _wait_for_subscribers(publishers: Sequence[Publisher], seconds: float) -> No
             'first, and remap its topics to these names')
 
 
-def _to_publish(raw: RawMessage, options: PlayerOptions) -> Any:
-    """The message, serialised where it goes on as it is."""
+def _outgoing(bag: Bag, topics: Sequence[Topic], options: PlayerOptions) -> Iterator[Outgoing]:
+    first_ns: int | None = None
+    for raw in bag.raw_messages(topics):
+        if first_ns is None:
+            first_ns = raw.bag_time_ns
+        yield Outgoing(raw.bag_time_ns - first_ns, raw.topic, raw.msgtype,
+                       _serialised(raw, options))
+
+
+def _serialised(raw: RawMessage, options: PlayerOptions) -> bytes:
     if options.decode and raw.msgtype == COMPRESSED_IMAGE:
         compressed = deserialize_message(raw.data, message_class(COMPRESSED_IMAGE))
-        return _decoded(compressed, options.decode)
-    return raw.data
+        return bytes(serialize_message(_decoded(compressed, options.decode)))
+    return bytes(raw.data)
 
 
-def _decoded(compressed: Any, encoding: str) -> Any:
+def _decoded(compressed: CompressedImage, encoding: str) -> Image:
     flags = cv2.IMREAD_GRAYSCALE if encoding == 'mono8' else cv2.IMREAD_COLOR
     pixels = cv2.imdecode(np.frombuffer(compressed.data, np.uint8),
                           flags | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -143,30 +176,35 @@ def _decoded(compressed: Any, encoding: str) -> Any:
         raise InputError('a compressed image of the bag cannot be decoded: it is corrupt')
     data = array('B')
     data.frombytes(pixels.tobytes())
-    return message_class(IMAGE)(
+    return Image(
         header=compressed.header, height=pixels.shape[0], width=pixels.shape[1],
         encoding=encoding, step=pixels.shape[1] * pixels[0, 0].size, data=data)
 
 
-def _publish(messages: Iterator[RawMessage], publishers: dict[str, Publisher],
+def _publish(messages: Iterator[Outgoing], publishers: dict[str, Publisher],
              options: PlayerOptions) -> int:
-    count = 0
-    first_ns = start_ns = 0
-    for raw in messages:
-        message = _to_publish(raw, options)
+    count = start_ns = 0
+    log: list[tuple[bool, int, int, int]] = []
+    for message in messages:
         if count == 0:
-            first_ns, start_ns = raw.bag_time_ns, time.monotonic_ns()
-        due_ns = start_ns + round((raw.bag_time_ns - first_ns) / options.rate)
+            start_ns = time.monotonic_ns() - round(message.due_ns / options.rate)
+        due_ns = start_ns + round(message.due_ns / options.rate)
         wait_ns = due_ns - time.monotonic_ns()
         if wait_ns > 0:
             time.sleep(wait_ns / NANOSECONDS)
         if not rclpy.ok():
-            return count
-        publishers[raw.topic].publish(message)
+            break
+        now_ns = time.monotonic_ns()
+        publishers[message.topic].publish(message.data)
         count += 1
-    for publisher in publishers.values():
-        publisher.wait_for_all_acked(Duration(seconds=1))
-    time.sleep(_LINGER)
+        if options.log is not None and message.msgtype in (IMAGE, COMPRESSED_IMAGE, IMU):
+            log.append((message.msgtype != IMU, stamp_of(message.data), due_ns, now_ns))
+    if options.log is not None:
+        np.save(options.log, np.array(log, dtype=LOG_DTYPE))
+    if rclpy.ok():
+        for publisher in publishers.values():
+            publisher.wait_for_all_acked(Duration(seconds=1))
+        time.sleep(_LINGER)
     return count
 
 
@@ -184,9 +222,19 @@ def parse(arguments: Sequence[str]) -> PlayerOptions:
                         help='only these topics of the bag')
     parser.add_argument('--wait-for-subscribers', type=float, default=0.0, metavar='SECONDS',
                         help='longest wait for a subscription to each sensor topic')
+    parser.add_argument('--loop', type=float, default=0.0, metavar='SECONDS',
+                        help='repeat a recording whose motion has this period, without a seam; '
+                             'everything is decoded ahead')
+    parser.add_argument('--duration', type=float, default=60.0, metavar='SECONDS',
+                        help='with --loop: end after so many seconds (default: 60)')
+    parser.add_argument('--log', type=Path, metavar='FILE',
+                        help='with --loop: write when each message was published (NPY)')
     given = parser.parse_args(arguments)
+    if given.loop < 0.0 or given.duration <= 0.0:
+        parser.error('--loop and --duration must be positive')
     return PlayerOptions(given.bag, given.rate, given.best_effort, given.decode,
-                         tuple(given.topics), given.wait_for_subscribers)
+                         tuple(given.topics), given.wait_for_subscribers, given.loop,
+                         given.duration, given.log)
 
 
 def _rate(text: str) -> float:

@@ -10,6 +10,7 @@ from rs_relpose_ros.pipeline.parameters import Parameters
 from rs_relpose_ros.pipeline.pipeline import Pipeline
 from rs_relpose_ros.pipeline.sequencer import FrameRefused, ReadyFrame, Sequencer
 from rs_relpose_ros.pipeline.warm_up import warm_up_pipeline
+from rs_relpose_ros.ros.frame_timings import FrameTimings
 
 _TAKE_TIMEOUT = 0.1
 
@@ -29,6 +30,11 @@ class Worker(threading.Thread):
         Called with every frame that was refused.
     on_error : callable
         Called with a sentence and the exception when a frame failed.
+
+    Raises
+    ------
+    InputError
+        `timings_file` cannot be written.
     """
 
     def __init__(self, parameters: Parameters, sequencer: Sequencer,
@@ -45,6 +51,8 @@ class Worker(threading.Thread):
         self._on_error = on_error
         self._parameters = parameters
         self._pipeline = Pipeline(parameters)
+        self._timings = (FrameTimings(parameters.pair.timings_file)
+                         if parameters.pair.timings_file else None)
         self._changed_parameters: Parameters | None = None
         self._stopping = threading.Event()
         self._warm = threading.Event()
@@ -72,6 +80,8 @@ class Worker(threading.Thread):
         except Exception as error:  # noqa: BLE001 - the node shows it; a silent thread is worse
             self._on_error('the kernels cannot be compiled', error)
             return
+        if self._timings is not None:
+            self._timings.start()
         self._warm.set()
         while not self._stopping.is_set():
             try:
@@ -79,6 +89,8 @@ class Worker(threading.Thread):
             except Exception as error:  # noqa: BLE001 - told with its traceback by the node
                 self._pipeline.reset()
                 self._on_error('a frame failed and tracking starts anew', error)
+        if self._timings is not None:
+            self._timings.close()
 
     def _step(self) -> None:
         taken = self._sequencer.take(_TAKE_TIMEOUT)
@@ -91,4 +103,8 @@ class Worker(threading.Thread):
             if taken.restart:
                 self._pipeline.reset()
             self._on_taken(taken)
-            self._on_result(taken, self._pipeline.process(taken.frame, taken.imu))
+            result = self._pipeline.process(taken.frame, taken.imu)
+            self._on_result(taken, result)
+            if self._timings is not None:
+                self._timings.add(taken, result)
+            self._pipeline.prepare()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import cv2
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
@@ -54,8 +55,7 @@ def find_corners(image: Image, taken: Array, count: int, config: TrackingConfig)
     free = np.zeros(image.shape, dtype=np.uint8)
     free[max(margin, math.ceil(first / scale)):math.floor(last / scale) + 1, margin:-margin] = 255
     free[-margin:] = 0
-    for x, y in taken / scale:
-        cv2.circle(free, (round(x), round(y)), math.ceil(distance), (0,), cv2.FILLED)
+    _occupy(free, taken / scale, math.ceil(distance))
     corners, quality = cv2.goodFeaturesToTrackWithQuality(
         image, 0, _ALL, distance, free, blockSize=_BLOCK)
     if corners is None:  # where there is none
@@ -64,6 +64,18 @@ def find_corners(image: Image, taken: Array, count: int, config: TrackingConfig)
     strong = np.ravel(quality) >= config.feature_quality * 4.0 / 255.0**2
     points = np.reshape(corners, (-1, 2))[strong].astype(np.float64) * scale
     return points[_spread(points, taken, math.sqrt(height * width / config.max_features))[:count]]
+
+
+@numba.njit(cache=True, nogil=True)
+def _occupy(free: Image, points: Array, radius: int) -> None:
+    """Clear the discs around `points` (M, 2)."""
+    height, width = free.shape
+    for k in range(points.shape[0]):
+        x, y = round(points[k, 0]), round(points[k, 1])
+        for row in range(max(y - radius, 0), min(y + radius + 1, height)):
+            for column in range(max(x - radius, 0), min(x + radius + 1, width)):
+                if (column - x)**2 + (row - y)**2 <= radius * radius:
+                    free[row, column] = 0
 
 
 def feature_rows(config: TrackingConfig, height: int) -> tuple[float, float]:

@@ -20,6 +20,10 @@ _FOLLOW = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02)
 _REFINE = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.005)
 # OpenCV's eigenvalues are those of Scharr gradients, 32 times the derivative, divided by 2^20.
 _SCHARR = 2.0**20 / 32.0**2
+# Levels of the pyramid where the gyro says where to look, and the share of tracks that may be lost
+# before all levels are asked.
+_EXPECTED_LEVELS = 2
+_MOST_LOST = 0.15
 # Corrections of the guess [px] that the image itself, without its pyramid, makes up for.
 _NEAR = 2.0
 # The comparison with the reference corrects drift; what it moves further was lost before.
@@ -44,7 +48,8 @@ class KltTracker:
         """Forget all images; ids are not used again."""
         self._reference: Image | None = None
         self._current: Image | None = None
-        self._set(np.empty(0, dtype=np.uint32), np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
+        self._set(np.empty(0, dtype=np.uint32), np.empty((0, 2)), np.empty((0, 2)), np.empty(0),
+                  np.empty((0, 2)))
         self._started = 0
         self._refined = False
 
@@ -73,24 +78,27 @@ class KltTracker:
             raise InputError('the tracker has no reference keyframe: call start() first')
         previous, points = self._current, self._points
         current = checked(image, previous.shape)
-        guess = points
+        predicted = points
         if predict is not None and len(points):
-            guess = np.asarray(predict(points), dtype=np.float64)
-            guess = np.where(np.isfinite(guess).all(axis=1, keepdims=True), guess, points)
-        levels = self._config.klt_levels
+            predicted = np.asarray(predict(points), dtype=np.float64)
+            predicted = np.where(np.isfinite(predicted).all(axis=1, keepdims=True), predicted,
+                                 points)
+        # What the gyro did not tell (parallax) goes on as it did.
+        guess = predicted + self._unpredicted
         seen = with_brightness_of(previous, current, points, guess, self._config.klt_window)
-        found, good, _ = self._follow(previous, seen, points, guess, levels, _FOLLOW)
-        # The way back starts as far off as the way forth did: the guess must not be the answer.
-        offset = found - guess
-        far = np.linalg.norm(offset, axis=1) > _NEAR
-        for mask, depth in ((good & far, levels), (good & ~far, 1)):
-            back, returned, _ = self._follow(
-                seen, previous, found[mask], (points + offset)[mask], depth, _FOLLOW)
-            good[mask] = returned & (np.linalg.norm(back - points[mask], axis=1)
-                                     <= self._config.forward_backward_threshold)
+        levels = self._config.klt_levels
+        expected = predict is not None or self._unpredicted.any()
+        depth = min(_EXPECTED_LEVELS, levels) if expected else levels
+        found, good = self._follow_and_return(previous, seen, points, guess, depth)
+        if depth < levels and np.count_nonzero(~good) > _MOST_LOST * len(good):
+            # Something unexpected: the lost ones once more, with all of the pyramid.
+            lost = ~good
+            found[lost], good[lost] = self._follow_and_return(
+                previous, seen, points[lost], predicted[lost], levels)
         first, last = feature_rows(self._config, image.shape[0])
         good &= (found[:, 1] >= first) & (found[:, 1] <= last)
-        self._set(self._ids[good], self._reference_points[good], found[good], self._quality[good])
+        self._set(self._ids[good], self._reference_points[good], found[good], self._quality[good],
+                  (found - predicted)[good])
         self._current = current
         self._refined = False
         return self._matches()
@@ -116,7 +124,8 @@ class KltTracker:
                      & (np.linalg.norm(found - self._points, axis=1) <= _LARGEST_CORRECTION))
             # A faint corner is worth less than a strong one of the same correlation.
             quality = correlation * strength / (strength + self._config.feature_quality)
-            self._set(self._ids[good], self._reference_points[good], found[good], quality[good])
+            self._set(self._ids[good], self._reference_points[good], found[good], quality[good],
+                      self._unpredicted[good])
         self._refined = True
         return self._matches()
 
@@ -127,6 +136,20 @@ class KltTracker:
         self._renew()
 
     # -- inside ------------------------------------------------------------------------------
+
+    def _follow_and_return(self, image1: Image, image2: Image, points1: Array, guess: Array,
+                           levels: int) -> tuple[Array, NDArray[np.bool_]]:
+        """Points of `image2` that look like `points1` (N, 2), and which of them lead back."""
+        found, good, _ = self._follow(image1, image2, points1, guess, levels, _FOLLOW)
+        # The way back starts as far off as the way forth did: the guess must not be the answer.
+        offset = found - guess
+        far = np.linalg.norm(offset, axis=1) > _NEAR
+        for mask, depth in ((good & far, levels), (good & ~far, 1)):
+            back, returned, _ = self._follow(
+                image2, image1, found[mask], (points1 + offset)[mask], depth, _FOLLOW)
+            good[mask] = returned & (np.linalg.norm(back - points1[mask], axis=1)
+                                     <= self._config.forward_backward_threshold)
+        return found, good
 
     def _follow(self, image1: Image, image2: Image, points1: Array, guess: Array, levels: int,
                 criteria: tuple[int, int, float]) -> tuple[Array, NDArray[np.bool_], Array]:
@@ -159,15 +182,16 @@ class KltTracker:
             np.arange(self._next_id, self._next_id + len(new)) % 2**32).astype(np.uint32)])
         self._next_id += len(new)
         points = np.concatenate([kept, new])
-        self._set(ids, points, points.copy(), np.ones(len(points)))
+        self._set(ids, points, points.copy(), np.ones(len(points)),
+                  np.concatenate([self._unpredicted[apart], np.zeros_like(new)]))
         self._started = len(points)
         self._reference = self._current
         self._refined = False
 
     def _set(self, ids: NDArray[np.uint32], reference_points: Array, points: Array,
-             quality: Array) -> None:
+             quality: Array, unpredicted: Array) -> None:
         self._ids, self._reference_points = ids, reference_points
-        self._points, self._quality = points, quality
+        self._points, self._quality, self._unpredicted = points, quality, unpredicted
 
     def _matches(self) -> Matches:
         # Copies: the tracker goes on, the matches do not change.

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,13 +47,13 @@ def with_brightness_of(image1: Image, image2: Image, points1: Array, points2: Ar
     """
     if not len(points1):
         return image2
-    first, second = (_windows(image, points, side)
-                     for image, points in ((image1, points1), (image2, points2)))
-    contrast = second.std(axis=1)
-    if not (contrast > 0.0).any():
+    first_mean, first_contrast = _statistics(image1, points1, side)
+    mean, contrast = _statistics(image2, points2, side)
+    textured = contrast > 0.0
+    if not textured.any():
         return image2
-    gain = np.median((first.std(axis=1) / np.maximum(contrast, 1e-9))[contrast > 0.0])
-    offset = np.median(first.mean(axis=1) - gain * second.mean(axis=1))
+    gain = np.median(first_contrast[textured] / contrast[textured])
+    offset = np.median(first_mean - gain * mean)
     if abs(gain - 1.0) < _LEAST_GAIN and abs(offset) < _LEAST_OFFSET:
         return image2
     table = np.clip(np.round(gain * np.arange(256.0) + offset), 0.0, 255.0).astype(np.uint8)
@@ -63,24 +66,85 @@ def correlations(image1: Image, image2: Image, points1: Array, points2: Array,
 
     Zero where one of the windows is flat.
     """
-    windows = []
-    for image, points in ((image1, points1), (image2, points2)):
-        sampled = _windows(image, points, side)
-        sampled -= sampled.mean(axis=1, keepdims=True)
-        windows.append(sampled)
-    first, second = windows
-    power = (first**2).sum(axis=1) * (second**2).sum(axis=1)
-    product = (first * second).sum(axis=1)
-    return np.where(power > 0.0, product / np.sqrt(np.maximum(power, 1e-30)), 0.0)
+    return _correlations(image1, image2, points1, points2, side)
 
 
-def _windows(image: Image, points: Array, side: int) -> Array:
-    """Pixels (N, side^2) of the windows centred at `points` (N, 2), the border repeated."""
-    offset = np.arange(side, dtype=np.float64) - side // 2
-    x = (points[:, 0, None, None] + offset[None, None, :]).repeat(side, axis=1)
-    y = (points[:, 1, None, None] + offset[None, :, None]).repeat(side, axis=2)
-    shape = len(points), side * side
-    sampled = cv2.remap(image, x.reshape(shape).astype(np.float32),
-                        y.reshape(shape).astype(np.float32), cv2.INTER_LINEAR,
-                        borderMode=cv2.BORDER_REPLICATE)
-    return sampled.astype(np.float64)
+@numba.njit(cache=True, nogil=True)
+def _statistics(image: Image, points: Array, side: int) -> tuple[Array, Array]:
+    """Mean and standard deviation (N,) of the windows around `points` (N, 2).
+
+    Of whole pixels: interpolation would smooth the noise, and more so in one of two images.
+    """
+    height, width = image.shape
+    count, pixels = points.shape[0], side * side
+    mean, deviation = np.empty(count), np.empty(count)
+    for k in range(count):
+        x, y = round(points[k, 0]), round(points[k, 1])
+        left, top = x - side // 2, y - side // 2
+        total, squares = np.int64(0), np.int64(0)
+        if left >= 0 and top >= 0 and left + side <= width and top + side <= height:
+            for i in range(side):
+                row = image[top + i, left:left + side]
+                # Integers of 32 bits, which are summed many at a time.
+                row_total, row_squares = np.uint32(0), np.uint32(0)
+                for j in range(side):
+                    value = np.uint32(row[j])
+                    row_total += value
+                    row_squares += value * value
+                total += np.int64(row_total)
+                squares += np.int64(row_squares)
+        else:
+            for i in range(side):
+                for j in range(side):
+                    inner = np.int64(image[min(max(top + i, 0), height - 1),
+                                           min(max(left + j, 0), width - 1)])
+                    total += inner
+                    squares += inner * inner
+        mean[k] = total / pixels
+        deviation[k] = math.sqrt(max(squares / pixels - mean[k] * mean[k], 0.0))
+    return mean, deviation
+
+
+@numba.njit(cache=True, nogil=True)
+def _correlations(image1: Image, image2: Image, points1: Array, points2: Array,
+                  side: int) -> Array:
+    count, pixels = points1.shape[0], side * side
+    result = np.zeros(count)
+    window1, window2 = np.empty(pixels, dtype=np.float32), np.empty(pixels, dtype=np.float32)
+    for k in range(count):
+        mean1 = _window(image1, points1[k, 0], points1[k, 1], side, window1)
+        mean2 = _window(image2, points2[k, 0], points2[k, 1], side, window2)
+        power1, power2, product = 0.0, 0.0, 0.0
+        for i in range(pixels):
+            off1, off2 = window1[i] - mean1, window2[i] - mean2
+            power1 += off1 * off1
+            power2 += off2 * off2
+            product += off1 * off2
+        # A flat window has nothing but rounding.
+        if power1 > 1e-6 * pixels and power2 > 1e-6 * pixels:
+            result[k] = product / math.sqrt(power1 * power2)
+    return result
+
+
+@numba.njit(cache=True, nogil=True)
+def _window(image: Image, x: float, y: float, side: int, window: NDArray[np.float32]) -> float:
+    """Sample the window (side^2,) centred at a point, the border repeated; its mean."""
+    height, width = image.shape
+    left, top = math.floor(x) - side // 2, math.floor(y) - side // 2
+    dx, dy = x - math.floor(x), y - math.floor(y)
+    # One fraction for all pixels, as they lie on a grid.
+    w00, w01 = np.float32((1.0 - dx) * (1.0 - dy)), np.float32(dx * (1.0 - dy))
+    w10, w11 = np.float32((1.0 - dx) * dy), np.float32(dx * dy)
+    inside = left >= 0 and top >= 0 and left + side < width and top + side < height
+    total = 0.0
+    for i in range(side):
+        row = top + i if inside else min(max(top + i, 0), height - 1)
+        below = row + 1 if inside else min(max(top + i + 1, 0), height - 1)
+        for j in range(side):
+            column = left + j if inside else min(max(left + j, 0), width - 1)
+            right = column + 1 if inside else min(max(left + j + 1, 0), width - 1)
+            value = (w00 * image[row, column] + w01 * image[row, right]
+                     + w10 * image[below, column] + w11 * image[below, right])
+            window[i * side + j] = value
+            total += value
+    return total / (side * side)

@@ -1,0 +1,105 @@
+"""Topics that are read when their messages are needed, instead of waking the process each time.
+
+Waking up for a message costs rclpy more than the message itself: it builds a new wait set of all
+that the node has. An IMU wakes hundreds of times a second, while its samples are needed thirty
+times: when a frame asks for them. Until then the middleware keeps them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.callback_groups import CallbackGroup
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.serialization import deserialize_message
+
+# Most messages that are taken in one go: others have their turn in between.
+_MOST_AT_ONCE = 2000
+# CDR of a message that begins with a header: encapsulation and stamp.
+_STAMPED = 12
+
+
+class PolledSubscription:
+    """A subscription that is read by `drain`, and wakes the executor only while it is urgent.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    msgtype : type
+    topic : str
+    qos : QoSProfile
+        Its depth must hold what comes between two calls of `drain`.
+    receive : callable
+        Called with each message (its bytes where `raw`).
+    urgent : callable
+        Whether the next message should wake the executor; asked before it waits.
+    raw : bool
+        Do not deserialise.
+    """
+
+    def __init__(self, node: Node, msgtype: type, topic: str, qos: QoSProfile,
+                 receive: Callable[[Any], None], urgent: Callable[[], bool], *,
+                 raw: bool = False) -> None:
+        self._receive = receive
+        self._subscription = node.create_subscription(
+            msgtype, topic, self._on_message, qos, callback_group=_WhileUrgent(urgent),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(), raw=raw)
+
+    def drain(self) -> None:
+        """Receive all that has come."""
+        subscription = self._subscription
+        with subscription.handle:
+            for _ in range(_MOST_AT_ONCE):
+                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+                if taken is None:
+                    return
+                self._receive(taken[0])
+
+    def _on_message(self, msg: Any) -> None:
+        self._receive(msg)
+        self.drain()
+
+
+class _WhileUrgent(CallbackGroup):
+    """Keeps its subscription out of the executor's wait set unless it is urgent."""
+
+    def __init__(self, urgent: Callable[[], bool]) -> None:
+        super().__init__()
+        self._urgent = urgent
+
+    def can_execute(self, entity: Any) -> bool:
+        return self._urgent()
+
+    def beginning_execution(self, entity: Any) -> bool:
+        return True
+
+    def ending_execution(self, entity: Any) -> None:
+        pass
+
+
+class WhenChanged:
+    """Hands on a serialised message only if it differs from the last one by more than its stamp.
+
+    A CameraInfo comes with each image and hardly ever changes.
+
+    Parameters
+    ----------
+    msgtype : type
+        Of messages that begin with a std_msgs/Header.
+    receive : callable
+        Called with the message.
+    """
+
+    def __init__(self, msgtype: type, receive: Callable[[Any], None]) -> None:
+        self._msgtype = msgtype
+        self._receive = receive
+        self._last = b''
+
+    def __call__(self, data: bytes) -> None:
+        """Take a serialised message."""
+        if data[_STAMPED:] != self._last:
+            self._last = data[_STAMPED:]
+            self._receive(deserialize_message(data, self._msgtype))
