@@ -118,7 +118,7 @@ class RelposeNode(Node):
         if parameters.pair.stamps_file:
             self._stamps = _opened(parameters.pair.stamps_file)
         self._sequencer = Sequencer(parameters)
-        self._intake = MessageIntake(self._sequencer)
+        self._intake = MessageIntake(self._sequencer, parameters.imu.stuck_gyro_time)
         self._worker = Worker(parameters, self._sequencer, self._on_taken, self._on_result,
                               self._on_refused, self._on_failure)
         self._worker.start()
