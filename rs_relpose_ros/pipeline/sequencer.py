@@ -54,6 +54,7 @@ class Refusal(str, Enum):
     DUPLICATE = 'duplicate'
     OUT_OF_ORDER = 'out_of_order'
     CLOCK_JUMP = 'clock_jump'
+    RESET = 'reset'
     BAD_IMAGE = 'bad_image'
     NO_CALIBRATION = 'no_calibration'
 
@@ -249,6 +250,12 @@ class Sequencer:
             self._frames += 1
             self._refuse(stamp_ns, cause, reason)
 
+    def reset(self) -> None:
+        """Forget all frames and the IMU; the next frame starts anew."""
+        with self._changed:
+            self._start_anew(Refusal.RESET, 'a reset was asked for')
+            self._clear_imu()
+
     def close(self) -> None:
         """End of the input: `take` gives what is there, then None."""
         with self._changed:
@@ -389,11 +396,14 @@ class Sequencer:
         self._changed.notify()
 
     def _jump(self, reason: str) -> None:
-        """Time starts anew: what waits belongs to the time before."""
         self._clock_jumps += 1
+        self._start_anew(Refusal.CLOCK_JUMP, reason)
+
+    def _start_anew(self, cause: Refusal, reason: str) -> None:
+        """What waits belongs to the time before."""
         self._generation += 1
         while self._waiting:
-            self._refuse(self._waiting.popleft().frame.stamp_ns, Refusal.CLOCK_JUMP, reason)
+            self._refuse(self._waiting.popleft().frame.stamp_ns, cause, reason)
         self._last_stamp_ns = self._previous_reference_ns = None
 
     def _clear_imu(self) -> None:
