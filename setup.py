@@ -35,7 +35,7 @@ setup(
     zip_safe=False,
     entry_points={
         'console_scripts': [
-            'relpose_node = rs_relpose_ros.ros.node:main',
+            'relpose_node = rs_relpose_ros.ros.start:main',
             'rs_relpose = rs_relpose_ros.cli.main:main',
         ],
     },

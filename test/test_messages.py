@@ -13,7 +13,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.messages import incoming, outgoing
+from rs_relpose_ros.messages.hanging import HangingCamera, HangingGyro
 from rs_relpose_ros.messages.intake import MessageIntake
 from rs_relpose_ros.pipeline.pair import PairResult
 from rs_relpose_ros.pipeline.parameters import Parameters
@@ -460,3 +462,47 @@ def test_image_of_another_size_is_refused():
     assert 'image is 640x240, but its CameraInfo tells 640x480' in refused.reason
     assert ready.frame.image.shape == (480, 640)
     assert sequencer.counts().refused == {Refusal.BAD_IMAGE: 1}
+
+
+# -- sensors that hang -----------------------------------------------------------------------
+
+
+def problems(values: list[tuple[float, float, float]], step_ms: int = 5) -> list[str]:
+    gyro = HangingGyro(0.025)
+    return [gyro.problem(ImuSample(k * step_ms * 10**6, value, None))
+            for k, value in enumerate(values)]
+
+
+def test_a_gyro_that_repeats_itself_hangs():
+    found = problems([(0.1, 0.2, 0.3)] * 8 + [(0.1, 0.2, 0.31)])
+    # 25 ms are borne.
+    assert [bool(problem) for problem in found] == [False] * 6 + [True] * 2 + [False]
+    assert 'it hangs' in found[7]
+    assert any(problems([(0.0, 0.0, 0.0)] * 8))
+
+
+def test_a_gyro_at_the_end_of_its_range_is_saturated():
+    moving = np.random.default_rng(0).normal(size=(8, 2))
+    found = problems([(-4.36, x, y) for x, y in moving])
+    assert found[-1] == 'the x axis of the gyro repeats -4.36 rad/s bit by bit: it is saturated'
+
+
+def test_what_sensors_do_repeat():
+    noise = np.random.default_rng(0).normal(size=40)
+    # A robot in the plane, a coarse gyro at rest, and a driver faster than its sensor.
+    assert not any(problems([(0.0, 0.0, z) for z in noise]))
+    assert not any(problems([(0.001, -0.001, z) for z in noise]))
+    assert not any(problems([(z, z, z) for z in noise for _ in range(5)], step_ms=1))
+    assert not any(problems([(z, z, z) for z in noise for _ in range(2)], step_ms=20))
+    gyro = HangingGyro(0.0)
+    assert not any(gyro.problem(ImuSample(k * 10**7, (0.0, 0.0, 0.0), None)) for k in range(100))
+
+
+def test_an_image_that_repeats_the_one_before():
+    camera = HangingCamera()
+    pixels = np.random.default_rng(0).integers(0, 256, (100, 80), dtype=np.uint8)
+    other = pixels.copy()
+    other[50, 50] ^= 1
+    told = [bool(camera.problem(image)) for image in (
+        pixels, pixels.copy(), other, other, pixels[:50], pixels)]
+    assert told == [False, True, False, True, False, False]

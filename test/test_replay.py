@@ -315,14 +315,17 @@ def test_bad_parameter_files(tmp_path, text, said):
 def write_bag(path: Path, *, images: int = 4, camera: RollingShutterCamera = CAMERA,
               topics: tuple[str, ...] = ('image', 'camera_info', 'imu'), spoil=None,
               encoding: str = 'mono8', size: tuple[int, int] = (120, 160)) -> Path:
-    """A short bag of a camera that stands; `spoil(topic, message, index)` may damage messages."""
+    """A short bag of a camera that stands, with noise as sensors have it.
+
+    `spoil(topic, message, index)` may damage messages.
+    """
     rng = np.random.default_rng(0)
     picture = cv2.GaussianBlur(rng.integers(0, 256, size, dtype=np.uint8), (5, 5), 1.5)
     entries = []
     bag = BagWriter(path)
     for k in range(images):
         stamp = START_NS + k * 33_000_000
-        image = bag.image(stamp, 'camera', picture)
+        image = bag.image(stamp, 'camera', picture ^ rng.integers(0, 2, size, dtype=np.uint8))
         image.encoding = encoding
         entries += [('camera_info', 'sensor_msgs/msg/CameraInfo',
                      bag.camera_info(stamp, 'camera', camera), stamp + 30_000_000, k),
@@ -330,7 +333,7 @@ def write_bag(path: Path, *, images: int = 4, camera: RollingShutterCamera = CAM
     for k in range(-20, images * 7 + 10):
         stamp = START_NS + k * 5_000_000
         entries.append(('imu', 'sensor_msgs/msg/Imu',
-                        bag.imu(stamp, 'imu', (0.0, 0.0, 0.0), (0.0, -9.81, 0.0)),
+                        bag.imu(stamp, 'imu', tuple(rng.normal(0.0, 1e-3, 3)), (0.0, -9.81, 0.0)),
                         stamp + 2_000_000, k))
     with bag:
         for topic, msgtype, message, bag_time_ns, index in sorted(entries, key=lambda e: e[3]):

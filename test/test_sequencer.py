@@ -430,3 +430,41 @@ def test_threads():
 def test_sensor_settings_are_needed():
     with pytest.raises(MissingInputError, match='quat_cam_imu_xyzw'):
         Sequencer(Parameters.from_mapping({'readout_time': 0.03}))
+
+
+def test_a_clock_that_is_set_back_by_less_than_a_second(live):
+    """Neither late messages nor a jump by their size; two times must not mix."""
+    add_imu(live, 0, 1000)
+    for ms in range(100, 1000, 100):
+        live.add_frame(frame(ms))
+    drain(live)
+    items = []
+    for ms in range(600, 960, 5):
+        live.add_imu(sample(ms))
+        if ms % 30 == 0:
+            live.add_frame(frame(ms))
+        items += drain(live)
+    refused = [item.cause for item in items if isinstance(item, FrameRefused)]
+    assert refused.count(Refusal.OUT_OF_ORDER) == 2
+    first, *others = (item for item in items if isinstance(item, ReadyFrame))
+    assert first.restart
+    assert not any(item.restart for item in others)
+    # The third frame tells, and IMU from then on is needed.
+    assert stamps(items) == [690.0 + 30.0 * k for k in range(9)]
+    assert live.counts().clock_jumps == 1
+
+
+def test_stragglers_are_no_clock_set_back(live):
+    for k in range(0, 100, 2):
+        live.add_imu(sample(5 * k + 5))
+        live.add_imu(sample(5 * k))
+    assert live.counts().clock_jumps == 0
+
+
+def test_a_gap_does_not_count_as_waiting_for_the_worker(live):
+    """All frames of a gap are known for lost at once, when the gyro comes back."""
+    add_imu(live, 0, 100)
+    for k in range(10):
+        live.add_frame(frame(110 + 30 * k))
+    add_imu(live, 500, 600)
+    assert live.counts().refused == {Refusal.IMU_GAP: 10}

@@ -30,6 +30,9 @@ class ImuConfig:
         low=0.01, high=20.0)
     max_imu_gap: float = setting(
         0.05, 'longest step between gyro samples that is interpolated', 's', low=1e-3, high=1.0)
+    stuck_gyro_time: float = setting(
+        0.025, 'a gyro that repeats its values bit by bit for longer hangs or is saturated, and '
+        'is not used; 0 believes it, for simulations without noise', 's', low=0.0, high=10.0)
     imu_buffer_seconds: float = setting(
         5.0, 'length of IMU history kept', 's', low=1.0, high=60.0)
 

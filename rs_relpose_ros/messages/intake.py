@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.errors import InputError, RsRelposeError
+from rs_relpose_ros.messages.hanging import HangingCamera, HangingGyro
 from rs_relpose_ros.messages.incoming import (
     accelerometer_sample_from_message,
     calibration_from_info,
@@ -31,14 +32,23 @@ _HELD_IMAGES = 4
 class MessageIntake:
     """Converts messages and hands them over; images are decoded later, by who takes the frames.
 
-    An image goes with the CameraInfo that came last. Not thread-safe: one thread feeds it.
+    An image goes with the CameraInfo that came last. Not thread-safe: one thread feeds it, and
+    one takes the frames.
+
+    Parameters
+    ----------
+    sequencer : Sequencer
+    stuck_gyro_time : float
+        As the parameter of that name [s]; 0 believes every gyro.
     """
 
-    def __init__(self, sequencer: Sequencer) -> None:
+    def __init__(self, sequencer: Sequencer, stuck_gyro_time: float = 0.0) -> None:
         self._sequencer = sequencer
         self._calibration: Calibration | None = None
         self._problem = ''
         self._held: deque[tuple[Any, Decode]] = deque()
+        self._camera = HangingCamera()
+        self._gyro = HangingGyro(stuck_gyro_time)
 
     @property
     def calibration(self) -> Calibration | None:
@@ -84,7 +94,11 @@ class MessageIntake:
         InputError
             It cannot be used.
         """
-        self._sequencer.add_imu(imu_sample_from_message(msg))
+        sample = imu_sample_from_message(msg)
+        problem = self._gyro.problem(sample)
+        if problem:
+            raise InputError(problem)
+        self._sequencer.add_imu(sample)
 
     def add_accelerometer(self, msg: Any) -> None:
         """Hand over a sensor_msgs/Imu of a driver that publishes the accelerometer apart."""
@@ -107,9 +121,17 @@ class MessageIntake:
         try:
             self._sequencer.add_frame(EncodedFrame(
                 stamp_ns(msg.header), str(msg.header.frame_id), self._calibration,
-                lambda: decode(msg)))
+                lambda: self._decoded(msg, decode)))
         except InputError as error:
             self._sequencer.refuse(0, Refusal.BAD_IMAGE, str(error))
+
+    def _decoded(self, msg: Any, decode: Decode) -> NDArray[np.uint8]:
+        """The image of a message; called by who takes the frames, one after the other."""
+        image = decode(msg)
+        problem = self._camera.problem(image)
+        if problem:
+            raise InputError(problem)
+        return image
 
     def _refuse_uncalibrated(self, msg: Any) -> None:
         try:

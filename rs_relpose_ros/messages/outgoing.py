@@ -113,6 +113,16 @@ def matches_message(result: PairResult, types: MessageTypes) -> Any:
         is_dense=True)
 
 
+def color_image_message(stamp_ns: int, frame_id: str, pixels: NDArray[np.uint8],
+                        types: MessageTypes) -> Any:
+    """sensor_msgs/Image, bgr8, of (H, W, 3) pixels."""
+    message_type = types('sensor_msgs/msg/Image')
+    return message_type(
+        header=header(stamp_ns, frame_id, types), height=pixels.shape[0], width=pixels.shape[1],
+        encoding='bgr8', is_bigendian=0, step=3 * pixels.shape[1],
+        data=_byte_data(pixels, message_type))
+
+
 def inlier_records(result: PairResult) -> NDArray[np.void]:
     """Inlier matches (N,) as records of `MATCH_DTYPE`."""
     inliers = result.pose.inliers
@@ -187,13 +197,13 @@ def _covariance(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.ascontiguousarray(covariance, dtype=np.float64).reshape(36)
 
 
-def _byte_data(records: NDArray[Any], message_type: Any) -> Any:
+def _byte_data(values: NDArray[Any], message_type: Any) -> Any:
     """Bytes in the container that is cheap: rclpy copies an ndarray element by element."""
     if _is_rclpy(message_type):
         data = array('B')
-        data.frombytes(records.tobytes())
+        data.frombytes(values.tobytes())
         return data
-    return np.frombuffer(records.tobytes(), dtype=np.uint8)
+    return np.frombuffer(values.tobytes(), dtype=np.uint8)
 
 
 def _is_rclpy(message_type: Any) -> bool:

@@ -78,6 +78,10 @@ class PairConfig:
     reference_frame: str = setting(
         '', 'frame_id of relative poses; empty for <camera frame>_reference')
     image_transport: str = setting('raw', 'transport of the images', choices=('raw', 'compressed'))
+    publish_debug_image: bool = setting(
+        True, 'publish ~/debug_image, of every pair, while somebody subscribes to it', live=True)
+    publish_tf: bool = setting(
+        False, 'broadcast the reference keyframe as a child of the camera on /tf; needs tf2_ros')
     stamps_file: str = setting(
         '', 'file that receives the stamp of every processed frame, for replay --stamps; empty '
         'for none')

@@ -27,6 +27,10 @@ from rs_relpose_ros.timing import ImageClock, NANOSECONDS, seconds_between, to_n
 
 # A stamp that lies further back than this is a bag that starts anew, not a late message.
 CLOCK_JUMP_NS = NANOSECONDS
+# So many in a row that lie behind the newest, each newer than the one before, are a clock that
+# was set back by less; messages that overtake each other come alone.
+_BACK_FRAMES = 3
+_BACK_SAMPLES = 20
 # Frames that wait for the worker; bounds the latency of an overloaded node.
 MAILBOX_FRAMES = 5
 # Frames that wait for the IMU; bounds the memory.
@@ -35,6 +39,8 @@ WAITING_FRAMES = 16
 MAX_IMU_WAIT_NS = NANOSECONDS
 # An accelerometer this far behind the gyro has stopped; frames no longer wait for it.
 _ACCELEROMETER_STALE_NS = NANOSECONDS // 10
+_IMU_GAP = ('the gyro does not cover the read-out of the frame: it has a gap there, or begins '
+            'later')
 # Refusals that nobody has taken yet; the counters lose none.
 _REFUSALS_KEPT = 256
 
@@ -48,6 +54,7 @@ class Refusal(str, Enum):
     DUPLICATE = 'duplicate'
     OUT_OF_ORDER = 'out_of_order'
     CLOCK_JUMP = 'clock_jump'
+    RESET = 'reset'
     BAD_IMAGE = 'bad_image'
     NO_CALIBRATION = 'no_calibration'
 
@@ -116,6 +123,26 @@ class _Waiting:
     ready_ns: int | None = None
 
 
+class _StepsBack:
+    """Tells stamps of a clock that was set back from those of late messages."""
+
+    def __init__(self, patience: int) -> None:
+        self._patience = patience
+        self._last_ns, self._count = 0, 0
+
+    def add(self, stamp_ns: int, newest_ns: int | None) -> bool:
+        """Whether this stamp ends a run of stamps that only a clock set back can give."""
+        if newest_ns is None or stamp_ns >= newest_ns:
+            self._count = 0
+            return False
+        self._count = self._count + 1 if self._count and stamp_ns > self._last_ns else 1
+        self._last_ns = stamp_ns
+        if self._count < self._patience:
+            return False
+        self._count = 0
+        return True
+
+
 class Sequencer:
     """Thread-safe meeting point of frames and IMU samples.
 
@@ -148,6 +175,8 @@ class Sequencer:
         self._image_clock: ImageClock | None = None
         self._last_stamp_ns: int | None = None
         self._previous_reference_ns: int | None = None
+        self._frames_back = _StepsBack(_BACK_FRAMES)
+        self._samples_back = _StepsBack(_BACK_SAMPLES)
         self._newest_imu_ns: int | None = None
         self._newest_gyro_ns: int | None = None
         self._newest_accelerometer_ns: int | None = None
@@ -170,7 +199,9 @@ class Sequencer:
         """
         with self._changed:
             newest = self._newest_imu_ns
-            if newest is not None and sample.stamp_ns < newest - CLOCK_JUMP_NS:
+            set_back = sample.angular_velocity is not None and self._samples_back.add(
+                sample.stamp_ns, self._newest_gyro_ns)
+            if newest is not None and (set_back or sample.stamp_ns < newest - CLOCK_JUMP_NS):
                 self._jump(f'IMU stamps jumped back by '
                            f'{seconds_between(sample.stamp_ns, newest):.3f} s')
                 self._clear_imu()
@@ -193,20 +224,22 @@ class Sequencer:
             self._frames += 1
             image_clock = self._clock_of(frame.calibration)
             start_ns, end_ns = image_clock.row_span_ns(frame.stamp_ns)
+            set_back = self._frames_back.add(frame.stamp_ns, self._last_stamp_ns)
             if self._last_stamp_ns is not None and frame.stamp_ns <= self._last_stamp_ns:
                 back = seconds_between(frame.stamp_ns, self._last_stamp_ns)
                 if frame.stamp_ns == self._last_stamp_ns:
                     self._refuse(frame.stamp_ns, Refusal.DUPLICATE,
                                  'a frame of this stamp came before')
                     return
-                if self._last_stamp_ns - frame.stamp_ns <= CLOCK_JUMP_NS:
+                if not set_back and self._last_stamp_ns - frame.stamp_ns <= CLOCK_JUMP_NS:
                     self._refuse(frame.stamp_ns, Refusal.OUT_OF_ORDER,
                                  f'the frame is {back:.3f} s older than the one before')
                     return
                 self._jump(f'image stamps jumped back by {back:.3f} s')
-                # The IMU may have jumped already, and then holds what this frame needs.
-                if (self._newest_imu_ns is not None
-                        and self._newest_imu_ns > end_ns + CLOCK_JUMP_NS):
+                # The IMU may have jumped already, and then holds what this frame needs; set back
+                # by little, it may hold two times at once.
+                if set_back or (self._newest_imu_ns is not None
+                                and self._newest_imu_ns > end_ns + CLOCK_JUMP_NS):
                     self._clear_imu()
             self._last_stamp_ns = frame.stamp_ns
             self._waiting.append(_Waiting(
@@ -224,6 +257,12 @@ class Sequencer:
         """Whether the newest frame still needs IMU samples."""
         with self._changed:
             return bool(self._waiting) and self._waiting[-1].ready_ns is None
+
+    def reset(self) -> None:
+        """Forget all frames and the IMU; the next frame starts anew."""
+        with self._changed:
+            self._start_anew(Refusal.RESET, 'a reset was asked for')
+            self._clear_imu()
 
     def close(self) -> None:
         """End of the input: `take` gives what is there, then None."""
@@ -292,10 +331,7 @@ class Sequencer:
                             return self._waiting.popleft()
                         if coverage is Coverage.NEVER:
                             self._waiting.popleft()
-                            return self._counted(
-                                head.frame.stamp_ns, Refusal.IMU_GAP,
-                                'the gyro does not cover the read-out of the frame: it has a gap '
-                                'there, or begins later')
+                            return self._counted(head.frame.stamp_ns, Refusal.IMU_GAP, _IMU_GAP)
                     if self._closed:
                         self._waiting.popleft()
                         return self._counted(head.frame.stamp_ns, Refusal.NO_IMU,
@@ -321,10 +357,15 @@ class Sequencer:
         """Mark the frames that the IMU covers by now, and keep the mailbox within its bounds."""
         now_ns = self._now()
         ready = 0
-        for waiting in self._waiting:
+        for waiting in tuple(self._waiting):
             if waiting.ready_ns is None:
                 if not self._covers(waiting.end_ns):
                     break
+                if self._buffer.coverage(waiting.start_ns, waiting.end_ns) is Coverage.NEVER:
+                    # Here, not when its turn comes: it must not count as waiting for the worker.
+                    self._waiting.remove(waiting)
+                    self._refuse(waiting.frame.stamp_ns, Refusal.IMU_GAP, _IMU_GAP)
+                    continue
                 waiting.ready_ns = now_ns
             ready += 1
         if not self._offline:
@@ -364,11 +405,14 @@ class Sequencer:
         self._changed.notify()
 
     def _jump(self, reason: str) -> None:
-        """Time starts anew: what waits belongs to the time before."""
         self._clock_jumps += 1
+        self._start_anew(Refusal.CLOCK_JUMP, reason)
+
+    def _start_anew(self, cause: Refusal, reason: str) -> None:
+        """What waits belongs to the time before."""
         self._generation += 1
         while self._waiting:
-            self._refuse(self._waiting.popleft().frame.stamp_ns, Refusal.CLOCK_JUMP, reason)
+            self._refuse(self._waiting.popleft().frame.stamp_ns, cause, reason)
         self._last_stamp_ns = self._previous_reference_ns = None
 
     def _clear_imu(self) -> None:

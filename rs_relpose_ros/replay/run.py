@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 import logging
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from rs_relpose_ros.bags.reader import Bag, COMPRESSED_IMAGE, SensorTopics
+from rs_relpose_ros.causes import CauseCounts
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.estimator.estimate import warm_up
 from rs_relpose_ros.messages.incoming import stamp_ns
@@ -47,7 +47,7 @@ class ReplayCounts:
     sequencer : SequencerCounts
     invalid_messages, failed_frames : int
     reasons : dict
-        Number of frames and messages that were not used, by the sentence that says why.
+        Number of frames and messages that were not used, by the first sentence of each cause.
     seconds : float
         Wall time of the whole, without compilation.
     processing_seconds : float
@@ -95,12 +95,12 @@ class Replay:
         self._bag, self._topics, self._stamps = bag, topics, stamps
         self._on_image = on_image
         self._sequencer = Sequencer(parameters, offline=True)
-        self._intake = MessageIntake(self._sequencer)
+        self._intake = MessageIntake(self._sequencer, parameters.imu.stuck_gyro_time)
         self._pipeline = Pipeline(parameters, keep_images=keep_images)
         self._references_ns: dict[int, int] = {}
         self._stamps_found: set[int] = set()
         self._images = self._skipped = self._invalid = self._failed = self._pairs = 0
-        self._reasons: Counter[str] = Counter()
+        self._reasons = CauseCounts()
         self._seconds = self._processing_seconds = 0.0
         self._first_ns = self._last_ns = 0
 
@@ -138,7 +138,7 @@ class Replay:
         return ReplayCounts(
             images=self._images, images_skipped=self._skipped,
             sequencer=self._sequencer.counts(), invalid_messages=self._invalid,
-            failed_frames=self._failed, reasons=dict(self._reasons.most_common()),
+            failed_frames=self._failed, reasons=self._reasons.most_common(),
             seconds=self._seconds, processing_seconds=self._processing_seconds,
             bag_seconds=(self._last_ns - self._first_ns) * 1e-9)
 
@@ -206,8 +206,7 @@ class Replay:
             self._processing_seconds += time.perf_counter() - started
 
     def _not_used(self, reason: str) -> None:
-        self._reasons[reason] += 1
-        if self._reasons[reason] == 1:
+        if self._reasons.add(reason):
             _logger.info('not used: %s', reason)
 
     def _check_outcome(self) -> None:
@@ -220,8 +219,9 @@ class Replay:
             if absent:
                 _logger.warning('%d of the %d chosen stamps are not in the bag', absent,
                                 len(self._stamps))
-        if self._reasons and (not counts.frames_taken or (self._failed and not self._pairs)):
-            reason, _ = Counter(self._reasons).most_common(1)[0]
+        reasons = self._reasons.most_common()
+        if reasons and (not counts.frames_taken or (self._failed and not self._pairs)):
+            reason = next(iter(reasons))
             raise InputError(f'no frame of {self._bag.path} could be used: {reason}')
 
 

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-import re
 import threading
 import time
 
-# Numbers vary from message to message, the cause does not.
-_NUMBERS = re.compile(r'[-+]?\d[\d.e+-]*')
-# Causes remembered; a source that makes up new texts must not fill the memory.
-_MOST_CAUSES = 64
+from rs_relpose_ros.causes import cause_of, MOST_CAUSES
 
 
 class CauseLog:
@@ -36,10 +32,10 @@ class CauseLog:
 
     def __call__(self, text: str) -> None:
         """Log `text`, or count it."""
-        cause = _NUMBERS.sub('#', text)
+        cause = cause_of(text)
         now = self._clock()
         with self._lock:
-            if cause not in self._last and len(self._last) >= _MOST_CAUSES:
+            if cause not in self._last and len(self._last) >= MOST_CAUSES:
                 cause, text = '', 'further problems of other kinds (see /diagnostics)'
             last = self._last.get(cause)
             if last is not None and now - last[0] < self._period:

@@ -25,18 +25,26 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2, TimeReference
+from std_srvs.srv import Trigger
 
 from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.messages.intake import MessageIntake
-from rs_relpose_ros.messages.outgoing import diagnostics_message, pair_messages, status_message
+from rs_relpose_ros.messages.outgoing import (
+    color_image_message,
+    diagnostics_message,
+    pair_messages,
+    status_message,
+)
 from rs_relpose_ros.pipeline.pair import PairResult
 from rs_relpose_ros.pipeline.parameters import Parameters
 from rs_relpose_ros.pipeline.sequencer import FrameRefused, ReadyFrame, Refusal, Sequencer
 from rs_relpose_ros.ros.cause_log import CauseLog
+from rs_relpose_ros.ros.debug_image import draw_debug_image
 from rs_relpose_ros.ros.diagnostics import Inputs, SILENCE, Statistics
 from rs_relpose_ros.ros.message_types import message_class
 from rs_relpose_ros.ros.params import NodeParameters, unknown_overrides
 from rs_relpose_ros.ros.polled import PolledSubscription, WhenChanged
+from rs_relpose_ros.ros.transform import Broadcast, transform_broadcaster
 from rs_relpose_ros.ros.worker import Worker
 from rs_relpose_ros.timing import NANOSECONDS
 
@@ -94,7 +102,12 @@ class RelposeNode(Node):
         self._reference = self.create_publisher(TimeReference, '~/reference', 10)
         self._velocity = self.create_publisher(TwistWithCovarianceStamped, '~/velocity', 10)
         self._matches = self.create_publisher(PointCloud2, '~/matches', 10)
+        self._debug_image = self.create_publisher(Image, '~/debug_image', 2)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._broadcast: Broadcast | None = None
+        if self._settings.current.pair.publish_tf:
+            self._broadcast = transform_broadcaster(self)
+        self.create_service(Trigger, '~/reset', self._reset)
         self._refused = self._cannot_estimate()
         if self._refused:
             self._error(self._refused)
@@ -121,7 +134,7 @@ class RelposeNode(Node):
         if parameters.pair.stamps_file:
             self._stamps = _opened(parameters.pair.stamps_file)
         self._sequencer = Sequencer(parameters)
-        self._intake = MessageIntake(self._sequencer)
+        self._intake = MessageIntake(self._sequencer, parameters.imu.stuck_gyro_time)
         self._worker = Worker(parameters, self._sequencer, self._on_taken, self._on_result,
                               self._on_refused, self._on_failure)
         self._worker.start()
@@ -183,6 +196,16 @@ class RelposeNode(Node):
             self._stamps.close()
         return stopped
 
+    def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Start anew, as after a restart, but for the calibration and the counters."""
+        response.success = self._sequencer is not None
+        if self._sequencer is not None:
+            self._sequencer.reset()
+            response.message = 'starting anew with the next frame'
+        else:
+            response.message = self._refused
+        return response
+
     # -- messages in -------------------------------------------------------------------------
 
     def _drain(self) -> None:
@@ -217,18 +240,27 @@ class RelposeNode(Node):
     def _on_result(self, ready: ReadyFrame, result: PairResult | None) -> None:
         if result is None:
             return
-        if result.pose:
-            messages = pair_messages(result, message_class,
-                                     self._settings.current.pair.reference_frame)
-            try:
-                self._relative_pose.publish(messages.relative_pose)
-                self._reference.publish(messages.reference)
-                self._velocity.publish(messages.velocity)
-                self._matches.publish(messages.matches)
-            except (rclpy_implementation.RCLError, InvalidHandle):
-                if self.context.ok():   # else the node is being shut down
-                    raise
-        self._statistics.add_pair(result, ready.ready_ns)
+        try:
+            if result.pose:
+                self._publish(result)
+            self._statistics.add_pair(result, ready.ready_ns)
+            if (self._settings.current.pair.publish_debug_image
+                    and self._debug_image.get_subscription_count()):
+                self._debug_image.publish(color_image_message(
+                    result.stamp_ns, result.frame_id, draw_debug_image(result), message_class))
+        except (rclpy_implementation.RCLError, InvalidHandle):
+            if self.context.ok():   # else the node is being shut down
+                raise
+
+    def _publish(self, result: PairResult) -> None:
+        messages = pair_messages(
+            result, message_class, self._settings.current.pair.reference_frame)
+        self._relative_pose.publish(messages.relative_pose)
+        self._reference.publish(messages.reference)
+        self._velocity.publish(messages.velocity)
+        self._matches.publish(messages.matches)
+        if self._broadcast is not None:
+            self._broadcast(messages.relative_pose, result.frame_id)
 
     def _on_refused(self, refused: FrameRefused) -> None:
         if refused.cause is Refusal.NO_CALIBRATION:
@@ -321,15 +353,22 @@ def _help() -> argparse.ArgumentParser:
             'Relative poses of a rolling-shutter camera, aided by an IMU.\n\n'
             'subscribes: image (or image/compressed with image_transport:=compressed), '
             'camera_info, imu, accel\n'
-            'publishes:  ~/relative_pose, ~/reference, ~/velocity, ~/matches, /diagnostics'),
+            'publishes:  ~/relative_pose, ~/reference, ~/velocity, ~/matches, ~/debug_image, '
+            '/diagnostics\n'
+            'service:    ~/reset'),
         epilog='\n'.join(lines))
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the node; its exit code: 0 after SIGINT or SIGTERM, 2 for an illegal parameter."""
+def main(arguments: Sequence[str] | None = None,
+         on_started: Callable[[], None] = lambda: None) -> int:
+    """Run the node; its exit code: 0 after SIGINT or SIGTERM, 2 for an illegal parameter.
+
+    `on_started` is called once rclpy handles the signals.
+    """
     given = sys.argv if arguments is None else ['relpose_node', *arguments]
     _help().parse_args(remove_ros_args(given)[1:])
     rclpy.init(args=list(given))
+    on_started()
     node: RelposeNode | None = None
     try:
         node = RelposeNode()

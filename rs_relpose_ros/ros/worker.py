@@ -50,9 +50,10 @@ class Worker(threading.Thread):
         self._on_refused = on_refused
         self._on_error = on_error
         self._parameters = parameters
-        self._pipeline = Pipeline(parameters)
         self._timings = (FrameTimings(parameters.pair.timings_file)
                          if parameters.pair.timings_file else None)
+        # For ~/debug_image; references only.
+        self._pipeline = Pipeline(parameters, keep_images=True)
         self._changed_parameters: Parameters | None = None
         self._stopping = threading.Event()
         self._warm = threading.Event()

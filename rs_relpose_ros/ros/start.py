@@ -1,0 +1,38 @@
+"""Entry of the console script: a signal ends the node quietly even while it still imports.
+
+Imports nothing heavy itself. Before rclpy runs, SIGINT would end the process with a traceback and
+SIGTERM with a signal's exit code.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from types import FrameType
+
+_started = False
+
+
+def main() -> int:
+    """Run the node; its exit code."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _on_signal)
+    from rs_relpose_ros.ros.node import main as run
+    return run(on_started=_on_started)
+
+
+def _on_started() -> None:
+    """From here on rclpy's own handlers end the node; they call this one too."""
+    global _started
+    _started = True
+
+
+def _on_signal(number: int, frame: FrameType | None) -> None:
+    if not _started:
+        # Nothing was begun that would need an end.
+        os._exit(0)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
