@@ -111,7 +111,8 @@ class Pipeline:
         gyro_rotation = gyro_covariance = None
         if self._gyro is not None:
             gyro_rotation, gyro_covariance = integrate_rotation(
-                self._gyro.stamps_ns, self._gyro.angular_velocities, self._parameters.imu)
+                self._gyro.stamps_ns, self._gyro.angular_velocities, self._parameters.imu,
+                self._gyro.bias_sigma)
         motion1, motion2 = reference.imu.motion, view.imu.motion
         config = self._parameters.estimator
         sigmas = [m.gravity_sigma for m in (reference.imu, view.imu)]

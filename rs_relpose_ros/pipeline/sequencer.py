@@ -15,7 +15,7 @@ import threading
 import time
 
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.imu.buffer import Coverage, ImuBuffer
+from rs_relpose_ros.imu.buffer import AddResult, Coverage, ImuBuffer
 from rs_relpose_ros.imu.frame_imu import frame_imu, FrameImu
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.pipeline.calibration import Calibration
@@ -90,7 +90,11 @@ class FrameRefused:
 
 @dataclass(frozen=True, slots=True)
 class SequencerCounts:
-    """What came and what became of it, since the start."""
+    """What came and what became of it, since the start.
+
+    `imu_repeated` counts samples of a stamp that had come before and were dropped, `imu_late`
+    those that came after a younger one and were sorted in.
+    """
 
     frames: int
     frames_taken: int
@@ -98,6 +102,8 @@ class SequencerCounts:
     imu_samples: int
     imu_gaps: int
     clock_jumps: int
+    imu_repeated: int = 0
+    imu_late: int = 0
 
 
 @dataclass(slots=True, eq=False)
@@ -152,7 +158,7 @@ class Sequencer:
         self._taken_generation = 0
         self._closed = False
         self._frames = self._frames_taken = self._imu_samples = 0
-        self._imu_gaps = self._clock_jumps = 0
+        self._imu_gaps = self._clock_jumps = self._imu_repeated = self._imu_late = 0
         self._refused: Counter[Refusal] = Counter()
 
     # -- input -------------------------------------------------------------------------------
@@ -171,8 +177,13 @@ class Sequencer:
                 self._jump(f'IMU stamps jumped back by '
                            f'{seconds_between(sample.stamp_ns, newest):.3f} s')
                 self._clear_imu()
-            self._buffer.add(sample)
+            added = self._buffer.add(sample)
             self._imu_samples += 1
+            self._imu_repeated += added is AddResult.DUPLICATE
+            # Of two topics one is always behind; a gyro sample behind the gyro is late.
+            self._imu_late += (added is AddResult.LATE and sample.angular_velocity is not None
+                               and self._newest_gyro_ns is not None
+                               and sample.stamp_ns < self._newest_gyro_ns)
             self._newest_imu_ns = _later(self._newest_imu_ns, sample.stamp_ns)
             if sample.linear_acceleration is not None:
                 self._newest_accelerometer_ns = _later(
@@ -263,7 +274,8 @@ class Sequencer:
             return SequencerCounts(
                 frames=self._frames, frames_taken=self._frames_taken,
                 refused=dict(self._refused), imu_samples=self._imu_samples,
-                imu_gaps=self._imu_gaps, clock_jumps=self._clock_jumps)
+                imu_gaps=self._imu_gaps, clock_jumps=self._clock_jumps,
+                imu_repeated=self._imu_repeated, imu_late=self._imu_late)
 
     # -- under the lock ----------------------------------------------------------------------
 

@@ -45,6 +45,8 @@ def summarize(records: Sequence[PairRecord], counts: ReplayCounts) -> dict[str, 
         'imu': {
             'samples': counts.sequencer.imu_samples,
             'gaps': counts.sequencer.imu_gaps,
+            'repeated': counts.sequencer.imu_repeated,
+            'late': counts.sequencer.imu_late,
             'clock_jumps': counts.sequencer.clock_jumps,
         },
         'invalid_messages': counts.invalid_messages,
