@@ -91,4 +91,6 @@ class Worker(threading.Thread):
             if taken.restart:
                 self._pipeline.reset()
             self._on_taken(taken)
-            self._on_result(taken, self._pipeline.process(taken.frame, taken.imu))
+            result = self._pipeline.process(taken.frame, taken.imu)
+            self._sequencer.apply_time_offset(self._pipeline.applied_offset_ns)
+            self._on_result(taken, result)
