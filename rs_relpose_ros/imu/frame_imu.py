@@ -64,12 +64,15 @@ class FrameImu:
     since_previous : GyroSegment or None
         From the previous frame's reference instant to this one's; None for the first frame or
         where the gyro has a gap.
+    applied_offset_ns : int
+        Tracked time offset that these instants hold beyond the parameter's.
     """
 
     motion: FrameMotion
     gravity_sigma: float | None
     reference_ns: int
     since_previous: GyroSegment | None
+    applied_offset_ns: int = 0
 
 
 def frame_imu(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_cam_imu: Array,

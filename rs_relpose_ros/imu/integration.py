@@ -87,3 +87,12 @@ def integrate_rotation(stamps_ns: NDArray[np.int64], rates: ArrayLike, config: I
         bias_sigma = config.gyro_bias_sigma
     covariance = config.gyro_noise_density**2 * noise + bias_sigma**2 * by_bias @ by_bias.T
     return rotation, covariance
+
+
+def bias_jacobian(stamps_ns: NDArray[np.int64], rates: Array) -> Array:
+    """Derivative (3, 3) of the integrated rotation by a constant added to all rates.
+
+    ``Exp(J dw) R`` is the rotation integrated from ``rates + dw``, to first order in dw; arguments
+    as in `integrate_rotation`.
+    """
+    return _integrate((stamps_ns - stamps_ns[0]) * 1e-9, np.ascontiguousarray(rates))[1]
