@@ -9,8 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.imu.bias import BiasTracker, GyroBias
 from rs_relpose_ros.imu.config import ImuConfig
-from rs_relpose_ros.imu.gravity import GravityEstimate, GravityFilter, mean_gravity, MEAN_WINDOW_NS
+from rs_relpose_ros.imu.gravity import (
+    agreed_gravity,
+    GravityEstimate,
+    GravityFilter,
+    mean_gravity,
+    MEAN_WINDOW_NS,
+)
 from rs_relpose_ros.imu.integration import integrate_rotation
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.timing import to_nanoseconds
@@ -39,11 +46,11 @@ class AddResult(Enum):
 
 
 class _Series:
-    """Stamped vectors (K, 3) in the order of their stamps, in growing contiguous arrays."""
+    """Stamped vectors (K, width) in the order of their stamps, in growing contiguous arrays."""
 
-    def __init__(self) -> None:
+    def __init__(self, width: int = 3) -> None:
         self._stamps = np.empty(256, dtype=np.int64)
-        self._values = np.empty((256, 3))
+        self._values = np.empty((256, width))
         self._start = 0
         self._end = 0
 
@@ -55,7 +62,7 @@ class _Series:
     def values(self) -> Array:
         return self._values[self._start:self._end]
 
-    def insert(self, stamp_ns: int, value: tuple[float, float, float]) -> bool:
+    def insert(self, stamp_ns: int, value: tuple[float, ...]) -> bool:
         """Insert in order; False for a stamp that is there already."""
         stamps = self.stamps
         position = len(stamps)
@@ -81,30 +88,32 @@ class _Series:
     def _make_room(self) -> None:
         count = self._end - self._start
         size = max(256, 2 * count)
-        stamps, values = np.empty(size, dtype=np.int64), np.empty((size, 3))
+        stamps = np.empty(size, dtype=np.int64)
+        values = np.empty((size, self._values.shape[1]))
         stamps[:count], values[:count] = self.stamps, self.values
         self._stamps, self._values, self._start, self._end = stamps, values, 0, count
 
 
 class ImuBuffer:
-    """Gyro and accelerometer of the last seconds, with a causal gravity filter.
+    """Gyro and accelerometer of the last seconds, with causal filters of gravity and gyro bias.
 
     Gyro and accelerometer may come in one message or in two (RealSense). Equal samples in equal
-    order give bit-equal answers, however the queries interleave: the gravity filter runs sample by
-    sample over the sorted gyro, up to the instant that is asked for.
+    order give bit-equal answers, however the queries interleave: the filters run sample by sample
+    over the sorted gyro, up to the instant that is asked for.
     """
 
     def __init__(self, config: ImuConfig) -> None:
         self._config = config
-        self._bias = np.array(config.gyro_bias)
+        self._told_bias = np.array(config.gyro_bias)
         self._gap_ns = to_nanoseconds(config.max_imu_gap)
         self._keep_ns = to_nanoseconds(config.imu_buffer_seconds)
         self.clear()
 
     def clear(self) -> None:
         """Forget everything."""
-        self._gyro, self._force = _Series(), _Series()
+        self._gyro, self._force, self._down = _Series(), _Series(), _Series(4)
         self._filter = GravityFilter(self._config)
+        self._bias = BiasTracker(self._config)
         self._filtered_ns = self._pruned_ns = int(np.iinfo(np.int64).min)
 
     @property
@@ -131,10 +140,13 @@ class ImuBuffer:
         if sample.stamp_ns < newest - JUMP_BACK_NS:
             return AddResult.JUMPED_BACK
         added = False
-        for series, value in ((self._gyro, sample.angular_velocity),
-                              (self._force, sample.linear_acceleration)):
-            if value is not None:
-                added |= series.insert(sample.stamp_ns, value)
+        own = sample.orientation
+        values: tuple[tuple[_Series, tuple[float, ...] | None], ...] = (
+            (self._gyro, sample.angular_velocity), (self._force, sample.linear_acceleration),
+            (self._down, None if own is None else (*own.down, own.sigma)))
+        for series, numbers in values:
+            if numbers is not None:
+                added |= series.insert(sample.stamp_ns, numbers)
         if not added:
             return AddResult.DUPLICATE
         # A tenth late, so that not each sample costs a search.
@@ -145,10 +157,10 @@ class ImuBuffer:
 
     def prune(self, before_ns: int) -> None:
         """Forget what is older than `before_ns`."""
-        # The filter takes in what is about to be forgotten.
-        self._run_filter(before_ns)
-        self._gyro.prune(before_ns)
-        self._force.prune(before_ns)
+        # The filters take in what is about to be forgotten.
+        self._run_filters(before_ns)
+        for series in (self._gyro, self._force, self._down):
+            series.prune(before_ns)
 
     def coverage(self, start_ns: int, end_ns: int) -> Coverage:
         """Whether the gyro covers [start_ns, end_ns] without a gap."""
@@ -174,7 +186,7 @@ class ImuBuffer:
         stamps_ns : (K,) ndarray of int64
             From `start_ns` to `end_ns`; one entry where they are equal.
         rates : (K, 3) ndarray
-            IMU frame [rad/s], bias subtracted.
+            IMU frame [rad/s], `bias` of `end_ns` subtracted.
         """
         if end_ns < start_ns:
             raise InputError(f'the interval must not end ({end_ns}) before it starts ({start_ns})')
@@ -189,39 +201,67 @@ class ImuBuffer:
         out = np.concatenate([self._interpolated(start_ns)[None], values[inner],
                               *([] if len(borders) == 1
                                 else [self._interpolated(end_ns)[None]])])
-        return out_stamps, out - self._bias
+        return out_stamps, out - self.bias(end_ns).value
+
+    def bias(self, at_ns: int) -> GyroBias:
+        """Bias of the gyro at an instant, from samples up to it; ask in the order of time."""
+        self._run_filters(at_ns)
+        return self._bias.estimate(at_ns)
 
     def rotation(self, start_ns: int, end_ns: int) -> tuple[Array, Array]:
         """``R_start^T R_end`` (3, 3) in the IMU frame and the covariance of its error.
 
         See `integrate_rotation`.
         """
-        return integrate_rotation(*self.angular_velocity(start_ns, end_ns), self._config)
+        stamps_ns, rates = self.angular_velocity(start_ns, end_ns)
+        return integrate_rotation(stamps_ns, rates, self._config, self.bias(end_ns).sigma)
 
     def gravity(self, at_ns: int) -> GravityEstimate | None:
         """Direction of gravity at an instant that the gyro covers, from samples up to it.
 
-        None where there is no accelerometer, or where the gyro does not cover the instant. Ask in
-        the order of time: an instant before one that was asked for gets that one's estimate,
-        turned back by the gyro.
+        None where neither accelerometer nor orientation came, or where the gyro does not cover the
+        instant. Ask in the order of time: an instant before one that was asked for gets that one's
+        estimate, turned back by the gyro.
         """
-        if self._config.gravity_filter == 'mean':
-            stamps = self._force.stamps
-            window = slice(int(np.searchsorted(stamps, at_ns - MEAN_WINDOW_NS)),
-                           int(np.searchsorted(stamps, at_ns, side='right')))
-            return mean_gravity(self._force.values[window])
-        self._run_filter(at_ns)
+        estimate = (self._mean_gravity(at_ns) if self._config.gravity_filter == 'mean'
+                    else self._filtered_gravity(at_ns))
+        if not self._config.use_imu_orientation:
+            return estimate
+        return agreed_gravity(self._own_gravity(at_ns), estimate)
+
+    # -- inside ------------------------------------------------------------------------------
+
+    def _mean_gravity(self, at_ns: int) -> GravityEstimate | None:
+        stamps = self._force.stamps
+        window = slice(int(np.searchsorted(stamps, at_ns - MEAN_WINDOW_NS)),
+                       int(np.searchsorted(stamps, at_ns, side='right')))
+        return mean_gravity(self._force.values[window])
+
+    def _filtered_gravity(self, at_ns: int) -> GravityEstimate | None:
+        self._run_filters(at_ns)
         estimate, stamp_ns = self._filter.estimate(), self._filter.stamp_ns
         if estimate is None or stamp_ns is None:
             return None
-        start_ns, end_ns = sorted((stamp_ns, at_ns))
+        return self._turned(estimate, stamp_ns, at_ns)
+
+    def _own_gravity(self, at_ns: int) -> GravityEstimate | None:
+        """What the IMU's last orientation up to an instant says of gravity."""
+        stamps = self._down.stamps
+        last = int(np.searchsorted(stamps, at_ns, side='right')) - 1
+        if last < 0 or at_ns - int(stamps[last]) > self._gap_ns:
+            return None
+        value = self._down.values[last]
+        return self._turned(GravityEstimate(value[:3], float(value[3])), int(stamps[last]), at_ns)
+
+    def _turned(self, estimate: GravityEstimate, from_ns: int,
+                to_ns: int) -> GravityEstimate | None:
+        """An estimate carried to another instant by the gyro; None where it has a gap."""
+        start_ns, end_ns = sorted((from_ns, to_ns))
         if self.coverage(start_ns, end_ns) is not Coverage.AVAILABLE:
             return None
         turn, _ = self.rotation(start_ns, end_ns)
-        return GravityEstimate((turn.T if stamp_ns < at_ns else turn) @ estimate.direction,
+        return GravityEstimate((turn.T if from_ns < to_ns else turn) @ estimate.direction,
                                estimate.sigma)
-
-    # -- inside ------------------------------------------------------------------------------
 
     def _interpolated(self, at_ns: int) -> Array:
         stamps, values = self._gyro.stamps, self._gyro.values
@@ -232,16 +272,17 @@ class ImuBuffer:
         fraction = (at_ns - stamps[before]) / (stamps[after] - stamps[before])
         return np.asarray(values[before] + fraction * (values[after] - values[before]))
 
-    def _run_filter(self, until_ns: int) -> None:
+    def _run_filters(self, until_ns: int) -> None:
         """Filter the samples up to an instant that were not filtered yet."""
-        if self._config.gravity_filter != 'complementary':
-            return
         stamps = self._gyro.stamps
         first = int(np.searchsorted(stamps, self._filtered_ns, side='right'))
         last = int(np.searchsorted(stamps, until_ns, side='right'))
         if first < last:
-            self._filter.run(stamps[first:last], self._gyro.values[first:last] - self._bias,
-                             self._forces_at(stamps[first:last]))
+            rates, forces = self._gyro.values[first:last], self._forces_at(stamps[first:last])
+            self._bias.run(stamps[first:last], rates, forces)
+            # This one learns on its own what the told bias leaves of gravity's error.
+            if self._config.gravity_filter == 'complementary':
+                self._filter.run(stamps[first:last], rates - self._told_bias, forces)
             self._filtered_ns = int(stamps[last - 1])
 
     def _forces_at(self, stamps_ns: NDArray[np.int64]) -> Array:

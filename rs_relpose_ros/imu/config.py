@@ -20,6 +20,11 @@ class ImuConfig:
         2e-4, 'white noise of the gyro', 'rad/s/sqrt(Hz)', low=1e-7, high=0.1)
     gyro_bias_sigma: float = setting(
         3e-3, 'uncertainty of gyro_bias, 1 sigma per axis', 'rad/s', low=0.0, high=1.0)
+    track_gyro_bias: bool = setting(
+        True, 'take the gyro bias anew whenever the IMU stands still (within 4 gyro_bias_sigma)')
+    use_imu_orientation: bool = setting(
+        True, 'gravity from the orientation of the IMU message where its covariance says that '
+        'there is one, as long as it agrees with the accelerometer')
     gravity_filter: str = setting(
         'complementary', 'gravity from gyro and accelerometer (complementary), or the mean '
         'specific force of the last 0.1 s as in the paper (mean)', choices=GRAVITY_FILTERS)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.imu.buffer import Coverage, ImuBuffer
 from rs_relpose_ros.motion import FrameMotion
+from rs_relpose_ros.timing import seconds_between
 
 Array = NDArray[np.float64]
 
@@ -23,16 +24,29 @@ class GyroSegment:
         The first and the last are the two instants themselves.
     angular_velocities : (K, 3) ndarray
         Rates [rad/s] in the camera frame.
+    bias : (3,) ndarray
+        What was removed [rad/s], in the camera frame; the mean where it changed meanwhile.
+    bias_sigma : float
+        Its uncertainty per axis [rad/s].
     """
 
     stamps_ns: NDArray[np.int64]
     angular_velocities: Array
+    bias: Array
+    bias_sigma: float
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first to the last instant."""
+        return seconds_between(int(self.stamps_ns[0]), int(self.stamps_ns[-1]))
 
     def joined(self, later: GyroSegment) -> GyroSegment:
         """This segment and the one that starts where it ends."""
+        share = later.duration / (self.duration + later.duration)
         return GyroSegment(
             np.concatenate([self.stamps_ns, later.stamps_ns[1:]]),
-            np.concatenate([self.angular_velocities, later.angular_velocities[1:]]))
+            np.concatenate([self.angular_velocities, later.angular_velocities[1:]]),
+            self.bias + share * (later.bias - self.bias), max(self.bias_sigma, later.bias_sigma))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,12 +64,15 @@ class FrameImu:
     since_previous : GyroSegment or None
         From the previous frame's reference instant to this one's; None for the first frame or
         where the gyro has a gap.
+    applied_offset_ns : int
+        Tracked time offset that these instants hold beyond the parameter's.
     """
 
     motion: FrameMotion
     gravity_sigma: float | None
     reference_ns: int
     since_previous: GyroSegment | None
+    applied_offset_ns: int = 0
 
 
 def frame_imu(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_cam_imu: Array,
@@ -95,5 +112,7 @@ def frame_imu(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_
     if (previous_reference_ns is not None and previous_reference_ns < reference_ns
             and buffer.coverage(previous_reference_ns, reference_ns) is Coverage.AVAILABLE):
         stamps_ns, rates = buffer.angular_velocity(previous_reference_ns, reference_ns)
-        since_previous = GyroSegment(stamps_ns, rates @ R_cam_imu.T)
+        bias = buffer.bias(reference_ns)
+        since_previous = GyroSegment(stamps_ns, rates @ R_cam_imu.T, R_cam_imu @ bias.value,
+                                     bias.sigma)
     return FrameImu(motion, gravity_sigma, reference_ns, since_previous)

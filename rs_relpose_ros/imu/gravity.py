@@ -20,6 +20,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.imu.bias import BIAS_MEMORY
 from rs_relpose_ros.imu.config import ImuConfig
 from rs_relpose_ros.so3 import exp_so3
 from rs_relpose_ros.timing import to_nanoseconds
@@ -30,10 +31,12 @@ STANDARD_GRAVITY = 9.80665
 MEAN_WINDOW_NS = 100_000_000
 # Time over which hand-held acceleration stays correlated [s]: samples within it are one.
 _CORRELATION_TIME = 0.2
-# Time after which the bias may be another one again, as far as `gyro_bias_sigma` [s].
-_BIAS_MEMORY = 600.0
 # Acceleration that lasts longer than this [s] drags the filter along.
 _LASTING = 1.0
+# No IMU knows the direction better than so while it is carried about [rad].
+_LEAST_OWN_SIGMA = 0.01
+# Further from the direction of the accelerometer, in sigmas, it counts from another world.
+_OWN_GATE = 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +58,7 @@ class GravityFilter:
         growth = (across * _CORRELATION_TIME / config.gravity_time_constant**2
                   + config.gyro_noise_density**2)
         self._noise = np.array([config.gravity_acceleration_sigma**2, growth,
-                                config.gyro_bias_sigma**2 / _BIAS_MEMORY])
+                                config.gyro_bias_sigma**2 / BIAS_MEMORY])
         self._bias = np.zeros(3)
         self._bias_covariance = config.gyro_bias_sigma**2 * np.eye(3)
         self._restart()
@@ -254,3 +257,20 @@ def mean_gravity(forces: Array) -> GravityEstimate | None:
     # Acceleration hides in the window as a whole; its length shows the part along gravity.
     excess = abs(length - STANDARD_GRAVITY) / STANDARD_GRAVITY
     return GravityEstimate(-mean / length, math.hypot(0.1, excess))
+
+
+def agreed_gravity(own: GravityEstimate | None,
+                   measured: GravityEstimate | None) -> GravityEstimate | None:
+    """The IMU's own estimate, unless it is absent or contradicts the accelerometer's.
+
+    An orientation may count from another world (north-east-down), from the start, or be a filler:
+    it is believed only where the accelerometer allows it.
+    """
+    if own is None:
+        return measured
+    own = GravityEstimate(own.direction, max(own.sigma, _LEAST_OWN_SIGMA))
+    if measured is None:
+        return own
+    apart = math.atan2(float(np.linalg.norm(np.cross(own.direction, measured.direction))),
+                       float(own.direction @ measured.direction))
+    return own if apart <= _OWN_GATE * math.hypot(own.sigma, measured.sigma) else measured

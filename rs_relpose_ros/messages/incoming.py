@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.errors import InputError, MissingInputError
-from rs_relpose_ros.imu.samples import ImuSample
+from rs_relpose_ros.imu.samples import ImuSample, Orientation
 from rs_relpose_ros.messages.image_headers import encoded_image_size
 from rs_relpose_ros.pipeline.calibration import Calibration
 from rs_relpose_ros.timing import NANOSECONDS
@@ -236,7 +236,26 @@ def _imu_sample(msg: Any, gyro: bool) -> ImuSample:
     if angular_velocity is None and linear_acceleration is None:
         raise InputError('an IMU message has neither gyro nor accelerometer: both are marked as '
                          'absent (covariance -1) or zero')
-    return ImuSample(stamp_ns(msg.header), angular_velocity, linear_acceleration)
+    return ImuSample(stamp_ns(msg.header), angular_velocity, linear_acceleration,
+                     _orientation(msg) if gyro else None)
+
+
+def _orientation(msg: Any) -> Orientation | None:
+    """Down in the IMU frame; None unless the covariance block says how good the orientation is.
+
+    All zeros, "unknown" by REP-145, is what drivers leave that compute none.
+    """
+    variance = max(float(msg.orientation_covariance[0]), float(msg.orientation_covariance[4]))
+    q = msg.orientation
+    x, y, z, w = float(q.x), float(q.y), float(q.z), float(q.w)
+    norm2 = x * x + y * y + z * z + w * w
+    if not (float(msg.orientation_covariance[0]) > 0.0 and 0.0 < variance < math.pi**2
+            and abs(norm2 - 1.0) < 0.02):
+        return None
+    # Minus the third row of R(q), world from IMU.
+    down = (-2.0 * (x * z - w * y) / norm2, -2.0 * (y * z + w * x) / norm2,
+            -(w * w - x * x - y * y + z * z) / norm2)
+    return Orientation(down, math.sqrt(variance))
 
 
 def _has_sensor(covariance: Any) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.pipeline.drift import Drift
 from rs_relpose_ros.result import RelativePose
 from rs_relpose_ros.tracking.matches import Matches
 
@@ -37,6 +38,8 @@ class PairResult:
         Median parallax after derotation [px].
     gyro_rotation : (3, 3) ndarray or None
         ``R_1^T R_2`` integrated from the gyro.
+    drift : Drift or None
+        Gyro bias and time offset as tracked up to this pair.
     image1, image2 : (H, W) ndarray of uint8 or None
         Kept where the pipeline was asked to.
     """
@@ -53,5 +56,6 @@ class PairResult:
     rays2: Array
     parallax: float
     gyro_rotation: Array | None = None
+    drift: Drift | None = None
     image1: NDArray[np.uint8] | None = None
     image2: NDArray[np.uint8] | None = None

@@ -40,6 +40,9 @@ class SensorConfig:
     time_offset: float = setting(
         0.0, 'IMU clock minus camera clock: t_imu = stamp + time_offset', 's', low=-10.0,
         high=10.0)
+    track_time_offset: bool = setting(
+        False, 'apply the time offset that is tracked while running (it is always reported)',
+        live=True)
     quat_cam_imu_xyzw: tuple[float, ...] | None = setting(
         None, 'rotation IMU to camera, v_cam = R(q) v_imu; x y z w', low=-1.0, high=1.0, length=4,
         kind=tuple)

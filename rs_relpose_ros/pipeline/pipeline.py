@@ -14,11 +14,13 @@ from rs_relpose_ros.estimator.estimate import estimate_relative_pose
 from rs_relpose_ros.imu.frame_imu import FrameImu, GyroSegment
 from rs_relpose_ros.imu.integration import integrate_rotation
 from rs_relpose_ros.pipeline.calibration import Calibration
+from rs_relpose_ros.pipeline.drift import DriftTracker, PairRotation
 from rs_relpose_ros.pipeline.frame import Frame
 from rs_relpose_ros.pipeline.pair import PairResult
 from rs_relpose_ros.pipeline.parameters import Parameters
 from rs_relpose_ros.result import RelativePose, Status
 from rs_relpose_ros.so3 import aligning_rotation
+from rs_relpose_ros.timing import NANOSECONDS
 from rs_relpose_ros.tracking.keyframes import decide_keyframe, KeyframeDecision
 from rs_relpose_ros.tracking.matches import Matches
 from rs_relpose_ros.tracking.selection import make_tracker
@@ -74,6 +76,7 @@ class Pipeline:
         self._parameters = parameters
         self._keep_images = keep_images
         self._tracker = make_tracker(parameters.tracking)
+        self._drift = DriftTracker(parameters)
         self._calibration: Calibration | None = None
         self._camera: RollingShutterCamera | None = None
         self._reference: _View | None = None
@@ -83,6 +86,11 @@ class Pipeline:
         self._current_rays: _DerotatedRays | None = None
         self._frames = 0
         self._promotion_due = False
+
+    @property
+    def applied_offset_ns(self) -> int:
+        """Tracked time offset that the next frame is to be shifted by [ns]."""
+        return self._drift.applied_ns
 
     def update(self, parameters: Parameters) -> None:
         """Take over parameters that may change while running (settings declared `live`)."""
@@ -148,7 +156,8 @@ class Pipeline:
         gyro_rotation = gyro_covariance = None
         if self._gyro is not None:
             gyro_rotation, gyro_covariance = integrate_rotation(
-                self._gyro.stamps_ns, self._gyro.angular_velocities, self._parameters.imu)
+                self._gyro.stamps_ns, self._gyro.angular_velocities, self._parameters.imu,
+                self._gyro.bias_sigma)
         motion1, motion2 = reference.imu.motion, view.imu.motion
         config = self._parameters.estimator
         sigmas = [m.gravity_sigma for m in (reference.imu, view.imu)]
@@ -164,12 +173,19 @@ class Pipeline:
             relative_rotation_covariance=gyro_covariance if pair.use_gyro_rotation else None,
             interval=self._interval(view), config=config, quality=matches.quality,
             rng=np.random.default_rng([pair.seed, reference.stamp_ns, view.stamp_ns]))
+        if self._gyro is not None and gyro_rotation is not None:
+            self._drift.add(PairRotation(
+                view.imu.reference_ns, pose.R, pose.covariance[3:, 3:], gyro_rotation,
+                gyro_covariance if pair.use_gyro_rotation else None, self._gyro,
+                reference.imu.applied_offset_ns / NANOSECONDS,
+                view.imu.applied_offset_ns / NANOSECONDS))
+        self._drift.apply(self._parameters.sensor.track_time_offset)
         parallax, (rays1, rays2, tau1, tau2) = self._parallax(matches, view)
         return PairResult(
             reference_stamp_ns=reference.stamp_ns, stamp_ns=view.stamp_ns,
             frame_id=frame.frame_id, interval=self._interval(view), pose=pose, matches=matches,
             row_times1=tau1, row_times2=tau2, rays1=rays1, rays2=rays2, parallax=parallax,
-            gyro_rotation=gyro_rotation,
+            gyro_rotation=gyro_rotation, drift=self._drift.estimate(),
             image1=reference.image if self._keep_images else None,
             image2=frame.image if self._keep_images else None)
 

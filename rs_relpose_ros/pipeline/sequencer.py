@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 import threading
 import time
 
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.imu.buffer import Coverage, ImuBuffer
+from rs_relpose_ros.imu.buffer import AddResult, Coverage, ImuBuffer
 from rs_relpose_ros.imu.frame_imu import frame_imu, FrameImu
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.pipeline.calibration import Calibration
@@ -100,7 +100,11 @@ class FrameRefused:
 
 @dataclass(frozen=True, slots=True)
 class SequencerCounts:
-    """What came and what became of it, since the start."""
+    """What came and what became of it, since the start.
+
+    `imu_repeated` counts samples of a stamp that had come before and were dropped, `imu_late`
+    those that came after a younger one and were sorted in.
+    """
 
     frames: int
     frames_taken: int
@@ -108,6 +112,8 @@ class SequencerCounts:
     imu_samples: int
     imu_gaps: int
     clock_jumps: int
+    imu_repeated: int = 0
+    imu_late: int = 0
 
 
 @dataclass(slots=True, eq=False)
@@ -180,11 +186,12 @@ class Sequencer:
         self._newest_imu_ns: int | None = None
         self._newest_gyro_ns: int | None = None
         self._newest_accelerometer_ns: int | None = None
+        self._offset_ns = 0
         self._generation = 0
         self._taken_generation = 0
         self._closed = False
         self._frames = self._frames_taken = self._imu_samples = 0
-        self._imu_gaps = self._clock_jumps = 0
+        self._imu_gaps = self._clock_jumps = self._imu_repeated = self._imu_late = 0
         self._refused: Counter[Refusal] = Counter()
 
     # -- input -------------------------------------------------------------------------------
@@ -205,8 +212,13 @@ class Sequencer:
                 self._jump(f'IMU stamps jumped back by '
                            f'{seconds_between(sample.stamp_ns, newest):.3f} s')
                 self._clear_imu()
-            self._buffer.add(sample)
+            added = self._buffer.add(sample)
             self._imu_samples += 1
+            self._imu_repeated += added is AddResult.DUPLICATE
+            # Of two topics one is always behind; a gyro sample behind the gyro is late.
+            self._imu_late += (added is AddResult.LATE and sample.angular_velocity is not None
+                               and self._newest_gyro_ns is not None
+                               and sample.stamp_ns < self._newest_gyro_ns)
             self._newest_imu_ns = _later(self._newest_imu_ns, sample.stamp_ns)
             if sample.linear_acceleration is not None:
                 self._newest_accelerometer_ns = _later(
@@ -272,6 +284,15 @@ class Sequencer:
 
     # -- output ------------------------------------------------------------------------------
 
+    def apply_time_offset(self, offset_ns: int) -> None:
+        """Shift the frames that are taken from now on by a tracked time offset.
+
+        Call it between `take` and `take`, from the thread that calls these: then the shift of a
+        frame depends on the frames before it alone, live as well as offline.
+        """
+        with self._changed:
+            self._offset_ns = offset_ns
+
     def take(self, timeout: float = 0.0) -> ReadyFrame | FrameRefused | None:
         """The next frame in the order of stamps, or a refusal, or None after `timeout` seconds.
 
@@ -287,19 +308,22 @@ class Sequencer:
             with self._changed:
                 return self._counted(taken.frame.stamp_ns, Refusal.BAD_IMAGE, str(error))
         with self._changed:
+            start_ns, end_ns = self._span(taken)
+            reference_ns = taken.reference_ns + self._offset_ns
             # While it was decoded time may have jumped, and the buffer belongs to another time.
-            if (taken.generation != self._generation or self._buffer.coverage(
-                    taken.start_ns, taken.end_ns) is not Coverage.AVAILABLE):
+            if (taken.generation != self._generation
+                    or self._buffer.coverage(start_ns, end_ns) is not Coverage.AVAILABLE):
                 return self._counted(
                     frame.stamp_ns, Refusal.CLOCK_JUMP,
                     'the gyro samples of the frame went while it was decoded: stamps jumped')
             previous_ns = self._previous_reference_ns
             if (previous_ns is not None
-                    and taken.reference_ns - previous_ns > self._longest_turn_ns):
+                    and reference_ns - previous_ns > self._longest_turn_ns):
                 previous_ns = None
-            imu = frame_imu(self._buffer, (taken.start_ns, taken.end_ns), taken.reference_ns,
-                            self._R_cam_imu, previous_ns)
-            self._previous_reference_ns = taken.reference_ns
+            imu = replace(frame_imu(self._buffer, (start_ns, end_ns), reference_ns,
+                                    self._R_cam_imu, previous_ns),
+                          applied_offset_ns=self._offset_ns)
+            self._previous_reference_ns = reference_ns
             self._frames_taken += 1
             restart = self._taken_generation != self._generation
             self._taken_generation = self._generation
@@ -311,7 +335,8 @@ class Sequencer:
             return SequencerCounts(
                 frames=self._frames, frames_taken=self._frames_taken,
                 refused=dict(self._refused), imu_samples=self._imu_samples,
-                imu_gaps=self._imu_gaps, clock_jumps=self._clock_jumps)
+                imu_gaps=self._imu_gaps, clock_jumps=self._clock_jumps,
+                imu_repeated=self._imu_repeated, imu_late=self._imu_late)
 
     # -- under the lock ----------------------------------------------------------------------
 
@@ -325,8 +350,10 @@ class Sequencer:
                     return self._refusals.popleft()
                 if self._waiting:
                     head = self._waiting[0]
-                    if head.ready_ns is not None:
-                        coverage = self._buffer.coverage(head.start_ns, head.end_ns)
+                    # A tracked offset may have moved a frame that was ready.
+                    start_ns, end_ns = self._span(head)
+                    if head.ready_ns is not None and self._covers(end_ns):
+                        coverage = self._buffer.coverage(start_ns, end_ns)
                         if coverage is Coverage.AVAILABLE:
                             return self._waiting.popleft()
                         if coverage is Coverage.NEVER:
@@ -359,7 +386,7 @@ class Sequencer:
         ready = 0
         for waiting in tuple(self._waiting):
             if waiting.ready_ns is None:
-                if not self._covers(waiting.end_ns):
+                if not self._covers(self._span(waiting)[1]):
                     break
                 if self._buffer.coverage(waiting.start_ns, waiting.end_ns) is Coverage.NEVER:
                     # Here, not when its turn comes: it must not count as waiting for the worker.
@@ -377,6 +404,10 @@ class Sequencer:
                              f'{WAITING_FRAMES} newer frames wait for the gyro')
         if ready:
             self._changed.notify()
+
+    def _span(self, waiting: _Waiting) -> tuple[int, int]:
+        """Instants of its first and last row, with the offset tracked by now."""
+        return waiting.start_ns + self._offset_ns, waiting.end_ns + self._offset_ns
 
     def _covers(self, end_ns: int) -> bool:
         """Whether the IMU has come as far as `end_ns`, an accelerometer on its own topic too."""

@@ -13,6 +13,7 @@ from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.messages.outgoing import pair_messages
 from rs_relpose_ros.pipeline.calibration import Calibration
+from rs_relpose_ros.pipeline.drift import Drift
 from rs_relpose_ros.pipeline.pair import PairResult
 from rs_relpose_ros.pipeline.parameters import Parameters
 from rs_relpose_ros.replay.record import pair_record, PairRecord
@@ -96,6 +97,7 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
     _prepare(folder, with_bag)
     records: list[PairRecord] = []
     shown: PairResult | None = None
+    drift: Drift | None = None
     files = [folder / POSES_FILE]
     with ExitStack() as stack:
         poses = stack.enter_context(TableWriter(folder / POSES_FILE, RELATIVE_POSE_COLUMNS))
@@ -107,6 +109,7 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
         for pair in run.pairs():
             record = pair_record(pair.result, pair.reference_ns1, pair.reference_ns2, truth)
             records.append(record)
+            drift = pair.result.drift
             poses.write(relative_pose_cells(record))
             if errors is not None:
                 errors.write(error_cells(record))
@@ -120,7 +123,8 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
     if pictures and records and shown is not None:
         files += _draw(folder, records, shown, truth)
     counts = run.counts()
-    return ReplayOutcome(records, counts, run.calibration, summarize(records, counts), files)
+    return ReplayOutcome(records, counts, run.calibration, summarize(records, counts, drift),
+                         files)
 
 
 def _prepare(folder: Path, with_bag: bool) -> None:

@@ -195,7 +195,9 @@ class Replay:
         try:
             if ready.restart:
                 self._pipeline.reset()
-            return self._pipeline.process(ready.frame, ready.imu)
+            result = self._pipeline.process(ready.frame, ready.imu)
+            self._sequencer.apply_time_offset(self._pipeline.applied_offset_ns)
+            return result
         except RsRelposeError as error:
             # As the live node does it: one frame does not end the run.
             self._pipeline.reset()

@@ -16,6 +16,7 @@ import numpy as np
 import scipy
 
 from rs_relpose_ros.bags.reader import SensorTopics
+from rs_relpose_ros.pipeline.drift import Drift
 from rs_relpose_ros.pipeline.parameters import Parameters
 from rs_relpose_ros.replay.record import PairRecord
 from rs_relpose_ros.replay.run import ReplayCounts
@@ -23,8 +24,12 @@ from rs_relpose_ros.replay.truth import median_and_p90
 from rs_relpose_ros.result import Status
 
 
-def summarize(records: Sequence[PairRecord], counts: ReplayCounts) -> dict[str, Any]:
-    """Figures of a run; medians are over the answered pairs, null where there are none."""
+def summarize(records: Sequence[PairRecord], counts: ReplayCounts,
+              drift: Drift | None = None) -> dict[str, Any]:
+    """Figures of a run; medians are over the answered pairs, null where there are none.
+
+    `drift`: as after the last pair.
+    """
     answered = [record for record in records if record.status is Status.OK]
     by_status = Counter(record.status.value for record in records)
     seconds = counts.processing_seconds
@@ -45,7 +50,16 @@ def summarize(records: Sequence[PairRecord], counts: ReplayCounts) -> dict[str, 
         'imu': {
             'samples': counts.sequencer.imu_samples,
             'gaps': counts.sequencer.imu_gaps,
+            'repeated': counts.sequencer.imu_repeated,
+            'late': counts.sequencer.imu_late,
             'clock_jumps': counts.sequencer.clock_jumps,
+        },
+        'tracked': None if drift is None or not drift.pairs else {
+            'gyro_bias_rad_s': drift.gyro_bias.tolist(),
+            'gyro_bias_sigma_rad_s': drift.gyro_bias_sigma.tolist(),
+            'time_offset_s': drift.time_offset,
+            'time_offset_sigma_s': drift.time_offset_sigma,
+            'applied_s': drift.applied,
         },
         'invalid_messages': counts.invalid_messages,
         'not_used': counts.reasons,

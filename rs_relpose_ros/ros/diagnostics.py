@@ -10,6 +10,7 @@ import time
 
 import numpy as np
 
+from rs_relpose_ros.pipeline.drift import Drift
 from rs_relpose_ros.pipeline.pair import PairResult
 from rs_relpose_ros.pipeline.sequencer import Refusal, SequencerCounts
 from rs_relpose_ros.timing import NANOSECONDS
@@ -132,6 +133,8 @@ class Statistics:
                 ('messages_invalid', str(inputs.invalid)),
                 ('imu_samples', str(counts.imu_samples if counts else 0)),
                 ('imu_gaps', str(counts.imu_gaps if counts else 0)),
+                ('imu_repeated', str(counts.imu_repeated if counts else 0)),
+                ('imu_late', str(counts.imu_late if counts else 0)),
                 ('clock_jumps', str(counts.clock_jumps if counts else 0)),
                 ('pairs', str(self._pairs)),
                 ('poses', str(self._poses)),
@@ -140,6 +143,7 @@ class Statistics:
                 ('inlier_ratio', f'{_inlier_ratio(last):.3f}' if last else ''),
                 ('parallax_px', f'{last.parallax:.1f}' if last else ''),
                 ('model', pose.pose.model if pose else ''),
+                *_drift_values(last.drift if last else None),
                 ('latency_p50_ms', latency[0]),
                 ('latency_p99_ms', latency[1]),
                 ('last_reason_no_pose', self._last_no_pose),
@@ -161,3 +165,16 @@ class Statistics:
 
 def _inlier_ratio(result: PairResult) -> float:
     return float(result.pose.inliers.mean()) if len(result.pose.inliers) else 0.0
+
+
+def _drift_values(drift: Drift | None) -> tuple[tuple[str, str], ...]:
+    """Bias and time offset as tracked; to be compared with the parameters."""
+    names = ('tracked_gyro_bias_rad_s', 'tracked_gyro_bias_sigma_rad_s', 'tracked_time_offset_ms',
+             'tracked_time_offset_sigma_ms', 'applied_time_offset_ms')
+    if drift is None or not drift.pairs:
+        return tuple((name, '') for name in names)
+    texts = (' '.join(f'{value:.5f}' for value in drift.gyro_bias),
+             ' '.join(f'{value:.5f}' for value in drift.gyro_bias_sigma),
+             *(f'{1e3 * seconds:.2f}' for seconds in (
+                 drift.time_offset, drift.time_offset_sigma, drift.applied)))
+    return tuple(zip(names, texts, strict=True))

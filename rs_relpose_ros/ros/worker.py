@@ -105,6 +105,7 @@ class Worker(threading.Thread):
                 self._pipeline.reset()
             self._on_taken(taken)
             result = self._pipeline.process(taken.frame, taken.imu)
+            self._sequencer.apply_time_offset(self._pipeline.applied_offset_ns)
             self._on_result(taken, result)
             if self._timings is not None:
                 self._timings.add(taken, result)
