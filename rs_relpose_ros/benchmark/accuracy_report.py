@@ -14,6 +14,7 @@ from scipy.stats import chi2, trim_mean
 from rs_relpose_ros.benchmark.accuracy import by_setting, Experiment, Trial
 from rs_relpose_ros.benchmark.scoring import POSE_FREEDOM
 from rs_relpose_ros.benchmark.tables import markdown_table, write_csv
+from rs_relpose_ros.picture_files import save_picture
 
 Array = NDArray[np.float64]
 
@@ -237,15 +238,13 @@ def _against_true_sigmas(group: Sequence[CellStatistics], reference: Sequence[Ce
 
 def _plot(path: Path, cells: Sequence[CellStatistics]) -> None:
     """Ratios to the oracle and NEES of every cell."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     panels = (('rotation_ratio.median', 'median rotation error / oracle', 1.6),
               ('translation_ratio.median', 'median translation error / oracle', 1.6),
               ('nees.mean', 'NEES / 5', 1.25))
     names = list(dict.fromkeys(cell.cell for cell in cells))
-    figure = Figure(figsize=(12.0, 1.6 + 0.22 * len(names)), layout='constrained')
-    FigureCanvasAgg(figure)
+    figure = Figure(figsize=(12.0, 1.6 + 0.22 * len(names)), dpi=110, layout='constrained')
     axes = figure.subplots(1, len(panels), sharey=True)
     for axis, (field, label, limit) in zip(axes, panels, strict=True):
         for (noise, factor), group in _settings(cells).items():
@@ -259,4 +258,4 @@ def _plot(path: Path, cells: Sequence[CellStatistics]) -> None:
     axes[0].set_yticks(range(len(names)), names)
     axes[0].invert_yaxis()
     axes[-1].legend(fontsize='small')
-    figure.savefig(path, dpi=110)
+    save_picture(figure, path)

@@ -14,6 +14,7 @@ import numpy as np
 from rs_relpose_ros.benchmark.methods import LIBRARY, POSELIB_DEROTATED, THRESHOLD
 from rs_relpose_ros.benchmark.speed import exponent, FirstEstimate, medians, Run, Soak
 from rs_relpose_ros.benchmark.tables import markdown_table, write_csv
+from rs_relpose_ros.picture_files import save_picture
 
 RUNS_FILE, METHODS_FILE, SCALING_FILE = 'runs.csv', 'methods.csv', 'scaling.csv'
 REPORT_FILE, PLOT_FILE = 'speed.md', 'speed.png'
@@ -149,11 +150,9 @@ def _versions() -> str:
 
 def _plot(path: Path, compared: Sequence[MethodStatistics], scaling: Sequence[Run]) -> None:
     """Error over time of every method, and time over matches."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(12.0, 4.5), layout='constrained')
-    FigureCanvasAgg(figure)
+    figure = Figure(figsize=(12.0, 4.5), dpi=110, layout='constrained')
     left, right = figure.subplots(1, 2)
     markers = dict(zip(dict.fromkeys(entry.cell for entry in compared), 'osD^v<>Pp*h' * 5,
                        strict=False))
@@ -175,4 +174,4 @@ def _plot(path: Path, compared: Sequence[MethodStatistics], scaling: Sequence[Ru
     right.set_ylabel('median time [ms]')
     for axis in (left, right):
         axis.grid(visible=True, which='both', alpha=0.3)
-    figure.savefig(path, dpi=110)
+    save_picture(figure, path)

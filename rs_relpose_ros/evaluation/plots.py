@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import matplotlib as mpl
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 import numpy as np
@@ -15,6 +13,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.evaluation.methods import METHODS
 from rs_relpose_ros.evaluation.results import Cell, CellErrors
+from rs_relpose_ros.picture_files import save_picture
 
 _DPI = 110
 # Colours that are told apart in every kind of colour vision (Okabe and Ito).
@@ -61,7 +60,7 @@ def draw_boxes(cells: Mapping[Cell, Mapping[str, CellErrors]], title: str, axis:
         for method, color in zip(methods, _COLORS, strict=False)],
         loc='upper left', bbox_to_anchor=(1.0, 1.0), fontsize=9)
     figure.suptitle(title, fontsize=13)
-    _save(figure, path)
+    save_picture(figure, path)
 
 
 def _limits(cells: Mapping[Cell, Mapping[str, CellErrors]], side: str) -> tuple[float, float]:
@@ -124,10 +123,3 @@ def _tick(decade: float) -> str:
     text = f'{decade:.{max(0, -round(np.log10(decade)))}f}'
     # What is drawn there is that or less.
     return f'≤ {text}' if decade <= 1.01 * FLOOR else text
-
-
-def _save(figure: Figure, path: Path) -> None:
-    # Without the version of matplotlib in it, equal figures are equal files.
-    with mpl.rc_context({'savefig.facecolor': 'white'}):
-        FigureCanvasAgg(figure)
-        figure.savefig(path, metadata={'Software': None})

@@ -8,9 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib as mpl
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
@@ -19,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_ros.picture_files import save_picture
 from rs_relpose_ros.pipeline.pair import PairResult
 from rs_relpose_ros.replay.record import PairRecord, rotation_sigmas, translation_sigmas
 from rs_relpose_ros.replay.truth import rotation_angle, TrueTrajectory
@@ -64,7 +63,7 @@ def draw_matches(result: PairResult, path: Path) -> None:
     figure.colorbar(ScalarMappable(norm, _COLORMAP), ax=[left, right], shrink=0.8, pad=0.01,
                     label='row time, from the stamped row [ms]')
     figure.suptitle(_pair_title(result, int(inliers.sum())), fontsize=12)
-    _save(figure, path)
+    save_picture(figure, path)
 
 
 def draw_errors(records: Sequence[PairRecord], path: Path) -> None:
@@ -93,7 +92,7 @@ def draw_errors(records: Sequence[PairRecord], path: Path) -> None:
         _shade_no_pose(axis, records, start_ns)
         axis.legend(loc='upper left', bbox_to_anchor=(1.0, 1.0), fontsize=9)
     axes[-1].set_xlabel('time since the first keyframe [s]')
-    _save(figure, path)
+    save_picture(figure, path)
 
 
 def draw_residuals(records: Sequence[PairRecord], path: Path) -> None:
@@ -118,7 +117,7 @@ def draw_residuals(records: Sequence[PairRecord], path: Path) -> None:
         _shade_no_pose(axis, records, start_ns)
         axis.legend(loc='upper left', bbox_to_anchor=(1.0, 1.0), fontsize=9)
     axes[-1].set_xlabel('time since the first keyframe [s]')
-    _save(figure, path)
+    save_picture(figure, path)
 
 
 def draw_rotation(records: Sequence[PairRecord], path: Path,
@@ -162,7 +161,7 @@ def draw_rotation(records: Sequence[PairRecord], path: Path,
     for axis in (above, below):
         axis.legend(loc='upper left', bbox_to_anchor=(1.0, 1.0), fontsize=9)
     below.set_xlabel('time since the first keyframe [s]')
-    _save(figure, path)
+    save_picture(figure, path)
 
 
 # -- parts -----------------------------------------------------------------------------------
@@ -245,10 +244,3 @@ def _accumulated(rotations: Sequence[Array]) -> list[Array]:
     for rotation in rotations:
         products.append(products[-1] @ rotation)
     return products
-
-
-def _save(figure: Figure, path: Path) -> None:
-    # Without the version of matplotlib in it, equal figures are equal files.
-    with mpl.rc_context({'savefig.facecolor': 'white'}):
-        FigureCanvasAgg(figure)
-        figure.savefig(path, metadata={'Software': None})
