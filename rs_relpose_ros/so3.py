@@ -105,11 +105,11 @@ def skew(v: Array) -> Array:
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
-def aligning_rotation(vectors1: Array, vectors2: Array) -> Array:
-    """The rotation (3, 3) of least ``sum |a - R b|^2`` over vectors a, b (N, 3) (Wahba, Kabsch).
+def aligning_rotation(correlation: Array) -> Array:
+    """The rotation (3, 3) of least ``sum |a - R b|^2``, from ``sum a b^T`` (Wahba, Kabsch).
 
     As SciPy's ``align_vectors``, which warns where the turn about one axis is arbitrary.
     """
-    u, _, vt = np.linalg.svd(vectors1.T @ vectors2)
+    u, _, vt = np.linalg.svd(correlation)
     u[:, 2] *= np.linalg.det(u) * np.linalg.det(vt)
     return np.ascontiguousarray(u @ vt)

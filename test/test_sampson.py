@@ -88,8 +88,13 @@ def test_depths_of_exact_matches():
     points2 = (points1 - t + rows[:, 18:19] * d1 - rows[:, 19:20] * d2) @ R
     depth1, depth2 = np.linalg.norm(points1, axis=1), np.linalg.norm(points2, axis=1)
     rows[:, 0:3], rows[:, 9:12] = points1 / depth1[:, None], points2 / depth2[:, None]
-    out = np.empty((30, 2))
-    sampson.depths(rows, R, t, d1, d2, out)
-    np.testing.assert_allclose(out, np.column_stack([depth1, depth2]), rtol=1e-8)
-    sampson.depths(rows, R, -t, -d1, -d2, out)
-    assert (out < 0.0).all()
+    for k in range(30):
+        *depths, parallax, baseline = sampson.triangulated(rows, k, R, t, d1, d2)
+        np.testing.assert_allclose(depths, [depth1[k], depth2[k]], rtol=1e-8)
+        f1, h = rows[k, 0:3], R @ rows[k, 9:12]
+        assert parallax == pytest.approx(np.linalg.norm(np.cross(f1, h)))
+        moved = t - rows[k, 18] * d1 + rows[k, 19] * d2
+        assert baseline == pytest.approx(np.linalg.norm(moved))
+        behind = sampson.triangulated(rows, k, R, -t, -d1, -d2)
+        assert behind[0] < 0.0
+        assert behind[1] < 0.0

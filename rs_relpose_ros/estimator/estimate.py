@@ -46,6 +46,11 @@ from rs_relpose_ros.estimator.problem import (
 )
 from rs_relpose_ros.estimator.rotation_only import fit_rotation, transfer_errors
 from rs_relpose_ros.estimator.sampling import POOL, sample_hypotheses
+from rs_relpose_ros.estimator.spread import (
+    correlation,
+    distance_from_a_plane,
+    distinct_directions,
+)
 from rs_relpose_ros.estimator.velocity_prior import (
     fit_with_evidence,
     GRID,
@@ -85,6 +90,8 @@ MODES = {
 SAMPLING_VELOCITY_SIGMA = 3.0
 # Share of the matches that a generator must explain to spare those that know less.
 EXPLAINED = 0.5
+# Columns of an observation at which its rays f_1 and f_2 begin.
+RAYS = (0, 9)
 # Noise of |f_1 - R f_2| is 1.67 sigma in the median (Rayleigh, two images).
 ROTATION_ONLY_SIGMAS = 2.5
 # Points whose root mean square distance from a line is below so many thresholds lie on it.
@@ -206,15 +213,15 @@ class _Estimation:
             return self._failure(Status.NO_CONSENSUS, 'no hypothesis explains the matches')
         # 3. Refinement on its inliers.
         state, inliers, velocity_sigma, sigma, local = self._refine(state)
-        rays = [self.problem.observations[inliers, k:k + 3] for k in (0, 9)]
-        cell = config.threshold / self.problem.focal
-        count = min(_distinct(f, cell) for f in rays)
+        observations, cell = self.problem.observations, config.threshold / self.problem.focal
+        count = min(distinct_directions(observations, inliers, f, cell) for f in RAYS)
         chance = self._inliers_by_chance()
         if count < max(config.min_inliers, chance):
             return self._failure(
                 Status.NO_CONSENSUS, f'{count} distinct of {len(self.order)} matches agree, fewer '
                 f'than max(min_inliers = {config.min_inliers}, {chance} expected by chance)')
-        if min(_distance_from_a_plane(f) for f in rays) < DEGENERATE_THRESHOLDS * cell:
+        if min(distance_from_a_plane(observations, inliers, f)
+               for f in RAYS) < DEGENERATE_THRESHOLDS * cell:
             return self._failure(
                 Status.NO_CONSENSUS, f'the {count} matches that agree lie on one line: many poses '
                 'explain them')
@@ -326,13 +333,12 @@ class _Estimation:
         """
         problem, config = self.problem, self.config
         parallax = float(np.median(transfer_errors(
-            problem.observations, np.ascontiguousarray(state.R), problem.focal)[inliers]))
+            problem.observations, inliers, np.ascontiguousarray(state.R), problem.focal)))
         # Not from the pose's own rotation: on a line of points that may be any.
-        rays1, rays2 = problem.observations[inliers, 0:3], problem.observations[inliers, 9:12]
+        start = aligning_rotation(correlation(problem.observations, inliers, *RAYS))
         R, information = fit_rotation(
-            problem.observations, inliers, aligning_rotation(rays1, rays2), self.priors,
-            problem.focal, sigma)
-        left = transfer_errors(problem.observations, R, problem.focal)[inliers]
+            problem.observations, inliers, start, self.priors, problem.focal, sigma)
+        left = transfer_errors(problem.observations, inliers, R, problem.focal)
         median = float(np.median(left))
         turned_only = median < ROTATION_ONLY_SIGMAS * sigma
         if not turned_only and parallax >= config.min_parallax:
@@ -448,20 +454,6 @@ def _sideways() -> tuple[Array, Array, RollingShutterCamera, FrameMotion]:
     motion = FrameMotion(np.array([0.0, 0.1, 0.0]), gravity=np.array([0.0, 1.0, 0.0]))
     world = rng.uniform([-4.0, -3.0, 4.0], [4.0, 3.0, 12.0], (100, 3))
     return camera.project(world), camera.project(world - [0.5, 0.0, 0.0]), camera, motion
-
-
-def _distinct(rays: Array, cell: float) -> int:
-    """Number of different directions (N, 3), to `cell` [rad]: copies of one say nothing new."""
-    x, y = np.round(rays[:, :2].T / cell)
-    return len(np.unique(x + 1e6 * y))
-
-
-def _distance_from_a_plane(rays: Array) -> float:
-    """Root mean square distance [rad] of unit rays (N, 3) from the best plane through the centre.
-
-    Small where the points lie in one place or, in the image, on one line.
-    """
-    return float(np.sqrt(max(np.linalg.eigvalsh(rays.T @ rays / len(rays))[0], 0.0)))
 
 
 def _priors(problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig,

@@ -9,20 +9,20 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.estimator import sampson
-from rs_relpose_ros.estimator.map_fit import fit, linearised, prior_cost, Priors, State
+from rs_relpose_ros.estimator.map_fit import prior_cost, Priors, State, stepped
 
 Array = NDArray[np.float64]
 
 # Multiples of the inlier threshold: the angular model leaves up to 20 px at true inliers.
 SHRINKING = np.array([6.0, 3.0, 1.5, 1.0])
-ITERATIONS = 2
+STEPS = 2
 
 # A depth is judged only where the parallax is this many times its noise.
 SIGNIFICANT_PARALLAX = 4.0
 # A match is taken for an outlier where the logarithm of its depth is so many times as far from the
 # median as the quantile of one sigma on that side.
 DEPTH_GATE = 4.0
-DEPTH_QUANTILES = np.array([0.16, 0.5, 0.84])
+DEPTH_QUANTILES = (0.16, 0.5, 0.84)
 # Scenes are never flatter than this (log units): keeps the gate open on planar scenes.
 MIN_DEPTH_SPREAD = 0.25
 
@@ -33,13 +33,14 @@ def cheirality_sign(observations: Array, use: NDArray[np.bool_], state: State) -
 
     Matches vote with their parallax: the sign of a depth without parallax is noise.
     """
-    out = np.empty((observations.shape[0], 2))
-    sampson.depths(observations, state.R, state.t, state.d1, state.d2, out)
     vote = 0.0
     for i in range(observations.shape[0]):
-        if use[i] and not math.isnan(out[i, 0]):
-            # Bounded: a match on the baseline has an arbitrarily large inverse depth.
-            vote += max(-1.0, min(1.0, 0.5 / out[i, 0])) + max(-1.0, min(1.0, 0.5 / out[i, 1]))
+        if use[i]:
+            depth1, depth2, _, _ = sampson.triangulated(
+                observations, i, state.R, state.t, state.d1, state.d2)
+            if not math.isnan(depth1):
+                # Bounded: a match on the baseline has an arbitrarily large inverse depth.
+                vote += max(-1.0, min(1.0, 0.5 / depth1)) + max(-1.0, min(1.0, 0.5 / depth2))
     return 1.0 if vote >= 0.0 else -1.0
 
 
@@ -58,48 +59,55 @@ def gate_depths(observations: Array, use: NDArray[np.bool_], state: State,
     to geometry. `angle_sigma` is the noise of a match [rad].
     """
     n = observations.shape[0]
-    out = np.empty((n, 2))
-    sampson.depths(observations, state.R, state.t, state.d1, state.d2, out)
-    logs = np.empty(n)
-    significant = np.zeros(n, dtype=np.bool_)
+    # Depths in units of what the camera moved between the two rows; NaN for no opinion.
+    depths = np.full(n, np.nan)
     count = 0
     for i in range(n):
-        if not use[i] or math.isnan(out[i, 0]):
+        if not use[i]:
             continue
-        o = observations[i]
-        # Parallax: the angle between the rays, of order |b| / depth.
-        nearest = min(abs(out[i, 0]), abs(out[i, 1]))
-        bx = state.t[0] - o[18] * state.d1[0] + o[19] * state.d2[0]
-        by = state.t[1] - o[18] * state.d1[1] + o[19] * state.d2[1]
-        bz = state.t[2] - o[18] * state.d1[2] + o[19] * state.d2[2]
-        hx = state.R[0, 0] * o[9] + state.R[0, 1] * o[10] + state.R[0, 2] * o[11]
-        hy = state.R[1, 0] * o[9] + state.R[1, 1] * o[10] + state.R[1, 2] * o[11]
-        hz = state.R[2, 0] * o[9] + state.R[2, 1] * o[10] + state.R[2, 2] * o[11]
-        cx = o[1] * hz - o[2] * hy
-        cy = o[2] * hx - o[0] * hz
-        cz = o[0] * hy - o[1] * hx
-        parallax = math.sqrt(cx * cx + cy * cy + cz * cz)
-        if parallax < SIGNIFICANT_PARALLAX * angle_sigma:
+        depth1, depth2, parallax, baseline = sampson.triangulated(
+            observations, i, state.R, state.t, state.d1, state.d2)
+        if not parallax >= SIGNIFICANT_PARALLAX * angle_sigma:
             continue
-        if out[i, 0] <= 0.0 or out[i, 1] <= 0.0:
+        if depth1 <= 0.0 or depth2 <= 0.0:
             use[i] = False
             continue
-        significant[i] = True
-        logs[count] = math.log(nearest / math.sqrt(bx * bx + by * by + bz * bz))
+        depths[i] = min(depth1, depth2) / baseline
         count += 1
     if count < 8:
         return
-    # Near and far side apart: a scene is denser far away, and its few near points, which look like
-    # outliers beside the rest, know most of the translation.
-    near, centre, far = np.quantile(logs[:count], DEPTH_QUANTILES)
-    lowest = centre - DEPTH_GATE * max(centre - near, MIN_DEPTH_SPREAD)
-    highest = centre + DEPTH_GATE * max(far - centre, MIN_DEPTH_SPREAD)
+    known = np.empty(count)
     k = 0
     for i in range(n):
-        if significant[i]:
-            if not lowest <= logs[k] <= highest:
-                use[i] = False
+        if not math.isnan(depths[i]):
+            known[k] = depths[i]
             k += 1
+    known.sort()
+    # Near and far side apart: a scene is denser far away, and its few near points, which look like
+    # outliers beside the rest, know most of the translation.
+    last = count - 1
+    near, centre, far = (math.log(known[int(DEPTH_QUANTILES[0] * last)]),
+                         math.log(known[int(DEPTH_QUANTILES[1] * last)]),
+                         math.log(known[int(DEPTH_QUANTILES[2] * last)]))
+    lowest = math.exp(centre - DEPTH_GATE * max(centre - near, MIN_DEPTH_SPREAD))
+    highest = math.exp(centre + DEPTH_GATE * max(far - centre, MIN_DEPTH_SPREAD))
+    for i in range(n):
+        if depths[i] < lowest or depths[i] > highest:
+            use[i] = False
+
+
+@kernel
+def count_behind(observations: Array, use: NDArray[np.bool_], state: State,
+                 angle_sigma: float) -> int:
+    """How many of the matches in `use` lie behind a camera, with a parallax that can tell."""
+    count = 0
+    for i in range(observations.shape[0]):
+        if use[i]:
+            depth1, depth2, parallax, _ = sampson.triangulated(
+                observations, i, state.R, state.t, state.d1, state.d2)
+            if parallax >= SIGNIFICANT_PARALLAX * angle_sigma and min(depth1, depth2) <= 0.0:
+                count += 1
+    return count
 
 
 @kernel
@@ -164,20 +172,19 @@ def optimise(observations: Array, valid: NDArray[np.bool_], R: Array, x: Array, 
         states.append(signed(state, cheirality_sign(observations, near, state)))
     for scale in SHRINKING:
         costs = np.full(len(states), math.inf)
+        # Wide selections hold outliers: their residuals are not pixel noise.
+        noise, bound = scale * sigma, scale * threshold
         for k in range(len(states)):
-            use = within(r[k], observations, valid, states[k], scale * threshold, angle_sigma)
+            use = within(r[k], observations, valid, states[k], bound, angle_sigma)
             if use.sum() < 6:
                 continue
-            # Wide selections hold outliers: their residuals are not pixel noise.
-            noise = scale * sigma
-            state, _, _, _ = fit(observations, use, states[k],
-                                 linearised(observations, use, states[k], noise), priors, noise,
-                                 ITERATIONS)
-            states[k] = state
-            r[k] = sampson.residuals(observations, state.R, state.t, state.d1, state.d2,
-                                     state.dw1, state.dw2)
-            costs[k] = _truncated_cost(r[k], valid, scale * threshold, noise) \
-                + prior_cost(state, priors)
+            costs[k] = _truncated_cost(r[k], valid, bound, noise) + prior_cost(states[k], priors)
+            state = stepped(observations, use, states[k], priors, noise, STEPS)
+            residuals = sampson.residuals(observations, state.R, state.t, state.d1, state.d2,
+                                          state.dw1, state.dw2)
+            cost = _truncated_cost(residuals, valid, bound, noise) + prior_cost(state, priors)
+            if cost < costs[k]:
+                states[k], r[k], costs[k] = state, residuals, cost
         order = np.argsort(costs, kind='mergesort')
         good = int((costs < math.inf).sum())
         if good == 0:

@@ -30,6 +30,8 @@ from rs_relpose_ros.so3 import exp_so3, log_so3
 Array = NDArray[np.float64]
 
 PINNED = 1e14
+# Of the diagonal of the Hessian.
+FIRST_DAMPING = 1e-4
 # A fit ends where a step gains less than this share of a cost (chi-square) of one.
 LEAST_GAIN = 1e-7
 
@@ -69,7 +71,7 @@ def _add_gravity_prior(state: State, priors: Priors, hessian: Array, gradient: A
     tau = priors.gravity_row_time
     g = exp_so3(tau * state.dw1) @ priors.gravity1
     k = exp_so3(tau * state.dw2) @ (state.R @ priors.gravity2)
-    dot = (g * k).sum()
+    dot = g[0] * k[0] + g[1] * k[1] + g[2] * k[2]
     # dr = ((g.k) I - k g^T) (dtheta + tau ddw_2) + tau (g k^T - (g.k) I) ddw_1
     blocks = (THETA, DW1, DW2)
     jac = np.zeros((3, 9))
@@ -87,10 +89,13 @@ def _add_gravity_prior(state: State, priors: Priors, hessian: Array, gradient: A
     w = 0.5 * priors.gravity_weight
     for a in range(9):
         row = blocks[a // 3] + a % 3
-        gradient[row] += w * (jac[:, a] * r).sum()
+        for i in range(3):
+            gradient[row] += w * jac[i, a] * r[i]
         for b in range(9):
-            hessian[row, blocks[b // 3] + b % 3] += w * (jac[:, a] * jac[:, b]).sum()
-    return w * (r * r).sum()
+            column = blocks[b // 3] + b % 3
+            for i in range(3):
+                hessian[row, column] += w * jac[i, a] * jac[i, b]
+    return w * (r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
 
 
 @kernel
@@ -253,7 +258,7 @@ def fit(observations: Array, use: NDArray[np.bool_], start: State, data: DataTer
         Of the whole objective.
     """
     state = start
-    damping = 1e-4
+    damping = FIRST_DAMPING
     hessian, gradient, cost = normal_equations(data, state, priors)
     damped = np.empty((PARAMETERS, PARAMETERS))
     factor = np.zeros((PARAMETERS, PARAMETERS))
@@ -283,6 +288,23 @@ def fit(observations: Array, use: NDArray[np.bool_], start: State, data: DataTer
             if not damping < 1e8:
                 break
     return state, data, cost, hessian
+
+
+@kernel
+def stepped(observations: Array, use: NDArray[np.bool_], start: State, priors: Priors,
+            sigma: float, steps: int) -> State:
+    """The state after some Gauss-Newton steps from `start`, better or not."""
+    state = start
+    factor = np.zeros((PARAMETERS, PARAMETERS))
+    for _ in range(steps):
+        hessian, gradient, _ = normal_equations(
+            linearised(observations, use, state, sigma), state, priors)
+        for i in range(PARAMETERS):
+            hessian[i, i] += FIRST_DAMPING * hessian[i, i] + 1e-12
+        if not cholesky(hessian, factor):
+            break
+        state = moved(state, cholesky_solve(factor, -gradient))
+    return state
 
 
 @kernel

@@ -17,18 +17,21 @@ ITERATIONS = 12
 
 
 @kernel
-def transfer_errors(observations: Array, R: Array, focal: float) -> Array:
-    """``|f_1 - R f_2|`` in pixels (N,): what is left of a match's motion after the rotation."""
-    n = observations.shape[0]
-    out = np.empty(n)
-    for i in range(n):
-        total = 0.0
-        for j in range(3):
-            value = observations[i, j]
-            for k in range(3):
-                value -= R[j, k] * observations[i, 9 + k]
-            total += value * value
-        out[i] = focal * math.sqrt(total)
+def transfer_errors(observations: Array, use: NDArray[np.bool_], R: Array,
+                    focal: float) -> Array:
+    """``|f_1 - R f_2|`` [px] of the matches in `use`: what a rotation leaves of their motion."""
+    out = np.empty(use.sum())
+    count = 0
+    for i in range(observations.shape[0]):
+        if use[i]:
+            total = 0.0
+            for j in range(3):
+                value = observations[i, j]
+                for k in range(3):
+                    value -= R[j, k] * observations[i, 9 + k]
+                total += value * value
+            out[count] = focal * math.sqrt(total)
+            count += 1
     return out
 
 

@@ -247,28 +247,27 @@ def normal_equations(observations: Array, use: NDArray[np.bool_], R: Array, t: A
 
 
 @kernel
-def depths(observations: Array, R: Array, t: Array, d1: Array, d2: Array, out: Array) -> None:
-    """Depths along both rays (N, 2) in baselines, each match with its own row times.
+def triangulated(observations: Array, i: int, R: Array, t: Array, d1: Array,
+                 d2: Array) -> tuple[float, float, float, float]:
+    """Depths of match i along both rays [baselines], its parallax [rad] and length of baseline.
 
-    ``l_1 f_1 = l_2 h + b`` in the least-squares sense of its cross products with h and f_1. NaN
-    where the rays are parallel.
+    ``l_1 f_1 = l_2 h + b`` in the least-squares sense of its cross products with h and f_1, each
+    match with its own row times; depths are NaN where the rays are parallel.
     """
-    for i in range(observations.shape[0]):
-        o = observations[i]
-        tau1, tau2 = o[18], o[19]
-        bx = t[0] - tau1 * d1[0] + tau2 * d2[0]
-        by = t[1] - tau1 * d1[1] + tau2 * d2[1]
-        bz = t[2] - tau1 * d1[2] + tau2 * d2[2]
-        hx = R[0, 0] * o[9] + R[0, 1] * o[10] + R[0, 2] * o[11]
-        hy = R[1, 0] * o[9] + R[1, 1] * o[10] + R[1, 2] * o[11]
-        hz = R[2, 0] * o[9] + R[2, 1] * o[10] + R[2, 2] * o[11]
-        nx, ny, nz = _cross(o[0], o[1], o[2], hx, hy, hz)
-        n2 = nx * nx + ny * ny + nz * nz
-        if n2 < 1e-18:
-            out[i, 0] = np.nan
-            out[i, 1] = np.nan
-            continue
-        cx, cy, cz = _cross(bx, by, bz, hx, hy, hz)
-        out[i, 0] = (cx * nx + cy * ny + cz * nz) / n2
-        cx, cy, cz = _cross(bx, by, bz, o[0], o[1], o[2])
-        out[i, 1] = (cx * nx + cy * ny + cz * nz) / n2
+    o = observations[i]
+    tau1, tau2 = o[18], o[19]
+    bx = t[0] - tau1 * d1[0] + tau2 * d2[0]
+    by = t[1] - tau1 * d1[1] + tau2 * d2[1]
+    bz = t[2] - tau1 * d1[2] + tau2 * d2[2]
+    hx = R[0, 0] * o[9] + R[0, 1] * o[10] + R[0, 2] * o[11]
+    hy = R[1, 0] * o[9] + R[1, 1] * o[10] + R[1, 2] * o[11]
+    hz = R[2, 0] * o[9] + R[2, 1] * o[10] + R[2, 2] * o[11]
+    nx, ny, nz = _cross(o[0], o[1], o[2], hx, hy, hz)
+    n2 = nx * nx + ny * ny + nz * nz
+    baseline = math.sqrt(bx * bx + by * by + bz * bz)
+    if n2 < 1e-18:
+        return math.nan, math.nan, 0.0, baseline
+    cx, cy, cz = _cross(bx, by, bz, hx, hy, hz)
+    ex, ey, ez = _cross(bx, by, bz, o[0], o[1], o[2])
+    return ((cx * nx + cy * ny + cz * nz) / n2, (ex * nx + ey * ny + ez * nz) / n2, math.sqrt(n2),
+            baseline)

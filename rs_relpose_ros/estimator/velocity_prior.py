@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel
-from rs_relpose_ros.estimator.local_optimisation import gate_depths, within
+from rs_relpose_ros.estimator.local_optimisation import count_behind, within
 from rs_relpose_ros.estimator.map_fit import (
     DataTerm,
     fit,
@@ -153,9 +153,7 @@ def _candidate(observations: Array, inliers: NDArray[np.bool_], start: State, da
         iterations)
     # Velocities that carry the camera past its own baseline within a frame explain any residual,
     # with points behind the cameras: those count as outliers.
-    plausible = inliers.copy()
-    gate_depths(observations, plausible, state, angle_sigma)
-    cost += (inliers.sum() - plausible.sum()) * (threshold / sigma) ** 2
+    cost += count_behind(observations, inliers, state, angle_sigma) * (threshold / sigma) ** 2
     evidence = (-0.5 * cost - 0.5 * log_determinant(hessian)
                 - (6.0 + SMALL_IS_LIKELIER) * math.log(velocity_sigma))
     return state, data, hessian, evidence

@@ -218,7 +218,7 @@ class Pipeline:
             rotation, _ = integrate_rotation(
                 self._gyro.stamps_ns, self._gyro.angular_velocities, self._parameters.imu)
         else:
-            rotation = aligning_rotation(rays1, rays2)
+            rotation = aligning_rotation(rays1.T @ rays2)
         parallax = np.linalg.norm(np.cross(rays1, rays2 @ rotation.T), axis=1)
         return float(camera.fx * np.nanmedian(parallax)), (rays1, rays2, tau1, tau2)
 
