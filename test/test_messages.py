@@ -280,6 +280,8 @@ def test_accelerometer_topic_has_no_gyro(types):
 
 @pytest.mark.parametrize(('change', 'sentence'), [
     ({'gyro': (float('nan'), 0.0, 0.0)}, 'angular_velocity of an IMU message must be finite'),
+    ({'gyro': (0.0, -1e308, 0.0)}, 'angular_velocity of an IMU message must be at most 1000'),
+    ({'accelerometer': (0.0, 0.0, 2e4)}, 'linear_acceleration of an IMU message must be at most'),
     ({'accelerometer': (0.0, float('inf'), 0.0)}, 'linear_acceleration of an IMU message must be'),
     ({'gyro_covariance': -1.0, 'accelerometer_covariance': -1.0}, 'neither gyro nor accel'),
 ])
