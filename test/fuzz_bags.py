@@ -1,7 +1,7 @@
 """Mutated bag files into the reader and the replay: python test/fuzz_bags.py COUNT.
 
 One process reads all of them; whatever is in a file, the outcome is a result or an error of the
-package's own with one sentence. A crash of a library ends the process, a hang its alarm.
+package's own with one sentence. A crash of a library ends the process, a hang its timer.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from rs_relpose_ros.replay.run import read_truth, Replay
 KINDS = (*bags.ROSBAG2_KINDS, *bags.ROS1_KINDS)
 PARAMETERS = Parameters.from_mapping({
     'readout_time': 0.02, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0]})
-# No file of a few messages takes so long [s].
+# No file of a few messages takes so long [s of CPU].
 PATIENCE = 20
 
 
@@ -118,9 +118,9 @@ def fuzz(count: int, seed: int, folder: Path) -> dict[str, Any]:
         # What is at hand if the process dies.
         (folder / 'current').write_text(f'{seed} {number} {kind} {bases[kind]}')
         begun = time.perf_counter()
-        signal.alarm(PATIENCE)
+        signal.setitimer(signal.ITIMER_PROF, PATIENCE)
         outcomes[read(bases[kind])] += 1
-        signal.alarm(0)
+        signal.setitimer(signal.ITIMER_PROF, 0)
         slowest = max(slowest, time.perf_counter() - begun)
     return {'bags': count, 'seed': seed, 'seconds': round(time.perf_counter() - started, 1),
             'slowest_ms': round(1e3 * slowest, 1),
@@ -132,7 +132,7 @@ def fuzz(count: int, seed: int, folder: Path) -> dict[str, Any]:
 def main() -> None:
     faulthandler.enable()
     # A hang shows where, and ends the process.
-    faulthandler.register(signal.SIGALRM, chain=True)
+    faulthandler.register(signal.SIGPROF, chain=True)
     folder = Path(tempfile.mkdtemp(dir='/dev/shm' if Path('/dev/shm').is_dir() else None))
     try:
         print(json.dumps(fuzz(int(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 0,
