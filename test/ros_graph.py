@@ -39,10 +39,13 @@ class Process:
     """A Python process of this project; ended, if need be, when the block ends."""
 
     def __init__(self, module: str, *arguments: str) -> None:
+        self._start('-m', module, *arguments)
+
+    def _start(self, *arguments: str) -> None:
         # A pipe that nobody reads would block it.
         self._output = tempfile.TemporaryFile()  # noqa: SIM115 - closed on exit
         self._process = subprocess.Popen(
-            [sys.executable, '-m', module, *arguments], cwd=ROOT, stdout=self._output,
+            [sys.executable, *arguments], cwd=ROOT, stdout=self._output,
             stderr=subprocess.STDOUT, env={**os.environ, 'PYTHONUNBUFFERED': '1'})
 
     def __enter__(self) -> Process:
@@ -54,7 +57,7 @@ class Process:
             self._process.kill()
             self._process.wait(10.0)
         if kind is not None:
-            print(f'--- output of {self._process.args[2]}\n{self.output}')
+            print(f'--- output of {self._process.args[1:3]}\n{self.output}')
         self._output.close()
 
     @property
@@ -89,6 +92,13 @@ class Process:
     def wait(self, timeout: float = PATIENCE) -> int:
         """Its exit code."""
         return self._process.wait(timeout)
+
+
+class Script(Process):
+    """A Python file."""
+
+    def __init__(self, path: Path, *arguments: str) -> None:
+        self._start(str(path), *arguments)
 
 
 def node_process(parameter_file: Path | None = None, *, remap: dict[str, str] | None = None,

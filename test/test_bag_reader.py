@@ -6,14 +6,15 @@ from collections.abc import Callable
 from pathlib import Path
 import shutil
 
+import lz4.frame
 import message_builders as build
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, storage_mcap, StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 
-from rs_relpose_ros.bags import reader
+from rs_relpose_ros.bags import limits, reader
 from rs_relpose_ros.bags.reader import Bag, open_bag, TopicOptions
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.camera import RollingShutterCamera
@@ -450,6 +451,58 @@ def test_an_array_longer_than_its_message(tmp_path):
 
 def test_a_message_beyond_any_image_is_not_decoded(tmp_path, monkeypatch):
     bag = write_kind('mcap', tmp_path)
-    monkeypatch.setattr(reader, '_MAX_MESSAGE_BYTES', 200)
+    monkeypatch.setattr(reader, 'MAX_MESSAGE_BYTES', 200)
     with pytest.raises(InputError, match='at most 200 are read'):
+        read_all(bag)
+
+
+# --- sizes that a bag makes of itself
+
+
+def bomb(kind: str, folder: Path) -> Path:
+    """A bag of some kB with a compressed message or chunk that has many MB."""
+    zeros = np.zeros((4096, 4096), dtype=np.uint8)
+    messages = [*camera_messages(folder), (
+        '/camera/image_raw', IMAGE, BagWriter(folder / 'no_bag').image(STAMP_NS, 'c', zeros), 8)]
+    bag = (write_ros1(folder / 'bomb.bag', messages, ROS1_KINDS[kind]) if kind in ROS1_KINDS
+           else write_rosbag2(folder / 'bomb', messages, *ROSBAG2_KINDS[kind]))
+    assert sum(file.stat().st_size for file in [bag, *bag.parent.glob('bomb/*')]
+               if file.is_file()) < 200_000
+    return bag
+
+
+@pytest.mark.parametrize('kind, limit', [
+    ('sqlite3_zstd_messages', 'MAX_MESSAGE_BYTES'), ('mcap_zstd_messages', 'MAX_MESSAGE_BYTES'),
+    ('mcap_zstd_chunks', 'MAX_CHUNK_BYTES'), ('ros1_lz4', 'MAX_CHUNK_BYTES'),
+    ('ros1_bz2', 'MAX_CHUNK_BYTES')])
+def test_decompression_is_bounded(tmp_path, monkeypatch, kind, limit):
+    bag = bomb(kind, tmp_path)
+    assert len(read_all(bag)) == 8
+    monkeypatch.setattr(limits, limit, 1 << 20)
+    with pytest.raises(InputError, match='bytes decompress to more than 1048576'):
+        read_all(bag)
+
+
+def test_a_chunk_never_becomes_larger_than_it_says(tmp_path):
+    """What its head says is checked before, so no bigger one may hide behind it."""
+    with pytest.raises(InputError, match='decompress to more than 100'):
+        storage_mcap.DECOMPRESSORS['zstd'](storage_mcap.zstd.compress(bytes(10**8)), 100)
+    for name, data in (('zstd', storage_mcap.zstd.compress(bytes(100))),
+                       ('lz4', lz4.frame.compress(bytes(100)))):
+        assert storage_mcap.DECOMPRESSORS[name](data, 100) == bytes(100)
+        with pytest.raises(InputError, match='incomplete'):
+            storage_mcap.DECOMPRESSORS[name](data[:-6], 100)
+
+
+def test_metadata_with_aliases_of_aliases(tmp_path):
+    """Printed in an error they would have no end."""
+    bag = write_kind('mcap', tmp_path)
+    laughs = ''.join(f'l{k + 1}: &l{k + 1} [{", ".join([f"*l{k}"] * 9)}]\n' for k in range(12))
+    (bag / 'metadata.yaml').write_text(
+        f'l0: &l0 ha\n{laughs}rosbag2_bagfile_information: {{version: 9, '
+        'relative_file_paths: [], storage_identifier: *l12}')
+    with pytest.raises(InputError, match='YAML aliases'):
+        read_all(bag)
+    (bag / 'metadata.yaml').write_text('#' * (2**24 + 1))
+    with pytest.raises(InputError, match='more than 16777216 bytes'):
         read_all(bag)

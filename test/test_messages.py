@@ -280,6 +280,8 @@ def test_accelerometer_topic_has_no_gyro(types):
 
 @pytest.mark.parametrize(('change', 'sentence'), [
     ({'gyro': (float('nan'), 0.0, 0.0)}, 'angular_velocity of an IMU message must be finite'),
+    ({'gyro': (0.0, -1e308, 0.0)}, 'angular_velocity of an IMU message must be at most 1000'),
+    ({'accelerometer': (0.0, 0.0, 2e4)}, 'linear_acceleration of an IMU message must be at most'),
     ({'accelerometer': (0.0, float('inf'), 0.0)}, 'linear_acceleration of an IMU message must be'),
     ({'gyro_covariance': -1.0, 'accelerometer_covariance': -1.0}, 'neither gyro nor accel'),
 ])
@@ -467,35 +469,44 @@ def test_image_of_another_size_is_refused():
 # -- sensors that hang -----------------------------------------------------------------------
 
 
-def problems(values: list[tuple[float, float, float]], step_ms: int = 5) -> list[str]:
-    gyro = HangingGyro(0.025)
-    return [gyro.problem(ImuSample(k * step_ms * 10**6, value, None))
-            for k, value in enumerate(values)]
+def used(values: list[tuple[float, float, float]], step_ms: int = 5,
+         longest: float = 0.025) -> list[str]:
+    """Of each sample: whether it is used, or what is said."""
+    gyro, told = HangingGyro(longest), []
+    for k, value in enumerate(values):
+        try:
+            repeats = gyro.repeats(ImuSample(k * step_ms * 10**6, value, None))
+            told.append('' if repeats else 'used')
+        except InputError as error:
+            told.append(str(error))
+    return told
 
 
 def test_a_gyro_that_repeats_itself_hangs():
-    found = problems([(0.1, 0.2, 0.3)] * 8 + [(0.1, 0.2, 0.31)])
+    told = used([(0.1, 0.2, 0.3)] * 8 + [(0.1, 0.2, 0.31)])
     # 25 ms are borne.
-    assert [bool(problem) for problem in found] == [False] * 6 + [True] * 2 + [False]
-    assert 'it hangs' in found[7]
-    assert any(problems([(0.0, 0.0, 0.0)] * 8))
+    assert told[:6] == ['used', *[''] * 5]
+    assert all('it hangs' in text for text in told[6:8])
+    assert told[8] == 'used'
+    assert 'it hangs' in used([(0.0, 0.0, 0.0)] * 8)[-1]
 
 
 def test_a_gyro_at_the_end_of_its_range_is_saturated():
     moving = np.random.default_rng(0).normal(size=(8, 2))
-    found = problems([(-4.36, x, y) for x, y in moving])
-    assert found[-1] == 'the x axis of the gyro repeats -4.36 rad/s bit by bit: it is saturated'
+    told = used([(-4.36, x, y) for x, y in moving])
+    assert told[1] == ''
+    assert told[-1] == 'the x axis of the gyro repeats -4.36 rad/s bit by bit: it is saturated'
 
 
 def test_what_sensors_do_repeat():
     noise = np.random.default_rng(0).normal(size=40)
-    # A robot in the plane, a coarse gyro at rest, and a driver faster than its sensor.
-    assert not any(problems([(0.0, 0.0, z) for z in noise]))
-    assert not any(problems([(0.001, -0.001, z) for z in noise]))
-    assert not any(problems([(z, z, z) for z in noise for _ in range(5)], step_ms=1))
-    assert not any(problems([(z, z, z) for z in noise for _ in range(2)], step_ms=20))
-    gyro = HangingGyro(0.0)
-    assert not any(gyro.problem(ImuSample(k * 10**7, (0.0, 0.0, 0.0), None)) for k in range(100))
+    # A robot in the plane, and a coarse gyro at rest.
+    assert set(used([(0.0, 0.0, z) for z in noise])) == {'used'}
+    assert set(used([(0.001, -0.001, z) for z in noise])) == {'used'}
+    # Drivers that are faster than their sensor.
+    assert used([(z, z, z) for z in noise for _ in range(5)], step_ms=1).count('used') == 40
+    assert used([(z, z, z) for z in noise for _ in range(2)], step_ms=20).count('used') == 40
+    assert set(used([(0.0, 0.0, 0.0)] * 100, longest=0.0)) == {'used'}
 
 
 def test_an_image_that_repeats_the_one_before():

@@ -5,27 +5,28 @@ One node takes one fault after the other, as it would in the field, and works ag
 
 from __future__ import annotations
 
-from array import array
 from collections.abc import Callable, Iterator
 import copy
 from dataclasses import dataclass, field
+import importlib.util
 import itertools
+import os
 from pathlib import Path
 import re
 import signal
 from typing import Any
 
-import cv2
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from fault_stream import gray_image, read_messages
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 import numpy as np
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterDescriptor, ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, SetParameters
-import rclpy.serialization
+from rclpy.qos import ReliabilityPolicy
 import ros_graph
-from rosbags.highlevel import AnyReader
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import CameraInfo, Image, Imu
 
 from rs_relpose_ros.estimator.estimate import warm_up
 
@@ -33,8 +34,6 @@ from rs_relpose_ros.estimator.estimate import warm_up
 pytestmark = pytest.mark.timeout(600)
 
 SECOND = 10**9
-TYPES = {'/imu/data_raw': Imu, '/camera/camera_info': CameraInfo,
-         '/camera/image_raw/compressed': CompressedImage}
 # Of the bag, and between one phase and the next on the camera's clock.
 PHASE_SECONDS = 2.6
 PAUSE_SECONDS = 1.0
@@ -89,30 +88,6 @@ class Field:
         return self.diagnostics[-1].status[0]
 
 
-def read_messages(bag: Path) -> list[tuple[int, Any]]:
-    """Bag time [ns] and message of the bag's first seconds, images decoded."""
-    messages = []
-    with AnyReader([bag]) as reader:
-        connections = [c for c in reader.connections if c.topic in TYPES]
-        for connection, bag_time_ns, raw in reader.messages(connections):
-            if messages and bag_time_ns - messages[0][0] > PHASE_SECONDS * SECOND:
-                break
-            message = rclpy.serialization.deserialize_message(
-                bytes(raw), TYPES[connection.topic])
-            if isinstance(message, CompressedImage):
-                pixels = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_GRAYSCALE)
-                message = gray_image(message.header, pixels)
-            messages.append((bag_time_ns, message))
-    return messages
-
-
-def gray_image(header: Any, pixels: np.ndarray) -> Image:
-    data = array('B')
-    data.frombytes(pixels.tobytes())
-    return Image(header=header, height=pixels.shape[0], width=pixels.shape[1], encoding='mono8',
-                 step=pixels.shape[1], data=data)
-
-
 @pytest.fixture(scope='module')
 def field_(module_ros_domain_id: int, bundled_bag: Path) -> Iterator[Field]:
     warm_up()
@@ -127,7 +102,8 @@ def field_(module_ros_domain_id: int, bundled_bag: Path) -> Iterator[Field]:
             # Either kind of publisher will do.
             CameraInfo: graph.publisher(CameraInfo, '/camera/camera_info', best_effort=True),
             Imu: graph.publisher(Imu, '/imu/data_raw', best_effort=True)}
-        yield Field(graph, node, publishers, read_messages(bundled_bag), poses, diagnostics)
+        yield Field(graph, node, publishers, read_messages(bundled_bag, PHASE_SECONDS), poses,
+                    diagnostics)
         code, seconds = node.signal(signal.SIGINT)
         assert code == 0, node.output
         assert seconds <= 1.0
@@ -337,3 +313,68 @@ def test_a_misspelt_parameter_is_told(ros_domain_id):
     with ros_graph.node_process(parameters={'readout_tme': 0.03}) as node:
         node.wait_for("there is no parameter 'readout_tme'; did you mean readout_time")
         assert node.signal(signal.SIGINT)[0] == 0
+
+
+def test_quality_of_service_can_be_overridden(ros_domain_id):
+    """A reliable subscription, which a publisher of best effort does not match."""
+    override = 'qos_overrides./camera/image_raw.subscription.reliability'
+    with ros_graph.Graph() as graph, ros_graph.node_process(
+            ros_graph.ROOT / 'bags' / 'hand_held.yaml', remap=ros_graph.BAG_TOPICS,
+            parameters={'image_transport': 'raw', override: 'reliable'}) as node:
+        node.wait_for('ready')
+        info = ros_graph.wait_until(
+            lambda: graph.node.get_subscriptions_info_by_topic('/camera/image_raw'), 'discovery')
+        assert info[0].qos_profile.reliability is ReliabilityPolicy.RELIABLE
+        [imu] = graph.node.get_subscriptions_info_by_topic('/imu/data_raw')
+        assert imu.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT
+        assert node.signal(signal.SIGINT)[0] == 0
+        assert 'there is no parameter' not in node.output
+
+
+# -- transform -------------------------------------------------------------------------------
+
+# In place of tf2_ros, which is in no wheel: says what it is asked to send.
+FAKE_TF2_ROS = """
+class TransformBroadcaster:
+    def __init__(self, node):
+        self._publisher = node.create_publisher(__import__(
+            'geometry_msgs.msg').msg.TransformStamped, '/sent_transform', 10)
+
+    def sendTransform(self, transform):
+        self._publisher.publish(transform)
+"""
+
+
+def test_transform_is_the_inverse_of_the_pose(ros_domain_id, bundled_bag, tmp_path, monkeypatch):
+    """The camera has a parent in the robot's tree, so the reference keyframe is its child."""
+    (tmp_path / 'tf2_ros.py').write_text(FAKE_TF2_ROS)
+    monkeypatch.setenv('PYTHONPATH', os.pathsep.join(
+        [str(tmp_path), *filter(None, [os.environ.get('PYTHONPATH')])]))
+    with ros_graph.Graph() as graph, ros_graph.node_process(
+            ros_graph.ROOT / 'bags' / 'hand_held.yaml', remap=ros_graph.BAG_TOPICS,
+            parameters={'publish_tf': True}) as node:
+        poses = graph.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
+        transforms = graph.listen(TransformStamped, '/sent_transform')
+        with ros_graph.Process('rs_relpose_ros.ros.player', str(bundled_bag),
+                               '--wait-for-subscribers', '300'):
+            ros_graph.wait_until(lambda: len(poses) >= 3 and len(transforms) >= 3, 'poses')
+        assert node.signal(signal.SIGINT)[0] == 0
+    for message, sent in zip(poses, transforms, strict=False):
+        assert sent.header.stamp == message.header.stamp
+        assert (sent.header.frame_id, sent.child_frame_id) == (
+            'camera_optical_frame', 'camera_optical_frame_reference')
+        t, q = message.pose.pose.position, message.pose.pose.orientation
+        found, r = sent.transform.translation, sent.transform.rotation
+        inverse = Rotation.from_quat([q.x, q.y, q.z, q.w]).inv()
+        np.testing.assert_allclose([found.x, found.y, found.z], -inverse.apply([t.x, t.y, t.z]))
+        np.testing.assert_allclose(
+            Rotation.from_quat([r.x, r.y, r.z, r.w]).as_matrix(), inverse.as_matrix(), atol=1e-12)
+
+
+def test_a_transform_without_tf2_ros(ros_domain_id):
+    if importlib.util.find_spec('tf2_ros'):
+        pytest.skip('tf2_ros is installed')
+    with ros_graph.node_process(parameters={'publish_tf': True}) as node:
+        assert node.wait() == 2
+        assert 'publish_tf needs tf2_ros, which is not installed' in node.output
+        assert 'Traceback' not in node.output

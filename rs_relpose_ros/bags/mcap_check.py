@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 import struct
 
+from rs_relpose_ros.bags.limits import MAX_CHUNK_BYTES
 from rs_relpose_ros.errors import InputError
 
 _MAGIC = b'\x89MCAP0\r\n'
@@ -12,9 +13,6 @@ _FOOTER, _CHUNK = 0x02, 0x06
 _RECORD = struct.Struct('<BQ')
 # Start time, end time, uncompressed size, CRC: the head of a chunk.
 _CHUNK_HEAD = struct.Struct('<QQQI')
-
-# No recorder makes chunks near this; what claims more is corrupt, and would exhaust memory.
-_MAX_CHUNK_BYTES = 1 << 30
 
 
 def check_mcap(path: Path) -> None:
@@ -50,7 +48,7 @@ def check_mcap(path: Path) -> None:
 
 
 def _check_chunk(path: Path, head: bytes) -> None:
-    if len(head) < _CHUNK_HEAD.size or _CHUNK_HEAD.unpack(head)[2] > _MAX_CHUNK_BYTES:
+    if len(head) < _CHUNK_HEAD.size or _CHUNK_HEAD.unpack(head)[2] > MAX_CHUNK_BYTES:
         raise InputError(f'{path} is corrupt: one of its chunks has an impossible size')
 
 

@@ -13,6 +13,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
 from rosbags.typesys import get_typestore, Stores
 
+from rs_relpose_ros.bags.limits import bound_decompression, check_metadata, MAX_MESSAGE_BYTES
 from rs_relpose_ros.bags.mcap_check import check_mcap
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.timing import NANOSECONDS
@@ -25,11 +26,11 @@ POSE_STAMPED = 'geometry_msgs/msg/PoseStamped'
 
 # Where the project's own bags keep the truth; taken where several topics could be it.
 _GROUND_TRUTH = '/ground_truth/pose'
-# Largest message that is decoded: above any image that is accepted (64 Mpx in four channels).
-_MAX_MESSAGE_BYTES = 1 << 29
 _STORAGE_SUFFIXES = ('.mcap', '.db3')
 
 _logger = logging.getLogger(__name__)
+
+bound_decompression()
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,9 +173,9 @@ class Bag:
             # A damaged file makes the parsers below fail in any way.
             except Exception as error:
                 raise InputError(f'{self.path} is damaged: {_sentence(error)}') from error
-            if len(data) > _MAX_MESSAGE_BYTES:
+            if len(data) > MAX_MESSAGE_BYTES:
                 raise InputError(f'a message of {connection.topic} in {self.path} has {len(data)} '
-                                 f'bytes; at most {_MAX_MESSAGE_BYTES} are read')
+                                 f'bytes; at most {MAX_MESSAGE_BYTES} are read')
             yield connection, bag_time_ns, data
 
     @contextmanager
@@ -309,6 +310,7 @@ def _check_path(path: Path) -> None:
                     f'{path} has no metadata.yaml, so its recorder was not stopped properly: give '
                     f'{files[0].name} itself, or make one with "ros2 bag reindex {path}"')
             raise InputError(f'{path} is no bag: it has no metadata.yaml')
+        check_metadata(path / 'metadata.yaml')
     elif path.suffix in (*_STORAGE_SUFFIXES, '.bag'):
         files = [path]
     else:

@@ -10,11 +10,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.timing import to_nanoseconds
 
-_AXES = 'xyz'
-# Drivers that publish faster than the sensor samples repeat a value now and then.
+# Of a slow IMU two or three equal ones may be chance.
 _FEWEST_SAMPLES = 4
 # No gyro has a range below 125 deg/s; a coarse one repeats small values at rest.
 _LEAST_RANGE = 2.0
@@ -41,10 +41,13 @@ class HangingCamera:
 class HangingGyro:
     """Watches the gyro samples as they come.
 
+    Repetitions are not used from the first one on: between equal values interpolation gives the
+    same, if they were true, and drivers that publish faster than the sensor measures do repeat.
+
     Parameters
     ----------
     longest : float
-        Time [s] for which values may repeat; 0 to find nothing.
+        Time [s] after which repetitions are a fault; 0 to believe everything.
     """
 
     def __init__(self, longest: float) -> None:
@@ -53,25 +56,35 @@ class HangingGyro:
         self._since_ns = [0] * 3
         self._counts = [0] * 3
 
-    def problem(self, sample: ImuSample) -> str:
-        """Why the gyro of this sample cannot be believed; empty for no reason."""
+    def repeats(self, sample: ImuSample) -> bool:
+        """Whether this sample says nothing new.
+
+        Raises
+        ------
+        InputError
+            It does so for too long.
+        """
         if sample.angular_velocity is None or self._longest_ns == 0:
-            return ''
-        repeats = []
+            return False
         for axis, value in enumerate(sample.angular_velocity):
-            # Also a clock that was set back begins anew.
+            # A clock that was set back begins anew.
             if value != self._values[axis] or sample.stamp_ns < self._since_ns[axis]:
                 self._values[axis], self._since_ns[axis] = value, sample.stamp_ns
                 self._counts[axis] = 0
             self._counts[axis] += 1
-            repeats.append(self._counts[axis] >= _FEWEST_SAMPLES
-                           and sample.stamp_ns - self._since_ns[axis] > self._longest_ns)
-        if all(repeats):
-            return ('the gyro repeats the same values bit by bit: it hangs (set stuck_gyro_time '
-                    'to 0 for a simulation without noise)')
-        for axis, (value, repeated) in enumerate(
-                zip(sample.angular_velocity, repeats, strict=True)):
-            if repeated and abs(value) >= _LEAST_RANGE:
-                return (f'the {_AXES[axis]} axis of the gyro repeats {value:.4g} rad/s bit by '
-                        'bit: it is saturated')
-        return ''
+        if min(self._counts) > 1:
+            if self._too_long(sample, max(self._since_ns), min(self._counts)):
+                raise InputError('the gyro repeats the same values bit by bit: it hangs (set '
+                                 'stuck_gyro_time to 0 for a simulation without noise)')
+            return True
+        for name, value, since_ns, count in zip(
+                'xyz', sample.angular_velocity, self._since_ns, self._counts, strict=True):
+            if count > 1 and abs(value) >= _LEAST_RANGE:
+                if self._too_long(sample, since_ns, count):
+                    raise InputError(f'the {name} axis of the gyro repeats {value:.4g} rad/s bit '
+                                     'by bit: it is saturated')
+                return True
+        return False
+
+    def _too_long(self, sample: ImuSample, since_ns: int, count: int) -> bool:
+        return count >= _FEWEST_SAMPLES and sample.stamp_ns - since_ns > self._longest_ns

@@ -26,6 +26,10 @@ Gray = NDArray[np.uint8]
 MAX_IMAGE_SIDE = 16384
 MAX_IMAGE_PIXELS = 64 * 1024 * 1024
 
+# Largest values of an IMU, far above any sensor, far below what filters overflow at.
+MAX_ANGULAR_VELOCITY = 1e3   # rad/s
+MAX_LINEAR_ACCELERATION = 1e4   # m/s^2
+
 # Encoding -> (channels, conversion of OpenCV). The order of a '8UC3' is not told; as cv_bridge.
 _COLOR = {
     'bgr8': (3, cv2.COLOR_BGR2GRAY),
@@ -216,7 +220,7 @@ def imu_sample_from_message(msg: Any) -> ImuSample:
     Raises
     ------
     InputError
-        NaN or infinite, or neither of the two sensors.
+        NaN, infinite or beyond any sensor, or neither of the two sensors.
     """
     return _imu_sample(msg, gyro=_has_sensor(msg.angular_velocity_covariance))
 
@@ -227,10 +231,12 @@ def accelerometer_sample_from_message(msg: Any) -> ImuSample:
 
 
 def _imu_sample(msg: Any, gyro: bool) -> ImuSample:
-    angular_velocity = _vector('angular_velocity', msg.angular_velocity) if gyro else None
+    angular_velocity = (_vector('angular_velocity', msg.angular_velocity, MAX_ANGULAR_VELOCITY)
+                        if gyro else None)
     linear_acceleration = None
     if _has_sensor(msg.linear_acceleration_covariance):
-        linear_acceleration = _vector('linear_acceleration', msg.linear_acceleration)
+        linear_acceleration = _vector('linear_acceleration', msg.linear_acceleration,
+                                      MAX_LINEAR_ACCELERATION)
         if linear_acceleration == (0.0, 0.0, 0.0):
             linear_acceleration = None
     if angular_velocity is None and linear_acceleration is None:
@@ -262,8 +268,11 @@ def _has_sensor(covariance: Any) -> bool:
     return bool(covariance[0] != -1.0)
 
 
-def _vector(name: str, vector: Any) -> tuple[float, float, float]:
+def _vector(name: str, vector: Any, largest: float) -> tuple[float, float, float]:
     values = (float(vector.x), float(vector.y), float(vector.z))
     if not all(map(math.isfinite, values)):
         raise InputError(f'{name} of an IMU message must be finite, got {list(values)}')
+    if max(map(abs, values)) > largest:
+        raise InputError(f'{name} of an IMU message must be at most {largest:g}, '
+                         f'got {list(values)}: is it in rad/s and m/s^2?')
     return values

@@ -95,10 +95,8 @@ class MessageIntake:
             It cannot be used.
         """
         sample = imu_sample_from_message(msg)
-        problem = self._gyro.problem(sample)
-        if problem:
-            raise InputError(problem)
-        self._sequencer.add_imu(sample)
+        if not self._gyro.repeats(sample):
+            self._sequencer.add_imu(sample)
 
     def add_accelerometer(self, msg: Any) -> None:
         """Hand over a sensor_msgs/Imu of a driver that publishes the accelerometer apart."""

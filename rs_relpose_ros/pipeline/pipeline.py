@@ -108,7 +108,7 @@ class Pipeline:
         """Track `frame`; the estimate of the pair that it closes, or None.
 
         Frames come in the order of their stamps. A frame whose calibration differs from the last
-        one's starts anew.
+        one's, or that a gap of the gyro parts from it, starts anew.
         """
         self.prepare()
         if frame.calibration != self._calibration:
@@ -116,7 +116,8 @@ class Pipeline:
             self._calibration = frame.calibration
             self._camera = sensor_camera(frame.calibration, self._parameters)
         view = _View(frame.stamp_ns, imu, frame.image)
-        if self._reference is None or self._previous is None:
+        # Over a gap of the gyro tracks are not predicted, and what is found by chance looks good.
+        if self._reference is None or self._previous is None or imu.since_previous is None:
             self._tracker.start(frame.image)
             self._restart_from(view)
             return None

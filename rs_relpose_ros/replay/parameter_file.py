@@ -50,7 +50,7 @@ def read_parameters(path: Path | str | None, assignments: Sequence[str] = ()) ->
             raise InputError(f'--set takes NAME=VALUE, got {assignment!r}')
         try:
             given[name.strip()] = yaml.safe_load(text)
-        except yaml.YAMLError:
+        except (yaml.YAMLError, RecursionError):
             raise InputError(f'--set {name}: the value {text!r} is no YAML') from None
     return parameters.updated(_converted(given))
 
@@ -62,8 +62,12 @@ def _values(path: Path) -> dict[str, Any]:
     if path.stat().st_size > _MAX_BYTES:
         raise InputError(f'{path} is no parameter file: it has more than {_MAX_BYTES} bytes')
     try:
-        document = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        text = path.read_text(encoding='utf-8')
+        # Aliases of aliases, printed in an error, have no end; ROS does not know them either.
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
+            raise InputError(f'{path} has YAML aliases, which parameter files must not have')
+        document = yaml.safe_load(text)
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f'{path} is no YAML file: {error}') from error
     if not isinstance(document, dict):
         raise InputError(f'{path} is no ROS parameter file: it must begin with "/**:" and '

@@ -1,0 +1,82 @@
+"""Bounds for what a bag may make of itself when it is read; rosbags has none of its own.
+
+A few bytes can decompress to any size, and a few lines of YAML with aliases can be printed at any
+length.
+"""
+
+from __future__ import annotations
+
+import bz2
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from lz4.frame import LZ4FrameDecompressor
+from rosbags.rosbag1 import reader as rosbag1
+from rosbags.rosbag2 import reader as rosbag2
+from rosbags.rosbag2 import storage_mcap as mcap
+import yaml
+
+from rs_relpose_ros.errors import InputError
+
+# No recorder makes chunks near this size.
+MAX_CHUNK_BYTES = 1 << 30
+# Largest message that is decoded: above any image that is accepted (64 Mpx in four channels).
+MAX_MESSAGE_BYTES = 1 << 29
+# Thousands of topics take less.
+_MAX_METADATA_BYTES = 1 << 24
+
+# Python's own from 3.14 on, a package before: what rosbags uses.
+_zstd: Any = vars(mcap)['zstd']
+
+
+def check_metadata(path: Path) -> None:
+    """Check the size of a metadata.yaml, and that it has no aliases.
+
+    Raises
+    ------
+    InputError
+    """
+    if path.stat().st_size > _MAX_METADATA_BYTES:
+        raise InputError(f'{path} is no metadata of a bag: it has more than '
+                         f'{_MAX_METADATA_BYTES} bytes')
+    content = path.read_bytes()
+    # Looked for in the bytes first: parsing takes time, and recorders write no aliases.
+    if b'*' in content and has_aliases(content):
+        raise InputError(f'{path} has YAML aliases, which no recorder writes: it is damaged')
+
+
+def has_aliases(content: bytes | str) -> bool:
+    """Whether YAML refers to parts of itself; False for what is no YAML."""
+    try:
+        return any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(content))
+    except (yaml.YAMLError, RecursionError):
+        return False
+
+
+def bound_decompression() -> None:
+    """Let rosbags decompress to bounded sizes only."""
+    mcap.DECOMPRESSORS['zstd'] = lambda data, size: _bounded(
+        _zstd.ZstdDecompressor, data, min(size, MAX_CHUNK_BYTES))
+    mcap.DECOMPRESSORS['lz4'] = lambda data, size: _bounded(
+        LZ4FrameDecompressor, data, min(size, MAX_CHUNK_BYTES))
+    rosbag1.decompressors['lz4'] = lambda data: _bounded(
+        LZ4FrameDecompressor, data, MAX_CHUNK_BYTES)
+    rosbag1.decompressors['bz2'] = lambda data: _bounded(
+        bz2.BZ2Decompressor, data, MAX_CHUNK_BYTES)
+    vars(rosbag2)['zstd'] = SimpleNamespace(
+        open=_zstd.open, decompress=lambda data: _bounded(
+            _zstd.ZstdDecompressor, data, MAX_MESSAGE_BYTES))
+
+
+def _bounded(decompressor: Callable[[], Any], data: bytes, limit: int) -> bytes:
+    """One frame, decompressed."""
+    stream = decompressor()
+    # One byte more, as the end of the frame may not be seen at exactly the limit.
+    out: bytes = stream.decompress(data, limit + 1)
+    if len(out) > limit:
+        raise InputError(f'{len(data)} bytes decompress to more than {limit}')
+    if not stream.eof:
+        raise InputError(f'{len(data)} compressed bytes are incomplete')
+    return out

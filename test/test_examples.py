@@ -1,0 +1,139 @@
+"""The examples of the documentation do what they say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+import signal
+from typing import Any
+
+from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
+from nav_msgs.msg import Path as PathMessage
+import numpy as np
+import pytest
+import ros_graph
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import PointCloud2, TimeReference
+
+from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.messages.outgoing import pair_messages, PairMessages
+from rs_relpose_ros.replay.parameter_file import read_parameters
+from rs_relpose_ros.replay.run import read_truth, Replay
+from rs_relpose_ros.replay.truth import TrueTrajectory
+from rs_relpose_ros.ros.message_types import message_class
+
+# Whoever comes first compiles the kernels.
+pytestmark = pytest.mark.timeout(600)
+
+EXAMPLE = ros_graph.ROOT / 'docs' / 'examples' / 'chain_poses.py'
+KINDS = {'relative_pose': PoseWithCovarianceStamped, 'reference': TimeReference,
+         'velocity': TwistWithCovarianceStamped, 'matches': PointCloud2}
+
+
+@dataclass(frozen=True)
+class Run:
+    """Paths that the example published, each with its last stamp, and what it said."""
+
+    pairs: list[PairMessages]
+    paths: list[PathMessage]
+    truth: TrueTrajectory
+    output: str
+    exit_code: int
+
+
+def to_ns(time: Any) -> int:
+    return time.sec * 10**9 + time.nanosec
+
+
+@pytest.fixture(scope='module')
+def recorded(bundled_bag: Path) -> tuple[list[PairMessages], TrueTrajectory]:
+    """What the node publishes of the bundled bag."""
+    with open_bag(bundled_bag) as bag:
+        topics = bag.find_topics()
+        truth = read_truth(bag, topics)
+        assert truth is not None
+        replay = Replay(bag, topics, read_parameters(bundled_bag.with_suffix('.yaml')))
+        return [pair_messages(pair.result, message_class) for pair in replay.pairs()
+                if pair.result.pose], truth
+
+
+@pytest.fixture(scope='module')
+def run(module_ros_domain_id: int,
+        recorded: tuple[list[PairMessages], TrueTrajectory]) -> Iterator[Run]:
+    pairs, truth = recorded
+    with ros_graph.Graph() as graph, ros_graph.Script(
+            EXAMPLE, '--ros-args', '-r', '__ns:=/relpose_node') as example:
+        paths = graph.listen(PathMessage, '/relpose_node/pose_chain/path')
+        publishers = {name: graph.publisher(kind, f'/relpose_node/{name}')
+                      for name, kind in KINDS.items()}
+        ros_graph.wait_until(
+            lambda: graph.node.count_publishers('/relpose_node/pose_chain/path'), 'discovery')
+        for count, pair in enumerate(pairs):
+            # In any order: their stamps say what belongs together.
+            for name in sorted(KINDS, reverse=count % 2 == 1):
+                publishers[name].publish(getattr(pair, name))
+            ros_graph.wait_until(lambda n=count: len(paths) > n, 'a path')
+        code, _ = example.signal(signal.SIGINT)
+        yield Run(pairs, paths, truth, example.output, code)
+
+
+def whole_paths(run: Run) -> list[PathMessage]:
+    """The longest of each that was begun."""
+    return [path for path, later in zip(run.paths, [*run.paths[1:], None], strict=True)
+            if later is None or len(later.poses) <= len(path.poses)]
+
+
+def test_each_pair_extends_a_path(run):
+    assert len(run.paths) == len(run.pairs) > 20
+    for path, pair in zip(run.paths, run.pairs, strict=True):
+        assert path.header.stamp == pair.relative_pose.header.stamp
+    assert run.exit_code == 0
+    assert 'Traceback' not in run.output
+
+
+def test_it_says_where_it_cannot_go_on(run):
+    """The bag's standstill and pure rotation have no translation: no pose, and no scale."""
+    paths = whole_paths(run)
+    assert len(paths) == 2
+    assert run.output.count('a pair is missing: the path starts anew, at another scale') == 1
+    assert to_ns(paths[1].poses[0].header.stamp) > to_ns(paths[0].poses[-1].header.stamp)
+
+
+def test_shape_of_the_paths(run):
+    """After one similarity each: scale is carried from pair to pair."""
+    for path in whole_paths(run):
+        stamps = [to_ns(pose.header.stamp) for pose in path.poses]
+        found = np.array([[p.x, p.y, p.z] for p in (pose.pose.position for pose in path.poses)])
+        true = true_positions(run.truth, stamps)
+        aligned, scale = after_similarity(found, true)
+        length = np.linalg.norm(np.diff(true, axis=0), axis=1).sum()
+        error = np.sqrt(np.mean(np.sum((aligned - true)**2, axis=1)))
+        steps = np.linalg.norm(np.diff(aligned, axis=0), axis=1) / np.linalg.norm(
+            np.diff(true, axis=0), axis=1)
+        print(f'{len(stamps)} poses over {length:.2f} m: {1e3 * error:.1f} mm, '
+              f'{100 * error / length:.2f} % of the length; steps {steps.min():.3f} to '
+              f'{steps.max():.3f} of the true ones, scale {scale:.3f}')
+        assert error <= 0.02 * length
+        assert 0.8 < steps.min()
+        # A pair of 4 px of parallax, after the standstill, tells depths badly.
+        assert steps.max() < 1.25
+
+
+def true_positions(truth: TrueTrajectory, stamps: list[int]) -> np.ndarray:
+    """Of the camera at the first of the stamps, in its axes there."""
+    positions = [np.zeros(3)]
+    for stamp in stamps[1:]:
+        pose = truth.relative_pose(stamps[0], stamp)
+        assert pose is not None
+        positions.append(pose[1])
+    return np.array(positions)
+
+
+def after_similarity(points: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, float]:
+    """`points` (N, 3) moved, turned and scaled onto `target` in the sense of least squares."""
+    centred, aim = points - points.mean(axis=0), target - target.mean(axis=0)
+    rotation, _ = Rotation.align_vectors(aim, centred)
+    turned = rotation.apply(centred)
+    scale = float(np.sum(turned * aim) / np.sum(turned**2))
+    return scale * turned + target.mean(axis=0), scale

@@ -1,0 +1,397 @@
+"""One running node, one fault of its sensors after the other in mid-stream, and the way back.
+
+After each fault a pose comes within a second of good data, and no pose that was published is
+wrong: those of frames during the faults are compared with the truth as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+import re
+import signal
+import time
+from typing import Any
+
+import cv2
+from diagnostic_msgs.msg import DiagnosticArray
+import fault_stream as faults
+from fault_stream import Fault, SECOND, Sent, Stream
+from geometry_msgs.msg import PoseWithCovarianceStamped
+import numpy as np
+import pytest
+import ros_graph
+from rosgraph_msgs.msg import Clock
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import CameraInfo, Image, Imu, TimeReference
+from std_srvs.srv import Trigger
+
+from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.estimator.estimate import warm_up
+from rs_relpose_ros.replay.run import read_truth
+from rs_relpose_ros.replay.truth import TrueTrajectory
+
+# Whoever comes first compiles the kernels.
+pytestmark = pytest.mark.timeout(600)
+
+FIRST_STAMP_NS = 10_000 * SECOND
+PARAMETER_FILE = ros_graph.ROOT / 'bags' / 'hand_held.yaml'
+_rng = np.random.default_rng(0)
+
+
+def uncalibrated(message: CameraInfo) -> None:
+    message.k = np.zeros(9)
+
+
+def cropped(message: Any) -> Any:
+    """Of the image, and of the CameraInfo alike."""
+    if isinstance(message, CameraInfo):
+        roi = message.roi
+        roi.x_offset, roi.y_offset, roi.width, roi.height = 40, 100, 600, 380
+        return message
+    return faults.gray_image(message.header, faults.pixels_of(message)[100:, 40:])
+
+
+def nan(message: Imu) -> None:
+    message.angular_velocity.y = float('nan')
+
+
+def zero(message: Imu) -> None:
+    for part in (message.angular_velocity, message.linear_acceleration):
+        part.x = part.y = part.z = 0.0
+
+
+def hang_imu(message: Imu, first: Imu) -> Imu:
+    message.angular_velocity = first.angular_velocity
+    message.linear_acceleration = first.linear_acceleration
+    return message
+
+
+def blurred(sigma: float) -> Any:
+    return faults.pixels(lambda image: cv2.GaussianBlur(image, (0, 0), sigma))
+
+
+GAP = 'the gyro does not cover the read-out of the frame'
+HANGS = 'the gyro repeats the same values bit by bit'
+SAME = 'the image repeats the one before bit by bit'
+FAULTS = [
+    # Only before the first one there is no calibration.
+    Fault('late CameraInfo', faults.without(CameraInfo, 0.0)),
+    Fault('no fault', faults.nothing),
+    Fault('IMU stops', faults.without(Imu), GAP),
+    Fault('IMU gap inside a frame', faults.without(Imu, 0.52, 0.58), GAP),
+    Fault('clocks back', faults.nothing, jump=-20.0),
+    Fault('clocks ahead', faults.nothing, GAP, jump=20.0),
+    Fault('clocks back by less than a second', faults.nothing, 'older than the one before',
+          jump=-0.4),
+    Fault('one image far ahead', faults.first_ahead(Image, 100.0), 'image stamps jumped back'),
+    Fault('one IMU sample far ahead', faults.first_ahead(Imu, 100.0), 'IMU stamps jumped back'),
+    Fault('camera stops', faults.without(Image)),
+    Fault('camera slows down', faults.every(Image, 3)),
+    Fault('camera changes its size', faults.changed((Image, CameraInfo), cropped)),
+    Fault('CameraInfo stops', faults.without(CameraInfo)),
+    Fault('CameraInfo uncalibrated', faults.changed(CameraInfo, uncalibrated),
+          'the camera is uncalibrated'),
+    Fault('every message twice', faults.twice, 'a frame of this stamp came before'),
+    Fault('messages overtake each other', faults.delayed(
+        object, lambda: float(_rng.uniform(0.0, 0.04)))),
+    Fault('late IMU', faults.delayed(Imu, lambda: 0.3)),
+    Fault('late images', faults.delayed(Image, lambda: 0.3)),
+    Fault('NaN', faults.changed(Imu, nan), 'angular_velocity of an IMU message must be finite'),
+    Fault('IMU of zeros', faults.changed(Imu, zero), HANGS),
+    Fault('IMU hangs', faults.changed(Imu, faults.repeating(lambda m: m, hang_imu)), HANGS),
+    Fault('gyro saturated', faults.changed(Imu, faults.vector('angular_velocity', z=4.36)),
+          'the z axis of the gyro repeats 4.36 rad/s bit by bit: it is saturated'),
+    Fault('accelerometer saturated', faults.changed(
+        Imu, faults.vector('linear_acceleration', x=39.2))),
+    Fault('black', faults.changed(Image, faults.pixels(np.zeros_like)), SAME),
+    Fault('white', faults.changed(Image, faults.pixels(lambda i: np.full_like(i, 255))), SAME),
+    Fault('frozen', faults.changed(Image, faults.repeating(
+        faults.pixels_of, lambda m, first: faults.gray_image(m.header, first))), SAME),
+    Fault('blurred', faults.changed(Image, blurred(4.0))),
+    Fault('blurred beyond use', faults.changed(Image, blurred(20.0))),
+    Fault('the end', faults.nothing),
+]
+
+
+@dataclass(frozen=True)
+class Session:
+    """What the node published and wrote while all phases were played."""
+
+    stream: Stream
+    poses: list[PoseWithCovarianceStamped]
+    references: dict[int, int]
+    diagnostics: list[DiagnosticArray]
+    output: str
+    memory_growth: float
+    restarted: Any
+    debug_images: list[Image]
+    exit_code: int
+
+
+def drivers(graph: ros_graph.Graph, namespace: str = '') -> dict[tuple[type, bool], Any]:
+    """Publishers of each kind of message, reliable ones and those of best effort."""
+    return {(kind, best_effort): graph.publisher(kind, f'{namespace}{topic}', best_effort)
+            for kind, topic in ((Image, '/camera/image_raw'),
+                                (CameraInfo, '/camera/camera_info'), (Imu, '/imu/data_raw'))
+            for best_effort in (False, True)}
+
+
+def play(publishers: dict[tuple[type, bool], Any], sent: list[Sent]) -> None:
+    """Publish in real time; from phase to phase with the other quality of service."""
+    ros_graph.publish_in_time((publishers[type(item.message), item.phase % 2 == 1], item.time_ns,
+                               item.message) for item in sent)
+
+
+def resident(pid: int) -> float:
+    """Memory [MB] of a process."""
+    return int(Path(f'/proc/{pid}/statm').read_text().split()[1]) * 4096 / 2**20
+
+
+@pytest.fixture(scope='module')
+def bag_messages(bundled_bag: Path) -> list[tuple[int, Any]]:
+    return faults.read_messages(bundled_bag, faults.PHASE + 0.1)
+
+
+@pytest.fixture(scope='module')
+def truth(bundled_bag: Path) -> TrueTrajectory:
+    with open_bag(bundled_bag) as bag:
+        truth = read_truth(bag, bag.find_topics())
+    assert truth is not None
+    return truth
+
+
+@pytest.fixture(scope='module')
+def session(module_ros_domain_id: int, bag_messages: list[tuple[int, Any]]) -> Iterator[Session]:
+    warm_up()
+    stream = Stream(bag_messages, FAULTS, FIRST_STAMP_NS)
+    last = len(FAULTS) - 1
+    with ros_graph.Graph() as graph, ros_graph.node_process(
+            PARAMETER_FILE, remap=ros_graph.BAG_TOPICS,
+            parameters={'image_transport': 'raw'}) as node:
+        poses = graph.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
+        references = graph.listen(TimeReference, '/relpose_node/reference')
+        diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
+        node.wait_for('ready')
+        publishers = drivers(graph)
+        play(publishers, [item for item in stream.sent if item.phase <= 2])
+        memory = resident(node.pid)
+        play(publishers, [item for item in stream.sent if 2 < item.phase < last])
+        growth = resident(node.pid) - memory
+        restarted = graph.call(Trigger, '/relpose_node/reset', Trigger.Request())
+        debug_images = graph.listen(Image, '/relpose_node/debug_image')
+        ros_graph.wait_until(
+            lambda: graph.node.count_publishers('/relpose_node/debug_image'), 'discovery')
+        play(publishers, [item for item in stream.sent if item.phase == last])
+        count = len(diagnostics)
+        ros_graph.wait_until(lambda: len(diagnostics) >= count + 2, 'diagnostics')
+        code, _ = node.signal(signal.SIGINT)
+        print(node.output)
+        yield Session(stream, poses, {
+            faults.stamp_of(item): item.time_ref.sec * SECOND + item.time_ref.nanosec
+            for item in references}, diagnostics, node.output, growth, restarted, debug_images,
+            code)
+
+
+def wrong(message: PoseWithCovarianceStamped, begin_ns: int, end_ns: int,
+          truth: TrueTrajectory) -> str:
+    """How a pose is wrong: by more than its covariance claims, and enough to do harm."""
+    position, q = message.pose.pose.position, message.pose.pose.orientation
+    errors = truth.errors(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(),
+                          np.array([position.x, position.y, position.z]), begin_ns, end_ns)
+    assert errors is not None
+    variances = np.diag(np.reshape(message.pose.covariance, (6, 6)))
+    translation_sigma, rotation_sigma = np.degrees(np.sqrt(
+        [variances[:3].sum(), variances[3:].sum()]))
+    if (errors.rotation_error <= max(1.0, 4.0 * rotation_sigma)
+            and errors.translation_error <= max(5.0, 4.0 * translation_sigma)):
+        return ''
+    return (f'rotation by {errors.rotation_error:.3f} deg (sigma {rotation_sigma:.3f}), '
+            f'translation by {errors.translation_error:.2f} deg (sigma {translation_sigma:.2f})')
+
+
+@pytest.mark.parametrize('name', [fault.name for fault in FAULTS])
+def test_a_pose_comes_within_a_second_of_good_data(session, name):
+    number = [fault.name for fault in FAULTS].index(name)
+    begin_ns, end_ns = session.stream.good[number]
+    assert end_ns - begin_ns <= SECOND
+    found = [stamp for stamp in map(faults.stamp_of, session.poses) if begin_ns <= stamp <= end_ns]
+    print([(stamp - begin_ns) / SECOND for stamp in found])
+    assert found
+
+
+def test_no_wrong_pose_is_published(session, truth):
+    stream, checked, found = session.stream, 0, []
+    for message in session.poses:
+        stamp = faults.stamp_of(message)
+        reference = session.references[stamp]
+        begin_ns, end_ns = stream.taken_at[reference], stream.taken_at[stamp]
+        # A stamp that two images carry says of none when it was taken.
+        if begin_ns is None or end_ns is None:
+            continue
+        checked += 1
+        how = wrong(message, begin_ns, end_ns, truth)
+        if how:
+            phases = [FAULTS[stream.phase_of[item]].name for item in (reference, stamp)]
+            found.append(f'{phases[0]} to {phases[1]}: images of '
+                         f'{(begin_ns - stream.bag_start_ns) / SECOND:.3f} s and '
+                         f'{(end_ns - stream.bag_start_ns) / SECOND:.3f} s: {how}')
+    assert found == []
+    assert checked > 5 * len(FAULTS)
+
+
+@pytest.mark.parametrize('name', [fault.name for fault in FAULTS if fault.said])
+def test_a_fault_is_told(session, name):
+    [fault] = [fault for fault in FAULTS if fault.name == name]
+    # Once, and after half a minute once more if it lasts or comes back.
+    assert 1 <= len([line for line in told(session) if fault.said in line]) <= 4
+
+
+def test_nothing_else_is_told(session):
+    said = [fault.said for fault in FAULTS if fault.said]
+    # While clocks and sensors change, frames wait in vain, come late or in between.
+    said += ['newer frames wait for the gyro', 'no gyro sample that covers', '(overload)',
+             'frame is ', 'stamps jumped', 'image is ', '(reset)']
+    assert [line for line in told(session) if not any(text in line for text in said)] == []
+    assert 'Traceback' not in session.output
+    assert session.exit_code == 0
+
+
+def told(session: Session) -> list[str]:
+    """Warnings and errors of the log."""
+    return [line for line in session.output.splitlines()
+            if re.match(r'\[(WARN|ERROR|FATAL)\]', line)]
+
+
+def test_diagnostics_count_what_happened(session):
+    values = ros_graph.diagnostic_values(session.diagnostics[-1])
+    refused = {key.removeprefix('frames_refused_'): int(value) for key, value in values.items()
+               if key.startswith('frames_refused_')}
+    assert int(values['frames_received']) == int(values['frames_processed']) + sum(
+        refused.values())
+    for cause in ('imu_gap', 'no_imu', 'duplicate', 'out_of_order', 'clock_jump', 'bad_image',
+                  'no_calibration'):
+        assert refused[cause] > 0, cause
+    assert int(values['imu_gaps']) >= 5
+    assert int(values['clock_jumps']) >= 4
+    assert int(values['messages_invalid']) > 200
+    assert values['frames_failed'] == '0'
+    assert int(values['poses']) == len(session.poses)
+    assert values['last_reason_no_pose'].split(':')[0] in (
+        'TOO_FEW_MATCHES', 'NO_CONSENSUS', 'LOW_PARALLAX', 'PURE_ROTATION')
+
+
+def test_memory_stays(session):
+    assert session.memory_growth < 60.0
+
+
+def test_reset_starts_anew(session):
+    """What was before the call is not referred to after it."""
+    assert session.restarted.success
+    begin_ns = session.stream.good[-2][1]
+    later = [stamp for stamp in map(faults.stamp_of, session.poses) if stamp > begin_ns]
+    assert later
+    assert all(session.references[stamp] > begin_ns for stamp in later)
+
+
+def test_debug_images_show_pairs(session):
+    """Published only while somebody subscribes: in the last phase."""
+    begin_ns = session.stream.good[-2][1]
+    stamps = [faults.stamp_of(message) for message in session.debug_images]
+    # A busy node may still have been at the end of the phase before.
+    assert min(stamps) > session.stream.good[-2][0]
+    assert len([stamp for stamp in stamps if stamp > begin_ns]) >= 5
+    assert {stamp for stamp in map(faults.stamp_of, session.poses) if stamp > begin_ns} <= set(
+        stamps)
+    for message in session.debug_images:
+        assert (message.encoding, message.width, message.step) == ('bgr8', 640, 1920)
+        assert message.header.frame_id == 'camera_optical_frame'
+        image = np.frombuffer(message.data, np.uint8).reshape(message.height, 640, 3)
+        colored = (np.ptp(image.astype(int), axis=2) > 40)[:480, 20:].sum()
+        # 270 tracks of some pixels each, and the caption.
+        assert 1000 < colored < 30_000
+        assert image[480:].max() == 255
+
+
+# -- several nodes, and their ends -----------------------------------------------------------
+
+
+def test_two_nodes_one_is_killed_and_the_other_lives_in_a_looping_bag(
+        ros_domain_id, bag_messages, truth):
+    """Two namespaces; one on the clock of a bag that starts again, one killed and restarted."""
+    phase = Stream(bag_messages, [Fault('', faults.nothing)], FIRST_STAMP_NS)
+    with ros_graph.Graph() as graph:
+        poses = {name: graph.listen(
+            PoseWithCovarianceStamped, f'/{name}/relpose_node/relative_pose') for name in 'ab'}
+        references = {name: graph.listen(
+            TimeReference, f'/{name}/relpose_node/reference') for name in 'ab'}
+        diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
+
+        def start(name: str, **parameters: Any) -> ros_graph.Process:
+            return ros_graph.node_process(
+                PARAMETER_FILE, parameters={'image_transport': 'raw', **parameters},
+                remap={'__ns': f'/{name}', **{source: f'/{name}{target}' for source, target
+                                              in ros_graph.BAG_TOPICS.items()}})
+
+        with start('b', use_sim_time=True) as looping:
+            clock = graph.node.create_publisher(Clock, '/clock', 10)
+            killed = start('a')
+            with killed:
+                killed.wait_for('ready')
+                looping.wait_for('ready')
+                publishers = {name: drivers(graph, f'/{name}') for name in 'ab'}
+
+                def play_both() -> None:
+                    """The same stamps again and again, to both."""
+                    def messages() -> Iterator[tuple[Any, int, Any]]:
+                        for item in phase.sent:
+                            kind = type(item.message), False
+                            yield publishers['a'][kind], item.time_ns, item.message
+                            yield publishers['b'][kind], item.time_ns, item.message
+                            tick = Clock()
+                            tick.clock.sec, tick.clock.nanosec = divmod(
+                                FIRST_STAMP_NS + item.time_ns, SECOND)
+                            yield clock, item.time_ns, tick
+                    ros_graph.publish_in_time(messages())
+                    time.sleep(0.1)
+
+                play_both()
+                before = {name: len(poses[name]) for name in 'ab'}
+                assert min(before.values()) >= 5
+                assert killed.signal(signal.SIGKILL)[0] == -signal.SIGKILL
+            with start('a') as restarted:
+                play_both()
+                assert len(poses['b']) >= before['b'] + 5
+                assert len(poses['a']) == before['a']
+                restarted.wait_for('ready')
+                ros_graph.wait_until(lambda: all(
+                    publisher.get_subscription_count() == 1
+                    for publisher in publishers['a'].values()), 'the restarted node')
+                play_both()
+                assert len(poses['a']) >= before['a'] + 5
+                for process in (restarted, looping):
+                    assert process.signal(signal.SIGTERM)[0] == 0
+                    assert 'Traceback' not in process.output
+        for name in 'ab':
+            for message, reference in zip(poses[name], references[name], strict=True):
+                begin_ns = phase.taken_at[reference.time_ref.sec * SECOND
+                                          + reference.time_ref.nanosec]
+                end_ns = phase.taken_at[faults.stamp_of(message)]
+                assert begin_ns is not None and end_ns is not None
+                assert wrong(message, begin_ns, end_ns, truth) == ''
+        named = {name: [d for d in diagnostics if d.status[0].name.startswith(f'/{name}/')]
+                 for name in 'ab'}
+        jumps = ros_graph.diagnostic_values(named['b'][-1])['clock_jumps']
+        assert int(jumps) >= 2
+        # Stamped by the clock of the graph.
+        assert faults.stamp_of(named['b'][-1]) < FIRST_STAMP_NS + 10 * SECOND
+        assert faults.stamp_of(named['a'][-1]) > FIRST_STAMP_NS + 10 * SECOND
+
+
+def test_reset_of_a_node_that_cannot_estimate(ros_domain_id):
+    with ros_graph.Graph() as graph, ros_graph.node_process() as node:
+        answer = graph.call(Trigger, '/relpose_node/reset', Trigger.Request())
+        assert not answer.success
+        assert 'readout_time' in answer.message
+        assert node.signal(signal.SIGTERM)[0] == 0
