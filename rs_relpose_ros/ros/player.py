@@ -51,6 +51,8 @@ LOG_DTYPE = np.dtype([('is_image', '?'), ('stamp_ns', '<i8'), ('due_ns', '<i8'),
 # What the node subscribes to, and so what is worth waiting for.
 _SENSOR_TYPES = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, IMU)
 _DEPTH = 1000
+# A subscriber knows of the match a little later than the publisher, and misses what comes before.
+_SETTLE = 0.5
 # Best-effort samples are confirmed by nobody; the last ones need this long to be read.
 _LINGER = 0.2
 
@@ -106,16 +108,19 @@ def play(node: Node, options: PlayerOptions) -> int:
         topics = _chosen(bag, options)
         publishers = {topic.name: _publisher(node, topic, options) for topic in topics}
         messages = _outgoing(bag, topics, options)
+        settle = 0.0
         if options.loop > 0.0:
             messages = in_turns(list(messages), to_nanoseconds(options.loop),
                                 to_nanoseconds(options.duration))
             # The sensors' clocks must not stop for a search of so many objects.
             gc.collect()
             gc.freeze()
+            settle = _SETTLE
         if options.wait_for_subscribers > 0.0:
             _wait_for_subscribers(
                 [publishers[topic.name] for topic in topics if topic.msgtype in _SENSOR_TYPES],
                 options.wait_for_subscribers)
+        time.sleep(settle)
         return _publish(messages, publishers, options)
 
 
