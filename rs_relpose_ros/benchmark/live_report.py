@@ -16,7 +16,7 @@ from rs_relpose_ros.benchmark.tables import markdown_table, write_csv
 REPORT_FILE, STATISTICS_FILE = 'live.md', 'live.csv'
 PLOT_FILE, SOAK_PLOT_FILE = 'live.png', 'soak.png'
 
-# Percentiles over time are those of windows of this length [s]; shorter runs have ten of them.
+# Percentiles over time are those of windows of this length [s]; a short run has ten of them.
 _WINDOW = 60.0
 # The first part of a run, in which caches and pools fill, says nothing of leaks.
 _SETTLING = 0.1
@@ -92,7 +92,7 @@ def write_soak_report(folder: Path, cell: LiveStatistics, course: Course) -> str
 def latency_over_time(course: Course) -> list[tuple[float, Percentiles]]:
     """Start [s] and latency of successive windows."""
     end = float(course.latency_seconds[-1])
-    length = min(_WINDOW, max(end / 10.0, 1e-3))
+    length = _WINDOW if end >= 5.0 * _WINDOW else max(end / 10.0, 1e-3)
     starts = np.arange(0.0, end, length)
     return [(float(start), Percentiles.of(course.latencies[
         (course.latency_seconds >= start) & (course.latency_seconds < start + length)]))
