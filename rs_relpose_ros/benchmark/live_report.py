@@ -117,7 +117,7 @@ def _plot(path: Path, cells: Sequence[LiveStatistics]) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10.0, 1.6 + 0.36 * len(cells)), layout='constrained')
+    figure = Figure(figsize=(10.0, 1.9 + 0.36 * len(cells)), layout='constrained')
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2, sharey=True)
     at: NDArray[np.float64] = np.arange(len(cells), dtype=np.float64)
@@ -139,10 +139,10 @@ def _plot(path: Path, cells: Sequence[LiveStatistics]) -> None:
                label='node: callbacks')
     right.plot([c.cpu_player for c in cells], at, 'k|', markersize=9.0, label='player')
     right.set_xlabel('processor time [percent of one core]')
-    for axis in (left, right):
+    for axis, corner in ((left, 'left'), (right, 'right')):
         axis.grid(visible=True, axis='x', alpha=0.3)
-        axis.legend(fontsize='small', loc='upper center', bbox_to_anchor=(0.5, -0.12 - 1.0 / (
-            2 + len(cells))), ncols=2)
+        figure.legend(*axis.get_legend_handles_labels(), fontsize='small', ncols=2,
+                      loc=f'outside lower {corner}')
     figure.savefig(path, dpi=110)
 
 
