@@ -141,8 +141,8 @@ def _plot(path: Path, cells: Sequence[LiveStatistics]) -> None:
     right.set_xlabel('processor time [percent of one core]')
     for axis, corner in ((left, 'left'), (right, 'right')):
         axis.grid(visible=True, axis='x', alpha=0.3)
-        figure.legend(*axis.get_legend_handles_labels(), fontsize='small', ncols=2,
-                      loc=f'outside lower {corner}')
+        handles, labels = axis.get_legend_handles_labels()
+        figure.legend(handles, labels, fontsize='small', ncols=2, loc=f'outside lower {corner}')
     figure.savefig(path, dpi=110)
 
 

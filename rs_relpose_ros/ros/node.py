@@ -48,8 +48,10 @@ from rs_relpose_ros.ros.transform import Broadcast, transform_broadcaster
 from rs_relpose_ros.ros.worker import Worker
 from rs_relpose_ros.timing import NANOSECONDS
 
-# Best effort matches every publisher; a reliable subscription would not.
-IMAGE_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=5,
+# Best effort matches every publisher; a reliable subscription would not. Half a second of images:
+# where the process had to wait for a processor its mailbox drops them, which is counted, and not
+# the middleware, which is not.
+IMAGE_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=15,
                        reliability=ReliabilityPolicy.BEST_EFFORT)
 # Samples of some seconds, so that no stall loses any.
 IMU_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000,
