@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import os
 from pathlib import Path
 import platform
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from rs_relpose_ros.benchmark.tables import markdown_table, write_csv
 REPORT_FILE, STATISTICS_FILE = 'live.md', 'live.csv'
 PLOT_FILE, SOAK_PLOT_FILE = 'live.png', 'soak.png'
 
+_LEGEND: Mapping[str, Any] = {'fontsize': 'small', 'ncols': 2}
 # Percentiles over time are those of windows of this length [s]; a short run has ten of them.
 _WINDOW = 60.0
 # The first part of a run, in which caches and pools fill, says nothing of leaks.
@@ -139,10 +141,10 @@ def _plot(path: Path, cells: Sequence[LiveStatistics]) -> None:
                label='node: callbacks')
     right.plot([c.cpu_player for c in cells], at, 'k|', markersize=9.0, label='player')
     right.set_xlabel('processor time [percent of one core]')
-    for axis, corner in ((left, 'left'), (right, 'right')):
+    for axis in (left, right):
         axis.grid(visible=True, axis='x', alpha=0.3)
-        handles, labels = axis.get_legend_handles_labels()
-        figure.legend(handles, labels, fontsize='small', ncols=2, loc=f'outside lower {corner}')
+    figure.legend(*left.get_legend_handles_labels(), loc='outside lower left', **_LEGEND)
+    figure.legend(*right.get_legend_handles_labels(), loc='outside lower right', **_LEGEND)
     figure.savefig(path, dpi=110)
 
 

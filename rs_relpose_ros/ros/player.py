@@ -108,19 +108,16 @@ def play(node: Node, options: PlayerOptions) -> int:
         topics = _chosen(bag, options)
         publishers = {topic.name: _publisher(node, topic, options) for topic in topics}
         messages = _outgoing(bag, topics, options)
-        settle = 0.0
         if options.loop > 0.0:
             messages = in_turns(list(messages), to_nanoseconds(options.loop),
                                 to_nanoseconds(options.duration))
             # The sensors' clocks must not stop for a search of so many objects.
             gc.collect()
             gc.freeze()
-            settle = _SETTLE
         if options.wait_for_subscribers > 0.0:
             _wait_for_subscribers(
                 [publishers[topic.name] for topic in topics if topic.msgtype in _SENSOR_TYPES],
                 options.wait_for_subscribers)
-        time.sleep(settle)
         return _publish(messages, publishers, options)
 
 
@@ -148,6 +145,7 @@ def _wait_for_subscribers(publishers: Sequence[Publisher], seconds: float) -> No
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline and rclpy.ok():
         if all(p.get_subscription_count() > 0 for p in publishers):
+            time.sleep(_SETTLE)
             return
         time.sleep(0.02)
     lonely = [p.topic_name for p in publishers if p.get_subscription_count() == 0]
