@@ -240,6 +240,10 @@ class RelposeNode(Node):
             self._stamps.write(f'{ready.frame.stamp_ns}\n')
 
     def _on_result(self, ready: ReadyFrame, result: PairResult | None) -> None:
+        self._publish_result(ready, result)
+        self._statistics.add_frame(ready.taken_ns)
+
+    def _publish_result(self, ready: ReadyFrame, result: PairResult | None) -> None:
         if result is None:
             return
         try:
