@@ -106,6 +106,33 @@ def test_latency_is_from_ready_to_publication(clock):
     assert (values['inlier_ratio'], values['inliers'], values['matches']) == ('0.750', '15', '20')
 
 
+def test_the_worker_s_share_is_that_since_the_last_report(clock):
+    statistics = Statistics(clock)
+    for k in range(30):
+        clock.now = (k + 1) * SECOND // 30
+        statistics.add_frame(clock.now - 20 * 10**6)
+    clock.now = SECOND
+    values = dict(statistics.report(inputs(), counts(), problem='', missing=()).values)
+    assert (values['frame_time_p50_ms'], values['frame_time_p99_ms']) == ('20.0', '20.0')
+    assert values['worker_busy_percent'] == '60'
+    clock.now = 2 * SECOND
+    values = dict(statistics.report(inputs(), counts(), problem='', missing=()).values)
+    assert values['worker_busy_percent'] == '0'
+    assert values['frame_time_p50_ms'] == '20.0'
+
+
+def test_overload_is_told_as_such(clock):
+    statistics = Statistics(clock)
+    report = statistics.report(inputs(), counts(frames=9, taken=4, overload=3, no_imu=2),
+                               problem='', missing=())
+    assert report.level == WARN
+    assert report.text.startswith('5 frames were not used')
+    assert '3 of them because the worker is too slow' in report.text
+    report = statistics.report(inputs(), counts(frames=10, taken=4, overload=3, no_imu=3),
+                               problem='', missing=())
+    assert report.text == '1 frames were not used since the last report'
+
+
 def test_level_and_text(clock):
     statistics = Statistics(clock)
     report = statistics.report(inputs(), None, problem='not estimating: why', missing=('a', 'b'))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import os
 from pathlib import Path
 import platform
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,8 @@ from rs_relpose_ros.benchmark.tables import markdown_table, write_csv
 REPORT_FILE, STATISTICS_FILE = 'live.md', 'live.csv'
 PLOT_FILE, SOAK_PLOT_FILE = 'live.png', 'soak.png'
 
-# Percentiles over time are those of windows of this length [s]; shorter runs have ten of them.
+_LEGEND: Mapping[str, Any] = {'fontsize': 'small', 'ncols': 2}
+# Percentiles over time are those of windows of this length [s]; a short run has ten of them.
 _WINDOW = 60.0
 # The first part of a run, in which caches and pools fill, says nothing of leaks.
 _SETTLING = 0.1
@@ -92,7 +94,7 @@ def write_soak_report(folder: Path, cell: LiveStatistics, course: Course) -> str
 def latency_over_time(course: Course) -> list[tuple[float, Percentiles]]:
     """Start [s] and latency of successive windows."""
     end = float(course.latency_seconds[-1])
-    length = min(_WINDOW, max(end / 10.0, 1e-3))
+    length = _WINDOW if end >= 5.0 * _WINDOW else max(end / 10.0, 1e-3)
     starts = np.arange(0.0, end, length)
     return [(float(start), Percentiles.of(course.latencies[
         (course.latency_seconds >= start) & (course.latency_seconds < start + length)]))
@@ -117,7 +119,7 @@ def _plot(path: Path, cells: Sequence[LiveStatistics]) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10.0, 1.6 + 0.36 * len(cells)), layout='constrained')
+    figure = Figure(figsize=(10.0, 1.9 + 0.36 * len(cells)), layout='constrained')
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2, sharey=True)
     at: NDArray[np.float64] = np.arange(len(cells), dtype=np.float64)
@@ -141,8 +143,8 @@ def _plot(path: Path, cells: Sequence[LiveStatistics]) -> None:
     right.set_xlabel('processor time [percent of one core]')
     for axis in (left, right):
         axis.grid(visible=True, axis='x', alpha=0.3)
-        axis.legend(fontsize='small', loc='upper center', bbox_to_anchor=(0.5, -0.12 - 1.0 / (
-            2 + len(cells))), ncols=2)
+    figure.legend(*left.get_legend_handles_labels(), loc='outside lower left', **_LEGEND)
+    figure.legend(*right.get_legend_handles_labels(), loc='outside lower right', **_LEGEND)
     figure.savefig(path, dpi=110)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 import threading
 import time
@@ -17,8 +17,9 @@ from rs_relpose_ros.timing import NANOSECONDS
 
 OK, WARN, ERROR = 0, 1, 2
 
-# Pairs that the latency and the answered fraction are taken from.
+# Pairs that the latency, and frames that the time of a frame is taken from.
 _RECENT_PAIRS = 300
+_RECENT_FRAMES = 900
 # An input that is silent for so long is missing.
 SILENCE = 2.0
 
@@ -62,8 +63,23 @@ class Statistics:
         self._last_no_pose = ''
         self._since_ns = clock()
         self._counted = Inputs(0, 0, 0, 0, 0)
-        self._refused_before = 0
+        self._refused_before = self._overload_before = 0
+        self._frame_times: deque[float] = deque(maxlen=_RECENT_FRAMES)
+        self._busy_ns = 0
         self._last_input_ns: dict[str, int] = {}
+
+    def add_frame(self, taken_ns: int) -> None:
+        """Count a frame; call it when all is done for it.
+
+        Parameters
+        ----------
+        taken_ns : int
+            When the worker took it, on the monotonic clock.
+        """
+        spent_ns = self._clock() - taken_ns
+        with self._lock:
+            self._frame_times.append(spent_ns / NANOSECONDS)
+            self._busy_ns += spent_ns
 
     def add_pair(self, result: PairResult, ready_ns: int) -> None:
         """Count a pair; call it right after its publication.
@@ -114,10 +130,12 @@ class Statistics:
             refused = {} if counts is None else dict(counts.refused)
             dropped = sum(refused.values()) - self._refused_before
             self._refused_before = sum(refused.values())
-            level, text = self._judge(problem, dropped)
+            overload = refused.get(Refusal.OVERLOAD, 0) - self._overload_before
+            self._overload_before = refused.get(Refusal.OVERLOAD, 0)
+            busy, self._busy_ns = self._busy_ns / NANOSECONDS / elapsed, 0
+            level, text = self._judge(problem, dropped, overload)
             last, pose = self._last_pair, self._last_pose
-            latency = [f'{1e3 * np.percentile(self._latencies, p):.1f}' if self._latencies else ''
-                       for p in (50, 99)]
+            latency, frame_time = _milliseconds(self._latencies), _milliseconds(self._frame_times)
             values = [
                 ('state', {OK: 'ok', WARN: 'degraded', ERROR: 'not estimating'}[level]),
                 ('missing', ', '.join(missing)),
@@ -146,13 +164,19 @@ class Statistics:
                 *_drift_values(last.drift if last else None),
                 ('latency_p50_ms', latency[0]),
                 ('latency_p99_ms', latency[1]),
+                ('frame_time_p50_ms', frame_time[0]),
+                ('frame_time_p99_ms', frame_time[1]),
+                ('worker_busy_percent', f'{100.0 * busy:.0f}'),
                 ('last_reason_no_pose', self._last_no_pose),
             ]
         return Report(level, text, tuple(values))
 
-    def _judge(self, problem: str, dropped: int) -> tuple[int, str]:
+    def _judge(self, problem: str, dropped: int, overload: int) -> tuple[int, str]:
         if problem:
             return ERROR, problem
+        if overload > 0:
+            return WARN, (f'{dropped} frames were not used since the last report, {overload} of '
+                          'them because the worker is too slow for the camera')
         if dropped > 0:
             return WARN, f'{dropped} frames were not used since the last report'
         last = self._last_pair
@@ -161,6 +185,14 @@ class Statistics:
         if not last.pose:
             return WARN, f'no pose of the last pair: {self._last_no_pose}'
         return OK, f'estimating: {self._poses} poses of {self._pairs} pairs'
+
+
+def _milliseconds(seconds: Collection[float]) -> tuple[str, str]:
+    """Median and 99th percentile; empty where there is none."""
+    if not seconds:
+        return '', ''
+    median, p99 = 1e3 * np.percentile(list(seconds), (50, 99))
+    return f'{median:.1f}', f'{p99:.1f}'
 
 
 def _inlier_ratio(result: PairResult) -> float:

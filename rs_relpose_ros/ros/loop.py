@@ -6,12 +6,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import struct
 
+from rs_relpose_ros.bags.reader import COMPRESSED_IMAGE, IMAGE
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.timing import NANOSECONDS
 
 # In CDR a message that begins with a std_msgs/Header has its stamp after four bytes, the second of
 # which tells the byte order.
 _STAMP = slice(4, 12)
+_TAIL_NS = NANOSECONDS // 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +36,8 @@ def in_turns(messages: Sequence[Outgoing], period_ns: int,
         In the order of `due_ns`; all begin with a header, and their stamps span one period.
     period_ns : int
     duration_ns : int
-        What would be due later is left out.
+        What would be due later is left out, and the last images a little earlier: the IMU samples
+        that cover their last rows are still to come.
     """
     stamps = [stamp_of(message.data) for message in messages]
     if messages and max(stamps) - min(stamps) >= period_ns:
@@ -49,9 +52,12 @@ def in_turns(messages: Sequence[Outgoing], period_ns: int,
             repeat_ns = (turn - message.due_ns // period_ns) * period_ns
             if repeat_ns < 0:
                 continue
-            if message.due_ns + repeat_ns >= duration_ns:
+            due_ns = message.due_ns + repeat_ns
+            if due_ns >= duration_ns:
                 return
-            yield Outgoing(message.due_ns + repeat_ns, message.topic, message.msgtype,
+            if message.msgtype in (IMAGE, COMPRESSED_IMAGE) and due_ns >= duration_ns - _TAIL_NS:
+                continue
+            yield Outgoing(due_ns, message.topic, message.msgtype,
                            _with_stamp(message.data, stamps[k] + repeat_ns))
         turn += 1
 

@@ -48,8 +48,10 @@ from rs_relpose_ros.ros.transform import Broadcast, transform_broadcaster
 from rs_relpose_ros.ros.worker import Worker
 from rs_relpose_ros.timing import NANOSECONDS
 
-# Best effort matches every publisher; a reliable subscription would not.
-IMAGE_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=5,
+# Best effort matches every publisher; a reliable subscription would not. Half a second of images:
+# where the process had to wait for a processor its mailbox drops them, which is counted, and not
+# the middleware, which is not.
+IMAGE_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=15,
                        reliability=ReliabilityPolicy.BEST_EFFORT)
 # Samples of some seconds, so that no stall loses any.
 IMU_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000,
@@ -238,6 +240,10 @@ class RelposeNode(Node):
             self._stamps.write(f'{ready.frame.stamp_ns}\n')
 
     def _on_result(self, ready: ReadyFrame, result: PairResult | None) -> None:
+        self._publish_result(ready, result)
+        self._statistics.add_frame(ready.taken_ns)
+
+    def _publish_result(self, ready: ReadyFrame, result: PairResult | None) -> None:
         if result is None:
             return
         try:

@@ -51,6 +51,8 @@ LOG_DTYPE = np.dtype([('is_image', '?'), ('stamp_ns', '<i8'), ('due_ns', '<i8'),
 # What the node subscribes to, and so what is worth waiting for.
 _SENSOR_TYPES = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, IMU)
 _DEPTH = 1000
+# A subscriber knows of the match a little later than the publisher, and misses what comes before.
+_SETTLE = 0.5
 # Best-effort samples are confirmed by nobody; the last ones need this long to be read.
 _LINGER = 0.2
 
@@ -143,6 +145,7 @@ def _wait_for_subscribers(publishers: Sequence[Publisher], seconds: float) -> No
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline and rclpy.ok():
         if all(p.get_subscription_count() > 0 for p in publishers):
+            time.sleep(_SETTLE)
             return
         time.sleep(0.02)
     lonely = [p.topic_name for p in publishers if p.get_subscription_count() == 0]

@@ -77,6 +77,13 @@ class Worker(threading.Thread):
     def run(self) -> None:
         """Work until `stop`."""
         try:
+            self._work()
+        finally:
+            if self._timings is not None:
+                self._timings.close()
+
+    def _work(self) -> None:
+        try:
             warm_up_pipeline(self._parameters)
         except Exception as error:  # noqa: BLE001 - the node shows it; a silent thread is worse
             self._on_error('the kernels cannot be compiled', error)
@@ -90,8 +97,6 @@ class Worker(threading.Thread):
             except Exception as error:  # noqa: BLE001 - told with its traceback by the node
                 self._pipeline.reset()
                 self._on_error('a frame failed and tracking starts anew', error)
-        if self._timings is not None:
-            self._timings.close()
 
     def _step(self) -> None:
         taken = self._sequencer.take(_TAKE_TIMEOUT)

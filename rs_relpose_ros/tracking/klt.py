@@ -143,13 +143,17 @@ class KltTracker:
         found, good, _ = self._follow(image1, image2, points1, guess, levels, _FOLLOW)
         # The way back starts as far off as the way forth did: the guess must not be the answer.
         offset = found - guess
+        leads_back = np.zeros(len(points1), dtype=bool)
+        # From nearby the image itself, without its pyramid, leads back; from afar it may.
         far = np.linalg.norm(offset, axis=1) > _NEAR
-        for mask, depth in ((good & far, levels), (good & ~far, 1)):
-            back, returned, _ = self._follow(
-                image2, image1, found[mask], (points1 + offset)[mask], depth, _FOLLOW)
-            good[mask] = returned & (np.linalg.norm(back - points1[mask], axis=1)
-                                     <= self._config.forward_backward_threshold)
-        return found, good
+        for depth, tried in ((1, np.ones(len(points1), dtype=bool)), (levels, far)):
+            mask = good & tried & ~leads_back
+            if depth == 1 or (levels > 1 and mask.any()):
+                back, returned, _ = self._follow(
+                    image2, image1, found[mask], (points1 + offset)[mask], depth, _FOLLOW)
+                leads_back[mask] = returned & (np.linalg.norm(back - points1[mask], axis=1)
+                                               <= self._config.forward_backward_threshold)
+        return found, leads_back
 
     def _follow(self, image1: Image, image2: Image, points1: Array, guess: Array, levels: int,
                 criteria: tuple[int, int, float]) -> tuple[Array, NDArray[np.bool_], Array]:
