@@ -22,6 +22,7 @@ from rs_relpose_ros.pipeline.parameters import Parameters
 from rs_relpose_ros.pipeline.sequencer import Refusal, Sequencer
 from rs_relpose_ros.replay.parameter_file import read_parameters
 from rs_relpose_ros.replay.run import Replay
+from rs_relpose_ros.ros.diagnostics import Inputs, Statistics
 from rs_relpose_ros.ros.worker import Worker
 
 MS = 1_000_000
@@ -231,6 +232,20 @@ def test_the_bag_shows_its_bias_and_a_wrong_time_offset(bundled_bag):
     assert np.abs(drift.gyro_bias - [0.011, -0.007, 0.005]).max() < 1e-3
     assert abs(drift.time_offset) < 1e-3
     assert drift.applied == pytest.approx(-0.01, abs=1e-3)
+    # As the node tells it.
+    statistics = Statistics()
+    statistics.add_pair(results[-1], 0)
+    told = dict(statistics.report(Inputs(0, 0, 0, 0, 0), None, problem='', missing=()).values)
+    assert float(told['tracked_time_offset_ms']) == pytest.approx(
+        1e3 * drift.time_offset, abs=0.01)
+    assert float(told['applied_time_offset_ms']) == pytest.approx(1e3 * drift.applied, abs=0.01)
+    assert [float(v) for v in told['tracked_gyro_bias_rad_s'].split()] == pytest.approx(
+        drift.gyro_bias.tolist(), abs=1e-5)
+
+
+def test_before_the_first_pair_diagnostics_tell_no_drift():
+    told = dict(Statistics().report(Inputs(0, 0, 0, 0, 0), None, problem='', missing=()).values)
+    assert told['tracked_time_offset_ms'] == told['tracked_gyro_bias_rad_s'] == ''
 
 
 def test_live_and_replay_agree_while_the_offset_is_applied(bundled_bag):

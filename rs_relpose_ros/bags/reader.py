@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rosbags.highlevel import AnyReader
-from rosbags.interfaces import Connection
+from rosbags.interfaces import Connection, ConnectionExtRosbag2, QosReliability
 from rosbags.typesys import get_typestore, Stores
 
 from rs_relpose_ros.bags.limits import bound_decompression, check_metadata, MAX_MESSAGE_BYTES
@@ -103,6 +103,17 @@ class Bag:
     def duration(self) -> float:
         """Time from the first to the last message [s]."""
         return float(self._reader.duration) / NANOSECONDS
+
+    def reliability(self, topic: Topic) -> str:
+        """``'reliable'`` or ``'best effort'`` as its publishers offered; empty where not told."""
+        offered = {
+            profile.reliability for connection in self._reader.connections
+            if (connection.topic, connection.msgtype) == (topic.name, topic.msgtype)
+            and isinstance(connection.ext, ConnectionExtRosbag2)
+            for profile in connection.ext.offered_qos_profiles}
+        if QosReliability.BEST_EFFORT in offered:
+            return 'best effort'
+        return 'reliable' if QosReliability.RELIABLE in offered else ''
 
     def find_topics(self, options: TopicOptions | None = None) -> SensorTopics:
         """The sensors' topics: as chosen, or by type where only one can be meant.

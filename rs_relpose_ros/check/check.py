@@ -1,0 +1,112 @@
+"""The check of a bag: choose topics, read it once, judge."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from rs_relpose_ros.bags.reader import (
+    Bag,
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    IMU,
+    Topic,
+    TopicOptions,
+)
+from rs_relpose_ros.check import judge_images, judge_imu, judge_turning
+from rs_relpose_ros.check.findings import Finding, Report, Verdict
+from rs_relpose_ros.check.scan import Chosen, scan
+from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.pipeline.parameters import Parameters
+
+
+def choose_topics(bag: Bag, options: TopicOptions) -> Chosen:
+    """The topics to look at: as `Bag.find_topics`, but what is absent is None.
+
+    Raises
+    ------
+    InputError, MissingInputError
+        Several could be meant, or a topic that was asked for is not there.
+    """
+    try:
+        topics = bag.find_topics(options)
+    except (InputError, MissingInputError) as error:
+        # Asked for by name, it is a mistake; absent altogether or rectified, it is a finding.
+        asked = [name for name in (options.image, options.camera_info, options.imu, options.accel)
+                 if name]
+        there = {topic.name.lstrip('/') for topic in bag.topics if topic.count}
+        chosen = Chosen(_first(bag, options.image, IMAGE, COMPRESSED_IMAGE),
+                        _first(bag, options.camera_info, CAMERA_INFO),
+                        _first(bag, options.imu, IMU), None)
+        absent = isinstance(error, MissingInputError) and all(
+            name.lstrip('/') in there for name in asked)
+        if not absent and 'image_rect' not in (chosen.image.name if chosen.image else ''):
+            raise
+        return chosen
+    return Chosen(topics.image, topics.camera_info, topics.imu, topics.accel)
+
+
+def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters,
+              on_message: Callable[[], object] = lambda: None) -> Report:
+    """Read the chosen topics once and judge them.
+
+    Parameters
+    ----------
+    bag : Bag
+        Open.
+    chosen : Chosen
+    parameters : Parameters
+        Of the node; those that were not given are judged as such.
+    on_message : callable
+        Called after each message, for a progress bar.
+
+    Raises
+    ------
+    InputError
+        The bag is damaged.
+    """
+    seen = scan(bag, chosen, on_message)
+    findings = [_topics(bag, chosen), _parameters(parameters)]
+    if chosen.image is not None:
+        findings += judge_images.findings(
+            seen, chosen.image, bag.reliability(chosen.image), parameters)
+    if chosen.imu is not None:
+        findings += judge_imu.findings(seen, bag.reliability(chosen.imu), parameters)
+    if chosen.image is not None and chosen.imu is not None:
+        findings += judge_turning.findings(seen, parameters)
+    return Report(str(bag.path), tuple(findings))
+
+
+def _first(bag: Bag, name: str, *msgtypes: str) -> Topic | None:
+    for topic in bag.topics:
+        if topic.msgtype in msgtypes and topic.count and (
+                not name or topic.name.lstrip('/') == name.lstrip('/')):
+            return topic
+    return None
+
+
+def _topics(bag: Bag, chosen: Chosen) -> Finding:
+    roles = {'image': chosen.image, 'camera_info': chosen.camera_info, 'imu': chosen.imu,
+             'accel': chosen.accel}
+    figures = {role: topic.name if topic else None for role, topic in roles.items()}
+    absent = [role for role in ('image', 'camera_info', 'imu') if roles[role] is None]
+    text = ', '.join(f'{topic.name} ({topic.count})' for topic in chosen.all)
+    if not absent:
+        return Finding('topics', Verdict.OK, text, figures=figures)
+    there = ', '.join(map(str, bag.topics)) or 'no topics at all'
+    return Finding('topics', Verdict.FAILURE,
+                   f'no {" and no ".join(absent)} topic; the bag has {there}',
+                   'record images (raw or compressed), their CameraInfo and a sensor_msgs/Imu '
+                   'with gyro', figures)
+
+
+def _parameters(parameters: Parameters) -> Finding:
+    missing = parameters.sensor.missing()
+    if missing:
+        return Finding('parameters', Verdict.WARNING, f'{" and ".join(missing)} not given',
+                       'the node needs them: give --params FILE, or find them from a recording '
+                       'with "rs_relpose calibrate"', {'missing': missing})
+    return Finding('parameters', Verdict.OK, 'readout_time '
+                   f'{1e3 * (parameters.sensor.readout_time or 0.0):.1f} ms, quat_cam_imu_xyzw '
+                   f'and time_offset {1e3 * parameters.sensor.time_offset:.1f} ms are given',
+                   figures={'missing': []})

@@ -1,0 +1,81 @@
+"""Findings of a check: verdict, sentence, remedy and figures; as text and as data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+import textwrap
+from typing import Any
+
+
+class Verdict(str, Enum):
+    """`FAILURE` is what would make the estimation fail or its results wrong."""
+
+    OK = 'ok'
+    WARNING = 'warning'
+    FAILURE = 'failure'
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One line of the report.
+
+    Attributes
+    ----------
+    name : str
+        What was looked at.
+    verdict : Verdict
+    text : str
+        What was found, with units.
+    remedy : str
+        What to do about it; empty where nothing need be done.
+    figures : dict
+        The same in numbers, SI units unless the name says otherwise.
+    """
+
+    name: str
+    verdict: Verdict
+    text: str
+    remedy: str = ''
+    figures: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """All findings of one bag."""
+
+    bag: str
+    findings: tuple[Finding, ...]
+
+    @property
+    def failed(self) -> bool:
+        """Whether something would make the estimation fail."""
+        return any(finding.verdict is Verdict.FAILURE for finding in self.findings)
+
+    def count(self, verdict: Verdict) -> int:
+        """Number of findings with this verdict."""
+        return sum(finding.verdict is verdict for finding in self.findings)
+
+    def lines(self, width: int = 100) -> list[str]:
+        """The report as text of at most `width` columns."""
+        names = max(len(finding.name) for finding in self.findings)
+        lines = []
+        for finding in self.findings:
+            head = f'{finding.verdict.value:<8} {finding.name:<{names}}  '
+            text = finding.text + (f' -> {finding.remedy}' if finding.remedy else '')
+            lines += textwrap.wrap(text, width, initial_indent=head,
+                                   subsequent_indent=' ' * len(head), break_on_hyphens=False)
+        counts = [f'{self.count(verdict)} {verdict.value}' for verdict in Verdict]
+        lines.append(f'{self.bag}: {", ".join(counts)}')
+        return lines
+
+    def to_mapping(self) -> dict[str, Any]:
+        """The report as data for JSON."""
+        return {
+            'bag': self.bag,
+            'failed': self.failed,
+            'findings': [{'name': f.name, 'verdict': f.verdict.value, 'text': f.text,
+                          'remedy': f.remedy, 'figures': dict(f.figures)}
+                         for f in self.findings],
+        }

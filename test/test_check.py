@@ -1,0 +1,478 @@
+"""`rs_relpose check`: the verdicts on good bags, and on bags broken in one way each."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import cv2
+from message_builders import imu as imu_message
+import numpy as np
+import pytest
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import get_typestore, Stores
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_ros.bags.reader import open_bag, TopicOptions
+from rs_relpose_ros.bags.writer import BagWriter
+from rs_relpose_ros.camera import RollingShutterCamera
+from rs_relpose_ros.check import judge_turning
+from rs_relpose_ros.check.check import check_bag, choose_topics
+from rs_relpose_ros.check.findings import Finding, Report, Verdict
+from rs_relpose_ros.check.scan import scan
+from rs_relpose_ros.check.streams import Stamps, Thinned
+from rs_relpose_ros.check.turning import axis_map
+from rs_relpose_ros.cli.main import main
+from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.pipeline.parameters import Parameters
+from rs_relpose_ros.replay.parameter_file import read_parameters
+
+START = 1_700_000_000_000_000_000
+MS = 1_000_000
+CAMERA = RollingShutterCamera(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5,
+                              readout_time=0.02, distortion=(-0.1, 0.0, 0.0, 0.0, 0.0))
+GIVEN = {'readout_time': 0.02, 'quat_cam_imu_xyzw': (0.0, 0.0, 0.0, 1.0)}
+PIXELS = np.random.default_rng(0).integers(0, 256, (48, 64), dtype=np.uint8)
+
+
+def checked(path, parameters=None, **topics):
+    """Verdicts and findings by name."""
+    with open_bag(path) as bag:
+        report = check_bag(bag, choose_topics(bag, TopicOptions(**topics)),
+                           parameters or Parameters.from_mapping(GIVEN))
+    return {finding.name: finding for finding in report.findings}, report
+
+
+class Small:
+    """A bag of tiny images at 10 Hz and an IMU at 200 Hz; subclasses break one thing."""
+
+    seconds = 4.0
+    image_topic, info_topic, imu_topic = '/camera/image_raw', '/camera/camera_info', '/imu'
+    pixels = PIXELS
+    rng = np.random.default_rng(1)
+
+    def image_stamps(self):
+        return START + (100 * MS * np.arange(10 * self.seconds)).astype(np.int64)
+
+    def imu_stamps(self):
+        return START + (5 * MS * np.arange(-20, 200 * self.seconds + 20)).astype(np.int64)
+
+    def recorded(self, stamp_ns, index):
+        return stamp_ns
+
+    def rate(self, t):
+        return 0.3 * np.sin([2.0 * t, 3.0 * t, 4.0 * t]) + 0.002 * self.rng.normal(size=3)
+
+    def force(self, t):
+        return np.array([0.0, -9.81, 0.0]) + 0.5 * np.cos([2.0 * t, 3.0 * t, 5.0 * t])
+
+    def imu(self, bag, stamp_ns):
+        t = (stamp_ns - START) * 1e-9
+        return bag.imu(stamp_ns, 'imu', self.rate(t), self.force(t))
+
+    def info(self, bag, stamp_ns):
+        return bag.camera_info(stamp_ns, 'camera', CAMERA)
+
+    def image(self, bag, stamp_ns):
+        return 'sensor_msgs/msg/Image', bag.image(stamp_ns, 'camera', self.pixels)
+
+    def write(self, path):
+        with BagWriter(path) as bag:
+            for k, stamp in enumerate(list(map(int, self.imu_stamps()))):
+                self._write(bag, self.imu_topic, 'sensor_msgs/msg/Imu', self.imu(bag, stamp),
+                            self.recorded(stamp, k))
+            for stamp in map(int, self.image_stamps()):
+                self._write(bag, self.info_topic, 'sensor_msgs/msg/CameraInfo',
+                            self.info(bag, stamp), stamp)
+                self._write(bag, self.image_topic, *self.image(bag, stamp), stamp)
+        return path
+
+    def _write(self, bag, topic, msgtype, message, recorded_ns):
+        if topic:
+            bag.write(topic, msgtype, message, recorded_ns + 2 * MS)
+
+
+def broken(**changes):
+    return type('Broken', (Small,), changes)()
+
+
+def test_a_good_bag_has_no_warning(tmp_path):
+    findings, report = checked(Small().write(tmp_path / 'bag'), Parameters.from_mapping(
+        {**GIVEN, 'readout_time': 0.02}))
+    wrong = [f for f in report.findings if f.verdict is not Verdict.OK]
+    # Random pixels that do not move are not what the gyro turns.
+    assert [f.name for f in wrong] in ([], ['axes and clock'])
+    assert findings['image rate'].figures['rate_hz'] == pytest.approx(10.0)
+    assert findings['imu rate'].figures['rate_hz'] == pytest.approx(200.0)
+    assert findings['gravity'].figures['mean_length_m_s2'] == pytest.approx(9.81, abs=0.2)
+    # 0.02 s, 60 px and the median rate.
+    assert findings['rolling shutter'].figures['median_px'] == pytest.approx(
+        0.02 * 60.0 * findings['gyro'].figures['median_rad_s'], rel=0.1)
+    assert 'global-shutter method would do' in findings['rolling shutter'].text
+
+
+def gapped(self):
+    stamps = Small.imu_stamps(self)
+    return stamps[(stamps < START + 1000 * MS) | (stamps > START + 1200 * MS)]
+
+
+def without_images(self):
+    stamps = Small.image_stamps(self)
+    return np.delete(stamps, [5, 6, 7, 15, 16, 22])
+
+
+def swapped(self):
+    stamps = Small.imu_stamps(self)
+    stamps[300], stamps[301] = stamps[301], stamps[300]
+    return stamps
+
+
+def jumping(self):
+    stamps = Small.imu_stamps(self)
+    stamps[400:] -= 1500 * MS
+    return stamps
+
+
+def steadily(self, stamp, index):
+    return START + 5 * MS * (index - 20)
+
+
+def jittery(self):
+    stamps = Small.image_stamps(self)
+    return stamps + np.random.default_rng(2).integers(0, 60 * MS, len(stamps))
+
+
+def at_rest(self, t):
+    return np.array([0.02, -0.03, 0.01]) + 0.002 * self.rng.normal(size=3)
+
+
+def h264(self, bag, stamp_ns):
+    return 'sensor_msgs/msg/CompressedImage', bag.compressed_image(
+        stamp_ns, 'camera', b'\x00\x00\x00\x01\x67' * 20, 'h264')
+
+
+def strange(self, bag, stamp_ns):
+    message = bag.image(stamp_ns, 'camera', PIXELS)
+    message.encoding = '32FC1'
+    return 'sensor_msgs/msg/Image', message
+
+
+def jpeg(self, bag, stamp_ns):
+    data = cv2.imencode('.jpg', PIXELS)[1].tobytes()
+    return 'sensor_msgs/msg/CompressedImage', bag.compressed_image(stamp_ns, 'camera', data)
+
+
+def uncalibrated(self, bag, stamp_ns):
+    message = bag.camera_info(stamp_ns, 'camera', CAMERA)
+    message.k[:] = 0.0
+    return message
+
+
+def of_another_size(self, bag, stamp_ns):
+    return bag.camera_info(stamp_ns, 'camera', RollingShutterCamera(
+        width=128, height=96, fx=120.0, fy=120.0, cx=63.5, cy=47.5, readout_time=0.02))
+
+
+def without_gyro(self, bag, stamp_ns):
+    return bag.imu(stamp_ns, 'imu', None, (0.0, -9.81, 0.0))
+
+
+def without_force(self, bag, stamp_ns):
+    return bag.imu(stamp_ns, 'imu', self.rate((stamp_ns - START) * 1e-9), None)
+
+
+W, F = Verdict.WARNING, Verdict.FAILURE
+BROKEN = {
+    'no image topic': ({'image_topic': ''}, 'topics', F, 'record images'),
+    'no imu topic': ({'imu_topic': ''}, 'topics', F, 'record images'),
+    'no camera info topic': ({'info_topic': ''}, 'topics', F, 'CameraInfo'),
+    'rectified': ({'image_topic': '/camera/image_rect'}, 'images', F, 'raw'),
+    'unknown encoding': ({'image': strange}, 'images', F, 'known encoding'),
+    'video': ({'image': h264, 'image_topic': '/camera/image_raw/h264'}, 'images', F, 'JPEG'),
+    'compressed': ({'image': jpeg, 'image_topic': '/camera/image_raw/compressed'}, 'transport', W,
+                   'image_transport: compressed'),
+    'uncalibrated': ({'info': uncalibrated}, 'calibration', F, 'calibrate'),
+    'calibration of another size': ({'info': of_another_size}, 'calibration', F, 'resolution'),
+    'lost images': ({'image_stamps': without_images}, 'image rate', W, 'fastdds.xml'),
+    'one image': ({'image_stamps': lambda self: [START]}, 'image rate', F, 'record'),
+    'slow images': ({'image_stamps': lambda self: Small.image_stamps(self)[::4]}, 'image rate',
+                    W, '8 Hz'),
+    'stamps of arrival': ({'image_stamps': jittery}, 'image stamps', W, 'hardware'),
+    'equal stamps': ({'image_stamps': lambda self: np.repeat(START, 40)}, 'image stamps', F,
+                     'driver'),
+    'gaps': ({'imu_stamps': gapped}, 'imu rate', W, 'queue'),
+    'slow imu': ({'imu_stamps': lambda self: Small.imu_stamps(self)[::4]}, 'imu rate', W, '200'),
+    'very slow imu': ({'imu_stamps': lambda self: Small.imu_stamps(self)[::20]}, 'imu rate', F,
+                      '100 Hz'),
+    'order': ({'imu_stamps': swapped, 'recorded': steadily}, 'imu stamps', W, 'publishers'),
+    'repeated': ({'imu_stamps': lambda self: np.repeat(Small.imu_stamps(self), 2)}, 'imu stamps',
+                 F, 'own instant'),
+    'clock set back': ({'imu_stamps': jumping, 'recorded': steadily}, 'imu stamps', W, 'set back'),
+    'other clock': ({'imu_stamps': lambda self: Small.imu_stamps(self) - START + 7 * MS,
+                     'recorded': lambda self, stamp, k: stamp + START},
+                    'clocks', F, 'one clock'),
+    'imu ends early': ({'imu_stamps': lambda self: Small.imu_stamps(self)[:400]}, 'clocks', W,
+                       'stop it last'),
+    'no gyro': ({'imu': without_gyro}, 'gyro', F, '--imu-topic'),
+    'hanging gyro': ({'rate': lambda self, t: [0.1, 0.0, 0.0]}, 'gyro', F, 'hangs'),
+    'degrees per second': ({'rate': lambda self, t: 57.3 * Small.rate(self, t)}, 'gyro', F,
+                           'rad/s'),
+    'bias': ({'rate': at_rest, 'force': lambda self, t: [0.0, -9.81, 0.0]}, 'gyro bias', W,
+             'gyro_bias: [0.0'),
+    'no accelerometer': ({'imu': without_force}, 'gravity', W, '--accel-topic'),
+    'in g': ({'force': lambda self, t: [0.0, -1.0, 0.01]}, 'gravity', F, 'm/s^2'),
+    'gravity taken out': ({'force': lambda self, t: [0.3, 0.2, 0.01]}, 'gravity', F, 'REP-145'),
+    'accelerometer off': ({'force': lambda self, t: [0.0, -11.5, 0.0]}, 'gravity', W,
+                          'calibrate'),
+    'big images': ({'pixels': np.zeros((800, 800), np.uint8), 'seconds': 0.5}, 'live transport', W,
+                   'fastdds.xml'),
+    'no texture': ({'pixels': np.full((48, 64), 90, np.uint8)}, 'texture', F, 'textured'),
+}
+
+
+@pytest.mark.parametrize('case', BROKEN)
+def test_what_is_broken_is_said_with_its_remedy(case, tmp_path):
+    changes, name, verdict, remedy = BROKEN[case]
+    findings, report = checked(broken(**changes).write(tmp_path / 'bag'))
+    found = findings[name]
+    assert found.verdict is verdict, found
+    assert remedy in found.remedy + found.text, found
+    assert found.remedy, found
+    assert report.failed == any(f.verdict is Verdict.FAILURE for f in report.findings)
+    json.dumps(report.to_mapping(), allow_nan=False)
+    assert len(report.lines(80)) > len(findings)
+    assert max(map(len, report.lines(100))) <= 100
+
+
+def test_parameters_that_are_missing_are_a_warning(tmp_path):
+    findings, _ = checked(Small().write(tmp_path / 'bag'), Parameters())
+    assert findings['parameters'].verdict is Verdict.WARNING
+    assert 'readout_time and quat_cam_imu_xyzw' in findings['parameters'].text
+    assert 'assumed' in findings['rolling shutter'].text
+
+
+# -- images against the gyro -----------------------------------------------------------------
+
+
+def rewritten(bundled_bag, path, change, seconds=3.0):
+    """The first seconds of the bundled bag, its IMU messages changed."""
+    with open_bag(bundled_bag) as bag, BagWriter(path) as out:
+        topics = bag.find_topics()
+        first = None
+        for message in bag.messages([topics.image, topics.camera_info, topics.imu]):
+            first = first or message.bag_time_ns
+            if message.bag_time_ns > first + seconds * 1e9:
+                break
+            msg = message.message
+            kinds = {t.name: t.msgtype for t in (topics.image, topics.camera_info, topics.imu)}
+            if message.topic == topics.imu.name:
+                w = change(np.array([msg.angular_velocity.x, msg.angular_velocity.y,
+                                     msg.angular_velocity.z]))
+                stamp = msg.header.stamp
+                msg = imu_message(out.type, stamp.sec * 10**9 + stamp.nanosec,
+                                  tuple(map(float, w)),
+                                  (msg.linear_acceleration.x, msg.linear_acceleration.y,
+                                   msg.linear_acceleration.z))
+            out.write(message.topic, kinds[message.topic], msg, message.bag_time_ns)
+    return path
+
+
+@pytest.fixture(scope='module')
+def parameters(bundled_bag):
+    return read_parameters(bundled_bag.with_name('hand_held.yaml'))
+
+
+@pytest.fixture(scope='module')
+def good(bundled_bag, tmp_path_factory):
+    return rewritten(bundled_bag, tmp_path_factory.mktemp('good') / 'bag', lambda w: w)
+
+
+@pytest.fixture(scope='module')
+def seen(good):
+    """What one pass saw of it."""
+    with open_bag(good) as bag:
+        return scan(bag, choose_topics(bag, TopicOptions()), lambda: None)
+
+
+def judged(seen, parameters):
+    return {finding.name: finding for finding in judge_turning.findings(seen, parameters)}
+
+
+def test_the_bundled_bag_is_good(good, parameters):
+    findings, report = checked(good, parameters)
+    assert [f for f in report.findings if f.verdict is not Verdict.OK] == []
+    # Against its parameter file, which is the truth.
+    assert abs(findings['time offset'].figures['time_offset_s']) < 2e-3
+    assert findings['axes'].figures['apart_deg'] < 1.0
+    assert findings['axes'].figures['nearest'] == 'cam x = -imu y, cam y = -imu z, cam z = +imu x'
+    assert 'global-shutter method loses' in findings['rolling shutter'].text
+
+
+@pytest.mark.parametrize('name, assignment, verdict', [
+    ('time offset', 'time_offset=0.01', W), ('time offset', 'time_offset=-0.04', F),
+    ('axes', 'quat_cam_imu_xyzw=[0.0, 0.0, 0.0, 1.0]', F),
+])
+def test_parameters_that_contradict_the_recording(seen, bundled_bag, name, assignment, verdict):
+    findings = judged(seen, read_parameters(
+        bundled_bag.with_name('hand_held.yaml'), [assignment]))
+    assert findings[name].verdict is verdict, findings[name]
+
+
+def test_small_misalignment_of_the_axes(seen, parameters):
+    R = Rotation.from_rotvec([0.0, 0.15, 0.0]) * Rotation.from_quat(
+        parameters.sensor.quat_cam_imu_xyzw)
+    findings = judged(seen, parameters.updated({'quat_cam_imu_xyzw': tuple(R.as_quat())}))
+    assert findings['axes'].verdict is Verdict.WARNING
+    assert findings['axes'].figures['apart_deg'] == pytest.approx(8.6, abs=1.0)
+
+
+def test_gyro_of_a_wrong_scale_or_another_body(bundled_bag, tmp_path, parameters):
+    scaled = rewritten(bundled_bag, tmp_path / 'scaled', lambda w: 0.3 * w, 2.0)
+    assert checked(scaled, parameters)[0]['scale'].verdict is Verdict.FAILURE
+    rng = np.random.default_rng(0)
+    other = rewritten(bundled_bag, tmp_path / 'other', lambda w: 0.3 * rng.normal(size=3), 2.0)
+    findings, _ = checked(other, parameters)
+    assert findings['axes and clock'].verdict is Verdict.FAILURE
+
+
+def test_axes_in_words():
+    R = Rotation.from_euler('xyz', [88.0, 1.0, -2.0], degrees=True).as_matrix()
+    assert axis_map(R) == 'cam x = +imu x, cam y = -imu z, cam z = +imu y'
+
+
+# -- containers, options, output -------------------------------------------------------------
+
+
+def copied(source, writer, typestore, path_qos=()):
+    """Copy the messages of a bag into another container."""
+    store = get_typestore(typestore)
+    with open_bag(source) as bag:
+        connections = {}
+        for message in bag.messages(bag.topics):
+            topic = next(t for t in bag.topics if t.name == message.topic)
+            if topic.name not in connections:
+                extra = {'offered_qos_profiles': path_qos} if path_qos else {}
+                connections[topic.name] = writer.add_connection(
+                    topic.name, topic.msgtype, typestore=store, **extra)
+            serialize = store.serialize_ros1 if typestore is Stores.ROS1_NOETIC \
+                else store.serialize_cdr
+            msg = message.message
+            if typestore is Stores.ROS1_NOETIC:
+                msg = as_ros1(store, msg, topic.msgtype)
+            writer.write(connections[topic.name], message.bag_time_ns,
+                         serialize(msg, topic.msgtype))
+
+
+def as_ros1(store, msg, msgtype):
+    """With the header's sequence number and the capital names of ROS 1."""
+    kinds = store.types
+    header = kinds['std_msgs/msg/Header'](seq=0, stamp=msg.header.stamp,
+                                          frame_id=msg.header.frame_id)
+    values = {name: getattr(msg, name if hasattr(msg, name) else name.lower())
+              for name in kinds[msgtype].__dataclass_fields__
+              if name not in ('header', '__msgtype__')}
+    return kinds[msgtype](header=header, **values)
+
+
+BEST_EFFORT = Qos(QosHistory.KEEP_LAST, 5, QosReliability.BEST_EFFORT, QosDurability.VOLATILE,
+                  QosTime(0, 0), QosTime(0, 0), QosLiveliness.AUTOMATIC, QosTime(0, 0), False)
+
+
+@pytest.mark.parametrize('kind', ['sqlite3', 'mcap', 'ros1'])
+def test_every_container(kind, tmp_path):
+    source = broken(seconds=1.0).write(tmp_path / 'source')
+    if kind == 'ros1':
+        path = tmp_path / 'copy.bag'
+        with Writer1(path) as writer:
+            copied(source, writer, Stores.ROS1_NOETIC)
+    else:
+        path = tmp_path / 'copy'
+        plugin = StoragePlugin.SQLITE3 if kind == 'sqlite3' else StoragePlugin.MCAP
+        with Writer(path, version=9, storage_plugin=plugin) as writer:
+            copied(source, writer, Stores.ROS2_JAZZY, [BEST_EFFORT])
+    findings, _ = checked(path)
+    assert findings['image rate'].figures['count'] == 10
+    assert findings['imu rate'].figures['rate_hz'] == pytest.approx(200.0)
+    expected = None if kind == 'ros1' else 'best effort'
+    assert findings['live transport'].figures['reliability'] == expected
+    assert findings['imu rate'].figures['reliability'] == expected
+
+
+def test_command_line(tmp_path, capsys):
+    good = Small().write(tmp_path / 'good')
+    bad = broken(info=uncalibrated).write(tmp_path / 'bad')
+    options = ['--set', 'readout_time=0.02', '--set', 'quat_cam_imu_xyzw=[0, 0, 0, 1]']
+    code = main(['check', str(good), *options])
+    shown = capsys.readouterr()
+    assert shown.err == ''
+    assert code == (1 if re.search('^failure', shown.out, re.MULTILINE) else 0)
+    assert re.search(r'^ok +imu rate +200 Hz', shown.out, re.MULTILINE)
+    assert main(['check', str(bad), *options, '--json']) == 1
+    report = json.loads(capsys.readouterr().out)
+    assert report['failed'] is True
+    assert {f['name']: f['verdict'] for f in report['findings']}['calibration'] == 'failure'
+
+
+@pytest.mark.parametrize('arguments, message', [
+    (['nowhere'], 'there is no bag'), (['BAG', '--imu-topic', '/nothing'], '/nothing'),
+    (['BAG', '--set', 'readout=1'], 'readout_time'), (['BAG', '--params', 'no.yaml'], 'no.yaml'),
+    (['BAG', '--image-topic', '/imu'], 'must be'),
+])
+def test_bad_usage_is_one_line_and_exit_code_2(arguments, message, tmp_path, capsys):
+    bag = str(broken(seconds=0.3).write(tmp_path / 'bag'))
+    assert main(['check', *(bag if word == 'BAG' else word for word in arguments)]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count('\n') == 1
+
+
+def test_a_damaged_bag_is_exit_code_2(tmp_path, capsys):
+    path = broken(seconds=0.3).write(tmp_path / 'bag') / 'bag.mcap'
+    path.write_bytes(path.read_bytes()[:3000])
+    assert main(['check', str(path)]) == 2
+    assert capsys.readouterr().err.count('\n') == 1
+
+
+def test_several_topics_want_a_choice(tmp_path):
+    bag_path = Small().write(tmp_path / 'bag')
+    with open_bag(bag_path) as bag, BagWriter(tmp_path / 'two') as out:
+        for message in bag.messages(bag.topics):
+            kind = next(t.msgtype for t in bag.topics if t.name == message.topic)
+            out.write(message.topic, kind, message.message, message.bag_time_ns)
+            if kind.endswith('Imu'):
+                out.write('/other_imu', kind, message.message, message.bag_time_ns)
+    with pytest.raises(InputError, match='choose one with --imu-topic'):
+        checked(tmp_path / 'two')
+    assert checked(tmp_path / 'two', imu='/other_imu')[0]['topics'].figures['imu'] == '/other_imu'
+    with pytest.raises(MissingInputError):
+        checked(tmp_path / 'two', imu='/third_imu')
+
+
+def test_memory_does_not_grow_with_the_stream():
+    thinned, stamps = Thinned(), Stamps()
+    for k in range(200_000):
+        thinned.add(float(k))
+        stamps.add(k * 5 * MS + (100 * MS if k > 100_000 else 0), k * 5 * MS)
+    assert len(thinned.values) <= 2 * 8192
+    # Still evenly over all of it.
+    assert np.abs(np.median(thinned.values) - 100_000) < 200
+    assert np.diff(thinned.values[:, 0]).max() < 2 * np.diff(thinned.values[:, 0]).min()
+    summary = stamps.summary()
+    assert summary.interval == pytest.approx(0.005) and summary.count == 200_000
+    assert stamps.longer_than(0.05) == (1, pytest.approx(0.105))
+
+
+def test_lines_hold_verdict_text_and_remedy():
+    report = Report('b', (Finding('short', Verdict.OK, 'fine'),
+                          Finding('much longer', Verdict.FAILURE, 'x' * 10, 'do this')))
+    assert report.lines() == ['ok       short        fine',
+                              'failure  much longer  xxxxxxxxxx -> do this',
+                              'b: 1 ok, 0 warning, 1 failure']
