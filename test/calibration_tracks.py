@@ -1,0 +1,172 @@
+"""Simulated tracks and gyro of a rolling-shutter camera with a known calibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+import itertools
+import math
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_ros.calibration.gyro_path import GyroSeries
+from rs_relpose_ros.calibration.tracks import Tracks
+from rs_relpose_ros.simulation.hand_held import hand_held, Plan
+from rs_relpose_ros.simulation.trajectory import Trajectory
+
+START_NS = 1_700_000_000_000_000_000
+
+
+def axis_maps():
+    """Return the 24 rotations that map axes to axes."""
+    maps = []
+    for columns in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            matrix = np.zeros((3, 3))
+            matrix[range(3), columns] = signs
+            if np.linalg.det(matrix) > 0.0:
+                maps.append(matrix)
+    return maps
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a recording was made with; rotation as ``v_cam = R_cam_imu v_imu``."""
+
+    readout_time: float = 0.025          # negative: read upwards
+    time_offset: float = 0.02            # t_imu = stamp + time_offset + row / height * readout
+    R_cam_imu: np.ndarray = field(default_factory=lambda: np.eye(3))
+    gyro_bias: tuple[float, float, float] = (0.01, -0.02, 0.015)
+    focal: float = 640.0
+    width: int = 1280
+    height: int = 720
+    fps: float = 30.0
+    frames: int = 300
+    pixel_noise: float = 0.3
+    outliers: float = 0.1
+    gyro_rate: float = 200.0
+    gyro_noise: float = 2e-4
+    features: int = 200
+    speed: float = 1.0
+    rotation_rate: float = math.radians(30.0)
+    exposure_slope: float = 0.0          # of the offset, by the interval to the next frame
+    long_interval: float = 1.0           # intervals of the second half, relative to the first
+
+
+def drawn(rng: np.random.Generator, **given) -> Truth:
+    """Truth within the ranges that calibration must master."""
+    misalignment = Rotation.from_rotvec(np.radians(2.0) * rng.standard_normal(3) / math.sqrt(3.0))
+    values = {
+        'readout_time': rng.uniform(0.008, 0.040), 'time_offset': rng.uniform(-0.08, 0.08),
+        'R_cam_imu': misalignment.as_matrix() @ axis_maps()[rng.integers(24)],
+        'gyro_bias': tuple(rng.uniform(-0.05, 0.05, 3)), 'focal': rng.uniform(500.0, 1000.0),
+        'gyro_rate': rng.choice([100.0, 200.0, 400.0]),
+        'gyro_noise': 10.0 ** rng.uniform(-4.0, -3.4), 'speed': rng.uniform(0.3, 1.6),
+        'rotation_rate': np.radians(rng.uniform(20.0, 45.0)),
+    } | given
+    if values['readout_time'] > 0.9 / values.get('fps', 30.0):
+        values['fps'] = 0.9 / values['readout_time']
+    return Truth(**values)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    tracks: Tracks
+    gyro: GyroSeries
+    truth: Truth
+    trajectory: Trajectory
+
+
+def record(truth: Truth, rng: np.random.Generator, trajectory: Trajectory | None = None) -> Recorded:
+    """Tracks and gyro along a hand-held walk (or `trajectory`) among points of many depths."""
+    intervals = np.full(truth.frames, 1.0 / truth.fps)
+    intervals[truth.frames // 2:] *= truth.long_interval
+    # Instants of the first row on the IMU clock, which is the trajectory's.
+    instants = np.concatenate([[0.0], np.cumsum(intervals[:-1])])
+    offsets = truth.time_offset + truth.exposure_slope * (intervals - np.median(intervals))
+    end = instants[-1] + 0.2
+    if trajectory is None:
+        trajectory = hand_held(rng, -0.7, end + 0.5, Plan.parse(f'walk:{end + 1.0}'),
+                               speed=truth.speed, rotation_rate=truth.rotation_rate)
+    stamps = START_NS + np.rint((instants - offsets) * 1e9).astype(np.int64)
+    frames = _frames(truth, trajectory, instants, _world(rng), rng)
+    return Recorded(Tracks(stamps, *frames), _gyro(truth, trajectory, end, rng), truth, trajectory)
+
+
+def _gyro(truth, trajectory, end, rng):
+    count = int((end + 0.5) * truth.gyro_rate)
+    times = -0.5 + (np.arange(count) + rng.uniform()) / truth.gyro_rate
+    rates = trajectory.states(times).angular_velocity @ truth.R_cam_imu
+    noise = truth.gyro_noise * math.sqrt(truth.gyro_rate) * rng.standard_normal(rates.shape)
+    return GyroSeries(START_NS + np.rint(times * 1e9).astype(np.int64),
+                      rates + np.array(truth.gyro_bias) + noise)
+
+
+def _world(rng, count=6000):
+    """Points (N, 3) around the walk, 2.5 to 25 m away, on a floor, on walls and between them."""
+    azimuth, elevation = rng.uniform(-1.9, 1.9, count), rng.uniform(-1.0, 0.9, count)
+    distance = 2.5 * 10.0 ** rng.uniform(0.0, 1.0, count)
+    direction = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth),
+                          np.sin(elevation)], axis=1)
+    points = np.array([0.0, 0.0, 1.6]) + direction * distance[:, None]
+    points[:, 2] = np.maximum(points[:, 2], 0.0)
+    return points
+
+
+class _Path:
+    """Poses on a fine grid, linear in between."""
+
+    step = 1e-3
+
+    def __init__(self, trajectory, begin, end):
+        self.begin = begin
+        times = begin + self.step * np.arange(math.ceil((end - begin) / self.step) + 1)
+        self.positions, self.rotations = trajectory.poses(times)
+        self.turns = Rotation.from_matrix(
+            np.einsum('nji,njk->nik', self.rotations[:-1], self.rotations[1:])).as_rotvec()
+
+    def to_camera(self, points, times):
+        """Points (N, 3) in the camera at their instants (N,)."""
+        at = (times - self.begin) / self.step
+        k = np.clip(at.astype(int), 0, len(self.turns) - 1)
+        share = (at - k)[:, None]
+        position = self.positions[k] + share * (self.positions[k + 1] - self.positions[k])
+        turned = np.einsum('nji,nj->ni', self.rotations[k], points - position)
+        return turned - share * np.cross(self.turns[k], turned)  # of 1e-3 rad: exact to 1e-6
+
+
+def _frames(truth, trajectory, instants, world, rng):
+    size = np.array([truth.width, truth.height])
+    center = 0.5 * (size - 1.0)
+    path = _Path(trajectory, instants[0] - 0.1, instants[-1] + 0.15)
+    ids = np.full(len(world), -1, dtype=np.int64)       # track of a point that is followed
+    drift, start = np.zeros((len(world), 2)), np.zeros(len(world))
+    next_id, frame, track, pixels = 0, [], [], []
+    for index, instant in enumerate(instants):
+        rows = np.full(len(world), center[1])
+        for _ in range(4):
+            seen = path.to_camera(world, instant + rows / truth.height * truth.readout_time)
+            depth = np.maximum(seen[:, 2:], 0.1)
+            points = center + truth.focal * seen[:, :2] / depth
+            rows = np.clip(points[:, 1], 0.0, truth.height - 1.0)
+        visible = (seen[:, 2] > 0.3) & (points > 2.0).all(axis=1) & (points < size - 3.0).all(axis=1)
+        # A track is lost now and then, even in sight.
+        ids[~visible | (rng.uniform(size=len(world)) < 0.02)] = -1
+        free = truth.features - int((ids >= 0).sum())
+        candidates = np.flatnonzero(visible & (ids < 0))
+        new = rng.permutation(candidates)[:max(free, 0)]
+        ids[new] = next_id + np.arange(len(new))
+        next_id += len(new)
+        # Half of the outliers slide over the scene, the others jump from frame to frame.
+        slides = rng.uniform(size=len(new)) < 0.5 * truth.outliers
+        drift[new] = slides[:, None] * rng.normal(0.0, 80.0, (len(new), 2))
+        start[new] = instant
+        followed = np.flatnonzero(ids >= 0)
+        measured = (points[followed] + drift[followed] * (instant - start[followed])[:, None]
+                    + truth.pixel_noise * rng.standard_normal((len(followed), 2)))
+        jumps = rng.uniform(size=len(followed)) < 0.25 * truth.outliers
+        measured[jumps] += rng.uniform(-50.0, 50.0, (int(jumps.sum()), 2))
+        frame.append(np.full(len(followed), index))
+        track.append(ids[followed])
+        pixels.append(measured)
+    return np.concatenate(frame), np.concatenate(track), np.concatenate(pixels)
