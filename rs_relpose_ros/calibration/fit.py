@@ -17,6 +17,10 @@ Array = NDArray[np.float64]
 
 # Distance [sigma] at which the Geman-McClure loss levels off.
 ROBUST = 4.0
+# Frames over which errors of pairs are taken to be correlated.
+LAGS = 12
+# What the scatter may be learned to be; units as in `Scatter`.
+DEPTH, VELOCITY, ACCELERATION, TURN = (0.3, 1.0), (1e-3, 3.0), (1e-2, 5.0), (2e-5, 4e-3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,3 +131,116 @@ def evaluate(problem: Problem, state: State, derivatives: bool = True) -> Evalua
                ROBUST, out.losses, out.weights, out.across, out.sharpness, out.score, out.reduced,
                out.back, out.spread)
     return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """Where the fit ended.
+
+    `covariance` (GLOBAL, GLOBAL): zero rows and columns where a parameter was held.
+    `information` (GLOBAL, GLOBAL): the Hessian, before any prior.
+    """
+
+    state: State
+    evaluation: Evaluation
+    covariance: Array
+    information: Array
+    converged: bool
+
+
+def fit(problem: Problem, state: State, free: NDArray[np.bool_], *, rounds: int = 25,
+        bias_sigma: float = 0.1, tolerance: float = 0.03) -> Fit:
+    """Minimise the cost over the `free` (GLOBAL,) parameters, and learn the scatter on the way.
+
+    Parameters
+    ----------
+    bias_sigma : float
+        What a gyro's bias may be, 1 sigma [rad/s].
+    tolerance : float
+        Steps shorter than this [sigma of the parameters] end the fit.
+    """
+    prior = np.zeros(GLOBAL)
+    prior[BIAS:BIAS + 3] = bias_sigma**-2
+    evaluation = evaluate(problem, state)
+    converged = False
+    damping = 1e-3
+    near = False
+    for _ in range(rounds):
+        state, evaluation, damping, moved = _step(problem, state, evaluation, free, prior, damping)
+        scatter = learned(problem, state, evaluation)
+        if not near:
+            # Far from the solution the pairs' own unknowns would take over what is wrong with it.
+            scatter = replace(state.scatter, pixel=scatter.pixel)
+        change = np.abs(np.log(scatter.as_array() / state.scatter.as_array()))
+        settled = bool((change < 0.05).all())
+        if moved < tolerance and settled and near:
+            converged = True
+            break
+        near = near or (moved < 1.0 and settled)
+        state = replace(state, scatter=scatter, rho=evaluation.rho)
+        evaluation = evaluate(problem, state)
+    state = replace(state, rho=evaluation.rho)
+    return Fit(state, evaluation, _covariance(problem, evaluation, free, prior),
+               evaluation.reduced.sum(axis=0), converged)
+
+
+def _step(problem: Problem, state: State, evaluation: Evaluation, free: NDArray[np.bool_],
+          prior: Array, damping: float) -> tuple[State, Evaluation, float, float]:
+    """One accepted step, or none; last its length in sigma."""
+    cost = _total(state, evaluation, prior)
+    H = (evaluation.reduced.sum(axis=0) + np.diag(prior))[np.ix_(free, free)]
+    gradient = (evaluation.score.sum(axis=0) + prior * state.parameters)[free]
+    for _ in range(6):
+        step = np.zeros(GLOBAL)
+        step[free] = -np.linalg.solve(H + damping * np.diag(np.diag(H)) + 1e-12 * np.eye(len(H)),
+                                      gradient)
+        local = state.local - evaluation.back[:, :, GLOBAL] - evaluation.back[:, :, :GLOBAL] @ step
+        tried = replace(state.moved(step, local), rho=evaluation.rho)
+        result = evaluate(problem, tried)
+        if _total(tried, result, prior) <= cost:
+            moved = float(np.sqrt(step[free] @ H @ step[free]))
+            return tried, result, max(0.2 * damping, 1e-9), moved
+        damping = max(10.0 * damping, 1e-3)
+    return state, evaluation, damping, 0.0
+
+
+def _total(state: State, evaluation: Evaluation, prior: Array) -> float:
+    return evaluation.cost + 0.5 * float(prior @ state.parameters**2)
+
+
+def learned(problem: Problem, state: State, evaluation: Evaluation) -> Scatter:
+    """Scatter that the residuals and the pairs' own unknowns show (empirical Bayes)."""
+    old = state.scatter
+    gaps = problem.times2 - problem.times1
+    # Across the epipolar line: nine unknowns of the pair hide part of the noise.
+    counts = np.diff(problem.begin)
+    seen = np.sqrt(max(1.0 - LOCAL * len(counts) / counts.sum(), 0.3))
+    pixel = 1.4826 * float(np.median(np.abs(evaluation.across))) * old.pixel / seen
+    weights = evaluation.weights
+    depth = np.sqrt(float(weights @ ((evaluation.rho - 1.0) ** 2 + evaluation.sharpness))
+                    / max(float(weights.sum()), 1.0))
+    def spread(part: slice, power: float) -> float:
+        squares = (state.local[:, part] ** 2 + evaluation.spread[:, part]).mean(axis=1)
+        return float(np.sqrt(np.mean(squares / gaps**power)))
+    return Scatter(
+        pixel=max(pixel, 0.02), depth=float(np.clip(depth, *DEPTH)),
+        velocity=float(np.clip(spread(slice(0, 3), 2.0), *VELOCITY)),
+        acceleration=float(np.clip(spread(slice(3, 6), 2.0), *ACCELERATION)),
+        turn=float(np.clip(spread(slice(6, 9), 1.0), *TURN)))
+
+
+def _covariance(problem: Problem, evaluation: Evaluation, free: NDArray[np.bool_],
+                prior: Array) -> Array:
+    """Sandwich estimate: pairs that share frames, or nearly, have common errors."""
+    H = (evaluation.reduced.sum(axis=0) + np.diag(prior))[np.ix_(free, free)]
+    frames = int(problem.first.max()) + 1
+    scores = np.zeros((frames, int(free.sum())))
+    np.add.at(scores, problem.first, evaluation.score[:, free])
+    meat = scores.T @ scores
+    for lag in range(1, min(LAGS, frames - 1) + 1):
+        product = scores[lag:].T @ scores[:-lag]
+        meat += (1.0 - lag / (LAGS + 1.0)) * (product + product.T)
+    inverse = np.linalg.pinv(H, hermitian=True)
+    covariance = np.zeros((GLOBAL, GLOBAL))
+    covariance[np.ix_(free, free)] = inverse @ meat @ inverse
+    return covariance
