@@ -18,9 +18,9 @@ Array = NDArray[np.float64]
 # Distance [sigma] at which the Geman-McClure loss levels off.
 ROBUST = 4.0
 # Frames over which errors of pairs are taken to be correlated.
-LAGS = 12
+LAGS = 20
 # What the scatter may be learned to be; units as in `Scatter`.
-DEPTH, VELOCITY, ACCELERATION, TURN = (0.3, 1.0), (1e-3, 3.0), (1e-2, 5.0), (2e-5, 4e-3)
+DEPTH, VELOCITY, ACCELERATION, TURN = (1.5, 1.5), (0.02, 3.0), (3.0, 3.0), (2e-5, 1e-3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,9 +56,9 @@ class Scatter:
     """
 
     pixel: float = 5.0
-    depth: float = 0.5
+    depth: float = 1.5
     velocity: float = 0.5
-    acceleration: float = 1.0
+    acceleration: float = 3.0
     turn: float = 1e-3
 
     def as_array(self) -> Array:
@@ -149,7 +149,7 @@ class Fit:
 
 
 def fit(problem: Problem, state: State, free: NDArray[np.bool_], *, rounds: int = 25,
-        bias_sigma: float = 0.1, tolerance: float = 0.03) -> Fit:
+        bias_sigma: float = 0.1, tolerance: float = 0.1) -> Fit:
     """Minimise the cost over the `free` (GLOBAL,) parameters, and learn the scatter on the way.
 
     Parameters
