@@ -35,7 +35,7 @@ _MOST_PAIRS, _PAIRS_AT_START = 700, 120
 # Intervals between frames that differ by more than this share may have exposures that differ.
 _VARYING = 0.02
 _FOCAL_FACTORS = np.geomspace(0.5, 2.0, 9)
-_CURVE_POINTS = 15
+_CURVE_POINTS = 13
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,11 +123,14 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
     progress(0.4)
     problem = _problem(data, _spans(data, _SPANS), coarse.state.parameters[OFFSET],
                        coarse.state.R_imu_cam, _MATCHES_PER_PAIR, _MOST_PAIRS, config, rng)
-    begin = _restarted(problem, coarse.state)
+    begin = _restarted(problem, coarse.state,
+                       replace(Scatter(), pixel=2.0 * coarse.state.scatter.pixel))
     free[SLOPE] = _intervals_vary(data)
     final = fit(problem, begin, free)
     progress(0.8)
-    curve = _cost_curve(problem, final, free, float(np.median(np.diff(data.times))),
+    some = _problem(data, _spans(data, _SPANS), final.state.parameters[OFFSET],
+                    final.state.R_imu_cam, _MATCHES_PER_PAIR_AT_START, _PAIRS_AT_START, config, rng)
+    curve = _cost_curve(some, len(problem.points1), final, free, float(np.median(np.diff(data.times))),
                         lambda share: progress(0.8 + 0.2 * share))
     return _judged(data, problem, final, free, curve, config)
 
@@ -244,12 +247,11 @@ def _coarse_fit(data: _Input, starts: list[Start], free: NDArray[np.bool_],
     return best
 
 
-def _restarted(problem: Problem, state: State) -> State:
+def _restarted(problem: Problem, state: State, scatter: Scatter) -> State:
     """The globals of `state` for other pairs."""
     p = state.parameters
     begun = State.start(problem, state.R_imu_cam, p[OFFSET], p[READOUT], p[BIAS:BIAS + 3],
                         p[FOCAL])
-    scatter = replace(Scatter(), pixel=2.0 * state.scatter.pixel)
     return replace(begun, scatter=scatter)
 
 
@@ -295,40 +297,42 @@ def _covered(data: _Input, pairs: Pairs, offset: float,
 # -- outcome -----------------------------------------------------------------------------------
 
 
-def _cost_curve(problem: Problem, final: Fit, free: NDArray[np.bool_], interval: float,
-                progress: Progress) -> CostCurve:
+def _cost_curve(problem: Problem, matches: int, final: Fit, free: NDArray[np.bool_],
+                interval: float, progress: Progress) -> CostCurve:
     """Cost with the read-out time held, from one frame interval upwards to one downwards."""
     best = float(final.state.parameters[READOUT])
     held = free.copy()
     held[READOUT] = False
     values = np.unique(np.concatenate([np.linspace(-interval, interval, _CURVE_POINTS), [best]]))
     costs = np.empty(len(values))
-    prior = np.zeros(GLOBAL)
-    done = 0
     order = np.argsort(np.abs(values - best))
+    begin = _refitted(problem, _restarted(problem, final.state, final.state.scatter), held, 5)
     for side in (order[values[order] <= best], order[values[order] > best]):
-        state = final.state
+        state = begin
         for k in side:
             parameters = state.parameters.copy()
             parameters[READOUT] = values[k]
-            state = replace(state, parameters=parameters)
-            for _ in range(2):
-                evaluation = evaluate(problem, state)
-                H = evaluation.reduced.sum(axis=0)[np.ix_(held, held)]
-                step = prior.copy()
-                step[held] = -np.linalg.solve(H + 1e-6 * np.diag(np.diag(H)),
-                                              evaluation.score.sum(axis=0)[held])
-                local = (state.local - evaluation.back[:, :, GLOBAL]
-                         - evaluation.back[:, :, :GLOBAL] @ step)
-                state = replace(state.moved(step, local), rho=evaluation.rho)
+            state = _refitted(problem, replace(state, parameters=parameters), held, 2)
             costs[k] = evaluate(problem, state, derivatives=False).cost
-            done += 1
-            progress(done / len(values))
-    # Matches of a frame serve in many pairs; scale so that the curvature is that of sigma.
-    sigma2 = float(final.covariance[READOUT, READOUT])
-    naive = np.linalg.inv(final.information[np.ix_(free, free)])[0, 0]
-    thinned = min(1.0, float(naive) / max(sigma2, 1e-18))
-    return CostCurve(values, (costs - costs.min()) * thinned)
+            progress(float(np.isfinite(costs).mean()))
+    # Matches of a frame serve in many pairs: scaled so that its bend at the minimum tells sigma.
+    information = final.information[np.ix_(free, free)] * len(problem.points1) / matches
+    naive = float(np.linalg.inv(information)[0, 0])
+    return CostCurve(values, (costs - costs.min()) * naive / float(final.covariance[READOUT, READOUT]))
+
+
+def _refitted(problem: Problem, state: State, free: NDArray[np.bool_], rounds: int) -> State:
+    """A few plain Gauss-Newton steps."""
+    for _ in range(rounds):
+        evaluation = evaluate(problem, state)
+        H = evaluation.reduced.sum(axis=0)[np.ix_(free, free)]
+        step = np.zeros(GLOBAL)
+        step[free] = -np.linalg.solve(H + 1e-6 * np.diag(np.diag(H)),
+                                      evaluation.score.sum(axis=0)[free])
+        local = (state.local - evaluation.back[:, :, GLOBAL]
+                 - evaluation.back[:, :, :GLOBAL] @ step)
+        state = replace(state.moved(step, local), rho=evaluation.rho)
+    return state
 
 
 def _judged(data: _Input, problem: Problem, final: Fit, free: NDArray[np.bool_], curve: CostCurve,

@@ -16,7 +16,7 @@ from rs_relpose_ros.calibration.normal_equations import (
 Array = NDArray[np.float64]
 
 # Distance [sigma] at which the Geman-McClure loss levels off.
-ROBUST = 4.0
+ROBUST = 2.5
 # Frames over which errors of pairs are taken to be correlated.
 LAGS = 20
 # What the scatter may be learned to be; units as in `Scatter`.

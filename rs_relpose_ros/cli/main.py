@@ -18,6 +18,7 @@ PROGRAM = 'rs_relpose'
 # is asked for, so that the overview does not wait for OpenCV and Numba.
 COMMANDS: Mapping[str, str] = {
     'benchmark': 'measure accuracy and speed of the estimator: tables and plots',
+    'calibrate': 'read-out time, time offset, axes and gyro bias from a bag, without a target',
     'convert': 'turn a public recording into a rosbag2 bag and its parameter file',
     'evaluate': 'run the experiments of the paper: tables and box plots',
     'replay': 'estimate relative poses from a bag: CSV, summary and pictures',
