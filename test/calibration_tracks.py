@@ -77,7 +77,8 @@ class Recorded:
     trajectory: Trajectory
 
 
-def record(truth: Truth, rng: np.random.Generator, trajectory: Trajectory | None = None) -> Recorded:
+def record(truth: Truth, rng: np.random.Generator,
+           trajectory: Trajectory | None = None) -> Recorded:
     """Tracks and gyro along a hand-held walk (or `trajectory`) among points of many depths."""
     intervals = np.full(truth.frames, 1.0 / truth.fps)
     intervals[truth.frames // 2:] *= truth.long_interval
@@ -149,7 +150,8 @@ def _frames(truth, trajectory, instants, world, rng):
             depth = np.maximum(seen[:, 2:], 0.1)
             points = center + truth.focal * seen[:, :2] / depth
             rows = np.clip(points[:, 1], 0.0, truth.height - 1.0)
-        visible = (seen[:, 2] > 0.3) & (points > 2.0).all(axis=1) & (points < size - 3.0).all(axis=1)
+        inside = (points > 2.0).all(axis=1) & (points < size - 3.0).all(axis=1)
+        visible = (seen[:, 2] > 0.3) & inside
         # A track is lost now and then, even in sight.
         ids[~visible | (rng.uniform(size=len(world)) < 0.02)] = -1
         free = truth.features - int((ids >= 0).sum())

@@ -9,10 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.calibration.alignment import find_starts, nearest_axis_map, seen_rates, Start
-from rs_relpose_ros.calibration.fit import evaluate, fit, Fit, Problem, Scatter, State
+from rs_relpose_ros.calibration.fit import evaluate, Fit, fit, Problem, Scatter, State
 from rs_relpose_ros.calibration.gyro_path import GyroSeries
 from rs_relpose_ros.calibration.normal_equations import (
-    BIAS, FOCAL, GLOBAL, OFFSET, READOUT, ROTATION, SLOPE,
+    BIAS,
+    FOCAL,
+    GLOBAL,
+    OFFSET,
+    READOUT,
+    ROTATION,
+    SLOPE,
 )
 from rs_relpose_ros.calibration.result import AXES, CalibrationResult, CostCurve, Estimate
 from rs_relpose_ros.calibration.tracks import make_pairs, Pairs, Tracks
@@ -78,6 +84,11 @@ class _Input:
     gyro_rates: Array
     gyro_gaps: Array
 
+    @property
+    def interval(self) -> float:
+        """Median interval between frames [s]."""
+        return float(np.median(np.diff(self.times)))
+
 
 def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
               focal_known: bool = True, config: CalibrationConfig | None = None,
@@ -122,15 +133,15 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
     coarse = _coarse_fit(data, starts, free, config, rng)
     progress(0.4)
     problem = _problem(data, _spans(data, _SPANS), coarse.state.parameters[OFFSET],
-                       coarse.state.R_imu_cam, _MATCHES_PER_PAIR, _MOST_PAIRS, config, rng)
+                       _MATCHES_PER_PAIR, _MOST_PAIRS, config, rng)
     begin = _restarted(problem, coarse.state,
                        replace(Scatter(), pixel=2.0 * coarse.state.scatter.pixel))
     free[SLOPE] = _intervals_vary(data)
     final = fit(problem, begin, free)
     progress(0.8)
     some = _problem(data, _spans(data, _SPANS), final.state.parameters[OFFSET],
-                    final.state.R_imu_cam, _MATCHES_PER_PAIR_AT_START, _PAIRS_AT_START, config, rng)
-    curve = _cost_curve(some, len(problem.points1), final, free, float(np.median(np.diff(data.times))),
+                    _MATCHES_PER_PAIR_AT_START, _PAIRS_AT_START, config, rng)
+    curve = _cost_curve(some, len(problem.points1), final, free, data.interval,
                         lambda share: progress(0.8 + 0.2 * share))
     return _judged(data, problem, final, free, curve, config)
 
@@ -163,8 +174,8 @@ def _check_recording(data: _Input, config: CalibrationConfig) -> None:
     last = min(data.times[-1], data.gyro_times[-1] + config.max_time_offset)
     if last - first < 0.5 * data.times[-1]:
         raise InputError(
-            f'the gyro covers {max(last - first, 0.0):.1f} s of the {data.times[-1]:.1f} s of images: '
-            'record both together, and let the clocks differ by less than '
+            f'the gyro covers {max(last - first, 0.0):.1f} s of the {data.times[-1]:.1f} s of '
+            'images: record both together, and let the clocks differ by less than '
             f'{config.max_time_offset:g} s')
     if np.median(data.gyro_gaps) > config.max_gyro_gap:
         raise InputError(
@@ -186,15 +197,15 @@ def _check_recording(data: _Input, config: CalibrationConfig) -> None:
 
 
 def _intervals_vary(data: _Input) -> bool:
-    spread = np.abs(data.covariates) > _VARYING * np.median(np.diff(data.times))
+    spread = np.abs(data.covariates) > _VARYING * data.interval
     # A lost frame is no exposure: most of the intervals that differ must be shorter than two.
-    usual = data.covariates < 0.5 * np.median(np.diff(data.times))
+    usual = data.covariates < 0.5 * data.interval
     return bool((spread & usual).mean() > 0.1 and (~spread).mean() > 0.1)
 
 
 def _spans(data: _Input, spans: tuple[float, ...]) -> tuple[int, ...]:
     """Numbers of frames that make up these spans of time."""
-    interval = float(np.median(np.diff(data.times)))
+    interval = data.interval
     return tuple(sorted({max(1, round(span / interval)) for span in spans}))
 
 
@@ -203,7 +214,7 @@ def _spans(data: _Input, spans: tuple[float, ...]) -> tuple[int, ...]:
 
 def _starts(data: _Input, focal_known: bool, config: CalibrationConfig,
             rng: np.random.Generator) -> list[Start]:
-    interval = float(np.median(np.diff(data.times)))
+    interval = data.interval
     pairs = make_pairs(data.tracks, (1,), max_matches=80, min_matches=8,
                        max_interval=1.5 * interval, rng=rng)
     if len(pairs) < 0.5 * len(data.tracks):
@@ -212,7 +223,8 @@ def _starts(data: _Input, focal_known: bool, config: CalibrationConfig,
             'images only: the images are blurred, the scene has no texture, or it moves too fast. '
             'Record with a short exposure in good light, and turn more slowly')
     times1, times2 = data.times[pairs.first], data.times[pairs.second]
-    points1, points2 = _normalised(data.camera, pairs.points1), _normalised(data.camera, pairs.points2)
+    points1 = _normalised(data.camera, pairs.points1)
+    points2 = _normalised(data.camera, pairs.points2)
     rates = seen_rates(pairs, points1, points2, times2 - times1)
     found = find_starts(
         rates, times1, times2, data.gyro_times, data.gyro_rates,
@@ -234,7 +246,7 @@ def _coarse_fit(data: _Input, starts: list[Start], free: NDArray[np.bool_],
     best: Fit | None = None
     best_cost = np.inf
     for start in starts:
-        problem = _problem(data, _spans(data, _SPANS[:1]), start.offset, start.R_cam_imu.T,
+        problem = _problem(data, _spans(data, _SPANS[:1]), start.offset,
                            _MATCHES_PER_PAIR_AT_START, _PAIRS_AT_START, config, rng)
         state = State.start(problem, start.R_cam_imu.T, start.offset, 0.0, start.bias,
                             float(np.log(start.focal_factor)))
@@ -255,11 +267,10 @@ def _restarted(problem: Problem, state: State, scatter: Scatter) -> State:
     return replace(begun, scatter=scatter)
 
 
-def _problem(data: _Input, gaps: tuple[int, ...], offset: float, R_imu_cam: Array,
-             matches: int, most_pairs: int, config: CalibrationConfig,
-             rng: np.random.Generator) -> Problem:
+def _problem(data: _Input, gaps: tuple[int, ...], offset: float, matches: int, most_pairs: int,
+             config: CalibrationConfig, rng: np.random.Generator) -> Problem:
     """Pairs whose rows the gyro covers, as the fit takes them."""
-    interval = float(np.median(np.diff(data.times)))
+    interval = data.interval
     pairs = make_pairs(data.tracks, gaps, max_matches=matches, min_matches=_LEAST_MATCHES,
                        max_interval=1.5 * interval, rng=rng)
     pairs = pairs.chosen(_covered(data, pairs, offset, config))
@@ -286,7 +297,7 @@ def _problem(data: _Input, gaps: tuple[int, ...], offset: float, R_imu_cam: Arra
 def _covered(data: _Input, pairs: Pairs, offset: float,
              config: CalibrationConfig) -> NDArray[np.bool_]:
     """Pairs that lie within the gyro's samples and touch no gap of them."""
-    half = 0.5 * float(np.median(np.diff(data.times))) + 0.01
+    half = 0.5 * data.interval + 0.01
     begin, end = data.times[pairs.first] + offset - half, data.times[pairs.second] + offset + half
     good = (begin >= data.gyro_times[0]) & (end <= data.gyro_times[-1])
     for k in np.flatnonzero(data.gyro_gaps > config.max_gyro_gap):
@@ -318,7 +329,8 @@ def _cost_curve(problem: Problem, matches: int, final: Fit, free: NDArray[np.boo
     # Matches of a frame serve in many pairs: scaled so that its bend at the minimum tells sigma.
     information = final.information[np.ix_(free, free)] * len(problem.points1) / matches
     naive = float(np.linalg.inv(information)[0, 0])
-    return CostCurve(values, (costs - costs.min()) * naive / float(final.covariance[READOUT, READOUT]))
+    variance = float(final.covariance[READOUT, READOUT])
+    return CostCurve(values, (costs - costs.min()) * naive / variance)
 
 
 def _refitted(problem: Problem, state: State, free: NDArray[np.bool_], rounds: int) -> State:
@@ -340,16 +352,16 @@ def _judged(data: _Input, problem: Problem, final: Fit, free: NDArray[np.bool_],
     """Figures with their sigmas and verdicts."""
     covariance = final.covariance * np.outer(_SIGMA_FACTORS, _SIGMA_FACTORS)
     parameters, R_cam_imu = final.state.parameters, final.state.R_imu_cam.T
-    interval = float(np.median(np.diff(data.times)))
+    interval = data.interval
     rates, weak = _excitation(data, parameters[BIAS:BIAS + 3], R_cam_imu, config)
     readout = float(parameters[READOUT])
     readout_sigma = float(np.sqrt(covariance[READOUT, READOUT]))
     if abs(readout) - 3.0 * readout_sigma > interval:
         raise InputError(
-            f'the read-out time comes out as {1e3 * abs(readout):.1f} +- {1e3 * readout_sigma:.1f} '
-            f'ms, longer than the interval of {1e3 * interval:.1f} ms between frames, which no '
-            'camera can do: stamps or frames are not what they seem (frames dropped and stamped '
-            'anew, images cropped, scaled or rotated)')
+            f'the read-out time comes out as {1e3 * abs(readout):.1f} +- '
+            f'{1e3 * readout_sigma:.1f} ms, longer than the interval of {1e3 * interval:.1f} ms '
+            'between frames, which no camera can do: stamps or frames are not what they seem '
+            '(frames dropped and stamped anew, images cropped, scaled or rotated)')
     # Row 0 is read this share of the read-out before the middle row.
     to_first = np.zeros(GLOBAL)
     to_first[OFFSET], to_first[READOUT] = 1.0, -0.5 * (data.camera.height - 1) / data.camera.height

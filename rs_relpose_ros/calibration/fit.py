@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,7 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.calibration.gyro_path import GyroPath
 from rs_relpose_ros.calibration.normal_equations import (
-    accumulate, BIAS, FOCAL, GLOBAL, LOCAL, OFFSET, READOUT, ROTATION, SLOPE,
+    accumulate,
+    BIAS,
+    FOCAL,
+    GLOBAL,
+    LOCAL,
+    OFFSET,
+    READOUT,
+    ROTATION,
 )
 
 Array = NDArray[np.float64]
@@ -43,6 +51,7 @@ class Problem:
 
     @property
     def pairs(self) -> int:
+        """Number of pairs."""
         return len(self.times1)
 
 
@@ -50,8 +59,8 @@ class Problem:
 class Scatter:
     """1 sigma of what the fit does not solve for globally; learned from the data.
 
-    `pixel`: a match [px]; `depth`: inverse depth of a point relative to its pair; `velocity`: of the
-    camera [depths/s]; `acceleration` [depths/s^2]; `turn`: error of the gyro's rotation
+    `pixel`: a match [px]; `depth`: inverse depth of a point relative to its pair; `velocity`: of
+    the camera [depths/s]; `acceleration` [depths/s^2]; `turn`: error of the gyro's rotation
     [rad/sqrt(s)].
     """
 
@@ -62,15 +71,16 @@ class Scatter:
     turn: float = 1e-3
 
     def as_array(self) -> Array:
-        return np.array([self.pixel, self.depth, self.velocity, self.acceleration, self.turn])
+        """As `accumulate` takes it."""
+        return np.array(dataclasses.astuple(self))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
     """A calibration: values of the parameters, and the rotation from camera to IMU.
 
-    `parameters` (GLOBAL,): read-out, offset of the middle row, slope, three unused, bias, log of the
-    focal length's factor.
+    `parameters` (GLOBAL,): read-out, offset of the middle row, slope, three unused, bias, log of
+    the focal length's factor.
     """
 
     parameters: Array
@@ -82,6 +92,7 @@ class State:
     @classmethod
     def start(cls, problem: Problem, R_imu_cam: Array, offset: float, readout: float = 0.0,
               bias: Array | None = None, log_focal: float = 0.0) -> State:
+        """State in which all pairs stand still."""
         parameters = np.zeros(GLOBAL)
         parameters[READOUT], parameters[OFFSET], parameters[FOCAL] = readout, offset, log_focal
         if bias is not None:
@@ -90,6 +101,7 @@ class State:
                    np.ones(len(problem.points1)))
 
     def moved(self, step: Array, local: Array) -> State:
+        """State after a step of the parameters (GLOBAL,), with other unknowns of the pairs."""
         parameters = self.parameters + step
         parameters[ROTATION:ROTATION + 3] = 0.0
         turn = Rotation.from_rotvec(step[ROTATION:ROTATION + 3]).as_matrix()
@@ -112,6 +124,7 @@ class Evaluation:
 
     @property
     def cost(self) -> float:
+        """Sum over the pairs."""
         return float(self.losses.sum())
 
 
@@ -219,9 +232,11 @@ def learned(problem: Problem, state: State, evaluation: Evaluation) -> Scatter:
     weights = evaluation.weights
     depth = np.sqrt(float(weights @ ((evaluation.rho - 1.0) ** 2 + evaluation.sharpness))
                     / max(float(weights.sum()), 1.0))
+
     def spread(part: slice, power: float) -> float:
         squares = (state.local[:, part] ** 2 + evaluation.spread[:, part]).mean(axis=1)
         return float(np.sqrt(np.mean(squares / gaps**power)))
+
     return Scatter(
         pixel=max(pixel, 0.02), depth=float(np.clip(depth, *DEPTH)),
         velocity=float(np.clip(spread(slice(0, 3), 2.0), *VELOCITY)),

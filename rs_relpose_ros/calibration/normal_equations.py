@@ -9,10 +9,11 @@ rho B`` from frame 2, and
     B = (1 + (tau_2 - tau_1) / D) (T + (tau_1 + tau_2) / 2 V),             tau_i = s_i readout
 
 `rho` is the inverse depth of the point, relative to that of the whole pair. A pair has a
-translation T (over the pair's interval D, in units of the pair's depth), a change of velocity V, and
-an error of the gyro's rotation between its frames; the inverse depth of each match is free within
-its prior, so that a match says what lies across the epipolar line (coplanarity), and next to nothing
-of what lies along it unless there is next to no parallax. All of these are eliminated.
+translation T (over the pair's interval D, in units of the pair's depth), a change of velocity V,
+and an error of the gyro's rotation between its frames; the inverse depth of each match is free
+within its prior, so that a match says what lies across the epipolar line (coplanarity), and next
+to nothing of what lies along it unless there is next to no parallax. All of these are
+eliminated.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ from rs_relpose_ros.calibration.gyro_path import knot_before, rotation_at
 Array = NDArray[np.float64]
 
 # Order of the calibration's parameters: read-out [s], offset of the middle row [s], slope of the
-# offset, rotation vector on the left of R_imu_cam (3) [rad], bias (3) [rad/s], log of the focal length.
+# offset, rotation vector on the left of R_imu_cam (3) [rad], bias (3) [rad/s], log of the focal
+# length.
 READOUT, OFFSET, SLOPE, ROTATION, BIAS, FOCAL = 0, 1, 2, 3, 6, 9
 GLOBAL = 10
 # Of a pair: T (3), V (3), rotation error of frame 2 (3).
@@ -45,7 +47,7 @@ def _cross_into(a: Array, b: Array, out: Array) -> None:
 
 
 @numba.njit(cache=True, nogil=True, error_model='numpy')
-def accumulate(
+def accumulate(  # noqa: C901 - one pass, unrolled by hand, is what makes it fast
         knots: Array, rates: Array, path: Array, turned: Array, begin: NDArray[np.int64],
         times1: Array, times2: Array, covariates1: Array, covariates2: Array, points1: Array,
         points2: Array, rows1: Array, rows2: Array, scales: Array, parameters: Array,
@@ -71,8 +73,8 @@ def accumulate(
         Read-out, offset, slope, -, -, -, -, -, -, log of the focal length's factor.
     R_imu_cam : (3, 3)
     scatter : (5,)
-        1 sigma of the match [px], of the inverse depth, of T and V per second of the interval, and of
-        the rotation error per root of a second.
+        1 sigma of the match [px], of the inverse depth, of T and V per second of the interval,
+        and of the rotation error per root of a second.
     local, rho : (P, LOCAL), (N,)
         State of the pairs and of the matches; rho is improved in place.
     derivatives : bool
@@ -82,9 +84,9 @@ def accumulate(
 
     Fills per match: `weights`, `across` (normalised residual across the epipolar line) and
     `sharpness` (variance of rho); per pair: `losses`; and with `derivatives` per pair `score`
-    (P, GLOBAL), `reduced` (P, GLOBAL, GLOBAL), `back` (P, LOCAL, GLOBAL + 1), `spread` (P, LOCAL): the
-    gradient, the Hessian after elimination, what leads back to the pair's own unknowns, and their
-    variances.
+    (P, GLOBAL), `reduced` (P, GLOBAL, GLOBAL), `back` (P, LOCAL, GLOBAL + 1), `spread` (P, LOCAL):
+    the gradient, the Hessian after elimination, what leads back to the pair's own unknowns, and
+    their variances.
     """
     readout, offset, slope = parameters[READOUT], parameters[OFFSET], parameters[SLOPE]
     stretch = math.exp(parameters[FOCAL])
@@ -264,8 +266,9 @@ def accumulate(
 
 
 @numba.njit(cache=True, nogil=True, error_model='numpy')
-def _eliminate(H: Array, gradient: Array, L: Array, score: Array, reduced: Array, back: Array,
-               spread: Array) -> None:
+def _eliminate(  # noqa: C901 - a Cholesky factorisation and three substitutions by hand
+        H: Array, gradient: Array, L: Array, score: Array, reduced: Array, back: Array,
+        spread: Array) -> None:
     """Schur complement of the pair's own unknowns; H (_ALL, _ALL) has its lower half filled."""
     for i in range(LOCAL):
         for j in range(i + 1):

@@ -23,8 +23,9 @@ def report(result: CalibrationResult, camera: RollingShutterCamera) -> list[str]
     rates = ', '.join(f'{axis} {np.degrees(rate):.1f}'
                       for axis, rate in zip(AXES, result.rotation_rates, strict=True))
     lines = [
-        f'{result.frames} frames, {result.pairs} pairs, {result.matches} matches; '
-        f'{100 * result.inlier_ratio:.0f} % inliers, noise of a match {result.pixel_sigma:.2f} px',
+        (f'{result.frames} frames, {result.pairs} pairs, {result.matches} matches; '
+         f'{100 * result.inlier_ratio:.0f} % inliers, noise of a match '
+         f'{result.pixel_sigma:.2f} px'),
         f'rotation of the camera, rms [deg/s]: {rates}',
         f'shutter: {shutter_text(result)}',
         _line('read-out time', f'{_MS * abs(readout.value):.2f} +- {_MS * readout.sigma:.2f} ms'
@@ -39,7 +40,7 @@ def report(result: CalibrationResult, camera: RollingShutterCamera) -> list[str]
     sigmas = ', '.join(f'{np.degrees(sigma):.3f}' for sigma in result.rotation_sigma)
     lines += [
         _line('rotation IMU to camera', f'{axes_text(result.axis_map)}, and '
-              f'{np.degrees(result.rotation.value):.2f} deg off it; 1 sigma about the camera\'s '
+              f"{np.degrees(result.rotation.value):.2f} deg off it; 1 sigma about the camera's "
               f'x, y, z: {sigmas} deg', result.rotation),
         '  quaternion x y z w: ' + ', '.join(f'{v:.6f}' for v in result.quat_cam_imu_xyzw)]
     lines += [

@@ -46,8 +46,8 @@ class CostCurve:
 class CalibrationResult:
     """Calibration of a rolling-shutter camera against a gyro.
 
-    ``t_imu(row v) = stamp + time_offset + v / height * readout_time`` for a positive read-out time;
-    a negative one is read upwards, with `time_offset` still that of row 0.
+    ``t_imu(row v) = stamp + time_offset + v / height * readout_time``: a negative read-out time is
+    read upwards, with `time_offset` still that of row 0.
 
     Attributes
     ----------
