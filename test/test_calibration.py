@@ -83,7 +83,7 @@ def test_cost_curve_has_its_minimum_at_the_read_out_time():
 
 
 def test_parameter_file_is_the_nodes(tmp_path):
-    recorded, result = usual()
+    _, result = usual()
     path = tmp_path / 'calibration.yaml'
     path.write_text(parameter_file(result, 'A test.', compressed=True))
     sensor = read_parameters(path).sensor
@@ -157,7 +157,7 @@ def few_frames(recorded: Recorded, count: int) -> Tracks:
 
 def test_too_short_a_recording_is_refused():
     recorded, _ = usual()
-    with pytest.raises(InputError, match='too short: 10 frames.*Record 10 s or more'):
+    with pytest.raises(InputError, match=r'too short: 10 frames.*Record 10 s or more'):
         calibrate(few_frames(recorded, 10), recorded.gyro, camera_of(recorded.truth))
 
 
@@ -166,7 +166,7 @@ def test_camera_at_rest_is_refused():
     rng = np.random.default_rng(0)
     still = GyroSeries(recorded.gyro.stamps_ns, 1e-3 * rng.standard_normal(
         recorded.gyro.rates.shape) + 0.05)
-    with pytest.raises(InputError, match='hardly turns.*all three axes'):
+    with pytest.raises(InputError, match=r'hardly turns.*all three axes'):
         calibrate(recorded.tracks, still, camera_of(recorded.truth))
 
 
@@ -174,21 +174,21 @@ def test_scene_without_texture_is_refused():
     tracks = usual()[0].tracks
     kept = tracks.ids % 30 == 0
     bare = Tracks(tracks.stamps_ns, tracks.frames[kept], tracks.ids[kept], tracks.points[kept])
-    with pytest.raises(InputError, match='too little to follow.*texture'):
+    with pytest.raises(InputError, match=r'too little to follow.*texture'):
         calibrate(bare, usual()[0].gyro, camera_of(usual()[0].truth))
 
 
 def test_points_that_cannot_be_followed_are_refused():
     tracks = usual()[0].tracks
     torn = Tracks(tracks.stamps_ns, tracks.frames, np.arange(len(tracks.ids)), tracks.points)
-    with pytest.raises(InputError, match='blurred.*short exposure'):
+    with pytest.raises(InputError, match=r'blurred.*short exposure'):
         calibrate(torn, usual()[0].gyro, camera_of(usual()[0].truth))
 
 
 def test_gyro_of_another_time_is_refused():
     recorded, _ = usual()
     later = GyroSeries(recorded.gyro.stamps_ns + 3_600_000_000_000, recorded.gyro.rates)
-    with pytest.raises(InputError, match='the gyro covers 0.0 s'):
+    with pytest.raises(InputError, match=r'the gyro covers 0.0 s'):
         calibrate(recorded.tracks, later, camera_of(recorded.truth))
 
 
