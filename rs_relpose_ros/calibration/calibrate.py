@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.calibration.alignment import find_starts, nearest_axis_map, seen_rates, Start
-from rs_relpose_ros.calibration.fit import evaluate, Fit, fit, Problem, Scatter, State
+from rs_relpose_ros.calibration.fit import evaluate, Fit, fit, Problem, robust_weights, State
 from rs_relpose_ros.calibration.gyro_path import GyroSeries
-from rs_relpose_ros.calibration.normal_equations import (
+from rs_relpose_ros.calibration.coplanarity import (
     BIAS,
     FOCAL,
     GLOBAL,
@@ -32,7 +32,7 @@ Progress = Callable[[float], object]
 # The sandwich estimate knows what scatters between pairs, not what all of them have in common
 # (depths, how a camera moves between its rows): factor found on simulated recordings, by parameter
 # (read-out, offset, slope, rotation, bias, focal length).
-_SIGMA_FACTORS = np.array([1.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5])
+_SIGMA_FACTORS = np.ones(GLOBAL)
 # Frame pairs this far apart [s]: near ones have many matches, far ones parallax.
 _SPANS = (0.1, 0.27)
 _LEAST_MATCHES = 20
@@ -134,8 +134,7 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
     progress(0.4)
     problem = _problem(data, _spans(data, _SPANS), coarse.state.parameters[OFFSET],
                        _MATCHES_PER_PAIR, _MOST_PAIRS, config, rng)
-    begin = _restarted(problem, coarse.state,
-                       replace(Scatter(), pixel=2.0 * coarse.state.scatter.pixel))
+    begin = _restarted(problem, coarse.state, 2.0)
     free[SLOPE] = _intervals_vary(data)
     final = fit(problem, begin, free)
     progress(0.8)
@@ -248,23 +247,22 @@ def _coarse_fit(data: _Input, starts: list[Start], free: NDArray[np.bool_],
     for start in starts:
         problem = _problem(data, _spans(data, _SPANS[:1]), start.offset,
                            _MATCHES_PER_PAIR_AT_START, _PAIRS_AT_START, config, rng)
-        state = State.start(problem, start.R_cam_imu.T, start.offset, 0.0, start.bias,
-                            float(np.log(start.focal_factor)))
+        state = State.start(problem, start.R_cam_imu.T, start.offset,
+                            log_focal=float(np.log(start.focal_factor)))
         result = fit(problem, state, free, rounds=20, tolerance=0.3)
         # Pairs differ between the starts; sigma of the matches does not depend on their number.
-        cost = result.state.scatter.pixel
+        cost = float(np.median(result.state.noise))
         if cost < best_cost:
             best, best_cost = result, cost
     assert best is not None
     return best
 
 
-def _restarted(problem: Problem, state: State, scatter: Scatter) -> State:
-    """The globals of `state` for other pairs."""
+def _restarted(problem: Problem, state: State, caution: float = 1.0) -> State:
+    """The globals of `state` for other pairs, with a multiple of its noise."""
     p = state.parameters
-    begun = State.start(problem, state.R_imu_cam, p[OFFSET], p[READOUT], p[BIAS:BIAS + 3],
-                        p[FOCAL])
-    return replace(begun, scatter=scatter)
+    return State.start(problem, state.R_imu_cam, p[OFFSET], p[READOUT], p[BIAS:BIAS + 3],
+                       p[FOCAL], caution * float(np.median(state.noise)))
 
 
 def _problem(data: _Input, gaps: tuple[int, ...], offset: float, matches: int, most_pairs: int,
@@ -280,18 +278,24 @@ def _problem(data: _Input, gaps: tuple[int, ...], offset: float, matches: int, m
         raise InputError(
             f'only {len(pairs)} pairs of images have {_LEAST_MATCHES} points in common and a gyro '
             'without gaps: record a textured scene with a short exposure, and all of the gyro')
-    rays, jacobian = data.camera.unproject_with_jacobian(pairs.points2)
     camera = data.camera
     middle = 0.5 * (camera.height - 1)
-    points1 = _normalised(camera, pairs.points1)
-    points2 = np.asarray(rays[:, :2] / rays[:, 2:])
-    # n = m_xy / m_z, so dn = (dm_xy - n dm_z) / m_z; its inverse takes n to pixels.
-    by_pixel = (jacobian[:, :2] - points2[:, :, None] * jacobian[:, 2:]) / rays[:, 2:, None]
+    points1, by_pixel1 = _normalised_by_pixel(camera, pairs.points1)
+    points2, by_pixel2 = _normalised_by_pixel(camera, pairs.points2)
     return Problem(
         data.gyro_times, data.gyro_rates, pairs.begin, pairs.first, data.times[pairs.first],
         data.times[pairs.second], data.covariates[pairs.first], data.covariates[pairs.second],
         points1, points2, (pairs.points1[:, 1] - middle) / camera.height,
-        (pairs.points2[:, 1] - middle) / camera.height, np.linalg.inv(by_pixel))
+        (pairs.points2[:, 1] - middle) / camera.height, by_pixel1, by_pixel2)
+
+
+def _normalised_by_pixel(camera: RollingShutterCamera, points: Array) -> tuple[Array, Array]:
+    """Normalised points (N, 2), and their derivative by the pixels (N, 2, 2)."""
+    rays, jacobian = camera.unproject_with_jacobian(points)
+    normalised = np.asarray(rays[:, :2] / rays[:, 2:])
+    # n = m_xy / m_z, so dn = (dm_xy - n dm_z) / m_z.
+    by_pixel = (jacobian[:, :2] - normalised[:, :, None] * jacobian[:, 2:]) / rays[:, 2:, None]
+    return normalised, np.ascontiguousarray(by_pixel)
 
 
 def _covered(data: _Input, pairs: Pairs, offset: float,
@@ -317,7 +321,7 @@ def _cost_curve(problem: Problem, matches: int, final: Fit, free: NDArray[np.boo
     values = np.unique(np.concatenate([np.linspace(-interval, interval, _CURVE_POINTS), [best]]))
     costs = np.empty(len(values))
     order = np.argsort(np.abs(values - best))
-    begin = _refitted(problem, _restarted(problem, final.state, final.state.scatter), held, 5)
+    begin = _refitted(problem, _restarted(problem, final.state), held, 5)
     for side in (order[values[order] <= best], order[values[order] > best]):
         state = begin
         for k in side:
@@ -341,9 +345,8 @@ def _refitted(problem: Problem, state: State, free: NDArray[np.bool_], rounds: i
         step = np.zeros(GLOBAL)
         step[free] = -np.linalg.solve(H + 1e-6 * np.diag(np.diag(H)),
                                       evaluation.score.sum(axis=0)[free])
-        local = (state.local - evaluation.back[:, :, GLOBAL]
-                 - evaluation.back[:, :, :GLOBAL] @ step)
-        state = replace(state.moved(step, local), rho=evaluation.rho)
+        local = -evaluation.back[:, :, GLOBAL] - evaluation.back[:, :, :GLOBAL] @ step
+        state = state.moved(step, local)
     return state
 
 
@@ -371,6 +374,7 @@ def _judged(data: _Input, problem: Problem, final: Fit, free: NDArray[np.bool_],
     rotation_sigma = np.sqrt(np.diag(R_cam_imu @ rotation @ R_cam_imu.T))
     axis_map = nearest_axis_map(R_cam_imu)
     angle = float(np.arccos(np.clip((np.trace(R_cam_imu @ axis_map.T) - 1.0) / 2.0, -1.0, 1.0)))
+    weights = robust_weights(problem, final.state, final.evaluation)
     warnings = []
     if not final.converged:
         warnings.append('the fit had not settled when it was stopped')
@@ -401,8 +405,8 @@ def _judged(data: _Input, problem: Problem, final: Fit, free: NDArray[np.bool_],
         rotation=told(angle, float(rotation_sigma.max()), config.max_rotation_sigma),
         axis_map=axis_map, gyro_bias=(biases[0], biases[1], biases[2]), focal_factor=focal,
         offset_by_interval=slope, rotation_rates=rates, curve=curve,
-        pixel_sigma=float(final.state.scatter.pixel),
-        inlier_ratio=float((final.evaluation.weights > 0.25).mean()), frames=len(data.tracks),
+        pixel_sigma=float(np.median(final.state.noise)),
+        inlier_ratio=float((weights > 0.25).mean()), frames=len(data.tracks),
         pairs=problem.pairs, matches=len(problem.points1), frame_interval=interval,
         warnings=tuple(warnings))
 

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.calibration.gyro_path import GyroPath
-from rs_relpose_ros.calibration.normal_equations import (
+from rs_relpose_ros.calibration.coplanarity import (
     accumulate,
     BIAS,
+    find_directions,
     FOCAL,
     GLOBAL,
     LOCAL,
@@ -20,15 +19,22 @@ from rs_relpose_ros.calibration.normal_equations import (
     READOUT,
     ROTATION,
 )
+from rs_relpose_ros.calibration.gyro_path import GyroPath
 
 Array = NDArray[np.float64]
 
 # Distance [sigma] at which the Geman-McClure loss levels off.
-ROBUST = 2.5
-# Frames over which errors of pairs are taken to be correlated.
-LAGS = 20
-# What the scatter may be learned to be; units as in `Scatter`.
-DEPTH, VELOCITY, ACCELERATION, TURN = (1.5, 1.5), (0.02, 3.0), (3.0, 3.0), (2e-5, 1e-3)
+ROBUST = 3.0
+# Time over which errors of pairs are taken to be correlated [frames].
+LAGS = 15
+# Change of the camera's velocity while it takes a frame, relative to the velocity (1 sigma, each
+# component): 2 m/s^2 for 30 ms at 1 m/s, split between the frames.
+BEND = 0.03
+# Scatter of a match as it is before anything is known [px], and at the least.
+_NOISE_AT_START, _LEAST_NOISE = 5.0, 0.05
+_HYPOTHESES = 60
+# Noise of a pair is not let out of this range of the median over all pairs.
+_NOISE_RANGE = (0.6, 4.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,7 +53,8 @@ class Problem:
     points2: Array
     rows1: Array
     rows2: Array
-    scales: Array
+    by_pixel1: Array
+    by_pixel2: Array
 
     @property
     def pairs(self) -> int:
@@ -55,57 +62,55 @@ class Problem:
         return len(self.times1)
 
 
-@dataclass(frozen=True, slots=True)
-class Scatter:
-    """1 sigma of what the fit does not solve for globally; learned from the data.
-
-    `pixel`: a match [px]; `depth`: inverse depth of a point relative to its pair; `velocity`: of
-    the camera [depths/s]; `acceleration` [depths/s^2]; `turn`: error of the gyro's rotation
-    [rad/sqrt(s)].
-    """
-
-    pixel: float = 5.0
-    depth: float = 1.5
-    velocity: float = 0.5
-    acceleration: float = 3.0
-    turn: float = 1e-3
-
-    def as_array(self) -> Array:
-        """As `accumulate` takes it."""
-        return np.array(dataclasses.astuple(self))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """A calibration: values of the parameters, and the rotation from camera to IMU.
+    """A calibration, and what belongs to the pairs alone.
 
     `parameters` (GLOBAL,): read-out, offset of the middle row, slope, three unused, bias, log of
-    the focal length's factor.
+    the focal length's factor. `direction`, `bend` (P, 3) and `noise` (P,) [px]: see `accumulate`.
     """
 
     parameters: Array
     R_imu_cam: Array
-    local: Array
-    rho: Array
-    scatter: Scatter = field(default_factory=Scatter)
+    direction: Array
+    bend: Array
+    noise: Array
 
     @classmethod
     def start(cls, problem: Problem, R_imu_cam: Array, offset: float, readout: float = 0.0,
-              bias: Array | None = None, log_focal: float = 0.0) -> State:
-        """State in which all pairs stand still."""
+              bias: Array | None = None, log_focal: float = 0.0,
+              noise: float = _NOISE_AT_START) -> State:
+        """State with the directions that these parameters make likely."""
         parameters = np.zeros(GLOBAL)
         parameters[READOUT], parameters[OFFSET], parameters[FOCAL] = readout, offset, log_focal
         if bias is not None:
             parameters[BIAS:BIAS + 3] = bias
-        return cls(parameters, R_imu_cam, np.zeros((problem.pairs, LOCAL)),
-                   np.ones(len(problem.points1)))
+        direction = np.tile([1.0, 0.0, 0.0], (problem.pairs, 1))
+        state = cls(parameters, R_imu_cam, direction, np.zeros((problem.pairs, 3)),
+                    np.full(problem.pairs, noise))
+        return redirected(problem, state)
 
     def moved(self, step: Array, local: Array) -> State:
-        """State after a step of the parameters (GLOBAL,), with other unknowns of the pairs."""
+        """State after a step of the parameters (GLOBAL,) and of the pairs (P, LOCAL)."""
         parameters = self.parameters + step
         parameters[ROTATION:ROTATION + 3] = 0.0
         turn = Rotation.from_rotvec(step[ROTATION:ROTATION + 3]).as_matrix()
-        return replace(self, parameters=parameters, R_imu_cam=turn @ self.R_imu_cam, local=local)
+        first = _tangents(self.direction)
+        # No further than a right angle or so: the step may be along what nothing tells.
+        along = np.clip(local[:, :2], -1.0, 1.0)
+        direction = self.direction + np.einsum('pk,pki->pi', along, first)
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        return replace(self, parameters=parameters, R_imu_cam=turn @ self.R_imu_cam,
+                       direction=direction, bend=self.bend + local[:, 2:])
+
+
+def _tangents(directions: Array) -> Array:
+    """As `coplanarity.tangents`, (P, 2, 3)."""
+    smallest = np.argmin(np.abs(directions), axis=1)
+    first = np.eye(3)[smallest]
+    first = first - (first * directions).sum(axis=1, keepdims=True) * directions
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(directions, first)], axis=1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,14 +118,10 @@ class Evaluation:
     """What a pass over all matches gives; see `accumulate`."""
 
     losses: Array
-    weights: Array
-    across: Array
-    sharpness: Array
-    rho: Array
+    residuals: Array
     score: Array
     reduced: Array
     back: Array
-    spread: Array
 
     @property
     def cost(self) -> float:
@@ -128,22 +129,39 @@ class Evaluation:
         return float(self.losses.sum())
 
 
+def redirected(problem: Problem, state: State) -> State:
+    """State with each pair's direction the best of many that two of its matches fix."""
+    path = _path(problem, state)
+    direction = state.direction.copy()
+    chosen = np.random.default_rng(0).integers(0, 2**30, (_HYPOTHESES, 2))
+    find_directions(path.times, path.rates, path.rotations, problem.begin, problem.times1,
+                    problem.times2, problem.covariates1, problem.covariates2, problem.points1,
+                    problem.points2, problem.rows1, problem.rows2, problem.by_pixel1,
+                    problem.by_pixel2, state.parameters, state.R_imu_cam, state.noise, chosen,
+                    ROBUST, direction)
+    moved = (np.abs((direction * state.direction).sum(axis=1)) < 0.999)[:, None]
+    return replace(state, direction=direction, bend=np.where(moved, 0.0, state.bend))
+
+
 def evaluate(problem: Problem, state: State, derivatives: bool = True) -> Evaluation:
-    """Residuals at `state`; the inverse depths are improved on the way."""
-    path = GyroPath.integrated(problem.gyro_times, problem.gyro_rates,
-                               state.parameters[BIAS:BIAS + 3])
-    pairs, matches = problem.pairs, len(problem.points1)
+    """Residuals, and the normal equations, at `state`."""
+    path = _path(problem, state)
+    pairs = problem.pairs
     size = pairs if derivatives else 0
-    out = Evaluation(np.empty(pairs), np.empty(matches), np.empty(matches), np.empty(matches),
-                     state.rho.copy(), np.empty((size, GLOBAL)), np.empty((size, GLOBAL, GLOBAL)),
-                     np.empty((size, LOCAL, GLOBAL + 1)), np.empty((size, LOCAL)))
+    out = Evaluation(np.empty(pairs), np.empty(len(problem.points1)), np.empty((size, GLOBAL)),
+                     np.empty((size, GLOBAL, GLOBAL)), np.empty((size, LOCAL, GLOBAL + 1)))
     accumulate(path.times, path.rates, path.rotations, path.turned, problem.begin, problem.times1,
                problem.times2, problem.covariates1, problem.covariates2, problem.points1,
-               problem.points2, problem.rows1, problem.rows2, problem.scales, state.parameters,
-               state.R_imu_cam, state.scatter.as_array(), state.local, out.rho, derivatives,
-               ROBUST, out.losses, out.weights, out.across, out.sharpness, out.score, out.reduced,
-               out.back, out.spread)
+               problem.points2, problem.rows1, problem.rows2, problem.by_pixel1,
+               problem.by_pixel2, state.parameters, state.R_imu_cam, state.noise, BEND,
+               state.direction, state.bend, derivatives, ROBUST, out.losses, out.residuals,
+               out.score, out.reduced, out.back)
     return out
+
+
+def _path(problem: Problem, state: State) -> GyroPath:
+    return GyroPath.integrated(problem.gyro_times, problem.gyro_rates,
+                               state.parameters[BIAS:BIAS + 3])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,9 +179,9 @@ class Fit:
     converged: bool
 
 
-def fit(problem: Problem, state: State, free: NDArray[np.bool_], *, rounds: int = 25,
-        bias_sigma: float = 0.1, tolerance: float = 0.1) -> Fit:
-    """Minimise the cost over the `free` (GLOBAL,) parameters, and learn the scatter on the way.
+def fit(problem: Problem, state: State, free: NDArray[np.bool_], *, rounds: int = 30,
+        bias_sigma: float = 0.03, tolerance: float = 0.1) -> Fit:
+    """Minimise the cost over the `free` (GLOBAL,) parameters, and learn the noise on the way.
 
     Parameters
     ----------
@@ -177,23 +195,19 @@ def fit(problem: Problem, state: State, free: NDArray[np.bool_], *, rounds: int 
     evaluation = evaluate(problem, state)
     converged = False
     damping = 1e-3
-    near = False
-    for _ in range(rounds):
+    for k in range(rounds):
         state, evaluation, damping, moved = _step(problem, state, evaluation, free, prior, damping)
-        scatter = learned(problem, state, evaluation)
-        if not near:
-            # Far from the solution the pairs' own unknowns would take over what is wrong with it.
-            scatter = replace(state.scatter, pixel=scatter.pixel)
-        change = np.abs(np.log(scatter.as_array() / state.scatter.as_array()))
-        settled = bool((change < 0.05).all())
-        if moved < tolerance and settled and near:
+        noise = learned(problem, state, evaluation)
+        settled = bool(np.median(np.abs(np.log(noise / state.noise))) < 0.03)
+        if moved < tolerance and settled:
             converged = True
             break
-        near = near or (moved < 1.0 and settled)
-        state = replace(state, scatter=scatter, rho=evaluation.rho)
+        state = replace(state, noise=noise)
+        # The cost is not convex in the directions: look for better ones while the rest is far off.
+        if k < 4 or k % 4 == 0:
+            state = redirected(problem, state)
         evaluation = evaluate(problem, state)
-    state = replace(state, rho=evaluation.rho)
-    return Fit(state, evaluation, _covariance(problem, evaluation, free, prior),
+    return Fit(state, evaluation, _covariance(problem, state, evaluation, free, prior),
                evaluation.reduced.sum(axis=0), converged)
 
 
@@ -207,8 +221,8 @@ def _step(problem: Problem, state: State, evaluation: Evaluation, free: NDArray[
         step = np.zeros(GLOBAL)
         step[free] = -np.linalg.solve(H + damping * np.diag(np.diag(H)) + 1e-12 * np.eye(len(H)),
                                       gradient)
-        local = state.local - evaluation.back[:, :, GLOBAL] - evaluation.back[:, :, :GLOBAL] @ step
-        tried = replace(state.moved(step, local), rho=evaluation.rho)
+        local = -evaluation.back[:, :, GLOBAL] - evaluation.back[:, :, :GLOBAL] @ step
+        tried = state.moved(step, local)
         result = evaluate(problem, tried)
         if _total(tried, result, prior) <= cost:
             moved = float(np.sqrt(step[free] @ H @ step[free]))
@@ -221,33 +235,33 @@ def _total(state: State, evaluation: Evaluation, prior: Array) -> float:
     return evaluation.cost + 0.5 * float(prior @ state.parameters**2)
 
 
-def learned(problem: Problem, state: State, evaluation: Evaluation) -> Scatter:
-    """Scatter that the residuals and the pairs' own unknowns show (empirical Bayes)."""
-    old = state.scatter
-    gaps = problem.times2 - problem.times1
-    # Across the epipolar line: nine unknowns of the pair hide part of the noise.
+def learned(problem: Problem, state: State, evaluation: Evaluation) -> Array:
+    """Noise (P,) of each pair that the residuals show [px]; shrinks by a half at most."""
     counts = np.diff(problem.begin)
-    seen = np.sqrt(max(1.0 - LOCAL * len(counts) / counts.sum(), 0.3))
-    pixel = 1.4826 * float(np.median(np.abs(evaluation.across))) * old.pixel / seen
-    weights = evaluation.weights
-    depth = np.sqrt(float(weights @ ((evaluation.rho - 1.0) ** 2 + evaluation.sharpness))
-                    / max(float(weights.sum()), 1.0))
-
-    def spread(part: slice, power: float) -> float:
-        squares = (state.local[:, part] ** 2 + evaluation.spread[:, part]).mean(axis=1)
-        return float(np.sqrt(np.mean(squares / gaps**power)))
-
-    return Scatter(
-        pixel=max(pixel, 0.02), depth=float(np.clip(depth, *DEPTH)),
-        velocity=float(np.clip(spread(slice(0, 3), 2.0), *VELOCITY)),
-        acceleration=float(np.clip(spread(slice(3, 6), 2.0), *ACCELERATION)),
-        turn=float(np.clip(spread(slice(6, 9), 1.0), *TURN)))
+    sizes = np.abs(evaluation.residuals)
+    medians = np.array([np.median(sizes[begin:end]) for begin, end in zip(
+        problem.begin[:-1], problem.begin[1:], strict=True)])
+    # Two unknowns and a bit of each pair hide some of it.
+    noise = 1.4826 * medians * np.sqrt(counts / np.maximum(counts - 3.0, 1.0))
+    middle = max(float(np.median(noise)), _LEAST_NOISE)
+    return np.maximum(np.clip(noise, _NOISE_RANGE[0] * middle, _NOISE_RANGE[1] * middle),
+                      0.5 * state.noise)
 
 
-def _covariance(problem: Problem, evaluation: Evaluation, free: NDArray[np.bool_],
+def robust_weights(problem: Problem, state: State, evaluation: Evaluation) -> Array:
+    """Weights (N,) of the matches, 1 where the residual is 0."""
+    noise = np.repeat(state.noise, np.diff(problem.begin))
+    return np.asarray((1.0 + (evaluation.residuals / (ROBUST * noise)) ** 2) ** -2)
+
+
+def _covariance(problem: Problem, state: State, evaluation: Evaluation, free: NDArray[np.bool_],
                 prior: Array) -> Array:
     """Sandwich estimate: pairs that share frames, or nearly, have common errors."""
-    H = (evaluation.reduced.sum(axis=0) + np.diag(prior))[np.ix_(free, free)]
+    weights = robust_weights(problem, state, evaluation)
+    level = np.sqrt(weights)
+    # Curvature of the loss against the weight that Gauss-Newton takes for it.
+    bent = float((weights * (4.0 * level - 3.0)).sum() / weights.sum())
+    H = (bent * evaluation.reduced.sum(axis=0) + np.diag(prior))[np.ix_(free, free)]
     frames = int(problem.first.max()) + 1
     scores = np.zeros((frames, int(free.sum())))
     np.add.at(scores, problem.first, evaluation.score[:, free])
@@ -255,6 +269,8 @@ def _covariance(problem: Problem, evaluation: Evaluation, free: NDArray[np.bool_
     for lag in range(1, min(LAGS, frames - 1) + 1):
         product = scores[lag:].T @ scores[:-lag]
         meat += (1.0 - lag / (LAGS + 1.0)) * (product + product.T)
+    # What the prior knows counts as known.
+    meat += np.diag(prior)[np.ix_(free, free)]
     inverse = np.linalg.pinv(H, hermitian=True)
     covariance = np.zeros((GLOBAL, GLOBAL))
     covariance[np.ix_(free, free)] = inverse @ meat @ inverse
