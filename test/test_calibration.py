@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.calibration.alignment import nearest_axis_map
 from rs_relpose_ros.calibration.calibrate import calibrate
-from rs_relpose_ros.calibration.fit import evaluate, Problem, State
+from rs_relpose_ros.calibration.coplanarity import GLOBAL, LOCAL
+from rs_relpose_ros.calibration.fit import evaluate, Problem, redirected, State
 from rs_relpose_ros.calibration.gyro_path import GyroPath, GyroSeries
-from rs_relpose_ros.calibration.normal_equations import GLOBAL, SLOPE
 from rs_relpose_ros.calibration.report import parameter_file
 from rs_relpose_ros.calibration.result import CalibrationResult
 from rs_relpose_ros.calibration.tracks import make_pairs, Tracks
@@ -221,7 +221,9 @@ def test_gyro_path_is_the_rotation_of_an_even_turn():
     np.testing.assert_allclose(path.at(at), expected, atol=1e-9)
 
 
-def test_gradient_is_that_of_finite_differences():
+@lru_cache(maxsize=1)
+def few_pairs() -> tuple[Problem, State, Truth]:
+    """Pairs, and a state a little off the truth."""
     rng = np.random.default_rng(1)
     recorded = record(drawn(rng, frames=10, outliers=0.0), rng)
     truth, tracks = recorded.truth, recorded.tracks
@@ -229,34 +231,58 @@ def test_gradient_is_that_of_finite_differences():
     origin = int(tracks.stamps_ns[0])
     times, middle = tracks.seconds(origin), 0.5 * (truth.height - 1)
     center = 0.5 * np.array([truth.width - 1, truth.height - 1])
-    count = len(pairs.points1)
+    by_pixel = np.tile(np.eye(2) / truth.focal, (len(pairs.points1), 1, 1))
     problem = Problem(
         recorded.gyro.seconds(origin), recorded.gyro.rates, pairs.begin, pairs.first,
-        times[pairs.first], times[pairs.second], 0.01 * np.arange(len(pairs)),
+        pairs.second, times[pairs.first], times[pairs.second], 0.01 * np.arange(len(pairs)),
         0.02 * np.arange(len(pairs)), (pairs.points1 - center) / truth.focal,
         (pairs.points2 - center) / truth.focal, (pairs.points1[:, 1] - middle) / truth.height,
-        (pairs.points2[:, 1] - middle) / truth.height,
-        np.tile(truth.focal * np.eye(2), (count, 1, 1)))
+        (pairs.points2[:, 1] - middle) / truth.height, by_pixel, by_pixel)
     state = State.start(problem, truth.R_cam_imu.T, truth.time_offset
-                        + middle / truth.height * truth.readout_time, truth.readout_time,
-                        np.array(truth.gyro_bias), 0.01)
+                        + middle / truth.height * truth.readout_time + 1e-3,
+                        truth.readout_time + 2e-3, np.array(truth.gyro_bias), 0.01, noise=1.0)
+    return problem, state, truth
+
+
+def test_gradient_is_that_of_finite_differences():
+    problem, state, _ = few_pairs()
     # At the optimum of the pairs' own unknowns the total derivative is the partial one.
-    for _ in range(60):
-        evaluation = evaluate(problem, state)
-        state = dataclasses.replace(
-            state, rho=evaluation.rho, local=state.local - 0.5 * evaluation.back[:, :, GLOBAL])
+    still = np.zeros(GLOBAL)
+    for _ in range(40):
+        state = state.moved(still, -0.5 * evaluate(problem, state).back[:, :, GLOBAL])
     analytic = evaluate(problem, state).score.sum(axis=0)
 
     def cost(step: np.ndarray) -> float:
-        moved = state.moved(step, state.local)
-        for _ in range(4):
-            moved = dataclasses.replace(moved, rho=evaluate(problem, moved, False).rho)
+        moved = state.moved(step, np.zeros((problem.pairs, LOCAL)))
         return evaluate(problem, moved, derivatives=False).cost
 
     h = 1e-6
     numeric = np.array([(cost(h * unit) - cost(-h * unit)) / (2 * h) for unit in np.eye(GLOBAL)])
-    assert SLOPE < GLOBAL
-    np.testing.assert_allclose(analytic, numeric, rtol=2e-3, atol=1e-3 * np.abs(numeric).max())
+    np.testing.assert_allclose(analytic, numeric, rtol=2e-3, atol=1e-4 * np.abs(numeric).max())
+
+
+def test_residual_is_the_distance_in_pixels_to_the_nearest_pair_that_fits():
+    problem, state, truth = few_pairs()
+    residuals = evaluate(problem, state, derivatives=False).residuals
+    # Moved against its gradient by the residual, a match of two ends fits: first order in 0.3 px.
+    h, n = 1e-4, 17
+    gradient = np.zeros(4)
+    for k in range(4):
+        points = [problem.points1.copy(), problem.points2.copy()]
+        points[k // 2][n, k % 2] += h / truth.focal
+        moved = dataclasses.replace(problem, points1=points[0], points2=points[1])
+        change = evaluate(moved, state, derivatives=False).residuals[n] - residuals[n]
+        gradient[k] = change / h
+    assert np.linalg.norm(gradient) == pytest.approx(1.0, abs=0.01)
+
+
+def test_direction_is_that_of_the_walk():
+    problem, state, _ = few_pairs()
+    # From directions at right angles to the best ones, the search comes back to them.
+    lost = dataclasses.replace(state, direction=np.tile([0.0, 0.0, 1.0], (problem.pairs, 1)))
+    found = redirected(problem, lost).direction
+    assert np.abs((found * state.direction).sum(axis=1)).min() > 0.99
+    assert evaluate(problem, redirected(problem, lost)).cost < evaluate(problem, lost).cost
 
 
 def test_pairs_have_the_tracks_points_in_common():

@@ -9,8 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.calibration.alignment import find_starts, nearest_axis_map, seen_rates, Start
-from rs_relpose_ros.calibration.fit import evaluate, Fit, fit, Problem, robust_weights, State
-from rs_relpose_ros.calibration.gyro_path import GyroSeries
 from rs_relpose_ros.calibration.coplanarity import (
     BIAS,
     FOCAL,
@@ -20,6 +18,8 @@ from rs_relpose_ros.calibration.coplanarity import (
     ROTATION,
     SLOPE,
 )
+from rs_relpose_ros.calibration.fit import evaluate, Fit, fit, Problem, robust_weights, State
+from rs_relpose_ros.calibration.gyro_path import GyroSeries
 from rs_relpose_ros.calibration.result import AXES, CalibrationResult, CostCurve, Estimate
 from rs_relpose_ros.calibration.tracks import make_pairs, Pairs, Tracks
 from rs_relpose_ros.camera import RollingShutterCamera
@@ -33,8 +33,8 @@ Progress = Callable[[float], object]
 # (depths, how a camera moves between its rows): factor found on simulated recordings, by parameter
 # (read-out, offset, slope, rotation, bias, focal length).
 _SIGMA_FACTORS = np.ones(GLOBAL)
-# Frame pairs this far apart [s]: near ones have many matches, far ones parallax.
-_SPANS = (0.1, 0.27)
+# Frame pairs this far apart [s]: short, since the camera must move evenly meanwhile.
+_SPANS = (0.033, 0.067, 0.1, 0.133)
 _LEAST_MATCHES = 20
 _MATCHES_PER_PAIR, _MATCHES_PER_PAIR_AT_START = 100, 40
 _MOST_PAIRS, _PAIRS_AT_START = 700, 120
@@ -283,9 +283,10 @@ def _problem(data: _Input, gaps: tuple[int, ...], offset: float, matches: int, m
     points1, by_pixel1 = _normalised_by_pixel(camera, pairs.points1)
     points2, by_pixel2 = _normalised_by_pixel(camera, pairs.points2)
     return Problem(
-        data.gyro_times, data.gyro_rates, pairs.begin, pairs.first, data.times[pairs.first],
-        data.times[pairs.second], data.covariates[pairs.first], data.covariates[pairs.second],
-        points1, points2, (pairs.points1[:, 1] - middle) / camera.height,
+        data.gyro_times, data.gyro_rates, pairs.begin, pairs.first, pairs.second,
+        data.times[pairs.first], data.times[pairs.second], data.covariates[pairs.first],
+        data.covariates[pairs.second], points1, points2,
+        (pairs.points1[:, 1] - middle) / camera.height,
         (pairs.points2[:, 1] - middle) / camera.height, by_pixel1, by_pixel2)
 
 

@@ -237,7 +237,7 @@ def _spread(M: Array, by_pixel: Array, c: Array, stretch: float, out: Array) -> 
 
 
 @numba.njit(cache=True, nogil=True, error_model='numpy')
-def _eliminate(  # noqa: C901 - a Cholesky factorisation and three substitutions by hand
+def _eliminate(
         H: Array, gradient: Array, L: Array, score: Array, reduced: Array, back: Array) -> None:
     """Schur complement of the pair's own unknowns; H (_ALL, _ALL) has its lower half filled."""
     for i in range(LOCAL):
@@ -275,7 +275,7 @@ def _eliminate(  # noqa: C901 - a Cholesky factorisation and three substitutions
 
 
 @numba.njit(cache=True, nogil=True, error_model='numpy')
-def find_directions(
+def find_directions(  # noqa: C901 - one pass as above
         knots: Array, rates: Array, path: Array, begin: NDArray[np.int64], times1: Array,
         times2: Array, covariates1: Array, covariates2: Array, points1: Array, points2: Array,
         rows1: Array, rows2: Array, by_pixel1: Array, by_pixel2: Array, parameters: Array,
@@ -322,7 +322,7 @@ def find_directions(
             for frame in range(2):
                 other = m[1 - frame]
                 for r in range(2):
-                    # Derivative of e by pixel coordinate r of this frame is G b: M P_r . (other x b)
+                    # Derivative of e by pixel coordinate r of this frame: G b.
                     P = by_pixel1[n] if frame == 0 else by_pixel2[n]
                     for c in range(3):
                         b[c] = (M[frame, c, 0] * P[0, r] + M[frame, c, 1] * P[1, r]) / stretch

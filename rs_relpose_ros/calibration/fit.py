@@ -28,8 +28,8 @@ ROBUST = 3.0
 # Time over which errors of pairs are taken to be correlated [frames].
 LAGS = 15
 # Change of the camera's velocity while it takes a frame, relative to the velocity (1 sigma, each
-# component): 2 m/s^2 for 30 ms at 1 m/s, split between the frames.
-BEND = 0.03
+# component): 2 m/s^2 for 30 ms at 0.2 m/s. A wide one costs next to nothing.
+BEND = 0.3
 # Scatter of a match as it is before anything is known [px], and at the least.
 _NOISE_AT_START, _LEAST_NOISE = 5.0, 0.05
 _HYPOTHESES = 60
@@ -45,6 +45,7 @@ class Problem:
     gyro_rates: Array
     begin: NDArray[np.int64]
     first: NDArray[np.int64]
+    second: NDArray[np.int64]
     times1: Array
     times2: Array
     covariates1: Array
@@ -203,12 +204,26 @@ def fit(problem: Problem, state: State, free: NDArray[np.bool_], *, rounds: int 
             converged = True
             break
         state = replace(state, noise=noise)
-        # The cost is not convex in the directions: look for better ones while the rest is far off.
-        if k < 4 or k % 4 == 0:
-            state = redirected(problem, state)
+        # The cost is not convex in the directions: look for better ones while the rest moves.
+        if k < 4 or moved > 1.0:
+            state = _better_directions(problem, state)
         evaluation = evaluate(problem, state)
     return Fit(state, evaluation, _covariance(problem, state, evaluation, free, prior),
                evaluation.reduced.sum(axis=0), converged)
+
+
+def _better_directions(problem: Problem, state: State) -> State:
+    """Each pair with the better of its own direction and the one found anew."""
+    ways = []
+    for start in (state, redirected(problem, state)):
+        for _ in range(2):
+            back = evaluate(problem, start).back
+            start = start.moved(np.zeros(GLOBAL), -back[:, :, GLOBAL])
+        ways.append((start, evaluate(problem, start, derivatives=False).losses))
+    (kept, losses), (other, others) = ways
+    better = (others < losses)[:, None]
+    return replace(state, direction=np.where(better, other.direction, kept.direction),
+                   bend=np.where(better, other.bend, kept.bend))
 
 
 def _step(problem: Problem, state: State, evaluation: Evaluation, free: NDArray[np.bool_],
@@ -256,7 +271,10 @@ def robust_weights(problem: Problem, state: State, evaluation: Evaluation) -> Ar
 
 def _covariance(problem: Problem, state: State, evaluation: Evaluation, free: NDArray[np.bool_],
                 prior: Array) -> Array:
-    """Sandwich estimate: pairs that share frames, or nearly, have common errors."""
+    """Sandwich estimate: pairs that share frames, or nearly, have common errors.
+
+    So do pairs of the same span, where the camera's motion is not what the model says.
+    """
     weights = robust_weights(problem, state, evaluation)
     level = np.sqrt(weights)
     # Curvature of the loss against the weight that Gauss-Newton takes for it.
@@ -269,6 +287,10 @@ def _covariance(problem: Problem, state: State, evaluation: Evaluation, free: ND
     for lag in range(1, min(LAGS, frames - 1) + 1):
         product = scores[lag:].T @ scores[:-lag]
         meat += (1.0 - lag / (LAGS + 1.0)) * (product + product.T)
+    # Pairs of different spans agree if the model is right; what they disagree is its error.
+    for span in np.unique(problem.second - problem.first):
+        total = evaluation.score[problem.second - problem.first == span][:, free].sum(axis=0)
+        meat += np.outer(total, total)
     # What the prior knows counts as known.
     meat += np.diag(prior)[np.ix_(free, free)]
     inverse = np.linalg.pinv(H, hermitian=True)
