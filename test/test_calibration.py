@@ -106,6 +106,27 @@ def test_camera_read_upwards_with_unknown_focal_length():
     assert 'readout_direction: "up"' in parameter_file(result, 'A test.', compressed=False)
 
 
+def test_slow_camera_is_not_confidently_wrong():
+    rng = np.random.default_rng(17)
+    truth = drawn(rng, readout_time=0.02, speed=0.2, rotation_rate=math.radians(6.0),
+                  pixel_noise=0.4, gyro_bias=(0.004, -0.003, 0.002), **SHORT)
+    recorded = record(truth, rng)
+    result = calibrate(recorded.tracks, recorded.gyro, camera_of(truth))
+    readout = result.readout_time
+    assert abs(readout.value - truth.readout_time) < 4.0 * readout.sigma
+    # A fifth of the rotation tells a fifth as much.
+    assert readout.sigma > 3.0 * usual()[1].readout_time.sigma
+
+
+def test_noise_does_not_make_the_read_out_time_longer():
+    """Freedom that grows with the read-out time would."""
+    rng = np.random.default_rng(18)
+    truth = drawn(rng, readout_time=0.02, pixel_noise=1.0, outliers=0.25, **SHORT)
+    recorded = record(truth, rng)
+    result = calibrate(recorded.tracks, recorded.gyro, camera_of(truth))
+    assert result.readout_time.value == pytest.approx(0.02, abs=1.5e-3)
+
+
 def test_global_shutter_is_told():
     rng = np.random.default_rng(13)
     recorded = record(drawn(rng, readout_time=0.0, fps=30.0, **SHORT), rng)

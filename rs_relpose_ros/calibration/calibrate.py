@@ -68,6 +68,13 @@ class CalibrationConfig:
     max_focal_sigma: float = setting(
         0.03, 'sigma of an observable focal length, relative', low=1e-4, high=1.0)
 
+    tracking_time_sigma: float = setting(
+        0.0, 'error of read-out and offset by the tracker, beyond scatter', 's', low=0.0, high=0.1)
+    tracking_rotation_sigma: float = setting(
+        0.0, 'error of the rotation by the tracker, beyond scatter', 'rad', low=0.0, high=1.0)
+    tracking_bias_sigma: float = setting(
+        0.0, 'error of the gyro bias by the tracker, beyond scatter', 'rad/s', low=0.0, high=1.0)
+
     def __post_init__(self) -> None:
         check_settings(self)
 
@@ -196,10 +203,10 @@ def _check_recording(data: _Input, config: CalibrationConfig) -> None:
 
 
 def _intervals_vary(data: _Input) -> bool:
-    spread = np.abs(data.covariates) > _VARYING * data.interval
-    # A lost frame is no exposure: most of the intervals that differ must be shorter than two.
-    usual = data.covariates < 0.5 * data.interval
-    return bool((spread & usual).mean() > 0.1 and (~spread).mean() > 0.1)
+    # A lost frame is no exposure: intervals that differ by less than that count.
+    usual = data.covariates[data.covariates < 0.5 * data.interval]
+    low, high = np.quantile(usual, (0.1, 0.9))
+    return bool(high - low > _VARYING * data.interval)
 
 
 def _spans(data: _Input, spans: tuple[float, ...]) -> tuple[int, ...]:
@@ -354,7 +361,7 @@ def _refitted(problem: Problem, state: State, free: NDArray[np.bool_], rounds: i
 def _judged(data: _Input, problem: Problem, final: Fit, free: NDArray[np.bool_], curve: CostCurve,
             config: CalibrationConfig) -> CalibrationResult:
     """Figures with their sigmas and verdicts."""
-    covariance = final.covariance * np.outer(_SIGMA_FACTORS, _SIGMA_FACTORS)
+    covariance = _inflated(final.covariance, free, config)
     parameters, R_cam_imu = final.state.parameters, final.state.R_imu_cam.T
     interval = data.interval
     rates, weak = _excitation(data, parameters[BIAS:BIAS + 3], R_cam_imu, config)
@@ -410,6 +417,16 @@ def _judged(data: _Input, problem: Problem, final: Fit, free: NDArray[np.bool_],
         inlier_ratio=float((weights > 0.25).mean()), frames=len(data.tracks),
         pairs=problem.pairs, matches=len(problem.points1), frame_interval=interval,
         warnings=tuple(warnings))
+
+
+def _inflated(covariance: Array, free: NDArray[np.bool_], config: CalibrationConfig) -> Array:
+    """Covariance with what the sandwich estimate does not see."""
+    floors = np.zeros(GLOBAL)
+    floors[[READOUT, OFFSET]] = config.tracking_time_sigma
+    floors[ROTATION:ROTATION + 3] = config.tracking_rotation_sigma
+    floors[BIAS:BIAS + 3] = config.tracking_bias_sigma
+    floors[~free] = 0.0
+    return covariance * np.outer(_SIGMA_FACTORS, _SIGMA_FACTORS) + np.diag(floors**2)
 
 
 def _excitation(data: _Input, bias: Array, R_cam_imu: Array,

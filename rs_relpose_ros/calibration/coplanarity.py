@@ -147,11 +147,10 @@ def accumulate(  # noqa: C901 - one pass, unrolled by hand, is what makes it fas
             _cross_into(m2, b, c1)
             _cross_into(b, m1, c2)
             e = m1[0] * c1[0] + m1[1] * c1[1] + m1[2] * c1[2]
-            # s^2 = |P_1^T M_1^T c_1|^2 + |P_2^T M_2^T c_2|^2 with P the derivative by the pixel, and
+            # s^2 = |P_1^T M_1^T c_1|^2 + |P_2^T M_2^T c_2|^2 with P the derivative by the pixel;
             # half its derivative is k_1 . d(c_1) + k_2 . d(c_2) with k = M P P^T M^T c.
-            s2 = _spread(M1, by_pixel1[n], c1, stretch, k1) + _spread(M2, by_pixel2[n], c2, stretch,
-                                                                      k2)
-            s2 = max(s2, 1e-16)
+            s2 = _spread(M1, by_pixel1[n], c1, stretch, k1)
+            s2 = max(s2 + _spread(M2, by_pixel2[n], c2, stretch, k2), 1e-16)
             s = math.sqrt(s2)
             residual = e / s
             residuals[n] = residual

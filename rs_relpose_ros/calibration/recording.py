@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.bags.reader import Bag, COMPRESSED_IMAGE, SensorTopics
+from rs_relpose_ros.calibration.calibrate import CalibrationConfig
 from rs_relpose_ros.calibration.gyro_path import GyroSeries
 from rs_relpose_ros.calibration.tracks import Tracks
 from rs_relpose_ros.camera import RollingShutterCamera
@@ -32,6 +33,11 @@ Array = NDArray[np.float64]
 _FOCAL_GUESS = 0.8
 # New corners are looked for when so many of the last ones are lost, or so many frames went by.
 _KEPT, _RENEWED_AFTER = 0.8, 10
+
+# What KLT adds to the errors of a calibration, found on rendered bags: its errors are not
+# independent from frame to frame.
+TRACKED_IN_IMAGES = CalibrationConfig(
+    tracking_time_sigma=5e-5, tracking_rotation_sigma=1e-3, tracking_bias_sigma=2.5e-4)
 
 _logger = logging.getLogger(__name__)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 import json
 import logging
 from pathlib import Path
@@ -12,7 +13,7 @@ from tqdm import tqdm
 
 from rs_relpose_ros.bags.reader import COMPRESSED_IMAGE, open_bag, TopicOptions
 from rs_relpose_ros.calibration.calibrate import calibrate, CalibrationConfig
-from rs_relpose_ros.calibration.recording import read_recording
+from rs_relpose_ros.calibration.recording import read_recording, TRACKED_IN_IMAGES
 from rs_relpose_ros.calibration.report import as_mapping, draw_curve, parameter_file, report
 from rs_relpose_ros.tracking.config import TrackingConfig
 
@@ -55,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     options = TopicOptions(image=args.image_topic, camera_info=args.camera_info_topic,
                            imu=args.imu_topic)
     tracking = TrackingConfig(feature_rows=tuple(args.rows))
-    config = CalibrationConfig(max_time_offset=args.max_offset)
+    config = replace(TRACKED_IN_IMAGES, max_time_offset=args.max_offset)
     name = args.bag.resolve().stem if args.bag.is_file() else args.bag.resolve().name
     folder: Path = args.out if args.out is not None else Path(f'{name}_calibration')
     quiet = not sys.stderr.isatty()
