@@ -408,7 +408,7 @@ def _judged(data: _Input, problem: Problem, final: Fit, free: NDArray[np.bool_],
         slope = told(parameters[SLOPE], sigma, 0.5, '')
     return CalibrationResult(
         readout_time=told(readout, readout_sigma, config.max_readout_sigma, ''),
-        time_offset=told(to_first @ parameters, offset_sigma, config.max_offset_sigma, ''),
+        time_offset=told(float(to_first @ parameters), offset_sigma, config.max_offset_sigma, ''),
         R_cam_imu=R_cam_imu, rotation_sigma=rotation_sigma,
         rotation=told(angle, float(rotation_sigma.max()), config.max_rotation_sigma),
         axis_map=axis_map, gyro_bias=(biases[0], biases[1], biases[2]), focal_factor=focal,

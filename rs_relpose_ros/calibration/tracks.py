@@ -58,7 +58,7 @@ class Tracks:
 
     def seconds(self, origin_ns: int) -> Array:
         """Stamps (F,) [s] since `origin_ns`."""
-        return (self.stamps_ns - origin_ns) * 1e-9
+        return np.asarray((self.stamps_ns - origin_ns) * 1e-9, dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
