@@ -32,9 +32,10 @@ Progress = Callable[[float], object]
 # The sandwich estimate knows what scatters between pairs, not what all of them have in common
 # (depths, how a camera moves between its rows): factor found on simulated recordings, by parameter
 # (read-out, offset, slope, rotation, bias, focal length).
-_SIGMA_FACTORS = np.ones(GLOBAL)
-# Frame pairs this far apart [s]: short, since the camera must move evenly meanwhile.
-_SPANS = (0.033, 0.067, 0.1, 0.133)
+_SIGMA_FACTORS = np.array([1.5, 1.5, 1.5, 1.2, 1.2, 1.2, 1.3, 1.3, 1.3, 1.3])
+# Frame pairs this far apart [s]: near ones, while the camera moves evenly, and far ones, whose
+# rows the gyro has turned by different rates.
+_SPANS = (0.067, 0.133, 0.267)
 _LEAST_MATCHES = 20
 _MATCHES_PER_PAIR, _MATCHES_PER_PAIR_AT_START = 100, 40
 _MOST_PAIRS, _PAIRS_AT_START = 700, 120
@@ -57,7 +58,7 @@ class CalibrationConfig:
     max_gyro_gap: float = setting(
         0.03, 'longest step between gyro samples that is interpolated', 's', low=1e-3, high=1.0)
     max_readout_sigma: float = setting(
-        2e-3, 'sigma of an observable read-out time', 's', low=1e-5, high=1.0)
+        1.5e-3, 'sigma of an observable read-out time', 's', low=1e-5, high=1.0)
     max_offset_sigma: float = setting(
         3e-3, 'sigma of an observable offset', 's', low=1e-5, high=1.0)
     max_rotation_sigma: float = setting(

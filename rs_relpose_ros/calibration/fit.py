@@ -28,8 +28,9 @@ ROBUST = 3.0
 # Time over which errors of pairs are taken to be correlated [frames].
 LAGS = 15
 # Change of the camera's velocity while it takes a frame, relative to the velocity (1 sigma, each
-# component): 2 m/s^2 for 30 ms at 0.2 m/s. A wide one costs next to nothing.
-BEND = 0.3
+# component): 2 m/s^2 for 30 ms at 0.6 m/s. Wider costs precision at a walk, narrower is wrong for
+# a slow hand.
+BEND = 0.1
 # Scatter of a match as it is before anything is known [px], and at the least.
 _NOISE_AT_START, _LEAST_NOISE = 5.0, 0.05
 _HYPOTHESES = 60
