@@ -254,7 +254,8 @@ def few_pairs() -> tuple[Problem, State, Truth]:
     center = 0.5 * np.array([truth.width - 1, truth.height - 1])
     by_pixel = np.tile(np.eye(2) / truth.focal, (len(pairs.points1), 1, 1))
     problem = Problem(
-        recorded.gyro.seconds(origin), recorded.gyro.rates, pairs.begin, pairs.first,
+        recorded.gyro.seconds(origin), recorded.gyro.rates, pairs.begin,
+        np.searchsorted(recorded.gyro.seconds(origin), times[pairs.first] + 0.05), pairs.first,
         pairs.second, times[pairs.first], times[pairs.second], 0.01 * np.arange(len(pairs)),
         0.02 * np.arange(len(pairs)), (pairs.points1 - center) / truth.focal,
         (pairs.points2 - center) / truth.focal, (pairs.points1[:, 1] - middle) / truth.height,

@@ -290,9 +290,11 @@ def _problem(data: _Input, gaps: tuple[int, ...], offset: float, matches: int, m
     middle = 0.5 * (camera.height - 1)
     points1, by_pixel1 = _normalised_by_pixel(camera, pairs.points1)
     points2, by_pixel2 = _normalised_by_pixel(camera, pairs.points2)
+    times1, times2 = data.times[pairs.first], data.times[pairs.second]
+    middle_knots = np.searchsorted(data.gyro_times, 0.5 * (times1 + times2) + offset)
     return Problem(
-        data.gyro_times, data.gyro_rates, pairs.begin, pairs.first, pairs.second,
-        data.times[pairs.first], data.times[pairs.second], data.covariates[pairs.first],
+        data.gyro_times, data.gyro_rates, pairs.begin, middle_knots, pairs.first, pairs.second,
+        times1, times2, data.covariates[pairs.first],
         data.covariates[pairs.second], points1, points2,
         (pairs.points1[:, 1] - middle) / camera.height,
         (pairs.points2[:, 1] - middle) / camera.height, by_pixel1, by_pixel2)

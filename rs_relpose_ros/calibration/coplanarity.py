@@ -60,11 +60,11 @@ def tangents(b: Array, out: Array) -> None:
 @numba.njit(cache=True, nogil=True, error_model='numpy')
 def accumulate(  # noqa: C901 - one pass, unrolled by hand, is what makes it fast
         knots: Array, rates: Array, path: Array, turned: Array, begin: NDArray[np.int64],
-        times1: Array, times2: Array, covariates1: Array, covariates2: Array, points1: Array,
-        points2: Array, rows1: Array, rows2: Array, by_pixel1: Array, by_pixel2: Array,
-        parameters: Array, R_imu_cam: Array, noise: Array, bend_sigma: float, direction: Array,
-        bend: Array, derivatives: bool, robust: float, losses: Array, residuals: Array,
-        score: Array, reduced: Array, back: Array) -> None:
+        middle: NDArray[np.int64], times1: Array, times2: Array, covariates1: Array, covariates2: Array,
+        points1: Array, points2: Array, rows1: Array, rows2: Array, by_pixel1: Array,
+        by_pixel2: Array, parameters: Array, R_imu_cam: Array, noise: Array, bend_sigma: float,
+        direction: Array, bend: Array, damping: Array, derivatives: bool, robust: float, losses: Array,
+        residuals: Array, score: Array, reduced: Array, back: Array) -> None:
     """Go over all pairs; see the module for the model.
 
     Parameters
@@ -72,6 +72,9 @@ def accumulate(  # noqa: C901 - one pass, unrolled by hand, is what makes it fas
     knots, rates, path, turned
         The integrated gyro (`GyroPath`).
     begin : (P + 1,)
+    middle : (P,)
+        Knot near the middle of the pair, in whose frame `direction` and `bend` are: else they would
+        turn with the bias, the more the later the pair.
     times1, times2, covariates1, covariates2 : (P,)
         Stamps [s] and intervals that the offset may depend on.
     points1, points2 : (N, 2)
@@ -88,6 +91,8 @@ def accumulate(  # noqa: C901 - one pass, unrolled by hand, is what makes it fas
     bend_sigma : float
         1 sigma of each component of `bend`.
     direction, bend : (P, 3)
+    damping : (P,)
+        Levenberg-Marquardt's, of the pair's own unknowns.
     derivatives : bool
         Whether to fill what follows `residuals`.
     robust : float
@@ -106,12 +111,18 @@ def accumulate(  # noqa: C901 - one pass, unrolled by hand, is what makes it fas
     b, c1, c2, k1, k2 = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     g1, g2, d1, d2 = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     u, v, db = np.empty(3), np.empty(3), np.empty(3)
-    C1, C2, Cm = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    C1, C2, b0, b1 = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
     J = np.empty(_ALL)
     H, gradient = np.empty((_ALL, _ALL)), np.empty(_ALL)
     L = np.empty((LOCAL, LOCAL))
     for p in range(len(begin) - 1):
-        tangents(direction[p], B)
+        Qm, Cm = path[middle[p]], turned[middle[p]]
+        tangents(direction[p], L[:2, :3])
+        for i in range(3):
+            b0[i] = Qm[i, 0] * direction[p, 0] + Qm[i, 1] * direction[p, 1] + Qm[i, 2] * direction[p, 2]
+            b1[i] = Qm[i, 0] * bend[p, 0] + Qm[i, 1] * bend[p, 1] + Qm[i, 2] * bend[p, 2]
+            for j in range(2):
+                B[j, i] = Qm[i, 0] * L[j, 0] + Qm[i, 1] * L[j, 1] + Qm[i, 2] * L[j, 2]
         loss = 0.0
         for i in range(3):
             loss += 0.5 * bend_weight * bend[p, i] ** 2
@@ -121,7 +132,6 @@ def accumulate(  # noqa: C901 - one pass, unrolled by hand, is what makes it fas
         start2 = times2[p] + offset + slope * covariates2[p]
         n1 = np.searchsorted(knots, start1) - 1
         n2 = np.searchsorted(knots, start2) - 1
-        Cm[:] = turned[knot_before(knots, 0.5 * (start1 + start2), n1)]
         per_noise2 = 1.0 / noise[p] ** 2
         for n in range(begin[p], begin[p + 1]):
             t1, t2 = start1 + rows1[n] * readout, start2 + rows2[n] * readout
@@ -142,7 +152,7 @@ def accumulate(  # noqa: C901 - one pass, unrolled by hand, is what makes it fas
                 f2[i] = M2[i, 0] * x2 + M2[i, 1] * y2
                 m1[i] = f1[i] + M1[i, 2]
                 m2[i] = f2[i] + M2[i, 2]
-                b[i] = direction[p, i] + both * bend[p, i]
+                b[i] = b0[i] + both * b1[i]
             # de = dm_1 . c_1 + dm_2 . c_2
             _cross_into(m2, b, c1)
             _cross_into(b, m1, c2)
@@ -198,7 +208,7 @@ def accumulate(  # noqa: C901 - one pass, unrolled by hand, is what makes it fas
                                    + g2[0] * Q2[0, j] + g2[1] * Q2[1, j] + g2[2] * Q2[2, j])
                 J[BIAS + j] = -(g1[0] * C1[0, j] + g1[1] * C1[1, j] + g1[2] * C1[2, j]
                                 + g2[0] * C2[0, j] + g2[1] * C2[1, j] + g2[2] * C2[2, j])
-                J[GLOBAL + 2 + j] = both * db[j]
+                J[GLOBAL + 2 + j] = both * (db[0] * Qm[0, j] + db[1] * Qm[1, j] + db[2] * Qm[2, j])
             # The points shrink with a longer focal length, and so does s.
             J[FOCAL] = residual
             for i in range(3):
@@ -218,6 +228,8 @@ def accumulate(  # noqa: C901 - one pass, unrolled by hand, is what makes it fas
         for i in range(3):
             H[GLOBAL + 2 + i, GLOBAL + 2 + i] += bend_weight
             gradient[GLOBAL + 2 + i] += bend_weight * bend[p, i]
+        for i in range(GLOBAL, _ALL):
+            H[i, i] *= 1.0 + damping[p]
         _eliminate(H, gradient, L, score[p], reduced[p], back[p])
 
 
@@ -275,8 +287,8 @@ def _eliminate(
 
 @numba.njit(cache=True, nogil=True, error_model='numpy')
 def find_directions(  # noqa: C901 - one pass as above
-        knots: Array, rates: Array, path: Array, begin: NDArray[np.int64], times1: Array,
-        times2: Array, covariates1: Array, covariates2: Array, points1: Array, points2: Array,
+        knots: Array, rates: Array, path: Array, begin: NDArray[np.int64],
+        middle: NDArray[np.int64], times1: Array, times2: Array, covariates1: Array, covariates2: Array, points1: Array, points2: Array,
         rows1: Array, rows2: Array, by_pixel1: Array, by_pixel2: Array, parameters: Array,
         R_imu_cam: Array, noise: Array, chosen: NDArray[np.int64], robust: float,
         direction: Array) -> None:
@@ -297,6 +309,7 @@ def find_directions(  # noqa: C901 - one pass as above
     b, best = np.empty(3), np.empty(3)
     for p in range(len(begin) - 1):
         count = begin[p + 1] - begin[p]
+        Qm = path[middle[p]]
         k = 0
         for i in range(count):
             n = begin[p] + i
@@ -333,7 +346,7 @@ def find_directions(  # noqa: C901 - one pass as above
         least = np.inf
         for h in range(-1, len(chosen)):
             if h < 0:
-                b[:] = direction[p]
+                b[:] = Qm @ direction[p]
             else:
                 _cross_into(normals[chosen[h, 0] % count], normals[chosen[h, 1] % count], b)
             norm = math.sqrt(b[0] ** 2 + b[1] ** 2 + b[2] ** 2)
@@ -355,4 +368,4 @@ def find_directions(  # noqa: C901 - one pass as above
                 least = cost
                 best[:] = b
         if least < np.inf:
-            direction[p] = best
+            direction[p] = Qm.T @ best

@@ -34,6 +34,10 @@ BEND = 0.1
 # Scatter of a match as it is before anything is known [px], and at the least.
 _NOISE_AT_START, _LEAST_NOISE = 5.0, 0.05
 _HYPOTHESES = 60
+# Newton's step [sigma] below which the optimum is near.
+_NEAR = 2.0
+# Levenberg-Marquardt's damping of the pairs' own unknowns stays in this range.
+_DAMPING = (1e-6, 1e3)
 # Noise of a pair is not let out of this range of the median over all pairs.
 _NOISE_RANGE = (0.6, 4.0)
 
@@ -45,6 +49,7 @@ class Problem:
     gyro_times: Array
     gyro_rates: Array
     begin: NDArray[np.int64]
+    middle: NDArray[np.int64]
     first: NDArray[np.int64]
     second: NDArray[np.int64]
     times1: Array
@@ -69,7 +74,8 @@ class State:
     """A calibration, and what belongs to the pairs alone.
 
     `parameters` (GLOBAL,): read-out, offset of the middle row, slope, three unused, bias, log of
-    the focal length's factor. `direction`, `bend` (P, 3) and `noise` (P,) [px]: see `accumulate`.
+    the focal length's factor. `direction`, `bend` (P, 3), `noise` (P,) [px] and `damping` (P,): see
+    `accumulate`.
     """
 
     parameters: Array
@@ -77,6 +83,7 @@ class State:
     direction: Array
     bend: Array
     noise: Array
+    damping: Array
 
     @classmethod
     def start(cls, problem: Problem, R_imu_cam: Array, offset: float, readout: float = 0.0,
@@ -89,7 +96,7 @@ class State:
             parameters[BIAS:BIAS + 3] = bias
         direction = np.tile([1.0, 0.0, 0.0], (problem.pairs, 1))
         state = cls(parameters, R_imu_cam, direction, np.zeros((problem.pairs, 3)),
-                    np.full(problem.pairs, noise))
+                    np.full(problem.pairs, noise), np.full(problem.pairs, _DAMPING[0]))
         return redirected(problem, state)
 
     def moved(self, step: Array, local: Array) -> State:
@@ -136,8 +143,8 @@ def redirected(problem: Problem, state: State) -> State:
     path = _path(problem, state)
     direction = state.direction.copy()
     chosen = np.random.default_rng(0).integers(0, 2**30, (_HYPOTHESES, 2))
-    find_directions(path.times, path.rates, path.rotations, problem.begin, problem.times1,
-                    problem.times2, problem.covariates1, problem.covariates2, problem.points1,
+    find_directions(path.times, path.rates, path.rotations, problem.begin, problem.middle,
+                    problem.times1, problem.times2, problem.covariates1, problem.covariates2, problem.points1,
                     problem.points2, problem.rows1, problem.rows2, problem.by_pixel1,
                     problem.by_pixel2, state.parameters, state.R_imu_cam, state.noise, chosen,
                     ROBUST, direction)
@@ -152,11 +159,11 @@ def evaluate(problem: Problem, state: State, derivatives: bool = True) -> Evalua
     size = pairs if derivatives else 0
     out = Evaluation(np.empty(pairs), np.empty(len(problem.points1)), np.empty((size, GLOBAL)),
                      np.empty((size, GLOBAL, GLOBAL)), np.empty((size, LOCAL, GLOBAL + 1)))
-    accumulate(path.times, path.rates, path.rotations, path.turned, problem.begin, problem.times1,
-               problem.times2, problem.covariates1, problem.covariates2, problem.points1,
+    accumulate(path.times, path.rates, path.rotations, path.turned, problem.begin, problem.middle,
+               problem.times1, problem.times2, problem.covariates1, problem.covariates2, problem.points1,
                problem.points2, problem.rows1, problem.rows2, problem.by_pixel1,
                problem.by_pixel2, state.parameters, state.R_imu_cam, state.noise, BEND,
-               state.direction, state.bend, derivatives, ROBUST, out.losses, out.residuals,
+               state.direction, state.bend, state.damping, derivatives, ROBUST, out.losses, out.residuals,
                out.score, out.reduced, out.back)
     return out
 
@@ -181,7 +188,7 @@ class Fit:
     converged: bool
 
 
-def fit(problem: Problem, state: State, free: NDArray[np.bool_], *, rounds: int = 30,
+def fit(problem: Problem, state: State, free: NDArray[np.bool_], *, rounds: int = 40,
         bias_sigma: float = 0.03, tolerance: float = 0.1) -> Fit:
     """Minimise the cost over the `free` (GLOBAL,) parameters, and learn the noise on the way.
 
@@ -190,65 +197,84 @@ def fit(problem: Problem, state: State, free: NDArray[np.bool_], *, rounds: int 
     bias_sigma : float
         What a gyro's bias may be, 1 sigma [rad/s].
     tolerance : float
-        Steps shorter than this [sigma of the parameters] end the fit.
+        Newton steps shorter than this [sigma of the parameters] end the fit.
     """
     prior = np.zeros(GLOBAL)
     prior[BIAS:BIAS + 3] = bias_sigma**-2
     evaluation = evaluate(problem, state)
     converged = False
     damping = 1e-3
-    for k in range(rounds):
-        state, evaluation, damping, moved = _step(problem, state, evaluation, free, prior, damping)
+    for _ in range(rounds):
+        state, damping, length = _step(problem, state, evaluation, free, prior, damping)
+        evaluation = evaluate(problem, state)
+        if length > _NEAR:
+            continue
+        # Noise is learned near the optimum only: far from it, residuals are no noise.
         noise = learned(problem, state, evaluation)
-        settled = bool(np.median(np.abs(np.log(noise / state.noise))) < 0.03)
-        if moved < tolerance and settled:
+        change = float(np.median(np.abs(np.log(noise / state.noise))))
+        if length < tolerance and change < 0.03:
             converged = True
             break
         state = replace(state, noise=noise)
-        # The cost is not convex in the directions: look for better ones while the rest moves.
-        if k < 4 or moved > 1.0:
+        if change > 0.1:
+            # The cost is not convex in the directions: less noise tells more of them apart.
             state = _better_directions(problem, state)
         evaluation = evaluate(problem, state)
+    state = replace(state, damping=np.zeros(problem.pairs))
+    evaluation = evaluate(problem, state)
     return Fit(state, evaluation, _covariance(problem, state, evaluation, free, prior),
                evaluation.reduced.sum(axis=0), converged)
 
 
 def _better_directions(problem: Problem, state: State) -> State:
     """Each pair with the better of its own direction and the one found anew."""
-    ways = []
-    for start in (state, redirected(problem, state)):
-        for _ in range(2):
-            back = evaluate(problem, start).back
-            start = start.moved(np.zeros(GLOBAL), -back[:, :, GLOBAL])
-        ways.append((start, evaluate(problem, start, derivatives=False).losses))
-    (kept, losses), (other, others) = ways
-    better = (others < losses)[:, None]
-    return replace(state, direction=np.where(better, other.direction, kept.direction),
-                   bend=np.where(better, other.bend, kept.bend))
+    kept, other = (_settled(problem, start) for start in (state, redirected(problem, state)))
+    return _chosen(problem, other, kept)[0]
+
+
+def _settled(problem: Problem, state: State) -> State:
+    """State after two steps of the pairs' own unknowns."""
+    for _ in range(2):
+        back = evaluate(problem, state).back
+        moved = state.moved(np.zeros(GLOBAL), -back[:, :, GLOBAL])
+        state = _chosen(problem, moved, state)[0]
+    return state
+
+
+def _chosen(problem: Problem, moved: State, kept: State) -> tuple[State, float]:
+    """State `moved`, but pairs that cost less with their own unknowns as in `kept` keep them."""
+    stay = replace(moved, direction=kept.direction, bend=kept.bend)
+    losses = evaluate(problem, moved, derivatives=False).losses
+    others = evaluate(problem, stay, derivatives=False).losses
+    better = losses <= others
+    pairs = better[:, None]
+    damping = np.clip(kept.damping * np.where(better, 0.2, 10.0), *_DAMPING)
+    return replace(moved, direction=np.where(pairs, moved.direction, kept.direction),
+                   bend=np.where(pairs, moved.bend, kept.bend),
+                   damping=damping), float(np.minimum(losses, others).sum())
 
 
 def _step(problem: Problem, state: State, evaluation: Evaluation, free: NDArray[np.bool_],
-          prior: Array, damping: float) -> tuple[State, Evaluation, float, float]:
-    """One accepted step, or none; last its length in sigma."""
-    cost = _total(state, evaluation, prior)
+          prior: Array, damping: float) -> tuple[State, float, float]:
+    """State after a step that lowers the cost, the damping, and Newton's step in sigma."""
+    cost = evaluation.cost + _prior_cost(state, prior)
     H = (evaluation.reduced.sum(axis=0) + np.diag(prior))[np.ix_(free, free)]
     gradient = (evaluation.score.sum(axis=0) + prior * state.parameters)[free]
-    for _ in range(6):
+    newton = np.linalg.solve(H + 1e-9 * np.diag(np.diag(H)), gradient)
+    length = float(np.sqrt(max(gradient @ newton, 0.0)))
+    for _ in range(8):
         step = np.zeros(GLOBAL)
-        step[free] = -np.linalg.solve(H + damping * np.diag(np.diag(H)) + 1e-12 * np.eye(len(H)),
-                                      gradient)
+        step[free] = -np.linalg.solve(H + damping * np.diag(np.diag(H)), gradient)
         local = -evaluation.back[:, :, GLOBAL] - evaluation.back[:, :, :GLOBAL] @ step
-        tried = state.moved(step, local)
-        result = evaluate(problem, tried)
-        if _total(tried, result, prior) <= cost:
-            moved = float(np.sqrt(step[free] @ H @ step[free]))
-            return tried, result, max(0.2 * damping, 1e-9), moved
+        tried, tried_cost = _chosen(problem, state.moved(step, local), state)
+        if tried_cost + _prior_cost(tried, prior) <= cost:
+            return tried, max(0.1 * damping, 1e-9), length
         damping = max(10.0 * damping, 1e-3)
-    return state, evaluation, damping, 0.0
+    return state, damping, length
 
 
-def _total(state: State, evaluation: Evaluation, prior: Array) -> float:
-    return evaluation.cost + 0.5 * float(prior @ state.parameters**2)
+def _prior_cost(state: State, prior: Array) -> float:
+    return 0.5 * float(prior @ state.parameters**2)
 
 
 def learned(problem: Problem, state: State, evaluation: Evaluation) -> Array:
