@@ -259,7 +259,8 @@ def few_pairs() -> tuple[Problem, State, Truth]:
         pairs.second, times[pairs.first], times[pairs.second], 0.01 * np.arange(len(pairs)),
         0.02 * np.arange(len(pairs)), (pairs.points1 - center) / truth.focal,
         (pairs.points2 - center) / truth.focal, (pairs.points1[:, 1] - middle) / truth.height,
-        (pairs.points2[:, 1] - middle) / truth.height, by_pixel, by_pixel)
+        (pairs.points2[:, 1] - middle) / truth.height, by_pixel, by_pixel,
+        truth.gyro_noise, np.full(len(pairs), 0.1))
     state = State.start(problem, truth.R_cam_imu.T, truth.time_offset
                         + middle / truth.height * truth.readout_time + 1e-3,
                         truth.readout_time + 2e-3, np.array(truth.gyro_bias), 0.01, noise=1.0)

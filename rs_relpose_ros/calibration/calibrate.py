@@ -18,8 +18,17 @@ from rs_relpose_ros.calibration.coplanarity import (
     ROTATION,
     SLOPE,
 )
-from rs_relpose_ros.calibration.fit import evaluate, Fit, fit, Problem, robust_weights, State
-from rs_relpose_ros.calibration.gyro_path import GyroSeries
+from rs_relpose_ros.calibration.fit import (
+    BEND_AT_START,
+    evaluate,
+    Fit,
+    fit,
+    Problem,
+    robust_weights,
+    State,
+    with_bends,
+)
+from rs_relpose_ros.calibration.gyro_path import GyroSeries, noise_density
 from rs_relpose_ros.calibration.result import AXES, CalibrationResult, CostCurve, Estimate
 from rs_relpose_ros.calibration.tracks import make_pairs, Pairs, Tracks
 from rs_relpose_ros.camera import RollingShutterCamera
@@ -35,7 +44,7 @@ Progress = Callable[[float], object]
 _SIGMA_FACTORS = np.array([1.5, 1.5, 1.5, 1.2, 1.2, 1.2, 1.3, 1.3, 1.3, 1.3])
 # Frame pairs this far apart [s]: near ones, while the camera moves evenly, and far ones, whose
 # rows the gyro has turned by different rates.
-_SPANS = (0.067, 0.133, 0.267)
+_SPANS = (0.067, 0.133, 0.267, 0.533, 1.067)
 _LEAST_MATCHES = 20
 _MATCHES_PER_PAIR, _MATCHES_PER_PAIR_AT_START = 100, 40
 _MOST_PAIRS, _PAIRS_AT_START = 700, 120
@@ -91,6 +100,7 @@ class _Input:
     gyro_times: Array
     gyro_rates: Array
     gyro_gaps: Array
+    gyro_density: float
 
     @property
     def interval(self) -> float:
@@ -143,11 +153,13 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
     problem = _problem(data, _spans(data, _SPANS), coarse.state.parameters[OFFSET],
                        _MATCHES_PER_PAIR, _MOST_PAIRS, config, rng)
     begin = _restarted(problem, coarse.state, 2.0)
+    problem = with_bends(problem, begin)
     free[SLOPE] = _intervals_vary(data)
     final = fit(problem, begin, free)
     progress(0.8)
-    some = _problem(data, _spans(data, _SPANS), final.state.parameters[OFFSET],
-                    _MATCHES_PER_PAIR_AT_START, _PAIRS_AT_START, config, rng)
+    some = with_bends(_problem(
+        data, _spans(data, _SPANS), final.state.parameters[OFFSET], _MATCHES_PER_PAIR_AT_START,
+        _PAIRS_AT_START, config, rng), final.state)
     curve = _cost_curve(some, len(problem.points1), final, free, data.interval,
                         lambda share: progress(0.8 + 0.2 * share))
     return _judged(data, problem, final, free, curve, config)
@@ -166,7 +178,7 @@ def _prepared(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera) ->
     to_next = np.append(intervals, intervals[-1])
     gaps = np.diff(gyro_times)
     return _Input(tracks, camera, times, to_next - np.median(intervals), gyro_times,
-                  gyro.rates, gaps)
+                  gyro.rates, gaps, noise_density(gyro_times, gyro.rates))
 
 
 def _check_recording(data: _Input, config: CalibrationConfig) -> None:
@@ -297,7 +309,8 @@ def _problem(data: _Input, gaps: tuple[int, ...], offset: float, matches: int, m
         times1, times2, data.covariates[pairs.first],
         data.covariates[pairs.second], points1, points2,
         (pairs.points1[:, 1] - middle) / camera.height,
-        (pairs.points2[:, 1] - middle) / camera.height, by_pixel1, by_pixel2)
+        (pairs.points2[:, 1] - middle) / camera.height, by_pixel1, by_pixel2, data.gyro_density,
+        np.full(len(pairs), BEND_AT_START))
 
 
 def _normalised_by_pixel(camera: RollingShutterCamera, points: Array) -> tuple[Array, Array]:

@@ -10,9 +10,9 @@ moves in the same direction b, and
 
 with the exact derivative by all four pixel coordinates. How far the camera moves, and how far away
 the points are, drops out. b is a unit vector for each pair, plus `bend` times s_1 + s_2 for a
-change of velocity that is small by its prior. Both are eliminated. The prior of `bend` is in
-units of |b|, and does not contain the read-out time: a read-out time that is too long gains no
-freedom by it.
+change of velocity, and `turn`, what the gyro's noise turned frame 2 too little against frame 1;
+both are small by their priors. All are eliminated. The prior of `bend` is in units of |b|, and
+does not contain the read-out time: a read-out time that is too long gains no freedom by it.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.calibration.gyro_path import knot_before, rotation_at
+from rs_relpose_ros.so3 import exp_so3
 
 Array = NDArray[np.float64]
 
@@ -32,8 +33,8 @@ Array = NDArray[np.float64]
 # length.
 READOUT, OFFSET, SLOPE, ROTATION, BIAS, FOCAL = 0, 1, 2, 3, 6, 9
 GLOBAL = 10
-# Of a pair: step of the direction in its tangent plane (2), bend (3).
-LOCAL = 5
+# Of a pair: step of the direction in its tangent plane (2), bend (3), turn (3).
+LOCAL = 8
 _ALL = GLOBAL + LOCAL
 
 
@@ -60,11 +61,12 @@ def tangents(b: Array, out: Array) -> None:
 @numba.njit(cache=True, nogil=True, error_model='numpy')
 def accumulate(  # noqa: C901 - one pass, unrolled by hand, is what makes it fast
         knots: Array, rates: Array, path: Array, turned: Array, begin: NDArray[np.int64],
-        middle: NDArray[np.int64], times1: Array, times2: Array, covariates1: Array, covariates2: Array,
-        points1: Array, points2: Array, rows1: Array, rows2: Array, by_pixel1: Array,
-        by_pixel2: Array, parameters: Array, R_imu_cam: Array, noise: Array, bend_sigma: float,
-        direction: Array, bend: Array, damping: Array, derivatives: bool, robust: float, losses: Array,
-        residuals: Array, score: Array, reduced: Array, back: Array) -> None:
+        middle: NDArray[np.int64], times1: Array, times2: Array, covariates1: Array,
+        covariates2: Array, points1: Array, points2: Array, rows1: Array, rows2: Array,
+        by_pixel1: Array, by_pixel2: Array, parameters: Array, R_imu_cam: Array, noise: Array,
+        bend_sigma: Array, turn_sigma: Array, direction: Array, bend: Array, turn: Array,
+        damping: Array, derivatives: bool, robust: float, losses: Array, residuals: Array,
+        score: Array, reduced: Array, back: Array) -> None:
     """Go over all pairs; see the module for the model.
 
     Parameters
@@ -73,8 +75,8 @@ def accumulate(  # noqa: C901 - one pass, unrolled by hand, is what makes it fas
         The integrated gyro (`GyroPath`).
     begin : (P + 1,)
     middle : (P,)
-        Knot near the middle of the pair, in whose frame `direction` and `bend` are: else they would
-        turn with the bias, the more the later the pair.
+        Knot near the middle of the pair, in whose frame `direction`, `bend` and `turn` are: else
+        they would turn with the bias, the more the later the pair.
     times1, times2, covariates1, covariates2 : (P,)
         Stamps [s] and intervals that the offset may depend on.
     points1, points2 : (N, 2)
@@ -88,9 +90,9 @@ def accumulate(  # noqa: C901 - one pass, unrolled by hand, is what makes it fas
     R_imu_cam : (3, 3)
     noise : (P,)
         1 sigma of the residuals [px].
-    bend_sigma : float
-        1 sigma of each component of `bend`.
-    direction, bend : (P, 3)
+    bend_sigma, turn_sigma : (P,)
+        1 sigma of each component of `bend` and of `turn` [rad].
+    direction, bend, turn : (P, 3)
     damping : (P,)
         Levenberg-Marquardt's, of the pair's own unknowns.
     derivatives : bool
@@ -104,8 +106,9 @@ def accumulate(  # noqa: C901 - one pass, unrolled by hand, is what makes it fas
     """
     readout, offset, slope = parameters[READOUT], parameters[OFFSET], parameters[SLOPE]
     stretch = math.exp(parameters[FOCAL])
-    bend_weight, robust2 = 1.0 / bend_sigma**2, robust**2
+    robust2 = robust**2
     Q1, Q2, rate1, rate2 = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
+    G1, G2, half = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     M1, M2, B = np.empty((3, 3)), np.empty((3, 3)), np.empty((2, 3))
     m1, m2, f1, f2 = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     b, c1, c2, k1, k2 = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
@@ -118,14 +121,16 @@ def accumulate(  # noqa: C901 - one pass, unrolled by hand, is what makes it fas
     for p in range(len(begin) - 1):
         Qm, Cm = path[middle[p]], turned[middle[p]]
         tangents(direction[p], L[:2, :3])
+        bend_weight, turn_weight = 1.0 / bend_sigma[p] ** 2, 1.0 / turn_sigma[p] ** 2
+        b0[:] = Qm @ direction[p]
+        b1[:] = Qm @ bend[p]
         for i in range(3):
-            b0[i] = Qm[i, 0] * direction[p, 0] + Qm[i, 1] * direction[p, 1] + Qm[i, 2] * direction[p, 2]
-            b1[i] = Qm[i, 0] * bend[p, 0] + Qm[i, 1] * bend[p, 1] + Qm[i, 2] * bend[p, 2]
             for j in range(2):
                 B[j, i] = Qm[i, 0] * L[j, 0] + Qm[i, 1] * L[j, 1] + Qm[i, 2] * L[j, 2]
+        half[:] = exp_so3(0.5 * (Qm @ turn[p]))
         loss = 0.0
         for i in range(3):
-            loss += 0.5 * bend_weight * bend[p, i] ** 2
+            loss += 0.5 * (bend_weight * bend[p, i] ** 2 + turn_weight * turn[p, i] ** 2)
         H[:] = 0.0
         gradient[:] = 0.0
         start1 = times1[p] + offset + slope * covariates1[p]
@@ -136,8 +141,14 @@ def accumulate(  # noqa: C901 - one pass, unrolled by hand, is what makes it fas
         for n in range(begin[p], begin[p + 1]):
             t1, t2 = start1 + rows1[n] * readout, start2 + rows2[n] * readout
             n1, n2 = knot_before(knots, t1, n1), knot_before(knots, t2, n2)
-            rotation_at(knots, rates, path, t1, n1, Q1, rate1)
-            rotation_at(knots, rates, path, t2, n2, Q2, rate2)
+            rotation_at(knots, rates, path, t1, n1, G1, rate1)
+            rotation_at(knots, rates, path, t2, n2, G2, rate2)
+            for i in range(3):
+                for j in range(3):
+                    Q1[i, j] = (half[0, i] * G1[0, j] + half[1, i] * G1[1, j]
+                                + half[2, i] * G1[2, j])
+                    Q2[i, j] = (half[i, 0] * G2[0, j] + half[i, 1] * G2[1, j]
+                                + half[i, 2] * G2[2, j])
             x1, y1 = points1[n, 0] / stretch, points1[n, 1] / stretch
             x2, y2 = points2[n, 0] / stretch, points2[n, 1] / stretch
             both = rows1[n] + rows2[n]
@@ -208,7 +219,11 @@ def accumulate(  # noqa: C901 - one pass, unrolled by hand, is what makes it fas
                                    + g2[0] * Q2[0, j] + g2[1] * Q2[1, j] + g2[2] * Q2[2, j])
                 J[BIAS + j] = -(g1[0] * C1[0, j] + g1[1] * C1[1, j] + g1[2] * C1[2, j]
                                 + g2[0] * C2[0, j] + g2[1] * C2[1, j] + g2[2] * C2[2, j])
-                J[GLOBAL + 2 + j] = both * (db[0] * Qm[0, j] + db[1] * Qm[1, j] + db[2] * Qm[2, j])
+                J[GLOBAL + 2 + j] = both * (
+                    db[0] * Qm[0, j] + db[1] * Qm[1, j] + db[2] * Qm[2, j])
+                J[GLOBAL + 5 + j] = 0.5 * (
+                    (g2[0] - g1[0]) * Qm[0, j] + (g2[1] - g1[1]) * Qm[1, j]
+                    + (g2[2] - g1[2]) * Qm[2, j])
             # The points shrink with a longer focal length, and so does s.
             J[FOCAL] = residual
             for i in range(3):
@@ -227,7 +242,9 @@ def accumulate(  # noqa: C901 - one pass, unrolled by hand, is what makes it fas
             H[GLOBAL + i, GLOBAL + i] += 1.0
         for i in range(3):
             H[GLOBAL + 2 + i, GLOBAL + 2 + i] += bend_weight
+            H[GLOBAL + 5 + i, GLOBAL + 5 + i] += turn_weight
             gradient[GLOBAL + 2 + i] += bend_weight * bend[p, i]
+            gradient[GLOBAL + 5 + i] += turn_weight * turn[p, i]
         for i in range(GLOBAL, _ALL):
             H[i, i] *= 1.0 + damping[p]
         _eliminate(H, gradient, L, score[p], reduced[p], back[p])
@@ -288,10 +305,10 @@ def _eliminate(
 @numba.njit(cache=True, nogil=True, error_model='numpy')
 def find_directions(  # noqa: C901 - one pass as above
         knots: Array, rates: Array, path: Array, begin: NDArray[np.int64],
-        middle: NDArray[np.int64], times1: Array, times2: Array, covariates1: Array, covariates2: Array, points1: Array, points2: Array,
-        rows1: Array, rows2: Array, by_pixel1: Array, by_pixel2: Array, parameters: Array,
-        R_imu_cam: Array, noise: Array, chosen: NDArray[np.int64], robust: float,
-        direction: Array) -> None:
+        middle: NDArray[np.int64], times1: Array, times2: Array, covariates1: Array,
+        covariates2: Array, points1: Array, points2: Array, rows1: Array, rows2: Array,
+        by_pixel1: Array, by_pixel2: Array, parameters: Array, R_imu_cam: Array, noise: Array,
+        chosen: NDArray[np.int64], robust: float, direction: Array) -> None:
     """Improve `direction` (P, 3) by those that two matches each fix.
 
     Parameters are those of `accumulate`; `chosen` (K, 2) are large random numbers that pick the
@@ -368,4 +385,4 @@ def find_directions(  # noqa: C901 - one pass as above
                 least = cost
                 best[:] = b
         if least < np.inf:
-            direction[p] = Qm.T @ best
+            direction[p] = best @ Qm

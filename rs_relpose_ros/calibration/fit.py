@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+import itertools
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +28,11 @@ Array = NDArray[np.float64]
 ROBUST = 3.0
 # Time over which errors of pairs are taken to be correlated [frames].
 LAGS = 15
-# Change of the camera's velocity while it takes a frame, relative to the velocity (1 sigma, each
-# component): 2 m/s^2 for 30 ms at 0.6 m/s. Wider costs precision at a walk, narrower is wrong for
-# a slow hand.
-BEND = 0.1
+# Change of the camera's velocity while it takes half a frame, over the depth of the scene [1/s]:
+# 2 m/s^2 for 15 ms at 3 m. Over the parallax per second it is `bend`, within these limits.
+_BEND, _BEND_RANGE, BEND_AT_START = 0.01, (0.03, 0.5), 0.1
+# Rotation between two frames that the gyro's samples do not tell even without noise [rad].
+_LEAST_TURN = 2e-5
 # Scatter of a match as it is before anything is known [px], and at the least.
 _NOISE_AT_START, _LEAST_NOISE = 5.0, 0.05
 _HYPOTHESES = 60
@@ -62,6 +64,13 @@ class Problem:
     rows2: Array
     by_pixel1: Array
     by_pixel2: Array
+    gyro_density: float
+    bend_sigma: Array
+
+    @property
+    def turn_sigma(self) -> Array:
+        """1 sigma (P,) of each component of `turn`, from the white noise of the gyro [rad]."""
+        return np.sqrt(self.gyro_density**2 * (self.times2 - self.times1) + _LEAST_TURN**2)
 
     @property
     def pairs(self) -> int:
@@ -74,14 +83,15 @@ class State:
     """A calibration, and what belongs to the pairs alone.
 
     `parameters` (GLOBAL,): read-out, offset of the middle row, slope, three unused, bias, log of
-    the focal length's factor. `direction`, `bend` (P, 3), `noise` (P,) [px] and `damping` (P,): see
-    `accumulate`.
+    the focal length's factor. `direction`, `bend`, `turn` (P, 3), `noise` (P,) [px] and `damping`
+    (P,): see `accumulate`.
     """
 
     parameters: Array
     R_imu_cam: Array
     direction: Array
     bend: Array
+    turn: Array
     noise: Array
     damping: Array
 
@@ -96,7 +106,8 @@ class State:
             parameters[BIAS:BIAS + 3] = bias
         direction = np.tile([1.0, 0.0, 0.0], (problem.pairs, 1))
         state = cls(parameters, R_imu_cam, direction, np.zeros((problem.pairs, 3)),
-                    np.full(problem.pairs, noise), np.full(problem.pairs, _DAMPING[0]))
+                    np.zeros((problem.pairs, 3)), np.full(problem.pairs, noise),
+                    np.full(problem.pairs, _DAMPING[0]))
         return redirected(problem, state)
 
     def moved(self, step: Array, local: Array) -> State:
@@ -110,7 +121,8 @@ class State:
         direction = self.direction + np.einsum('pk,pki->pi', along, first)
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         return replace(self, parameters=parameters, R_imu_cam=turn @ self.R_imu_cam,
-                       direction=direction, bend=self.bend + local[:, 2:])
+                       direction=direction, bend=self.bend + local[:, 2:5],
+                       turn=self.turn + local[:, 5:])
 
 
 def _tangents(directions: Array) -> Array:
@@ -144,12 +156,13 @@ def redirected(problem: Problem, state: State) -> State:
     direction = state.direction.copy()
     chosen = np.random.default_rng(0).integers(0, 2**30, (_HYPOTHESES, 2))
     find_directions(path.times, path.rates, path.rotations, problem.begin, problem.middle,
-                    problem.times1, problem.times2, problem.covariates1, problem.covariates2, problem.points1,
-                    problem.points2, problem.rows1, problem.rows2, problem.by_pixel1,
-                    problem.by_pixel2, state.parameters, state.R_imu_cam, state.noise, chosen,
-                    ROBUST, direction)
+                    problem.times1, problem.times2, problem.covariates1, problem.covariates2,
+                    problem.points1, problem.points2, problem.rows1, problem.rows2,
+                    problem.by_pixel1, problem.by_pixel2, state.parameters, state.R_imu_cam,
+                    state.noise, chosen, ROBUST, direction)
     moved = (np.abs((direction * state.direction).sum(axis=1)) < 0.999)[:, None]
-    return replace(state, direction=direction, bend=np.where(moved, 0.0, state.bend))
+    return replace(state, direction=direction, bend=np.where(moved, 0.0, state.bend),
+                   turn=np.where(moved, 0.0, state.turn))
 
 
 def evaluate(problem: Problem, state: State, derivatives: bool = True) -> Evaluation:
@@ -160,12 +173,31 @@ def evaluate(problem: Problem, state: State, derivatives: bool = True) -> Evalua
     out = Evaluation(np.empty(pairs), np.empty(len(problem.points1)), np.empty((size, GLOBAL)),
                      np.empty((size, GLOBAL, GLOBAL)), np.empty((size, LOCAL, GLOBAL + 1)))
     accumulate(path.times, path.rates, path.rotations, path.turned, problem.begin, problem.middle,
-               problem.times1, problem.times2, problem.covariates1, problem.covariates2, problem.points1,
-               problem.points2, problem.rows1, problem.rows2, problem.by_pixel1,
-               problem.by_pixel2, state.parameters, state.R_imu_cam, state.noise, BEND,
-               state.direction, state.bend, state.damping, derivatives, ROBUST, out.losses, out.residuals,
-               out.score, out.reduced, out.back)
+               problem.times1, problem.times2, problem.covariates1, problem.covariates2,
+               problem.points1, problem.points2, problem.rows1, problem.rows2, problem.by_pixel1,
+               problem.by_pixel2, state.parameters, state.R_imu_cam, state.noise,
+               problem.bend_sigma, problem.turn_sigma, state.direction, state.bend, state.turn,
+               state.damping, derivatives, ROBUST, out.losses, out.residuals, out.score,
+               out.reduced, out.back)
     return out
+
+
+def with_bends(problem: Problem, state: State) -> Problem:
+    """Problem with priors of `bend` that fit how fast points pass by, seen with `state`."""
+    path, parameters = _path(problem, state), state.parameters
+    pair = np.repeat(np.arange(problem.pairs), np.diff(problem.begin))
+    rays = []
+    for times, points, rows in ((problem.times1, problem.points1, problem.rows1),
+                                (problem.times2, problem.points2, problem.rows2)):
+        at = times[pair] + parameters[OFFSET] + parameters[READOUT] * rows
+        turns = path.at(at) @ state.R_imu_cam
+        seen = np.column_stack([points / np.exp(parameters[FOCAL]), np.ones(len(points))])
+        rays.append(np.einsum('nij,nj->ni', turns, seen / np.linalg.norm(seen, axis=1)[:, None]))
+    angles = np.linalg.norm(np.cross(rays[0], rays[1]), axis=1)
+    medians = np.array([np.median(angles[begin:end]) for begin, end in itertools.pairwise(
+        problem.begin)])
+    passing = np.maximum(medians / (problem.times2 - problem.times1), 1e-6)
+    return replace(problem, bend_sigma=np.clip(_BEND / passing, *_BEND_RANGE))
 
 
 def _path(problem: Problem, state: State) -> GyroPath:
@@ -243,15 +275,16 @@ def _settled(problem: Problem, state: State) -> State:
 
 def _chosen(problem: Problem, moved: State, kept: State) -> tuple[State, float]:
     """State `moved`, but pairs that cost less with their own unknowns as in `kept` keep them."""
-    stay = replace(moved, direction=kept.direction, bend=kept.bend)
+    stay = replace(moved, direction=kept.direction, bend=kept.bend, turn=kept.turn)
     losses = evaluate(problem, moved, derivatives=False).losses
     others = evaluate(problem, stay, derivatives=False).losses
     better = losses <= others
     pairs = better[:, None]
-    damping = np.clip(kept.damping * np.where(better, 0.2, 10.0), *_DAMPING)
-    return replace(moved, direction=np.where(pairs, moved.direction, kept.direction),
-                   bend=np.where(pairs, moved.bend, kept.bend),
-                   damping=damping), float(np.minimum(losses, others).sum())
+    state = replace(
+        moved, direction=np.where(pairs, moved.direction, kept.direction),
+        bend=np.where(pairs, moved.bend, kept.bend), turn=np.where(pairs, moved.turn, kept.turn),
+        damping=np.clip(kept.damping * np.where(better, 0.2, 10.0), *_DAMPING))
+    return state, float(np.minimum(losses, others).sum())
 
 
 def _step(problem: Problem, state: State, evaluation: Evaluation, free: NDArray[np.bool_],
@@ -281,8 +314,8 @@ def learned(problem: Problem, state: State, evaluation: Evaluation) -> Array:
     """Noise (P,) of each pair that the residuals show [px]; shrinks by a half at most."""
     counts = np.diff(problem.begin)
     sizes = np.abs(evaluation.residuals)
-    medians = np.array([np.median(sizes[begin:end]) for begin, end in zip(
-        problem.begin[:-1], problem.begin[1:], strict=True)])
+    medians = np.array([np.median(sizes[begin:end]) for begin, end in itertools.pairwise(
+        problem.begin)])
     # Two unknowns and a bit of each pair hide some of it.
     noise = 1.4826 * medians * np.sqrt(counts / np.maximum(counts - 3.0, 1.0))
     middle = max(float(np.median(noise)), _LEAST_NOISE)

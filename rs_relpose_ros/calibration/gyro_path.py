@@ -51,6 +51,27 @@ class GyroSeries:
         return np.asarray((self.stamps_ns - origin_ns) * 1e-9, dtype=np.float64)
 
 
+def noise_density(times: Array, rates: Array) -> float:
+    """White noise of a gyro [rad/s/sqrt(Hz)], from third differences of its samples.
+
+    A movement that is smooth from sample to sample drops out of them; vibration counts as noise.
+
+    Parameters
+    ----------
+    times, rates : (K,), (K, 3) ndarray
+        [s], [rad/s].
+    """
+    steps = np.diff(times)
+    step = float(np.median(steps))
+    even = np.abs(steps - step) < 0.2 * step
+    even = even[2:] & even[1:-1] & even[:-2]
+    third = np.abs(np.diff(rates, n=3, axis=0))[even]
+    if len(third) == 0:
+        return 0.0
+    # 1, -3, 3, -1 of independent samples; the median of a normal deviate's size is 0.6745.
+    return float(np.median(third) / 0.6745 / np.sqrt(20.0) * np.sqrt(step))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class GyroPath:
     """Integrated gyro: everything is linear or constant between neighbouring knots.
