@@ -6,12 +6,12 @@ import dataclasses
 from functools import lru_cache
 import math
 
-from calibration_tracks import axis_maps, drawn, record, Recorded, Truth
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.calibration.alignment import nearest_axis_map
+from rs_relpose_ros.benchmark.calibration_tracks import drawn, record, Recorded, Truth
+from rs_relpose_ros.calibration.alignment import axis_maps, nearest_axis_map
 from rs_relpose_ros.calibration.calibrate import calibrate
 from rs_relpose_ros.calibration.coplanarity import GLOBAL, LOCAL
 from rs_relpose_ros.calibration.fit import evaluate, Problem, redirected, State
@@ -228,7 +228,8 @@ def test_readout_longer_than_the_interval_is_refused():
 
 def test_every_axis_map_is_recognised():
     maps = axis_maps()
-    assert len(maps) == 24
+    assert len({m.tobytes() for m in maps}) == 24
+    np.testing.assert_allclose(np.linalg.det(maps), 1.0)
     tilt = Rotation.from_rotvec([0.1, -0.2, 0.15]).as_matrix()
     for matrix in maps:
         np.testing.assert_array_equal(nearest_axis_map(tilt @ matrix), matrix)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 import itertools
 
 import numpy as np
@@ -42,6 +43,7 @@ class Start:
     misfit: float
 
 
+@cache
 def axis_maps() -> Array:
     """All 24 rotations (24, 3, 3) that map axes to axes."""
     maps = []
@@ -51,13 +53,15 @@ def axis_maps() -> Array:
             matrix[range(3), columns] = signs
             if np.linalg.det(matrix) > 0.0:
                 maps.append(matrix)
-    return np.array(maps)
+    all_maps = np.array(maps)
+    all_maps.setflags(write=False)      # one copy serves everybody
+    return all_maps
 
 
 def nearest_axis_map(R: Array) -> Array:
     """The axis map (3, 3) nearest to a rotation."""
     maps = axis_maps()
-    return np.asarray(maps[int(np.argmax(np.einsum('kij,ij->k', maps, R)))])
+    return np.array(maps[int(np.argmax(np.einsum('kij,ij->k', maps, R)))])
 
 
 def seen_rates(pairs: Pairs, points1: Array, points2: Array, intervals: Array) -> Array:

@@ -38,16 +38,14 @@ from rs_relpose_ros.settings import check_settings, setting
 Array = NDArray[np.float64]
 Progress = Callable[[float], object]
 
-# The sandwich estimate knows what scatters between pairs, not what all of them have in common
-# (depths, how a camera moves between its rows): factor found on simulated recordings, by parameter
-# (read-out, offset, slope, rotation, bias, focal length).
-_SIGMA_FACTORS = np.array([1.5, 1.5, 1.5, 1.2, 1.2, 1.2, 1.3, 1.3, 1.3, 1.3])
-# Frame pairs this far apart [s]: near ones, while the camera moves evenly, and far ones, whose
-# rows the gyro has turned by different rates.
-_SPANS = (0.067, 0.133, 0.267, 0.533, 1.067)
+# Frame pairs this far apart [s]: far ones, whose rows the gyro has turned by different rates, and
+# near ones, over which a tracker's errors do not add up and the camera moves evenly. The noise of
+# each pair, as found, decides what counts.
+_SPANS = (0.033, 0.067, 0.133, 0.267)
+_SPAN_AT_START = (0.067,)
 _LEAST_MATCHES = 20
-_MATCHES_PER_PAIR, _MATCHES_PER_PAIR_AT_START = 100, 40
-_MOST_PAIRS, _PAIRS_AT_START = 700, 120
+_MATCHES_PER_PAIR, _MATCHES_PER_PAIR_AT_START = 80, 40
+_MOST_PAIRS, _PAIRS_AT_START = 800, 100
 # Intervals between frames that differ by more than this share may have exposures that differ.
 _VARYING = 0.02
 _FOCAL_FACTORS = np.geomspace(0.5, 2.0, 9)
@@ -265,7 +263,7 @@ def _coarse_fit(data: _Input, starts: list[Start], free: NDArray[np.bool_],
     best: Fit | None = None
     best_cost = np.inf
     for start in starts:
-        problem = _problem(data, _spans(data, _SPANS[:1]), start.offset,
+        problem = _problem(data, _spans(data, _SPAN_AT_START), start.offset,
                            _MATCHES_PER_PAIR_AT_START, _PAIRS_AT_START, config, rng)
         state = State.start(problem, start.R_cam_imu.T, start.offset,
                             log_focal=float(np.log(start.focal_factor)))
@@ -436,13 +434,13 @@ def _judged(data: _Input, problem: Problem, final: Fit, free: NDArray[np.bool_],
 
 
 def _inflated(covariance: Array, free: NDArray[np.bool_], config: CalibrationConfig) -> Array:
-    """Covariance with what the sandwich estimate does not see."""
+    """Covariance with what a tracker does to all of a recording alike."""
     floors = np.zeros(GLOBAL)
     floors[[READOUT, OFFSET]] = config.tracking_time_sigma
     floors[ROTATION:ROTATION + 3] = config.tracking_rotation_sigma
     floors[BIAS:BIAS + 3] = config.tracking_bias_sigma
     floors[~free] = 0.0
-    return covariance * np.outer(_SIGMA_FACTORS, _SIGMA_FACTORS) + np.diag(floors**2)
+    return covariance + np.diag(floors**2)
 
 
 def _excitation(data: _Input, bias: Array, R_cam_imu: Array,

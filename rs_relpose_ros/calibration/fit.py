@@ -20,14 +20,13 @@ from rs_relpose_ros.calibration.coplanarity import (
     READOUT,
     ROTATION,
 )
+from rs_relpose_ros.calibration.covariance import jackknife, stretches
 from rs_relpose_ros.calibration.gyro_path import GyroPath
 
 Array = NDArray[np.float64]
 
 # Distance [sigma] at which the Geman-McClure loss levels off.
 ROBUST = 3.0
-# Time over which errors of pairs are taken to be correlated [frames].
-LAGS = 15
 # Change of the camera's velocity while it takes half a frame, over the depth of the scene [1/s]:
 # 2 m/s^2 for 15 ms at 3 m. Over the parallax per second it is `bend`, within these limits.
 _BEND, _BEND_RANGE, BEND_AT_START = 0.01, (0.03, 0.5), 0.1
@@ -237,8 +236,8 @@ def fit(problem: Problem, state: State, free: NDArray[np.bool_], *, rounds: int 
     converged = False
     damping = 1e-3
     for _ in range(rounds):
-        state, damping, length = _step(problem, state, evaluation, free, prior, damping)
-        evaluation = evaluate(problem, state)
+        state, evaluation, damping, length = _step(
+            problem, state, evaluation, free, prior, damping)
         if length > _NEAR:
             continue
         # Noise is learned near the optimum only: far from it, residuals are no noise.
@@ -288,7 +287,7 @@ def _chosen(problem: Problem, moved: State, kept: State) -> tuple[State, float]:
 
 
 def _step(problem: Problem, state: State, evaluation: Evaluation, free: NDArray[np.bool_],
-          prior: Array, damping: float) -> tuple[State, float, float]:
+          prior: Array, damping: float) -> tuple[State, Evaluation, float, float]:
     """State after a step that lowers the cost, the damping, and Newton's step in sigma."""
     cost = evaluation.cost + _prior_cost(state, prior)
     H = (evaluation.reduced.sum(axis=0) + np.diag(prior))[np.ix_(free, free)]
@@ -299,11 +298,16 @@ def _step(problem: Problem, state: State, evaluation: Evaluation, free: NDArray[
         step = np.zeros(GLOBAL)
         step[free] = -np.linalg.solve(H + damping * np.diag(np.diag(H)), gradient)
         local = -evaluation.back[:, :, GLOBAL] - evaluation.back[:, :, :GLOBAL] @ step
-        tried, tried_cost = _chosen(problem, state.moved(step, local), state)
-        if tried_cost + _prior_cost(tried, prior) <= cost:
-            return tried, max(0.1 * damping, 1e-9), length
-        damping = max(10.0 * damping, 1e-3)
-    return state, damping, length
+        tried = state.moved(step, local)
+        result = evaluate(problem, tried)
+        if result.cost + _prior_cost(tried, prior) > cost:
+            tried, tried_cost = _chosen(problem, tried, state)
+            if tried_cost + _prior_cost(tried, prior) > cost:
+                damping = max(10.0 * damping, 1e-3)
+                continue
+            result = evaluate(problem, tried)
+        return tried, result, max(0.1 * damping, 1e-9), length
+    return state, evaluation, damping, length
 
 
 def _prior_cost(state: State, prior: Array) -> float:
@@ -311,7 +315,7 @@ def _prior_cost(state: State, prior: Array) -> float:
 
 
 def learned(problem: Problem, state: State, evaluation: Evaluation) -> Array:
-    """Noise (P,) of each pair that the residuals show [px]; shrinks by a half at most."""
+    """Noise (P,) of each pair that the residuals show [px]; a third of the last at least."""
     counts = np.diff(problem.begin)
     sizes = np.abs(evaluation.residuals)
     medians = np.array([np.median(sizes[begin:end]) for begin, end in itertools.pairwise(
@@ -320,7 +324,7 @@ def learned(problem: Problem, state: State, evaluation: Evaluation) -> Array:
     noise = 1.4826 * medians * np.sqrt(counts / np.maximum(counts - 3.0, 1.0))
     middle = max(float(np.median(noise)), _LEAST_NOISE)
     return np.maximum(np.clip(noise, _NOISE_RANGE[0] * middle, _NOISE_RANGE[1] * middle),
-                      0.5 * state.noise)
+                      state.noise / 3.0)
 
 
 def robust_weights(problem: Problem, state: State, evaluation: Evaluation) -> Array:
@@ -331,29 +335,11 @@ def robust_weights(problem: Problem, state: State, evaluation: Evaluation) -> Ar
 
 def _covariance(problem: Problem, state: State, evaluation: Evaluation, free: NDArray[np.bool_],
                 prior: Array) -> Array:
-    """Sandwich estimate: pairs that share frames, or nearly, have common errors.
-
-    So do pairs of the same span, where the camera's motion is not what the model says.
-    """
     weights = robust_weights(problem, state, evaluation)
-    level = np.sqrt(weights)
     # Curvature of the loss against the weight that Gauss-Newton takes for it.
-    bent = float((weights * (4.0 * level - 3.0)).sum() / weights.sum())
-    H = (bent * evaluation.reduced.sum(axis=0) + np.diag(prior))[np.ix_(free, free)]
-    frames = int(problem.first.max()) + 1
-    scores = np.zeros((frames, int(free.sum())))
-    np.add.at(scores, problem.first, evaluation.score[:, free])
-    meat = scores.T @ scores
-    for lag in range(1, min(LAGS, frames - 1) + 1):
-        product = scores[lag:].T @ scores[:-lag]
-        meat += (1.0 - lag / (LAGS + 1.0)) * (product + product.T)
-    # Pairs of different spans agree if the model is right; what they disagree is its error.
-    for span in np.unique(problem.second - problem.first):
-        total = evaluation.score[problem.second - problem.first == span][:, free].sum(axis=0)
-        meat += np.outer(total, total)
-    # What the prior knows counts as known.
-    meat += np.diag(prior)[np.ix_(free, free)]
-    inverse = np.linalg.pinv(H, hermitian=True)
+    bent = float((weights * (4.0 * np.sqrt(weights) - 3.0)).sum() / weights.sum())
     covariance = np.zeros((GLOBAL, GLOBAL))
-    covariance[np.ix_(free, free)] = inverse @ meat @ inverse
+    covariance[np.ix_(free, free)] = jackknife(
+        evaluation.score[:, free], bent * evaluation.reduced[:, free][:, :, free],
+        stretches(0.5 * (problem.times1 + problem.times2)), prior[free])
     return covariance

@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 # Guess of an unknown focal length, share of the longer side: 64 deg of view.
 _FOCAL_GUESS = 0.8
 # New corners are looked for when so many of the last ones are lost, or so many frames went by.
-_KEPT, _RENEWED_AFTER = 0.8, 10
+_KEPT, _RENEWED_AFTER = 0.8, 30
 
 # What KLT adds to the errors of a calibration, found on rendered bags: its errors are not
 # independent from frame to frame.
@@ -144,8 +144,10 @@ class _Reader:
             self._tracker.start(image)
             self._started = True
             self._size = image.shape[1], image.shape[0]
-        # Matches with the reference, which holds every point that is followed.
-        matches = self._tracker.track(image)
+        # Matches with the reference, which holds every point that is followed: aligned with it,
+        # their errors do not add up from frame to frame.
+        self._tracker.track(image)
+        matches = self._tracker.refined_matches()
         self._since_renewed += 1
         if (self._tracker.tracked_fraction < _KEPT or self._since_renewed >= _RENEWED_AFTER):
             self._tracker.promote()

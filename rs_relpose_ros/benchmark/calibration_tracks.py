@@ -3,39 +3,35 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-import itertools
 import math
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_ros.calibration.alignment import axis_maps
 from rs_relpose_ros.calibration.gyro_path import GyroSeries
 from rs_relpose_ros.calibration.tracks import Tracks
 from rs_relpose_ros.simulation.hand_held import hand_held, Plan
 from rs_relpose_ros.simulation.trajectory import Trajectory
 
+Array = NDArray[np.float64]
+
 START_NS = 1_700_000_000_000_000_000
 
 
-def axis_maps():
-    """Return the 24 rotations that map axes to axes."""
-    maps = []
-    for columns in itertools.permutations(range(3)):
-        for signs in itertools.product((1.0, -1.0), repeat=3):
-            matrix = np.zeros((3, 3))
-            matrix[range(3), columns] = signs
-            if np.linalg.det(matrix) > 0.0:
-                maps.append(matrix)
-    return maps
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """What a recording was made with; rotation as ``v_cam = R_cam_imu v_imu``."""
+    """What a recording was made with; rotation as ``v_cam = R_cam_imu v_imu``.
+
+    Times [s], noise of the pixels [px] and of the gyro [rad/s/sqrt(Hz)], bias [rad/s], speed
+    [m/s], rms of the rotation [rad/s].
+    """
 
     readout_time: float = 0.025          # negative: read upwards
     time_offset: float = 0.02            # t_imu = stamp + time_offset + row / height * readout
-    R_cam_imu: np.ndarray = field(default_factory=lambda: np.eye(3))
+    R_cam_imu: Array = field(default_factory=lambda: np.eye(3))
     gyro_bias: tuple[float, float, float] = (0.01, -0.02, 0.015)
     focal: float = 640.0
     width: int = 1280
@@ -53,12 +49,17 @@ class Truth:
     long_interval: float = 1.0           # intervals of the second half, relative to the first
 
 
-def drawn(rng: np.random.Generator, **given) -> Truth:
-    """Truth within the ranges that calibration must master."""
-    misalignment = Rotation.from_rotvec(np.radians(2.0) * rng.standard_normal(3) / math.sqrt(3.0))
-    values = {
+def drawn(rng: np.random.Generator, axis_map: int | None = None, **given: Any) -> Truth:
+    """Truth within the ranges that calibration must master.
+
+    `axis_map` is a number below 24, else drawn; `given` are fields of `Truth` that are not drawn.
+    """
+    axis = rng.standard_normal(3)
+    misalignment = Rotation.from_rotvec(math.radians(2.0) * axis / np.linalg.norm(axis))
+    number = rng.integers(24) if axis_map is None else axis_map
+    values: dict[str, Any] = {
         'readout_time': rng.uniform(0.008, 0.040), 'time_offset': rng.uniform(-0.08, 0.08),
-        'R_cam_imu': misalignment.as_matrix() @ axis_maps()[rng.integers(24)],
+        'R_cam_imu': misalignment.as_matrix() @ axis_maps()[number],
         'gyro_bias': tuple(rng.uniform(-0.05, 0.05, 3)), 'focal': rng.uniform(500.0, 1000.0),
         'gyro_rate': rng.choice([100.0, 200.0, 400.0]),
         'gyro_noise': 10.0 ** rng.uniform(-4.0, -3.4), 'speed': rng.uniform(0.3, 1.6),
@@ -69,8 +70,10 @@ def drawn(rng: np.random.Generator, **given) -> Truth:
     return Truth(**values)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Recorded:
+    """What `calibrate` takes, and what it should find."""
+
     tracks: Tracks
     gyro: GyroSeries
     truth: Truth
@@ -94,7 +97,8 @@ def record(truth: Truth, rng: np.random.Generator,
     return Recorded(Tracks(stamps, *frames), _gyro(truth, trajectory, end, rng), truth, trajectory)
 
 
-def _gyro(truth, trajectory, end, rng):
+def _gyro(truth: Truth, trajectory: Trajectory, end: float,
+          rng: np.random.Generator) -> GyroSeries:
     count = int((end + 0.5) * truth.gyro_rate)
     times = -0.5 + (np.arange(count) + rng.uniform()) / truth.gyro_rate
     rates = trajectory.states(times).angular_velocity @ truth.R_cam_imu
@@ -103,7 +107,7 @@ def _gyro(truth, trajectory, end, rng):
                       rates + np.array(truth.gyro_bias) + noise)
 
 
-def _world(rng, count=6000):
+def _world(rng: np.random.Generator, count: int = 4000) -> Array:
     """Points (N, 3) around the walk, 2.5 to 25 m away, on a floor, on walls and between them."""
     azimuth, elevation = rng.uniform(-1.9, 1.9, count), rng.uniform(-1.0, 0.9, count)
     distance = 2.5 * 10.0 ** rng.uniform(0.0, 1.0, count)
@@ -119,14 +123,14 @@ class _Path:
 
     step = 1e-3
 
-    def __init__(self, trajectory, begin, end):
+    def __init__(self, trajectory: Trajectory, begin: float, end: float) -> None:
         self.begin = begin
         times = begin + self.step * np.arange(math.ceil((end - begin) / self.step) + 1)
         self.positions, self.rotations = trajectory.poses(times)
         self.turns = Rotation.from_matrix(
             np.einsum('nji,njk->nik', self.rotations[:-1], self.rotations[1:])).as_rotvec()
 
-    def to_camera(self, points, times):
+    def to_camera(self, points: Array, times: Array) -> Array:
         """Points (N, 3) in the camera at their instants (N,)."""
         at = (times - self.begin) / self.step
         k = np.clip(at.astype(int), 0, len(self.turns) - 1)
@@ -136,7 +140,8 @@ class _Path:
         return turned - share * np.cross(self.turns[k], turned)  # of 1e-3 rad: exact to 1e-6
 
 
-def _frames(truth, trajectory, instants, world, rng):
+def _frames(truth: Truth, trajectory: Trajectory, instants: Array, world: Array,
+            rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     size = np.array([truth.width, truth.height])
     center = 0.5 * (size - 1.0)
     path = _Path(trajectory, instants[0] - 0.1, instants[-1] + 0.15)
@@ -145,7 +150,7 @@ def _frames(truth, trajectory, instants, world, rng):
     next_id, frame, track, pixels = 0, [], [], []
     for index, instant in enumerate(instants):
         rows = np.full(len(world), center[1])
-        for _ in range(4):
+        for _ in range(3):
             seen = path.to_camera(world, instant + rows / truth.height * truth.readout_time)
             depth = np.maximum(seen[:, 2:], 0.1)
             points = center + truth.focal * seen[:, :2] / depth
