@@ -10,7 +10,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.benchmark.calibration_tracks import drawn, record, Recorded, Truth
+from rs_relpose_ros.benchmark.calibration_tracks import (
+    about_one_axis,
+    drawn,
+    record,
+    Recorded,
+    Truth,
+)
 from rs_relpose_ros.calibration.alignment import axis_maps, nearest_axis_map
 from rs_relpose_ros.calibration.calibrate import calibrate
 from rs_relpose_ros.calibration.coplanarity import GLOBAL, LOCAL
@@ -22,7 +28,6 @@ from rs_relpose_ros.calibration.tracks import make_pairs, Tracks
 from rs_relpose_ros.camera import RollingShutterCamera
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.replay.parameter_file import read_parameters
-from rs_relpose_ros.simulation.trajectory import Trajectory
 
 SHORT = {'frames': 120}
 
@@ -148,19 +153,9 @@ def test_offset_that_follows_the_exposure_is_reported():
     assert slope.sigma < 0.15
 
 
-def about_one_axis(axis: int) -> Trajectory:
-    """Sways about one axis of the camera, and is carried sideways."""
-    times = -1.0 + 0.03 * np.arange(400)
-    positions = np.column_stack([0.3 * np.sin(times), 0.5 * np.cos(0.7 * times),
-                                 np.full(len(times), 1.6)])
-    angles = np.zeros((len(times), 3))
-    angles[:, axis] = 0.4 * np.sin(1.9 * times) + 0.1 * np.sin(5.0 * times)
-    return Trajectory(positions, angles, float(times[0]), 0.03, ())
-
-
 def test_rotation_about_one_axis_is_not_observable():
     rng = np.random.default_rng(15)
-    recorded = record(drawn(rng, readout_time=0.02, **SHORT), rng, about_one_axis(0))
+    recorded = record(drawn(rng, readout_time=0.02, **SHORT), rng, about_one_axis(0, 6.0))
     result = calibrate(recorded.tracks, recorded.gyro, camera_of(recorded.truth))
     assert not result.rotation.observable and not result.observable
     assert 'one axis only, nearly y (yaw)' in result.rotation.remark

@@ -70,6 +70,17 @@ def drawn(rng: np.random.Generator, axis_map: int | None = None, **given: Any) -
     return Truth(**values)
 
 
+def about_one_axis(axis: int, duration: float) -> Trajectory:
+    """Camera that sways about one axis (0 yaw, 1 pitch, 2 roll) and is carried sideways."""
+    spacing = 0.03
+    times = -1.0 + spacing * np.arange(math.ceil((duration + 2.0) / spacing))
+    positions = np.column_stack([0.3 * np.sin(times), 0.5 * np.cos(0.7 * times),
+                                 np.full(len(times), 1.6)])
+    angles = np.zeros((len(times), 3))
+    angles[:, axis] = 0.4 * np.sin(1.9 * times) + 0.1 * np.sin(5.0 * times)
+    return Trajectory(positions, angles, float(times[0]), spacing, ())
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Recorded:
     """What `calibrate` takes, and what it should find."""

@@ -174,8 +174,11 @@ def _prepared(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera) ->
     times, gyro_times = tracks.seconds(origin_ns), gyro.seconds(origin_ns)
     intervals = np.diff(times)
     to_next = np.append(intervals, intervals[-1])
+    longer = to_next - np.median(intervals)
+    # Where frames are lost, the interval tells nothing of the exposure.
+    longer[longer > 0.5 * np.median(intervals)] = 0.0
     gaps = np.diff(gyro_times)
-    return _Input(tracks, camera, times, to_next - np.median(intervals), gyro_times,
+    return _Input(tracks, camera, times, longer, gyro_times,
                   gyro.rates, gaps, noise_density(gyro_times, gyro.rates))
 
 
@@ -214,9 +217,7 @@ def _check_recording(data: _Input, config: CalibrationConfig) -> None:
 
 
 def _intervals_vary(data: _Input) -> bool:
-    # A lost frame is no exposure: intervals that differ by less than that count.
-    usual = data.covariates[data.covariates < 0.5 * data.interval]
-    low, high = np.quantile(usual, (0.1, 0.9))
+    low, high = np.quantile(data.covariates, (0.1, 0.9))
     return bool(high - low > _VARYING * data.interval)
 
 

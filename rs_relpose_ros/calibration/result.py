@@ -123,8 +123,6 @@ class CalibrationResult:
         1 ms of zero, and known to a millisecond.
         """
         value, sigma = abs(self.readout_time.value), self.readout_time.sigma
-        if not self.readout_time.observable:
-            return 'unsure'
         if value > max(5.0 * sigma, 1e-3):
             return 'rolling'
         return 'global' if sigma < 1e-3 and value < max(3.0 * sigma, 1e-3) else 'unsure'
