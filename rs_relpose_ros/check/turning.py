@@ -233,7 +233,7 @@ def _fit(images: Array, gyro: Array) -> _Fit:
         image_mean = np.average(images, axis=0, weights=weights)
         gyro_mean = np.average(gyro, axis=0, weights=weights)
         a, b = images - image_mean, gyro - gyro_mean
-        R = aligning_rotation(weights[:, None] * a, b)
+        R = aligning_rotation((weights[:, None] * a).T @ b)
         errors = np.linalg.norm(a - b @ R.T, axis=1)
         weights = 1.0 / (1.0 + (errors / max(1.5 * float(np.median(errors)), 1e-9))**2)
     power = float(weights @ (a**2).sum(axis=1))
@@ -276,7 +276,7 @@ def _rotation(rays1: Array, rays2: Array) -> Array:
     weights = np.ones(len(rays1))
     R = np.eye(3)
     for _ in range(_ROUNDS):
-        R = aligning_rotation(weights[:, None] * rays1, rays2)
+        R = aligning_rotation((weights[:, None] * rays1).T @ rays2)
         errors = np.linalg.norm(rays1 - rays2 @ R.T, axis=1)
         weights = 1.0 / (1.0 + (errors / max(1.5 * float(np.median(errors)), 1e-6))**2)
     return np.asarray(Rotation.from_matrix(R).as_rotvec())

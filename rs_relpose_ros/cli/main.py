@@ -19,6 +19,7 @@ PROGRAM = 'rs_relpose'
 COMMANDS: Mapping[str, str] = {
     'benchmark': 'measure accuracy and speed of the estimator: tables and plots',
     'check': 'look through a bag for what would spoil the poses, with remedies',
+    'calibrate': 'read-out time, time offset, axes and gyro bias from a bag, without a target',
     'convert': 'turn a public recording into a rosbag2 bag and its parameter file',
     'evaluate': 'run the experiments of the paper: tables and box plots',
     'replay': 'estimate relative poses from a bag: CSV, summary and pictures',

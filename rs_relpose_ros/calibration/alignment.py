@@ -1,0 +1,177 @@
+"""Clock offset, axes and focal length from nothing: rotation that is seen against the gyro's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.calibration.tracks import Pairs
+
+Array = NDArray[np.float64]
+
+_ROUNDS = 12
+# Residual [rad] below which a ray always counts in full.
+_LEAST_SCALE = 2e-4
+# Weaker second axis of the common rotation than this share of the first: only axis maps are tried.
+_ONE_AXIS = 0.05
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """A coarse calibration.
+
+    Attributes
+    ----------
+    offset : float
+        Of the middle row [s]: ``t_imu = stamp + offset``.
+    R_cam_imu : (3, 3) ndarray
+    bias : (3,) ndarray
+        IMU frame [rad/s].
+    focal_factor : float
+    misfit : float
+        Share of the rotation's variance that the two do not have in common.
+    """
+
+    offset: float
+    R_cam_imu: Array
+    bias: Array
+    focal_factor: float
+    misfit: float
+
+
+@cache
+def axis_maps() -> Array:
+    """All 24 rotations (24, 3, 3) that map axes to axes."""
+    maps = []
+    for columns in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            matrix = np.zeros((3, 3))
+            matrix[range(3), columns] = signs
+            if np.linalg.det(matrix) > 0.0:
+                maps.append(matrix)
+    all_maps = np.array(maps)
+    all_maps.setflags(write=False)      # one copy serves everybody
+    return all_maps
+
+
+def nearest_axis_map(R: Array) -> Array:
+    """The axis map (3, 3) nearest to a rotation."""
+    maps = axis_maps()
+    return np.array(maps[int(np.argmax(np.einsum('kij,ij->k', maps, R)))])
+
+
+def seen_rates(pairs: Pairs, points1: Array, points2: Array, intervals: Array) -> Array:
+    """Angular velocity (P, 3) [rad/s], camera frame, that turns the rays of each pair.
+
+    Translation is left out: a robust fit follows the far points, and what remains averages out.
+
+    Parameters
+    ----------
+    pairs : Pairs
+    points1, points2 : (N, 2) ndarray
+        Normalised.
+    intervals : (P,) ndarray
+        [s].
+    """
+    rays1, rays2 = _unit(points1), _unit(points2)
+    rates = np.empty((len(pairs), 3))
+    for p, (begin, end) in enumerate(itertools.pairwise(pairs.begin)):
+        rates[p] = _turn(rays1[begin:end], rays2[begin:end]) / intervals[p]
+    return rates
+
+
+def _unit(points: Array) -> Array:
+    rays = np.column_stack([points, np.ones(len(points))])
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+def _turn(rays1: Array, rays2: Array) -> Array:
+    """Rotation vector a with ``m_1 = m_2 + a x m_2``, by reweighted least squares (Cauchy)."""
+    difference = rays1 - rays2
+    # a x m = -[m]x a; normal equations (m^T m - m m^T) a = m x d.
+    moments = np.eye(3) - rays2[:, :, None] * rays2[:, None, :]
+    sides = np.cross(rays2, difference)
+    weights = np.ones(len(rays1))
+    turn = np.zeros(3)
+    for _ in range(_ROUNDS):
+        turn = np.linalg.solve(np.einsum('n,nij->ij', weights, moments) + 1e-12 * np.eye(3),
+                               weights @ sides)
+        lengths = np.linalg.norm(difference - np.cross(turn, rays2), axis=1)
+        scale = max(1.5 * float(np.median(lengths)), _LEAST_SCALE)
+        weights = 1.0 / (1.0 + (lengths / scale) ** 2)
+    return turn
+
+
+def find_starts(rates: Array, begins: Array, ends: Array, gyro_times: Array, gyro_rates: Array, *,
+                max_offset: float, step: float, focal_factors: Array, count: int) -> list[Start]:
+    """Offsets at which the gyro, turned, agrees best with what was seen; best first.
+
+    Parameters
+    ----------
+    rates : (P, 3) ndarray
+        Seen between `begins` and `ends` (P,) on the camera clock [s].
+    gyro_times, gyro_rates : (K,), (K, 3) ndarray
+    max_offset, step : float
+        Offsets searched [s].
+    focal_factors : (F,) ndarray
+        Factors of the assumed focal length that are tried.
+    count : int
+        At most so many starts, of different offsets.
+    """
+    steps = np.diff(gyro_times)[:, None]
+    turned = np.concatenate([
+        np.zeros((1, 3)), np.cumsum(0.5 * steps * (gyro_rates[1:] + gyro_rates[:-1]), axis=0)])
+    starts: list[Start] = []
+    for offset in np.arange(-max_offset, max_offset + 0.5 * step, step):
+        inside = ((begins + offset >= gyro_times[0]) & (ends + offset <= gyro_times[-1]))
+        # An offset at which the gyro misses most frames cannot be judged.
+        if inside.sum() < max(10, 0.5 * len(rates)):
+            continue
+        measured = np.stack([
+            np.interp(ends[inside] + offset, gyro_times, turned[:, i])
+            - np.interp(begins[inside] + offset, gyro_times, turned[:, i]) for i in range(3)],
+            axis=1) / (ends - begins)[inside, None]
+        starts.append(min((_aligned(rates[inside] * [1.0 / factor, 1.0 / factor, 1.0], measured,
+                                    float(offset), float(factor)) for factor in focal_factors),
+                          key=lambda start: start.misfit))
+    return _best_apart(starts, count, 4.0 * step)
+
+
+def _aligned(seen: Array, measured: Array, offset: float, focal_factor: float) -> Start:
+    kept = np.ones(len(seen), dtype=bool)
+    R, bias, misfit = np.eye(3), np.zeros(3), 1.0
+    for _ in range(3):
+        a, b = seen[kept], measured[kept]
+        mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
+        R = _rotation_onto(a - mean_a, b - mean_b)
+        residual = (seen - mean_a) - (measured - mean_b) @ R.T
+        squares = (residual**2).sum(axis=1)
+        total = ((a - mean_a) ** 2).sum() + ((b - mean_b) ** 2).sum()
+        misfit = float(squares[kept].sum() / max(total, 1e-12))
+        bias = mean_b - R.T @ mean_a
+        kept = squares <= 9.0 * max(float(np.median(squares)), 1e-10)
+    # A translation to one side looks like a bias; none of a gyro is large.
+    return Start(offset, R, np.clip(bias, -0.1, 0.1), focal_factor, misfit)
+
+
+def _rotation_onto(seen: Array, measured: Array) -> Array:
+    """Rotation R with ``seen = R measured`` (Kabsch), or the best axis map about a single axis."""
+    C = seen.T @ measured
+    u, s, vt = np.linalg.svd(C)
+    if s[1] < _ONE_AXIS * s[0]:
+        return nearest_axis_map(C)
+    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
+
+
+def _best_apart(starts: list[Start], count: int, apart: float) -> list[Start]:
+    chosen: list[Start] = []
+    for start in sorted(starts, key=lambda start: start.misfit):
+        if all(abs(start.offset - other.offset) >= apart for other in chosen):
+            chosen.append(start)
+        if len(chosen) == count:
+            break
+    return chosen

@@ -1,0 +1,128 @@
+"""What a calibration found, how sure it is, and what to record where it is not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+AXES = ('x (pitch)', 'y (yaw)', 'z (roll)')
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A figure with its 1 sigma, in the unit of the field; `remark` says why it is not observable.
+
+    A figure that is not observable keeps its value, which means nothing then.
+    """
+
+    value: float
+    sigma: float
+    observable: bool
+    remark: str = ''
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CostCurve:
+    """Cost of the whole fit over the read-out time, everything else fitted anew.
+
+    Attributes
+    ----------
+    readout_times : (K,) ndarray
+        Signed [s]: negative is read upwards.
+    costs : (K,) ndarray
+        Minus the log-likelihood above that of the best; thinned out to independent pairs.
+    """
+
+    readout_times: Array
+    costs: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationResult:
+    """Calibration of a rolling-shutter camera against a gyro.
+
+    ``t_imu(row v) = stamp + time_offset + v / height * readout_time``: a negative read-out time is
+    read upwards, with `time_offset` still that of row 0.
+
+    Attributes
+    ----------
+    readout_time : Estimate
+        Signed [s].
+    time_offset : Estimate
+        Of row 0 [s], at the median interval between frames.
+    R_cam_imu : (3, 3) ndarray
+        ``v_cam = R_cam_imu v_imu``.
+    rotation_sigma : (3,) ndarray
+        1 sigma about the camera's axes [rad].
+    rotation : Estimate
+        Angle to `axis_map` [rad]; its sigma is the largest of `rotation_sigma`.
+    axis_map : (3, 3) ndarray
+        The rotation between axes that is nearest.
+    gyro_bias : tuple of Estimate
+        IMU frame [rad/s].
+    focal_factor : Estimate or None
+        True focal length over the one that was assumed; None where it was given.
+    offset_by_interval : Estimate or None
+        How much the offset changes by the interval to the next frame [s/s]; None where all
+        intervals are alike.
+    rotation_rates : (3,) ndarray
+        Root mean square of the angular velocity about the camera's axes, mean removed [rad/s].
+    curve : CostCurve
+    pixel_sigma : float
+        Of a match, as seen [px].
+    inlier_ratio : float
+    frames, pairs, matches : int
+    frame_interval : float
+        Median [s].
+    warnings : tuple of str
+    """
+
+    readout_time: Estimate
+    time_offset: Estimate
+    R_cam_imu: Array
+    rotation_sigma: Array
+    rotation: Estimate
+    axis_map: Array
+    gyro_bias: tuple[Estimate, Estimate, Estimate]
+    focal_factor: Estimate | None
+    offset_by_interval: Estimate | None
+    rotation_rates: Array
+    curve: CostCurve
+    pixel_sigma: float
+    inlier_ratio: float
+    frames: int
+    pairs: int
+    matches: int
+    frame_interval: float
+    warnings: tuple[str, ...] = field(default=())
+
+    @property
+    def observable(self) -> bool:
+        """Whether all that a node needs could be told."""
+        parts = [self.readout_time, self.time_offset, self.rotation, *self.gyro_bias]
+        if self.focal_factor is not None:
+            parts.append(self.focal_factor)
+        return all(part.observable for part in parts)
+
+    @property
+    def quat_cam_imu_xyzw(self) -> tuple[float, float, float, float]:
+        """`R_cam_imu` as the node takes it."""
+        x, y, z, w = (float(v) for v in Rotation.from_matrix(self.R_cam_imu).as_quat())
+        return x, y, z, w
+
+    @property
+    def shutter(self) -> str:
+        """'rolling', 'global' or 'unsure'.
+
+        Rolling: the read-out time is 5 sigma and 1 ms from zero; global: it is within 3 sigma or
+        1 ms of zero, and known to a millisecond.
+        """
+        value, sigma = abs(self.readout_time.value), self.readout_time.sigma
+        if value > max(5.0 * sigma, 1e-3):
+            return 'rolling'
+        return 'global' if sigma < 1e-3 and value < max(3.0 * sigma, 1e-3) else 'unsure'

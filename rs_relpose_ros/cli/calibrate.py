@@ -1,0 +1,85 @@
+"""``rs_relpose calibrate``: read-out time, clock offset, axes and bias from a bag."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+import json
+import logging
+from pathlib import Path
+import sys
+
+from tqdm import tqdm
+
+from rs_relpose_ros.bags.reader import COMPRESSED_IMAGE, open_bag, TopicOptions
+from rs_relpose_ros.calibration.calibrate import calibrate, CalibrationConfig
+from rs_relpose_ros.calibration.recording import read_recording, TRACKED_IN_IMAGES
+from rs_relpose_ros.calibration.report import as_mapping, draw_curve, parameter_file, report
+from rs_relpose_ros.tracking.config import TrackingConfig
+
+HELP = (
+    'Calibrate a rolling-shutter camera against its IMU from a bag (rosbag2 or ROS 1) alone, '
+    'without a target: read-out time, camera-IMU time offset, rotation IMU to camera, gyro bias, '
+    'and the focal length where the CameraInfo has none (k[0] = 0). Record 10 s or more of a '
+    'textured scene that stands still, with a short exposure, while you turn the camera about all '
+    'three axes, 20 to 60 deg/s. Writes calibration.yaml (parameters of relpose_node), '
+    'calibration.json and cost_over_readout.png. Exit code 1: something is not observable in this '
+    'recording; it says what to record instead.')
+
+_NOT_OBSERVABLE = 1
+
+_logger = logging.getLogger(__name__)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument('bag', metavar='BAG', type=Path,
+                        help='rosbag2 directory, or a .mcap, .db3 or ROS 1 .bag file')
+    parser.add_argument('--out', metavar='DIR', type=Path,
+                        help='directory of the results (default: BAGNAME_calibration in the '
+                        'current one); those of an earlier run are replaced')
+    parser.add_argument('--rows', metavar=('FIRST', 'LAST'), type=float, nargs=2,
+                        default=(0.0, 0.0), help='use only these image rows, such as those above '
+                        'a dashboard that moves with the camera')
+    parser.add_argument('--max-offset', metavar='S', type=float,
+                        default=CalibrationConfig().max_time_offset,
+                        help='largest clock offset that is searched for [s] (default: '
+                        '%(default)s)')
+    topics = parser.add_argument_group('topics')
+    for role, what in (('image', 'Image or CompressedImage'), ('camera-info', 'CameraInfo'),
+                       ('imu', 'Imu')):
+        topics.add_argument(f'--{role}-topic', metavar='TOPIC', default='', help=what)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Calibrate; 1 when something could not be told."""
+    options = TopicOptions(image=args.image_topic, camera_info=args.camera_info_topic,
+                           imu=args.imu_topic)
+    tracking = TrackingConfig(feature_rows=tuple(args.rows))
+    config = replace(TRACKED_IN_IMAGES, max_time_offset=args.max_offset)
+    name = args.bag.resolve().stem if args.bag.is_file() else args.bag.resolve().name
+    folder: Path = args.out if args.out is not None else Path(f'{name}_calibration')
+    quiet = not sys.stderr.isatty()
+    with open_bag(args.bag) as bag:
+        topics = bag.find_topics(options)
+        with tqdm(total=topics.image.count, unit='image', desc='tracking', leave=False,
+                  disable=quiet) as bar:
+            recording = read_recording(bag, topics, tracking, on_image=bar.update)
+    for reason, count in recording.unused.items():
+        _logger.warning('not used, %d times: %s', count, reason)
+    with tqdm(total=100, unit='%', desc='fitting', leave=False, disable=quiet) as bar:
+        result = calibrate(recording.tracks, recording.gyro, recording.camera,
+                           focal_known=recording.focal_known, config=config,
+                           progress=lambda share: bar.update(round(100 * share) - bar.n))
+    folder.mkdir(parents=True, exist_ok=True)
+    text = parameter_file(
+        result, f'Parameters of relpose_node from `rs_relpose calibrate {args.bag.name}`.',
+        compressed=topics.image.msgtype == COMPRESSED_IMAGE, feature_rows=tuple(args.rows))
+    (folder / 'calibration.yaml').write_text(text, encoding='utf-8')
+    (folder / 'calibration.json').write_text(
+        json.dumps(as_mapping(result, recording.camera), indent=1) + '\n', encoding='utf-8')
+    draw_curve(result, folder / 'cost_over_readout.png')
+    for line in report(result, recording.camera):
+        print(line)
+    print(f'in {folder}: calibration.yaml, calibration.json, cost_over_readout.png')
+    return 0 if result.observable else _NOT_OBSERVABLE

@@ -1,0 +1,315 @@
+"""Calibration on simulated tracks: figures, sigmas, verdicts and refusals."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import lru_cache
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_ros.benchmark.calibration_tracks import (
+    about_one_axis,
+    drawn,
+    record,
+    Recorded,
+    Truth,
+)
+from rs_relpose_ros.calibration.alignment import axis_maps, nearest_axis_map
+from rs_relpose_ros.calibration.calibrate import calibrate
+from rs_relpose_ros.calibration.coplanarity import GLOBAL, LOCAL
+from rs_relpose_ros.calibration.fit import evaluate, Problem, redirected, State
+from rs_relpose_ros.calibration.gyro_path import GyroPath, GyroSeries
+from rs_relpose_ros.calibration.report import parameter_file
+from rs_relpose_ros.calibration.result import CalibrationResult
+from rs_relpose_ros.calibration.tracks import make_pairs, Tracks
+from rs_relpose_ros.camera import RollingShutterCamera
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.replay.parameter_file import read_parameters
+
+SHORT = {'frames': 120}
+
+
+def camera_of(truth: Truth, focal: float | None = None) -> RollingShutterCamera:
+    f = truth.focal if focal is None else focal
+    return RollingShutterCamera(
+        width=truth.width, height=truth.height, fx=f, fy=f, cx=0.5 * (truth.width - 1),
+        cy=0.5 * (truth.height - 1), readout_time=0.0)
+
+
+@lru_cache(maxsize=1)
+def usual() -> tuple[Recorded, CalibrationResult]:
+    rng = np.random.default_rng(11)
+    recorded = record(drawn(rng, readout_time=0.022, **SHORT), rng)
+    return recorded, calibrate(recorded.tracks, recorded.gyro, camera_of(recorded.truth))
+
+
+def rotation_error(result: CalibrationResult, truth: Truth) -> float:
+    return math.degrees(Rotation.from_matrix(result.R_cam_imu @ truth.R_cam_imu.T).magnitude())
+
+
+def assert_right(result: CalibrationResult, truth: Truth) -> None:
+    """Within the issue's limits for 300 frames, twice as wide for the shorter ones here."""
+    assert abs(result.readout_time.value - truth.readout_time) < 1e-3
+    assert abs(result.time_offset.value - truth.time_offset) < 2e-3
+    assert rotation_error(result, truth) < 0.6
+    biases = [bias.value for bias in result.gyro_bias]
+    np.testing.assert_allclose(biases, truth.gyro_bias, atol=5e-3)
+
+
+def test_usual_recording_is_calibrated_from_nothing():
+    recorded, result = usual()
+    assert_right(result, recorded.truth)
+    assert result.observable
+    assert result.shutter == 'rolling'
+    np.testing.assert_array_equal(result.axis_map, np.rint(recorded.truth.R_cam_imu))
+    assert result.focal_factor is None and result.offset_by_interval is None
+
+
+def test_sigmas_are_of_the_size_of_the_errors():
+    recorded, result = usual()
+    truth = recorded.truth
+    z = [(result.readout_time.value - truth.readout_time) / result.readout_time.sigma,
+         (result.time_offset.value - truth.time_offset) / result.time_offset.sigma,
+         *((bias.value - true) / bias.sigma
+           for bias, true in zip(result.gyro_bias, truth.gyro_bias, strict=True))]
+    assert np.abs(z).max() < 4.5
+    assert np.abs(z).max() > 0.1     # neither claimed ten times too large
+
+
+def test_cost_curve_has_its_minimum_at_the_read_out_time():
+    recorded, result = usual()
+    curve = result.curve
+    best = curve.readout_times[np.argmin(curve.costs)]
+    assert best == pytest.approx(recorded.truth.readout_time, abs=4e-3)
+    assert curve.costs[np.argmin(np.abs(curve.readout_times))] > 20.0
+
+
+def test_parameter_file_is_the_nodes(tmp_path):
+    _, result = usual()
+    path = tmp_path / 'calibration.yaml'
+    path.write_text(parameter_file(result, 'A test.', compressed=True))
+    sensor = read_parameters(path).sensor
+    assert sensor.readout_time == pytest.approx(result.readout_time.value, abs=1e-6)
+    assert sensor.time_offset == pytest.approx(result.time_offset.value, abs=1e-6)
+    assert sensor.readout_direction == 'down'
+    assert sensor.stamp_row == 'first'
+    np.testing.assert_allclose(sensor.R_cam_imu, result.R_cam_imu, atol=1e-6)
+
+
+def test_camera_read_upwards_with_unknown_focal_length():
+    rng = np.random.default_rng(12)
+    truth = drawn(rng, readout_time=0.02, focal=900.0, **SHORT)
+    truth = dataclasses.replace(truth, readout_time=-0.02)
+    recorded = record(truth, rng)
+    guess = 0.8 * truth.width
+    result = calibrate(recorded.tracks, recorded.gyro, camera_of(truth, guess), focal_known=False)
+    assert_right(result, truth)
+    assert result.focal_factor.value * guess == pytest.approx(900.0, rel=0.02)
+    assert 'readout_direction: "up"' in parameter_file(result, 'A test.', compressed=False)
+
+
+def test_slow_camera_is_not_confidently_wrong():
+    rng = np.random.default_rng(17)
+    truth = drawn(rng, readout_time=0.02, speed=0.2, rotation_rate=math.radians(6.0),
+                  pixel_noise=0.4, gyro_bias=(0.004, -0.003, 0.002), **SHORT)
+    recorded = record(truth, rng)
+    result = calibrate(recorded.tracks, recorded.gyro, camera_of(truth))
+    readout = result.readout_time
+    assert abs(readout.value - truth.readout_time) < 4.0 * readout.sigma
+    # A fifth of the rotation tells a fifth as much.
+    assert readout.sigma > 3.0 * usual()[1].readout_time.sigma
+
+
+def test_noise_does_not_make_the_read_out_time_longer():
+    """Freedom that grows with the read-out time would."""
+    rng = np.random.default_rng(18)
+    truth = drawn(rng, readout_time=0.02, pixel_noise=1.0, outliers=0.25, **SHORT)
+    recorded = record(truth, rng)
+    result = calibrate(recorded.tracks, recorded.gyro, camera_of(truth))
+    assert result.readout_time.value == pytest.approx(0.02, abs=1.5e-3)
+
+
+def test_global_shutter_is_told():
+    rng = np.random.default_rng(13)
+    recorded = record(drawn(rng, readout_time=0.0, fps=30.0, **SHORT), rng)
+    result = calibrate(recorded.tracks, recorded.gyro, camera_of(recorded.truth))
+    assert abs(result.readout_time.value) < 1e-3
+    assert result.shutter == 'global'
+    assert 'readout_time: 0.0' in parameter_file(result, 'A test.', compressed=False)
+
+
+def test_offset_that_follows_the_exposure_is_reported():
+    rng = np.random.default_rng(14)
+    truth = drawn(rng, readout_time=0.02, fps=30.0, exposure_slope=-0.5, long_interval=1.2,
+                  frames=160)
+    recorded = record(truth, rng)
+    result = calibrate(recorded.tracks, recorded.gyro, camera_of(truth))
+    slope = result.offset_by_interval
+    assert slope is not None
+    assert slope.value == pytest.approx(-0.5, abs=max(4.5 * slope.sigma, 0.05))
+    assert slope.sigma < 0.15
+
+
+def test_rotation_about_one_axis_is_not_observable():
+    rng = np.random.default_rng(15)
+    recorded = record(drawn(rng, readout_time=0.02, **SHORT), rng, about_one_axis(0, 6.0))
+    result = calibrate(recorded.tracks, recorded.gyro, camera_of(recorded.truth))
+    assert not result.rotation.observable and not result.observable
+    assert 'one axis only, nearly y (yaw)' in result.rotation.remark
+    assert 'x (pitch)' in result.rotation.remark.partition('turn about')[2]
+    assert 'left out: quat_cam_imu_xyzw' in ' '.join(
+        parameter_file(result, 'A test.', compressed=False).replace('\n# ', ' ').split())
+
+
+def few_frames(recorded: Recorded, count: int) -> Tracks:
+    tracks = recorded.tracks
+    kept = tracks.frames < count
+    return Tracks(tracks.stamps_ns[:count], tracks.frames[kept], tracks.ids[kept],
+                  tracks.points[kept])
+
+
+def test_too_short_a_recording_is_refused():
+    recorded, _ = usual()
+    with pytest.raises(InputError, match=r'too short: 10 frames.*Record 10 s or more'):
+        calibrate(few_frames(recorded, 10), recorded.gyro, camera_of(recorded.truth))
+
+
+def test_camera_at_rest_is_refused():
+    recorded, _ = usual()
+    rng = np.random.default_rng(0)
+    still = GyroSeries(recorded.gyro.stamps_ns, 1e-3 * rng.standard_normal(
+        recorded.gyro.rates.shape) + 0.05)
+    with pytest.raises(InputError, match=r'hardly turns.*all three axes'):
+        calibrate(recorded.tracks, still, camera_of(recorded.truth))
+
+
+def test_scene_without_texture_is_refused():
+    tracks = usual()[0].tracks
+    kept = tracks.ids % 30 == 0
+    bare = Tracks(tracks.stamps_ns, tracks.frames[kept], tracks.ids[kept], tracks.points[kept])
+    with pytest.raises(InputError, match=r'too little to follow.*texture'):
+        calibrate(bare, usual()[0].gyro, camera_of(usual()[0].truth))
+
+
+def test_points_that_cannot_be_followed_are_refused():
+    tracks = usual()[0].tracks
+    torn = Tracks(tracks.stamps_ns, tracks.frames, np.arange(len(tracks.ids)), tracks.points)
+    with pytest.raises(InputError, match=r'blurred.*short exposure'):
+        calibrate(torn, usual()[0].gyro, camera_of(usual()[0].truth))
+
+
+def test_gyro_of_another_time_is_refused():
+    recorded, _ = usual()
+    later = GyroSeries(recorded.gyro.stamps_ns + 3_600_000_000_000, recorded.gyro.rates)
+    with pytest.raises(InputError, match=r'the gyro covers 0.0 s'):
+        calibrate(recorded.tracks, later, camera_of(recorded.truth))
+
+
+def test_readout_longer_than_the_interval_is_refused():
+    rng = np.random.default_rng(16)
+    # No camera can do this: the simulation can.
+    truth = dataclasses.replace(drawn(rng, readout_time=0.03, fps=30.0, **SHORT),
+                                readout_time=0.045)
+    recorded = record(truth, rng)
+    with pytest.raises(InputError, match='longer than the interval'):
+        calibrate(recorded.tracks, recorded.gyro, camera_of(truth))
+
+
+# -- parts ------------------------------------------------------------------------------------
+
+
+def test_every_axis_map_is_recognised():
+    maps = axis_maps()
+    assert len({m.tobytes() for m in maps}) == 24
+    np.testing.assert_allclose(np.linalg.det(maps), 1.0)
+    tilt = Rotation.from_rotvec([0.1, -0.2, 0.15]).as_matrix()
+    for matrix in maps:
+        np.testing.assert_array_equal(nearest_axis_map(tilt @ matrix), matrix)
+
+
+def test_gyro_path_is_the_rotation_of_an_even_turn():
+    times = np.linspace(0.0, 2.0, 41)
+    path = GyroPath.integrated(times, np.tile([0.3, -0.4, 0.5], (41, 1)), [0.1, 0.0, 0.0])
+    at = np.array([0.0, 0.333, 1.7])
+    expected = Rotation.from_rotvec(at[:, None] * [0.2, -0.4, 0.5]).as_matrix()
+    np.testing.assert_allclose(path.at(at), expected, atol=1e-9)
+
+
+@lru_cache(maxsize=1)
+def few_pairs() -> tuple[Problem, State, Truth]:
+    """Pairs, and a state a little off the truth."""
+    rng = np.random.default_rng(1)
+    recorded = record(drawn(rng, frames=10, outliers=0.0), rng)
+    truth, tracks = recorded.truth, recorded.tracks
+    pairs = make_pairs(tracks, (2,), max_matches=60, min_matches=20, max_interval=0.1, rng=rng)
+    origin = int(tracks.stamps_ns[0])
+    times, middle = tracks.seconds(origin), 0.5 * (truth.height - 1)
+    center = 0.5 * np.array([truth.width - 1, truth.height - 1])
+    by_pixel = np.tile(np.eye(2) / truth.focal, (len(pairs.points1), 1, 1))
+    problem = Problem(
+        recorded.gyro.seconds(origin), recorded.gyro.rates, pairs.begin,
+        np.searchsorted(recorded.gyro.seconds(origin), times[pairs.first] + 0.05), pairs.first,
+        pairs.second, times[pairs.first], times[pairs.second], 0.01 * np.arange(len(pairs)),
+        0.02 * np.arange(len(pairs)), (pairs.points1 - center) / truth.focal,
+        (pairs.points2 - center) / truth.focal, (pairs.points1[:, 1] - middle) / truth.height,
+        (pairs.points2[:, 1] - middle) / truth.height, by_pixel, by_pixel,
+        truth.gyro_noise, np.full(len(pairs), 0.1))
+    state = State.start(problem, truth.R_cam_imu.T, truth.time_offset
+                        + middle / truth.height * truth.readout_time + 1e-3,
+                        truth.readout_time + 2e-3, np.array(truth.gyro_bias), 0.01, noise=1.0)
+    return problem, state, truth
+
+
+def test_gradient_is_that_of_finite_differences():
+    problem, state, _ = few_pairs()
+    # At the optimum of the pairs' own unknowns the total derivative is the partial one.
+    still = np.zeros(GLOBAL)
+    for _ in range(40):
+        state = state.moved(still, -0.5 * evaluate(problem, state).back[:, :, GLOBAL])
+    analytic = evaluate(problem, state).score.sum(axis=0)
+
+    def cost(step: np.ndarray) -> float:
+        moved = state.moved(step, np.zeros((problem.pairs, LOCAL)))
+        return evaluate(problem, moved, derivatives=False).cost
+
+    h = 1e-6
+    numeric = np.array([(cost(h * unit) - cost(-h * unit)) / (2 * h) for unit in np.eye(GLOBAL)])
+    np.testing.assert_allclose(analytic, numeric, rtol=2e-3, atol=1e-4 * np.abs(numeric).max())
+
+
+def test_residual_is_the_distance_in_pixels_to_the_nearest_pair_that_fits():
+    problem, state, truth = few_pairs()
+    residuals = evaluate(problem, state, derivatives=False).residuals
+    # Moved against its gradient by the residual, a match of two ends fits: first order in 0.3 px.
+    h, n = 1e-4, 17
+    gradient = np.zeros(4)
+    for k in range(4):
+        points = [problem.points1.copy(), problem.points2.copy()]
+        points[k // 2][n, k % 2] += h / truth.focal
+        moved = dataclasses.replace(problem, points1=points[0], points2=points[1])
+        change = evaluate(moved, state, derivatives=False).residuals[n] - residuals[n]
+        gradient[k] = change / h
+    assert np.linalg.norm(gradient) == pytest.approx(1.0, abs=0.01)
+
+
+def test_direction_is_that_of_the_walk():
+    problem, state, _ = few_pairs()
+    # From directions at right angles to the best ones, the search comes back to them.
+    lost = dataclasses.replace(state, direction=np.tile([0.0, 0.0, 1.0], (problem.pairs, 1)))
+    found = redirected(problem, lost).direction
+    assert np.abs((found * state.direction).sum(axis=1)).min() > 0.99
+    assert evaluate(problem, redirected(problem, lost)).cost < evaluate(problem, lost).cost
+
+
+def test_pairs_have_the_tracks_points_in_common():
+    tracks = Tracks([0, 10, 20, 30], [0, 0, 1, 1, 1, 3, 3], [5, 6, 6, 5, 7, 7, 6],
+                    np.arange(14.0).reshape(7, 2))
+    pairs = make_pairs(tracks, (1, 2), max_matches=9, min_matches=1, max_interval=1.0,
+                       rng=np.random.default_rng(0))
+    assert list(zip(pairs.first, pairs.second, strict=True)) == [(0, 1), (1, 3)]
+    np.testing.assert_array_equal(pairs.begin, [0, 2, 4])
+    np.testing.assert_array_equal(pairs.points1, tracks.points[[0, 1, 2, 4]])
+    np.testing.assert_array_equal(pairs.points2, tracks.points[[3, 2, 6, 5]])

@@ -1,0 +1,149 @@
+"""``rs_relpose calibrate`` from bag to parameter file, and bags that it refuses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.bags.writer import BagWriter
+from rs_relpose_ros.benchmark.calibration_tracks import about_one_axis
+from rs_relpose_ros.cli.main import main
+from rs_relpose_ros.replay.parameter_file import read_parameters
+from rs_relpose_ros.simulation import simulate, SimulationConfig
+from rs_relpose_ros.simulation.bag import write_bag
+from rs_relpose_ros.simulation.trajectory import Trajectory
+
+IMAGE, IMU = '/camera/image_raw/compressed', '/imu/data_raw'
+
+
+def small(**given: Any) -> SimulationConfig:
+    values: dict[str, Any] = {
+        'duration': 3.0, 'width': 320, 'height': 240, 'fx': 225.0, 'edge_samples': 1,
+        'plan': 'walk:3', 'readout_time': 0.02, 'time_offset': 0.03, 'seed': 5} | given
+    return SimulationConfig(**values)
+
+
+def rendered(folder: Path, config: SimulationConfig,
+             trajectory: Trajectory | None = None) -> Path:
+    write_bag(simulate(config, trajectory=trajectory), folder)
+    return folder
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return rendered(tmp_path_factory.mktemp('walk') / 'bag', small())
+
+
+def calibrated(bag: Path, out: Path) -> tuple[int, dict[str, Any]]:
+    code = main(['calibrate', str(bag), '--out', str(out)])
+    return code, json.loads((out / 'calibration.json').read_text())
+
+
+def test_bag_gives_a_parameter_file_that_the_node_takes(bag, tmp_path, capsys):
+    code, figures = calibrated(bag, tmp_path)
+    truth = small()
+    assert code == 0
+    assert 'shutter: rolling' in capsys.readouterr().out
+    assert figures['readout_time_s']['value'] == pytest.approx(0.02, abs=1.5e-3)
+    assert figures['time_offset_s']['value'] == pytest.approx(0.03, abs=1.5e-3)
+    sensor = read_parameters(tmp_path / 'calibration.yaml').sensor
+    turn = Rotation.from_matrix(sensor.R_cam_imu @ truth.R_cam_imu.T).magnitude()
+    assert np.degrees(turn) < 0.6
+    assert sensor.readout_time == pytest.approx(figures['readout_time_s']['value'], abs=1e-6)
+    picture = cv2.imread(str(tmp_path / 'cost_over_readout.png'))
+    assert picture is not None and picture.std() > 5.0
+
+
+def test_bag_of_a_global_shutter_and_of_one_axis(tmp_path, capsys):
+    """The rotation about the only axis cannot be told, read-out time and offset can."""
+    config = small(readout_time=0.0)
+    path = rendered(tmp_path / 'bag', config, about_one_axis(0, 3.0))
+    code, figures = calibrated(path, tmp_path / 'out')
+    assert code == 1
+    assert figures['shutter'] == 'global'
+    assert abs(figures['readout_time_s']['value']) < 1e-3
+    assert not figures['rotation_from_axis_map_rad']['observable']
+    assert 'NOT OBSERVABLE: the camera turns about one axis only' in capsys.readouterr().out
+    assert read_parameters(tmp_path / 'out/calibration.yaml').sensor.R_cam_imu is None
+
+
+# -- refused ----------------------------------------------------------------------------------
+
+
+def changed(bag: Path, path: Path, change: Callable[[str, Any], Any],
+            last: int | None = None) -> Path:
+    """A copy of a bag with `change` applied to its messages; those it makes None are left out."""
+    with open_bag(bag) as source, BagWriter(path) as copy:
+        topics = source.find_topics()
+        images = 0
+        for item in source.messages([topics.image, topics.camera_info, topics.imu]):
+            images += item.topic == IMAGE
+            message = change(item.topic, item.message)
+            if message is None or (last is not None and images > last):
+                continue
+            copy.write(item.topic, message.__msgtype__, message, item.bag_time_ns)
+    return path
+
+
+def repainted(paint: Callable[[np.ndarray], np.ndarray]) -> Callable[[str, Any], Any]:
+    def change(topic: str, message: Any) -> Any:
+        if topic == IMAGE:
+            image = cv2.imdecode(np.asarray(message.data), cv2.IMREAD_GRAYSCALE)
+            message.data = cv2.imencode('.jpg', paint(image))[1].ravel()
+        return message
+    return change
+
+
+def refused(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    assert main(['calibrate', str(bag), '--out', str(tmp_path / 'out')]) == 2
+    assert not (tmp_path / 'out').exists()
+    return capsys.readouterr().err
+
+
+def test_too_short_a_bag(bag, tmp_path, capsys):
+    short = changed(bag, tmp_path / 'short', lambda topic, message: message, last=20)
+    assert 'too short: 20 frames' in refused(short, tmp_path, capsys)
+
+
+def test_bag_without_texture(bag, tmp_path, capsys):
+    bare = changed(bag, tmp_path / 'bare', repainted(lambda image: np.full_like(image, 120)))
+    assert 'Record a scene with texture' in refused(bare, tmp_path, capsys)
+
+
+def test_blurred_bag(bag, tmp_path, capsys):
+    blurred = changed(bag, tmp_path / 'blurred', repainted(
+        lambda image: cv2.blur(image, (161, 161))))
+    assert 'Record' in refused(blurred, tmp_path, capsys)
+
+
+def test_bag_of_a_camera_at_rest(bag, tmp_path, capsys):
+    def at_rest(topic: str, message: Any) -> Any:
+        if topic == IMU:
+            rate = message.angular_velocity
+            rate.x, rate.y, rate.z = 0.01, -0.02, 0.005
+        return message
+    still = changed(bag, tmp_path / 'still', at_rest)
+    assert 'the camera hardly turns' in refused(still, tmp_path, capsys)
+
+
+def test_bag_without_a_gyro(bag, tmp_path, capsys):
+    def no_gyro(topic: str, message: Any) -> Any:
+        if topic == IMU:
+            message.angular_velocity_covariance = np.array([-1.0] + 8 * [0.0])
+        return message
+    deaf = changed(bag, tmp_path / 'deaf', no_gyro)
+    assert 'record the angular velocity' in refused(deaf, tmp_path, capsys)
+
+
+def test_bag_without_an_imu(bag, tmp_path, capsys):
+    lone = changed(bag, tmp_path / 'lone',
+                   lambda topic, message: None if topic == IMU else message)
+    assert 'Imu' in refused(lone, tmp_path, capsys)
