@@ -118,7 +118,7 @@ class MessageIntake:
         try:
             stamp = stamp_ns(msg.header)
             # Here, before any of them is dropped: the next one would pass for new.
-            problem = self._camera.problem(np.frombuffer(msg.data, dtype=np.uint8))
+            problem = self._camera.problem(stamp, np.frombuffer(msg.data, dtype=np.uint8))
             if problem:
                 self._sequencer.refuse(stamp, Refusal.BAD_IMAGE, problem)
                 return
