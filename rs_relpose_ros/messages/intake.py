@@ -32,8 +32,7 @@ _HELD_IMAGES = 4
 class MessageIntake:
     """Converts messages and hands them over; images are decoded later, by who takes the frames.
 
-    An image goes with the CameraInfo that came last. Not thread-safe: one thread feeds it, and
-    one takes the frames.
+    An image goes with the CameraInfo that came last. Not thread-safe: one thread feeds it.
 
     Parameters
     ----------
@@ -117,19 +116,17 @@ class MessageIntake:
                 self._refuse_uncalibrated(self._held.popleft()[0])
             return
         try:
+            stamp = stamp_ns(msg.header)
+            # Here, before any of them is dropped: the next one would pass for new.
+            problem = self._camera.problem(stamp, np.frombuffer(msg.data, dtype=np.uint8))
+            if problem:
+                self._sequencer.refuse(stamp, Refusal.BAD_IMAGE, problem)
+                return
             self._sequencer.add_frame(EncodedFrame(
-                stamp_ns(msg.header), str(msg.header.frame_id), self._calibration,
-                lambda: self._decoded(msg, decode)))
+                stamp, str(msg.header.frame_id), self._calibration,
+                lambda: decode(msg)))
         except InputError as error:
             self._sequencer.refuse(0, Refusal.BAD_IMAGE, str(error))
-
-    def _decoded(self, msg: Any, decode: Decode) -> NDArray[np.uint8]:
-        """The image of a message; called by who takes the frames, one after the other."""
-        image = decode(msg)
-        problem = self._camera.problem(image)
-        if problem:
-            raise InputError(problem)
-        return image
 
     def _refuse_uncalibrated(self, msg: Any) -> None:
         try:
