@@ -23,6 +23,7 @@ from rs_relpose_ros.benchmark.live_clip import (
     seconds_into_loop,
 )
 from rs_relpose_ros.benchmark.process_figures import ProcessFigures
+from rs_relpose_ros.benchmark.tables import write_csv
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.pipeline.sequencer import Refusal
 from rs_relpose_ros.result import Status
@@ -36,6 +37,8 @@ Array = NDArray[np.float64]
 
 SIZES = ((640, 480), (1280, 720), (1920, 1080))
 FORMATS = ('mono8', 'bgr8', 'jpeg')
+# Processor time and memory of the node, a line per second; frames.csv and logs lie beside it.
+FIGURES_FILE = 'node.csv'
 # Images above this [bytes] do not get through Fast DDS's default transports.
 _BIG_IMAGE = 512 * 1024
 # A pose that is wrong by more than this is no noise [deg].
@@ -230,6 +233,7 @@ def run_cell(cell: LiveCell, clip: Clip, duration: float, folder: Path, profile:
         {'image': RAW_TOPIC, 'camera_info': CAMERA_INFO_TOPIC, 'imu': topics[2]},
         'compressed' if compressed else 'raw', tuple(player), profile if cell.is_big else None),
         folder, on_second)
+    write_csv(folder / FIGURES_FILE, run.figures)
     return statistics_of(cell, duration, run), course_of(run)
 
 
