@@ -163,17 +163,18 @@ def draw_curve(result: CalibrationResult, path: Path) -> None:
     picture = Picture(figsize=(7.5, 4.5), dpi=110, layout='constrained')
     axes = picture.subplots()
     readout = result.readout_time
-    axes.plot(_MS * result.curve.readout_times, result.curve.costs, 'o-', color=_BLUE)
+    # A parabola's root: straight on both sides of the best, so that a few points draw it.
+    axes.plot(_MS * result.curve.readout_times, np.sqrt(2.0 * result.curve.costs), 'o-',
+              color=_BLUE)
     axes.axvline(0.0, color='0.6', linewidth=0.8)
     axes.axvline(_MS * readout.value, color=_ORANGE,
                  label=f'{_MS * readout.value:.2f} +- {_MS * readout.sigma:.2f} ms')
     axes.axvspan(_MS * (readout.value - 3 * readout.sigma),
                  _MS * (readout.value + 3 * readout.sigma), color=_ORANGE, alpha=0.25,
                  label='3 sigma')
-    axes.set_yscale('symlog', linthresh=10.0)
     axes.set_ylim(bottom=0.0)
     axes.set_xlabel('read-out time [ms], negative: upwards; to +- one frame interval')
-    axes.set_ylabel('minus log-likelihood above the best')
+    axes.set_ylabel('cost: sqrt(2 x log-likelihood lost) [sigma]')
     axes.set_title(f'{result.shutter} shutter; everything else fitted anew at each point')
     axes.legend()
     axes.grid(alpha=0.3)
