@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.benchmark.live import Course, LiveStatistics, Percentiles
 from rs_relpose_ros.benchmark.tables import markdown_table, write_csv
+from rs_relpose_ros.picture_files import save_picture
 
 REPORT_FILE, STATISTICS_FILE = 'live.md', 'live.csv'
 PLOT_FILE, SOAK_PLOT_FILE = 'live.png', 'soak.png'
@@ -116,11 +117,9 @@ def _two(values: Percentiles, digits: int = 1) -> str:
 
 def _plot(path: Path, cells: Sequence[LiveStatistics]) -> None:
     """Latency and processor time of every cell."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10.0, 1.9 + 0.36 * len(cells)), layout='constrained')
-    FigureCanvasAgg(figure)
+    figure = Figure(figsize=(10.0, 1.9 + 0.36 * len(cells)), dpi=110, layout='constrained')
     left, right = figure.subplots(1, 2, sharey=True)
     at: NDArray[np.float64] = np.arange(len(cells), dtype=np.float64)
     for offset, colour, label, values in (
@@ -145,16 +144,14 @@ def _plot(path: Path, cells: Sequence[LiveStatistics]) -> None:
         axis.grid(visible=True, axis='x', alpha=0.3)
     figure.legend(*left.get_legend_handles_labels(), loc='outside lower left', **_LEGEND)
     figure.legend(*right.get_legend_handles_labels(), loc='outside lower right', **_LEGEND)
-    figure.savefig(path, dpi=110)
+    save_picture(figure, path)
 
 
 def _plot_soak(path: Path, cell: LiveStatistics, course: Course) -> None:
     """Latency of every pair, and memory, over time."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10.0, 6.0), layout='constrained')
-    FigureCanvasAgg(figure)
+    figure = Figure(figsize=(10.0, 6.0), dpi=110, layout='constrained')
     top, bottom = figure.subplots(2, 1, sharex=True)
     top.plot(course.latency_seconds / 60.0, course.latencies, '.', color='0.75', markersize=2.0,
              label='a pair')
@@ -176,4 +173,4 @@ def _plot_soak(path: Path, cell: LiveStatistics, course: Course) -> None:
     for axis in (top, bottom):
         axis.grid(visible=True, alpha=0.3)
         axis.legend(fontsize='small')
-    figure.savefig(path, dpi=110)
+    save_picture(figure, path)

@@ -19,11 +19,11 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.calibration.gyro_path import knot_before, rotation_at
+from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.so3 import exp_so3
 
 Array = NDArray[np.float64]
@@ -38,14 +38,14 @@ LOCAL = 8
 _ALL = GLOBAL + LOCAL
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _cross_into(a: Array, b: Array, out: Array) -> None:
     out[0] = a[1] * b[2] - a[2] * b[1]
     out[1] = a[2] * b[0] - a[0] * b[2]
     out[2] = a[0] * b[1] - a[1] * b[0]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def tangents(b: Array, out: Array) -> None:
     """Two unit vectors (2, 3) at right angles to a unit vector (3,) and to each other."""
     i = 0
@@ -58,7 +58,7 @@ def tangents(b: Array, out: Array) -> None:
     _cross_into(b, out[0], out[1])
 
 
-@numba.njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def accumulate(  # noqa: C901 - one pass, unrolled by hand, is what makes it fast
         knots: Array, rates: Array, path: Array, turned: Array, begin: NDArray[np.int64],
         middle: NDArray[np.int64], times1: Array, times2: Array, covariates1: Array,
@@ -250,7 +250,7 @@ def accumulate(  # noqa: C901 - one pass, unrolled by hand, is what makes it fas
         _eliminate(H, gradient, L, score[p], reduced[p], back[p])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _spread(M: Array, by_pixel: Array, c: Array, stretch: float, out: Array) -> float:
     """Squared length of P^T M^T c, and in `out` M P P^T M^T c."""
     h0 = M[0, 0] * c[0] + M[1, 0] * c[1] + M[2, 0] * c[2]
@@ -264,7 +264,7 @@ def _spread(M: Array, by_pixel: Array, c: Array, stretch: float, out: Array) -> 
     return float(q0 * q0 + q1 * q1)
 
 
-@numba.njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def _eliminate(
         H: Array, gradient: Array, L: Array, score: Array, reduced: Array, back: Array) -> None:
     """Schur complement of the pair's own unknowns; H (_ALL, _ALL) has its lower half filled."""
@@ -302,7 +302,7 @@ def _eliminate(
             reduced[b, a] = total
 
 
-@numba.njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def find_directions(  # noqa: C901 - one pass as above
         knots: Array, rates: Array, path: Array, begin: NDArray[np.int64],
         middle: NDArray[np.int64], times1: Array, times2: Array, covariates1: Array,

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 import math
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.so3 import exp_so3
 
@@ -107,7 +107,7 @@ class GyroPath:
                           np.ascontiguousarray(times, dtype=np.float64))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _integrated(times: Array, rates: Array) -> tuple[Array, Array]:
     count = len(times)
     rotations, turned = np.empty((count, 3, 3)), np.zeros((count, 3, 3))
@@ -127,7 +127,7 @@ def _integrated(times: Array, rates: Array) -> tuple[Array, Array]:
     return rotations, turned
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def rotation_at(times: Array, rates: Array, rotations: Array, instant: float, k: int,
                 rotation: Array, rate: Array) -> None:
     """Rotation (3, 3) and rate (3,) at an instant at or after knot `k`, written in place."""
@@ -158,7 +158,7 @@ def rotation_at(times: Array, rates: Array, rotations: Array, instant: float, k:
         rotation[i, 2] = q0 * e02 + q1 * e12 + q2 * e22
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def knot_before(times: Array, instant: float, near: int) -> int:
     """Index of the last knot not after `instant`, within [0, K - 2], searched from `near` on."""
     k = min(max(near, 0), len(times) - 2)
@@ -169,7 +169,7 @@ def knot_before(times: Array, instant: float, near: int) -> int:
     return k
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _evaluated(times: Array, rates: Array, rotations: Array, instants: Array) -> Array:
     out, rate = np.empty((len(instants), 3, 3)), np.empty(3)
     k = 0

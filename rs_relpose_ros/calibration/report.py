@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure as Picture
 import numpy as np
 
 from rs_relpose_ros.calibration.result import AXES, CalibrationResult, Estimate
 from rs_relpose_ros.camera import RollingShutterCamera
 from rs_relpose_ros.datasets.parameter_file import Figure, parameter_text
+from rs_relpose_ros.picture_files import save_picture
 
 _BLUE, _ORANGE = '#0072B2', '#E69F00'
 _MS = 1e3
@@ -178,8 +178,7 @@ def draw_curve(result: CalibrationResult, path: Path) -> None:
     axes.set_title(f'{result.shutter} shutter; everything else fitted anew at each point')
     axes.legend()
     axes.grid(alpha=0.3)
-    FigureCanvasAgg(picture)
-    picture.savefig(path, metadata={'Software': None})
+    save_picture(picture, path)
 
 
 def _upwards(result: CalibrationResult) -> bool:

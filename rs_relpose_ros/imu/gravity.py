@@ -16,10 +16,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.imu.bias import BIAS_MEMORY
 from rs_relpose_ros.imu.config import ImuConfig
 from rs_relpose_ros.so3 import exp_so3
@@ -134,7 +134,7 @@ class GravityFilter:
         return first + 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _advance(up: Array, bias: Array, residual: Array, covariance: Array, stamp_ns: int,
              rate: Array, stamps_ns: NDArray[np.int64], rates: Array, forces: Array, noise: Array,
              gap_ns: int) -> int:
@@ -187,7 +187,7 @@ def _advance(up: Array, bias: Array, residual: Array, covariance: Array, stamp_n
     return stamps_ns.shape[0]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _correct(up: Array, bias: Array, residual: Array, covariance: Array, measured: Array,
              sigma2: float, dt: float, slope: Array, cross: Array, gain: Array) -> None:
     """Kalman update by a measured direction (3,) of variance `sigma2` per axis."""
@@ -237,7 +237,7 @@ def _correct(up: Array, bias: Array, residual: Array, covariance: Array, measure
         up[i] = moved[i] / norm
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _product(matrix: Array, vector: Array) -> Array:
     out = np.empty(3)
     for i in range(3):

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.imu.config import ImuConfig
 from rs_relpose_ros.so3 import exp_so3, left_jacobian_so3
@@ -13,7 +13,7 @@ from rs_relpose_ros.so3 import exp_so3, left_jacobian_so3
 Array = NDArray[np.float64]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _product(a: Array, b: Array, out: Array) -> None:
     # By hand: a call of BLAS costs more than nine sums of three products.
     for i in range(3):
@@ -21,7 +21,7 @@ def _product(a: Array, b: Array, out: Array) -> None:
             out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _integrate(seconds: Array, rates: Array) -> tuple[Array, Array, Array]:
     """Rotation ``R_start^T R_end``, its derivative by a constant rate error, and noise growth.
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.tracking.config import TrackingConfig
 
 Array = NDArray[np.float64]
@@ -66,7 +66,7 @@ def find_corners(image: Image, taken: Array, count: int, config: TrackingConfig)
     return points[_spread(points, taken, math.sqrt(height * width / config.max_features))[:count]]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _occupy(free: Image, points: Array, radius: int) -> None:
     """Clear the discs around `points` (M, 2)."""
     height, width = free.shape

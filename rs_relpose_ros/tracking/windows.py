@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.tracking.images import Image
 
 Array = NDArray[np.float64]
@@ -69,7 +69,7 @@ def correlations(image1: Image, image2: Image, points1: Array, points2: Array,
     return _correlations(image1, image2, points1, points2, side)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _statistics(image: Image, points: Array, side: int) -> tuple[Array, Array]:
     """Mean and standard deviation (N,) of the windows around `points` (N, 2).
 
@@ -105,7 +105,7 @@ def _statistics(image: Image, points: Array, side: int) -> tuple[Array, Array]:
     return mean, deviation
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _correlations(image1: Image, image2: Image, points1: Array, points2: Array,
                   side: int) -> Array:
     count, pixels = points1.shape[0], side * side
@@ -126,7 +126,7 @@ def _correlations(image1: Image, image2: Image, points1: Array, points2: Array,
     return result
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _window(image: Image, x: float, y: float, side: int, window: NDArray[np.float32]) -> float:
     """Sample the window (side^2,) centred at a point, the border repeated; its mean."""
     height, width = image.shape
