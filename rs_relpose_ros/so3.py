@@ -13,17 +13,19 @@ Array = NDArray[np.float64]
 
 
 @kernel
+def rodrigues(theta2: float) -> tuple[float, float]:
+    """``sin(theta) / theta`` and ``(1 - cos(theta)) / theta^2`` of a squared angle [rad^2]."""
+    if theta2 < 1e-8:
+        return 1.0 - theta2 / 6.0, 0.5 - theta2 / 24.0
+    theta = math.sqrt(theta2)
+    return math.sin(theta) / theta, (1.0 - math.cos(theta)) / theta2
+
+
+@kernel
 def exp_so3(v: Array) -> Array:
     """Rotation matrix of the rotation vector `v` (3,) [rad] (Rodrigues' formula)."""
     x, y, z = v[0], v[1], v[2]
-    theta2 = x * x + y * y + z * z
-    if theta2 < 1e-8:
-        a = 1.0 - theta2 / 6.0
-        b = 0.5 - theta2 / 24.0
-    else:
-        theta = math.sqrt(theta2)
-        a = math.sin(theta) / theta
-        b = (1.0 - math.cos(theta)) / theta2
+    a, b = rodrigues(x * x + y * y + z * z)
     rotation = np.empty((3, 3))
     rotation[0, 0] = 1.0 - b * (y * y + z * z)
     rotation[1, 1] = 1.0 - b * (x * x + z * z)

@@ -11,11 +11,11 @@ from rs_relpose_ros.benchmark.accuracy import (
     estimate,
     Experiment,
     run_experiment,
-    select_cells,
     told_config,
     Trial,
 )
 from rs_relpose_ros.benchmark.accuracy_report import cell_statistics, consistency, summary
+from rs_relpose_ros.benchmark.cell_names import matching_cells
 from rs_relpose_ros.benchmark.methods import available_methods, derotated, LIBRARY
 from rs_relpose_ros.benchmark.oracle_cache import OracleCache
 from rs_relpose_ros.benchmark.problems import Cell, CELLS, make_problem
@@ -36,11 +36,11 @@ def trial(seed, rotation, oracle_rotation, nees=5.0):
 
 
 def test_cells_are_selected_by_pattern():
-    assert select_cells(['all']) == tuple(CELLS)
-    assert select_cells(['sideways-base', 'forward-v10*']) == (
+    assert matching_cells(['all'], CELLS) == tuple(CELLS)
+    assert matching_cells(['sideways-base', 'forward-v10*'], CELLS) == (
         'forward-v10-w1', 'forward-v10-w3', 'forward-v10-w3-outliers-60', 'sideways-base')
     with pytest.raises(InputError, match='no cell is named'):
-        select_cells(['backward-*'])
+        matching_cells(['backward-*'], CELLS)
 
 
 def test_ratios_are_of_medians_and_percentiles():

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from multiprocessing import get_context
 import time
 
@@ -15,7 +14,6 @@ from rs_relpose_ros import (
     estimate_relative_pose,
     EstimatorConfig,
     FrameMotion,
-    InputError,
     RelativePose,
     RollingShutterCamera,
     warm_up,
@@ -90,23 +88,6 @@ class _Task:
     sigma_factors: tuple[float, ...]
     solver: str
     known: dict[int, PoseError]
-
-
-def select_cells(patterns: Iterable[str]) -> tuple[str, ...]:
-    """Names of the cells that match any of the patterns ('all', or with ``*`` as in file names).
-
-    Raises
-    ------
-    InputError
-        A pattern matches none.
-    """
-    chosen: set[str] = set()
-    for pattern in patterns:
-        matching = {name for name in CELLS if pattern == 'all' or fnmatchcase(name, pattern)}
-        if not matching:
-            raise InputError(f'no cell is named {pattern!r}; there are {", ".join(CELLS)}')
-        chosen |= matching
-    return tuple(name for name in CELLS if name in chosen)
 
 
 def told_config(cell: Cell, sigma_factor: float, solver: str) -> EstimatorConfig:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 import csv
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.bags.layout import CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, RAW_TOPIC
+from rs_relpose_ros.benchmark.cell_names import matching_cells
 from rs_relpose_ros.benchmark.live_clip import (
     Clip,
     configuration,
@@ -24,7 +24,6 @@ from rs_relpose_ros.benchmark.live_clip import (
 )
 from rs_relpose_ros.benchmark.process_figures import ProcessFigures
 from rs_relpose_ros.benchmark.tables import write_csv
-from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.pipeline.sequencer import Refusal
 from rs_relpose_ros.result import Status
 from rs_relpose_ros.simulation.closed_loop import closed_loop
@@ -186,20 +185,8 @@ class Course:
 
 
 def select_cells(patterns: Iterable[str]) -> tuple[LiveCell, ...]:
-    """Cells whose names match any of the patterns ('all', or with ``*`` as in file names).
-
-    Raises
-    ------
-    InputError
-        A pattern matches none.
-    """
-    chosen: set[str] = set()
-    for pattern in patterns:
-        matching = {name for name in CELLS if pattern == 'all' or fnmatchcase(name, pattern)}
-        if not matching:
-            raise InputError(f'no cell is named {pattern!r}; there are {", ".join(CELLS)}')
-        chosen |= matching
-    return tuple(cell for name, cell in CELLS.items() if name in chosen)
+    """The cells that match any of the patterns, as `matching_cells` has them."""
+    return tuple(CELLS[name] for name in matching_cells(patterns, CELLS))
 
 
 def run_cell(cell: LiveCell, clip: Clip, duration: float, folder: Path, profile: Path,

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.so3 import exp_so3
+from rs_relpose_ros.so3 import exp_so3, rodrigues
 
 Array = NDArray[np.float64]
 
@@ -138,14 +137,7 @@ def rotation_at(times: Array, rates: Array, rotations: Array, instant: float, k:
     x = 0.5 * dt * (rates[k, 0] + rate[0])
     y = 0.5 * dt * (rates[k, 1] + rate[1])
     z = 0.5 * dt * (rates[k, 2] + rate[2])
-    theta2 = x * x + y * y + z * z
-    if theta2 < 1e-8:
-        a = 1.0 - theta2 / 6.0
-        b = 0.5 - theta2 / 24.0
-    else:
-        theta = math.sqrt(theta2)
-        a = math.sin(theta) / theta
-        b = (1.0 - math.cos(theta)) / theta2
+    a, b = rodrigues(x * x + y * y + z * z)
     e00, e11 = 1.0 - b * (y * y + z * z), 1.0 - b * (x * x + z * z)
     e22 = 1.0 - b * (x * x + y * y)
     e01, e10 = b * x * y - a * z, b * x * y + a * z

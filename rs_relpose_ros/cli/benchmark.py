@@ -164,16 +164,18 @@ def _check_at_least(low: int, args: argparse.Namespace, *names: str) -> None:
 def _run_accuracy(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
-    from rs_relpose_ros.benchmark.accuracy import Experiment, run_experiment, select_cells
+    from rs_relpose_ros.benchmark.accuracy import Experiment, run_experiment
     from rs_relpose_ros.benchmark.accuracy_report import write_report
+    from rs_relpose_ros.benchmark.cell_names import matching_cells
     from rs_relpose_ros.benchmark.oracle_cache import OracleCache
+    from rs_relpose_ros.benchmark.problems import CELLS
 
     _check_at_least(1, args, 'trials', 'jobs')
     _check_at_least(0, args, 'seed')
     if min(args.sigma_factor) <= 0.0:
         raise InputError(f'--sigma-factor must be positive, got {min(args.sigma_factor)}')
     experiment = Experiment(
-        select_cells(args.cells), tuple(dict.fromkeys(args.noise)),
+        matching_cells(args.cells, CELLS), tuple(dict.fromkeys(args.noise)),
         tuple(dict.fromkeys(args.sigma_factor)), args.trials, args.seed, args.solver)
     total = (len(experiment.cells) * len(experiment.noises) * len(experiment.sigma_factors)
              * experiment.trials)
@@ -207,15 +209,15 @@ def _run_calibration(args: argparse.Namespace) -> int:
 def _run_speed(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
-    from rs_relpose_ros.benchmark.accuracy import select_cells
-    from rs_relpose_ros.benchmark.problems import Cell
+    from rs_relpose_ros.benchmark.cell_names import matching_cells
+    from rs_relpose_ros.benchmark.problems import Cell, CELLS
     from rs_relpose_ros.benchmark.speed import compare, first_estimates, soak
     from rs_relpose_ros.benchmark.speed_report import write_report
 
     _check_at_least(1, args, 'trials', 'repeats')
     _check_at_least(0, args, 'processes', 'soak', 'seed')
     _check_at_least(50, args, 'matches')
-    cells = select_cells(args.cells)
+    cells = matching_cells(args.cells, CELLS)
     # Large problems need fewer: their times scatter less.
     few = max(args.trials // 5, 1)
     quiet = not sys.stderr.isatty()
