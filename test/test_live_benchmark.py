@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 import os
+import sys
 
 import numpy as np
 import pytest
@@ -145,6 +146,13 @@ def test_cells_are_selected_by_pattern(capsys):
     assert 'no cell is named' in capsys.readouterr().err
     assert main(['benchmark', 'live', '--duration', '1']) == 2
     assert '--duration must be at least 5' in capsys.readouterr().err
+
+
+def test_without_ros_it_is_said_before_anything_is_rendered(monkeypatch, tmp_path, capsys):
+    monkeypatch.setitem(sys.modules, 'rs_relpose_ros.ros.measured_run', None)
+    assert main(['benchmark', 'live', '--output', str(tmp_path / 'out')]) == 2
+    assert 'needs ROS 2' in capsys.readouterr().err
+    assert not (tmp_path / 'out').exists()
 
 
 def test_frame_timings_name_what_cannot_be_written(tmp_path):

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from importlib import import_module
 from pathlib import Path
 import sys
 
 from rs_relpose_ros.config import SOLVERS
-from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 
 HELP = ('Measure the estimator on simulated frame pairs, one thread each: "accuracy" against an '
         'oracle that knows the true matches and starts at the truth, "speed" beside OpenCV and '
@@ -249,6 +250,12 @@ def _run_live(args: argparse.Namespace) -> int:
     _check_at_least(5, args, 'duration')
     _check_at_least(0, args, 'soak')
     cells = select_cells(args.cells)
+    # Said before minutes of rendering.
+    try:
+        import_module('rs_relpose_ros.ros.measured_run')
+    except ImportError as error:
+        raise MissingInputError(f'the live benchmark needs ROS 2 (rclpy, Fast DDS): {error}; '
+                                'source its setup.bash, or use the environment of make') from error
     duration = 60.0 * args.soak or args.duration
     profile = args.profile or _shipped('fastdds.xml')
     if not profile.is_file():
@@ -258,18 +265,25 @@ def _run_live(args: argparse.Namespace) -> int:
     with tqdm(total=len(sizes) * round(FPS * PERIOD), unit='frame', desc='rendering',
               disable=quiet) as bar:
         clips = {size: prepare_clip(args.output / 'clips', *size, bar.update) for size in sizes}
-    results = []
+    results, failed = [], False
     with tqdm(total=round(len(cells) * duration), unit='s', disable=quiet) as bar:
         for cell in cells:
             bar.set_description(cell.name)
-            statistics, course = run_cell(cell, clips[cell.width, cell.height], duration,
-                                          args.output / cell.name, profile.resolve(), bar.update)
+            try:
+                statistics, course = run_cell(
+                    cell, clips[cell.width, cell.height], duration, args.output / cell.name,
+                    profile.resolve(), bar.update)
+            except RsRelposeError as error:   # the others are worth their time all the same
+                failed = True
+                print(f'{cell.name}: {error}', file=sys.stderr)
+                continue
             results.append(statistics)
             if args.soak:
                 print(write_soak_report(args.output / cell.name, statistics, course))
-    print(write_report(args.output, results))
-    print(f'written to {args.output}')
-    return 0
+    if results:
+        print(write_report(args.output, results))
+        print(f'written to {args.output}')
+    return int(failed)
 
 
 def _shipped(name: str) -> Path:
