@@ -344,6 +344,23 @@ def test_gyro_of_a_wrong_scale_or_another_body(bundled_bag, tmp_path, parameters
     assert findings['axes and clock'].verdict is Verdict.FAILURE
 
 
+@pytest.mark.recordings
+@pytest.mark.parametrize('name, offset', [
+    ('realsense_rgb_rs', -0.057), ('xiaomi_cc9_rs', -0.0024)])
+def test_recordings_of_real_cameras(recordings, tmp_path, name, offset):
+    """Against the READMEs of the recordings, whose figures come from other software."""
+    path = tmp_path / name
+    assert main(['convert', name, str(recordings / name), str(path)]) == 0
+    findings, report = checked(path, read_parameters(f'{path}.yaml'))
+    assert not report.failed
+    assert findings['time offset'].figures['time_offset_s'] == pytest.approx(offset, abs=3e-3)
+    assert findings['axes'].verdict is Verdict.OK
+    assert findings['gyro and images'].figures['explained'] > 0.7
+    # RealSense: three gaps of up to 0.3 s. The phone has no accelerometer.
+    expected = {'realsense_rgb_rs': 'image rate', 'xiaomi_cc9_rs': 'gravity'}[name]
+    assert [f.name for f in report.findings if f.verdict is Verdict.WARNING] == [expected]
+
+
 def test_axes_in_words():
     R = Rotation.from_euler('xyz', [88.0, 1.0, -2.0], degrees=True).as_matrix()
     assert axis_map(R) == 'cam x = +imu x, cam y = -imu z, cam z = +imu y'

@@ -14,8 +14,9 @@ from rs_relpose_ros.so3 import log_so3
 
 # Stamps of the two sensors that differ by more in their delay are of different clocks [s].
 _SAME_CLOCK = 0.5
-# Share of the images' turning that the gyro must explain to be of the same camera.
-_EXPLAINED, _DOUBTFUL = 0.8, 0.5
+# Share of the images' turning that the gyro must explain to be of the same camera. A strong
+# translation looks like turning, so that only a small share is beyond doubt.
+_EXPLAINED, _DOUBTFUL = 0.7, 0.25
 # Slower than this [rad/s] the images say nothing of clocks and axes.
 _LEAST_RATE = 0.03
 # Second over first principal rate: below, the axes' rotation is not known about one axis.
@@ -101,7 +102,8 @@ def _aligned(found: Alignment, seen: Scan, parameters: Parameters) -> list[Findi
         return [Finding(
             'axes and clock', Verdict.FAILURE if doubtful else Verdict.WARNING, text,
             'is it the IMU of this camera, are both clocks within 0.25 s, is electronic '
-            'stabilisation off and the scene at rest?', figures)]
+            'stabilisation off and the scene at rest? Then record more turning and less moving',
+            figures)]
     both = [Finding('gyro and images', Verdict.OK, text, figures=figures), _scale(found)]
     if both[1].verdict is Verdict.FAILURE:
         return both
