@@ -16,6 +16,7 @@ from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.benchmark.calibration_tracks import about_one_axis
 from rs_relpose_ros.cli.main import main
+from rs_relpose_ros.errors import MissingInputError
 from rs_relpose_ros.replay.parameter_file import read_parameters
 from rs_relpose_ros.simulation import simulate, SimulationConfig
 from rs_relpose_ros.simulation.bag import write_bag
@@ -72,7 +73,9 @@ def test_bag_of_a_global_shutter_and_of_one_axis(tmp_path, capsys):
     assert abs(figures['readout_time_s']['value']) < 1e-3
     assert not figures['rotation_from_axis_map_rad']['observable']
     assert 'NOT OBSERVABLE: the camera turns about one axis only' in capsys.readouterr().out
-    assert read_parameters(tmp_path / 'out/calibration.yaml').sensor.R_cam_imu is None
+    # The file leaves out what was not told, and the node asks for it.
+    with pytest.raises(MissingInputError, match='quat_cam_imu_xyzw is not set'):
+        _ = read_parameters(tmp_path / 'out/calibration.yaml').sensor.R_cam_imu
 
 
 # -- refused ----------------------------------------------------------------------------------

@@ -113,7 +113,7 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
     """Read-out time, clock offset, rotation, gyro bias and perhaps focal length, from nothing.
 
     Two views of every pair of frames obey the coplanarity of the rows' own instants; see
-    `rs_relpose_ros.calibration.normal_equations` and docs/calibration.md.
+    `rs_relpose_ros.calibration.coplanarity` and docs/calibration.md.
 
     Parameters
     ----------
