@@ -361,6 +361,16 @@ def metadata_is(text: str) -> Callable[[Path], Path]:
     return make
 
 
+def metadata_with(old: str, new: str) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        bag = write_kind('mcap', folder)
+        text = (bag / 'metadata.yaml').read_text()
+        assert old in text
+        (bag / 'metadata.yaml').write_text(text.replace(old, new, 1))
+        return bag
+    return make
+
+
 def no_storage(folder: Path) -> Path:
     bag = write_kind('mcap', folder)
     storage_file(bag).unlink()
@@ -392,6 +402,8 @@ def no_storage(folder: Path) -> Path:
     (metadata_is(''), InputError, 'is damaged'),
     (metadata_is('a: [1'), InputError, 'is damaged'),
     (metadata_is('rosbag2_bagfile_information: {version: 99}'), InputError, 'is damaged'),
+    (metadata_with('message_count: 4', 'message_count: many'), InputError, 'is damaged'),
+    (metadata_with('name: /imu', 'name: 17'), InputError, 'is damaged'),
     (no_storage, InputError, 'is damaged'),
 ])
 def test_bad_bags_are_told_in_one_sentence(tmp_path, make, kind, words):

@@ -93,16 +93,19 @@ class Bag:
         self.path = path
         self._reader = reader
         counts: dict[tuple[str, str], int] = {}
-        for connection in reader.connections:
+        # Typed, but metadata is YAML, in which anything may stand anywhere.
+        connections: Any = reader.connections
+        for connection in connections:
+            if not (isinstance(connection.topic, str) and isinstance(connection.msgtype, str)
+                    and isinstance(connection.msgcount, int)):
+                raise InputError(f'{path} is damaged: its metadata has a topic whose name, type '
+                                 'or number of messages is none')
             key = connection.topic, connection.msgtype
             counts[key] = counts.get(key, 0) + connection.msgcount
         self.topics = tuple(Topic(name, msgtype, count)
                             for (name, msgtype), count in sorted(counts.items()))
-
-    @property
-    def duration(self) -> float:
-        """Time from the first to the last message [s]."""
-        return float(self._reader.duration) / NANOSECONDS
+        # Time from the first to the last message [s].
+        self.duration = float(reader.duration) / NANOSECONDS
 
     def reliability(self, topic: Topic) -> str:
         """``'reliable'`` or ``'best effort'`` as its publishers offered; empty where not told."""
@@ -304,7 +307,11 @@ def open_bag(path: Path | str) -> Iterator[Bag]:
     except Exception as error:
         raise InputError(_why_not_opened(path, error)) from error
     try:
-        yield Bag(path, reader)
+        try:
+            bag = Bag(path, reader)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise InputError(_why_not_opened(path, error)) from error
+        yield bag
     finally:
         reader.close()
 
