@@ -289,6 +289,8 @@ def _run_live(args: argparse.Namespace) -> int:
 def _shipped(name: str) -> Path:
     """A file of `config/`: of the checkout, or where it was installed."""
     package = Path(__file__).resolve().parent.parent
-    installed = package.parents[3] / 'share' / package.name / 'config' / name
     checkout = package.parent / 'config' / name
-    return checkout if checkout.is_file() else installed
+    if checkout.is_file():
+        return checkout
+    # PREFIX/lib/pythonX/site-packages/PACKAGE, by pip and by colcon.
+    return package.parents[3] / 'share' / package.name / 'config' / name
