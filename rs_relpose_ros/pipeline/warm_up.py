@@ -41,6 +41,8 @@ _IMU_NS = NANOSECONDS // 200
 def warm_up_pipeline(parameters: Parameters) -> None:
     """Run the pipeline over a few made-up frames, once with all of the IMU, once with its gyro.
 
+    Images are read-only the first time and writable the second.
+
     Parameters
     ----------
     parameters : Parameters
@@ -54,6 +56,9 @@ def warm_up_pipeline(parameters: Parameters) -> None:
         sequencer = Sequencer(parameters, offline=True)
         pipeline = Pipeline(parameters)
         images = list(_images())
+        for image in images:
+            # A raw image is tracked in its message's memory; kernels for that are others.
+            image.flags.writeable = force is None
         for stamp_ns in range(NANOSECONDS, NANOSECONDS + (len(images) + 3) * _FRAME_NS, _IMU_NS):
             sequencer.add_imu(ImuSample(stamp_ns, (0.01, 0.02, 0.03), force))
         for k, image in enumerate(images):
