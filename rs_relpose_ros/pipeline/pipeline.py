@@ -23,6 +23,7 @@ from rs_relpose_ros.so3 import aligning_rotation
 from rs_relpose_ros.timing import NANOSECONDS
 from rs_relpose_ros.tracking.keyframes import decide_keyframe, KeyframeDecision
 from rs_relpose_ros.tracking.matches import Matches
+from rs_relpose_ros.tracking.parallax import median_parallax
 from rs_relpose_ros.tracking.selection import make_tracker
 
 Array = NDArray[np.float64]
@@ -213,15 +214,12 @@ class Pipeline:
                                         matches.points2)
         rays1, tau1 = self._reference_rays.rays, self._reference_rays.row_times
         rays2, tau2 = self._current_rays.rays, self._current_rays.row_times
-        if len(rays1) == 0:
-            return 0.0, (rays1, rays2, tau1, tau2)
         if self._gyro is not None:
             rotation, _ = integrate_rotation(
                 self._gyro.stamps_ns, self._gyro.angular_velocities, self._parameters.imu)
         else:
             rotation = aligning_rotation(rays1.T @ rays2)
-        parallax = np.linalg.norm(np.cross(rays1, rays2 @ rotation.T), axis=1)
-        return float(camera.fx * np.nanmedian(parallax)), (rays1, rays2, tau1, tau2)
+        return camera.fx * median_parallax(rays1, rays2, rotation), (rays1, rays2, tau1, tau2)
 
     def _predictor(self, previous: FrameImu, current: FrameImu) -> Callable[[Array], Array] | None:
         """Where the gyro expects previous-image points in the current image; None without gyro."""
