@@ -172,6 +172,10 @@ class RollingShutterCamera:
             self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Unit rays (N, 3) and their derivatives (N, 3, 2) by the raw pixel coordinates u, v."""
         points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 2)
+        return rays_with_jacobian(*self._normalized(points))
+
+    def _normalized(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+        """Undistorted points (N, 2) at z = 1, and their derivatives (N, 2, 2) by the pixel."""
         normalized = (points - (self.cx, self.cy)) / (self.fx, self.fy)
         by_pixel = np.empty((len(points), 2, 2))
         if self.is_undistorted:
@@ -179,7 +183,7 @@ class RollingShutterCamera:
         else:
             normalized, inverse = undistort_points(normalized, *self._distortion_arguments)
             np.divide(inverse, (self.fx, self.fy), out=by_pixel)
-        return rays_with_jacobian(normalized, by_pixel)
+        return normalized, by_pixel
 
     @property
     def _distortion_arguments(self) -> tuple[NDArray[np.float64], bool]:

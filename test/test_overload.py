@@ -173,7 +173,9 @@ def test_a_busy_worker_costs_the_node_no_imu(held, module_ros_domain_id):
                 publishers[Imu].publish(build.imu(
                     build.rclpy_types, START_NS - IMU_NS + samples * IMU_NS, noisy_rate(samples)))
                 samples += 1
-            publishers[Image].publish(build.gray_image(build.rclpy_types, IMAGE, frame_stamp(k)))
+            # No image is that before: a frozen camera's are refused.
+            publishers[Image].publish(build.gray_image(
+                build.rclpy_types, IMAGE + np.uint8(k), frame_stamp(k)))
             # Best effort: of the images only the latest five are kept for the callback.
             spin_until(lambda k=k: sequencer.counts().frames == k + 1, f'image {k}')
             if k == 0:

@@ -83,8 +83,7 @@ class OmnidirectionalCamera(RollingShutterCamera):
         pixels[~seen] = np.nan
         return pixels
 
-    def _unproject(self, points: ArrayLike) -> tuple[Array, ...]:
-        points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 2)
+    def _normalized(self, points: Array) -> tuple[Array, ...]:
         inverse = np.linalg.inv(self._stretch)
         plane = (points - (self.cx, self.cy)) @ inverse.T
         depth, by_rho = self._depth(np.hypot(plane[:, 0], plane[:, 1]))
@@ -93,9 +92,7 @@ class OmnidirectionalCamera(RollingShutterCamera):
         # d(m / depth)/dm = (I - n (d depth/dm)) / depth, with d depth/dm = by_rho m.
         by_plane = (np.eye(2) - normalized[:, :, None] * (by_rho[:, None] * plane)[:, None, :])
         by_pixel = by_plane / depth[:, None, None] @ inverse
-        scale = 1.0 / np.sqrt(1.0 + (normalized**2).sum(axis=1))
-        rays = np.column_stack([normalized * scale[:, None], scale])
-        return rays, by_pixel, scale
+        return normalized, np.ascontiguousarray(by_pixel)
 
     @property
     def _stretch(self) -> Array:
