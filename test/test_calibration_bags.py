@@ -150,3 +150,8 @@ def test_bag_without_an_imu(bag, tmp_path, capsys):
     lone = changed(bag, tmp_path / 'lone',
                    lambda topic, message: None if topic == IMU else message)
     assert 'Imu' in refused(lone, tmp_path, capsys)
+
+
+def test_rows_below_the_image_are_refused(bag, tmp_path, capsys):
+    assert main(['calibrate', str(bag), '--rows', '500', '900', '--out', str(tmp_path)]) == 2
+    assert '--rows 500 900 leave nothing of an image of 240 rows' in capsys.readouterr().err

@@ -15,6 +15,7 @@ from rs_relpose_ros.bags.reader import COMPRESSED_IMAGE, open_bag, TopicOptions
 from rs_relpose_ros.calibration.calibrate import calibrate, CalibrationConfig
 from rs_relpose_ros.calibration.recording import read_recording, TRACKED_IN_IMAGES
 from rs_relpose_ros.calibration.report import as_mapping, draw_curve, parameter_file, report
+from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.tracking.config import TrackingConfig
 
 HELP = (
@@ -65,6 +66,10 @@ def run(args: argparse.Namespace) -> int:
         with tqdm(total=topics.image.count, unit='image', desc='tracking', leave=False,
                   disable=quiet) as bar:
             recording = read_recording(bag, topics, tracking, on_image=bar.update)
+    first, last = args.rows
+    if first >= recording.camera.height:
+        raise InputError(f'--rows {first:g} {last:g} leave nothing of an image of '
+                         f'{recording.camera.height} rows: give the first and the last to use')
     for reason, count in recording.unused.items():
         _logger.warning('not used, %d times: %s', count, reason)
     with tqdm(total=100, unit='%', desc='fitting', leave=False, disable=quiet) as bar:
