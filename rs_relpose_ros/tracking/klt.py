@@ -20,12 +20,13 @@ _FOLLOW = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02)
 _REFINE = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.005)
 # OpenCV's eigenvalues are those of Scharr gradients, 32 times the derivative, divided by 2^20.
 _SCHARR = 2.0**20 / 32.0**2
-# Levels of the pyramid where the gyro says where to look, and the share of tracks that may be lost
-# before all levels are asked.
-_EXPECTED_LEVELS = 2
-_MOST_LOST = 0.15
 # Corrections of the guess [px] that the image itself, without its pyramid, makes up for.
 _NEAR = 2.0
+# Levels of the pyramid where the gyro says where to look, and where the guesses of the last frame
+# were off by no more than half of that, but for a share.
+_EXPECTED_LEVELS, _NEAR_LEVELS, _MOST_FAR = 2, 1, 0.05
+# Share of tracks that may be lost before all levels are asked.
+_MOST_LOST = 0.15
 # The comparison with the reference corrects drift; what it moves further was lost before.
 _LARGEST_CORRECTION = 3.0
 
@@ -51,6 +52,7 @@ class KltTracker:
         self._set(np.empty(0, dtype=np.uint32), np.empty((0, 2)), np.empty((0, 2)), np.empty(0),
                   np.empty((0, 2)))
         self._started = 0
+        self._guessed_well = False
         self._refined = False
 
     @property
@@ -88,13 +90,18 @@ class KltTracker:
         seen = with_brightness_of(previous, current, points, guess, self._config.klt_window)
         levels = self._config.klt_levels
         expected = predict is not None or self._unpredicted.any()
-        depth = min(_EXPECTED_LEVELS, levels) if expected else levels
+        depth = levels
+        if expected:
+            depth = min(_NEAR_LEVELS if self._guessed_well else _EXPECTED_LEVELS, levels)
         found, good = self._follow_and_return(previous, seen, points, guess, depth)
         if depth < levels and np.count_nonzero(~good) > _MOST_LOST * len(good):
             # Something unexpected: the lost ones once more, with all of the pyramid.
             lost = ~good
             found[lost], good[lost] = self._follow_and_return(
                 previous, seen, points[lost], predicted[lost], levels)
+        off = found[good] - guess[good]
+        far = np.count_nonzero((off**2).sum(axis=1) > (0.5 * _NEAR)**2)
+        self._guessed_well = far <= _MOST_FAR * len(off)
         first, last = feature_rows(self._config, image.shape[0])
         good &= (found[:, 1] >= first) & (found[:, 1] <= last)
         self._set(self._ids[good], self._reference_points[good], found[good], self._quality[good],
@@ -189,6 +196,8 @@ class KltTracker:
         self._set(ids, points, points.copy(), np.ones(len(points)),
                   np.concatenate([self._unpredicted[apart], np.zeros_like(new)]))
         self._started = len(points)
+        # Nobody knows how the new ones will move.
+        self._guessed_well = len(new) == 0
         self._reference = self._current
         self._refined = False
 

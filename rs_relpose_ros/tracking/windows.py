@@ -15,6 +15,8 @@ Array = NDArray[np.float64]
 
 # Exposure that changes by less is left alone: rounding would cost more than it gains.
 _LEAST_GAIN, _LEAST_OFFSET = 0.03, 3.0
+# Numbers of 32 bits that a vector register of AVX2 holds.
+_LANES = 8
 # A fit that stretches or squeezes areas by more than this is none.
 _LARGEST_STRETCH = 4.0
 
@@ -47,13 +49,7 @@ def with_brightness_of(image1: Image, image2: Image, points1: Array, points2: Ar
     """
     if not len(points1):
         return image2
-    first_mean, first_contrast = _statistics(image1, points1, side)
-    mean, contrast = _statistics(image2, points2, side)
-    textured = contrast > 0.0
-    if not textured.any():
-        return image2
-    gain = np.median(first_contrast[textured] / contrast[textured])
-    offset = np.median(first_mean - gain * mean)
+    gain, offset = _exposure(image1, image2, points1, points2, side)
     if abs(gain - 1.0) < _LEAST_GAIN and abs(offset) < _LEAST_OFFSET:
         return image2
     table = np.clip(np.round(gain * np.arange(256.0) + offset), 0.0, 255.0).astype(np.uint8)
@@ -67,6 +63,22 @@ def correlations(image1: Image, image2: Image, points1: Array, points2: Array,
     Zero where one of the windows is flat.
     """
     return _correlations(image1, image2, points1, points2, side)
+
+
+@kernel
+def _exposure(image1: Image, image2: Image, points1: Array, points2: Array,
+              side: int) -> tuple[float, float]:
+    """Gain and offset that make the second image's windows like the first's, by their medians.
+
+    1 and 0 where all windows of the second are flat.
+    """
+    mean1, contrast1 = _statistics(image1, points1, side)
+    mean2, contrast2 = _statistics(image2, points2, side)
+    textured = contrast2 > 0.0
+    if not textured.any():
+        return 1.0, 0.0
+    gain = float(np.median(contrast1[textured] / contrast2[textured]))
+    return gain, float(np.median(mean1 - gain * mean2))
 
 
 @kernel
@@ -108,43 +120,79 @@ def _statistics(image: Image, points: Array, side: int) -> tuple[Array, Array]:
 @kernel
 def _correlations(image1: Image, image2: Image, points1: Array, points2: Array,
                   side: int) -> Array:
+    # Rows as long as the processor's vectors like them; what is more than the window is not used.
+    padded = -(-side // _LANES) * _LANES
+    window1 = np.zeros((side, padded), dtype=np.float32)
+    window2 = np.zeros((side, padded), dtype=np.float32)
+    # Sums by column: of one running sum each addition would wait for the last.
+    power1, power2 = np.empty(padded, dtype=np.float32), np.empty(padded, dtype=np.float32)
+    product = np.empty(padded, dtype=np.float32)
     count, pixels = points1.shape[0], side * side
     result = np.zeros(count)
-    window1, window2 = np.empty(pixels, dtype=np.float32), np.empty(pixels, dtype=np.float32)
     for k in range(count):
-        mean1 = _window(image1, points1[k, 0], points1[k, 1], side, window1)
-        mean2 = _window(image2, points2[k, 0], points2[k, 1], side, window2)
-        power1, power2, product = 0.0, 0.0, 0.0
-        for i in range(pixels):
-            off1, off2 = window1[i] - mean1, window2[i] - mean2
-            power1 += off1 * off1
-            power2 += off2 * off2
-            product += off1 * off2
+        mean1 = np.float32(_window(image1, points1[k, 0], points1[k, 1], window1, power1) / pixels)
+        mean2 = np.float32(_window(image2, points2[k, 0], points2[k, 1], window2, power2) / pixels)
+        power1[:], power2[:], product[:] = 0.0, 0.0, 0.0
+        for i in range(side):
+            row1, row2 = window1[i], window2[i]
+            for j in range(padded):
+                off1, off2 = row1[j] - mean1, row2[j] - mean2
+                power1[j] += off1 * off1
+                power2[j] += off2 * off2
+                product[j] += off1 * off2
+        total1, total2 = _total(power1, side), _total(power2, side)
         # A flat window has nothing but rounding.
-        if power1 > 1e-6 * pixels and power2 > 1e-6 * pixels:
-            result[k] = product / math.sqrt(power1 * power2)
+        if total1 > 1e-6 * pixels and total2 > 1e-6 * pixels:
+            result[k] = _total(product, side) / math.sqrt(total1 * total2)
     return result
 
 
 @kernel
-def _window(image: Image, x: float, y: float, side: int, window: NDArray[np.float32]) -> float:
-    """Sample the window (side^2,) centred at a point, the border repeated; its mean."""
+def _window(image: Image, x: float, y: float, window: NDArray[np.float32],
+            by_column: NDArray[np.float32]) -> float:
+    """Sample the `window` centred at a point, the border repeated; the sum of its pixels.
+
+    Square, but for its rows' end, which is padded; `by_column` is room to work in.
+    """
     height, width = image.shape
+    side, padded = window.shape
     left, top = math.floor(x) - side // 2, math.floor(y) - side // 2
     dx, dy = x - math.floor(x), y - math.floor(y)
     # One fraction for all pixels, as they lie on a grid.
     w00, w01 = np.float32((1.0 - dx) * (1.0 - dy)), np.float32(dx * (1.0 - dy))
     w10, w11 = np.float32((1.0 - dx) * dy), np.float32(dx * dy)
-    inside = left >= 0 and top >= 0 and left + side < width and top + side < height
+    by_column[:] = 0.0
+    if left >= 0 and top >= 0 and left + padded < width and top + side < height:
+        for i in range(side):
+            above, below = image[top + i], image[top + i + 1]
+            above0, above1 = above[left:left + padded], above[left + 1:left + padded + 1]
+            below0, below1 = below[left:left + padded], below[left + 1:left + padded + 1]
+            row = window[i]
+            for j in range(padded):
+                value = (w00 * np.float32(above0[j]) + w01 * np.float32(above1[j])
+                         + w10 * np.float32(below0[j]) + w11 * np.float32(below1[j]))
+                row[j] = value
+                by_column[j] += value
+    else:
+        columns = np.empty(side + 1, dtype=np.int64)
+        for j in range(side + 1):
+            columns[j] = min(max(left + j, 0), width - 1)
+        for i in range(side):
+            above = image[min(max(top + i, 0), height - 1)]
+            below = image[min(max(top + i + 1, 0), height - 1)]
+            for j in range(side):
+                value = (w00 * np.float32(above[columns[j]])
+                         + w01 * np.float32(above[columns[j + 1]])
+                         + w10 * np.float32(below[columns[j]])
+                         + w11 * np.float32(below[columns[j + 1]]))
+                window[i, j] = value
+                by_column[j] += value
+    return _total(by_column, side)
+
+
+@kernel
+def _total(by_column: NDArray[np.float32], side: int) -> float:
     total = 0.0
-    for i in range(side):
-        row = top + i if inside else min(max(top + i, 0), height - 1)
-        below = row + 1 if inside else min(max(top + i + 1, 0), height - 1)
-        for j in range(side):
-            column = left + j if inside else min(max(left + j, 0), width - 1)
-            right = column + 1 if inside else min(max(left + j + 1, 0), width - 1)
-            value = (w00 * image[row, column] + w01 * image[row, right]
-                     + w10 * image[below, column] + w11 * image[below, right])
-            window[i * side + j] = value
-            total += value
-    return total / (side * side)
+    for j in range(side):
+        total += by_column[j]
+    return total
