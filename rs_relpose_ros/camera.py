@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rs_relpose_ros.distortion import (
-    distort_points,
+    project_points,
     RATIONAL_COEFFICIENTS,
     rays_with_jacobian,
     undistort_points,
@@ -153,13 +153,8 @@ class RollingShutterCamera:
         A single exposure instant: a moving camera's rows are the caller's business.
         """
         points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
-        pixels = np.full((len(points), 2), np.nan)
-        front = points[:, 2] > 1e-9
-        normalized = points[front, :2] / points[front, 2:]
-        if not self.is_undistorted:
-            normalized = distort_points(normalized, *self._distortion_arguments)
-        pixels[front] = normalized * (self.fx, self.fy) + (self.cx, self.cy)
-        return pixels
+        normalized = project_points(points, *self._distortion_arguments)
+        return normalized * (self.fx, self.fy) + (self.cx, self.cy)
 
     def unproject(self, points: ArrayLike) -> NDArray[np.float64]:
         """Unit rays (N, 3) in the camera frame of raw pixels (N, 2).

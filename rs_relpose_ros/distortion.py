@@ -22,6 +22,8 @@ RATIONAL_COEFFICIENTS = 12
 _ITERATIONS = 50
 # Step [1] below which Newton has converged: 1e-9 px at any focal length.
 _CONVERGED = 1e-13
+# Depth from which a point lies before the camera.
+_NEAREST = 1e-9
 
 
 @kernel
@@ -66,13 +68,17 @@ def distort(x: float, y: float, k: Array, fisheye: bool, out: Array) -> None:
 
 
 @kernel
-def distort_points(points: Array, k: Array, fisheye: bool) -> Array:
-    """Distorted normalised points (N, 2)."""
-    out = np.empty(points.shape)
+def project_points(points: Array, k: Array, fisheye: bool) -> Array:
+    """Distorted normalised points (N, 2) of points (N, 3); NaN behind the camera."""
+    out = np.empty((points.shape[0], 2))
     values = np.empty(6)
     for i in range(points.shape[0]):
-        distort(points[i, 0], points[i, 1], k, fisheye, values)
-        out[i, 0], out[i, 1] = values[0], values[1]
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        if z > _NEAREST:
+            distort(x / z, y / z, k, fisheye, values)
+            out[i, 0], out[i, 1] = values[0], values[1]
+        else:
+            out[i, 0], out[i, 1] = math.nan, math.nan
     return out
 
 

@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 
 # Far beyond any gyro [rad/s]; a larger number is no rate, and its products may overflow.
 _LARGEST_RATE = 1e4
+# Of row times against the gyro samples that must enclose them [s].
+_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,13 +118,12 @@ class FrameMotion:
         if self.knot_times is None or self.knot_rotations is None:
             return rotations_at_rate(self.angular_velocity, tau)
         times = self.knot_times
-        tolerance = 1e-6
-        if len(tau) and not (times[0] - tolerance <= tau.min()
-                             and tau.max() <= times[-1] + tolerance):
+        rotations, covered = rotations_between(times, self.knot_rotations, tau, _TOLERANCE)
+        if not covered:
             raise InputError(
                 f'row times [{tau.min():.6f}, {tau.max():.6f}] s are not covered by the gyro '
                 f'samples, [{times[0]:.6f}, {times[-1]:.6f}] s')
-        return rotations_between(times, self.knot_rotations, np.clip(tau, times[0], times[-1]))
+        return rotations
 
     def derotate(self, rays: ArrayLike, row_times: ArrayLike) -> Array:
         """Rays (N, 3) measured at `row_times` (N,) [s], turned into the reference row's frame."""
@@ -149,16 +150,25 @@ def rotations_at_rate(rate: Array, times: Array) -> Array:
 
 
 @kernel
-def rotations_between(knot_times: Array, knot_rotations: Array, times: Array) -> Array:
-    """Orientations (N, 3, 3) at times (N,) within the knots, at a constant rate between two."""
+def rotations_between(knot_times: Array, knot_rotations: Array, times: Array,
+                      tolerance: float) -> tuple[Array, bool]:
+    """Orientations (N, 3, 3) at times (N,) within the knots, at a constant rate between two.
+
+    Also whether the knots enclose all times, with a tolerance; beyond them nothing turns on.
+    """
     out = np.empty((len(times), 3, 3))
     steps = np.empty((len(knot_times) - 1, 3))
     for k in range(len(steps)):
         steps[k] = log_so3(knot_rotations[k].T @ knot_rotations[k + 1])
     after = np.searchsorted(knot_times, times, side='right')
+    covered = True
     for i in range(len(times)):
+        # Written so that NaN is not covered.
+        covered &= (times[i] >= knot_times[0] - tolerance
+                    and times[i] <= knot_times[-1] + tolerance)
+        time = min(max(times[i], knot_times[0]), knot_times[-1])
         k = min(max(after[i] - 1, 0), len(steps) - 1)
-        fraction = (times[i] - knot_times[k]) / (knot_times[k + 1] - knot_times[k])
+        fraction = (time - knot_times[k]) / (knot_times[k + 1] - knot_times[k])
         turn = exp_so3(fraction * steps[k])
         # By hand: a call of BLAS costs more than nine sums of three products.
         for a in range(3):
@@ -166,7 +176,7 @@ def rotations_between(knot_times: Array, knot_rotations: Array, times: Array) ->
                 out[i, a, b] = (knot_rotations[k, a, 0] * turn[0, b]
                                 + knot_rotations[k, a, 1] * turn[1, b]
                                 + knot_rotations[k, a, 2] * turn[2, b])
-    return out
+    return out, covered
 
 
 def _vector3(name: str, value: ArrayLike) -> Array:

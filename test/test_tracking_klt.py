@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 from tracking_images import errors, moved, WarpedScene
 
 from rs_relpose_ros.errors import InputError
@@ -300,6 +301,37 @@ def test_correlation_at_the_border_and_of_flat_windows(scene):
     np.testing.assert_allclose(correlations(image, 255 - image, points, points, 15), -1.0)
     flat = np.full_like(image, 7)
     np.testing.assert_array_equal(correlations(image, flat, points, points, 15), 0.0)
+
+
+@pytest.mark.parametrize('side', [5, 15, 17, 31])
+def test_correlation_equals_that_of_numpy(scene, side):
+    images = scene.view(np.eye(3)), scene.view(scene.similarity(1.0, 1.0, (0.4, 0.3)))
+    rng = np.random.default_rng(5)
+    # Over the whole image, its border included.
+    points1 = rng.uniform([0.0, 0.0], [639.0, 479.0], (200, 2))
+    points2 = np.clip(points1 + rng.normal(size=(200, 2)), 0.0, [639.0, 479.0])
+    steps = np.arange(side) - side // 2
+    grid = np.stack(np.meshgrid(steps, steps, indexing='ij'), axis=-1)
+    for row, point1, point2 in zip(
+            correlations(*images, points1, points2, side), points1, points2, strict=True):
+        windows = [map_coordinates(image.astype(float), (grid + point[::-1]).reshape(-1, 2).T,
+                                   order=1, mode='nearest')
+                   for image, point in zip(images, (point1, point2), strict=True)]
+        if min(window.std() for window in windows) > 0.1:
+            assert row == pytest.approx(np.corrcoef(*windows)[0, 1], abs=1e-4)
+
+
+def test_a_jerk_after_steady_motion_does_not_lose_the_tracks(scene):
+    """Where guesses were good less of the pyramid is asked, until they are not."""
+    tracker = make_tracker(TrackingConfig())
+    shifts = [0.0, 1.0, 2.0, 3.0, 4.0, 22.0, 23.0]
+    H = [scene.similarity(0.0, 1.0, (shift, 0.0)) for shift in shifts]
+    tracker.start(scene.view(H[0]))
+    for warp in H[1:]:
+        tracker.track(scene.view(warp))
+    matches = tracker.refined_matches()
+    assert len(matches) > 240
+    assert np.median(errors(matches, H[0], H[-1])) < 0.1
 
 
 def test_homography_of_windows_is_the_identity_where_there_is_none():

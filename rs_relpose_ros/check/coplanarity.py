@@ -98,8 +98,8 @@ def refine(flows: list[Flow], seconds: Array, rates: Array, R_cam_imu: Array, of
 
         def normals(x: Array, rays1: Array = rays1, rays2: Array = rays2,
                     guess: Array = R_cam_imu) -> Array:
-            at = [rotations_between(seconds, orientations, np.clip(
-                times + x[3], seconds[0], seconds[-1])) for times in (starts, ends)]
+            at = [rotations_between(seconds, orientations, times + x[3], np.inf)[0]
+                  for times in (starts, ends)]
             lost = Rotation.from_rotvec(-(ends - starts)[:, None] * x[4:7]).as_matrix()
             by_gyro = np.swapaxes(at[0], 1, 2) @ at[1] @ lost
             R = Rotation.from_rotvec(x[:3]).as_matrix() @ guess

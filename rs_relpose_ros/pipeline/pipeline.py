@@ -14,6 +14,7 @@ from rs_relpose_ros.estimator.estimate import estimate_relative_pose
 from rs_relpose_ros.imu.frame_imu import FrameImu, GyroSegment
 from rs_relpose_ros.imu.integration import integrate_rotation
 from rs_relpose_ros.pipeline.calibration import Calibration
+from rs_relpose_ros.pipeline.derotated_rays import DerotatedRays
 from rs_relpose_ros.pipeline.drift import DriftTracker, PairRotation
 from rs_relpose_ros.pipeline.frame import Frame
 from rs_relpose_ros.pipeline.pair import PairResult
@@ -39,25 +40,12 @@ class _View:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _DerotatedRays:
-    """Rays (N, 3) of points (N, 2) of an image turned to its stamped row, with row times (N,)."""
+class _GyroTurn:
+    """``R_1^T R_2`` since the reference by the gyro, its covariance, and what was integrated."""
 
-    track_ids: NDArray[np.uint32]
-    points: Array
-    rays: Array
-    row_times: Array
-
-    def hold(self, track_ids: NDArray[np.uint32]) -> bool:
-        """Whether all of these are among them."""
-        return bool(np.isin(track_ids, self.track_ids).all())
-
-    def of(self, track_ids: NDArray[np.uint32]) -> _DerotatedRays:
-        """Those of some of the tracks, in the same order."""
-        if len(track_ids) == len(self.track_ids):
-            return self
-        kept = np.isin(self.track_ids, track_ids)
-        return _DerotatedRays(self.track_ids[kept], self.points[kept], self.rays[kept],
-                              self.row_times[kept])
+    rotation: Array
+    covariance: Array
+    segment: GyroSegment
 
 
 class Pipeline:
@@ -82,9 +70,9 @@ class Pipeline:
         self._camera: RollingShutterCamera | None = None
         self._reference: _View | None = None
         self._previous: _View | None = None
-        self._gyro: GyroSegment | None = None
-        self._reference_rays: _DerotatedRays | None = None
-        self._current_rays: _DerotatedRays | None = None
+        self._gyro: _GyroTurn | None = None
+        self._reference_rays: DerotatedRays | None = None
+        self._current_rays: DerotatedRays | None = None
         self._frames = 0
         self._promotion_due = False
 
@@ -123,7 +111,7 @@ class Pipeline:
             self._restart_from(view)
             return None
         self._frames += 1
-        self._gyro = _extended(self._gyro, imu.since_previous, first=self._frames == 1)
+        self._gyro = self._extended(imu.since_previous)
         matches = self._tracker.track(frame.image, self._predictor(self._previous.imu, imu))
         self._previous = view
         parallax, _ = self._parallax(matches, view)
@@ -155,11 +143,8 @@ class Pipeline:
         pixels1 = self._calibration.to_sensor(matches.points1)
         pixels2 = self._calibration.to_sensor(matches.points2)
         pair = self._parameters.pair
-        gyro_rotation = gyro_covariance = None
-        if self._gyro is not None:
-            gyro_rotation, gyro_covariance = integrate_rotation(
-                self._gyro.stamps_ns, self._gyro.angular_velocities, self._parameters.imu,
-                self._gyro.bias_sigma)
+        gyro = self._gyro
+        told = gyro if pair.use_gyro_rotation else None
         motion1, motion2 = reference.imu.motion, view.imu.motion
         config = self._parameters.estimator
         sigmas = [m.gravity_sigma for m in (reference.imu, view.imu)]
@@ -171,14 +156,14 @@ class Pipeline:
             motion1, motion2 = replace(motion1, gravity=None), replace(motion2, gravity=None)
         pose = estimate_relative_pose(
             pixels1, pixels2, camera, motion1, motion2,
-            relative_rotation=gyro_rotation if pair.use_gyro_rotation else None,
-            relative_rotation_covariance=gyro_covariance if pair.use_gyro_rotation else None,
+            relative_rotation=None if told is None else told.rotation,
+            relative_rotation_covariance=None if told is None else told.covariance,
             interval=self._interval(view), config=config, quality=matches.quality,
             rng=np.random.default_rng([pair.seed, reference.stamp_ns, view.stamp_ns]))
-        if self._gyro is not None and gyro_rotation is not None:
+        if gyro is not None:
             self._drift.add(PairRotation(
-                view.imu.reference_ns, pose.R, pose.covariance[3:, 3:], gyro_rotation,
-                gyro_covariance if pair.use_gyro_rotation else None, self._gyro,
+                view.imu.reference_ns, pose.R, pose.covariance[3:, 3:], gyro.rotation,
+                None if told is None else told.covariance, gyro.segment,
                 reference.imu.applied_offset_ns / NANOSECONDS,
                 view.imu.applied_offset_ns / NANOSECONDS))
         self._drift.apply(self._parameters.sensor.track_time_offset)
@@ -187,7 +172,7 @@ class Pipeline:
             reference_stamp_ns=reference.stamp_ns, stamp_ns=view.stamp_ns,
             frame_id=frame.frame_id, interval=self._interval(view), pose=pose, matches=matches,
             row_times1=tau1, row_times2=tau2, rays1=rays1, rays2=rays2, parallax=parallax,
-            gyro_rotation=gyro_rotation, drift=self._drift.estimate(),
+            gyro_rotation=None if gyro is None else gyro.rotation, drift=self._drift.estimate(),
             image1=reference.image if self._keep_images else None,
             image2=frame.image if self._keep_images else None)
 
@@ -205,21 +190,30 @@ class Pipeline:
         """Median parallax [px] after derotation, and the derotated rays with their row times."""
         camera, calibration, reference = self._camera, self._calibration, self._reference
         assert camera is not None and calibration is not None and reference is not None
+        known = self._reference_rays
         # What is tracked gets fewer from frame to frame, and the reference's points stay.
-        if self._reference_rays is None or not self._reference_rays.hold(matches.track_ids):
-            self._reference_rays = _derotated(camera, calibration, reference, matches.track_ids,
-                                              matches.points1)
-        self._reference_rays = self._reference_rays.of(matches.track_ids)
-        self._current_rays = _derotated(camera, calibration, view, matches.track_ids,
-                                        matches.points2)
-        rays1, tau1 = self._reference_rays.rays, self._reference_rays.row_times
-        rays2, tau2 = self._current_rays.rays, self._current_rays.row_times
-        if self._gyro is not None:
-            rotation, _ = integrate_rotation(
-                self._gyro.stamps_ns, self._gyro.angular_velocities, self._parameters.imu)
-        else:
-            rotation = aligning_rotation(rays1.T @ rays2)
-        return camera.fx * median_parallax(rays1, rays2, rotation), (rays1, rays2, tau1, tau2)
+        first = None if known is None else known.of(matches.track_ids)
+        if first is None:
+            first = DerotatedRays.from_points(matches.track_ids, matches.points1, camera,
+                                              calibration, reference.imu.motion)
+        second = DerotatedRays.from_points(matches.track_ids, matches.points2, camera, calibration,
+                                           view.imu.motion)
+        self._reference_rays, self._current_rays = first, second
+        rotation = (aligning_rotation(first.rays.T @ second.rays) if self._gyro is None
+                    else self._gyro.rotation)
+        return (camera.fx * median_parallax(first.rays, second.rays, rotation),
+                (first.rays, second.rays, first.row_times, second.row_times))
+
+    def _extended(self, segment: GyroSegment | None) -> _GyroTurn | None:
+        """Gyro since the reference, continued by a frame; None as soon as a part is missing."""
+        if segment is None:
+            return None
+        if self._frames > 1:
+            if self._gyro is None:
+                return None
+            segment = self._gyro.segment.joined(segment)
+        return _GyroTurn(*integrate_rotation(segment.stamps_ns, segment.angular_velocities,
+                                             self._parameters.imu, segment.bias_sigma), segment)
 
     def _predictor(self, previous: FrameImu, current: FrameImu) -> Callable[[Array], Array] | None:
         """Where the gyro expects previous-image points in the current image; None without gyro."""
@@ -251,14 +245,6 @@ class Pipeline:
         return predict
 
 
-def _derotated(camera: RollingShutterCamera, calibration: Calibration, view: _View,
-               track_ids: NDArray[np.uint32], points: Array) -> _DerotatedRays:
-    pixels = calibration.to_sensor(points)
-    row_times = camera.row_times(pixels[:, 1])
-    return _DerotatedRays(track_ids, points,
-                          view.imu.motion.derotate(camera.unproject(pixels), row_times), row_times)
-
-
 def sensor_camera(calibration: Calibration, parameters: Parameters) -> RollingShutterCamera:
     """Camera model of the full sensor; published pixels map to it by `Calibration.to_sensor`."""
     sensor = parameters.sensor
@@ -270,16 +256,6 @@ def sensor_camera(calibration: Calibration, parameters: Parameters) -> RollingSh
         cx=calibration.cx, cy=calibration.cy, distortion_model=calibration.distortion_model,
         distortion=calibration.distortion, readout_time=sensor.readout_time,
         readout_direction=sensor.readout_direction, reference_row=sensor.stamp_row)
-
-
-def _extended(gyro: GyroSegment | None, segment: GyroSegment | None,
-              first: bool) -> GyroSegment | None:
-    """Gyro since the reference, continued by one frame; None as soon as a part is missing."""
-    if segment is None:
-        return None
-    if first:
-        return segment
-    return None if gyro is None else gyro.joined(segment)
 
 
 __all__ = ['Pipeline', 'RelativePose', 'Status', 'sensor_camera']

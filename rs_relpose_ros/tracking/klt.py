@@ -101,7 +101,7 @@ class KltTracker:
                 previous, seen, points[lost], predicted[lost], levels)
         off = found[good] - guess[good]
         far = np.count_nonzero((off**2).sum(axis=1) > (0.5 * _NEAR)**2)
-        self._guessed_well = far <= _MOST_FAR * len(off)
+        self._guessed_well = bool(far <= _MOST_FAR * len(off))
         first, last = feature_rows(self._config, image.shape[0])
         good &= (found[:, 1] >= first) & (found[:, 1] <= last)
         self._set(self._ids[good], self._reference_points[good], found[good], self._quality[good],

@@ -17,19 +17,23 @@ Array = NDArray[np.float64]
 _LEAST_GAIN, _LEAST_OFFSET = 0.03, 3.0
 # Numbers of 32 bits that a vector register of AVX2 holds.
 _LANES = 8
+# The fit of a window's turn and scale needs no more points than about this; each one costs time.
+_FITTED = 100
 # A fit that stretches or squeezes areas by more than this is none.
 _LARGEST_STRETCH = 4.0
 
 
 def window_homography(points1: Array, points2: Array) -> Array:
-    """Homography (3, 3) from the first image to the second that fits all points (N, 2).
+    """Homography (3, 3) from the first image to the second that fits the points (N, 2).
 
     The identity where there is none: too few points, or a wild fit.
     """
     if len(points1) < 8:
         return np.eye(3)
     # None, where there is none, becomes an array without shape.
-    H = np.asarray(cv2.findHomography(points1, points2, method=0)[0], dtype=np.float64)
+    some = slice(None, None, -(-len(points1) // _FITTED))
+    H = np.asarray(cv2.findHomography(points1[some], points2[some], method=0)[0],
+                   dtype=np.float64)
     if H.shape != (3, 3) or not np.isfinite(H).all():
         return np.eye(3)
     scale = points1 @ H[2, :2] + H[2, 2]

@@ -1,0 +1,43 @@
+"""Derotated rays are kept for the tracks that go on."""
+
+import numpy as np
+import pytest
+
+from rs_relpose_ros import FrameMotion, RollingShutterCamera
+from rs_relpose_ros.pipeline.calibration import Calibration
+from rs_relpose_ros.pipeline.derotated_rays import DerotatedRays
+
+CALIBRATION = Calibration(width=640, height=480, fx=450.0, fy=450.0, cx=320.0, cy=240.0,
+                          distortion_model='plumb_bob', distortion=(-0.2, 0.05, 0.0, 0.0),
+                          image_width=640, image_height=480)
+CAMERA = RollingShutterCamera(width=640, height=480, fx=450.0, fy=450.0, cx=320.0, cy=240.0,
+                              distortion=(-0.2, 0.05, 0.0, 0.0), readout_time=0.03)
+MOTION = FrameMotion([0.4, -0.8, 0.3])
+
+
+def rays_of(ids):
+    """Of a set of points that depend on their ids alone."""
+    ids = np.asarray(ids, dtype=np.uint32)
+    points = np.random.default_rng(0).uniform([20.0, 20.0], [620.0, 460.0], (5000, 2))[ids % 5000]
+    return DerotatedRays.from_points(ids, points, CAMERA, CALIBRATION, MOTION)
+
+
+# Ids wrap around: what is newer may be smaller.
+@pytest.mark.parametrize('ids', [range(40), [2**32 - 2, 2**32 - 1, 0, 1, 2, 3, 700, 30]])
+def test_those_that_go_on_are_the_same_as_computed_anew(ids):
+    every = rays_of(list(ids))
+    some = every.track_ids[[0, 2, 3, 6]]
+    kept, anew = every.of(some), rays_of(some)
+    for name in ('track_ids', 'points', 'rays', 'row_times'):
+        np.testing.assert_array_equal(getattr(kept, name), getattr(anew, name))
+
+
+def test_all_are_the_same_and_none_is_legal():
+    every = rays_of(range(9))
+    assert every.of(every.track_ids) is every
+    assert len(every.of(every.track_ids[:0]).rays) == 0
+
+
+@pytest.mark.parametrize('wanted', [[3, 99], [99], [5, 3]])
+def test_a_track_that_is_missing_or_out_of_order_is_no_subset(wanted):
+    assert rays_of(range(9)).of(np.array(wanted, dtype=np.uint32)) is None
