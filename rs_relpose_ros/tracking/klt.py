@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -10,16 +12,27 @@ from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.tracking.config import TrackingConfig
 from rs_relpose_ros.tracking.corners import feature_rows, find_corners, keep_apart
 from rs_relpose_ros.tracking.images import checked, Image
+from rs_relpose_ros.tracking.lucas_kanade import (
+    Flow,
+    follow,
+    inside,
+    patch_radius,
+    whole_images,
+)
 from rs_relpose_ros.tracking.matches import Matches
+from rs_relpose_ros.tracking.patches import cut, cut_warped
 from rs_relpose_ros.tracking.tracker import Predict
-from rs_relpose_ros.tracking.windows import correlations, window_homography, with_brightness_of
+from rs_relpose_ros.tracking.windows import (
+    brightness_table,
+    correlations,
+    window_jacobians,
+    with_brightness,
+)
 
 Array = NDArray[np.float64]
 
 _FOLLOW = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02)
 _REFINE = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.005)
-# OpenCV's eigenvalues are those of Scharr gradients, 32 times the derivative, divided by 2^20.
-_SCHARR = 2.0**20 / 32.0**2
 # Corrections of the guess [px] that the image itself, without its pyramid, makes up for.
 _NEAR = 2.0
 # Levels of the pyramid where the gyro says where to look, and where the guesses of the last frame
@@ -87,7 +100,8 @@ class KltTracker:
                                  points)
         # What the gyro did not tell (parallax) goes on as it did.
         guess = predicted + self._unpredicted
-        seen = with_brightness_of(previous, current, points, guess, self._config.klt_window)
+        seen = with_brightness(current, brightness_table(
+            previous, current, points, guess, self._config.klt_window))
         levels = self._config.klt_levels
         expected = predict is not None or self._unpredicted.any()
         depth = levels
@@ -114,21 +128,25 @@ class KltTracker:
         """Matches whose windows were aligned with the reference's own."""
         if (not self._refined and len(self._ids) and self._reference is not None
                 and self._current is not None and self._current is not self._reference):
-            H = window_homography(self._reference_points, self._points)
-            height, width = self._current.shape
-            # As the reference would see it, were all of it one plane.
-            seen: Image = cv2.warpPerspective(  # type: ignore[assignment]
-                self._current, H, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-            guess = _mapped(np.asarray(np.linalg.inv(H), dtype=np.float64), self._points)
-            seen = with_brightness_of(self._reference, seen, self._reference_points, guess,
-                                      self._config.klt_window)
-            aligned, good, strength = self._follow(
-                self._reference, seen, self._reference_points, guess, 1, _REFINE)
-            found = _mapped(H, aligned)
-            correlation = correlations(self._reference, seen, self._reference_points, aligned,
-                                       self._config.klt_window)
-            good &= ((correlation >= self._config.min_correlation)
-                     & (np.linalg.norm(found - self._points, axis=1) <= _LARGEST_CORRECTION))
+            side = self._config.klt_window
+            radius = patch_radius(side, math.ceil(_LARGEST_CORRECTION))
+            # Turned and scaled as the reference sees them.
+            jacobians = window_jacobians(self._reference_points, self._points)
+            seen = cut_warped(self._current, self._points, jacobians, radius,
+                              self._reference_points)
+            here = cut(self._reference, self._reference_points, radius)
+            windows = self._reference_points + here.shifts
+            image = with_brightness(seen.image, brightness_table(
+                self._reference, self._current, self._reference_points, self._points, side))
+            aligned = whole_images(here.image, image, windows, windows, side, 1, _REFINE)
+            correction = np.einsum('nij,nj->ni', jacobians, aligned.points - windows)
+            found = self._points + correction
+            correlation = correlations(here.image, image, windows, aligned.points, side)
+            # The border that is repeated in a patch is no image.
+            good = (aligned.found & inside(self._current, found, side // 4)
+                    & (correlation >= self._config.min_correlation)
+                    & (np.linalg.norm(correction, axis=1) <= _LARGEST_CORRECTION))
+            strength = aligned.strength
             # A faint corner is worth less than a strong one of the same correlation.
             quality = correlation * strength / (strength + self._config.feature_quality)
             self._set(self._ids[good], self._reference_points[good], found[good], quality[good],
@@ -147,7 +165,8 @@ class KltTracker:
     def _follow_and_return(self, image1: Image, image2: Image, points1: Array, guess: Array,
                            levels: int) -> tuple[Array, NDArray[np.bool_]]:
         """Points of `image2` that look like `points1` (N, 2), and which of them lead back."""
-        found, good, _ = self._follow(image1, image2, points1, guess, levels, _FOLLOW)
+        there = self._follow(image1, image2, points1, guess, levels)
+        found, good = there.points, there.found
         # The way back starts as far off as the way forth did: the guess must not be the answer.
         offset = found - guess
         leads_back = np.zeros(len(points1), dtype=bool)
@@ -156,31 +175,14 @@ class KltTracker:
         for depth, tried in ((1, np.ones(len(points1), dtype=bool)), (levels, far)):
             mask = good & tried & ~leads_back
             if depth == 1 or (levels > 1 and mask.any()):
-                back, returned, _ = self._follow(
-                    image2, image1, found[mask], (points1 + offset)[mask], depth, _FOLLOW)
-                leads_back[mask] = returned & (np.linalg.norm(back - points1[mask], axis=1)
-                                               <= self._config.forward_backward_threshold)
+                back = self._follow(image2, image1, found[mask], (points1 + offset)[mask], depth)
+                error = np.linalg.norm(back.points - points1[mask], axis=1)
+                leads_back[mask] = back.found & (error <= self._config.forward_backward_threshold)
         return found, leads_back
 
-    def _follow(self, image1: Image, image2: Image, points1: Array, guess: Array, levels: int,
-                criteria: tuple[int, int, float]) -> tuple[Array, NDArray[np.bool_], Array]:
-        """Points of `image2` that look like `points1` (N, 2), and which of them were found.
-
-        Last, the least eigenvalues (N,) of the windows' structure tensors [gray^2/px^2].
-        """
-        if not len(points1):
-            return points1, np.empty(0, dtype=bool), np.empty(0)
-        side = self._config.klt_window
-        found, status, eigenvalues = cv2.calcOpticalFlowPyrLK(
-            image1, image2, points1.astype(np.float32, order='C'),
-            guess.astype(np.float32, order='C'), winSize=(side, side), maxLevel=levels - 1,
-            criteria=criteria,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW | cv2.OPTFLOW_LK_GET_MIN_EIGENVALS)
-        points2 = np.asarray(found, dtype=np.float64)
-        height, width = image2.shape
-        inside = ((points2 >= 0.0) & (points2 <= (width - 1.0, height - 1.0))).all(axis=1)
-        strength = _SCHARR * np.asarray(eigenvalues, dtype=np.float64)[:, 0]
-        return points2, (np.asarray(status)[:, 0] == 1) & inside, strength
+    def _follow(self, image1: Image, image2: Image, points1: Array, guess: Array,
+                levels: int) -> Flow:
+        return follow(image1, image2, points1, guess, self._config.klt_window, levels, _FOLLOW)
 
     def _renew(self) -> None:
         assert self._current is not None
@@ -210,8 +212,3 @@ class KltTracker:
         # Copies: the tracker goes on, the matches do not change.
         return Matches(self._ids.copy(), self._reference_points.copy(), self._points.copy(),
                        self._quality.copy())
-
-
-def _mapped(H: Array, points: Array) -> Array:
-    """Points (N, 2) under a homography (3, 3)."""
-    return np.asarray(cv2.perspectiveTransform(points[:, None], H), dtype=np.float64)[:, 0]

@@ -45,19 +45,49 @@ def window_homography(points1: Array, points2: Array) -> Array:
     return H
 
 
-def with_brightness_of(image1: Image, image2: Image, points1: Array, points2: Array,
-                       side: int) -> Image:
-    """`image2` as bright and as rich in contrast as `image1`, as most windows tell.
+def window_jacobians(points1: Array, points2: Array) -> Array:
+    """How windows around points (N, 2) are turned and scaled in the second image (N, 2, 2).
+
+    Derivatives of `window_homography`: a column for each axis of the first image.
+    """
+    H = window_homography(points1, points2)
+    homogeneous = np.column_stack([points1, np.ones(len(points1))]) @ H.T
+    depth = homogeneous[:, 2, None, None]
+    mapped = homogeneous[:, :2] / depth[:, 0]
+    return (H[:2, :2] - mapped[:, :, None] * H[2, :2]) / depth
+
+
+def brightness_table(image1: Image, image2: Image, points1: Array, points2: Array,
+                     side: int) -> Image | None:
+    """What makes the second image as bright and as rich in contrast as the first.
 
     Lucas-Kanade takes brightness for constant, while automatic exposure changes it.
+
+    Parameters
+    ----------
+    image1, image2 : (H, W) ndarray of uint8
+        As the camera took them: interpolation smooths the noise, and contrast with it.
+    points1, points2 : (N, 2) ndarray
+        Matches, whose windows are compared.
+    side : int
+        Of the windows [px].
+
+    Returns
+    -------
+    (256,) ndarray of uint8 or None
+        The first image's brightness for each of the second's; None where they are alike.
     """
     if not len(points1):
-        return image2
+        return None
     gain, offset = _exposure(image1, image2, points1, points2, side)
     if abs(gain - 1.0) < _LEAST_GAIN and abs(offset) < _LEAST_OFFSET:
-        return image2
-    table = np.clip(np.round(gain * np.arange(256.0) + offset), 0.0, 255.0).astype(np.uint8)
-    return cv2.LUT(image2, table)  # type: ignore[return-value]
+        return None
+    return np.clip(np.round(gain * np.arange(256.0) + offset), 0.0, 255.0).astype(np.uint8)
+
+
+def with_brightness(image: Image, table: Image | None) -> Image:
+    """`image` as a table of `brightness_table` says."""
+    return image if table is None else cv2.LUT(image, table)  # type: ignore[return-value]
 
 
 def correlations(image1: Image, image2: Image, points1: Array, points2: Array,
@@ -87,10 +117,7 @@ def _exposure(image1: Image, image2: Image, points1: Array, points2: Array,
 
 @kernel
 def _statistics(image: Image, points: Array, side: int) -> tuple[Array, Array]:
-    """Mean and standard deviation (N,) of the windows around `points` (N, 2).
-
-    Of whole pixels: interpolation would smooth the noise, and more so in one of two images.
-    """
+    """Mean and standard deviation (N,) of the windows around `points` (N, 2), of whole pixels."""
     height, width = image.shape
     count, pixels = points.shape[0], side * side
     mean, deviation = np.empty(count), np.empty(count)

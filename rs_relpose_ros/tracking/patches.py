@@ -1,0 +1,132 @@
+"""Patches around points, laid side by side in one small image.
+
+What is done to windows then costs the same whatever the size of the image: OpenCV's Lucas-Kanade,
+for one, prepares all of an image for the sake of a few hundred windows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.compiled import kernel
+from rs_relpose_ros.tracking.images import Image
+
+Array = NDArray[np.float64]
+Map = NDArray[np.float32]
+
+# Beyond any image, and small enough for integers [px].
+_FARTHEST = 1e6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Patches:
+    """Square patches of one image.
+
+    Attributes
+    ----------
+    image : (H, W) ndarray of uint8
+        Patch by patch, in rows.
+    shifts : (N, 2) ndarray
+        What takes a point near the centre of patch k from the pixels of the whole image to those
+        of `image`.
+    """
+
+    image: Image
+    shifts: Array
+
+
+def cut(image: Image, points: Array, radius: int) -> Patches:
+    """Patches of ``2 radius + 1`` pixels around points (N, 2), the border repeated."""
+    centres = _whole(points)
+    side = 2 * radius + 1
+    shape, corners = _layout(len(points), side)
+    mosaic = np.zeros(shape, dtype=np.uint8)
+    _copy(image, centres - radius, side, corners, mosaic)
+    return Patches(mosaic, (corners + radius - centres).astype(np.float64))
+
+
+def cut_warped(image: Image, points: Array, jacobians: Array, radius: int,
+               points1: Array) -> Patches:
+    """Patches of another image's geometry, filled with what this one shows.
+
+    Parameters
+    ----------
+    image : (H, W) ndarray of uint8
+    points : (N, 2) ndarray
+        In this image.
+    jacobians : (N, 2, 2) ndarray
+        How far one moves in this image with a pixel of the other.
+    radius : int
+    points1 : (N, 2) ndarray
+        The same points in the other image.
+
+    Returns
+    -------
+    Patches
+        With shifts from the other image's pixels; patch k shows ``points + J (x - points1)`` at x.
+    """
+    centres = _whole(points1)
+    side = 2 * radius + 1
+    shape, corners = _layout(len(points), side)
+    x, y = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
+    _maps(points, jacobians, centres - points1, side, corners, x, y)
+    mosaic: Image = cv2.remap(  # type: ignore[assignment]
+        image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return Patches(mosaic, (corners + radius - centres).astype(np.float64))
+
+
+def _whole(points: Array) -> NDArray[np.int64]:
+    return np.rint(np.clip(points, -_FARTHEST, _FARTHEST)).astype(np.int64)
+
+
+def _layout(count: int, side: int) -> tuple[tuple[int, int], NDArray[np.int64]]:
+    """Height and width of an image for so many patches, and their upper left corners (N, 2)."""
+    columns = max(math.isqrt(max(count - 1, 0)) + 1, 1)
+    k = np.arange(count)
+    corners = side * np.column_stack([k % columns, k // columns])
+    return (side * max(-(-count // columns), 1), side * columns), corners
+
+
+@kernel
+def _copy(image: Image, first: NDArray[np.int64], side: int, corners: NDArray[np.int64],
+          mosaic: Image) -> None:
+    height, width = image.shape
+    for k in range(len(first)):
+        left, top = first[k, 0], first[k, 1]
+        column, row = corners[k, 0], corners[k, 1]
+        inside = left >= 0 and top >= 0 and left + side <= width and top + side <= height
+        for i in range(side):
+            target = mosaic[row + i, column:column + side]
+            if inside:
+                source = image[top + i, left:left + side]
+                for j in range(len(target)):
+                    target[j] = source[j]
+            else:
+                line = image[min(max(top + i, 0), height - 1)]
+                for j in range(len(target)):
+                    target[j] = line[min(max(left + j, 0), width - 1)]
+
+
+@kernel
+def _maps(points: Array, jacobians: Array, offsets: Array, side: int,
+          corners: NDArray[np.int64], x: Map, y: Map) -> None:
+    """Where patch k is sampled: ``point + J (offset + d)``, d whole pixels from its centre."""
+    radius = side // 2
+    for k in range(len(points)):
+        a, c = np.float32(jacobians[k, 0, 0]), np.float32(jacobians[k, 1, 0])
+        column, row = corners[k, 0], corners[k, 1]
+        for i in range(side):
+            across, down = offsets[k, 0] - radius, offsets[k, 1] + i - radius
+            x0 = np.float32(points[k, 0] + jacobians[k, 0, 0] * across
+                            + jacobians[k, 0, 1] * down)
+            y0 = np.float32(points[k, 1] + jacobians[k, 1, 0] * across
+                            + jacobians[k, 1, 1] * down)
+            xs, ys = x[row + i, column:column + side], y[row + i, column:column + side]
+            for j in range(side):
+                xs[j] = x0 + a * np.float32(j)
+                ys[j] = y0 + c * np.float32(j)
