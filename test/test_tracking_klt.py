@@ -93,6 +93,24 @@ def test_without_prediction_one_level_cannot_follow_60_px(scene):
     assert np.sum(errors(tracker.refined_matches(), H1, H2) < 1.0) < 20
 
 
+def test_motion_goes_on_in_proportion_to_the_time_between_images(scene):
+    """Frames that a busy machine drops leave gaps."""
+    flow = np.array([5.0, -2.0])
+    views = [scene.similarity(0.0, 1.0, tuple(-k * flow)) for k in (0, 1, 13)]
+    found = []
+    for gap in (12.0, 1.0):
+        # Without a pyramid nothing is found far from its guess.
+        tracker = make_tracker(TrackingConfig(klt_levels=1))
+        tracker.start(scene.view(views[0]))
+        # The prediction knows 80 % of the motion.
+        tracker.track(scene.view(views[1]), lambda points: points + 0.8 * flow, 1.0)
+        tracker.track(scene.view(views[2]), lambda points: points + 12.0 * 0.8 * flow, gap)
+        found.append(np.count_nonzero(
+            errors(tracker.refined_matches(), views[0], views[2]) < 0.5))
+    assert found[0] > 200
+    assert found[1] < 0.7 * found[0]
+
+
 def test_a_wrong_prediction_is_overcome_or_drops_the_track(scene):
     H1, H2 = np.eye(3), scene.similarity(1.0, 1.0, (4.0, 3.0))
     images = [scene.view(H1), scene.view(H2)]

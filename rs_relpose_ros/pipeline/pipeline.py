@@ -21,7 +21,7 @@ from rs_relpose_ros.pipeline.pair import PairResult
 from rs_relpose_ros.pipeline.parameters import Parameters
 from rs_relpose_ros.result import RelativePose, Status
 from rs_relpose_ros.so3 import aligning_rotation
-from rs_relpose_ros.timing import NANOSECONDS
+from rs_relpose_ros.timing import NANOSECONDS, seconds_between
 from rs_relpose_ros.tracking.keyframes import decide_keyframe, KeyframeDecision
 from rs_relpose_ros.tracking.matches import Matches
 from rs_relpose_ros.tracking.parallax import median_parallax
@@ -112,7 +112,9 @@ class Pipeline:
             return None
         self._frames += 1
         self._gyro = self._extended(imu.since_previous)
-        matches = self._tracker.track(frame.image, self._predictor(self._previous.imu, imu))
+        matches = self._tracker.track(
+            frame.image, self._predictor(self._previous.imu, imu),
+            seconds_between(self._previous.stamp_ns, frame.stamp_ns))
         self._previous = view
         parallax, _ = self._parallax(matches, view)
         decision = decide_keyframe(
@@ -183,7 +185,7 @@ class Pipeline:
 
     def _interval(self, view: _View) -> float:
         assert self._reference is not None
-        return (view.imu.reference_ns - self._reference.imu.reference_ns) * 1e-9
+        return seconds_between(self._reference.imu.reference_ns, view.imu.reference_ns)
 
     def _parallax(self, matches: Matches,
                   view: _View) -> tuple[float, tuple[Array, Array, Array, Array]]:

@@ -71,7 +71,8 @@ class DescriptorTracker:
         self._shape = image.shape
         self._reference = self._current = self._detect(image)
 
-    def track(self, image: Image, predict: Predict | None = None) -> Matches:
+    def track(self, image: Image, predict: Predict | None = None,
+              interval: float = 1.0) -> Matches:
         """Match `image`, which then is the current one, with the reference.
 
         `predict` speaks of the previous image, and is not needed: the search is not local.

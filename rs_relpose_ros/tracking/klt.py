@@ -80,7 +80,8 @@ class KltTracker:
         self._current = image
         self._renew()
 
-    def track(self, image: Image, predict: Predict | None = None) -> Matches:
+    def track(self, image: Image, predict: Predict | None = None,
+              interval: float = 1.0) -> Matches:
         """Follow the corners from the current image into `image`, which then is the current one.
 
         Parameters
@@ -88,6 +89,9 @@ class KltTracker:
         image : (H, W) ndarray of uint8
         predict : callable, optional
             Maps points of the previous image to where they are expected in this one.
+        interval : float
+            Time since the previous image, in any unit: what is not predicted goes on in
+            proportion to it.
         """
         if self._current is None:
             raise InputError('the tracker has no reference keyframe: call start() first')
@@ -99,11 +103,11 @@ class KltTracker:
             predicted = np.where(np.isfinite(predicted).all(axis=1, keepdims=True), predicted,
                                  points)
         # What the gyro did not tell (parallax) goes on as it did.
-        guess = predicted + self._unpredicted
+        guess = predicted + interval * self._residual_flow
         seen = with_brightness(current, brightness_table(
             previous, current, points, guess, self._config.klt_window))
         levels = self._config.klt_levels
-        expected = predict is not None or self._unpredicted.any()
+        expected = predict is not None or self._residual_flow.any()
         depth = levels
         if expected:
             depth = min(_NEAR_LEVELS if self._guessed_well else _EXPECTED_LEVELS, levels)
@@ -119,7 +123,7 @@ class KltTracker:
         first, last = feature_rows(self._config, image.shape[0])
         good &= (found[:, 1] >= first) & (found[:, 1] <= last)
         self._set(self._ids[good], self._reference_points[good], found[good], self._quality[good],
-                  (found - predicted)[good])
+                  (found - predicted)[good] / interval)
         self._current = current
         self._refined = False
         return self._matches()
@@ -150,7 +154,7 @@ class KltTracker:
             # A faint corner is worth less than a strong one of the same correlation.
             quality = correlation * strength / (strength + self._config.feature_quality)
             self._set(self._ids[good], self._reference_points[good], found[good], quality[good],
-                      self._unpredicted[good])
+                      self._residual_flow[good])
         self._refined = True
         return self._matches()
 
@@ -196,7 +200,7 @@ class KltTracker:
         self._next_id += len(new)
         points = np.concatenate([kept, new])
         self._set(ids, points, points.copy(), np.ones(len(points)),
-                  np.concatenate([self._unpredicted[apart], np.zeros_like(new)]))
+                  np.concatenate([self._residual_flow[apart], np.zeros_like(new)]))
         self._started = len(points)
         # Nobody knows how the new ones will move.
         self._guessed_well = len(new) == 0
@@ -204,9 +208,9 @@ class KltTracker:
         self._refined = False
 
     def _set(self, ids: NDArray[np.uint32], reference_points: Array, points: Array,
-             quality: Array, unpredicted: Array) -> None:
+             quality: Array, residual_flow: Array) -> None:
         self._ids, self._reference_points = ids, reference_points
-        self._points, self._quality, self._unpredicted = points, quality, unpredicted
+        self._points, self._quality, self._residual_flow = points, quality, residual_flow
 
     def _matches(self) -> Matches:
         # Copies: the tracker goes on, the matches do not change.

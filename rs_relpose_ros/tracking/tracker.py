@@ -30,7 +30,8 @@ class Tracker(Protocol):
     def start(self, image: Image) -> None:
         """Make `image` (H, W) the reference keyframe."""
 
-    def track(self, image: Image, predict: Predict | None = None) -> Matches:
+    def track(self, image: Image, predict: Predict | None = None,
+              interval: float = 1.0) -> Matches:
         """Make `image` the current one; its matches with the reference."""
 
     def refined_matches(self) -> Matches:
