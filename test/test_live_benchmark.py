@@ -145,7 +145,8 @@ def test_cells_are_selected_by_pattern(capsys):
         '1920x1080-bgr8-imu200', '1920x1080-bgr8-imu400']
     assert live.CELLS['1280x720-mono8-imu200'].is_big
     assert not live.CELLS['640x480-mono8-imu200'].is_big
-    assert not live.CELLS['1920x1080-jpeg-imu200'].is_big
+    assert live.CELLS['1920x1080-jpeg-imu200'].is_big
+    assert not live.CELLS['1280x720-jpeg-imu200'].is_big
     assert main(['benchmark', 'live', '--cells', '4k-*']) == 2
     assert 'no cell is named' in capsys.readouterr().err
     assert main(['benchmark', 'live', '--duration', '1']) == 2
