@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+import functools
 import logging
 from pathlib import Path
 from typing import Any
 
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, QosReliability
+from rosbags.rosbag2 import Reader
 from rosbags.typesys import get_typestore, Stores
+from rosbags.typesys.store import Typestore
 
 from rs_relpose_ros.bags.limits import bound_decompression, check_metadata, MAX_MESSAGE_BYTES
 from rs_relpose_ros.bags.mcap_check import check_mcap
@@ -86,10 +89,36 @@ class RawMessage:
     data: bytes
 
 
+class Rosbag2(Reader):
+    """A ROS 2 bag, of whose message types the names count and not the definitions.
+
+    rosbags would parse all definitions, of topics that nobody asks for as well: an expression in
+    one in IDL takes any time and memory, and makes Python code of them.
+    """
+
+    is2 = True
+
+    def deserialize(self, data: bytes, msgtype: str) -> Any:
+        """A message of a type of ROS 2 Jazzy."""
+        return ros2_types().deserialize_cdr(data, msgtype)
+
+
+@functools.cache
+def ros2_types() -> Typestore:
+    """The message types of ROS 2 Jazzy."""
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+@functools.cache
+def _type_hash(msgtype: str) -> str:
+    types = ros2_types()
+    return types.hash_rihs01(msgtype) if msgtype in types.fielddefs else ''
+
+
 class Bag:
     """An open bag; made by `open_bag`."""
 
-    def __init__(self, path: Path, reader: AnyReader) -> None:
+    def __init__(self, path: Path, reader: AnyReader | Rosbag2) -> None:
         self.path = path
         self._reader = reader
         counts: dict[tuple[str, str], int] = {}
@@ -149,6 +178,7 @@ class Bag:
             The bag is damaged, or a message cannot be decoded.
         """
         for connection, bag_time_ns, data in self._raw(topics):
+            self._check_type(connection)
             with self._decoding(connection):
                 message = self._reader.deserialize(data, connection.msgtype)
             yield BagMessage(connection.topic, bag_time_ns, message)
@@ -162,7 +192,7 @@ class Bag:
             The bag is damaged, or a ROS 1 message has no counterpart in ROS 2.
         """
         # Of ROS 2, not of the bag: headers of ROS 1 have a number more.
-        typestore = get_typestore(Stores.ROS2_JAZZY)
+        typestore = ros2_types()
         for connection, bag_time_ns, data in self._raw(topics):
             if not self._reader.is2:
                 if connection.msgtype not in typestore.fielddefs:
@@ -191,6 +221,14 @@ class Bag:
                 raise InputError(f'a message of {connection.topic} in {self.path} has {len(data)} '
                                  f'bytes; at most {MAX_MESSAGE_BYTES} are read')
             yield connection, bag_time_ns, data
+
+    def _check_type(self, connection: Connection) -> None:
+        """A type of the same name may have had other fields where the bag was recorded."""
+        known = _type_hash(connection.msgtype) if self._reader.is2 else ''
+        if known and connection.digest and connection.digest != known:
+            raise InputError(f'topic {connection.topic} of {self.path} is of another '
+                             f'{connection.msgtype} than that of ROS 2 Jazzy: its type hash is '
+                             f'{str(connection.digest)[:80]}')
 
     @contextmanager
     def _decoding(self, connection: Connection) -> Iterator[None]:
@@ -299,7 +337,7 @@ def open_bag(path: Path | str) -> Iterator[Bag]:
     _check_path(path)
     reader = None
     try:
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
+        reader = AnyReader([path]) if path.suffix == '.bag' and path.is_file() else Rosbag2(path)
         reader.open()
     except PermissionError as error:
         raise InputError(f'{path} cannot be read: {error.strerror}') from error
