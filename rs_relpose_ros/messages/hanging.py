@@ -21,7 +21,7 @@ _FEWEST_SAMPLES = 4
 _LEAST_RANGE = 2.0
 # A driver or a filter may clip below it: at the largest value that ever came, and above what the
 # bias of a coarse gyro repeats at rest [rad/s].
-_LEAST_CLIPPING = 0.5
+_LEAST_CLIPPING = 0.2
 
 
 class HangingCamera:
