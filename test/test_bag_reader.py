@@ -515,6 +515,17 @@ def test_a_type_with_other_fields_is_told(tmp_path):
         read_all(bag)
 
 
+def test_a_definition_of_ros_1_that_takes_any_time_or_memory(tmp_path):
+    """An array of messages without fields has no bytes, whatever its length."""
+    writer = Ros1Writer(tmp_path / 'bag.bag')
+    definition = f'std_msgs/Empty[4000000000] nothing\n{"=" * 80}\nMSG: std_msgs/Empty\n'
+    with writer:
+        connection = writer.add_connection('/imu', IMU, msgdef=definition, md5sum='0' * 32)
+        writer.write(connection, STAMP_NS, b'')
+    with pytest.raises(InputError, match='is of another sensor_msgs/msg/Imu than that of ROS 1'):
+        read_all(tmp_path / 'bag.bag')
+
+
 # --- sizes that a bag makes of itself
 
 

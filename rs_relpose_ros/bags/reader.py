@@ -10,11 +10,10 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, QosReliability
-from rosbags.rosbag2 import Reader
+from rosbags.rosbag1 import Reader as Reader1
+from rosbags.rosbag2 import Reader as Reader2
 from rosbags.typesys import get_typestore, Stores
-from rosbags.typesys.store import Typestore
 
 from rs_relpose_ros.bags.limits import bound_decompression, check_metadata, MAX_MESSAGE_BYTES
 from rs_relpose_ros.bags.mcap_check import check_mcap
@@ -89,38 +88,47 @@ class RawMessage:
     data: bytes
 
 
-class Rosbag2(Reader):
-    """A ROS 2 bag, of whose message types the names count and not the definitions.
+class _Types:
+    """Message types of one ROS, by their names alone.
 
-    rosbags would parse all definitions, of topics that nobody asks for as well: an expression in
-    one in IDL takes any time and memory, and makes Python code of them.
+    rosbags would parse the definitions in a bag, also of topics that nobody asks for, and make
+    code of them: an expression in IDL takes any time and memory to parse, an array of empty
+    messages to read.
     """
 
-    is2 = True
+    def __init__(self, store: Stores, name: str) -> None:
+        self.store = get_typestore(store)
+        self.name = name
+        self._hashes: dict[str, str] = {}
 
-    def deserialize(self, data: bytes, msgtype: str) -> Any:
-        """A message of a type of ROS 2 Jazzy."""
-        return ros2_types().deserialize_cdr(data, msgtype)
+    def hash(self, msgtype: str, of_ros2: bool) -> str:
+        """Hash of its fields as recorders write it; empty for a type that is not known."""
+        if msgtype not in self.store.fielddefs:
+            return ''
+        if msgtype not in self._hashes:
+            self._hashes[msgtype] = (self.store.hash_rihs01(msgtype) if of_ros2
+                                     else self.store.generate_msgdef(msgtype)[1])
+        return self._hashes[msgtype]
 
 
 @functools.cache
-def ros2_types() -> Typestore:
-    """The message types of ROS 2 Jazzy."""
-    return get_typestore(Stores.ROS2_JAZZY)
+def _ros1_types() -> _Types:
+    return _Types(Stores.ROS1_NOETIC, 'ROS 1 Noetic')
 
 
 @functools.cache
-def _type_hash(msgtype: str) -> str:
-    types = ros2_types()
-    return types.hash_rihs01(msgtype) if msgtype in types.fielddefs else ''
+def _ros2_types() -> _Types:
+    return _Types(Stores.ROS2_JAZZY, 'ROS 2 Jazzy')
 
 
 class Bag:
     """An open bag; made by `open_bag`."""
 
-    def __init__(self, path: Path, reader: AnyReader | Rosbag2) -> None:
+    def __init__(self, path: Path, reader: Reader1 | Reader2) -> None:
         self.path = path
         self._reader = reader
+        self._is_ros2 = isinstance(reader, Reader2)
+        self._types = _ros2_types() if self._is_ros2 else _ros1_types()
         counts: dict[tuple[str, str], int] = {}
         # Typed, but metadata is YAML, in which anything may stand anywhere.
         connections: Any = reader.connections
@@ -180,7 +188,9 @@ class Bag:
         for connection, bag_time_ns, data in self._raw(topics):
             self._check_type(connection)
             with self._decoding(connection):
-                message = self._reader.deserialize(data, connection.msgtype)
+                read = (self._types.store.deserialize_cdr if self._is_ros2
+                        else self._types.store.deserialize_ros1)
+                message = read(data, connection.msgtype)
             yield BagMessage(connection.topic, bag_time_ns, message)
 
     def raw_messages(self, topics: Sequence[Topic]) -> Iterator[RawMessage]:
@@ -192,9 +202,9 @@ class Bag:
             The bag is damaged, or a ROS 1 message has no counterpart in ROS 2.
         """
         # Of ROS 2, not of the bag: headers of ROS 1 have a number more.
-        typestore = ros2_types()
+        typestore = _ros2_types().store
         for connection, bag_time_ns, data in self._raw(topics):
-            if not self._reader.is2:
+            if not self._is_ros2:
                 if connection.msgtype not in typestore.fielddefs:
                     raise InputError(f'topic {connection.topic} of {self.path} is of type '
                                      f'{connection.msgtype}, which ROS 2 does not have: leave it '
@@ -224,11 +234,11 @@ class Bag:
 
     def _check_type(self, connection: Connection) -> None:
         """A type of the same name may have had other fields where the bag was recorded."""
-        known = _type_hash(connection.msgtype) if self._reader.is2 else ''
+        known = self._types.hash(connection.msgtype, self._is_ros2)
         if known and connection.digest and connection.digest != known:
             raise InputError(f'topic {connection.topic} of {self.path} is of another '
-                             f'{connection.msgtype} than that of ROS 2 Jazzy: its type hash is '
-                             f'{str(connection.digest)[:80]}')
+                             f'{connection.msgtype} than that of {self._types.name}: its type '
+                             f'hash is {str(connection.digest)[:80]}')
 
     @contextmanager
     def _decoding(self, connection: Connection) -> Iterator[None]:
@@ -337,7 +347,7 @@ def open_bag(path: Path | str) -> Iterator[Bag]:
     _check_path(path)
     reader = None
     try:
-        reader = AnyReader([path]) if path.suffix == '.bag' and path.is_file() else Rosbag2(path)
+        reader = Reader1(path) if path.suffix == '.bag' and path.is_file() else Reader2(path)
         reader.open()
     except PermissionError as error:
         raise InputError(f'{path} cannot be read: {error.strerror}') from error
