@@ -406,6 +406,7 @@ def no_storage(folder: Path) -> Path:
     (metadata_is('rosbag2_bagfile_information: {version: 99}'), InputError, 'is damaged'),
     (metadata_with('message_count: 4', 'message_count: many'), InputError, 'is damaged'),
     (metadata_with('name: /imu', 'name: 17'), InputError, 'is damaged'),
+    (metadata_with('name: /imu', 'name: "/im\\nu"'), InputError, 'is damaged'),
     (no_storage, InputError, 'is damaged'),
 ])
 def test_bad_bags_are_told_in_one_sentence(tmp_path, make, kind, words):
@@ -511,7 +512,7 @@ def test_a_type_with_other_fields_is_told(tmp_path):
     other = known[:-4] + 'beef'
     storage.write_bytes(storage.read_bytes().replace(known.encode(), other.encode()))
     (bag / 'metadata.yaml').write_text(metadata.replace(known, other))
-    with pytest.raises(InputError, match=f'topic /imu of .* is of another {IMU} .*beef$'):
+    with pytest.raises(InputError, match=f'topic /imu of .* is of another {IMU} .*beef\'$'):
         read_all(bag)
 
 

@@ -133,7 +133,8 @@ class Bag:
         # Typed, but metadata is YAML, in which anything may stand anywhere.
         connections: Any = reader.connections
         for connection in connections:
-            if not (isinstance(connection.topic, str) and isinstance(connection.msgtype, str)
+            if not (isinstance(connection.topic, str) and connection.topic.isprintable()
+                    and isinstance(connection.msgtype, str) and connection.msgtype.isprintable()
                     and isinstance(connection.msgcount, int)):
                 raise InputError(f'{path} is damaged: its metadata has a topic whose name, type '
                                  'or number of messages is none')
@@ -238,7 +239,7 @@ class Bag:
         if known and connection.digest and connection.digest != known:
             raise InputError(f'topic {connection.topic} of {self.path} is of another '
                              f'{connection.msgtype} than that of {self._types.name}: its type '
-                             f'hash is {str(connection.digest)[:80]}')
+                             f'hash is {str(connection.digest)[:80]!r}')
 
     @contextmanager
     def _decoding(self, connection: Connection) -> Iterator[None]:
