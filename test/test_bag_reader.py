@@ -512,7 +512,7 @@ def test_a_type_with_other_fields_is_told(tmp_path):
     other = known[:-4] + 'beef'
     storage.write_bytes(storage.read_bytes().replace(known.encode(), other.encode()))
     (bag / 'metadata.yaml').write_text(metadata.replace(known, other))
-    with pytest.raises(InputError, match=f'topic /imu of .* is of another {IMU} .*beef\'$'):
+    with pytest.raises(InputError, match=f"topic /imu of .* is of another {IMU} .*beef'$"):
         read_all(bag)
 
 
