@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 import shutil
+import sqlite3
+import tempfile
 
 import lz4.frame
 import message_builders as build
@@ -404,6 +406,7 @@ def no_storage(folder: Path) -> Path:
     (metadata_is('rosbag2_bagfile_information: {version: 99}'), InputError, 'is damaged'),
     (metadata_with('message_count: 4', 'message_count: many'), InputError, 'is damaged'),
     (metadata_with('name: /imu', 'name: 17'), InputError, 'is damaged'),
+    (metadata_with('name: /imu', 'name: "/im\\nu"'), InputError, 'is damaged'),
     (no_storage, InputError, 'is damaged'),
 ])
 def test_bad_bags_are_told_in_one_sentence(tmp_path, make, kind, words):
@@ -468,6 +471,62 @@ def test_a_message_beyond_any_image_is_not_decoded(tmp_path, monkeypatch):
         read_all(bag)
 
 
+# --- definitions of types, which are not read
+
+# An expression in IDL: of any size, or with brackets that take the parser any time.
+DEFINITIONS = ['const unsigned long X = 1 << 80000000000;', f'const long X = {"(" * 9}1{")" * 9};']
+
+
+@pytest.mark.parametrize('definition', DEFINITIONS)
+@pytest.mark.timeout(30)
+def test_a_definition_that_takes_any_time_or_memory(tmp_path, definition):
+    bag = write_kind('sqlite3', tmp_path)
+    text = f'module a {{ module msg {{ {definition} struct B {{ long y; }}; }}; }};'
+    [file] = bag.glob('*.db3')
+    with sqlite3.connect(file) as base:
+        changed = base.execute(
+            "UPDATE message_definitions SET encoding = 'ros2idl', encoded_message_definition = ?",
+            (text,)).rowcount
+    base.close()
+    assert changed == 4
+    assert len(read_all(bag)) == 7
+
+
+def test_definitions_that_nobody_can_read(tmp_path):
+    """Also that of a topic which is not asked for would have kept the bag shut."""
+    bag = write_kind('sqlite3', tmp_path)
+    [file] = bag.glob('*.db3')
+    with sqlite3.connect(file) as base:
+        base.execute("UPDATE message_definitions SET encoded_message_definition = '((('")
+    base.close()
+    assert len(read_all(bag)) == 7
+
+
+def test_a_type_with_other_fields_is_told(tmp_path):
+    """By its hash, which recorders write from Iron on."""
+    bag = write_kind('mcap', tmp_path)
+    metadata = (bag / 'metadata.yaml').read_text()
+    known = JAZZY.hash_rihs01(IMU)
+    assert known in metadata
+    storage = storage_file(bag)
+    other = known[:-4] + 'beef'
+    storage.write_bytes(storage.read_bytes().replace(known.encode(), other.encode()))
+    (bag / 'metadata.yaml').write_text(metadata.replace(known, other))
+    with pytest.raises(InputError, match=f"topic /imu of .* is of another {IMU} .*beef'$"):
+        read_all(bag)
+
+
+def test_a_definition_of_ros_1_that_takes_any_time_or_memory(tmp_path):
+    """An array of messages without fields has no bytes, whatever its length."""
+    writer = Ros1Writer(tmp_path / 'bag.bag')
+    definition = f'std_msgs/Empty[4000000000] nothing\n{"=" * 80}\nMSG: std_msgs/Empty\n'
+    with writer:
+        connection = writer.add_connection('/imu', IMU, msgdef=definition, md5sum='0' * 32)
+        writer.write(connection, STAMP_NS, b'')
+    with pytest.raises(InputError, match='is of another sensor_msgs/msg/Imu than that of ROS 1'):
+        read_all(tmp_path / 'bag.bag')
+
+
 # --- sizes that a bag makes of itself
 
 
@@ -493,6 +552,19 @@ def test_decompression_is_bounded(tmp_path, monkeypatch, kind, limit):
     monkeypatch.setattr(limits, limit, 1 << 20)
     with pytest.raises(InputError, match='bytes decompress to more than 1048576'):
         read_all(bag)
+
+
+@pytest.mark.parametrize('kind', ['sqlite3_zstd_files', 'mcap_zstd_files'])
+def test_decompression_of_files_is_bounded(tmp_path, monkeypatch, kind):
+    monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path / 'temporary'))
+    (tmp_path / 'temporary').mkdir()
+    bag = bomb(kind, tmp_path)
+    assert len(read_all(bag)) == 8
+    # And 200 times what the file has, some MB here.
+    monkeypatch.setattr(limits, 'MAX_FILE_BYTES', 1 << 20)
+    with pytest.raises(InputError, match=r'bytes decompress to more than \d+$'):
+        read_all(bag)
+    assert not list((tmp_path / 'temporary').iterdir())
 
 
 def test_a_chunk_never_becomes_larger_than_it_says(tmp_path):

@@ -8,16 +8,14 @@ from pathlib import Path
 import signal
 from typing import Any
 
-from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
 from nav_msgs.msg import Path as PathMessage
 import numpy as np
 import pytest
 import ros_graph
 from scipy.spatial.transform import Rotation
-from sensor_msgs.msg import PointCloud2, TimeReference
 
 from rs_relpose_ros.bags.reader import open_bag
-from rs_relpose_ros.messages.outgoing import pair_messages, PairMessages
+from rs_relpose_ros.messages.outgoing import pair_messages, PAIR_TOPICS, PairMessages
 from rs_relpose_ros.replay.parameter_file import read_parameters
 from rs_relpose_ros.replay.run import read_truth, Replay
 from rs_relpose_ros.replay.truth import TrueTrajectory
@@ -27,8 +25,6 @@ from rs_relpose_ros.ros.message_types import message_class
 pytestmark = pytest.mark.timeout(600)
 
 EXAMPLE = ros_graph.ROOT / 'docs' / 'examples' / 'chain_poses.py'
-KINDS = {'relative_pose': PoseWithCovarianceStamped, 'reference': TimeReference,
-         'velocity': TwistWithCovarianceStamped, 'matches': PointCloud2}
 
 
 @dataclass(frozen=True)
@@ -65,13 +61,13 @@ def run(module_ros_domain_id: int,
     with ros_graph.Graph() as graph, ros_graph.Script(
             EXAMPLE, '--ros-args', '-r', '__ns:=/relpose_node') as example:
         paths = graph.listen(PathMessage, '/relpose_node/pose_chain/path')
-        publishers = {name: graph.publisher(kind, f'/relpose_node/{name}')
-                      for name, kind in KINDS.items()}
+        publishers = {name: graph.publisher(message_class(kind), f'/relpose_node/{name}')
+                      for name, kind in PAIR_TOPICS.items()}
         ros_graph.wait_until(
             lambda: graph.node.count_publishers('/relpose_node/pose_chain/path'), 'discovery')
         for count, pair in enumerate(pairs):
             # In any order: their stamps say what belongs together.
-            for name in sorted(KINDS, reverse=count % 2 == 1):
+            for name in sorted(PAIR_TOPICS, reverse=count % 2 == 1):
                 publishers[name].publish(getattr(pair, name))
             ros_graph.wait_until(lambda n=count: len(paths) > n, 'a path')
         code, _ = example.signal(signal.SIGINT)

@@ -483,7 +483,7 @@ def used(values: list[tuple[float, float, float]], step_ms: int = 5,
 
 
 def test_a_gyro_that_repeats_itself_hangs():
-    told = used([(0.1, 0.2, 0.3)] * 8 + [(0.1, 0.2, 0.31)])
+    told = used([(0.01, 0.02, 0.3)] * 8 + [(0.01, 0.02, 0.31)])
     # 25 ms are borne.
     assert told[:6] == ['used', *[''] * 5]
     assert all('it hangs' in text for text in told[6:8])
@@ -498,8 +498,26 @@ def test_a_gyro_at_the_end_of_its_range_is_saturated():
     assert told[-1] == 'the x axis of the gyro repeats -4.36 rad/s bit by bit: it is saturated'
 
 
+def test_a_gyro_that_is_clipped_below_any_range_is_saturated():
+    """Told by what it repeats being the largest value that ever came."""
+    rng = np.random.default_rng(0)
+    turn = np.clip(1.3 * np.sin(np.linspace(0.0, 12.0, 240)), -0.7, 0.7)
+    told = used([(x, y, z) for (x, y), z in zip(rng.normal(size=(240, 2)), turn, strict=True)])
+    clipped = np.flatnonzero(np.abs(turn) == 0.7)
+    assert 100 < len(clipped) < 180
+    # Of each stretch the first is true.
+    firsts = clipped[np.diff(clipped, prepend=-2) > 1]
+    assert [k for k, text in enumerate(told) if text != 'used'] == sorted(
+        set(clipped.tolist()) - set(firsts.tolist()))
+    assert 'the z axis of the gyro repeats -0.7 rad/s bit by bit: it is saturated' in told
+
+
 def test_what_sensors_do_repeat():
     noise = np.random.default_rng(0).normal(size=40)
+    # Coarse values that are not the largest, and a bias at rest that is.
+    assert set(used([(1.0, -1.0, z) for z in noise[:1]] + [
+        (0.8, -0.8, z) for z in noise])) == {'used'}
+    assert set(used([(0.15, -0.15, z) for z in noise])) == {'used'}
     # A robot in the plane, and a coarse gyro at rest.
     assert set(used([(0.0, 0.0, z) for z in noise])) == {'used'}
     assert set(used([(0.001, -0.001, z) for z in noise])) == {'used'}

@@ -315,20 +315,42 @@ def test_a_misspelt_parameter_is_told(ros_domain_id):
         assert node.signal(signal.SIGINT)[0] == 0
 
 
-def test_quality_of_service_can_be_overridden(ros_domain_id):
-    """A reliable subscription, which a publisher of best effort does not match."""
-    override = 'qos_overrides./camera/image_raw.subscription.reliability'
+@pytest.mark.parametrize('reliable', [
+    ['/camera/image_raw'], ['/imu/data_raw', '/camera/camera_info']])
+def test_quality_of_service_can_be_overridden(ros_domain_id, reliable):
+    """Reliable subscriptions, which a publisher of best effort does not match; one by one."""
+    unknown = 'qos_overrides./camera/nothing.subscription.depth'
+    parameters = {f'qos_overrides.{topic}.subscription.reliability': 'reliable'
+                  for topic in reliable}
     with ros_graph.Graph() as graph, ros_graph.node_process(
             ros_graph.ROOT / 'bags' / 'hand_held.yaml', remap=ros_graph.BAG_TOPICS,
-            parameters={'image_transport': 'raw', override: 'reliable'}) as node:
+            parameters={'image_transport': 'raw', unknown: 3, **parameters}) as node:
         node.wait_for('ready')
-        info = ros_graph.wait_until(
-            lambda: graph.node.get_subscriptions_info_by_topic('/camera/image_raw'), 'discovery')
-        assert info[0].qos_profile.reliability is ReliabilityPolicy.RELIABLE
-        [imu] = graph.node.get_subscriptions_info_by_topic('/imu/data_raw')
-        assert imu.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT
+        for topic in [*ros_graph.BAG_TOPICS.values(), '/accel']:
+            [info] = ros_graph.wait_until(
+                lambda topic=topic: graph.node.get_subscriptions_info_by_topic(topic), 'discovery')
+            assert info.qos_profile.reliability is (
+                ReliabilityPolicy.RELIABLE if topic in reliable else ReliabilityPolicy.BEST_EFFORT)
         assert node.signal(signal.SIGINT)[0] == 0
         assert 'there is no parameter' not in node.output
+        assert node.output.count('is no QoS override of this node') == 1
+        assert f'{unknown} is no QoS override of this node' in node.output
+
+
+@pytest.mark.parametrize(('policy', 'value', 'sentence'), [
+    ('reliability', 'sometimes', 'override for policy `reliability`: `sometimes`'),
+    ('depth', 'many', 'qos_overrides./camera/image_raw.subscription.depth')])
+def test_an_illegal_override_ends_the_node_with_one_line(ros_domain_id, policy, value, sentence):
+    override = f'qos_overrides./camera/image_raw.subscription.{policy}'
+    with ros_graph.node_process(
+            ros_graph.ROOT / 'bags' / 'hand_held.yaml', remap=ros_graph.BAG_TOPICS,
+            parameters={'image_transport': 'raw', override: value}) as node:
+        assert node.wait() == 2
+        lines = [line for line in node.output.strip().splitlines() if '[INFO]' not in line]
+        assert len(lines) == 1, lines
+        assert '[FATAL]' in lines[0]
+        assert 'a QoS override is not legal' in lines[0]
+        assert sentence in lines[0]
 
 
 # -- transform -------------------------------------------------------------------------------

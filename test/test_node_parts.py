@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+import re
+
+from conftest import ROOT
 import numpy as np
 import pytest
 
+from rs_relpose_ros.pipeline.drift import Drift
 from rs_relpose_ros.pipeline.pair import PairResult
 from rs_relpose_ros.pipeline.sequencer import Refusal, SequencerCounts
 from rs_relpose_ros.result import RelativePose, Status
@@ -26,6 +31,22 @@ class Clock:
 @pytest.fixture
 def clock() -> Clock:
     return Clock()
+
+
+# Of `test_every_counter_has_its_own_figure`, besides the refusals.
+EXPECTED = {
+    'state': 'degraded', 'missing': 'imu', 'image_rate_hz': '30.0', 'camera_info_rate_hz': '31.0',
+    'imu_rate_hz': '200.0', 'accel_rate_hz': '100.0', 'frames_received': '2000',
+    'frames_processed': '1064', 'frames_failed': '3', 'messages_invalid': '15',
+    'imu_samples': '9000', 'imu_gaps': '11', 'imu_repeated': '13', 'imu_late': '14',
+    'clock_jumps': '12', 'pairs': '3', 'poses': '2', 'matches': '20', 'inliers': '15',
+    'inlier_ratio': '0.750', 'parallax_px': '3.2', 'model': 'uniform',
+    'tracked_gyro_bias_rad_s': '0.01000 -0.02000 0.03000',
+    'tracked_gyro_bias_sigma_rad_s': '0.00100 0.00200 0.00300', 'tracked_time_offset_ms': '4.00',
+    'tracked_time_offset_sigma_ms': '0.50', 'applied_time_offset_ms': '-1.50',
+    'latency_p50_ms': '15.0', 'latency_p99_ms': '15.0',
+    'frame_time_p50_ms': '30.0', 'frame_time_p99_ms': '30.0', 'worker_busy_percent': '2',
+    'last_reason_no_pose': 'LOW_PARALLAX: it stands'}
 
 
 # -- log lines -------------------------------------------------------------------------------
@@ -131,6 +152,43 @@ def test_overload_is_told_as_such(clock):
     report = statistics.report(inputs(), counts(frames=10, taken=4, overload=3, no_imu=3),
                                problem='', missing=())
     assert report.text == '1 frames were not used since the last report'
+
+
+def test_every_counter_has_its_own_figure(clock):
+    """All different, so that none can stand for another."""
+    statistics = Statistics(clock)
+    refused = {cause: 100 + k for k, cause in enumerate(Refusal)}
+    for _ in range(3):
+        statistics.add_failure('a frame failed')
+    with_drift = replace(pair(Status.LOW_PARALLAX, 'it stands'), drift=Drift(
+        gyro_bias=np.array([0.01, -0.02, 0.03]), gyro_bias_sigma=np.array([1e-3, 2e-3, 3e-3]),
+        time_offset=0.004, time_offset_sigma=0.0005, applied=-0.0015, pairs=7))
+    clock.now = SECOND
+    for result in (pair(), pair(), with_drift):
+        statistics.add_pair(result, clock.now - 15 * 10**6)
+    statistics.add_frame(clock.now - 30 * 10**6)
+    counted = SequencerCounts(frames=2000, frames_taken=1064, refused=refused, imu_samples=9000,
+                              imu_gaps=11, clock_jumps=12, imu_repeated=13, imu_late=14)
+    clock.now = 2 * SECOND
+    report = statistics.report(Inputs(images=60, camera_infos=62, imu=400, accelerometer=200,
+                                      invalid=15), counted, problem='', missing=('imu',))
+    values = dict(report.values)
+    assert len(values) == len(report.values)
+    assert {name: values[name] for name in EXPECTED} == EXPECTED
+    refusals = {f'frames_refused_{cause.value}': str(n) for cause, n in refused.items()}
+    assert values == {**values, **refusals}
+    assert set(values) == {*EXPECTED, *refusals}
+
+
+def test_every_figure_is_documented(clock):
+    report = Statistics(clock).report(inputs(), counts(), problem='', missing=())
+    text = (ROOT / 'docs' / 'operation.md').read_text(encoding='utf-8')
+    documented = set(re.findall(r'`(\w+)`', text[text.index('## Diagnostics'):]
+                                .partition('\n## ')[0]))
+    names = {name for name, _ in report.values}
+    causes = {f'frames_refused_{cause.value}' for cause in Refusal}
+    assert names - causes <= documented
+    assert {cause.value for cause in Refusal} <= documented
 
 
 def test_level_and_text(clock):

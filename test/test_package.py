@@ -106,8 +106,8 @@ def test_every_folder_of_modules_is_a_package():
 def test_core_imports_neither_ros_nor_rosbags():
     core = sorted(name for name in MODULES
                   if not name.startswith((f'{NAME}.ros', f'{NAME}.bags', f'{NAME}.cli'))
-                  and re.match(rf'{NAME}($|\.(estimator|solvers|imu|tracking|pipeline|messages))',
-                               name))
+                  and re.match(rf'{NAME}($|\.(estimator|solvers|imu|tracking|pipeline|messages'
+                               '|pose_chain))', name))
     assert f'{NAME}.estimator.estimate' in core
     loaded = loaded_after('\n'.join(f'import {name}' for name in core))
     assert NAME in loaded

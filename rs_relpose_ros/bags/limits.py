@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import bz2
 from collections.abc import Callable
+import os
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, BinaryIO, Self
 
 from lz4.frame import LZ4FrameDecompressor
 from rosbags.rosbag1 import reader as rosbag1
@@ -24,6 +25,9 @@ from rs_relpose_ros.errors import InputError
 MAX_CHUNK_BYTES = 1 << 30
 # Largest message that is decoded: above any image that is accepted (64 Mpx in four channels).
 MAX_MESSAGE_BYTES = 1 << 29
+# A compressed storage file is decompressed to a temporary one: this and so many times its size.
+MAX_FILE_BYTES = 1 << 30
+_MAX_FILE_GROWTH = 200
 # Thousands of topics take less.
 _MAX_METADATA_BYTES = 1 << 24
 
@@ -66,8 +70,31 @@ def bound_decompression() -> None:
     rosbag1.decompressors['bz2'] = lambda data: _bounded(
         bz2.BZ2Decompressor, data, MAX_CHUNK_BYTES)
     vars(rosbag2)['zstd'] = SimpleNamespace(
-        open=_zstd.open, decompress=lambda data: _bounded(
+        open=_BoundedFile, decompress=lambda data: _bounded(
             _zstd.ZstdDecompressor, data, MAX_MESSAGE_BYTES))
+
+
+class _BoundedFile:
+    """A zstd file that is read up to a size only; where rosbags opens one for reading."""
+
+    def __init__(self, file: BinaryIO, mode: str) -> None:
+        self._size = os.fstat(file.fileno()).st_size
+        self._limit = MAX_FILE_BYTES + _MAX_FILE_GROWTH * self._size
+        self._stream: Any = _zstd.open(file, mode)
+        self._count = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stream.close()
+
+    def read(self, size: int) -> bytes:
+        data: bytes = self._stream.read(size)
+        self._count += len(data)
+        if self._count > self._limit:
+            raise InputError(f'{self._size} bytes decompress to more than {self._limit}')
+        return data
 
 
 def _bounded(decompressor: Callable[[], Any], data: bytes, limit: int) -> bytes:

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+import functools
 import logging
 from pathlib import Path
 from typing import Any
 
-from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, QosReliability
+from rosbags.rosbag1 import Reader as Reader1
+from rosbags.rosbag2 import Reader as Reader2
 from rosbags.typesys import get_typestore, Stores
 
 from rs_relpose_ros.bags.limits import bound_decompression, check_metadata, MAX_MESSAGE_BYTES
@@ -86,17 +88,53 @@ class RawMessage:
     data: bytes
 
 
+class _Types:
+    """Message types of one ROS, by their names alone.
+
+    rosbags would parse the definitions in a bag, also of topics that nobody asks for, and make
+    code of them: an expression in IDL takes any time and memory to parse, an array of empty
+    messages to read.
+    """
+
+    def __init__(self, store: Stores, name: str) -> None:
+        self.store = get_typestore(store)
+        self.name = name
+        self._hashes: dict[str, str] = {}
+
+    def hash(self, msgtype: str, of_ros2: bool) -> str:
+        """Hash of its fields as recorders write it; empty for a type that is not known."""
+        if msgtype not in self.store.fielddefs:
+            return ''
+        if msgtype not in self._hashes:
+            self._hashes[msgtype] = (self.store.hash_rihs01(msgtype) if of_ros2
+                                     else self.store.generate_msgdef(msgtype)[1])
+        return self._hashes[msgtype]
+
+
+@functools.cache
+def _ros1_types() -> _Types:
+    return _Types(Stores.ROS1_NOETIC, 'ROS 1 Noetic')
+
+
+@functools.cache
+def _ros2_types() -> _Types:
+    return _Types(Stores.ROS2_JAZZY, 'ROS 2 Jazzy')
+
+
 class Bag:
     """An open bag; made by `open_bag`."""
 
-    def __init__(self, path: Path, reader: AnyReader) -> None:
+    def __init__(self, path: Path, reader: Reader1 | Reader2) -> None:
         self.path = path
         self._reader = reader
+        self._is_ros2 = isinstance(reader, Reader2)
+        self._types = _ros2_types() if self._is_ros2 else _ros1_types()
         counts: dict[tuple[str, str], int] = {}
         # Typed, but metadata is YAML, in which anything may stand anywhere.
         connections: Any = reader.connections
         for connection in connections:
-            if not (isinstance(connection.topic, str) and isinstance(connection.msgtype, str)
+            if not (isinstance(connection.topic, str) and connection.topic.isprintable()
+                    and isinstance(connection.msgtype, str) and connection.msgtype.isprintable()
                     and isinstance(connection.msgcount, int)):
                 raise InputError(f'{path} is damaged: its metadata has a topic whose name, type '
                                  'or number of messages is none')
@@ -149,8 +187,11 @@ class Bag:
             The bag is damaged, or a message cannot be decoded.
         """
         for connection, bag_time_ns, data in self._raw(topics):
+            self._check_type(connection)
             with self._decoding(connection):
-                message = self._reader.deserialize(data, connection.msgtype)
+                read = (self._types.store.deserialize_cdr if self._is_ros2
+                        else self._types.store.deserialize_ros1)
+                message = read(data, connection.msgtype)
             yield BagMessage(connection.topic, bag_time_ns, message)
 
     def raw_messages(self, topics: Sequence[Topic]) -> Iterator[RawMessage]:
@@ -162,9 +203,9 @@ class Bag:
             The bag is damaged, or a ROS 1 message has no counterpart in ROS 2.
         """
         # Of ROS 2, not of the bag: headers of ROS 1 have a number more.
-        typestore = get_typestore(Stores.ROS2_JAZZY)
+        typestore = _ros2_types().store
         for connection, bag_time_ns, data in self._raw(topics):
-            if not self._reader.is2:
+            if not self._is_ros2:
                 if connection.msgtype not in typestore.fielddefs:
                     raise InputError(f'topic {connection.topic} of {self.path} is of type '
                                      f'{connection.msgtype}, which ROS 2 does not have: leave it '
@@ -191,6 +232,14 @@ class Bag:
                 raise InputError(f'a message of {connection.topic} in {self.path} has {len(data)} '
                                  f'bytes; at most {MAX_MESSAGE_BYTES} are read')
             yield connection, bag_time_ns, data
+
+    def _check_type(self, connection: Connection) -> None:
+        """A type of the same name may have had other fields where the bag was recorded."""
+        known = self._types.hash(connection.msgtype, self._is_ros2)
+        if known and connection.digest and connection.digest != known:
+            raise InputError(f'topic {connection.topic} of {self.path} is of another '
+                             f'{connection.msgtype} than that of {self._types.name}: its type '
+                             f'hash is {str(connection.digest)[:80]!r}')
 
     @contextmanager
     def _decoding(self, connection: Connection) -> Iterator[None]:
@@ -299,7 +348,7 @@ def open_bag(path: Path | str) -> Iterator[Bag]:
     _check_path(path)
     reader = None
     try:
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
+        reader = Reader1(path) if path.suffix == '.bag' and path.is_file() else Reader2(path)
         reader.open()
     except PermissionError as error:
         raise InputError(f'{path} cannot be read: {error.strerror}') from error

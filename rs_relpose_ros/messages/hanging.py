@@ -17,8 +17,11 @@ from rs_relpose_ros.timing import to_nanoseconds
 _STRIDE = 1009
 # Of a slow IMU two or three equal ones may be chance.
 _FEWEST_SAMPLES = 4
-# No gyro has a range below 125 deg/s; a coarse one repeats small values at rest.
+# No gyro has a range below 125 deg/s [rad/s].
 _LEAST_RANGE = 2.0
+# A driver or a filter may clip below it: at the largest value that ever came, and above what the
+# bias of a coarse gyro repeats at rest [rad/s].
+_LEAST_CLIPPING = 0.2
 
 
 class HangingCamera:
@@ -57,6 +60,7 @@ class HangingGyro:
     def __init__(self, longest: float) -> None:
         self._longest_ns = to_nanoseconds(longest)
         self._values = [math.nan] * 3
+        self._largest = [0.0] * 3
         self._since_ns = [0] * 3
         self._counts = [0] * 3
 
@@ -76,14 +80,16 @@ class HangingGyro:
                 self._values[axis], self._since_ns[axis] = value, sample.stamp_ns
                 self._counts[axis] = 0
             self._counts[axis] += 1
+            self._largest[axis] = max(self._largest[axis], abs(value))
         if min(self._counts) > 1:
             if self._too_long(sample, max(self._since_ns), min(self._counts)):
                 raise InputError('the gyro repeats the same values bit by bit: it hangs (set '
                                  'stuck_gyro_time to 0 for a simulation without noise)')
             return True
-        for name, value, since_ns, count in zip(
-                'xyz', sample.angular_velocity, self._since_ns, self._counts, strict=True):
-            if count > 1 and abs(value) >= _LEAST_RANGE:
+        for name, value, largest, since_ns, count in zip(
+                'xyz', sample.angular_velocity, self._largest, self._since_ns, self._counts,
+                strict=True):
+            if count > 1 and abs(value) >= min(_LEAST_RANGE, max(_LEAST_CLIPPING, largest)):
                 if self._too_long(sample, since_ns, count):
                     raise InputError(f'the {name} axis of the gyro repeats {value:.4g} rad/s bit '
                                      'by bit: it is saturated')

@@ -56,7 +56,12 @@ ENCODINGS = ('mono8', '8UC1', 'mono16', *_COLOR, *(f'{name}8' for name in _BAYER
 
 def stamp_ns(header: Any) -> int:
     """Stamp [ns] of a std_msgs/Header."""
-    seconds, nanoseconds = int(header.stamp.sec), int(header.stamp.nanosec)
+    return time_ns(header.stamp)
+
+
+def time_ns(stamp: Any) -> int:
+    """Instant [ns] of a builtin_interfaces/Time."""
+    seconds, nanoseconds = int(stamp.sec), int(stamp.nanosec)
     if seconds < 0 or not 0 <= nanoseconds < NANOSECONDS:
         raise InputError(f'stamp is out of range: {seconds} s and {nanoseconds} ns')
     return seconds * NANOSECONDS + nanoseconds

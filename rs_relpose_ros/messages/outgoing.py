@@ -25,6 +25,18 @@ _UINT32, _FLOAT32 = 6, 7   # sensor_msgs/PointField
 
 MATCH_DTYPE = np.dtype([('id', '<u4')] + [(name, '<f4') for name in (
     'u1', 'v1', 'u2', 'v2', 'tau1', 'tau2', 'x1', 'y1', 'z1', 'x2', 'y2', 'z2')])
+# Name, offset and type of each, for sensor_msgs/PointField.
+MATCH_FIELDS = tuple(
+    (name, int(offset), _UINT32 if name == 'id' else _FLOAT32)
+    for name, (_, offset, *_) in (MATCH_DTYPE.fields or {}).items())
+
+# What the node publishes of a pair: topic and message type.
+PAIR_TOPICS = {
+    'relative_pose': 'geometry_msgs/msg/PoseWithCovarianceStamped',
+    'reference': 'sensor_msgs/msg/TimeReference',
+    'velocity': 'geometry_msgs/msg/TwistWithCovarianceStamped',
+    'matches': 'sensor_msgs/msg/PointCloud2',
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,15 +114,23 @@ def matches_message(result: PairResult, types: MessageTypes) -> Any:
     """
     points = inlier_records(result)
     field_type = types('sensor_msgs/msg/PointField')
-    fields = [field_type(name=name, offset=offset, count=1,
-                         datatype=_UINT32 if name == 'id' else _FLOAT32)
-              for name, offset in _match_offsets()]
+    fields = [field_type(name=name, offset=offset, datatype=datatype, count=1)
+              for name, offset, datatype in MATCH_FIELDS]
     message_type = types('sensor_msgs/msg/PointCloud2')
     return message_type(
         header=header(result.stamp_ns, result.frame_id, types), height=1, width=len(points),
         fields=fields, is_bigendian=False, point_step=MATCH_DTYPE.itemsize,
         row_step=MATCH_DTYPE.itemsize * len(points), data=_byte_data(points, message_type),
         is_dense=True)
+
+
+def pose_stamped_message(stamp_ns: int, frame_id: str, R: NDArray[np.float64],
+                         position: NDArray[np.float64], types: MessageTypes) -> Any:
+    """geometry_msgs/PoseStamped."""
+    pose = types('geometry_msgs/msg/Pose')(
+        position=_point(position, types), orientation=_quaternion(R, types))
+    return types('geometry_msgs/msg/PoseStamped')(
+        header=header(stamp_ns, frame_id, types), pose=pose)
 
 
 def color_image_message(stamp_ns: int, frame_id: str, pixels: NDArray[np.uint8],
@@ -135,11 +155,6 @@ def inlier_records(result: PairResult) -> NDArray[np.void]:
         for column, name in enumerate(names.split()):
             records[name] = values[inliers, column]
     return records
-
-
-def _match_offsets() -> list[tuple[str, int]]:
-    fields: Any = MATCH_DTYPE.fields
-    return [(name, int(entry[1])) for name, entry in fields.items()]
 
 
 def diagnostics_message(stamp_ns: int, status: Any, types: MessageTypes) -> Any:

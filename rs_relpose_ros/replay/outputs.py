@@ -11,7 +11,7 @@ from typing import Any
 from rs_relpose_ros.bags.reader import Bag, SensorTopics
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.messages.outgoing import pair_messages
+from rs_relpose_ros.messages.outgoing import pair_messages, PAIR_TOPICS
 from rs_relpose_ros.pipeline.calibration import Calibration
 from rs_relpose_ros.pipeline.drift import Drift
 from rs_relpose_ros.pipeline.pair import PairResult
@@ -31,13 +31,6 @@ from rs_relpose_ros.replay.truth import TrueTrajectory
 POSES_FILE, ERRORS_FILE, SUMMARY_FILE = 'relative_poses.csv', 'errors.csv', 'summary.json'
 BAG_FOLDER = 'relpose_bag'
 _PICTURES = ('matches.png', 'errors.png', 'residuals.png', 'rotation.png')
-
-_TOPIC_TYPES = {
-    'relative_pose': 'geometry_msgs/msg/PoseWithCovarianceStamped',
-    'reference': 'sensor_msgs/msg/TimeReference',
-    'velocity': 'geometry_msgs/msg/TwistWithCovarianceStamped',
-    'matches': 'sensor_msgs/msg/PointCloud2',
-}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,7 +136,7 @@ def _prepare(folder: Path, with_bag: bool) -> None:
 
 def _write_messages(bag: BagWriter, pair: ReplayedPair, reference_frame: str) -> None:
     messages = pair_messages(pair.result, bag.type, reference_frame)
-    for name, msgtype in _TOPIC_TYPES.items():
+    for name, msgtype in PAIR_TOPICS.items():
         bag.write(f'/relpose_node/{name}', msgtype, getattr(messages, name), pair.bag_time_ns)
 
 

@@ -24,7 +24,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import TimeReference
 
 from rs_relpose_ros.benchmark.process_figures import process_figures, ProcessFigures
-from rs_relpose_ros.messages.incoming import stamp_ns
+from rs_relpose_ros.messages.incoming import stamp_ns, time_ns
 from rs_relpose_ros.ros.processes import LiveRunError, private_graph, Process
 
 # Compiling all kernels takes minutes, where nobody has done it ahead.
@@ -148,8 +148,7 @@ class _Listener:
         self.heard.set()
 
     def _on_reference(self, msg: Any) -> None:
-        self.references[stamp_ns(msg.header)] = (
-            int(msg.time_ref.sec) * 10**9 + int(msg.time_ref.nanosec))
+        self.references[stamp_ns(msg.header)] = time_ns(msg.time_ref)
 
     def _on_diagnostics(self, msg: Any) -> None:
         self.diagnostics.append((time.monotonic_ns(), {

@@ -17,7 +17,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
 import rclpy
 from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import InvalidHandle
+from rclpy.exceptions import InvalidHandle, ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
@@ -42,7 +42,7 @@ from rs_relpose_ros.ros.cause_log import CauseLog
 from rs_relpose_ros.ros.debug_image import draw_debug_image
 from rs_relpose_ros.ros.diagnostics import Inputs, SILENCE, Statistics
 from rs_relpose_ros.ros.message_types import message_class
-from rs_relpose_ros.ros.params import NodeParameters, unknown_overrides
+from rs_relpose_ros.ros.params import NodeParameters, unknown_overrides, unknown_qos_overrides
 from rs_relpose_ros.ros.polled import PolledSubscription, WhenChanged
 from rs_relpose_ros.ros.transform import Broadcast, transform_broadcaster
 from rs_relpose_ros.ros.worker import Worker
@@ -51,11 +51,9 @@ from rs_relpose_ros.timing import NANOSECONDS
 # Best effort matches every publisher; a reliable subscription would not. Half a second of images:
 # where the process had to wait for a processor its mailbox drops them, which is counted, and not
 # the middleware, which is not.
-IMAGE_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=15,
-                       reliability=ReliabilityPolicy.BEST_EFFORT)
+_IMAGE_DEPTH = 15
 # Samples of some seconds, so that no stall loses any.
-IMU_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000,
-                     reliability=ReliabilityPolicy.BEST_EFFORT)
+_IMU_DEPTH = 2000
 
 # IMU and CameraInfo are read so often [s] where no image asks for them.
 _DRAIN_PERIOD = 0.1
@@ -153,7 +151,23 @@ class RelposeNode(Node):
                            'ones some seconds')
             return
         self.destroy_timer(self._warm_timer)
-        intake = self._intake
+        try:
+            self._subscribe(self._intake, self._sequencer)
+        except (InvalidHandle, rclpy_implementation.RCLError):
+            raise   # the node is being shut down
+        except (ParameterException, RuntimeError) as error:
+            raise InputError(f'a QoS override is not legal: {error}') from error
+        for sentence in unknown_qos_overrides(self):
+            self._warn(sentence)
+        # All that exists by now lives to the end: collections need not look at it again.
+        gc.collect()
+        gc.freeze()
+        self._ready_ns = self._now_ns()
+        self.get_logger().info(
+            f'ready: {self._image_topic}, {self.resolve_topic_name("camera_info")} and '
+            f'{self.resolve_topic_name("imu")}')
+
+    def _subscribe(self, intake: MessageIntake, sequencer: Sequencer) -> None:
         image_type: type = Image
         image_topic, add_image = self.resolve_topic_name('image'), intake.add_image
         if self._settings.current.pair.image_transport == 'compressed':
@@ -161,15 +175,15 @@ class RelposeNode(Node):
             image_type = CompressedImage
             image_topic, add_image = f'{image_topic}/compressed', intake.add_compressed_image
         self._image_topic = image_topic
-        waiting = self._sequencer.waits_for_imu
+        waiting = sequencer.waits_for_imu
         self._info_subscription = PolledSubscription(
-            self, CameraInfo, 'camera_info', IMAGE_QOS, self._receiver(
+            self, CameraInfo, 'camera_info', _best_effort(_IMAGE_DEPTH), self._receiver(
                 'camera_infos', WhenChanged(CameraInfo, intake.add_camera_info)),
             lambda: intake.calibration is None, raw=True)
         self._imu_subscriptions = [
-            PolledSubscription(self, Imu, 'imu', IMU_QOS,
+            PolledSubscription(self, Imu, 'imu', _best_effort(_IMU_DEPTH),
                                self._receiver('imu', intake.add_imu), waiting),
-            PolledSubscription(self, Imu, 'accel', IMU_QOS,
+            PolledSubscription(self, Imu, 'accel', _best_effort(_IMU_DEPTH),
                                self._receiver('accelerometer', intake.add_accelerometer), waiting)]
         receive_image = self._receiver('images', add_image)
 
@@ -180,16 +194,9 @@ class RelposeNode(Node):
             self._drain_imu()
 
         self.create_subscription(
-            image_type, image_topic, with_all_before, IMAGE_QOS,
+            image_type, image_topic, with_all_before, _best_effort(_IMAGE_DEPTH),
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
         self.create_timer(_DRAIN_PERIOD, self._drain, clock=self._steady)
-        # All that exists by now lives to the end: collections need not look at it again.
-        gc.collect()
-        gc.freeze()
-        self._ready_ns = self._now_ns()
-        self.get_logger().info(
-            f'ready: {image_topic}, {self.resolve_topic_name("camera_info")} and '
-            f'{self.resolve_topic_name("imu")}')
 
     def stop(self) -> bool:
         """End the worker; whether it did. Call it before `destroy_node`."""
@@ -338,6 +345,12 @@ class RelposeNode(Node):
 
     def _now_ns(self) -> int:
         return int(self._steady.now().nanoseconds)
+
+
+def _best_effort(depth: int) -> QoSProfile:
+    """A profile of its own: rclpy writes a topic's overrides into what it is given."""
+    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth,
+                      reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 def _opened(path: str) -> TextIO:

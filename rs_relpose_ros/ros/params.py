@@ -21,6 +21,9 @@ from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.pipeline.parameters import Parameters
 from rs_relpose_ros.settings import Declared
 
+# What rclpy's names of QoS overrides begin with.
+_QOS = 'qos_overrides.'
+
 
 class NodeParameters:
     """The node's parameters; keeps them valid while it runs.
@@ -74,12 +77,20 @@ def unknown_overrides(node: Node) -> list[str]:
     """One sentence per parameter that was given but does not exist: ROS ignores them silently."""
     sentences = []
     for name in getattr(node, '_parameter_overrides', {}):
-        if not node.has_parameter(name) and not name.startswith('qos_overrides.'):
+        if not node.has_parameter(name) and not name.startswith(_QOS):
             try:
                 Parameters().updated({name: None})
             except InputError as error:
                 sentences.append(str(error))
     return sentences
+
+
+def unknown_qos_overrides(node: Node) -> list[str]:
+    """One sentence per QoS override of no subscription of the node; call it when it has them."""
+    return [f'{name} is no QoS override of this node: it must be {_QOS}<full topic name>'
+            '.subscription.<policy>, of a topic that it subscribes to'
+            for name in getattr(node, '_parameter_overrides', {})
+            if name.startswith(_QOS) and not node.has_parameter(name)]
 
 
 def _declare(node: Node, name: str, default: Any, declared: Declared) -> Any:

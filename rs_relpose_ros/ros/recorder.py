@@ -14,19 +14,19 @@ from pathlib import Path
 import sys
 from typing import Any
 
-from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
 import numpy as np
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.utilities import remove_ros_args
-from sensor_msgs.msg import PointCloud2, TimeReference
 
-from rs_relpose_ros.messages.incoming import stamp_ns
+from rs_relpose_ros.messages.incoming import stamp_ns, time_ns
+from rs_relpose_ros.messages.outgoing import PAIR_TOPICS
 from rs_relpose_ros.replay.record import rotation_sigmas, translation_sigmas
 from rs_relpose_ros.replay.tables import number, RELATIVE_POSE_COLUMNS, TableWriter
 from rs_relpose_ros.result import Status
+from rs_relpose_ros.ros.message_types import message_class
 
 _QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1000,
                   reliability=ReliabilityPolicy.RELIABLE)
@@ -45,13 +45,10 @@ class Recorder(Node):
         super().__init__('relpose_recorder')
         self._received: dict[str, dict[int, Any]] = {}
         self._topics = {}
-        for name, msgtype in (('relative_pose', PoseWithCovarianceStamped),
-                              ('reference', TimeReference),
-                              ('velocity', TwistWithCovarianceStamped),
-                              ('matches', PointCloud2)):
+        for name, msgtype in PAIR_TOPICS.items():
             self._received[name] = {}
             subscription = self.create_subscription(
-                msgtype, f'{target}/{name}', self._receiver(name), _QOS)
+                message_class(msgtype), f'{target}/{name}', self._receiver(name), _QOS)
             self._topics[name] = subscription.topic_name
 
     def matched(self) -> bool:
@@ -84,7 +81,7 @@ class Recorder(Node):
         matches = self._received['matches'].get(stamp)
         reference_stamp = ''
         if reference is not None:
-            reference_stamp = str(reference.time_ref.sec * 10**9 + reference.time_ref.nanosec)
+            reference_stamp = str(time_ns(reference.time_ref))
         return [reference_stamp, str(stamp), *map(number, figures),
                 '' if matches is None else str(matches.width), '', '', Status.OK.value]
 

@@ -1,0 +1,199 @@
+"""The four messages of a pair, as relpose_node publishes them, back to arrays.
+
+For who consumes the topics, live or from a bag. Messages are read by field name only, and nothing
+of them is trusted: what cannot be used raises `InputError` with one sentence.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.messages.incoming import stamp_ns, time_ns
+from rs_relpose_ros.messages.outgoing import (
+    MATCH_DTYPE,
+    MATCH_FIELDS,
+    PAIR_TOPICS,
+    PairMessages,
+)
+
+Array = NDArray[np.float64]
+
+# How far what is published with length 1 may be from it.
+_UNIT_TOLERANCE = 1e-3
+# Largest velocity, far above any camera, far below what overflows.
+_MAX_VELOCITY = 1e9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PublishedPair:
+    """A keyframe pair with a pose, as published.
+
+    Attributes
+    ----------
+    reference_stamp_ns, stamp_ns : int
+        Header stamps of the reference keyframe and of the current image.
+    frame_id : str
+        Of the current image.
+    R : (3, 3) ndarray
+        Of the current camera in the reference camera, ``X1 = R X2 + t``.
+    t : (3,) ndarray
+        Of length 1: the scale of two views is not observable.
+    covariance : (6, 6) ndarray
+        Of ``(dt, dtheta)`` with ``t_true = t + dt`` and ``R_true = Exp(dtheta) R``, in camera 1.
+    linear_velocity, angular_velocity : (3,) ndarray
+        Of the current camera in its own frame [baselines per second], [rad/s].
+    velocity_covariance : (6, 6) ndarray
+        Of linear and angular velocity.
+    matches : (N,) ndarray of MATCH_DTYPE
+        Inliers: track ``id``, pixels ``u1 v1 u2 v2``, row times ``tau1 tau2`` [s], rays
+        ``x1 y1 z1 x2 y2 z2`` turned to the stamped row.
+    """
+
+    reference_stamp_ns: int
+    stamp_ns: int
+    frame_id: str
+    R: Array
+    t: Array
+    covariance: Array
+    linear_velocity: Array
+    angular_velocity: Array
+    velocity_covariance: Array
+    matches: NDArray[np.void]
+
+
+class PairSynchronizer:
+    """Gathers the messages of a pair by their common stamp, in whatever order they come.
+
+    Parameters
+    ----------
+    capacity : int
+        Most stamps that may wait for the rest of their messages; of more, the one that was begun
+        first is given up: where messages are lost, nothing piles up.
+    """
+
+    def __init__(self, capacity: int = 10) -> None:
+        if capacity < 1:
+            raise InputError(f'capacity must be at least 1, got {capacity}')
+        self._capacity = capacity
+        self._waiting: dict[int, dict[str, Any]] = {}
+        self._given_up = 0
+
+    @property
+    def given_up(self) -> int:
+        """How many stamps were given up."""
+        return self._given_up
+
+    def add(self, topic: str, message: Any) -> PublishedPair | None:
+        """Take a message; the pair that it completes, if it does.
+
+        Parameters
+        ----------
+        topic : {'relative_pose', 'reference', 'velocity', 'matches'}
+        message : message
+            Of the type that the node publishes there.
+
+        Raises
+        ------
+        InputError
+            The pair that it completes cannot be used, or its stamp is out of range.
+        """
+        if topic not in PAIR_TOPICS:
+            raise InputError(f'topic must be one of {", ".join(PAIR_TOPICS)}, got {topic!r}')
+        stamp = stamp_ns(message.header)
+        messages = self._waiting.setdefault(stamp, {})
+        messages[topic] = message
+        if len(messages) == len(PAIR_TOPICS):
+            del self._waiting[stamp]
+            return published_pair(PairMessages(**messages))
+        if len(self._waiting) > self._capacity:
+            del self._waiting[next(iter(self._waiting))]
+            self._given_up += 1
+        return None
+
+
+def published_pair(messages: PairMessages) -> PublishedPair:
+    """Arrays of the four messages of one stamp.
+
+    Raises
+    ------
+    InputError
+        NaN, infinite, of another length than 1 where that is published, of different stamps, or
+        matches that are laid out otherwise than published.
+    """
+    stamps = {name: stamp_ns(getattr(messages, name).header) for name in PAIR_TOPICS}
+    if len(set(stamps.values())) > 1:
+        raise InputError(f'messages of one pair must have the same stamp, got {stamps}')
+    pose, twist = messages.relative_pose.pose, messages.velocity.twist
+    return PublishedPair(
+        reference_stamp_ns=time_ns(messages.reference.time_ref),
+        stamp_ns=stamps['relative_pose'],
+        frame_id=str(messages.velocity.header.frame_id),
+        R=np.asarray(Rotation.from_quat(_unit(
+            'the orientation of ~/relative_pose', pose.pose.orientation, 'xyzw')).as_matrix()),
+        t=_unit('the position of ~/relative_pose', pose.pose.position, 'xyz'),
+        covariance=_covariance('~/relative_pose', pose.covariance),
+        linear_velocity=_velocity('the linear velocity of ~/velocity', twist.twist.linear),
+        angular_velocity=_velocity('the angular velocity of ~/velocity', twist.twist.angular),
+        velocity_covariance=_covariance('~/velocity', twist.covariance),
+        matches=match_records(messages.matches))
+
+
+def match_records(cloud: Any) -> NDArray[np.void]:
+    """Records of MATCH_DTYPE (N,) of a sensor_msgs/PointCloud2; a view of the message's memory.
+
+    Raises
+    ------
+    InputError
+        Other fields than published, big endian, less or more data than its size, not finite, or
+        rays of another length than 1.
+    """
+    found = [(str(f.name), int(f.offset), int(f.datatype), int(f.count)) for f in cloud.fields]
+    wanted = [(name, offset, datatype, 1) for name, offset, datatype in MATCH_FIELDS]
+    if found != wanted or int(cloud.point_step) != MATCH_DTYPE.itemsize or cloud.is_bigendian:
+        names = ' '.join(name[:20] for name, *_ in found[:20])
+        raise InputError(
+            f'~/matches must have the fields {" ".join(MATCH_DTYPE.names or ())}, little endian, '
+            f'{MATCH_DTYPE.itemsize} bytes a point; got {names or "none"}, '
+            f'{"big" if cloud.is_bigendian else "little"} endian, {int(cloud.point_step)} bytes')
+    data = np.frombuffer(cloud.data, dtype=np.uint8)
+    count = int(cloud.width) * int(cloud.height)
+    if len(data) != count * MATCH_DTYPE.itemsize:
+        raise InputError(f'~/matches has {len(data)} bytes of data, but {int(cloud.width)}x'
+                         f'{int(cloud.height)} points need {count * MATCH_DTYPE.itemsize}')
+    records = data.view(MATCH_DTYPE)
+    if not all(np.isfinite(records[name]).all() for name in MATCH_DTYPE.names or ()):
+        raise InputError('~/matches must be finite')
+    for view in '12':
+        rays = np.stack([records[axis + view].astype(np.float64) for axis in 'xyz'])
+        if (np.abs(np.linalg.norm(rays, axis=0) - 1.0) > _UNIT_TOLERANCE).any():
+            raise InputError(f'the rays x{view} y{view} z{view} of ~/matches must have length 1')
+    return records
+
+
+def _unit(name: str, message: Any, axes: str) -> Array:
+    values = np.array([getattr(message, axis) for axis in axes], dtype=np.float64)
+    # What is not finite has no such length either.
+    if not abs(math.hypot(*values) - 1.0) <= _UNIT_TOLERANCE:
+        raise InputError(f'{name} must have length 1, got {values.tolist()}')
+    return values
+
+
+def _velocity(name: str, vector: Any) -> Array:
+    values = np.array([vector.x, vector.y, vector.z], dtype=np.float64)
+    if not (np.abs(values) <= _MAX_VELOCITY).all():
+        raise InputError(f'{name} must be at most {_MAX_VELOCITY:g}, got {values.tolist()}')
+    return values
+
+
+def _covariance(topic: str, covariance: Any) -> Array:
+    values = np.array(covariance, dtype=np.float64)
+    if values.shape != (36,) or not np.isfinite(values).all():
+        raise InputError(f'the covariance of {topic} must be 36 finite figures')
+    return values.reshape(6, 6)
