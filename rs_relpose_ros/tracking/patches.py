@@ -45,7 +45,8 @@ def cut(image: Image, points: Array, radius: int) -> Patches:
     centres = _whole(points)
     side = 2 * radius + 1
     shape, corners = _layout(len(points), side)
-    mosaic = np.zeros(shape, dtype=np.uint8)
+    # Of what lies beside the patches nothing is read.
+    mosaic = np.empty(shape, dtype=np.uint8)
     _copy(image, centres - radius, side, corners, mosaic)
     return Patches(mosaic, (corners + radius - centres).astype(np.float64))
 
@@ -73,6 +74,7 @@ def cut_warped(image: Image, points: Array, jacobians: Array, radius: int,
     centres = _whole(points1)
     side = 2 * radius + 1
     shape, corners = _layout(len(points), side)
+    # What lies beside the patches is not read, but must be a place in the image.
     x, y = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
     _maps(points, jacobians, centres - points1, side, corners, x, y)
     mosaic: Image = cv2.remap(  # type: ignore[assignment]
@@ -96,20 +98,24 @@ def _layout(count: int, side: int) -> tuple[tuple[int, int], NDArray[np.int64]]:
 def _copy(image: Image, first: NDArray[np.int64], side: int, corners: NDArray[np.int64],
           mosaic: Image) -> None:
     height, width = image.shape
+    rows, columns = mosaic.shape
+    pixels, target = image.reshape(height * width), mosaic.reshape(rows * columns)
     for k in range(len(first)):
         left, top = first[k, 0], first[k, 1]
-        column, row = corners[k, 0], corners[k, 1]
-        inside = left >= 0 and top >= 0 and left + side <= width and top + side <= height
-        for i in range(side):
-            target = mosaic[row + i, column:column + side]
-            if inside:
-                source = image[top + i, left:left + side]
-                for j in range(len(target)):
-                    target[j] = source[j]
-            else:
+        at = corners[k, 1] * columns + corners[k, 0]
+        if left >= 0 and top >= 0 and left + side <= width and top + side <= height:
+            # Indices that cannot be negative: rows are copied many bytes at a time.
+            source, to = np.uint64(top * width + left), np.uint64(at)
+            for _ in range(side):
+                for j in range(np.uint64(side)):
+                    target[to + j] = pixels[source + j]
+                source += np.uint64(width)
+                to += np.uint64(columns)
+        else:
+            for i in range(side):
                 line = image[min(max(top + i, 0), height - 1)]
-                for j in range(len(target)):
-                    target[j] = line[min(max(left + j, 0), width - 1)]
+                for j in range(side):
+                    target[at + i * columns + j] = line[min(max(left + j, 0), width - 1)]
 
 
 @kernel
