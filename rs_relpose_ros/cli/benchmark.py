@@ -47,26 +47,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                     'true ones, and memory over 100,000 estimates: some hours on one core.'))
 
 
+def _add_common_arguments(parser: argparse.ArgumentParser, folder: str, *, seed_of: str = '',
+                          jobs: str = '') -> None:
+    """``--output``, and what a benchmark has of ``--seed`` and ``--jobs``."""
+    if seed_of:
+        parser.add_argument('--seed', type=int, default=0, metavar='N',
+                            help=f'seed of the first {seed_of} (default: %(default)s)')
+    if jobs:
+        parser.add_argument('--jobs', type=int, default=1, metavar='N',
+                            help=f'{jobs} (default: %(default)s)')
+    parser.add_argument('--output', type=Path, default=Path(folder), metavar='DIR',
+                        help='folder of the tables (default: %(default)s)')
+
+
 def _add_all_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--trials', type=int, default=200, metavar='N',
                         help='problems a cell of the accuracy benchmark (default: 200)')
     parser.add_argument('--soak', type=int, default=100_000, metavar='N',
                         help='see whether memory grows over N estimates (default: 100000)')
-    parser.add_argument('--jobs', type=int, default=1, metavar='N',
-                        help='processes of the accuracy benchmark (default: 1)')
-    parser.add_argument('--output', type=Path, default=Path('out/benchmark'), metavar='DIR',
-                        help='folder of the tables (default: out/benchmark)')
+    _add_common_arguments(parser, 'out/benchmark', jobs='processes of the accuracy benchmark')
 
 
 def _add_calibration_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--runs', type=int, default=240, metavar='N',
                         help='recordings (default: 240)')
-    parser.add_argument('--seed', type=int, default=0, metavar='N',
-                        help='seed of the first recording (default: 0)')
-    parser.add_argument('--jobs', type=int, default=1, metavar='N',
-                        help='processes (default: 1)')
-    parser.add_argument('--output', type=Path, default=Path('out/calibration'), metavar='DIR',
-                        help='folder of the tables (default: out/calibration)')
+    _add_common_arguments(parser, 'out/calibration', seed_of='recording', jobs='processes')
 
 
 def _add_accuracy_arguments(parser: argparse.ArgumentParser) -> None:
@@ -83,13 +88,9 @@ def _add_accuracy_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--sigma-factor', nargs='+', type=float, default=[1.0], metavar='X',
                         help='tell the estimator so many times the true sigmas (default: 1)')
     parser.add_argument('--solver', choices=SOLVERS, default='auto', help='(default: auto)')
-    parser.add_argument('--seed', type=int, default=0, metavar='N',
-                        help='seed of the first problem of a cell (default: 0)')
-    parser.add_argument('--jobs', type=int, default=1, metavar='N',
-                        help='processes; times are comparable only where each has a core of its '
-                             'own (default: 1)')
-    parser.add_argument('--output', type=Path, default=Path('out/accuracy'), metavar='DIR',
-                        help='folder of the tables (default: out/accuracy)')
+    _add_common_arguments(
+        parser, 'out/accuracy', seed_of='problem of a cell', jobs='processes; times are '
+        'comparable only where each has a core of its own')
     parser.add_argument('--cache', type=Path, metavar='DIR',
                         help="folder that keeps the oracle's results (default: OUTPUT/oracle)")
 
@@ -111,10 +112,7 @@ def _add_speed_arguments(parser: argparse.ArgumentParser) -> None:
                         help='new processes whose first estimate is timed (default: 3)')
     parser.add_argument('--soak', type=int, default=0, metavar='N',
                         help='see whether memory grows over N estimates (default: 0, do not)')
-    parser.add_argument('--seed', type=int, default=0, metavar='N',
-                        help='seed of the first problem (default: 0)')
-    parser.add_argument('--output', type=Path, default=Path('out/speed'), metavar='DIR',
-                        help='folder of the tables (default: out/speed)')
+    _add_common_arguments(parser, 'out/speed', seed_of='problem')
 
 
 def _add_live_arguments(parser: argparse.ArgumentParser) -> None:
@@ -130,8 +128,7 @@ def _add_live_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--profile', type=Path, metavar='FILE',
                         help='Fast DDS profile for images above 512 KB (default: the shipped '
                              'config/fastdds.xml)')
-    parser.add_argument('--output', type=Path, default=Path('out/live'), metavar='DIR',
-                        help='folder of the tables (default: out/live)')
+    _add_common_arguments(parser, 'out/live')
 
 
 def run(args: argparse.Namespace) -> int:

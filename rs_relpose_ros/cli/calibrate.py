@@ -56,8 +56,12 @@ def run(args: argparse.Namespace) -> int:
     """Calibrate; 1 when something could not be told."""
     options = TopicOptions(image=args.image_topic, camera_info=args.camera_info_topic,
                            imu=args.imu_topic)
-    tracking = TrackingConfig(feature_rows=tuple(args.rows))
-    config = replace(TRACKED_IN_IMAGES, max_time_offset=args.max_offset)
+    try:
+        tracking = TrackingConfig(feature_rows=tuple(args.rows))
+        config = replace(TRACKED_IN_IMAGES, max_time_offset=args.max_offset)
+    except InputError as error:   # which names the settings behind the options
+        raise InputError(str(error).replace('feature_rows', '--rows').replace(
+            'max_time_offset', '--max-offset')) from None
     name = args.bag.resolve().stem if args.bag.is_file() else args.bag.resolve().name
     folder: Path = args.out if args.out is not None else Path(f'{name}_calibration')
     quiet = not sys.stderr.isatty()
