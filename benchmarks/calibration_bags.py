@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 from rs_relpose_ros.benchmark.calibration_tracks import about_one_axis
 from rs_relpose_ros.benchmark.tables import markdown_table, write_csv
-from rs_relpose_ros.calibration.alignment import axis_maps
+from rs_relpose_ros.calibration.axis_maps import axis_maps
 from rs_relpose_ros.cli.main import main as rs_relpose
 from rs_relpose_ros.simulation import simulate, SimulationConfig
 from rs_relpose_ros.simulation.bag import write_bag

@@ -17,7 +17,7 @@ from rs_relpose_ros.benchmark.calibration_tracks import (
     Recorded,
     Truth,
 )
-from rs_relpose_ros.calibration.alignment import axis_maps, nearest_axis_map
+from rs_relpose_ros.calibration.axis_maps import axis_maps, nearest_axis_map
 from rs_relpose_ros.calibration.calibrate import calibrate
 from rs_relpose_ros.calibration.coplanarity import GLOBAL, LOCAL
 from rs_relpose_ros.calibration.fit import evaluate, Problem, redirected, State

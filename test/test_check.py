@@ -24,13 +24,13 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.bags.reader import open_bag, TopicOptions
 from rs_relpose_ros.bags.writer import BagWriter
+from rs_relpose_ros.calibration.axis_maps import axes_text, nearest_axis_map
 from rs_relpose_ros.camera import RollingShutterCamera
 from rs_relpose_ros.check import judge_turning
 from rs_relpose_ros.check.check import check_bag, choose_topics
 from rs_relpose_ros.check.findings import Finding, Report, Verdict
 from rs_relpose_ros.check.scan import scan
 from rs_relpose_ros.check.streams import Stamps, Thinned
-from rs_relpose_ros.check.turning import axis_map
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.pipeline.parameters import Parameters
@@ -363,7 +363,7 @@ def test_recordings_of_real_cameras(recordings, tmp_path, name, offset):
 
 def test_axes_in_words():
     R = Rotation.from_euler('xyz', [88.0, 1.0, -2.0], degrees=True).as_matrix()
-    assert axis_map(R) == 'cam x = +imu x, cam y = -imu z, cam z = +imu y'
+    assert axes_text(nearest_axis_map(R)) == 'cam x = +imu x, cam y = -imu z, cam z = +imu y'
 
 
 # -- containers, options, output -------------------------------------------------------------

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.benchmark.calibration_tracks import drawn, record
 from rs_relpose_ros.benchmark.tables import markdown_table, write_csv
-from rs_relpose_ros.calibration.alignment import axis_maps
+from rs_relpose_ros.calibration.axis_maps import axis_maps
 from rs_relpose_ros.calibration.calibrate import calibrate
 from rs_relpose_ros.camera import RollingShutterCamera
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.calibration.alignment import axis_maps
+from rs_relpose_ros.calibration.axis_maps import axis_maps
 from rs_relpose_ros.calibration.gyro_path import GyroSeries
 from rs_relpose_ros.calibration.tracks import Tracks
 from rs_relpose_ros.simulation.hand_held import hand_held, Plan

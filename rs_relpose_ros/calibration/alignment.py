@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 import itertools
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.calibration.axis_maps import nearest_axis_map
 from rs_relpose_ros.calibration.tracks import Pairs
 
 Array = NDArray[np.float64]
@@ -41,27 +41,6 @@ class Start:
     bias: Array
     focal_factor: float
     misfit: float
-
-
-@cache
-def axis_maps() -> Array:
-    """All 24 rotations (24, 3, 3) that map axes to axes."""
-    maps = []
-    for columns in itertools.permutations(range(3)):
-        for signs in itertools.product((1.0, -1.0), repeat=3):
-            matrix = np.zeros((3, 3))
-            matrix[range(3), columns] = signs
-            if np.linalg.det(matrix) > 0.0:
-                maps.append(matrix)
-    all_maps = np.array(maps)
-    all_maps.setflags(write=False)      # one copy serves everybody
-    return all_maps
-
-
-def nearest_axis_map(R: Array) -> Array:
-    """The axis map (3, 3) nearest to a rotation."""
-    maps = axis_maps()
-    return np.array(maps[int(np.argmax(np.einsum('kij,ij->k', maps, R)))])
 
 
 def seen_rates(pairs: Pairs, points1: Array, points2: Array, intervals: Array) -> Array:

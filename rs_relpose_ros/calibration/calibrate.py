@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.calibration.alignment import find_starts, nearest_axis_map, seen_rates, Start
+from rs_relpose_ros.calibration.alignment import find_starts, seen_rates, Start
+from rs_relpose_ros.calibration.axis_maps import nearest_axis_map
 from rs_relpose_ros.calibration.coplanarity import (
     BIAS,
     FOCAL,

@@ -8,6 +8,7 @@ from typing import Any
 from matplotlib.figure import Figure as Picture
 import numpy as np
 
+from rs_relpose_ros.calibration.axis_maps import axes_text
 from rs_relpose_ros.calibration.result import AXES, CalibrationResult, Estimate
 from rs_relpose_ros.camera import RollingShutterCamera
 from rs_relpose_ros.datasets.parameter_file import Figure, parameter_text
@@ -75,15 +76,6 @@ def exposure_text(slope: Estimate) -> str:
     if abs(slope.value) < 3.0 * slope.sigma:
         return 'none that is sure'
     return 'the stamp moves with the exposure'
-
-
-def axes_text(axis_map: np.ndarray[Any, Any]) -> str:
-    """An axis map (3, 3) as 'cam x = -imu y, ...'."""
-    parts = []
-    for row, axis in zip(axis_map, 'xyz', strict=True):
-        k = int(np.argmax(np.abs(row)))
-        parts.append(f"cam {axis} = {'-' if row[k] < 0 else '+'}imu {'xyz'[k]}")
-    return ', '.join(parts)
 
 
 def parameter_file(result: CalibrationResult, title: str, *, compressed: bool,

@@ -6,9 +6,10 @@ import math
 
 import numpy as np
 
+from rs_relpose_ros.calibration.axis_maps import axes_text, nearest_axis_map
 from rs_relpose_ros.check.findings import Finding, Verdict
 from rs_relpose_ros.check.scan import Scan
-from rs_relpose_ros.check.turning import Alignment, axis_map
+from rs_relpose_ros.check.turning import Alignment
 from rs_relpose_ros.pipeline.parameters import Parameters
 from rs_relpose_ros.so3 import log_so3
 
@@ -150,7 +151,7 @@ def _clock(found: Alignment, parameters: Parameters) -> Finding:
 
 
 def _axes(found: Alignment, seen: Scan, parameters: Parameters) -> Finding:
-    nearest = axis_map(found.R_cam_imu)
+    nearest = axes_text(nearest_axis_map(found.R_cam_imu))
     figures = {'nearest': nearest, 'R_cam_imu': found.R_cam_imu.tolist(),
                'balance': found.balance}
     text = f'nearest map {nearest}'

@@ -8,7 +8,6 @@ find signs, scale and clock, which `coplanarity` then refines.
 from __future__ import annotations
 
 from dataclasses import dataclass
-import itertools
 from typing import Any
 
 import cv2
@@ -280,11 +279,3 @@ def _rotation(rays1: Array, rays2: Array) -> Array:
         errors = np.linalg.norm(rays1 - rays2 @ R.T, axis=1)
         weights = 1.0 / (1.0 + (errors / max(1.5 * float(np.median(errors)), 1e-6))**2)
     return np.asarray(Rotation.from_matrix(R).as_rotvec())
-
-
-def axis_map(R_cam_imu: Array) -> str:
-    """The nearest of the 24 maps of axes in words: ``cam x = -imu y, ...``."""
-    best = max(itertools.permutations(range(3)),
-               key=lambda order: sum(abs(R_cam_imu[i, order[i]]) for i in range(3)))
-    return ', '.join(f'cam {"xyz"[i]} = {"-" if R_cam_imu[i, j] < 0.0 else "+"}imu {"xyz"[j]}'
-                     for i, j in enumerate(best))
