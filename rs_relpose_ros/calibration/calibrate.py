@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.calibration.alignment import find_starts, seen_rates, Start
+from rs_relpose_ros.calibration.alignment import find_starts, Start
 from rs_relpose_ros.calibration.axis_maps import nearest_axis_map
 from rs_relpose_ros.calibration.coplanarity import (
     BIAS,
@@ -20,7 +20,6 @@ from rs_relpose_ros.calibration.coplanarity import (
     SLOPE,
 )
 from rs_relpose_ros.calibration.fit import (
-    BEND_AT_START,
     evaluate,
     Fit,
     fit,
@@ -29,9 +28,10 @@ from rs_relpose_ros.calibration.fit import (
     State,
     with_bends,
 )
-from rs_relpose_ros.calibration.gyro_path import GyroSeries, noise_density
+from rs_relpose_ros.calibration.gyro_path import GyroSeries
+from rs_relpose_ros.calibration.observations import evenly, Observations
 from rs_relpose_ros.calibration.result import AXES, CalibrationResult, CostCurve, Estimate
-from rs_relpose_ros.calibration.tracks import make_pairs, Pairs, Tracks
+from rs_relpose_ros.calibration.tracks import Tracks
 from rs_relpose_ros.camera import RollingShutterCamera
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.settings import check_settings, setting
@@ -88,25 +88,6 @@ class CalibrationConfig:
         check_settings(self)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Input:
-    """Tracks and gyro in seconds since the first frame."""
-
-    tracks: Tracks
-    camera: RollingShutterCamera
-    times: Array
-    covariates: Array
-    gyro_times: Array
-    gyro_rates: Array
-    gyro_gaps: Array
-    gyro_density: float
-
-    @property
-    def interval(self) -> float:
-        """Median interval between frames [s]."""
-        return float(np.median(np.diff(self.times)))
-
-
 def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
               focal_known: bool = True, config: CalibrationConfig | None = None,
               rng: np.random.Generator | int = 0,
@@ -140,7 +121,10 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
     """
     config = CalibrationConfig() if config is None else config
     rng = np.random.default_rng(rng)
-    data = _prepared(tracks, gyro, camera)
+    if len(tracks) < 2 or len(gyro) < 2:
+        raise InputError(f'{len(tracks)} frames and {len(gyro)} gyro samples are too few: record '
+                         'at least 10 s with both')
+    data = Observations.of(tracks, gyro, camera)
     _check_recording(data, config)
     starts = _starts(data, focal_known, config, rng)
     progress(0.15)
@@ -149,7 +133,7 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
     free[FOCAL] = not focal_known
     coarse = _coarse_fit(data, starts, free, config, rng)
     progress(0.4)
-    problem = _problem(data, _spans(data, _SPANS), coarse.state.parameters[OFFSET],
+    problem = _problem(data, _SPANS, coarse.state.parameters[OFFSET],
                        _MATCHES_PER_PAIR, _MOST_PAIRS, config, rng)
     begin = _restarted(problem, coarse.state, 2.0)
     problem = with_bends(problem, begin)
@@ -157,7 +141,7 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
     final = fit(problem, begin, free)
     progress(0.8)
     some = with_bends(_problem(
-        data, _spans(data, _SPANS), final.state.parameters[OFFSET], _MATCHES_PER_PAIR_AT_START,
+        data, _SPANS, final.state.parameters[OFFSET], _MATCHES_PER_PAIR_AT_START,
         _PAIRS_AT_START, config, rng), final.state)
     curve = _cost_curve(some, len(problem.points1), final, free, data.interval,
                         lambda share: progress(0.8 + 0.2 * share))
@@ -167,23 +151,7 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
 # -- what comes in -----------------------------------------------------------------------------
 
 
-def _prepared(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera) -> _Input:
-    if len(tracks) < 2 or len(gyro) < 2:
-        raise InputError(f'{len(tracks)} frames and {len(gyro)} gyro samples are too few: record '
-                         'at least 10 s with both')
-    origin_ns = int(tracks.stamps_ns[0])
-    times, gyro_times = tracks.seconds(origin_ns), gyro.seconds(origin_ns)
-    intervals = np.diff(times)
-    to_next = np.append(intervals, intervals[-1])
-    longer = to_next - np.median(intervals)
-    # Where frames are lost, the interval tells nothing of the exposure.
-    longer[longer > 0.5 * np.median(intervals)] = 0.0
-    gaps = np.diff(gyro_times)
-    return _Input(tracks, camera, times, longer, gyro_times,
-                  gyro.rates, gaps, noise_density(gyro_times, gyro.rates))
-
-
-def _check_recording(data: _Input, config: CalibrationConfig) -> None:
+def _check_recording(data: Observations, config: CalibrationConfig) -> None:
     """Refuse what cannot give a calibration, with what to record instead."""
     frames = len(data.tracks)
     if frames < config.min_frames:
@@ -198,9 +166,9 @@ def _check_recording(data: _Input, config: CalibrationConfig) -> None:
             f'the gyro covers {max(last - first, 0.0):.1f} s of the {data.times[-1]:.1f} s of '
             'images: record both together, and let the clocks differ by less than '
             f'{config.max_time_offset:g} s')
-    if np.median(data.gyro_gaps) > config.max_gyro_gap:
+    if np.median(data.gyro_steps) > config.max_gyro_gap:
         raise InputError(
-            f'the gyro has {1.0 / np.median(data.gyro_gaps):.0f} samples per second, at least '
+            f'the gyro has {1.0 / np.median(data.gyro_steps):.0f} samples per second, at least '
             f'{1.0 / config.max_gyro_gap:.0f} are needed, 200 are good')
     counts = np.bincount(data.tracks.frames, minlength=frames)
     if np.median(counts) < _LEAST_MATCHES:
@@ -217,55 +185,38 @@ def _check_recording(data: _Input, config: CalibrationConfig) -> None:
             'three axes, 20 to 60 deg/s')
 
 
-def _intervals_vary(data: _Input) -> bool:
+def _intervals_vary(data: Observations) -> bool:
     low, high = np.quantile(data.covariates, (0.1, 0.9))
     return bool(high - low > _VARYING * data.interval)
-
-
-def _spans(data: _Input, spans: tuple[float, ...]) -> tuple[int, ...]:
-    """Numbers of frames that make up these spans of time."""
-    interval = data.interval
-    return tuple(sorted({max(1, round(span / interval)) for span in spans}))
 
 
 # -- start -------------------------------------------------------------------------------------
 
 
-def _starts(data: _Input, focal_known: bool, config: CalibrationConfig,
+def _starts(data: Observations, focal_known: bool, config: CalibrationConfig,
             rng: np.random.Generator) -> list[Start]:
-    interval = data.interval
-    pairs = make_pairs(data.tracks, (1,), max_matches=80, min_matches=8,
-                       max_interval=1.5 * interval, rng=rng)
+    pairs = data.pairs((1,), max_matches=80, min_matches=8, rng=rng)
     if len(pairs) < 0.5 * len(data.tracks):
         raise InputError(
             f'points can be followed over {len(pairs)} of {len(data.tracks) - 1} steps between '
             'images only: the images are blurred, the scene has no texture, or it moves too fast. '
             'Record with a short exposure in good light, and turn more slowly')
-    times1, times2 = data.times[pairs.first], data.times[pairs.second]
-    points1 = _normalised(data.camera, pairs.points1)
-    points2 = _normalised(data.camera, pairs.points2)
-    rates = seen_rates(pairs, points1, points2, times2 - times1)
     found = find_starts(
-        rates, times1, times2, data.gyro_times, data.gyro_rates,
-        max_offset=config.max_time_offset + 0.02, step=5e-3,
+        data.seen_rates(pairs), data.times[pairs.first], data.times[pairs.second],
+        data.gyro_times, data.gyro_rates, max_offset=config.max_time_offset + 0.02, step=5e-3,
         focal_factors=np.ones(1) if focal_known else _FOCAL_FACTORS, count=3)
     if not found:
         raise InputError('the gyro does not cover the images: record both together')
     return found
 
 
-def _normalised(camera: RollingShutterCamera, points: Array) -> Array:
-    rays = camera.unproject(points)
-    return np.asarray(rays[:, :2] / rays[:, 2:])
-
-
-def _coarse_fit(data: _Input, starts: list[Start], free: NDArray[np.bool_],
+def _coarse_fit(data: Observations, starts: list[Start], free: NDArray[np.bool_],
                 config: CalibrationConfig, rng: np.random.Generator) -> Fit:
     """The best of the starts after a fit to some of the pairs."""
     best: Fit | None = None
     best_cost = np.inf
     for start in starts:
-        problem = _problem(data, _spans(data, _SPAN_AT_START), start.offset,
+        problem = _problem(data, _SPAN_AT_START, start.offset,
                            _MATCHES_PER_PAIR_AT_START, _PAIRS_AT_START, config, rng)
         state = State.start(problem, start.R_cam_imu.T, start.offset,
                             log_focal=float(np.log(start.focal_factor)))
@@ -285,52 +236,17 @@ def _restarted(problem: Problem, state: State, caution: float = 1.0) -> State:
                        p[FOCAL], caution * float(np.median(state.noise)))
 
 
-def _problem(data: _Input, gaps: tuple[int, ...], offset: float, matches: int, most_pairs: int,
-             config: CalibrationConfig, rng: np.random.Generator) -> Problem:
+def _problem(data: Observations, spans: tuple[float, ...], offset: float, matches: int,
+             most_pairs: int, config: CalibrationConfig, rng: np.random.Generator) -> Problem:
     """Pairs whose rows the gyro covers, as the fit takes them."""
-    interval = data.interval
-    pairs = make_pairs(data.tracks, gaps, max_matches=matches, min_matches=_LEAST_MATCHES,
-                       max_interval=1.5 * interval, rng=rng)
-    pairs = pairs.chosen(_covered(data, pairs, offset, config))
-    if len(pairs) > most_pairs:
-        pairs = pairs.chosen(np.linspace(0, len(pairs) - 1, most_pairs).astype(np.int64))
+    pairs = data.pairs(data.frames_in(spans), max_matches=matches, min_matches=_LEAST_MATCHES,
+                       rng=rng)
+    pairs = evenly(pairs.chosen(data.covered(pairs, offset, config.max_gyro_gap)), most_pairs)
     if len(pairs) < 10:
         raise InputError(
             f'only {len(pairs)} pairs of images have {_LEAST_MATCHES} points in common and a gyro '
             'without gaps: record a textured scene with a short exposure, and all of the gyro')
-    camera = data.camera
-    middle = 0.5 * (camera.height - 1)
-    points1, by_pixel1 = _normalised_by_pixel(camera, pairs.points1)
-    points2, by_pixel2 = _normalised_by_pixel(camera, pairs.points2)
-    times1, times2 = data.times[pairs.first], data.times[pairs.second]
-    middle_knots = np.searchsorted(data.gyro_times, 0.5 * (times1 + times2) + offset)
-    return Problem(
-        data.gyro_times, data.gyro_rates, pairs.begin, middle_knots, pairs.first, pairs.second,
-        times1, times2, data.covariates[pairs.first],
-        data.covariates[pairs.second], points1, points2,
-        (pairs.points1[:, 1] - middle) / camera.height,
-        (pairs.points2[:, 1] - middle) / camera.height, by_pixel1, by_pixel2, data.gyro_density,
-        np.full(len(pairs), BEND_AT_START))
-
-
-def _normalised_by_pixel(camera: RollingShutterCamera, points: Array) -> tuple[Array, Array]:
-    """Normalised points (N, 2), and their derivative by the pixels (N, 2, 2)."""
-    rays, jacobian = camera.unproject_with_jacobian(points)
-    normalised = np.asarray(rays[:, :2] / rays[:, 2:])
-    # n = m_xy / m_z, so dn = (dm_xy - n dm_z) / m_z.
-    by_pixel = (jacobian[:, :2] - normalised[:, :, None] * jacobian[:, 2:]) / rays[:, 2:, None]
-    return normalised, np.ascontiguousarray(by_pixel)
-
-
-def _covered(data: _Input, pairs: Pairs, offset: float,
-             config: CalibrationConfig) -> NDArray[np.bool_]:
-    """Pairs that lie within the gyro's samples and touch no gap of them."""
-    half = 0.5 * data.interval + 0.01
-    begin, end = data.times[pairs.first] + offset - half, data.times[pairs.second] + offset + half
-    good = (begin >= data.gyro_times[0]) & (end <= data.gyro_times[-1])
-    for k in np.flatnonzero(data.gyro_gaps > config.max_gyro_gap):
-        good &= (end <= data.gyro_times[k]) | (begin >= data.gyro_times[k + 1])
-    return np.asarray(good)
+    return data.problem(pairs, offset)
 
 
 # -- outcome -----------------------------------------------------------------------------------
@@ -374,8 +290,8 @@ def _refitted(problem: Problem, state: State, free: NDArray[np.bool_], rounds: i
     return state
 
 
-def _judged(data: _Input, problem: Problem, final: Fit, free: NDArray[np.bool_], curve: CostCurve,
-            config: CalibrationConfig) -> CalibrationResult:
+def _judged(data: Observations, problem: Problem, final: Fit, free: NDArray[np.bool_],
+            curve: CostCurve, config: CalibrationConfig) -> CalibrationResult:
     """Figures with their sigmas and verdicts."""
     covariance = _inflated(final.covariance, free, config)
     parameters, R_cam_imu = final.state.parameters, final.state.R_imu_cam.T
@@ -445,7 +361,7 @@ def _inflated(covariance: Array, free: NDArray[np.bool_], config: CalibrationCon
     return covariance + np.diag(floors**2)
 
 
-def _excitation(data: _Input, bias: Array, R_cam_imu: Array,
+def _excitation(data: Observations, bias: Array, R_cam_imu: Array,
                 config: CalibrationConfig) -> tuple[Array, str]:
     """Rms rates about the camera's axes [rad/s], and what is missing of them (empty: nothing)."""
     inside = (data.gyro_times >= data.times[0]) & (data.gyro_times <= data.times[-1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,6 +42,13 @@ class GyroSeries:
             raise InputError('rates of the gyro must be finite')
         object.__setattr__(self, 'stamps_ns', stamps)
         object.__setattr__(self, 'rates', rates)
+
+    @classmethod
+    def by_stamp(cls, rates: Mapping[int, ArrayLike]) -> GyroSeries:
+        """Series of rates (3,) [rad/s] by their stamps [ns], in whatever order."""
+        stamps = sorted(rates)
+        return cls(np.array(stamps, dtype=np.int64),
+                   np.array([rates[stamp] for stamp in stamps]).reshape(-1, 3))
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

@@ -7,11 +7,9 @@ from dataclasses import dataclass
 import logging
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from rs_relpose_ros.bags.reader import Bag, COMPRESSED_IMAGE, SensorTopics
 from rs_relpose_ros.calibration.calibrate import CalibrationConfig
+from rs_relpose_ros.calibration.follow import PointFollower
 from rs_relpose_ros.calibration.gyro_path import GyroSeries
 from rs_relpose_ros.calibration.tracks import Tracks
 from rs_relpose_ros.camera import RollingShutterCamera
@@ -25,14 +23,9 @@ from rs_relpose_ros.messages.incoming import (
 )
 from rs_relpose_ros.pipeline.calibration import Calibration
 from rs_relpose_ros.tracking.config import TrackingConfig
-from rs_relpose_ros.tracking.klt import KltTracker
-
-Array = NDArray[np.float64]
 
 # Guess of an unknown focal length, share of the longer side: 64 deg of view.
 _FOCAL_GUESS = 0.8
-# New corners are looked for when so many of the last ones are lost, or so many frames went by.
-_KEPT, _RENEWED_AFTER = 0.8, 30
 
 # What KLT adds to the errors of a calibration, found on rendered bags: its errors are not
 # independent from frame to frame.
@@ -96,14 +89,9 @@ def read_recording(bag: Bag, topics: SensorTopics, tracking: TrackingConfig | No
 class _Reader:
     def __init__(self, topics: SensorTopics, tracking: TrackingConfig) -> None:
         self._topics = topics
-        self._tracker = KltTracker(tracking)
+        self._follower = PointFollower(tracking)
         self._calibration: Calibration | None = None
         self._uncalibrated = False
-        self._started = False
-        self._since_renewed = 0
-        self._stamps: list[int] = []
-        self._ids: list[NDArray[np.uint32]] = []
-        self._points: list[Array] = []
         self._size: tuple[int, int] | None = None
         self._gyro: dict[int, tuple[float, float, float]] = {}
         self._unused: dict[str, int] = {}
@@ -134,46 +122,30 @@ class _Reader:
 
     def _take_image(self, msg: Any) -> None:
         stamp = stamp_ns(msg.header)
-        if self._stamps and stamp <= self._stamps[-1]:
+        last = self._follower.last_stamp_ns
+        if last is not None and stamp <= last:
             raise InputError('the stamp of an image is not later than that of the one before')
         if self._topics.image.msgtype == COMPRESSED_IMAGE:
             image = image_from_compressed(msg)
         else:
             image = image_from_message(msg)
-        if not self._started:
-            self._tracker.start(image)
-            self._started = True
-            self._size = image.shape[1], image.shape[0]
-        # Matches with the reference, which holds every point that is followed: aligned with it,
-        # their errors do not add up from frame to frame.
-        self._tracker.track(image)
-        matches = self._tracker.refined_matches()
-        self._since_renewed += 1
-        if (self._tracker.tracked_fraction < _KEPT or self._since_renewed >= _RENEWED_AFTER):
-            self._tracker.promote()
-            self._since_renewed = 0
-        self._stamps.append(stamp)
-        self._ids.append(matches.track_ids)
-        self._points.append(matches.points2)
+        self._follower.add(stamp, image)
+        self._size = image.shape[1], image.shape[0]
 
     def recording(self) -> Recording:
         images, imu = self._topics.image.name, self._topics.imu.name
         why = ''.join(f'; {reason}' for reason in list(self._unused)[:2])
-        if not self._stamps or self._size is None:
+        if self._size is None:
             raise InputError(f'no image of {images} can be used{why}')
         if not self._gyro:
             raise MissingInputError(f'no message of {imu} has a gyro{why}: record the angular '
                                     'velocity together with the images')
         camera = self._camera(self._size)
-        points = np.concatenate(self._points)
-        if self._calibration is not None:
-            points = self._calibration.to_sensor(points)
-        frames = np.repeat(np.arange(len(self._stamps)), [len(ids) for ids in self._ids])
-        tracks = Tracks(np.array(self._stamps), frames,
-                        np.concatenate(self._ids).astype(np.int64), points)
-        stamps = np.array(sorted(self._gyro), dtype=np.int64)
-        gyro = GyroSeries(stamps, np.array([self._gyro[int(stamp)] for stamp in stamps]))
-        return Recording(tracks, gyro, camera, self._calibration is not None, self._unused)
+        calibration = self._calibration
+        tracks = (self._follower.tracks() if calibration is None
+                  else self._follower.tracks(calibration.to_sensor))
+        return Recording(tracks, GyroSeries.by_stamp(self._gyro), camera,
+                         calibration is not None, self._unused)
 
     def _camera(self, size: tuple[int, int]) -> RollingShutterCamera:
         calibration = self._calibration
@@ -183,11 +155,7 @@ class _Reader:
                     f'the images are {size[0]}x{size[1]}, but the CameraInfo is for '
                     f'{calibration.image_width}x{calibration.image_height}: a resized image '
                     'needs a CameraInfo of its own')
-            return RollingShutterCamera(
-                width=calibration.width, height=calibration.height, fx=calibration.fx,
-                fy=calibration.fy, cx=calibration.cx, cy=calibration.cy,
-                distortion_model=calibration.distortion_model,
-                distortion=calibration.distortion, readout_time=0.0)
+            return calibration.global_shutter_camera()
         if not self._uncalibrated:
             raise MissingInputError(f'no message of {self._topics.camera_info.name} can be used'
                                     + ''.join(f'; {reason}' for reason in list(self._unused)[:2]))

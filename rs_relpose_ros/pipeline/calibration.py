@@ -53,9 +53,7 @@ class Calibration:
 
     def __post_init__(self) -> None:
         # The camera model checks intrinsics and distortion; one place of those rules is enough.
-        RollingShutterCamera(
-            width=self.width, height=self.height, fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy,
-            distortion_model=self.distortion_model, distortion=self.distortion, readout_time=0.0)
+        self.global_shutter_camera()
         for name in ('image_width', 'image_height', 'binning_x', 'binning_y'):
             if getattr(self, name) < 1:
                 raise InputError(f'{name} must be >= 1, got {getattr(self, name)}')
@@ -66,6 +64,12 @@ class Calibration:
                 raise InputError(
                     f'region of interest leaves the sensor in {axis}: offset {offset} and {size} '
                     f'pixels of {binning} must lie within {sensor}')
+
+    def global_shutter_camera(self) -> RollingShutterCamera:
+        """Camera model of the full sensor, its read-out time 0."""
+        return RollingShutterCamera(
+            width=self.width, height=self.height, fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy,
+            distortion_model=self.distortion_model, distortion=self.distortion, readout_time=0.0)
 
     def to_sensor(self, points: ArrayLike) -> NDArray[np.float64]:
         """Sensor pixels (N, 2) of pixels (N, 2) of the published image."""

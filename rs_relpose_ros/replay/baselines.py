@@ -97,10 +97,7 @@ def best_opencv_score(method: str, pairs: Sequence[ReplayedPair], calibration: C
     calibration : Calibration
     truth : TrueTrajectory
     """
-    camera = RollingShutterCamera(
-        width=calibration.width, height=calibration.height, fx=calibration.fx, fy=calibration.fy,
-        cx=calibration.cx, cy=calibration.cy, distortion_model=calibration.distortion_model,
-        distortion=calibration.distortion, readout_time=0.0)
+    camera = calibration.global_shutter_camera()
     scores = []
     for threshold in THRESHOLDS:
         errors = []
