@@ -17,6 +17,7 @@ from rs_relpose_ros.benchmark.calibration_tracks import (
     Recorded,
     Truth,
 )
+from rs_relpose_ros.calibration.alignment import find_starts, Start
 from rs_relpose_ros.calibration.axis_maps import axis_maps, nearest_axis_map
 from rs_relpose_ros.calibration.calibrate import calibrate
 from rs_relpose_ros.calibration.coplanarity import GLOBAL, LOCAL
@@ -228,6 +229,37 @@ def test_every_axis_map_is_recognised():
     tilt = Rotation.from_rotvec([0.1, -0.2, 0.15]).as_matrix()
     for matrix in maps:
         np.testing.assert_array_equal(nearest_axis_map(tilt @ matrix), matrix)
+
+
+def coarse_start(R: np.ndarray, axes: np.ndarray, unit: float) -> Start:
+    """Of a gyro 50 ms ahead that tells its rates in `unit` rad/s, turning about `axes` (3,)."""
+    rng = np.random.default_rng(3)
+    times = np.arange(0.0, 6.0, 0.005)
+    rates = axes * np.sin(2.0 * times[:, None] * [1.0, 1.7, 2.3]) * 0.4
+    begins = np.linspace(0.5, 5.0, 120)
+    ends = begins + 0.033
+    seen = np.stack([np.interp(0.5 * (begins + ends) + 0.05, times, rates[:, i])
+                     for i in range(3)], axis=1) @ R.T + 0.01 * rng.standard_normal((120, 3))
+    start, = find_starts(seen, begins, ends, times, rates / unit, max_offset=0.2, step=5e-3,
+                         focal_factors=np.ones(1), count=1, scale_known=False)
+    return start
+
+
+@pytest.mark.parametrize('unit', [1.0, math.radians(1.0)])
+def test_search_tells_the_unit_of_the_gyro(unit):
+    R = Rotation.from_rotvec([0.5, -1.2, 2.0]).as_matrix()
+    start = coarse_start(R, np.ones(3), unit)
+    assert start.offset == pytest.approx(0.05, abs=5e-3)
+    assert start.scale == pytest.approx(unit, rel=0.02)
+    assert start.explained > 0.97
+    assert Rotation.from_matrix(start.R_cam_imu @ R.T).magnitude() < 0.03
+
+
+def test_search_from_one_axis_takes_the_rotation_next_to_an_axis_map():
+    tilt = Rotation.from_rotvec([math.radians(30.0), 0.0, 0.0]).as_matrix()
+    start = coarse_start(tilt, np.array([0.0, 1.0, 0.0]), 1.0)
+    assert start.explained > 0.97
+    np.testing.assert_allclose(start.R_cam_imu, tilt, atol=0.03)
 
 
 def test_gyro_path_is_the_rotation_of_an_even_turn():

@@ -7,6 +7,7 @@ import itertools
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.calibration.axis_maps import nearest_axis_map
 from rs_relpose_ros.calibration.tracks import Pairs
@@ -16,7 +17,7 @@ Array = NDArray[np.float64]
 _ROUNDS = 12
 # Residual [rad] below which a ray always counts in full.
 _LEAST_SCALE = 2e-4
-# Weaker second axis of the common rotation than this share of the first: only axis maps are tried.
+# Weaker second axis of the common rotation than this share of the first: an axis map fills it in.
 _ONE_AXIS = 0.05
 
 
@@ -34,6 +35,10 @@ class Start:
     focal_factor : float
     misfit : float
         Share of the rotation's variance that the two do not have in common.
+    scale : float
+        What was seen over what the gyro measured; 1 where that is taken to be known.
+    explained : float
+        Share of what was seen that the gyro explains, whatever its scale: 0 to 1.
     """
 
     offset: float
@@ -41,6 +46,8 @@ class Start:
     bias: Array
     focal_factor: float
     misfit: float
+    scale: float
+    explained: float
 
 
 def seen_rates(pairs: Pairs, points1: Array, points2: Array, intervals: Array) -> Array:
@@ -86,7 +93,8 @@ def _turn(rays1: Array, rays2: Array) -> Array:
 
 
 def find_starts(rates: Array, begins: Array, ends: Array, gyro_times: Array, gyro_rates: Array, *,
-                max_offset: float, step: float, focal_factors: Array, count: int) -> list[Start]:
+                max_offset: float, step: float, focal_factors: Array, count: int,
+                scale_known: bool = True) -> list[Start]:
     """Offsets at which the gyro, turned, agrees best with what was seen; best first.
 
     Parameters
@@ -100,6 +108,8 @@ def find_starts(rates: Array, begins: Array, ends: Array, gyro_times: Array, gyr
         Factors of the assumed focal length that are tried.
     count : int
         At most so many starts, of different offsets.
+    scale_known : bool
+        Whether the gyro's scale is taken to be right; where not, neither is the unit of `bias`.
     """
     steps = np.diff(gyro_times)[:, None]
     turned = np.concatenate([
@@ -115,34 +125,42 @@ def find_starts(rates: Array, begins: Array, ends: Array, gyro_times: Array, gyr
             - np.interp(begins[inside] + offset, gyro_times, turned[:, i]) for i in range(3)],
             axis=1) / (ends - begins)[inside, None]
         starts.append(min((_aligned(rates[inside] * [1.0 / factor, 1.0 / factor, 1.0], measured,
-                                    float(offset), float(factor)) for factor in focal_factors),
+                                    float(offset), float(factor), scale_known)
+                           for factor in focal_factors),
                           key=lambda start: start.misfit))
     return _best_apart(starts, count, 4.0 * step)
 
 
-def _aligned(seen: Array, measured: Array, offset: float, focal_factor: float) -> Start:
+def _aligned(seen: Array, measured: Array, offset: float, focal_factor: float,
+             scale_known: bool) -> Start:
     kept = np.ones(len(seen), dtype=bool)
-    R, bias, misfit = np.eye(3), np.zeros(3), 1.0
+    start = Start(offset, np.eye(3), np.zeros(3), focal_factor, 1.0, 1.0, 0.0)
     for _ in range(3):
-        a, b = seen[kept], measured[kept]
-        mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
-        R = _rotation_onto(a - mean_a, b - mean_b)
-        residual = (seen - mean_a) - (measured - mean_b) @ R.T
-        squares = (residual**2).sum(axis=1)
-        total = ((a - mean_a) ** 2).sum() + ((b - mean_b) ** 2).sum()
-        misfit = float(squares[kept].sum() / max(total, 1e-12))
-        bias = mean_b - R.T @ mean_a
+        mean_a, mean_b = seen[kept].mean(axis=0), measured[kept].mean(axis=0)
+        a, b = seen - mean_a, measured - mean_b
+        R = _rotation_onto(a[kept], b[kept])
+        turned = b @ R.T
+        in_a, in_b, shared = (float((x[kept] * y[kept]).sum())
+                              for x, y in ((a, a), (b, b), (a, turned)))
+        scale = 1.0 if scale_known else max(shared, 0.0) / max(in_b, 1e-12)
+        squares = ((a - scale * turned)**2).sum(axis=1)
+        start = Start(
+            # A translation to one side looks like a bias; none of a gyro is large.
+            offset, R, np.clip(mean_b - R.T @ mean_a / max(scale, 1e-12), -0.1, 0.1), focal_factor,
+            float(squares[kept].sum()) / max(in_a + scale**2 * in_b, 1e-12), scale,
+            max(shared, 0.0)**2 / max(in_a * in_b, 1e-24))
         kept = squares <= 9.0 * max(float(np.median(squares)), 1e-10)
-    # A translation to one side looks like a bias; none of a gyro is large.
-    return Start(offset, R, np.clip(bias, -0.1, 0.1), focal_factor, misfit)
+    return start
 
 
 def _rotation_onto(seen: Array, measured: Array) -> Array:
-    """Rotation R with ``seen = R measured`` (Kabsch), or the best axis map about a single axis."""
+    """Rotation R with ``seen = R measured`` (Kabsch); from one axis, that next to an axis map."""
     C = seen.T @ measured
     u, s, vt = np.linalg.svd(C)
     if s[1] < _ONE_AXIS * s[0]:
-        return nearest_axis_map(C)
+        nearest = nearest_axis_map(C)
+        tilt, _ = Rotation.align_vectors(u[:, :1].T, vt[:1] @ nearest.T)
+        return np.asarray(tilt.as_matrix() @ nearest)
     return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
 
 

@@ -37,8 +37,10 @@ def findings(seen: Scan, parameters: Parameters) -> list[Finding]:
     found = [_overlap(seen, parameters), _texture(seen)]
     if found[0].verdict is not Verdict.FAILURE:
         sensor = parameters.sensor
-        readout = _EXAMPLE_READOUT if sensor.readout_time is None else sensor.readout_time
-        alignment = seen.turning.align(readout if sensor.readout_direction == 'down' else -readout)
+        readout = sensor.readout_time
+        if readout is not None and sensor.readout_direction == 'up':
+            readout = -readout
+        alignment = seen.turning.align(readout)
         found += ([Finding('axes and clock', Verdict.OK, 'not measured: too few images to track '
                            'beside the gyro', 'record some seconds of a textured scene')]
                   if alignment is None else _aligned(alignment, seen, parameters))
