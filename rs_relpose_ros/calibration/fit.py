@@ -104,8 +104,10 @@ class State:
         if bias is not None:
             parameters[BIAS:BIAS + 3] = bias
         direction = np.tile([1.0, 0.0, 0.0], (problem.pairs, 1))
-        state = cls(parameters, R_imu_cam, direction, np.zeros((problem.pairs, 3)),
-                    np.zeros((problem.pairs, 3)), np.full(problem.pairs, noise),
+        # A transposed one would have the kernels compiled a second time.
+        state = cls(parameters, np.ascontiguousarray(R_imu_cam), direction,
+                    np.zeros((problem.pairs, 3)), np.zeros((problem.pairs, 3)),
+                    np.full(problem.pairs, noise),
                     np.full(problem.pairs, _DAMPING[0]))
         return redirected(problem, state)
 
