@@ -135,7 +135,7 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
     progress(0.4)
     problem = _problem(data, _SPANS, coarse.state.parameters[OFFSET],
                        _MATCHES_PER_PAIR, _MOST_PAIRS, config, rng)
-    begin = _restarted(problem, coarse.state, 2.0)
+    begin = coarse.state.restarted(problem, 2.0)
     problem = with_bends(problem, begin)
     free[SLOPE] = _intervals_vary(data)
     final = fit(problem, begin, free)
@@ -229,13 +229,6 @@ def _coarse_fit(data: Observations, starts: list[Start], free: NDArray[np.bool_]
     return best
 
 
-def _restarted(problem: Problem, state: State, caution: float = 1.0) -> State:
-    """The globals of `state` for other pairs, with a multiple of its noise."""
-    p = state.parameters
-    return State.start(problem, state.R_imu_cam, p[OFFSET], p[READOUT], p[BIAS:BIAS + 3],
-                       p[FOCAL], caution * float(np.median(state.noise)))
-
-
 def _problem(data: Observations, spans: tuple[float, ...], offset: float, matches: int,
              most_pairs: int, config: CalibrationConfig, rng: np.random.Generator) -> Problem:
     """Pairs whose rows the gyro covers, as the fit takes them."""
@@ -261,7 +254,7 @@ def _cost_curve(problem: Problem, matches: int, final: Fit, free: NDArray[np.boo
     values = np.unique(np.concatenate([np.linspace(-interval, interval, _CURVE_POINTS), [best]]))
     costs = np.empty(len(values))
     order = np.argsort(np.abs(values - best))
-    begin = _refitted(problem, _restarted(problem, final.state), held, 5)
+    begin = _refitted(problem, final.state.restarted(problem), held, 5)
     for side in (order[values[order] <= best], order[values[order] > best]):
         state = begin
         for k in side:

@@ -111,6 +111,12 @@ class State:
                     np.full(problem.pairs, _DAMPING[0]))
         return redirected(problem, state)
 
+    def restarted(self, problem: Problem, caution: float = 1.0) -> State:
+        """The globals of this state for other pairs, with a multiple of its noise."""
+        p = self.parameters
+        return State.start(problem, self.R_imu_cam, p[OFFSET], p[READOUT], p[BIAS:BIAS + 3],
+                           p[FOCAL], caution * float(np.median(self.noise)))
+
     def moved(self, step: Array, local: Array) -> State:
         """State after a step of the parameters (GLOBAL,) and of the pairs (P, LOCAL)."""
         parameters = self.parameters + step

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.calibration.alignment import find_starts, Start
 from rs_relpose_ros.calibration.coplanarity import BIAS, GLOBAL, OFFSET, READOUT, ROTATION
-from rs_relpose_ros.calibration.fit import fit, State
+from rs_relpose_ros.calibration.fit import fit, State, with_bends
 from rs_relpose_ros.calibration.follow import PointFollower
 from rs_relpose_ros.calibration.gyro_path import GyroSeries
 from rs_relpose_ros.calibration.observations import evenly, Observations
@@ -40,8 +40,8 @@ _GYRO_GAP = 0.1
 _LEAST_PAIRS = 20
 _WORTH_REFINING = 0.5
 # Pairs for the refinement: how far apart [s], how many, and of how many points.
-_SPANS = (0.033, 0.067)
-_MOST_PAIRS, _REFINED_POINTS = 120, 60
+_SPANS = (0.033, 0.067, 0.133)
+_MOST_PAIRS, _REFINED_POINTS = 160, 80
 # What rows, blur and moving things leave open at least [s].
 _LEAST_SIGMA = 7e-4
 
@@ -197,6 +197,7 @@ def _refined(data: Observations, start: Start, readout: float | None,
     problem = data.problem(pairs, start.offset)
     state = State.start(problem, start.R_cam_imu.T, start.offset,
                         0.0 if readout is None else readout)
-    fitted = fit(problem, state, free, rounds=20, tolerance=0.3)
+    near = fit(problem, state, free, rounds=20, tolerance=0.3).state.restarted(problem, 2.0)
+    fitted = fit(with_bends(problem, near), near, free, rounds=20, tolerance=0.3)
     return (fitted.state.R_imu_cam.T, float(fitted.state.parameters[OFFSET]),
             math.hypot(_LEAST_SIGMA, math.sqrt(fitted.covariance[OFFSET, OFFSET])))
