@@ -78,8 +78,9 @@ def frame_stamp(k: int) -> int:
 
 
 def noisy_rate(k: int) -> tuple[float, float, float]:
-    """A gyro that repeats itself bit by bit would be refused."""
-    return 0.1, 0.2 + 1e-4 * np.sin(k), 0.3
+    """A gyro of which an axis repeats itself bit by bit would be refused."""
+    noise = 1e-4 * np.sin(k)
+    return 0.1 + noise, 0.2 + noise, 0.3 + noise
 
 
 def test_the_oldest_frame_goes_and_the_latest_wait(held):

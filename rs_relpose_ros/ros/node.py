@@ -11,7 +11,7 @@ from pathlib import Path
 import signal
 import sys
 import traceback
-from typing import Any, TextIO
+from typing import Any, NoReturn, TextIO
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
@@ -410,18 +410,24 @@ def _finish(node: RelposeNode | None) -> None:
     _ignore_signals()
     if node is not None:
         if not node.stop():
-            # Compiling or loading kernels cannot be interrupted, and a thread that still runs
-            # while the interpreter goes down aborts the process.
-            logging.shutdown()
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(0)
+            # Compiling or loading kernels cannot be interrupted.
+            leave(0)
         node.destroy_node()
     rclpy.try_shutdown()
     # It brought back the handlers of before.
     _ignore_signals()
-    # The interpreter's last collection would visit every object of every module: up to a second.
-    gc.freeze()
+
+
+def leave(code: int) -> NoReturn:
+    """End the process at once, all of its output written.
+
+    Threads of ours, of OpenCV or of the middleware that still run while the interpreter and the
+    libraries go down can abort it.
+    """
+    logging.shutdown()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 def _ignore_signals() -> None:
@@ -431,4 +437,4 @@ def _ignore_signals() -> None:
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    leave(main())

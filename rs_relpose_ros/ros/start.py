@@ -8,18 +8,19 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 from types import FrameType
+from typing import NoReturn
 
 _started = False
 
 
-def main() -> int:
-    """Run the node; its exit code."""
+def main() -> NoReturn:
+    """Run the node, and end the process with its exit code."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _on_signal)
+    from rs_relpose_ros.ros.node import leave
     from rs_relpose_ros.ros.node import main as run
-    return run(on_started=_on_started)
+    leave(run(on_started=_on_started))
 
 
 def _on_started() -> None:
@@ -35,4 +36,4 @@ def _on_signal(number: int, frame: FrameType | None) -> None:
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()

@@ -13,8 +13,8 @@ from rs_relpose_ros.tracking.images import Image
 
 Array = NDArray[np.float64]
 
-# Exposure that changes by less is left alone: another rounding to whole gray levels costs more than
-# it gains where texture is faint (RealSense recording: a pair costs half as much as at 0.03 and 3).
+# Exposure that changes by less is left alone: another rounding to whole gray levels costs more
+# than it gains where texture is faint (a RealSense recording: half the cost of 0.03 and 3).
 _LEAST_GAIN, _LEAST_OFFSET = 0.1, 10.0
 # Numbers of 32 bits that a vector register of AVX2 holds.
 _LANES = 8
