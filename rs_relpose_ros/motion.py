@@ -118,7 +118,7 @@ class FrameMotion:
         if self.knot_times is None or self.knot_rotations is None:
             return rotations_at_rate(self.angular_velocity, tau)
         times = self.knot_times
-        rotations, covered = rotations_between(times, self.knot_rotations, tau, _TOLERANCE)
+        rotations, covered = rotations_between(times, self.knot_rotations, tau)
         if not covered:
             raise InputError(
                 f'row times [{tau.min():.6f}, {tau.max():.6f}] s are not covered by the gyro '
@@ -150,11 +150,11 @@ def rotations_at_rate(rate: Array, times: Array) -> Array:
 
 
 @kernel
-def rotations_between(knot_times: Array, knot_rotations: Array, times: Array,
-                      tolerance: float) -> tuple[Array, bool]:
+def rotations_between(knot_times: Array, knot_rotations: Array,
+                      times: Array) -> tuple[Array, bool]:
     """Orientations (N, 3, 3) at times (N,) within the knots, at a constant rate between two.
 
-    Also whether the knots enclose all times, with a tolerance; beyond them nothing turns on.
+    Also whether the knots enclose all times; beyond them nothing turns on.
     """
     out = np.empty((len(times), 3, 3))
     steps = np.empty((len(knot_times) - 1, 3))
@@ -164,8 +164,8 @@ def rotations_between(knot_times: Array, knot_rotations: Array, times: Array,
     covered = True
     for i in range(len(times)):
         # Written so that NaN is not covered.
-        covered &= (times[i] >= knot_times[0] - tolerance
-                    and times[i] <= knot_times[-1] + tolerance)
+        covered &= (times[i] >= knot_times[0] - _TOLERANCE
+                    and times[i] <= knot_times[-1] + _TOLERANCE)
         time = min(max(times[i], knot_times[0]), knot_times[-1])
         k = min(max(after[i] - 1, 0), len(steps) - 1)
         fraction = (time - knot_times[k]) / (knot_times[k + 1] - knot_times[k])

@@ -14,7 +14,6 @@ import traceback
 from typing import Any, NoReturn, TextIO
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
 import rclpy
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidHandle, ParameterException
@@ -24,7 +23,7 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.utilities import remove_ros_args
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2, TimeReference
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 from std_srvs.srv import Trigger
 
 from rs_relpose_ros.errors import InputError, RsRelposeError
@@ -33,6 +32,7 @@ from rs_relpose_ros.messages.outgoing import (
     color_image_message,
     diagnostics_message,
     pair_messages,
+    PAIR_TOPICS,
     status_message,
 )
 from rs_relpose_ros.pipeline.pair import PairResult
@@ -97,11 +97,9 @@ class RelposeNode(Node):
         self._heard_ns: dict[str, int] = {}
         # Diagnostics and time-outs go by the wall's pace also where /clock stands still.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._relative_pose = self.create_publisher(
-            PoseWithCovarianceStamped, '~/relative_pose', 10)
-        self._reference = self.create_publisher(TimeReference, '~/reference', 10)
-        self._velocity = self.create_publisher(TwistWithCovarianceStamped, '~/velocity', 10)
-        self._matches = self.create_publisher(PointCloud2, '~/matches', 10)
+        self._pair_publishers = {
+            name: self.create_publisher(message_class(msgtype), f'~/{name}', 10)
+            for name, msgtype in PAIR_TOPICS.items()}
         self._debug_image = self.create_publisher(Image, '~/debug_image', 2)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._broadcast: Broadcast | None = None
@@ -268,10 +266,8 @@ class RelposeNode(Node):
     def _publish(self, result: PairResult) -> None:
         messages = pair_messages(
             result, message_class, self._settings.current.pair.reference_frame)
-        self._relative_pose.publish(messages.relative_pose)
-        self._reference.publish(messages.reference)
-        self._velocity.publish(messages.velocity)
-        self._matches.publish(messages.matches)
+        for name, publisher in self._pair_publishers.items():
+            publisher.publish(getattr(messages, name))
         if self._broadcast is not None:
             self._broadcast(messages.relative_pose, result.frame_id)
 
