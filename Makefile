@@ -44,7 +44,7 @@ $(stamp): requirements/base.txt requirements/test.txt $(CONSTRAINTS) setup.py se
 	@$(bin)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)
 	$(pip) install --no-compile -r requirements/test.txt $(CONSTRAINTS:%=-c %)
 	$(pip) install --no-deps --no-build-isolation --editable .
-	$(bin)/python -m rs_relpose_ros.pipeline.warm_up
+	$(bin)/python -m rs_relpose_ros.front_end.warm_up
 	touch $@
 
 # A PYTHON that was asked for must be the one that an existing environment was made with.

@@ -5,6 +5,7 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NAME = 'rs_relpose_ros'
+LABORATORY = 'rs_relpose_lab'
 
 
 def files_in(folder: str) -> list[str]:
@@ -20,8 +21,8 @@ setup(
     maintainer_email='maintainers@users.noreply.h-seed-7badc013.example',
     license='Apache-2.0',
     python_requires='>=3.11',
-    packages=find_packages(include=[NAME, NAME + '.*']),
-    package_data={NAME: ['py.typed']},
+    packages=find_packages(include=[NAME, NAME + '.*', LABORATORY, LABORATORY + '.*']),
+    package_data={NAME: ['py.typed'], LABORATORY: ['py.typed']},
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/' + NAME]),
         ('share/' + NAME, ['package.xml']),
@@ -35,7 +36,7 @@ setup(
     zip_safe=False,
     entry_points={
         'console_scripts': [
-            'relpose_node = rs_relpose_ros.ros.start:main',
+            'relpose_node = rs_relpose_ros.node.start:main',
             'rs_relpose = rs_relpose_ros.cli.main:main',
         ],
     },

@@ -21,13 +21,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from rs_relpose_ros.benchmark.calibration_tracks import about_one_axis
-from rs_relpose_ros.benchmark.tables import markdown_table, write_csv
-from rs_relpose_ros.calibration.axis_maps import axis_maps
+from rs_relpose_lab.experiments.calibration_tracks import about_one_axis
+from rs_relpose_lab.experiments.tables import markdown_table, write_csv
+from rs_relpose_lab.simulation import simulate, SimulationConfig
+from rs_relpose_lab.simulation.bag import write_bag
+from rs_relpose_lab.simulation.config import SCENES
+from rs_relpose_ros.calibrate.axis_maps import axis_maps
 from rs_relpose_ros.cli.main import main as rs_relpose
-from rs_relpose_ros.simulation import simulate, SimulationConfig
-from rs_relpose_ros.simulation.bag import write_bag
-from rs_relpose_ros.simulation.config import SCENES
 
 DURATION = 6.0
 

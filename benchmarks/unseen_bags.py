@@ -18,19 +18,19 @@ import sys
 
 from tqdm import tqdm
 
+from rs_relpose_lab.experiments.comparison import differing_poses, is_still, score_of_table
+from rs_relpose_lab.experiments.opencv_baseline import best_opencv_score, METHODS
+from rs_relpose_lab.live.live_run import run_live
+from rs_relpose_lab.simulation import simulate, SimulationConfig
+from rs_relpose_lab.simulation.bag import write_bag, write_parameters
+from rs_relpose_lab.simulation.config import SCENES
 from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.errors import RsRelposeError
-from rs_relpose_ros.replay.baselines import best_opencv_score, METHODS
-from rs_relpose_ros.replay.comparison import differing_poses, is_still, score_of_table
+from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.replay.outputs import POSES_FILE, replay_into
-from rs_relpose_ros.replay.parameter_file import read_parameters
 from rs_relpose_ros.replay.run import read_truth, ReplayedPair
 from rs_relpose_ros.replay.stamps import read_stamps
-from rs_relpose_ros.result import Status
-from rs_relpose_ros.ros.live_run import run_live
-from rs_relpose_ros.simulation import simulate, SimulationConfig
-from rs_relpose_ros.simulation.bag import write_bag, write_parameters
-from rs_relpose_ros.simulation.config import SCENES
 
 SHORTEST_READOUT, LONGEST_READOUT = 0.012, 0.035
 DURATION = 6.0

@@ -14,10 +14,7 @@ from pathlib import Path
 import sys
 import time
 
-from rs_relpose_ros.bags.reader import open_bag
-from rs_relpose_ros.errors import RsRelposeError
-from rs_relpose_ros.replay.baselines import best_opencv_score, METHODS
-from rs_relpose_ros.replay.comparison import (
+from rs_relpose_lab.experiments.comparison import (
     differing_poses,
     is_still,
     PAPER_METHODS,
@@ -27,12 +24,15 @@ from rs_relpose_ros.replay.comparison import (
     score_of_table,
     score_table,
 )
+from rs_relpose_lab.experiments.opencv_baseline import best_opencv_score, METHODS
+from rs_relpose_lab.live.live_run import LiveRun, run_live
+from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.config.parameter_file import read_parameters
+from rs_relpose_ros.errors import RsRelposeError
+from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.replay.outputs import POSES_FILE, replay_into, ReplayOutcome
-from rs_relpose_ros.replay.parameter_file import read_parameters
 from rs_relpose_ros.replay.run import read_truth, ReplayedPair
 from rs_relpose_ros.replay.stamps import read_stamps
-from rs_relpose_ros.result import Status
-from rs_relpose_ros.ros.live_run import LiveRun, run_live
 
 ROOT = Path(__file__).resolve().parent.parent
 BAG = ROOT / 'bags' / 'hand_held'

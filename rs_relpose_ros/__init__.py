@@ -12,20 +12,21 @@ import logging
 from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rs_relpose_ros.camera import RollingShutterCamera
-    from rs_relpose_ros.config import EstimatorConfig
+    from rs_relpose_ros.config.estimator import EstimatorConfig
     from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
     from rs_relpose_ros.estimator.estimate import estimate_relative_pose, warm_up
-    from rs_relpose_ros.motion import FrameMotion
-    from rs_relpose_ros.result import RelativePose, Status
+    from rs_relpose_ros.estimator.result import RelativePose, Status
+    from rs_relpose_ros.geometry.camera import RollingShutterCamera
+    from rs_relpose_ros.geometry.motion import FrameMotion
 
 __all__ = ['EstimatorConfig', 'FrameMotion', 'InputError', 'MissingInputError', 'RelativePose',
            'RollingShutterCamera', 'RsRelposeError', 'Status', 'estimate_relative_pose', 'warm_up']
 
 _HOMES = {
-    'EstimatorConfig': 'config', 'FrameMotion': 'motion', 'InputError': 'errors',
-    'MissingInputError': 'errors', 'RelativePose': 'result', 'RollingShutterCamera': 'camera',
-    'RsRelposeError': 'errors', 'Status': 'result', 'estimate_relative_pose': 'estimator.estimate',
+    'EstimatorConfig': 'config.estimator', 'FrameMotion': 'geometry.motion',
+    'InputError': 'errors', 'MissingInputError': 'errors', 'RelativePose': 'estimator.result',
+    'RollingShutterCamera': 'geometry.camera', 'RsRelposeError': 'errors',
+    'Status': 'estimator.result', 'estimate_relative_pose': 'estimator.estimate',
     'warm_up': 'estimator.estimate',
 }
 

@@ -24,9 +24,9 @@ import test_bag_reader as bags
 
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.bags.writer import BagWriter
-from rs_relpose_ros.camera import RollingShutterCamera
+from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import RsRelposeError
-from rs_relpose_ros.pipeline.parameters import Parameters
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.replay.run import read_truth, Replay
 
 KINDS = (*bags.ROSBAG2_KINDS, *bags.ROS1_KINDS)

@@ -20,11 +20,11 @@ import message_builders as build
 import numpy as np
 from rosbags.typesys import get_typestore, Stores
 
+from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import RsRelposeError
+from rs_relpose_ros.front_end.sequencer import FrameRefused, ReadyFrame, Sequencer, WAITING_FRAMES
 from rs_relpose_ros.messages.incoming import ENCODINGS
 from rs_relpose_ros.messages.intake import MessageIntake
-from rs_relpose_ros.pipeline.parameters import Parameters
-from rs_relpose_ros.pipeline.sequencer import FrameRefused, ReadyFrame, Sequencer, WAITING_FRAMES
 
 TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
 START_NS = 1_700_000_000 * 10**9

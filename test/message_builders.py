@@ -19,7 +19,7 @@ def rosbags_types(name: str) -> Any:
 
 
 def rclpy_types(name: str) -> Any:
-    from rs_relpose_ros.ros.message_types import message_class
+    from rs_relpose_ros.node.message_types import message_class
     return message_class(name)
 
 

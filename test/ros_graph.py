@@ -113,7 +113,7 @@ def node_process(parameter_file: Path | None = None, *, remap: dict[str, str] | 
         arguments += ['-r', f'{source}:={target}']
     if name:
         arguments += ['-r', f'__node:={name}']
-    return Process('rs_relpose_ros.ros.node', *arguments)
+    return Process('rs_relpose_ros.node.node', *arguments)
 
 
 BAG_TOPICS = {'image': '/camera/image_raw', 'camera_info': '/camera/camera_info',

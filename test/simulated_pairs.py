@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 import two_view_scene
 
-from rs_relpose_ros.pipeline.pair import PairResult
-from rs_relpose_ros.result import RelativePose, Status
+from rs_relpose_ros.estimator.result import RelativePose, Status
+from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.tracking.matches import Matches
 
 VELOCITY = np.array([0.8, -0.3, 1.5])   # m/s, in the world

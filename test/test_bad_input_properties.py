@@ -26,7 +26,7 @@ from rs_relpose_ros import (
     solvers,
     Status,
 )
-from rs_relpose_ros.config import REFINEMENTS, SOLVERS
+from rs_relpose_ros.config.estimator import REFINEMENTS, SOLVERS
 from rs_relpose_ros.solvers.paper_reference import solve_by_determinants
 
 POINTS = {'linear_9pt': 9, 'uniform_9pt': 9, 'angular_3pt': 3, 'angular_5pt': 5, 'global_5pt': 5,

@@ -19,8 +19,8 @@ from rosbags.typesys import get_typestore, Stores
 from rs_relpose_ros.bags import limits, reader
 from rs_relpose_ros.bags.reader import Bag, open_bag, TopicOptions
 from rs_relpose_ros.bags.writer import BagWriter
-from rs_relpose_ros.camera import RollingShutterCamera
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.messages.incoming import calibration_from_info, imu_sample_from_message
 
 STAMP_NS = 1_700_000_000_123_456_789

@@ -8,8 +8,8 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from rs_relpose_ros.bags.writer import BagWriter
-from rs_relpose_ros.camera import RollingShutterCamera
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
 STAMP_NS = 1_700_000_000_123_456_789
 

@@ -6,22 +6,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rs_relpose_ros.benchmark import accuracy
-from rs_relpose_ros.benchmark.accuracy import (
+from rs_relpose_lab.experiments import accuracy
+from rs_relpose_lab.experiments.accuracy import (
     estimate,
     Experiment,
     run_experiment,
     told_config,
     Trial,
 )
-from rs_relpose_ros.benchmark.accuracy_report import cell_statistics, consistency, summary
-from rs_relpose_ros.benchmark.cell_names import matching_cells
-from rs_relpose_ros.benchmark.methods import available_methods, derotated, LIBRARY
-from rs_relpose_ros.benchmark.oracle_cache import OracleCache
-from rs_relpose_ros.benchmark.problems import Cell, CELLS, make_problem
-from rs_relpose_ros.benchmark.scoring import NO_POSE, pose_error, PoseError
-from rs_relpose_ros.benchmark.speed import compare, exponent, FirstEstimate, medians, Run, soak
-from rs_relpose_ros.benchmark.speed_report import method_statistics, write_report
+from rs_relpose_lab.experiments.accuracy_report import cell_statistics, consistency, summary
+from rs_relpose_lab.experiments.cell_names import matching_cells
+from rs_relpose_lab.experiments.oracle_cache import OracleCache
+from rs_relpose_lab.experiments.peers import available_methods, derotated, LIBRARY
+from rs_relpose_lab.experiments.problems import Cell, CELLS, make_problem
+from rs_relpose_lab.experiments.scoring import NO_POSE, pose_error, PoseError
+from rs_relpose_lab.experiments.speed import compare, exponent, FirstEstimate, medians, Run, soak
+from rs_relpose_lab.experiments.speed_report import method_statistics, write_report
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.errors import InputError
 

@@ -10,11 +10,11 @@ import pytest
 from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.benchmark import oracle, problems
-from rs_relpose_ros.benchmark.oracle import Objective, oracle_estimate, start_at
-from rs_relpose_ros.benchmark.oracle_cache import OracleCache
-from rs_relpose_ros.benchmark.problems import Cell, CELLS, make_problem
-from rs_relpose_ros.benchmark.scoring import pose_error, PoseError
+from rs_relpose_lab.experiments import oracle, problems
+from rs_relpose_lab.experiments.oracle import Objective, oracle_estimate, start_at
+from rs_relpose_lab.experiments.oracle_cache import OracleCache
+from rs_relpose_lab.experiments.problems import Cell, CELLS, make_problem
+from rs_relpose_lab.experiments.scoring import pose_error, PoseError
 
 NO_NOISE = {'pixel_noise': 0.0, 'gravity_noise': 0.0, 'gyro_noise': 0.0, 'outliers': 0.0}
 SIGMAS = 0.5, np.radians(0.2), np.radians(0.1)
@@ -27,7 +27,7 @@ def test_it_uses_nothing_of_the_package(module):
                 for alias in node.names}
     imported |= {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
     assert {name for name in imported if name.startswith('rs_relpose')} <= {
-        'rs_relpose_ros.benchmark.problems'}
+        'rs_relpose_lab.experiments.problems'}
 
 
 @pytest.mark.parametrize('cell', ['forward-base', 'sideways-v10-w3', 'forward-v0-w3'])

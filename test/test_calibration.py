@@ -10,25 +10,25 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.benchmark.calibration_tracks import (
+from rs_relpose_lab.experiments.calibration_tracks import (
     about_one_axis,
     drawn,
     record,
     Recorded,
     Truth,
 )
-from rs_relpose_ros.calibration.alignment import find_starts, Start
-from rs_relpose_ros.calibration.axis_maps import axis_maps, nearest_axis_map
-from rs_relpose_ros.calibration.calibrate import calibrate
-from rs_relpose_ros.calibration.coplanarity import GLOBAL, LOCAL
-from rs_relpose_ros.calibration.fit import evaluate, Problem, redirected, State
-from rs_relpose_ros.calibration.gyro_path import GyroPath, GyroSeries
-from rs_relpose_ros.calibration.report import parameter_file
-from rs_relpose_ros.calibration.result import CalibrationResult
-from rs_relpose_ros.calibration.tracks import make_pairs, Tracks
-from rs_relpose_ros.camera import RollingShutterCamera
+from rs_relpose_ros.calibrate.alignment import find_starts, Start
+from rs_relpose_ros.calibrate.axis_maps import axis_maps, nearest_axis_map
+from rs_relpose_ros.calibrate.coplanarity import GLOBAL, LOCAL
+from rs_relpose_ros.calibrate.fit import evaluate, Problem, redirected, State
+from rs_relpose_ros.calibrate.gyro_path import GyroPath, GyroSeries
+from rs_relpose_ros.calibrate.procedure import calibrate
+from rs_relpose_ros.calibrate.report import parameter_file
+from rs_relpose_ros.calibrate.result import CalibrationResult
+from rs_relpose_ros.calibrate.tracks import make_pairs, Tracks
+from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.replay.parameter_file import read_parameters
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
 SHORT = {'frames': 120}
 

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_lab.experiments.calibration_tracks import about_one_axis
+from rs_relpose_lab.simulation import simulate, SimulationConfig
+from rs_relpose_lab.simulation.bag import write_bag
+from rs_relpose_lab.simulation.trajectory import Trajectory
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.bags.writer import BagWriter
-from rs_relpose_ros.benchmark.calibration_tracks import about_one_axis
 from rs_relpose_ros.cli.main import main
+from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.errors import MissingInputError
-from rs_relpose_ros.replay.parameter_file import read_parameters
-from rs_relpose_ros.simulation import simulate, SimulationConfig
-from rs_relpose_ros.simulation.bag import write_bag
-from rs_relpose_ros.simulation.trajectory import Trajectory
 
 IMAGE, IMU = '/camera/image_raw/compressed', '/imu/data_raw'
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.stats import norm, t
 
-from rs_relpose_ros.benchmark.calibration import CalibrationRun, Figure, write_report
-from rs_relpose_ros.calibration.covariance import jackknife, stretches
-from rs_relpose_ros.calibration.gyro_path import noise_density
+from rs_relpose_lab.experiments.calibration_accuracy import CalibrationRun, Figure, write_report
+from rs_relpose_ros.calibrate.covariance import jackknife, stretches
+from rs_relpose_ros.calibrate.gyro_path import noise_density
 
 
 def mean_of(samples: np.ndarray, groups: np.ndarray) -> tuple[float, float]:

@@ -13,13 +13,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 import yaml
 
-from rs_relpose_ros.calibration.calibrate import calibrate
-from rs_relpose_ros.calibration.gyro_path import GyroSeries
-from rs_relpose_ros.calibration.tracks import Tracks
-from rs_relpose_ros.camera import RollingShutterCamera
+from rs_relpose_ros.calibrate.gyro_path import GyroSeries
+from rs_relpose_ros.calibrate.procedure import calibrate
+from rs_relpose_ros.calibrate.tracks import Tracks
 from rs_relpose_ros.cli.main import main
+from rs_relpose_ros.config.tracking import TrackingConfig
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.tracking.config import TrackingConfig
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.tracking.klt import KltTracker
 
 pytestmark = pytest.mark.recordings

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from rs_relpose_ros.camera import RollingShutterCamera
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
 # EuRoC's factory calibration, a wide rational model, a fisheye lens.
 MODELS = [

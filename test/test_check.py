@@ -24,17 +24,17 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.bags.reader import open_bag, TopicOptions
 from rs_relpose_ros.bags.writer import BagWriter
-from rs_relpose_ros.calibration.axis_maps import axes_text, nearest_axis_map
-from rs_relpose_ros.camera import RollingShutterCamera
+from rs_relpose_ros.calibrate.axis_maps import axes_text, nearest_axis_map
 from rs_relpose_ros.check import judge_turning
 from rs_relpose_ros.check.check import check_bag, choose_topics
 from rs_relpose_ros.check.findings import Finding, Report, Verdict
 from rs_relpose_ros.check.scan import scan
 from rs_relpose_ros.check.streams import Stamps, Thinned
 from rs_relpose_ros.cli.main import main
+from rs_relpose_ros.config.parameter_file import read_parameters
+from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
-from rs_relpose_ros.pipeline.parameters import Parameters
-from rs_relpose_ros.replay.parameter_file import read_parameters
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
 START = 1_700_000_000_000_000_000
 MS = 1_000_000

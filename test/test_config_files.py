@@ -10,9 +10,9 @@ import pytest
 import ros_graph
 import yaml
 
-from rs_relpose_ros.pipeline.parameters import Parameters
-from rs_relpose_ros.replay.parameter_file import read_parameters
-from rs_relpose_ros.ros.parameter_template import parameter_template
+from rs_relpose_ros.config.parameter_file import read_parameters
+from rs_relpose_ros.config.parameters import Parameters
+from rs_relpose_ros.config.template import parameter_template
 
 CONFIG = ros_graph.ROOT / 'config'
 LAUNCH_FILE = ros_graph.ROOT / 'launch' / 'relpose.launch.py'
@@ -21,7 +21,7 @@ NAMESPACE = '{http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles}'
 
 def test_template_is_up_to_date():
     assert (CONFIG / 'relpose.yaml').read_text(encoding='utf-8') == parameter_template(), (
-        'run python -m rs_relpose_ros.ros.parameter_template config/relpose.yaml')
+        'run python -m rs_relpose_ros.config.template config/relpose.yaml')
 
 
 def test_template_holds_every_parameter_at_its_default():

@@ -14,8 +14,9 @@ import yaml
 
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.cli import convert, main
-from rs_relpose_ros.datasets import xiaomi
-from rs_relpose_ros.datasets.parameter_file import parameter_text, write_parameters
+from rs_relpose_ros.config.commented_file import parameter_text, write_parameters
+from rs_relpose_ros.config.parameter_file import read_parameters
+from rs_relpose_ros.convert import xiaomi
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.messages.incoming import (
     calibration_from_info,
@@ -23,7 +24,6 @@ from rs_relpose_ros.messages.incoming import (
     imu_sample_from_message,
     stamp_ns,
 )
-from rs_relpose_ros.replay.parameter_file import read_parameters
 
 ROOT = Path(__file__).resolve().parent.parent
 SECOND = 10**9

@@ -12,11 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.camera import RollingShutterCamera
-from rs_relpose_ros.pipeline.calibration import Calibration
-from rs_relpose_ros.pipeline.pair import PairResult
-from rs_relpose_ros.replay.baselines import best_opencv_score, METHODS, opencv_five_point
-from rs_relpose_ros.replay.comparison import (
+from rs_relpose_lab.experiments.comparison import (
     differing_poses,
     Score,
     score,
@@ -24,11 +20,19 @@ from rs_relpose_ros.replay.comparison import (
     score_of_table,
     score_table,
 )
+from rs_relpose_lab.experiments.opencv_baseline import (
+    best_opencv_score,
+    METHODS,
+    opencv_five_point,
+)
+from rs_relpose_ros.estimator.result import RelativePose, Status
+from rs_relpose_ros.front_end.pair import PairResult
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.intrinsics import Calibration
 from rs_relpose_ros.replay.record import pair_record
 from rs_relpose_ros.replay.run import ReplayedPair
 from rs_relpose_ros.replay.tables import relative_pose_cells, RELATIVE_POSE_COLUMNS, TableWriter
 from rs_relpose_ros.replay.truth import PairErrors, TrueTrajectory
-from rs_relpose_ros.result import RelativePose, Status
 from rs_relpose_ros.tracking.matches import Matches
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from rs_relpose_ros import FrameMotion, RollingShutterCamera
-from rs_relpose_ros.pipeline.calibration import Calibration
-from rs_relpose_ros.pipeline.derotated_rays import DerotatedRays
+from rs_relpose_ros.front_end.derotated_rays import DerotatedRays
+from rs_relpose_ros.geometry.intrinsics import Calibration
 
 CALIBRATION = Calibration(width=640, height=480, fx=450.0, fy=450.0, cx=320.0, cy=240.0,
                           distortion_model='plumb_bob', distortion=(-0.2, 0.05, 0.0, 0.0),

@@ -10,20 +10,20 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.bags.reader import open_bag
-from rs_relpose_ros.imu.config import ImuConfig
+from rs_relpose_ros.config.imu import ImuConfig
+from rs_relpose_ros.config.parameter_file import read_parameters
+from rs_relpose_ros.config.parameters import Parameters
+from rs_relpose_ros.front_end.drift import DriftTracker, OFFSET_SIGMA, PairRotation
+from rs_relpose_ros.front_end.frame import Frame
+from rs_relpose_ros.front_end.sequencer import Refusal, Sequencer
+from rs_relpose_ros.geometry.intrinsics import Calibration
 from rs_relpose_ros.imu.frame_imu import GyroSegment
 from rs_relpose_ros.imu.integration import bias_jacobian, integrate_rotation
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.messages.intake import MessageIntake
-from rs_relpose_ros.pipeline.calibration import Calibration
-from rs_relpose_ros.pipeline.drift import DriftTracker, OFFSET_SIGMA, PairRotation
-from rs_relpose_ros.pipeline.frame import Frame
-from rs_relpose_ros.pipeline.parameters import Parameters
-from rs_relpose_ros.pipeline.sequencer import Refusal, Sequencer
-from rs_relpose_ros.replay.parameter_file import read_parameters
+from rs_relpose_ros.node.diagnostics import Inputs, Statistics
+from rs_relpose_ros.node.worker import Worker
 from rs_relpose_ros.replay.run import Replay
-from rs_relpose_ros.ros.diagnostics import Inputs, Statistics
-from rs_relpose_ros.ros.worker import Worker
 
 MS = 1_000_000
 PERIOD = 5 * MS

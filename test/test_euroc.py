@@ -17,15 +17,15 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 import yaml
 
-from rs_relpose_ros.camera import RollingShutterCamera
-from rs_relpose_ros.config import EstimatorConfig
+from rs_relpose_ros.config.estimator import EstimatorConfig
+from rs_relpose_ros.config.imu import ImuConfig
+from rs_relpose_ros.config.tracking import TrackingConfig
 from rs_relpose_ros.estimator.estimate import estimate_relative_pose
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.imu.buffer import Coverage, ImuBuffer
-from rs_relpose_ros.imu.config import ImuConfig
 from rs_relpose_ros.imu.frame_imu import frame_imu
 from rs_relpose_ros.imu.samples import ImuSample
-from rs_relpose_ros.tracking.config import TrackingConfig
-from rs_relpose_ros.tracking.selection import make_tracker
+from rs_relpose_ros.tracking.registry import make_tracker
 
 pytestmark = pytest.mark.recordings
 

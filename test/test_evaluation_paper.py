@@ -10,14 +10,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.cli import main
-from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.evaluation.methods import METHODS, Outcome, run_method
-from rs_relpose_ros.evaluation.paper import EXPERIMENTS, pair_problem, PaperRun, run_paper
-from rs_relpose_ros.evaluation.plots import draw_boxes
-from rs_relpose_ros.evaluation.results import by_cell, Cell, Record, table_lines
-from rs_relpose_ros.evaluation.row_by_row import see, Shutter
-from rs_relpose_ros.evaluation.scenes import (
+from rs_relpose_lab.experiments.paper import EXPERIMENTS, pair_problem, PaperRun, run_paper
+from rs_relpose_lab.experiments.paper_methods import METHODS, Outcome, run_method
+from rs_relpose_lab.experiments.paper_plots import draw_boxes
+from rs_relpose_lab.experiments.paper_results import by_cell, Cell, Record, table_lines
+from rs_relpose_lab.experiments.paper_scenes import (
     CENTRE,
     FOCAL,
     HEIGHT,
@@ -27,7 +24,10 @@ from rs_relpose_ros.evaluation.scenes import (
     SceneSettings,
     WIDTH,
 )
-from rs_relpose_ros.result import Status
+from rs_relpose_lab.experiments.row_by_row import see, Shutter
+from rs_relpose_ros.cli import main
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.estimator.result import Status
 
 SHUTTER = Shutter(WIDTH, HEIGHT, LINE_DELAY, 0.0)
 

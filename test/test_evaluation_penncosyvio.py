@@ -12,19 +12,24 @@ import pytest
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.cli import main
-from rs_relpose_ros.errors import InputError, MissingInputError
-from rs_relpose_ros.evaluation.methods import run_method
-from rs_relpose_ros.evaluation.omnidirectional import OmnidirectionalCamera
-from rs_relpose_ros.evaluation.pair_imu import PairImu
-from rs_relpose_ros.evaluation.penncosyvio import (
+from rs_relpose_lab.experiments.omnidirectional import OmnidirectionalCamera
+from rs_relpose_lab.experiments.pair_imu import PairImu
+from rs_relpose_lab.experiments.paper_methods import run_method
+from rs_relpose_lab.experiments.paper_results import (
+    by_cell,
+    Cell,
+    Record,
+    table_lines,
+    with_totals,
+)
+from rs_relpose_lab.experiments.penncosyvio import (
     EXPERIMENT,
     Pair,
     PennCosyvioRun,
     RecordedSequence,
     STRETCHES,
 )
-from rs_relpose_ros.evaluation.penncosyvio_files import (
+from rs_relpose_lab.experiments.penncosyvio_files import (
     Poses,
     read_camera,
     read_extrinsics,
@@ -32,19 +37,20 @@ from rs_relpose_ros.evaluation.penncosyvio_files import (
     read_imu,
     read_poses,
 )
-from rs_relpose_ros.evaluation.penncosyvio_simulated import (
+from rs_relpose_lab.experiments.penncosyvio_simulated import (
     PlacedMotion,
     Simulated,
     SimulatedSequence,
 )
-from rs_relpose_ros.evaluation.recorded_motion import RecordedMotion
-from rs_relpose_ros.evaluation.results import by_cell, Cell, Record, table_lines, with_totals
-from rs_relpose_ros.imu.config import ImuConfig
+from rs_relpose_lab.experiments.recorded_motion import RecordedMotion
+from rs_relpose_lab.simulation.inertial import ImuModel
+from rs_relpose_lab.simulation.render import Renderer
+from rs_relpose_lab.simulation.scene import make_scene
+from rs_relpose_ros.cli import main
+from rs_relpose_ros.config.imu import ImuConfig
+from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.geometry.timing import ImageClock
 from rs_relpose_ros.imu.samples import ImuSample
-from rs_relpose_ros.simulation.inertial import ImuModel
-from rs_relpose_ros.simulation.render import Renderer
-from rs_relpose_ros.simulation.scene import make_scene
-from rs_relpose_ros.timing import ImageClock
 
 # The published figures of the GoPro C2, as OCamCalib in Matlab has them: row before column, both
 # counted from 1.
@@ -426,8 +432,8 @@ def test_bad_input_is_one_line_and_exit_code_2(made, tmp_path, arguments, said, 
 
 
 def test_totals_are_of_all_levels_of_a_case():
-    from rs_relpose_ros.evaluation.methods import Outcome
-    from rs_relpose_ros.result import Status
+    from rs_relpose_lab.experiments.paper_methods import Outcome
+    from rs_relpose_ros.estimator.result import Status
     records = [Record(Cell('x', 'as', str(level)), 'auto', 0, Outcome(Status.OK, 1.0 * level, 2.0))
                for level in (1, 2, 3)]
     records.append(Record(Cell('x', 'af', '1'), 'auto', 0,

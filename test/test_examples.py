@@ -15,11 +15,11 @@ import ros_graph
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.messages.outgoing import pair_messages, PAIR_TOPICS, PairMessages
-from rs_relpose_ros.replay.parameter_file import read_parameters
+from rs_relpose_ros.node.message_types import message_class
 from rs_relpose_ros.replay.run import read_truth, Replay
 from rs_relpose_ros.replay.truth import TrueTrajectory
-from rs_relpose_ros.ros.message_types import message_class
 
 # Whoever comes first compiles the kernels.
 pytestmark = pytest.mark.timeout(600)

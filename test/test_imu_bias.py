@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_ros.config.imu import ImuConfig
 from rs_relpose_ros.imu.bias import BIAS_MEMORY, BiasTracker
 from rs_relpose_ros.imu.buffer import ImuBuffer
-from rs_relpose_ros.imu.config import ImuConfig
 from rs_relpose_ros.imu.frame_imu import frame_imu
 from rs_relpose_ros.imu.samples import ImuSample
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_ros.config.imu import ImuConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.imu.buffer import AddResult, Coverage, ImuBuffer
-from rs_relpose_ros.imu.config import ImuConfig
 from rs_relpose_ros.imu.frame_imu import frame_imu
 from rs_relpose_ros.imu.integration import integrate_rotation
 from rs_relpose_ros.imu.samples import ImuSample

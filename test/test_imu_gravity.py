@@ -6,8 +6,8 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 import yaml
 
+from rs_relpose_ros.config.imu import ImuConfig
 from rs_relpose_ros.imu.buffer import ImuBuffer
-from rs_relpose_ros.imu.config import ImuConfig
 from rs_relpose_ros.imu.samples import ImuSample
 
 PERIOD = 5_000_000

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_ros.config.imu import ImuConfig
 from rs_relpose_ros.imu.buffer import ImuBuffer
-from rs_relpose_ros.imu.config import ImuConfig
 from rs_relpose_ros.imu.samples import ImuSample, Orientation
 from rs_relpose_ros.messages.incoming import imu_sample_from_message
 

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.imu.config import ImuConfig
+from rs_relpose_ros.config.imu import ImuConfig
+from rs_relpose_ros.config.parameters import Parameters
+from rs_relpose_ros.front_end.frame import Frame
+from rs_relpose_ros.front_end.sequencer import ReadyFrame, Refusal, Sequencer
+from rs_relpose_ros.geometry.intrinsics import Calibration
+from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.imu.integration import integrate_rotation
 from rs_relpose_ros.imu.samples import ImuSample
-from rs_relpose_ros.motion import FrameMotion
-from rs_relpose_ros.pipeline.calibration import Calibration
-from rs_relpose_ros.pipeline.frame import Frame
-from rs_relpose_ros.pipeline.parameters import Parameters
-from rs_relpose_ros.pipeline.sequencer import ReadyFrame, Refusal, Sequencer
 
 MS = 1_000_000
 CALIBRATION = Calibration(width=32, height=20, fx=30.0, fy=30.0, cx=16.0, cy=10.0,

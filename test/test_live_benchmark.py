@@ -12,16 +12,18 @@ import pytest
 import ros_graph
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.benchmark import live, live_clip, live_report
-from rs_relpose_ros.benchmark.live import Course, LiveCell, Percentiles
-from rs_relpose_ros.benchmark.process_figures import process_figures
+from rs_relpose_lab.live import clip as live_clip
+from rs_relpose_lab.live import courses as live
+from rs_relpose_lab.live import report as live_report
+from rs_relpose_lab.live.courses import Course, LiveCell, Percentiles
+from rs_relpose_lab.live.loop import in_turns, Outgoing, stamp_of
+from rs_relpose_lab.live.measured_run import ReceivedPose
+from rs_relpose_lab.live.process_figures import process_figures
+from rs_relpose_lab.simulation.closed_loop import closed_loop
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.estimate import warm_up
-from rs_relpose_ros.ros.frame_timings import COLUMNS, FrameTimings
-from rs_relpose_ros.ros.loop import in_turns, Outgoing, stamp_of
-from rs_relpose_ros.ros.measured_run import ReceivedPose
-from rs_relpose_ros.simulation.closed_loop import closed_loop
+from rs_relpose_ros.node.frame_timings import COLUMNS, FrameTimings
 
 # Whoever comes first compiles the kernels.
 pytestmark = pytest.mark.timeout(600)
@@ -154,7 +156,7 @@ def test_cells_are_selected_by_pattern(capsys):
 
 
 def test_without_ros_it_is_said_before_anything_is_rendered(monkeypatch, tmp_path, capsys):
-    monkeypatch.setitem(sys.modules, 'rs_relpose_ros.ros.measured_run', None)
+    monkeypatch.setitem(sys.modules, 'rs_relpose_lab.live.measured_run', None)
     assert main(['benchmark', 'live', '--output', str(tmp_path / 'out')]) == 2
     assert 'needs ROS 2' in capsys.readouterr().err
     assert not (tmp_path / 'out').exists()

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.estimator.result import RelativePose, Status
+from rs_relpose_ros.front_end.pair import PairResult
+from rs_relpose_ros.front_end.sequencer import FrameRefused, ReadyFrame, Refusal, Sequencer
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.messages import incoming, outgoing
 from rs_relpose_ros.messages.hanging import HangingCamera, HangingGyro
 from rs_relpose_ros.messages.intake import MessageIntake
-from rs_relpose_ros.pipeline.pair import PairResult
-from rs_relpose_ros.pipeline.parameters import Parameters
-from rs_relpose_ros.pipeline.sequencer import FrameRefused, ReadyFrame, Refusal, Sequencer
-from rs_relpose_ros.result import RelativePose, Status
 from rs_relpose_ros.tracking.matches import Matches
 
 # Luma of ITU-R BT.601.

@@ -5,11 +5,11 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.camera import RollingShutterCamera
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.motion import FrameMotion
-from rs_relpose_ros.so3 import exp_so3, left_jacobian_so3, log_so3
-from rs_relpose_ros.timing import ImageClock, seconds_between, to_nanoseconds
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.motion import FrameMotion
+from rs_relpose_ros.geometry.so3 import exp_so3, left_jacobian_so3, log_so3
+from rs_relpose_ros.geometry.timing import ImageClock, seconds_between, to_nanoseconds
 
 
 def wobble(t):

@@ -21,7 +21,7 @@ from rs_relpose_ros.estimator.estimate import warm_up
 pytestmark = pytest.mark.timeout(600)
 
 PARAMETER_FILE = ros_graph.ROOT / 'bags' / 'hand_held.yaml'
-ENTRY = 'rs_relpose_ros.ros.start'
+ENTRY = 'rs_relpose_ros.node.start'
 SIGNALS = [signal.SIGINT, signal.SIGTERM]
 
 

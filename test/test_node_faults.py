@@ -377,7 +377,7 @@ def test_transform_is_the_inverse_of_the_pose(ros_domain_id, bundled_bag, tmp_pa
             parameters={'publish_tf': True}) as node:
         poses = graph.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
         transforms = graph.listen(TransformStamped, '/sent_transform')
-        with ros_graph.Process('rs_relpose_ros.ros.player', str(bundled_bag),
+        with ros_graph.Process('rs_relpose_lab.live.player', str(bundled_bag),
                                '--wait-for-subscribers', '300'):
             ros_graph.wait_until(lambda: len(poses) >= 3 and len(transforms) >= 3, 'poses')
         assert node.signal(signal.SIGINT)[0] == 0

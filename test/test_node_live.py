@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation, Slerp
 from sensor_msgs.msg import PointCloud2, TimeReference
 
 from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.estimator.estimate import warm_up
 from rs_relpose_ros.messages.outgoing import MATCH_DTYPE, quat_xyzw
-from rs_relpose_ros.replay.parameter_file import read_parameters
 from rs_relpose_ros.replay.run import Replay
 
 # Whoever comes first compiles the kernels.
@@ -48,7 +48,7 @@ class LiveRun:
 
 
 def play(bag: Path) -> None:
-    with ros_graph.Process('rs_relpose_ros.ros.player', str(bag),
+    with ros_graph.Process('rs_relpose_lab.live.player', str(bag),
                            '--wait-for-subscribers', '30') as player:
         assert player.wait() == 0, player.output
 
@@ -195,7 +195,7 @@ def test_a_good_run_ends_well_and_says_little(run):
 def test_signals_end_a_working_node(module_ros_domain_id, bundled_bag, number):
     with ros_graph.Graph() as graph, ros_graph.node_process(PARAMETER_FILE, remap=REMAP) as node:
         poses = graph.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
-        with ros_graph.Process('rs_relpose_ros.ros.player', str(bundled_bag),
+        with ros_graph.Process('rs_relpose_lab.live.player', str(bundled_bag),
                                '--wait-for-subscribers', '300'):
             ros_graph.wait_until(lambda: poses, 'a pose')
             code, seconds = node.signal(number)
@@ -241,7 +241,7 @@ def no_bag(tmp_path: Path) -> Path:
 def test_the_player_says_what_is_wrong(module_ros_domain_id, bundled_bag, no_bag, arguments,
                                        sentence):
     arguments = [item.format(no_bag=no_bag, bag=bundled_bag) for item in arguments]
-    with ros_graph.Process('rs_relpose_ros.ros.player', *arguments) as player:
+    with ros_graph.Process('rs_relpose_lab.live.player', *arguments) as player:
         assert player.wait() == 2
         assert sentence in player.output
         assert 'Traceback' not in player.output

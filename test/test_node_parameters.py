@@ -11,9 +11,9 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from rs_relpose_ros.pipeline.parameters import Parameters
-from rs_relpose_ros.ros.params import NodeParameters
-from rs_relpose_ros.settings import Declared
+from rs_relpose_ros.config.declarations import Declared
+from rs_relpose_ros.config.parameters import Parameters
+from rs_relpose_ros.node.params import NodeParameters
 
 DECLARATIONS = {name: declared for name, _, declared in Parameters.declarations()}
 DEFAULTS = {name: default for name, default, _ in Parameters.declarations()}

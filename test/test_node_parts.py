@@ -9,12 +9,12 @@ from conftest import ROOT
 import numpy as np
 import pytest
 
-from rs_relpose_ros.pipeline.drift import Drift
-from rs_relpose_ros.pipeline.pair import PairResult
-from rs_relpose_ros.pipeline.sequencer import Refusal, SequencerCounts
-from rs_relpose_ros.result import RelativePose, Status
-from rs_relpose_ros.ros.cause_log import CauseLog
-from rs_relpose_ros.ros.diagnostics import ERROR, Inputs, OK, Statistics, WARN
+from rs_relpose_ros.estimator.result import RelativePose, Status
+from rs_relpose_ros.front_end.drift import Drift
+from rs_relpose_ros.front_end.pair import PairResult
+from rs_relpose_ros.front_end.sequencer import Refusal, SequencerCounts
+from rs_relpose_ros.node.cause_log import CauseLog
+from rs_relpose_ros.node.diagnostics import ERROR, Inputs, OK, Statistics, WARN
 from rs_relpose_ros.tracking.matches import Matches
 
 SECOND = 10**9

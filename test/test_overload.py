@@ -15,20 +15,20 @@ import pytest
 import ros_graph
 from sensor_msgs.msg import CameraInfo, Image, Imu
 
+from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.estimator.estimate import warm_up
-from rs_relpose_ros.imu.frame_imu import FrameImu
-from rs_relpose_ros.imu.samples import ImuSample
-from rs_relpose_ros.pipeline.calibration import Calibration
-from rs_relpose_ros.pipeline.frame import Frame
-from rs_relpose_ros.pipeline.parameters import Parameters
-from rs_relpose_ros.pipeline.pipeline import Pipeline
-from rs_relpose_ros.pipeline.sequencer import (
+from rs_relpose_ros.front_end.frame import Frame
+from rs_relpose_ros.front_end.pipeline import Pipeline
+from rs_relpose_ros.front_end.sequencer import (
     MAILBOX_FRAMES,
     Refusal,
     Sequencer,
 )
-from rs_relpose_ros.ros.diagnostics import Inputs, Statistics, WARN
-from rs_relpose_ros.ros.worker import Worker
+from rs_relpose_ros.geometry.intrinsics import Calibration
+from rs_relpose_ros.imu.frame_imu import FrameImu
+from rs_relpose_ros.imu.samples import ImuSample
+from rs_relpose_ros.node.diagnostics import Inputs, Statistics, WARN
+from rs_relpose_ros.node.worker import Worker
 
 # Whoever comes first compiles the kernels.
 pytestmark = pytest.mark.timeout(600)
@@ -67,7 +67,7 @@ class HeldPipeline(Pipeline):
 def held(monkeypatch: pytest.MonkeyPatch) -> Iterator[type[HeldPipeline]]:
     HeldPipeline.frames = []
     HeldPipeline.started, HeldPipeline.let_go = threading.Event(), threading.Event()
-    monkeypatch.setattr('rs_relpose_ros.ros.worker.Pipeline', HeldPipeline)
+    monkeypatch.setattr('rs_relpose_ros.node.worker.Pipeline', HeldPipeline)
     # The warm-up has a pipeline of its own, which nobody holds.
     yield HeldPipeline
     HeldPipeline.let_go.set()
@@ -140,7 +140,7 @@ def test_a_busy_worker_costs_the_node_no_imu(held, module_ros_domain_id):
     from rclpy.context import Context
     from rclpy.executors import SingleThreadedExecutor
 
-    from rs_relpose_ros.ros.node import RelposeNode
+    from rs_relpose_ros.node.node import RelposeNode
 
     context = Context()
     rclpy.init(context=context)

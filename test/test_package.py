@@ -24,8 +24,9 @@ NAME = 'rs_relpose_ros'
 VERSION = '0.1.0'
 ROS = re.compile(r'(rclpy|rcl_interfaces|ament_\w+|builtin_interfaces|launch\w*|rosgraph_msgs'
                  r'|tf2_ros|std_srvs|\w+_msgs)$')
+LABORATORY = 'rs_relpose_lab'
 MODULES = {'.'.join(path.relative_to(ROOT).with_suffix('').parts).removesuffix('.__init__'): path
-           for path in sorted((ROOT / NAME).rglob('*.py'))}
+           for package in (NAME, LABORATORY) for path in sorted((ROOT / package).rglob('*.py'))}
 
 
 def run(*command: str | Path, **kwargs) -> subprocess.CompletedProcess[str]:
@@ -103,23 +104,89 @@ def test_every_folder_of_modules_is_a_package():
 # --- layers
 
 
+# Folder -> what its modules may import of the package, besides itself and the modules at the top
+# (errors, how kernels are compiled, how pictures are saved), which import nothing of it.
+BASE = {'geometry', 'config'}
+CORE = BASE | {'solvers', 'estimator', 'imu', 'tracking'}
+MAY_IMPORT = {
+    'geometry': set(),
+    'config': {'geometry'},
+    'solvers': {'geometry'},
+    'imu': BASE,
+    'tracking': BASE,
+    'estimator': BASE | {'solvers'},
+    'front_end': CORE,
+    'messages': CORE | {'front_end'},
+    'bags': {'geometry'},
+    'node': BASE | {'front_end', 'messages'},
+    'replay': CORE | {'front_end', 'messages', 'bags'},
+    'calibrate': CORE | {'messages', 'bags'},
+    'check': CORE | {'messages', 'bags', 'calibrate'},
+    'convert': BASE | {'imu', 'messages', 'bags'},
+    'cli': BASE | {'bags', 'replay', 'calibrate', 'check', 'convert'},
+}
+# The laboratory uses all of the product, and nothing of the product imports it.
+MAY_IMPORT_IN_THE_LABORATORY = {
+    'simulation': set(),
+    'live': {'simulation'},
+    'experiments': {'simulation', 'live'},
+    'cli': {'simulation', 'live', 'experiments'},
+}
+FREE_OF_ROS = ('geometry', 'config', 'solvers', 'estimator', 'imu', 'tracking', 'front_end',
+               'messages')
+
+
+def room_of(module: str) -> tuple[str, str]:
+    """Return package and folder of a module; the folder is '' at the top."""
+    package, _, rest = module.partition('.')
+    folder = rest.partition('.')[0]
+    return package, folder if (ROOT / package / folder).is_dir() else ''
+
+
+def test_folders_import_what_their_layer_may():
+    assert {room_of(name)[1] for name in MODULES if name.startswith(NAME)} == {'', *MAY_IMPORT}
+    wrong = []
+    for name, path in MODULES.items():
+        package, folder = room_of(name)
+        for imported in map(module_behind, imports(path)):
+            if not imported or room_of(imported) == (package, folder):
+                continue
+            other, room = room_of(imported)
+            if package == LABORATORY:
+                allowed = other == NAME or room in MAY_IMPORT_IN_THE_LABORATORY[folder]
+            else:
+                allowed = other == NAME and (room == '' or room in MAY_IMPORT.get(folder, set()))
+            if not allowed:
+                wrong.append(f'{name} imports {imported}')
+    assert wrong == []
+
+
+def test_no_private_name_crosses_a_folder():
+    crossing = [f'{name} imports {imported}'
+                for name, path in MODULES.items() for imported in imports(path)
+                if imported.partition('.')[0] in (NAME, LABORATORY)
+                and any(part.startswith('_') and not part.startswith('__')
+                        for part in imported.split('.'))
+                and room_of(module_behind(imported)) != room_of(name)]
+    assert crossing == []
+
+
 def test_core_imports_neither_ros_nor_rosbags():
     core = sorted(name for name in MODULES
-                  if not name.startswith((f'{NAME}.ros', f'{NAME}.bags', f'{NAME}.cli'))
-                  and re.match(rf'{NAME}($|\.(estimator|solvers|imu|tracking|pipeline|messages'
-                               '|pose_chain))', name))
+                  if name == NAME or name.startswith(tuple(f'{NAME}.{f}' for f in FREE_OF_ROS)))
     assert f'{NAME}.estimator.estimate' in core
     loaded = loaded_after('\n'.join(f'import {name}' for name in core))
     assert NAME in loaded
     assert {name for name in loaded if ROS.match(name) or name == 'rosbags'} == set()
 
 
-@pytest.mark.parametrize(('library', 'folder'), [(ROS, 'ros'), (re.compile('rosbags$'), 'bags')])
-def test_library_is_imported_in_one_folder_only(library, folder):
+@pytest.mark.parametrize(('library', 'folders'), [
+    (ROS, {f'{NAME}/node', f'{LABORATORY}/live'}), (re.compile('rosbags$'), {f'{NAME}/bags'})])
+def test_library_is_imported_in_its_folders_only(library, folders):
     users = {path for path in MODULES.values()
              if any(library.match(name.partition('.')[0]) for name in imports(path))}
     assert users, f'nothing imports {library.pattern}: the test would see nothing'
-    assert {path for path in users if path.parent != ROOT / NAME / folder} == set()
+    assert {str(path.parent.relative_to(ROOT)) for path in users} <= folders
 
 
 def test_modules_import_each_other_without_cycles():
@@ -132,7 +199,7 @@ def test_modules_import_each_other_without_cycles():
 def test_the_library_does_not_print_or_exit():
     """Only the command line and the node's main do (what ruff's T20 cannot see: sys.exit)."""
     exits = [f'{path.relative_to(ROOT)}:{node.lineno}'
-             for path in MODULES.values() if path.parent.name not in ('cli', 'ros')
+             for path in MODULES.values() if path.parent.name not in ('cli', 'node', 'live')
              for node in ast.walk(ast.parse(path.read_text()))
              if isinstance(node, ast.Call)
              and ast.unparse(node.func) in ('sys.exit', 'exit', 'quit', 'os._exit', 'print')]
@@ -150,7 +217,7 @@ def test_console_script_resolves(script):
 
 
 def test_node_describes_itself():
-    ended = run(sys.executable, '-m', f'{NAME}.ros.node', '--help')
+    ended = run(sys.executable, '-m', f'{NAME}.node.node', '--help')
     assert ended.returncode == 0, ended.stderr
     assert 'readout_time' in ended.stdout
     assert ended.stderr == ''

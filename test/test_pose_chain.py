@@ -11,10 +11,10 @@ from simulated_pairs import simulated_flight
 
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator import sampson
+from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.messages.outgoing import pair_messages
+from rs_relpose_ros.messages.pose_chain import PathPose, PoseChain, track_distances
 from rs_relpose_ros.messages.published_pair import published_pair, PublishedPair
-from rs_relpose_ros.pipeline.pair import PairResult
-from rs_relpose_ros.pose_chain import PathPose, PoseChain, track_distances
 
 
 def published(pairs: list[PairResult]) -> list[PublishedPair]:

@@ -16,6 +16,7 @@ import pytest
 from simulated_pairs import simulated_flight
 
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.messages.outgoing import (
     inlier_records,
     MATCH_DTYPE,
@@ -23,9 +24,8 @@ from rs_relpose_ros.messages.outgoing import (
     PAIR_TOPICS,
     PairMessages,
 )
+from rs_relpose_ros.messages.pose_chain import PoseChain
 from rs_relpose_ros.messages.published_pair import PairSynchronizer, published_pair
-from rs_relpose_ros.pipeline.pair import PairResult
-from rs_relpose_ros.pose_chain import PoseChain
 
 
 @pytest.fixture(scope='module')

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.estimator.problem import PairState, to_reference_row
-from rs_relpose_ros.result import RelativePose, Status
+from rs_relpose_ros.estimator.result import RelativePose, Status
 
 
 def make_state(rng, covariance=None):

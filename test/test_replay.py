@@ -17,10 +17,10 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.bags.writer import BagWriter
-from rs_relpose_ros.camera import RollingShutterCamera
 from rs_relpose_ros.cli.main import main
+from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.replay.parameter_file import read_parameters
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.replay.truth import TrueTrajectory
 
 HEADER = ('reference_stamp_ns,stamp_ns,tx,ty,tz,qx,qy,qz,qw,sigma_t1,sigma_t2,sigma_rx,sigma_ry,'

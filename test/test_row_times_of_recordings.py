@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.cli.main import main
-from rs_relpose_ros.pipeline.pipeline import sensor_camera
-from rs_relpose_ros.replay.parameter_file import read_parameters
+from rs_relpose_ros.config.parameter_file import read_parameters
+from rs_relpose_ros.front_end.pipeline import sensor_camera
 from rs_relpose_ros.replay.run import Replay
 
 # Every second frame is a keyframe, and the gyro serves for the rows only.

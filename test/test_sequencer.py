@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
-from rs_relpose_ros.imu.samples import ImuSample
-from rs_relpose_ros.pipeline.calibration import Calibration
-from rs_relpose_ros.pipeline.frame import EncodedFrame, Frame
-from rs_relpose_ros.pipeline.parameters import Parameters
-from rs_relpose_ros.pipeline.sequencer import (
+from rs_relpose_ros.estimator.result import Status
+from rs_relpose_ros.front_end.frame import EncodedFrame, Frame
+from rs_relpose_ros.front_end.sequencer import (
     FrameRefused,
     MAILBOX_FRAMES,
     ReadyFrame,
@@ -22,7 +21,8 @@ from rs_relpose_ros.pipeline.sequencer import (
     Sequencer,
     WAITING_FRAMES,
 )
-from rs_relpose_ros.result import Status
+from rs_relpose_ros.geometry.intrinsics import Calibration
+from rs_relpose_ros.imu.samples import ImuSample
 
 MS = 1_000_000
 SECOND = 1000 * MS

@@ -17,15 +17,15 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 import yaml
 
+from rs_relpose_lab.cli import simulate as command
+from rs_relpose_lab.simulation import simulate, SimulationConfig
+from rs_relpose_lab.simulation.bag import node_parameters, write_bag
+from rs_relpose_lab.simulation.hand_held import hand_held, Plan
+from rs_relpose_lab.simulation.scene import make_scene, Scene, SCENES, Surface
+from rs_relpose_lab.simulation.texture import make_texture
 from rs_relpose_ros.cli import main as cli
-from rs_relpose_ros.cli import simulate as command
+from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.pipeline.parameters import Parameters
-from rs_relpose_ros.simulation import simulate, SimulationConfig
-from rs_relpose_ros.simulation.bag import node_parameters, write_bag
-from rs_relpose_ros.simulation.hand_held import hand_held, Plan
-from rs_relpose_ros.simulation.scene import make_scene, Scene, SCENES, Surface
-from rs_relpose_ros.simulation.texture import make_texture
 
 TINY = {'width': 32, 'height': 24, 'fx': 25.0}
 BAGS = Path(__file__).parent.parent / 'bags'

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from tracking_images import errors, WarpedScene
 
-from rs_relpose_ros.tracking.config import TrackingConfig
-from rs_relpose_ros.tracking.selection import make_tracker
+from rs_relpose_ros.config.tracking import TrackingConfig
+from rs_relpose_ros.tracking.registry import make_tracker
 
 
 @pytest.fixture(scope='module')

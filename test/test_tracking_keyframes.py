@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from rs_relpose_ros.config.keyframes import KeyframeConfig
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.tracking.keyframes import decide_keyframe, KeyframeConfig, KeyframeDecision
+from rs_relpose_ros.front_end.keyframes import decide_keyframe, KeyframeDecision
 
 CONFIG = KeyframeConfig(min_keyframe_parallax=10.0, max_keyframe_interval=0.5,
                         max_keyframe_frames=12, min_tracked_fraction=0.3)

@@ -6,9 +6,9 @@ import pytest
 from scipy.ndimage import map_coordinates
 from tracking_images import errors, moved, WarpedScene
 
+from rs_relpose_ros.config.tracking import TrackingConfig
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.tracking.config import TrackingConfig
-from rs_relpose_ros.tracking.selection import make_tracker
+from rs_relpose_ros.tracking.registry import make_tracker
 from rs_relpose_ros.tracking.windows import correlations, window_homography
 
 

@@ -16,11 +16,11 @@ import json
 import sys
 from numba.core.dispatcher import Dispatcher
 from rs_relpose_ros.bags.reader import open_bag
-from rs_relpose_ros.pipeline.pipeline import Pipeline
-from rs_relpose_ros.pipeline.sequencer import ReadyFrame, Sequencer
+from rs_relpose_ros.front_end.pipeline import Pipeline
+from rs_relpose_ros.front_end.sequencer import ReadyFrame, Sequencer
 from rs_relpose_ros.messages.intake import MessageIntake
-from rs_relpose_ros.pipeline.warm_up import warm_up_pipeline
-from rs_relpose_ros.replay.parameter_file import read_parameters
+from rs_relpose_ros.front_end.warm_up import warm_up_pipeline
+from rs_relpose_ros.config.parameter_file import read_parameters
 
 def kernels():
     return {f'{k.py_func.__module__}.{k.py_func.__name__}': len(k.overloads)

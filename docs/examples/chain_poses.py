@@ -10,9 +10,9 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
 from rs_relpose_ros.messages.outgoing import PAIR_TOPICS, pose_stamped_message
+from rs_relpose_ros.messages.pose_chain import PoseChain
 from rs_relpose_ros.messages.published_pair import PairSynchronizer
-from rs_relpose_ros.pose_chain import PoseChain
-from rs_relpose_ros.ros.message_types import message_class
+from rs_relpose_ros.node.message_types import message_class
 
 
 class PathNode(Node):

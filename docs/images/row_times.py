@@ -11,9 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 
-from rs_relpose_ros.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.timing import ImageClock
 from rs_relpose_ros.picture_files import save_picture
-from rs_relpose_ros.timing import ImageClock
 
 MS = 1_000_000
 HEIGHT, READOUT, EXPOSURE, INTERVAL, OFFSET = 480, 0.020, 0.008, 0.0333, 0.006

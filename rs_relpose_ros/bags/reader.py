@@ -18,7 +18,7 @@ from rosbags.typesys import get_typestore, Stores
 from rs_relpose_ros.bags.limits import bound_decompression, check_metadata, MAX_MESSAGE_BYTES
 from rs_relpose_ros.bags.mcap_check import check_mcap
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
-from rs_relpose_ros.timing import NANOSECONDS
+from rs_relpose_ros.geometry.timing import NANOSECONDS
 
 IMAGE = 'sensor_msgs/msg/Image'
 COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'

@@ -14,9 +14,9 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 
-from rs_relpose_ros.camera import RollingShutterCamera
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.timing import NANOSECONDS
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.timing import NANOSECONDS
 
 # sensor_msgs/CameraInfo of plumb_bob holds five coefficients even where there is no distortion.
 _PLUMB_BOB_COEFFICIENTS = 5

@@ -16,8 +16,8 @@ from rs_relpose_ros.bags.reader import (
 from rs_relpose_ros.check import judge_images, judge_imu, judge_turning
 from rs_relpose_ros.check.findings import Finding, Report, Verdict
 from rs_relpose_ros.check.scan import Chosen, scan
+from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
-from rs_relpose_ros.pipeline.parameters import Parameters
 
 
 def choose_topics(bag: Bag, options: TopicOptions) -> Chosen:

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.check.streams import Thinned
+from rs_relpose_ros.config.imu import ImuConfig
 from rs_relpose_ros.imu.bias import BiasTracker
-from rs_relpose_ros.imu.config import ImuConfig
 from rs_relpose_ros.imu.samples import ImuSample, Vector
 
 Array = NDArray[np.float64]

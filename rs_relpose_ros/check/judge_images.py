@@ -6,7 +6,7 @@ from rs_relpose_ros.bags.reader import COMPRESSED_IMAGE, Topic
 from rs_relpose_ros.check.findings import Finding, Verdict
 from rs_relpose_ros.check.scan import Scan
 from rs_relpose_ros.check.streams import Stamps, StampSummary
-from rs_relpose_ros.pipeline.parameters import Parameters
+from rs_relpose_ros.config.parameters import Parameters
 
 # Fast DDS with its default transports loses best-effort messages above this [bytes].
 _BIG_MESSAGE = 512 * 1024

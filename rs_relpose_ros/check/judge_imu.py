@@ -11,8 +11,8 @@ from rs_relpose_ros.check.inertial import InertialSummary
 from rs_relpose_ros.check.judge_images import stamp_finding
 from rs_relpose_ros.check.scan import Scan
 from rs_relpose_ros.check.streams import StampSummary
+from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.imu.gravity import STANDARD_GRAVITY
-from rs_relpose_ros.pipeline.parameters import Parameters
 
 _SLOW = 80.0
 # Mean length of the specific force that hand-held motion explains [m/s^2].

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
-from rs_relpose_ros.calibration.axis_maps import axes_text, nearest_axis_map
+from rs_relpose_ros.calibrate.axis_maps import axes_text, nearest_axis_map
 from rs_relpose_ros.check.findings import Finding, Verdict
 from rs_relpose_ros.check.scan import Scan
 from rs_relpose_ros.check.turning import Alignment
-from rs_relpose_ros.pipeline.parameters import Parameters
-from rs_relpose_ros.so3 import log_so3
+from rs_relpose_ros.config.parameters import Parameters
+from rs_relpose_ros.geometry.so3 import log_so3
 
 # Stamps of the two sensors that differ by more in their delay are of different clocks [s].
 _SAME_CLOCK = 0.5

@@ -13,6 +13,7 @@ from rs_relpose_ros.check.inertial import Inertial
 from rs_relpose_ros.check.streams import Stamps
 from rs_relpose_ros.check.turning import TurningImages
 from rs_relpose_ros.errors import RsRelposeError
+from rs_relpose_ros.geometry.intrinsics import Calibration
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.messages.incoming import (
     accelerometer_sample_from_message,
@@ -22,7 +23,6 @@ from rs_relpose_ros.messages.incoming import (
     imu_sample_from_message,
     stamp_ns,
 )
-from rs_relpose_ros.pipeline.calibration import Calibration
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,14 +14,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.calibration.alignment import find_starts, Start
-from rs_relpose_ros.calibration.coplanarity import BIAS, GLOBAL, OFFSET, READOUT, ROTATION
-from rs_relpose_ros.calibration.fit import fit, State, with_bends
-from rs_relpose_ros.calibration.follow import PointFollower
-from rs_relpose_ros.calibration.gyro_path import GyroSeries
-from rs_relpose_ros.calibration.observations import evenly, Observations
-from rs_relpose_ros.pipeline.calibration import Calibration
-from rs_relpose_ros.tracking.config import TrackingConfig
+from rs_relpose_ros.calibrate.alignment import find_starts, Start
+from rs_relpose_ros.calibrate.coplanarity import BIAS, GLOBAL, OFFSET, READOUT, ROTATION
+from rs_relpose_ros.calibrate.fit import fit, State, with_bends
+from rs_relpose_ros.calibrate.follow import PointFollower
+from rs_relpose_ros.calibrate.gyro_path import GyroSeries
+from rs_relpose_ros.calibrate.observations import evenly, Observations
+from rs_relpose_ros.config.tracking import TrackingConfig
+from rs_relpose_ros.geometry.intrinsics import Calibration
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from rs_relpose_ros.bags.reader import open_bag, TopicOptions
 from rs_relpose_ros.check.check import check_bag, choose_topics
-from rs_relpose_ros.replay.parameter_file import read_parameters
+from rs_relpose_ros.config.parameter_file import read_parameters
 
 HELP = ('Look through a bag (rosbag2 or ROS 1) for whatever would spoil relative poses: topics, '
         'rates, gaps, stamps, clocks, encodings, calibration, units, axes, bias, transport, and '

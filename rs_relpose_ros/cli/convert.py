@@ -10,9 +10,9 @@ import sys
 
 from tqdm import tqdm
 
-from rs_relpose_ros.datasets import realsense, xiaomi
-from rs_relpose_ros.datasets.parameter_file import Figure, write_parameters
-from rs_relpose_ros.datasets.recording import Recording, write_bag
+from rs_relpose_ros.config.commented_file import Figure, write_parameters
+from rs_relpose_ros.convert import realsense, xiaomi
+from rs_relpose_ros.convert.recording import Recording, write_bag
 from rs_relpose_ros.errors import InputError, MissingInputError
 
 HELP = ('Turn a public recording into a rosbag2 directory (MCAP) with the topics '

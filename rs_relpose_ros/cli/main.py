@@ -14,8 +14,8 @@ from rs_relpose_ros.errors import RsRelposeError
 
 PROGRAM = 'rs_relpose'
 
-# Name -> one line of help. The module rs_relpose_ros.cli.<name> is imported only when its command
-# is asked for, so that the overview does not wait for OpenCV and Numba.
+# Name -> one line of help. The module of this name is imported only when its command is asked for:
+# the overview does not wait for OpenCV and Numba.
 COMMANDS: Mapping[str, str] = {
     'benchmark': 'measure accuracy and speed of the estimator: tables and plots',
     'check': 'look through a bag for what would spoil the poses, with remedies',
@@ -25,6 +25,9 @@ COMMANDS: Mapping[str, str] = {
     'replay': 'estimate relative poses from a bag: CSV, summary and pictures',
     'simulate': 'render rolling-shutter images and IMU of a known motion into a bag',
 }
+# Commands of the laboratory: found by name, so that the product does not depend on it.
+_LABORATORY = 'rs_relpose_lab.cli'
+_OF_THE_LABORATORY = ('benchmark', 'evaluate', 'simulate')
 
 DONE, FAILED, BAD_INPUT = 0, 1, 2
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
@@ -56,7 +59,8 @@ class _Version(argparse.Action):
 
 def load_command(name: str) -> Command:
     """Import the module of command `name`."""
-    return cast('Command', importlib.import_module(f'{__package__}.{name}'))
+    package = _LABORATORY if name in _OF_THE_LABORATORY else __package__
+    return cast('Command', importlib.import_module(f'{package}.{name}'))
 
 
 def make_parser(selected: str | None) -> argparse.ArgumentParser:
@@ -128,7 +132,8 @@ def _set_up_logging(verbosity: int) -> None:
     level = {0: logging.WARNING, 1: logging.INFO}.get(verbosity, logging.DEBUG)
     logging.basicConfig(level=logging.WARNING, format='%(levelname)s %(name)s: %(message)s')
     # Numba and Matplotlib would fill pages at level DEBUG.
-    logging.getLogger('rs_relpose_ros').setLevel(level)
+    for package in ('rs_relpose_ros', 'rs_relpose_lab'):
+        logging.getLogger(package).setLevel(level)
 
 
 def _complain(message: str, code: int) -> int:

@@ -12,9 +12,9 @@ from typing import Any
 from tqdm import tqdm
 
 from rs_relpose_ros.bags.reader import open_bag, TopicOptions
+from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.errors import MissingInputError
 from rs_relpose_ros.replay.outputs import replay_into, ReplayOutcome, SUMMARY_FILE
-from rs_relpose_ros.replay.parameter_file import read_parameters
 from rs_relpose_ros.replay.stamps import read_stamps
 from rs_relpose_ros.replay.summary import with_provenance, write_summary
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.estimator import sampson
 from rs_relpose_ros.estimator.map_fit import State
-from rs_relpose_ros.so3 import left_jacobian_so3
+from rs_relpose_ros.geometry.so3 import left_jacobian_so3
 
 Array = NDArray[np.float64]
 

@@ -8,8 +8,7 @@ import time
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rs_relpose_ros.camera import RollingShutterCamera
-from rs_relpose_ros.config import EstimatorConfig
+from rs_relpose_ros.config.estimator import EstimatorConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator import sampson
 from rs_relpose_ros.estimator.alternating import refine_alternating
@@ -44,6 +43,7 @@ from rs_relpose_ros.estimator.problem import (
     to_reference_row,
     TwoViewProblem,
 )
+from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.estimator.rotation_only import fit_rotation, transfer_errors
 from rs_relpose_ros.estimator.sampling import POOL, sample_hypotheses
 from rs_relpose_ros.estimator.spread import (
@@ -57,9 +57,9 @@ from rs_relpose_ros.estimator.velocity_prior import (
     LEAST_VELOCITY_CHANGE,
     with_velocity_sigma,
 )
-from rs_relpose_ros.motion import FrameMotion
-from rs_relpose_ros.result import RelativePose, Status
-from rs_relpose_ros.so3 import aligning_rotation, exp_so3, skew
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.motion import FrameMotion
+from rs_relpose_ros.geometry.so3 import aligning_rotation, exp_so3, skew
 from rs_relpose_ros.solvers.gravity import gravity_alignment
 
 Array = NDArray[np.float64]

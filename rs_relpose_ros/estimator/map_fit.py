@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.estimator import sampson
 from rs_relpose_ros.estimator.sampson import D1, D2, DW1, DW2, PARAMETERS, TANGENT, THETA
-from rs_relpose_ros.so3 import exp_so3, log_so3
+from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
 
 Array = NDArray[np.float64]
 

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.camera import RollingShutterCamera
 from rs_relpose_ros.compiled import kernel
-from rs_relpose_ros.motion import FrameMotion
-from rs_relpose_ros.so3 import skew
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.motion import FrameMotion
+from rs_relpose_ros.geometry.so3 import skew
 
 Array = NDArray[np.float64]
 

@@ -17,8 +17,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.imu.config import ImuConfig
-from rs_relpose_ros.timing import to_nanoseconds
+from rs_relpose_ros.config.imu import ImuConfig
+from rs_relpose_ros.geometry.timing import to_nanoseconds
 
 Array = NDArray[np.float64]
 

@@ -8,9 +8,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.config.imu import ImuConfig
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry.timing import to_nanoseconds
 from rs_relpose_ros.imu.bias import BiasTracker, GyroBias
-from rs_relpose_ros.imu.config import ImuConfig
 from rs_relpose_ros.imu.gravity import (
     agreed_gravity,
     GravityEstimate,
@@ -20,7 +21,6 @@ from rs_relpose_ros.imu.gravity import (
 )
 from rs_relpose_ros.imu.integration import integrate_rotation
 from rs_relpose_ros.imu.samples import ImuSample
-from rs_relpose_ros.timing import to_nanoseconds
 
 Array = NDArray[np.float64]
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.geometry.motion import FrameMotion
+from rs_relpose_ros.geometry.timing import seconds_between
 from rs_relpose_ros.imu.buffer import Coverage, ImuBuffer
-from rs_relpose_ros.motion import FrameMotion
-from rs_relpose_ros.timing import seconds_between
 
 Array = NDArray[np.float64]
 

@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel
+from rs_relpose_ros.config.imu import ImuConfig
+from rs_relpose_ros.geometry.so3 import exp_so3
+from rs_relpose_ros.geometry.timing import to_nanoseconds
 from rs_relpose_ros.imu.bias import BIAS_MEMORY
-from rs_relpose_ros.imu.config import ImuConfig
-from rs_relpose_ros.so3 import exp_so3
-from rs_relpose_ros.timing import to_nanoseconds
 
 Array = NDArray[np.float64]
 

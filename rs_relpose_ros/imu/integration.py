@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rs_relpose_ros.compiled import kernel
+from rs_relpose_ros.config.imu import ImuConfig
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.imu.config import ImuConfig
-from rs_relpose_ros.so3 import exp_so3, left_jacobian_so3
+from rs_relpose_ros.geometry.so3 import exp_so3, left_jacobian_so3
 
 Array = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry.timing import to_nanoseconds
 from rs_relpose_ros.imu.samples import ImuSample
-from rs_relpose_ros.timing import to_nanoseconds
 
 _STRIDE = 1009
 # Of a slow IMU two or three equal ones may be chance.

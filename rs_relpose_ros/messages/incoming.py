@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.geometry.intrinsics import Calibration
+from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.imu.samples import ImuSample, Orientation
 from rs_relpose_ros.messages.image_headers import encoded_image_size
-from rs_relpose_ros.pipeline.calibration import Calibration
-from rs_relpose_ros.timing import NANOSECONDS
 
 Gray = NDArray[np.uint8]
 

@@ -10,6 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.errors import InputError, RsRelposeError
+from rs_relpose_ros.front_end.frame import EncodedFrame
+from rs_relpose_ros.front_end.sequencer import Refusal, Sequencer
+from rs_relpose_ros.geometry.intrinsics import Calibration
 from rs_relpose_ros.messages.hanging import HangingCamera, HangingGyro
 from rs_relpose_ros.messages.incoming import (
     accelerometer_sample_from_message,
@@ -19,9 +22,6 @@ from rs_relpose_ros.messages.incoming import (
     imu_sample_from_message,
     stamp_ns,
 )
-from rs_relpose_ros.pipeline.calibration import Calibration
-from rs_relpose_ros.pipeline.frame import EncodedFrame
-from rs_relpose_ros.pipeline.sequencer import Refusal, Sequencer
 
 Decode = Callable[[Any], NDArray[np.uint8]]
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.pipeline.pair import PairResult
-from rs_relpose_ros.timing import NANOSECONDS
+from rs_relpose_ros.front_end.pair import PairResult
+from rs_relpose_ros.geometry.timing import NANOSECONDS
 
 MessageTypes = Callable[[str], Any]
 

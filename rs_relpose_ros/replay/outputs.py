@@ -10,12 +10,12 @@ from typing import Any
 
 from rs_relpose_ros.bags.reader import Bag, SensorTopics
 from rs_relpose_ros.bags.writer import BagWriter
+from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.front_end.drift import Drift
+from rs_relpose_ros.front_end.pair import PairResult
+from rs_relpose_ros.geometry.intrinsics import Calibration
 from rs_relpose_ros.messages.outgoing import pair_messages, PAIR_TOPICS
-from rs_relpose_ros.pipeline.calibration import Calibration
-from rs_relpose_ros.pipeline.drift import Drift
-from rs_relpose_ros.pipeline.pair import PairResult
-from rs_relpose_ros.pipeline.parameters import Parameters
 from rs_relpose_ros.replay.record import pair_record, PairRecord
 from rs_relpose_ros.replay.run import read_truth, Replay, ReplayCounts, ReplayedPair
 from rs_relpose_ros.replay.summary import summarize

@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_ros.estimator.result import Status
+from rs_relpose_ros.front_end.pair import PairResult
+from rs_relpose_ros.geometry.timing import seconds_between
 from rs_relpose_ros.picture_files import save_picture
-from rs_relpose_ros.pipeline.pair import PairResult
 from rs_relpose_ros.replay.record import PairRecord, rotation_sigmas, translation_sigmas
 from rs_relpose_ros.replay.truth import rotation_angle, TrueTrajectory
-from rs_relpose_ros.result import Status
-from rs_relpose_ros.timing import seconds_between
 
 Array = NDArray[np.float64]
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.pipeline.pair import PairResult
+from rs_relpose_ros.estimator.result import Status
+from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.replay.truth import PairErrors, rotation_angle, TrueTrajectory
-from rs_relpose_ros.result import Status
 
 Array = NDArray[np.float64]
 

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 
 from rs_relpose_ros.bags.reader import Bag, COMPRESSED_IMAGE, SensorTopics
-from rs_relpose_ros.causes import CauseCounts
+from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.estimator.estimate import warm_up
+from rs_relpose_ros.front_end.pair import PairResult
+from rs_relpose_ros.front_end.pipeline import Pipeline
+from rs_relpose_ros.front_end.sequencer import FrameRefused, ReadyFrame, Sequencer, SequencerCounts
+from rs_relpose_ros.geometry.intrinsics import Calibration
+from rs_relpose_ros.messages.causes import CauseCounts
 from rs_relpose_ros.messages.incoming import stamp_ns
 from rs_relpose_ros.messages.intake import MessageIntake
-from rs_relpose_ros.pipeline.calibration import Calibration
-from rs_relpose_ros.pipeline.pair import PairResult
-from rs_relpose_ros.pipeline.parameters import Parameters
-from rs_relpose_ros.pipeline.pipeline import Pipeline
-from rs_relpose_ros.pipeline.sequencer import FrameRefused, ReadyFrame, Sequencer, SequencerCounts
 from rs_relpose_ros.replay.truth import TrueTrajectory
 
 _logger = logging.getLogger(__name__)

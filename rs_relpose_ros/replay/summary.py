@@ -16,12 +16,12 @@ import numpy as np
 import scipy
 
 from rs_relpose_ros.bags.reader import SensorTopics
-from rs_relpose_ros.pipeline.drift import Drift
-from rs_relpose_ros.pipeline.parameters import Parameters
+from rs_relpose_ros.config.parameters import Parameters
+from rs_relpose_ros.estimator.result import Status
+from rs_relpose_ros.front_end.drift import Drift
 from rs_relpose_ros.replay.record import PairRecord
 from rs_relpose_ros.replay.run import ReplayCounts
 from rs_relpose_ros.replay.truth import median_and_p90
-from rs_relpose_ros.result import Status
 
 
 def summarize(records: Sequence[PairRecord], counts: ReplayCounts,

@@ -10,9 +10,9 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.messages.outgoing import quat_xyzw
 from rs_relpose_ros.replay.record import PairRecord, rotation_sigmas, translation_sigmas
-from rs_relpose_ros.result import Status
 
 RELATIVE_POSE_COLUMNS = (
     'reference_stamp_ns', 'stamp_ns', 'tx', 'ty', 'tz', 'qx', 'qy', 'qz', 'qw', 'sigma_t1',

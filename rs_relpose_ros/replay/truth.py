@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.timing import NANOSECONDS, to_nanoseconds
+from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel
-from rs_relpose_ros.so3 import exp_so3
+from rs_relpose_ros.geometry.so3 import exp_so3
 from rs_relpose_ros.solvers.cheirality import cheirality_votes
 from rs_relpose_ros.solvers.linear_algebra import normalise, reflect, triangularise
 from rs_relpose_ros.solvers.uniform_columns import row_time_factors, translation_and_velocities

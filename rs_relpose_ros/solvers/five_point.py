@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel
-from rs_relpose_ros.so3 import exp_so3
+from rs_relpose_ros.geometry.so3 import exp_so3
 from rs_relpose_ros.solvers.cheirality import cheirality_votes
 from rs_relpose_ros.solvers.linear_algebra import reflect, triangularise
 from rs_relpose_ros.solvers.polynomial import real_roots

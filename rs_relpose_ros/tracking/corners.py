@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from rs_relpose_ros.compiled import kernel
-from rs_relpose_ros.tracking.config import TrackingConfig
+from rs_relpose_ros.config.tracking import TrackingConfig
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.config.tracking import TrackingConfig
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.tracking.config import TrackingConfig
 from rs_relpose_ros.tracking.corners import feature_rows, find_corners, keep_apart
 from rs_relpose_ros.tracking.images import checked, Image
 from rs_relpose_ros.tracking.lucas_kanade import (

@@ -1,0 +1,1 @@
+"""Commands of ``rs_relpose`` that belong to the laboratory."""

@@ -1,0 +1,261 @@
+"""What the accuracy experiment says: statistics of each cell, against the project's limits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from operator import attrgetter
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2, trim_mean
+
+from rs_relpose_lab.experiments.accuracy import by_setting, Experiment, Trial
+from rs_relpose_lab.experiments.scoring import POSE_FREEDOM
+from rs_relpose_lab.experiments.tables import markdown_table, write_csv
+from rs_relpose_ros.picture_files import save_picture
+
+Array = NDArray[np.float64]
+
+TRIALS_FILE, CELLS_FILE = 'trials.csv', 'cells.csv'
+REPORT_FILE, PLOT_FILE = 'accuracy.md', 'accuracy.png'
+
+# A rotation this wrong [deg] is no noise in any of the cells.
+GROSS_ERROR = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Quantiles:
+    """Of errors [deg]; infinite where too many poses are lost."""
+
+    median: float
+    p90: float
+
+
+@dataclass(frozen=True, slots=True)
+class Consistency:
+    """How the errors compare with the covariance.
+
+    Attributes
+    ----------
+    mean : float
+        Of the inner 98 % of NEES, by its degrees of freedom: 1 is right, more is overconfident.
+    above : float
+        Share above the 95 % quantile of chi-square: 0.05 is right.
+    """
+
+    mean: float
+    above: float
+
+
+@dataclass(frozen=True, slots=True)
+class CellStatistics:
+    """Of one cell with one kind of noise and one factor of the told sigmas.
+
+    Attributes
+    ----------
+    noise, sigma_factor, cell, trials
+        What was run.
+    lost, gross : int
+        Trials without a pose, and with a rotation more than `GROSS_ERROR` wrong.
+    rotation, translation, oracle_rotation, oracle_translation : Quantiles
+        Of the estimator and of the oracle on the same problems; a lost pose counts as infinite.
+    rotation_ratio, translation_ratio : Quantiles
+        Estimator by oracle: of the medians and of the 90th percentiles.
+    nees, oracle_nees : Consistency
+    duration : float
+        Median [ms].
+    """
+
+    noise: str
+    sigma_factor: float
+    cell: str
+    trials: int
+    lost: int
+    gross: int
+    rotation: Quantiles
+    translation: Quantiles
+    oracle_rotation: Quantiles
+    oracle_translation: Quantiles
+    rotation_ratio: Quantiles
+    translation_ratio: Quantiles
+    nees: Consistency
+    oracle_nees: Consistency
+    duration: float
+
+
+def cell_statistics(trials: Sequence[Trial]) -> CellStatistics:
+    """Statistics of trials of one setting."""
+    rotation = _quantiles(trial.error.rotation for trial in trials)
+    translation = _quantiles(trial.error.translation for trial in trials)
+    best_rotation = _quantiles(trial.oracle.rotation for trial in trials)
+    best_translation = _quantiles(trial.oracle.translation for trial in trials)
+    return CellStatistics(
+        noise=trials[0].noise, sigma_factor=trials[0].sigma_factor, cell=trials[0].cell,
+        trials=len(trials),
+        lost=sum(bool(np.isinf(trial.error.rotation)) for trial in trials),
+        gross=sum(GROSS_ERROR < trial.error.rotation < np.inf for trial in trials),
+        rotation=rotation, translation=translation, oracle_rotation=best_rotation,
+        oracle_translation=best_translation, rotation_ratio=_ratio(rotation, best_rotation),
+        translation_ratio=_ratio(translation, best_translation),
+        nees=consistency([trial.error.nees for trial in trials]),
+        oracle_nees=consistency([trial.oracle.nees for trial in trials]),
+        duration=float(np.median([trial.duration for trial in trials])) * 1e3)
+
+
+def consistency(nees: Sequence[float]) -> Consistency:
+    """Statistics of normalised errors; NaN, of a pose that is lost, is left out."""
+    known = np.array([value for value in nees if not np.isnan(value)])
+    if len(known) == 0:
+        return Consistency(float('nan'), float('nan'))
+    return Consistency(float(trim_mean(known, 0.01)) / POSE_FREEDOM,
+                       float((known > chi2.ppf(0.95, POSE_FREEDOM)).mean()))
+
+
+def _quantiles(errors: Iterable[float]) -> Quantiles:
+    # Not interpolated: between a number and infinity there is nothing.
+    median, p90 = np.quantile(list(errors), [0.5, 0.9], method='higher')
+    return Quantiles(float(median), float(p90))
+
+
+def _ratio(error: Quantiles, reference: Quantiles) -> Quantiles:
+    return Quantiles(error.median / reference.median, error.p90 / reference.p90)
+
+
+def summary(cells: Sequence[CellStatistics]) -> list[tuple[str, float, str]]:
+    """What the project asks for, over cells of one noise and factor: name, figure, limit."""
+    def column(value: Callable[[CellStatistics], float]) -> Array:
+        return np.array([value(cell) for cell in cells])
+
+    rotation = column(lambda cell: cell.rotation_ratio.median)
+    translation = column(lambda cell: cell.translation_ratio.median)
+    mean = column(lambda cell: cell.nees.mean)
+    above = 100.0 * column(lambda cell: cell.nees.above)
+    return [
+        ('ratio of median rotation errors, median over cells', _median(rotation), '<= 1.10'),
+        ('ratio of median translation errors, median over cells', _median(translation), '<= 1.20'),
+        ('ratio of median errors, largest of a cell',
+         float(np.maximum(rotation, translation).max()), '<= 1.6'),
+        ('ratio of 90th percentiles of rotation, median over cells',
+         _median(column(lambda cell: cell.rotation_ratio.p90)), '<= 1.5'),
+        ('ratio of 90th percentiles of translation, median over cells',
+         _median(column(lambda cell: cell.translation_ratio.p90)), '<= 1.5'),
+        ('lost poses', float(sum(cell.lost for cell in cells)), '0'),
+        (f'rotations wrong by more than {GROSS_ERROR:g} deg',
+         float(sum(cell.gross for cell in cells)), '0'),
+        ('NEES / 5, smallest of a cell', float(mean.min()), '>= 0.8'),
+        ('NEES / 5, largest of a cell', float(mean.max()), '<= 1.25'),
+        ('above the 95 % quantile, smallest of a cell [%]', float(above.min()), '>= 2'),
+        ('above the 95 % quantile, largest of a cell [%]', float(above.max()), '<= 10'),
+        ('median time of an estimate, median over cells [ms]',
+         _median(column(lambda cell: cell.duration)), ''),
+    ]
+
+
+def _median(values: Array) -> float:
+    return float(np.median(values))
+
+
+def write_report(folder: Path, experiment: Experiment, trials: Sequence[Trial]) -> str:
+    """Write every trial, the statistics of every cell, the report and the plot.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+        Made where it is missing.
+    experiment : Experiment
+    trials : sequence of Trial
+
+    Returns
+    -------
+    str
+        The report (Markdown).
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    cells = [cell_statistics(group) for group in by_setting(trials).values()]
+    write_csv(folder / TRIALS_FILE, trials)
+    write_csv(folder / CELLS_FILE, cells)
+    report = _report(experiment, cells)
+    (folder / REPORT_FILE).write_text(report)
+    _plot(folder / PLOT_FILE, cells)
+    return report
+
+
+def _settings(cells: Sequence[CellStatistics]) -> dict[tuple[str, float], list[CellStatistics]]:
+    groups: dict[tuple[str, float], list[CellStatistics]] = {}
+    for cell in cells:
+        groups.setdefault((cell.noise, cell.sigma_factor), []).append(cell)
+    return groups
+
+
+def _report(experiment: Experiment, cells: Sequence[CellStatistics]) -> str:
+    parts = [
+        '# Accuracy against the oracle\n',
+        (f'{experiment.trials} trials a cell, solver `{experiment.solver}`, errors in degrees '
+         '(median / 90th percentile); a ratio is estimator by oracle. NEES / 5 is the mean of the '
+         'inner 98 %; "above" is the share above the 95 % quantile of chi-square(5).\n')]
+    settings = _settings(cells)
+    for (noise, factor), group in settings.items():
+        parts.append(f'## Noise of gravity: {noise}; told sigmas {factor:g} times the true ones\n')
+        parts.append(markdown_table(
+            ('cell', 'R', 'oracle', 'ratio', 't', 'oracle', 'ratio', 'lost', 'gross', 'NEES / 5',
+             'oracle', 'above [%]', 'oracle', 'ms'), [_row(cell) for cell in group]))
+        parts.append(markdown_table(
+            ('over all cells', 'figure', 'wanted'),
+            [(name, f'{value:.3g}', limit) for name, value, limit in summary(group)]))
+        reference = settings.get((noise, 1.0))
+        if factor != 1.0 and reference:
+            parts.append(_against_true_sigmas(group, reference))
+    return '\n'.join(parts)
+
+
+def _row(cell: CellStatistics) -> tuple[str, ...]:
+    def pair(quantiles: Quantiles, digits: int = 3) -> str:
+        return f'{quantiles.median:.{digits}f} / {quantiles.p90:.{digits}f}'
+
+    return (
+        cell.cell, pair(cell.rotation), pair(cell.oracle_rotation), pair(cell.rotation_ratio, 2),
+        pair(cell.translation), pair(cell.oracle_translation), pair(cell.translation_ratio, 2),
+        f'{cell.lost}', f'{cell.gross}', f'{cell.nees.mean:.2f}', f'{cell.oracle_nees.mean:.2f}',
+        f'{100 * cell.nees.above:.1f}', f'{100 * cell.oracle_nees.above:.1f}',
+        f'{cell.duration:.1f}')
+
+
+def _against_true_sigmas(group: Sequence[CellStatistics], reference: Sequence[CellStatistics],
+                         ) -> str:
+    """Table of errors by those with the true sigmas."""
+    told = {cell.cell: cell for cell in reference}
+    rows = []
+    for name in ('rotation', 'translation'):
+        for statistic in ('median', 'p90'):
+            value = attrgetter(f'{name}.{statistic}')
+            ratios = np.array([value(cell) / value(told[cell.cell]) for cell in group])
+            rows.append((f'{statistic} {name} error by that with the true sigmas',
+                         f'{_median(ratios):.3g}', f'{ratios.max():.3g}', '<= 1.3'))
+    return markdown_table(('over all cells', 'median', 'largest', 'wanted'), rows)
+
+
+def _plot(path: Path, cells: Sequence[CellStatistics]) -> None:
+    """Ratios to the oracle and NEES of every cell."""
+    from matplotlib.figure import Figure
+
+    panels = (('rotation_ratio.median', 'median rotation error / oracle', 1.6),
+              ('translation_ratio.median', 'median translation error / oracle', 1.6),
+              ('nees.mean', 'NEES / 5', 1.25))
+    names = list(dict.fromkeys(cell.cell for cell in cells))
+    figure = Figure(figsize=(12.0, 1.6 + 0.22 * len(names)), dpi=110, layout='constrained')
+    axes = figure.subplots(1, len(panels), sharey=True)
+    for axis, (field, label, limit) in zip(axes, panels, strict=True):
+        for (noise, factor), group in _settings(cells).items():
+            axis.plot(list(map(attrgetter(field), group)),
+                      [names.index(cell.cell) for cell in group], 'o', markersize=4, alpha=0.8,
+                      label=f'{noise}, told sigmas x {factor:g}')
+        axis.axvline(1.0, color='0.6', linewidth=1.0)
+        axis.axvline(limit, color='0.6', linewidth=1.0, linestyle=':')
+        axis.set_xlabel(label)
+        axis.grid(visible=True, axis='y', alpha=0.3)
+    axes[0].set_yticks(range(len(names)), names)
+    axes[0].invert_yaxis()
+    axes[-1].legend(fontsize='small')
+    save_picture(figure, path)

@@ -1,0 +1,190 @@
+"""Simulated tracks and gyro of a rolling-shutter camera with a known calibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_lab.simulation.hand_held import hand_held, Plan
+from rs_relpose_lab.simulation.trajectory import Trajectory
+from rs_relpose_ros.calibrate.axis_maps import axis_maps
+from rs_relpose_ros.calibrate.gyro_path import GyroSeries
+from rs_relpose_ros.calibrate.tracks import Tracks
+
+Array = NDArray[np.float64]
+
+START_NS = 1_700_000_000_000_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """What a recording was made with; rotation as ``v_cam = R_cam_imu v_imu``.
+
+    Times [s], noise of the pixels [px] and of the gyro [rad/s/sqrt(Hz)], bias [rad/s], speed
+    [m/s], rms of the rotation [rad/s].
+    """
+
+    readout_time: float = 0.025          # negative: read upwards
+    time_offset: float = 0.02            # t_imu = stamp + time_offset + row / height * readout
+    R_cam_imu: Array = field(default_factory=lambda: np.eye(3))
+    gyro_bias: tuple[float, float, float] = (0.01, -0.02, 0.015)
+    focal: float = 640.0
+    width: int = 1280
+    height: int = 720
+    fps: float = 30.0
+    frames: int = 300
+    pixel_noise: float = 0.3
+    outliers: float = 0.1
+    gyro_rate: float = 200.0
+    gyro_noise: float = 2e-4
+    features: int = 200
+    speed: float = 1.0
+    rotation_rate: float = math.radians(30.0)
+    exposure_slope: float = 0.0          # of the offset, by the interval to the next frame
+    long_interval: float = 1.0           # intervals of the second half, relative to the first
+
+
+def drawn(rng: np.random.Generator, axis_map: int | None = None, **given: Any) -> Truth:
+    """Truth within the ranges that calibration must master.
+
+    `axis_map` is a number below 24, else drawn; `given` are fields of `Truth` that are not drawn.
+    """
+    axis = rng.standard_normal(3)
+    misalignment = Rotation.from_rotvec(math.radians(2.0) * axis / np.linalg.norm(axis))
+    number = rng.integers(24) if axis_map is None else axis_map
+    values: dict[str, Any] = {
+        'readout_time': rng.uniform(0.008, 0.040), 'time_offset': rng.uniform(-0.08, 0.08),
+        'R_cam_imu': misalignment.as_matrix() @ axis_maps()[number],
+        'gyro_bias': tuple(rng.uniform(-0.05, 0.05, 3)), 'focal': rng.uniform(500.0, 1000.0),
+        'gyro_rate': rng.choice([100.0, 200.0, 400.0]),
+        'gyro_noise': 10.0 ** rng.uniform(-4.0, -3.4), 'speed': rng.uniform(0.3, 1.6),
+        'rotation_rate': np.radians(rng.uniform(20.0, 45.0)),
+    } | given
+    if values['readout_time'] > 0.9 / values.get('fps', 30.0):
+        values['fps'] = 0.9 / values['readout_time']
+    return Truth(**values)
+
+
+def about_one_axis(axis: int, duration: float) -> Trajectory:
+    """Camera that sways about one axis (0 yaw, 1 pitch, 2 roll) and is carried sideways."""
+    spacing = 0.03
+    times = -1.0 + spacing * np.arange(math.ceil((duration + 2.0) / spacing))
+    positions = np.column_stack([0.3 * np.sin(times), 0.5 * np.cos(0.7 * times),
+                                 np.full(len(times), 1.6)])
+    angles = np.zeros((len(times), 3))
+    angles[:, axis] = 0.4 * np.sin(1.9 * times) + 0.1 * np.sin(5.0 * times)
+    return Trajectory(positions, angles, float(times[0]), spacing, ())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recorded:
+    """What `calibrate` takes, and what it should find."""
+
+    tracks: Tracks
+    gyro: GyroSeries
+    truth: Truth
+    trajectory: Trajectory
+
+
+def record(truth: Truth, rng: np.random.Generator,
+           trajectory: Trajectory | None = None) -> Recorded:
+    """Tracks and gyro along a hand-held walk (or `trajectory`) among points of many depths."""
+    intervals = np.full(truth.frames, 1.0 / truth.fps)
+    intervals[truth.frames // 2:] *= truth.long_interval
+    # Instants of the first row on the IMU clock, which is the trajectory's.
+    instants = np.concatenate([[0.0], np.cumsum(intervals[:-1])])
+    offsets = truth.time_offset + truth.exposure_slope * (intervals - np.median(intervals))
+    end = instants[-1] + 0.2
+    if trajectory is None:
+        trajectory = hand_held(rng, -0.7, end + 0.5, Plan.parse(f'walk:{end + 1.0}'),
+                               speed=truth.speed, rotation_rate=truth.rotation_rate)
+    stamps = START_NS + np.rint((instants - offsets) * 1e9).astype(np.int64)
+    frames = _frames(truth, trajectory, instants, _world(rng), rng)
+    return Recorded(Tracks(stamps, *frames), _gyro(truth, trajectory, end, rng), truth, trajectory)
+
+
+def _gyro(truth: Truth, trajectory: Trajectory, end: float,
+          rng: np.random.Generator) -> GyroSeries:
+    count = int((end + 0.5) * truth.gyro_rate)
+    times = -0.5 + (np.arange(count) + rng.uniform()) / truth.gyro_rate
+    rates = trajectory.states(times).angular_velocity @ truth.R_cam_imu
+    noise = truth.gyro_noise * math.sqrt(truth.gyro_rate) * rng.standard_normal(rates.shape)
+    return GyroSeries(START_NS + np.rint(times * 1e9).astype(np.int64),
+                      rates + np.array(truth.gyro_bias) + noise)
+
+
+def _world(rng: np.random.Generator, count: int = 4000) -> Array:
+    """Points (N, 3) around the walk, 2.5 to 25 m away, on a floor, on walls and between them."""
+    azimuth, elevation = rng.uniform(-1.9, 1.9, count), rng.uniform(-1.0, 0.9, count)
+    distance = 2.5 * 10.0 ** rng.uniform(0.0, 1.0, count)
+    direction = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth),
+                          np.sin(elevation)], axis=1)
+    points = np.array([0.0, 0.0, 1.6]) + direction * distance[:, None]
+    points[:, 2] = np.maximum(points[:, 2], 0.0)
+    return points
+
+
+class _Path:
+    """Poses on a fine grid, linear in between."""
+
+    step = 1e-3
+
+    def __init__(self, trajectory: Trajectory, begin: float, end: float) -> None:
+        self.begin = begin
+        times = begin + self.step * np.arange(math.ceil((end - begin) / self.step) + 1)
+        self.positions, self.rotations = trajectory.poses(times)
+        self.turns = Rotation.from_matrix(
+            np.einsum('nji,njk->nik', self.rotations[:-1], self.rotations[1:])).as_rotvec()
+
+    def to_camera(self, points: Array, times: Array) -> Array:
+        """Points (N, 3) in the camera at their instants (N,)."""
+        at = (times - self.begin) / self.step
+        k = np.clip(at.astype(int), 0, len(self.turns) - 1)
+        share = (at - k)[:, None]
+        position = self.positions[k] + share * (self.positions[k + 1] - self.positions[k])
+        turned = np.einsum('nji,nj->ni', self.rotations[k], points - position)
+        return turned - share * np.cross(self.turns[k], turned)  # of 1e-3 rad: exact to 1e-6
+
+
+def _frames(truth: Truth, trajectory: Trajectory, instants: Array, world: Array,
+            rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    size = np.array([truth.width, truth.height])
+    center = 0.5 * (size - 1.0)
+    path = _Path(trajectory, instants[0] - 0.1, instants[-1] + 0.15)
+    ids = np.full(len(world), -1, dtype=np.int64)       # track of a point that is followed
+    drift, start = np.zeros((len(world), 2)), np.zeros(len(world))
+    next_id, frame, track, pixels = 0, [], [], []
+    for index, instant in enumerate(instants):
+        rows = np.full(len(world), center[1])
+        for _ in range(3):
+            seen = path.to_camera(world, instant + rows / truth.height * truth.readout_time)
+            depth = np.maximum(seen[:, 2:], 0.1)
+            points = center + truth.focal * seen[:, :2] / depth
+            rows = np.clip(points[:, 1], 0.0, truth.height - 1.0)
+        inside = (points > 2.0).all(axis=1) & (points < size - 3.0).all(axis=1)
+        visible = (seen[:, 2] > 0.3) & inside
+        # A track is lost now and then, even in sight.
+        ids[~visible | (rng.uniform(size=len(world)) < 0.02)] = -1
+        free = truth.features - int((ids >= 0).sum())
+        candidates = np.flatnonzero(visible & (ids < 0))
+        new = rng.permutation(candidates)[:max(free, 0)]
+        ids[new] = next_id + np.arange(len(new))
+        next_id += len(new)
+        # Half of the outliers slide over the scene, the others jump from frame to frame.
+        slides = rng.uniform(size=len(new)) < 0.5 * truth.outliers
+        drift[new] = slides[:, None] * rng.normal(0.0, 80.0, (len(new), 2))
+        start[new] = instant
+        followed = np.flatnonzero(ids >= 0)
+        measured = (points[followed] + drift[followed] * (instant - start[followed])[:, None]
+                    + truth.pixel_noise * rng.standard_normal((len(followed), 2)))
+        jumps = rng.uniform(size=len(followed)) < 0.25 * truth.outliers
+        measured[jumps] += rng.uniform(-50.0, 50.0, (int(jumps.sum()), 2))
+        frame.append(np.full(len(followed), index))
+        track.append(ids[followed])
+        pixels.append(measured)
+    return np.concatenate(frame), np.concatenate(track), np.concatenate(pixels)

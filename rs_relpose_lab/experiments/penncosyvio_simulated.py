@@ -1,0 +1,187 @@
+"""PennCOSYVIO without its images: simulated ones, or points, on its ground-truth trajectories."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_lab.experiments.pair_imu import PairImu
+from rs_relpose_lab.experiments.paper_methods import PairProblem
+from rs_relpose_lab.experiments.paper_scenes import measured, seen_by_both
+from rs_relpose_lab.experiments.penncosyvio import (
+    camera_poses,
+    Pair,
+    pair_problem,
+    PennCosyvioRun,
+    sift_matches,
+    STRETCHES,
+    with_gyro,
+)
+from rs_relpose_lab.experiments.penncosyvio_files import read_camera
+from rs_relpose_lab.experiments.recorded_motion import RecordedMotion
+from rs_relpose_lab.experiments.row_by_row import Motion, Shutter, View
+from rs_relpose_lab.simulation.inertial import ImuModel
+from rs_relpose_lab.simulation.render import Renderer
+from rs_relpose_lab.simulation.scene import make_scene, Scene, SCENES
+from rs_relpose_lab.simulation.trajectory import Trajectory
+from rs_relpose_ros.config.estimator import EstimatorConfig
+from rs_relpose_ros.config.imu import ImuConfig
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.timing import ImageClock, to_nanoseconds
+from rs_relpose_ros.imu.samples import ImuSample
+from rs_relpose_ros.tracking.matches import Matches
+
+Array = NDArray[np.float64]
+
+_IMU_RATE = 200.0
+# Of a small MEMS IMU, as `simulation.SimulationConfig` has it; what a calibration leaves of the
+# gyro's bias is the 0.1 deg/s that the paper gives for a low-cost sensor.
+_GYRO_DENSITY, _ACCEL_DENSITY = 1.7e-4, 2.0e-3
+_BIAS_ERROR = math.radians(0.1)
+_EYE_HEIGHT = 1.6
+# White noise of the rendered images [gray values].
+_IMAGE_NOISE = 2.0
+
+# Independent random streams of one seed.
+_IMU, _POINTS, _NOISE, _SCENE, _IMAGE = range(5)
+
+
+@dataclass(frozen=True, slots=True)
+class Simulated:
+    """What is put in place of the recorded images.
+
+    Attributes
+    ----------
+    rendered : bool
+        Images, of which SIFT features are matched, instead of points.
+    scene : str
+        Name of `simulation.scene.SCENES`, for images.
+    pixel_noise : float
+        Of points, 1 sigma of each coordinate [px].
+    outliers : float
+        Share of the points' matches that are random.
+    """
+
+    rendered: bool = False
+    scene: str = 'yard'
+    pixel_noise: float = 0.5
+    outliers: float = 0.3
+
+    def __post_init__(self) -> None:
+        for name, high in (('pixel_noise', 20.0), ('outliers', 0.95)):
+            if not 0.0 <= getattr(self, name) <= high:
+                raise InputError(f'{name} must be in [0, {high:g}], got {getattr(self, name):g}')
+        if self.scene not in SCENES:
+            raise InputError(f'scene must be one of {SCENES}, got {self.scene!r}')
+
+
+class SimulatedSequence:
+    """A sequence whose camera and IMU are simulated; frame k is taken at the k-th true pose."""
+
+    def __init__(self, folder: Path, name: str, run: PennCosyvioRun,
+                 simulated: Simulated) -> None:
+        self._name, self._run, self._simulated = name, run, simulated
+        self._camera = read_camera(folder, run.camera, run.readout_time, run.stamp_row)
+        poses = camera_poses(folder, name, run.camera)
+        self._stamps_ns = poses.stamps_ns
+        self._motion = RecordedMotion(poses)
+        # The IMU is in the camera: axes and place of the real one would cancel.
+        self._imu = PairImu(self._measure(), np.eye(3), ImageClock(self._camera), ImuConfig())
+        self._scene: Scene | None = None
+        if simulated.rendered:
+            self._scene = make_scene(simulated.scene, self._stream(_SCENE), self._camera.fx)
+
+    def problem(self, pair: Pair) -> PairProblem:
+        """Simulate the pair."""
+        if pair.second > len(self._stamps_ns):
+            raise InputError(f'{self._name} must have a pose {pair.second}, but has '
+                             f'{len(self._stamps_ns)}')
+        stamps = [int(self._stamps_ns[number - 1]) for number in (pair.first, pair.second)]
+        seconds = [self._motion.seconds(stamp) for stamp in stamps]
+        (R1, R2), (p1, p2) = self._motion.at(seconds)
+        truth = (R1.inv() * R2).as_matrix(), R1.inv().apply(p2 - p1)
+        told = EstimatorConfig()
+        if self._scene is None:
+            matches = self._points(pair, seconds)
+            told = EstimatorConfig(pixel_sigma=max(self._simulated.pixel_noise, 0.01))
+        else:
+            matches = self._rendered(self._scene, pair, seconds)
+        return pair_problem(matches, self._camera, self._imu, stamps, truth, told,
+                            with_gyro(self._run))
+
+    def _measure(self) -> tuple[ImuSample, ...]:
+        rng = self._stream(_IMU)
+        times = np.arange(math.ceil(self._motion.span[0] * _IMU_RATE),
+                          math.floor(self._motion.span[1] * _IMU_RATE) + 1) / _IMU_RATE
+        model = ImuModel(np.eye(3), gyro_bias=_BIAS_ERROR * rng.standard_normal(3),
+                         gyro_sigma=_GYRO_DENSITY * math.sqrt(_IMU_RATE),
+                         accel_sigma=_ACCEL_DENSITY * math.sqrt(_IMU_RATE))
+        rates, forces = model.measure(self._motion.states(times), rng)
+        start_ns = int(self._stamps_ns[0])
+        return tuple(ImuSample(start_ns + to_nanoseconds(time), tuple(rate), tuple(force))
+                     for time, rate, force in zip(times.tolist(), rates.tolist(),
+                                                  forces.tolist(), strict=True))
+
+    def _points(self, pair: Pair, seconds: list[float]) -> Matches:
+        view = view_of(self._camera)
+        points = seen_by_both(self._motion_from(seconds[0]), self._motion_from(seconds[1]), view,
+                              self._stream(_POINTS, pair.first))
+        points1, points2 = measured(points, view, self._simulated.pixel_noise,
+                                    self._simulated.outliers, self._stream(_NOISE, pair.first))
+        return Matches(np.arange(len(points1), dtype=np.uint32), points1, points2,
+                       np.ones(len(points1)))
+
+    def _motion_from(self, start: float) -> Motion:
+        """Poses at times that count from a frame's reference row."""
+        return lambda times: self._motion.at(start + times)
+
+    def _rendered(self, scene: Scene, pair: Pair, seconds: list[float]) -> Matches:
+        placed = PlacedMotion(self._motion, seconds[0])
+        # It asks a trajectory for nothing but its poses.
+        renderer = Renderer(scene, self._camera, cast('Trajectory', placed))
+        images = []
+        for number, second in zip((pair.first, pair.second), seconds, strict=True):
+            gray = renderer.render(second)
+            noise = self._stream(_IMAGE, number).standard_normal(gray.shape, dtype=np.float32)
+            images.append(np.clip(np.rint(gray + _IMAGE_NOISE * noise), 0, 255).astype(np.uint8))
+        return sift_matches(*images)
+
+    def _stream(self, *key: int) -> np.random.Generator:
+        return np.random.default_rng((self._run.seed, list(STRETCHES).index(self._name), *key))
+
+
+class PlacedMotion:
+    """Recorded motion that begins at the simulator's eye height at the origin, heading for x.
+
+    Its scenes have one place to look from; turning the world about the vertical changes nothing.
+    """
+
+    def __init__(self, motion: RecordedMotion, start: float) -> None:
+        self._motion = motion
+        orientation, position = motion.at([start])
+        forward = orientation.apply([0.0, 0.0, 1.0])[0]
+        self._turn = Rotation.from_euler('z', -math.atan2(forward[1], forward[0]))
+        self._origin = position[0]
+
+    def poses(self, times: ArrayLike) -> tuple[Array, Array]:
+        """Positions (N, 3) [m] and orientations (N, 3, 3) at times (N,) [s]."""
+        orientations, positions = self._motion.at(times)
+        moved = self._turn.apply(positions - self._origin)
+        moved[:, 2] += _EYE_HEIGHT
+        return moved, (self._turn * orientations).as_matrix()
+
+
+def view_of(camera: RollingShutterCamera) -> View:
+    """A camera, as the simulation of points needs it."""
+    def directions(pixels: Array) -> Array:
+        rays = camera.unproject(pixels)
+        return rays / rays[:, 2:]
+    return View(camera.project, directions, Shutter(
+        camera.width, camera.height, camera.line_delay, camera.reference_row_index))

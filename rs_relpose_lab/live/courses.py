@@ -1,0 +1,316 @@
+"""The live node at camera rate: what it does with the frames, how late, and what it costs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_lab.experiments.cell_names import matching_cells
+from rs_relpose_lab.experiments.tables import write_csv
+from rs_relpose_lab.live.clip import (
+    Clip,
+    configuration,
+    IMU_RATES,
+    imu_topic,
+    PERIOD,
+    seconds_into_loop,
+)
+from rs_relpose_lab.live.process_figures import ProcessFigures
+from rs_relpose_lab.simulation.closed_loop import closed_loop
+from rs_relpose_ros.bags.layout import CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, RAW_TOPIC
+from rs_relpose_ros.estimator.result import Status
+from rs_relpose_ros.front_end.sequencer import Refusal
+from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
+
+if TYPE_CHECKING:   # the rest of this module needs no ROS
+    from rs_relpose_lab.live.measured_run import MeasuredRun, ReceivedPose
+
+Array = NDArray[np.float64]
+
+SIZES = ((640, 480), (1280, 720), (1920, 1080))
+FORMATS = ('mono8', 'bgr8', 'jpeg')
+# Processor time and memory of the node, a line per second; frames.csv and logs lie beside it.
+FIGURES_FILE = 'node.csv'
+# JPEG as the clips have it, which are rich in texture.
+_BYTES_PER_PIXEL = {'mono8': 1.0, 'bgr8': 3.0, 'jpeg': 0.3}
+# Images above this [bytes] do not get through Fast DDS's default transports.
+_BIG_IMAGE = 512 * 1024
+# A pose that is wrong by more than this is no noise [deg].
+_WRONG_ROTATION, _WRONG_TRANSLATION = 1.0, 15.0
+
+
+@dataclass(frozen=True, slots=True)
+class LiveCell:
+    """One camera and IMU.
+
+    Attributes
+    ----------
+    width, height : int
+    image_format : {'mono8', 'bgr8', 'jpeg'}
+        Raw gray, raw colour, or JPEG in colour.
+    imu_rate : int
+        Samples per second.
+    """
+
+    width: int
+    height: int
+    image_format: str
+    imu_rate: int
+
+    @property
+    def name(self) -> str:
+        """Such as ``640x480-mono8-imu200``."""
+        return f'{self.width}x{self.height}-{self.image_format}-imu{self.imu_rate}'
+
+    @property
+    def is_big(self) -> bool:
+        """Whether the images need the Fast DDS profile."""
+        return self.width * self.height * _BYTES_PER_PIXEL[self.image_format] > _BIG_IMAGE
+
+
+CELLS = {cell.name: cell for cell in (
+    LiveCell(width, height, image_format, imu_rate)
+    for width, height in SIZES for image_format in FORMATS for imu_rate in IMU_RATES)}
+
+
+@dataclass(frozen=True, slots=True)
+class Percentiles:
+    """Of some figure; NaN where there is none."""
+
+    p50: float
+    p99: float
+    largest: float
+
+    @classmethod
+    def of(cls, values: Array) -> Percentiles:
+        """Percentiles of values (N,)."""
+        if len(values) == 0:
+            return cls(np.nan, np.nan, np.nan)
+        return cls(*(float(v) for v in np.percentile(values, [50.0, 99.0, 100.0])))
+
+
+@dataclass(frozen=True, slots=True)
+class LiveStatistics:
+    """Figures of one cell; times in ms, memory in MB, errors in degrees.
+
+    Attributes
+    ----------
+    cell : str
+    duration : float
+        Seconds that were played.
+    frames_sent, frames_received, frames_used : int
+        By the player, by the node's callback, and through the whole pipeline.
+    dropped_overload, dropped_other : int
+        Refused by the node because newer frames waited, or for any other cause.
+    imu_sent, imu_received : int
+    pairs, poses : int
+    latency : Percentiles
+        Of a published pair: from the later of image and first IMU sample that covers its last
+        row, as the node's callbacks got them, to publication.
+    end_to_end : Percentiles
+        The same from outside: from the later publication of the two by the player to the receipt
+        of the pose by a third process. No delay inside the node can hide from it.
+    frame_time, frame_cpu : Percentiles
+        Of every frame, pair or not: from its turn to its end, and processor time of the worker.
+    cpu, cpu_callbacks, cpu_player : float
+        Percent of one core: the node, its first thread alone (callbacks), and the player.
+    memory_start, memory_end : float
+        Resident memory of the node after the first pose and at the end.
+    private_start, private_end : float
+        Without what is shared with other processes.
+    seconds_to_ready, seconds_to_pose : float
+        From the start of the node's process to its subscriptions; from the first frame to the
+        first pose.
+    rotation_error, translation_error : Percentiles
+        Against the truth.
+    wrong : int
+        Poses that are off by more than 1 deg, or 15 deg in the direction of translation.
+    player_late : Percentiles
+        How late the player published, on this machine.
+    """
+
+    cell: str
+    duration: float
+    frames_sent: int
+    frames_received: int
+    frames_used: int
+    dropped_overload: int
+    dropped_other: int
+    imu_sent: int
+    imu_received: int
+    pairs: int
+    poses: int
+    latency: Percentiles
+    end_to_end: Percentiles
+    frame_time: Percentiles
+    frame_cpu: Percentiles
+    cpu: float
+    cpu_callbacks: float
+    cpu_player: float
+    memory_start: float
+    memory_end: float
+    private_start: float
+    private_end: float
+    seconds_to_ready: float
+    seconds_to_pose: float
+    rotation_error: Percentiles
+    translation_error: Percentiles
+    wrong: int
+    player_late: Percentiles
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Course:
+    """How latency and memory went over time.
+
+    Attributes
+    ----------
+    latency_seconds, latencies : (N,) ndarray
+        Seconds since the first pair, and ms.
+    memory_seconds, resident, private : (M,) ndarray
+        Seconds likewise, and MB.
+    """
+
+    latency_seconds: Array
+    latencies: Array
+    memory_seconds: Array
+    resident: Array
+    private: Array
+
+
+def select_cells(patterns: Iterable[str]) -> tuple[LiveCell, ...]:
+    """The cells that match any of the patterns, as `matching_cells` has them."""
+    return tuple(CELLS[name] for name in matching_cells(patterns, CELLS))
+
+
+def run_cell(cell: LiveCell, clip: Clip, duration: float, folder: Path, profile: Path,
+             on_second: Callable[[], object] = lambda: None) -> tuple[LiveStatistics, Course]:
+    """Play a clip to a node of its own.
+
+    Parameters
+    ----------
+    cell : LiveCell
+    clip : Clip
+        Of the cell's size.
+    duration : float
+        Seconds to play.
+    folder : Path
+        Directory of logs and tables; made where it is missing.
+    profile : Path
+        Fast DDS profile for big images.
+    on_second : callable
+        Called once a second.
+    """
+    # Here, so that the names of cells are known without ROS.
+    from rs_relpose_lab.live.measured_run import measure, Play
+
+    folder.mkdir(parents=True, exist_ok=True)
+    compressed = cell.image_format == 'jpeg'
+    topics = (COMPRESSED_TOPIC, CAMERA_INFO_TOPIC, imu_topic(cell.imu_rate))
+    player = ['--best-effort', '--loop', str(PERIOD), '--duration', str(duration), '--topics',
+              *topics, *([] if compressed else ['--decode', cell.image_format])]
+    run = measure(Play(
+        clip.bag, clip.parameters,
+        {'image': RAW_TOPIC, 'camera_info': CAMERA_INFO_TOPIC, 'imu': topics[2]},
+        'compressed' if compressed else 'raw', tuple(player), profile if cell.is_big else None),
+        folder, on_second)
+    write_csv(folder / FIGURES_FILE, run.figures)
+    return statistics_of(cell, duration, run), course_of(run)
+
+
+def statistics_of(cell: LiveCell, duration: float, run: MeasuredRun) -> LiveStatistics:
+    """Figures of a run."""
+    frames = _read_frames(run.timings)
+    paired, posed = frames['outcome'] != 'none', frames['outcome'] == Status.OK.value
+    latency = (frames['done_ns'] - frames['ready_ns']) / 1e6
+    log = np.load(run.log)
+    images, imu = log[log['is_image']], log[~log['is_image']]
+    last = run.diagnostics[-1][1]
+    refused = {cause: int(last[f'frames_refused_{cause.value}']) for cause in Refusal}
+    rotation, translation = errors(run.poses)
+    first, end = run.figures[0], run.figures[-1]
+    return LiveStatistics(
+        cell=cell.name, duration=duration, frames_sent=len(images),
+        frames_received=int(last['frames_received']), frames_used=len(frames),
+        dropped_overload=refused.pop(Refusal.OVERLOAD), dropped_other=sum(refused.values()),
+        imu_sent=len(imu), imu_received=int(last['imu_samples']),
+        pairs=int(np.count_nonzero(paired)), poses=len(run.poses),
+        latency=Percentiles.of(latency[posed]),
+        end_to_end=Percentiles.of(_end_to_end(run.poses, images, imu)),
+        frame_time=Percentiles.of((frames['done_ns'] - frames['taken_ns']) / 1e6),
+        frame_cpu=Percentiles.of(frames['cpu_ns'] / 1e6),
+        cpu=_percent(first, end, 'cpu'), cpu_callbacks=_percent(first, end, 'cpu_main'),
+        cpu_player=_percent(run.player_figures[0], run.player_figures[-1], 'cpu'),
+        memory_start=first.resident, memory_end=end.resident, private_start=first.private,
+        private_end=end.private,
+        seconds_to_ready=(run.ready_ns - run.started_ns) / NANOSECONDS,
+        seconds_to_pose=(run.poses[0].received_ns - images['published_ns'][0]) / NANOSECONDS,
+        rotation_error=Percentiles.of(rotation), translation_error=Percentiles.of(translation),
+        wrong=int(np.count_nonzero((rotation > _WRONG_ROTATION)
+                                   | (translation > _WRONG_TRANSLATION))),
+        player_late=Percentiles.of((log['published_ns'] - log['due_ns']) / 1e6))
+
+
+def course_of(run: MeasuredRun) -> Course:
+    """How latency and memory went over time."""
+    frames = _read_frames(run.timings)
+    posed = frames[frames['outcome'] == Status.OK.value]
+    start_ns = posed['ready_ns'][0]
+    return Course(
+        (posed['ready_ns'] - start_ns) / NANOSECONDS,
+        (posed['done_ns'] - posed['ready_ns']) / 1e6,
+        np.array([(f.time_ns - start_ns) / NANOSECONDS for f in run.figures]),
+        np.array([f.resident for f in run.figures]), np.array([f.private for f in run.figures]))
+
+
+def errors(poses: Sequence[ReceivedPose]) -> tuple[Array, Array]:
+    """Errors [deg] of rotation and direction of translation (N,) against the clip's motion."""
+    if not poses:
+        return np.empty(0), np.empty(0)
+    motion = closed_loop(PERIOD)
+    position1, R1 = motion.poses([seconds_into_loop(pose.reference_stamp_ns) for pose in poses])
+    position2, R2 = motion.poses([seconds_into_loop(pose.stamp_ns) for pose in poses])
+    true_R = np.einsum('nji,njk->nik', R1, R2)
+    true_t = np.einsum('nji,nj->ni', R1, position2 - position1)
+    R = Rotation.from_quat([pose.quat_xyzw for pose in poses])
+    rotation = (Rotation.from_matrix(true_R).inv() * R).magnitude()
+    t = np.array([pose.t for pose in poses])
+    cosine = (t * true_t).sum(axis=1) / np.linalg.norm(true_t, axis=1)
+    return np.degrees(rotation), np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def _end_to_end(poses: Sequence[ReceivedPose], images: NDArray[np.void],
+                imu: NDArray[np.void]) -> Array:
+    # A row earlier does not matter: samples are further apart.
+    readout_ns = to_nanoseconds(configuration(*SIZES[0]).readout_time)
+    image_sent = dict(zip(images['stamp_ns'].tolist(), images['published_ns'].tolist(),
+                          strict=True))
+    covering = np.searchsorted(imu['stamp_ns'], [p.stamp_ns + readout_ns for p in poses])
+    return np.array([
+        (pose.received_ns - max(image_sent[pose.stamp_ns], int(imu['published_ns'][k]))) / 1e6
+        for pose, k in zip(poses, covering, strict=True) if k < len(imu)])
+
+
+def _read_frames(path: Path) -> NDArray[np.void]:
+    with path.open(newline='') as file:
+        rows = list(csv.DictReader(file))
+    numbers = ('stamp_ns', 'ready_ns', 'taken_ns', 'done_ns', 'cpu_ns')
+    frames = np.empty(len(rows), dtype=[(name, '<i8') for name in numbers] + [('outcome', 'U24')])
+    for name in numbers:
+        frames[name] = [int(row[name]) for row in rows]
+    frames['outcome'] = [row['outcome'] for row in rows]
+    return frames
+
+
+def _percent(first: ProcessFigures, last: ProcessFigures, name: str) -> float:
+    """Processor time between two instants, in percent of one core."""
+    elapsed = (last.time_ns - first.time_ns) / NANOSECONDS
+    spent = getattr(last, name) - getattr(first, name)
+    return float(100.0 * spent / elapsed) if elapsed > 0.0 else float('nan')

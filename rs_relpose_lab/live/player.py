@@ -1,0 +1,271 @@
+"""Plays a bag into the ROS graph at bag time: a stand-in for camera and IMU drivers.
+
+    python -m rs_relpose_lab.live.player bags/hand_held --wait-for-subscribers 10
+
+For tests, the demo, the live benchmark and machines without ``ros2 bag``. Ends by itself after the
+last message.
+"""
+
+from __future__ import annotations
+
+import argparse
+from array import array
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+import gc
+from pathlib import Path
+import sys
+import time
+
+import cv2
+import numpy as np
+import rclpy
+from rclpy.duration import Duration
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.utilities import remove_ros_args
+from sensor_msgs.msg import CompressedImage, Image
+
+from rs_relpose_lab.live.loop import in_turns, Outgoing, stamp_of
+from rs_relpose_ros.bags.reader import (
+    Bag,
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    IMU,
+    open_bag,
+    RawMessage,
+    Topic,
+)
+from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
+from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
+from rs_relpose_ros.node.message_types import message_class
+
+# When a message was due and when it was published, on the monotonic clock [ns].
+LOG_DTYPE = np.dtype([('is_image', '?'), ('stamp_ns', '<i8'), ('due_ns', '<i8'),
+                      ('published_ns', '<i8')])
+
+# What the node subscribes to, and so what is worth waiting for.
+_SENSOR_TYPES = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, IMU)
+_DEPTH = 1000
+# A subscriber knows of the match a little later than the publisher, and misses what comes before.
+_SETTLE = 0.5
+# Best-effort samples are confirmed by nobody; the last ones need this long to be read.
+_LINGER = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class PlayerOptions:
+    """How a bag is played.
+
+    Parameters
+    ----------
+    bag : Path
+        Rosbag2 directory, MCAP file or ROS 1 bag.
+    rate : float
+        Speed against bag time.
+    best_effort : bool
+        QoS of the publishers; reliable otherwise.
+    decode : {'', 'mono8', 'bgr8'}
+        Publish compressed images raw, in this encoding, on the topic without ``/compressed``.
+    topics : tuple of str
+        Only these topics of the bag; empty for all.
+    wait_for_subscribers : float
+        Longest wait [s] for a subscription to each sensor topic; 0 starts at once.
+    loop : float
+        Repeat a recording without a seam, whose motion has this period [s]: stamps go on from
+        turn to turn. All messages are decoded and serialised ahead. 0 plays the bag as it is.
+    duration : float
+        With `loop`: end after so many seconds.
+    log : Path or None
+        With `loop`: file (NPY) that receives when each image and IMU message was published,
+        records of `LOG_DTYPE`.
+    """
+
+    bag: Path
+    rate: float = 1.0
+    best_effort: bool = False
+    decode: str = ''
+    topics: tuple[str, ...] = ()
+    wait_for_subscribers: float = 0.0
+    loop: float = 0.0
+    duration: float = 60.0
+    log: Path | None = None
+
+
+def play(node: Node, options: PlayerOptions) -> int:
+    """Publish the bag; the number of messages published.
+
+    Raises
+    ------
+    InputError, MissingInputError
+        No bag, no such topic, or no subscriber in time.
+    """
+    with open_bag(options.bag) as bag:
+        topics = _chosen(bag, options)
+        publishers = {topic.name: _publisher(node, topic, options) for topic in topics}
+        messages = _outgoing(bag, topics, options)
+        if options.loop > 0.0:
+            messages = in_turns(list(messages), to_nanoseconds(options.loop),
+                                to_nanoseconds(options.duration))
+            # The sensors' clocks must not stop for a search of so many objects.
+            gc.collect()
+            gc.freeze()
+        if options.wait_for_subscribers > 0.0:
+            _wait_for_subscribers(
+                [publishers[topic.name] for topic in topics if topic.msgtype in _SENSOR_TYPES],
+                options.wait_for_subscribers)
+        return _publish(messages, publishers, options)
+
+
+def _chosen(bag: Bag, options: PlayerOptions) -> list[Topic]:
+    there = {topic.name for topic in bag.topics}
+    for name in options.topics:
+        if name not in there:
+            raise MissingInputError(
+                f'the bag {options.bag} has no topic {name}; it has {", ".join(sorted(there))}')
+    return [topic for topic in bag.topics if not options.topics or topic.name in options.topics]
+
+
+def _publisher(node: Node, topic: Topic, options: PlayerOptions) -> Publisher:
+    name, msgtype = topic.name, topic.msgtype
+    if options.decode and msgtype == COMPRESSED_IMAGE:
+        name, msgtype = name.removesuffix('/compressed'), IMAGE
+    reliability = (ReliabilityPolicy.BEST_EFFORT if options.best_effort
+                   else ReliabilityPolicy.RELIABLE)
+    return node.create_publisher(message_class(msgtype), name, QoSProfile(
+        history=HistoryPolicy.KEEP_LAST, depth=_DEPTH if msgtype == IMU else 10,
+        reliability=reliability))
+
+
+def _wait_for_subscribers(publishers: Sequence[Publisher], seconds: float) -> None:
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline and rclpy.ok():
+        if all(p.get_subscription_count() > 0 for p in publishers):
+            time.sleep(_SETTLE)
+            return
+        time.sleep(0.02)
+    lonely = [p.topic_name for p in publishers if p.get_subscription_count() == 0]
+    if lonely:
+        raise MissingInputError(
+            f'nobody subscribed to {", ".join(lonely)} within {seconds:g} s: start the node '
+            'first, and remap its topics to these names')
+
+
+def _outgoing(bag: Bag, topics: Sequence[Topic], options: PlayerOptions) -> Iterator[Outgoing]:
+    first_ns: int | None = None
+    for raw in bag.raw_messages(topics):
+        if first_ns is None:
+            first_ns = raw.bag_time_ns
+        yield Outgoing(raw.bag_time_ns - first_ns, raw.topic, raw.msgtype,
+                       _serialised(raw, options))
+
+
+def _serialised(raw: RawMessage, options: PlayerOptions) -> bytes:
+    if options.decode and raw.msgtype == COMPRESSED_IMAGE:
+        compressed = deserialize_message(raw.data, message_class(COMPRESSED_IMAGE))
+        return bytes(serialize_message(_decoded(compressed, options.decode)))
+    return bytes(raw.data)
+
+
+def _decoded(compressed: CompressedImage, encoding: str) -> Image:
+    flags = cv2.IMREAD_GRAYSCALE if encoding == 'mono8' else cv2.IMREAD_COLOR
+    pixels = cv2.imdecode(np.frombuffer(compressed.data, np.uint8),
+                          flags | cv2.IMREAD_IGNORE_ORIENTATION)
+    if pixels is None:
+        raise InputError('a compressed image of the bag cannot be decoded: it is corrupt')
+    data = array('B')
+    data.frombytes(pixels.tobytes())
+    return Image(
+        header=compressed.header, height=pixels.shape[0], width=pixels.shape[1],
+        encoding=encoding, step=pixels.shape[1] * pixels[0, 0].size, data=data)
+
+
+def _publish(messages: Iterator[Outgoing], publishers: dict[str, Publisher],
+             options: PlayerOptions) -> int:
+    count = start_ns = 0
+    log: list[tuple[bool, int, int, int]] = []
+    for message in messages:
+        if count == 0:
+            start_ns = time.monotonic_ns() - round(message.due_ns / options.rate)
+        due_ns = start_ns + round(message.due_ns / options.rate)
+        wait_ns = due_ns - time.monotonic_ns()
+        if wait_ns > 0:
+            time.sleep(wait_ns / NANOSECONDS)
+        if not rclpy.ok():
+            break
+        now_ns = time.monotonic_ns()
+        publishers[message.topic].publish(message.data)
+        count += 1
+        if options.log is not None and message.msgtype in (IMAGE, COMPRESSED_IMAGE, IMU):
+            log.append((message.msgtype != IMU, stamp_of(message.data), due_ns, now_ns))
+    if options.log is not None:
+        np.save(options.log, np.array(log, dtype=LOG_DTYPE))
+    if rclpy.ok():
+        for publisher in publishers.values():
+            publisher.wait_for_all_acked(Duration(seconds=1))
+        time.sleep(_LINGER)
+    return count
+
+
+def parse(arguments: Sequence[str]) -> PlayerOptions:
+    """Options of a command line."""
+    parser = argparse.ArgumentParser(
+        prog='player', description='Play a bag into the ROS graph at bag time.')
+    parser.add_argument('bag', type=Path, help='rosbag2 directory, MCAP file or ROS 1 bag')
+    parser.add_argument('--rate', type=_rate, default=1.0, help='speed against bag time')
+    parser.add_argument('--best-effort', action='store_true',
+                        help='best-effort publishers instead of reliable ones')
+    parser.add_argument('--decode', choices=('mono8', 'bgr8'), default='',
+                        help='publish compressed images raw in this encoding')
+    parser.add_argument('--topics', nargs='+', default=(), metavar='TOPIC',
+                        help='only these topics of the bag')
+    parser.add_argument('--wait-for-subscribers', type=float, default=0.0, metavar='SECONDS',
+                        help='longest wait for a subscription to each sensor topic')
+    parser.add_argument('--loop', type=float, default=0.0, metavar='SECONDS',
+                        help='repeat a recording whose motion has this period, without a seam; '
+                             'everything is decoded ahead')
+    parser.add_argument('--duration', type=float, default=60.0, metavar='SECONDS',
+                        help='with --loop: end after so many seconds (default: 60)')
+    parser.add_argument('--log', type=Path, metavar='FILE',
+                        help='with --loop: write when each message was published (NPY)')
+    given = parser.parse_args(arguments)
+    if given.loop < 0.0 or given.duration <= 0.0:
+        parser.error('--loop and --duration must be positive')
+    return PlayerOptions(given.bag, given.rate, given.best_effort, given.decode,
+                         tuple(given.topics), given.wait_for_subscribers, given.loop,
+                         given.duration, given.log)
+
+
+def _rate(text: str) -> float:
+    rate = float(text)
+    if not 0.0 < rate <= 1000.0:
+        raise argparse.ArgumentTypeError(f'must lie in (0, 1000], got {text}')
+    return rate
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; its exit code."""
+    given = sys.argv if arguments is None else ['player', *arguments]
+    options = parse(remove_ros_args(given)[1:])
+    rclpy.init(args=list(given))
+    node = rclpy.create_node('player')
+    try:
+        count = play(node, options)
+        node.get_logger().info(f'played {count} messages of {options.bag}')
+    except RsRelposeError as error:
+        node.get_logger().fatal(str(error))
+        return 2
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return 0
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,395 @@
+"""Rolling-shutter images of a scene: every row is seen from where the camera is at its instant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+import math
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rs_relpose_lab.simulation.scene import Scene
+from rs_relpose_lab.simulation.trajectory import Trajectory
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+
+Array = NDArray[np.float64]
+
+# Pixels whose rays are tried against the same short list of surfaces.
+_TILE = 40
+# A lookup covers a footprint that is this much longer than wide; a longer one takes several.
+_TAP_STRETCH = 1.6
+_MAX_TAPS = 6
+# Slightly sharper than the textbook choice of mip level, whose filter is wider than a pixel.
+_LEVEL_BIAS = -0.35
+_NOTHING = 128.0
+
+# Nothing here lets the compiler fuse operations: the same image on every processor.
+_jit = numba.njit(cache=True, nogil=True, error_model='numpy',
+                  fastmath={'arcp', 'nsz'})
+_inline = numba.njit(cache=True, nogil=True, error_model='numpy', forceinline=True,
+                     fastmath={'arcp', 'nsz'})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Renderer:
+    """Renders a scene as a camera on a trajectory sees it.
+
+    Pixel centres are at integer coordinates; row v is seen at the time of the reference row plus
+    ``camera.row_times(v)``.
+
+    Parameters
+    ----------
+    scene : Scene
+    camera : RollingShutterCamera
+    trajectory : Trajectory
+    edge_samples : int
+        Pixels on the outline of a surface are the mean of this many samples squared.
+    """
+
+    scene: Scene
+    camera: RollingShutterCamera
+    trajectory: Trajectory
+    edge_samples: int = 2
+    _rays: Array = field(init=False, repr=False)
+    _tile_angles: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        u, v = np.meshgrid(np.arange(self.camera.width), np.arange(self.camera.height))
+        rays = self.camera.unproject(np.stack([u.ravel(), v.ravel()], axis=1))
+        if np.isnan(rays).any():
+            raise InputError('the distortion cannot be inverted over the whole image: choose '
+                             'weaker coefficients or a longer focal length')
+        rays = rays.reshape(self.camera.height, self.camera.width, 3)
+        object.__setattr__(self, '_rays', rays)
+        object.__setattr__(self, '_tile_angles', _tile_angles(rays))
+
+    def render(self, reference_time: float) -> NDArray[np.float32]:
+        """Noise-free image (H, W) of gray values 0 to 255.
+
+        Parameters
+        ----------
+        reference_time : float
+            Time of the reference row on the trajectory [s].
+        """
+        positions, rotations = self._row_poses(reference_time)
+        shape = (self.camera.height, self.camera.width)
+        image = np.empty(shape, dtype=np.float32)
+        hits = np.empty(shape, dtype=np.int32)
+        scene = self.scene
+        arrays = (self._rays, self._tile_angles, positions, rotations, scene.corners, scene.across,
+                  scene.down, scene.sizes, scene.texels, scene.pixels, scene.offsets,
+                  scene.shapes, scene.levels, 1.0 / self.camera.fx)
+        _render(*arrays, image, hits)
+        if self.edge_samples > 1:
+            _smooth_edges(*arrays, self.edge_samples, image, hits)
+        return image
+
+    def locate(self, reference_time: float,
+               points: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
+        """What pixels show: world points (N, 3) [m] and indices of surfaces (N,).
+
+        `points` (N, 2) may lie between pixels. Where nothing is hit: NaN and -1.
+        """
+        points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
+        times = reference_time + self.camera.row_times(points[:, 1])
+        positions, rotations = self.trajectory.poses(times)
+        rays = np.einsum('nij,nj->ni', rotations, self.camera.unproject(points))
+        scene = self.scene
+        distances = np.empty(len(points))
+        hits = np.empty(len(points), dtype=np.int64)
+        _trace_all(positions, rays, scene.corners, scene.across, scene.down, scene.sizes,
+                   distances, hits)
+        return positions + distances[:, None] * rays, hits
+
+    def project(self, reference_time: float, world_points: ArrayLike) -> Array:
+        """Pixels (N, 2) at which world points (N, 3) are seen, hidden or not.
+
+        The row decides the instant and the instant the row: a fixed point. NaN where there is
+        none, or behind the camera or beyond half an image outside.
+        """
+        points = np.asarray(world_points, dtype=np.float64).reshape(-1, 3)
+        height = self.camera.height
+        rows = np.full(len(points), height / 2)
+        for _ in range(_FIXED_POINT_STEPS):
+            times = reference_time + self.camera.row_times(np.clip(rows, -0.5 * height,
+                                                                   1.5 * height))
+            positions, rotations = self.trajectory.poses(times)
+            pixels = self.camera.project(
+                np.einsum('nji,nj->ni', rotations, points - positions))
+            change = np.abs(pixels[:, 1] - rows)
+            rows = np.where(np.isnan(pixels[:, 1]), rows, pixels[:, 1])
+            if not np.any(change > 1e-9):
+                break
+        outside = ~(np.abs(pixels[:, 1] - height / 2) < height) | ~(change < 1e-6)
+        pixels[outside] = np.nan
+        return pixels
+
+    def _row_poses(self, reference_time: float) -> tuple[Array, Array]:
+        rows = np.arange(self.camera.height)
+        return self.trajectory.poses(reference_time + self.camera.row_times(rows))
+
+
+_FIXED_POINT_STEPS = 50
+
+
+def _tile_angles(rays: Array) -> Array:
+    """Half angle (H, tiles) [rad] of a cone around each tile's middle ray, with a margin."""
+    height, width = rays.shape[:2]
+    starts = np.arange(0, width, _TILE)
+    angles = np.empty((height, len(starts)))
+    for i, start in enumerate(starts):
+        tile = rays[:, start:start + _TILE]
+        middle = tile[:, tile.shape[1] // 2]
+        cosine = np.einsum('hwi,hi->hw', tile, middle).min(axis=1)
+        # A margin of two pixels for the samples around an outline.
+        pixel = np.linalg.norm(tile[:, 1] - tile[:, 0], axis=1) if tile.shape[1] > 1 else 0.01
+        angles[:, i] = np.arccos(np.minimum(cosine, 1.0)) + 2.0 * pixel
+    return angles
+
+
+# Columns of a face, a surface as seen from one row's position: unit normal, height of the camera
+# above its plane; axes of its texture and the camera's own place along them; size; the surface's
+# index; direction and half angle of a cone around it.
+_NORMAL, _HEIGHT, _ACROSS, _A, _DOWN, _B, _SIZE, _INDEX, _TOWARDS, _ANGLE = (
+    0, 3, 4, 7, 8, 11, 12, 14, 15, 18)
+_FACE_COLUMNS = 19
+
+
+@_inline
+def _dot(x, y, z, faces, i, column):  # type: ignore[no-untyped-def]
+    # Indices, not rows: a view of a row in the innermost loop costs more than the product.
+    return x * faces[i, column] + y * faces[i, column + 1] + z * faces[i, column + 2]
+
+
+@_inline
+def _turned(rotation, x, y, z):  # type: ignore[no-untyped-def]
+    return (rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,
+            rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z,
+            rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z)
+
+
+@_jit
+def _find_faces(position, corners, across, down, sizes, faces):  # type: ignore[no-untyped-def]
+    """Surfaces that turn their face to `position`; fills `faces` and returns their number."""
+    count = 0
+    for s in range(len(corners)):
+        i = count
+        faces[i, _NORMAL] = down[s, 1] * across[s, 2] - down[s, 2] * across[s, 1]
+        faces[i, _NORMAL + 1] = down[s, 2] * across[s, 0] - down[s, 0] * across[s, 2]
+        faces[i, _NORMAL + 2] = down[s, 0] * across[s, 1] - down[s, 1] * across[s, 0]
+        x = position[0] - corners[s, 0]
+        y = position[1] - corners[s, 1]
+        z = position[2] - corners[s, 2]
+        faces[i, _HEIGHT] = _dot(x, y, z, faces, i, _NORMAL)
+        if faces[i, _HEIGHT] <= 0.0:
+            continue
+        for k in range(3):
+            faces[i, _ACROSS + k] = across[s, k]
+            faces[i, _DOWN + k] = down[s, k]
+            faces[i, _TOWARDS + k] = (
+                corners[s, k] - position[k]
+                + 0.5 * (sizes[s, 0] * across[s, k] + sizes[s, 1] * down[s, k]))
+        faces[i, _A] = _dot(x, y, z, faces, i, _ACROSS)
+        faces[i, _B] = _dot(x, y, z, faces, i, _DOWN)
+        faces[i, _SIZE] = sizes[s, 0]
+        faces[i, _SIZE + 1] = sizes[s, 1]
+        faces[i, _INDEX] = s
+        distance = math.sqrt(_dot(faces[i, _TOWARDS], faces[i, _TOWARDS + 1],
+                                  faces[i, _TOWARDS + 2], faces, i, _TOWARDS))
+        radius = 0.5 * math.sqrt(sizes[s, 0] ** 2 + sizes[s, 1] ** 2)
+        faces[i, _ANGLE] = math.asin(radius / distance) if radius < distance else math.pi
+        for k in range(3):
+            faces[i, _TOWARDS + k] /= max(distance, 1e-9)
+        count += 1
+    return count
+
+
+@_jit
+def _shortlist(rotation, ray, half_angle, faces, face_count, chosen):  # type: ignore[no-untyped-def]
+    """Faces that a cone around a ray may hit; fills `chosen` and returns their number."""
+    x, y, z = _turned(rotation, ray[0], ray[1], ray[2])
+    count = 0
+    for i in range(face_count):
+        limit = half_angle + faces[i, _ANGLE]
+        if limit >= math.pi or _dot(x, y, z, faces, i, _TOWARDS) >= math.cos(limit):
+            chosen[count] = i
+            count += 1
+    return count
+
+
+@_inline
+def _trace(x, y, z, faces, chosen, count):  # type: ignore[no-untyped-def]
+    """Nearest hit of a ray (x, y, z): face (-1 for none), distance, texture place a, b [m]."""
+    best = np.inf
+    hit = -1
+    hit_a = 0.0
+    hit_b = 0.0
+    for k in range(count):
+        i = chosen[k]
+        approach = -_dot(x, y, z, faces, i, _NORMAL)
+        if approach <= 0.0:
+            continue
+        distance = faces[i, _HEIGHT] / approach
+        if distance >= best:
+            continue
+        a = faces[i, _A] + distance * _dot(x, y, z, faces, i, _ACROSS)
+        if a < 0.0 or a > faces[i, _SIZE]:
+            continue
+        b = faces[i, _B] + distance * _dot(x, y, z, faces, i, _DOWN)
+        if b < 0.0 or b > faces[i, _SIZE + 1]:
+            continue
+        best = distance
+        hit = i
+        hit_a = a
+        hit_b = b
+    return hit, best, hit_a, hit_b
+
+
+@_inline
+def _bilinear(pixels, offset, height, width, x, y):  # type: ignore[no-untyped-def]
+    """Gray value between texels, clamped at the border."""
+    x = min(max(x, 0.0), width - 1.0)
+    y = min(max(y, 0.0), height - 1.0)
+    j = min(int(x), width - 2)
+    i = min(int(y), height - 2)
+    fx = x - j
+    fy = y - i
+    # Unsigned, or every access asks whether the index counts from the end.
+    upper_left = np.uintp(offset + i * width + j)
+    lower_left = np.uintp(offset + i * width + j + width)
+    one = np.uintp(1)
+    left = np.float64(pixels[upper_left])
+    upper = left + fx * (pixels[upper_left + one] - left)
+    left = np.float64(pixels[lower_left])
+    lower = left + fx * (pixels[lower_left + one] - left)
+    return upper + fy * (lower - upper)
+
+
+@_inline
+def _shade(faces, i, distance, a, b, x, y, z, pixel_angle, texels, pixels, offsets, shapes,  # type: ignore[no-untyped-def]
+           levels):
+    """Gray value of a pixel's footprint: trilinear lookups along its longer axis."""
+    s = int(faces[i, _INDEX])
+    minor = distance * pixel_angle
+    major = minor / max(-_dot(x, y, z, faces, i, _NORMAL), 1e-3)
+    taps = min(int(math.ceil(major / (_TAP_STRETCH * minor))), _MAX_TAPS)  # noqa: RUF046
+    # The footprint is stretched along the ray's trace on the surface.
+    da = _dot(x, y, z, faces, i, _ACROSS)
+    db = _dot(x, y, z, faces, i, _DOWN)
+    norm = math.sqrt(da * da + db * db)
+    if norm > 1e-9:
+        da *= major / norm
+        db *= major / norm
+    texel_a = texels[s, 0]
+    texel_b = texels[s, 1]
+    level = math.log2(max(minor, major / taps) / texel_a) + _LEVEL_BIAS
+    level = min(max(level, 0.0), levels[s] - 1.0)
+    low = int(level)
+    high = min(low + 1, levels[s] - 1)
+    mix = level - low
+    scale_low = 1.0 / (1 << low)
+    scale_high = 1.0 / (1 << high)
+    total = 0.0
+    for tap in range(taps):
+        along = (tap + 0.5) / taps - 0.5
+        column = (a + along * da) / texel_a - 0.5
+        row = (b + along * db) / texel_b - 0.5
+        value = _bilinear(pixels, offsets[s, low], shapes[s, low, 0], shapes[s, low, 1],
+                          column * scale_low, row * scale_low)
+        if mix > 0.0:
+            other = _bilinear(pixels, offsets[s, high], shapes[s, high, 0], shapes[s, high, 1],
+                              column * scale_high, row * scale_high)
+            value += mix * (other - value)
+        total += value
+    return total / taps
+
+
+@_jit
+def _render(rays, tile_angles, positions, rotations, corners, across, down, sizes, texels, pixels,  # type: ignore[no-untyped-def]
+            offsets, shapes, levels, pixel_angle, image, hits):
+    """Fill `image` and the index of the surface that every pixel shows."""
+    height, width = image.shape
+    faces = np.empty((len(corners) + 1, _FACE_COLUMNS))
+    chosen = np.empty(len(corners), dtype=np.int64)
+    for v in range(height):
+        rotation = rotations[v]
+        face_count = _find_faces(positions[v], corners, across, down, sizes, faces)
+        for tile in range(tile_angles.shape[1]):
+            start = tile * _TILE
+            end = min(start + _TILE, width)
+            count = _shortlist(rotation, rays[v, start + (end - start) // 2], tile_angles[v, tile],
+                               faces, face_count, chosen)
+            for u in range(start, end):
+                x, y, z = _turned(rotation, rays[v, u, 0], rays[v, u, 1], rays[v, u, 2])
+                hit, distance, a, b = _trace(x, y, z, faces, chosen, count)
+                if hit < 0:
+                    hits[v, u] = -1
+                    image[v, u] = _NOTHING
+                else:
+                    hits[v, u] = int(faces[hit, _INDEX])
+                    image[v, u] = _shade(faces, hit, distance, a, b, x, y, z,
+                                         pixel_angle * rays[v, u, 2], texels, pixels, offsets,
+                                         shapes, levels)
+
+
+@_jit
+def _smooth_edges(rays, tile_angles, positions, rotations, corners, across, down, sizes, texels,  # type: ignore[no-untyped-def]
+                  pixels, offsets, shapes, levels, pixel_angle, samples, image, hits):
+    """Replace pixels on outlines by the mean of samples within them, at their row's instant."""
+    height, width = image.shape
+    faces = np.empty((len(corners) + 1, _FACE_COLUMNS))
+    chosen = np.empty(len(corners), dtype=np.int64)
+    ray = np.empty(3)
+    for v in range(height):
+        rotation = rotations[v]
+        above = max(v - 1, 0)
+        below = min(v + 1, height - 1)
+        face_count = -1
+        listed = -1
+        count = 0
+        for u in range(width):
+            left = max(u - 1, 0)
+            right = min(u + 1, width - 1)
+            here = hits[v, u]
+            if (hits[above, u] == here and hits[below, u] == here and hits[v, left] == here
+                    and hits[v, right] == here):
+                continue
+            if face_count < 0:
+                face_count = _find_faces(positions[v], corners, across, down, sizes, faces)
+            tile = u // _TILE
+            if tile != listed:
+                start = tile * _TILE
+                end = min(start + _TILE, width)
+                count = _shortlist(rotation, rays[v, start + (end - start) // 2],
+                                   tile_angles[v, tile], faces, face_count, chosen)
+                listed = tile
+            total = 0.0
+            for i in range(samples):
+                dv = ((i + 0.5) / samples - 0.5) / max(below - above, 1)
+                for j in range(samples):
+                    du = ((j + 0.5) / samples - 0.5) / max(right - left, 1)
+                    for k in range(3):
+                        ray[k] = (rays[v, u, k] + du * (rays[v, right, k] - rays[v, left, k])
+                                  + dv * (rays[below, u, k] - rays[above, u, k]))
+                    x, y, z = _turned(rotation, ray[0], ray[1], ray[2])
+                    hit, distance, a, b = _trace(x, y, z, faces, chosen, count)
+                    if hit < 0:
+                        total += _NOTHING
+                    else:
+                        total += _shade(faces, hit, distance, a, b, x, y, z, pixel_angle * ray[2],
+                                        texels, pixels, offsets, shapes, levels)
+            image[v, u] = total / (samples * samples)
+
+
+@_jit
+def _trace_all(positions, rays, corners, across, down, sizes, distances, hits):  # type: ignore[no-untyped-def]
+    """Nearest hits of rays (N, 3) in the world from positions (N, 3)."""
+    faces = np.empty((len(corners) + 1, _FACE_COLUMNS))
+    every = np.arange(len(corners))
+    for n in range(len(rays)):
+        count = _find_faces(positions[n], corners, across, down, sizes, faces)
+        hit, distance, _, _ = _trace(rays[n, 0], rays[n, 1], rays[n, 2], faces, every, count)
+        hits[n] = int(faces[hit, _INDEX]) if hit >= 0 else -1
+        distances[n] = distance if hit >= 0 else np.nan

@@ -1,0 +1,207 @@
+"""A simulated recording: frames, IMU and truth of one configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rs_relpose_lab.simulation.config import SimulationConfig
+from rs_relpose_lab.simulation.hand_held import hand_held, Plan
+from rs_relpose_lab.simulation.inertial import ImuModel
+from rs_relpose_lab.simulation.render import Renderer
+from rs_relpose_lab.simulation.scene import make_scene, Scene
+from rs_relpose_lab.simulation.trajectory import CameraStates, Trajectory
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
+
+Array = NDArray[np.float64]
+
+# IMU and truth begin and end this long before the first and after the last row [s].
+_MARGIN = 0.1
+_MOTION_MARGIN = 0.5
+
+# Independent random streams of one seed: what one of them draws leaves the others alone.
+_MOTION, _SCENE, _IMU, _BIAS, _IMAGE = range(5)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuSeries:
+    """IMU samples, IMU frame.
+
+    Attributes
+    ----------
+    stamps_ns : (N,) ndarray of int64
+        On the IMU clock.
+    angular_velocities : (N, 3) ndarray
+        [rad/s].
+    linear_accelerations : (N, 3) ndarray
+        Specific force [m/s^2].
+    """
+
+    stamps_ns: NDArray[np.int64]
+    angular_velocities: Array
+    linear_accelerations: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SimulatedFrame:
+    """An image and its instants.
+
+    Attributes
+    ----------
+    index : int
+    stamp_ns : int
+        Header stamp, camera clock.
+    reference_ns : int
+        Instant of the stamped row on the IMU clock.
+    image : (H, W) ndarray of uint8
+    """
+
+    index: int
+    stamp_ns: int
+    reference_ns: int
+    image: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TruePose:
+    """Relative pose of two frames' stamped rows: ``X1 = R X2 + t``.
+
+    Attributes
+    ----------
+    R : (3, 3) ndarray
+    t : (3,) ndarray
+        [m], camera 1.
+    linear_velocity1, linear_velocity2 : (3,) ndarray
+        [m/s], each in its own camera's frame.
+    angular_velocity1, angular_velocity2 : (3,) ndarray
+        [rad/s], likewise.
+    """
+
+    R: Array
+    t: Array
+    linear_velocity1: Array
+    linear_velocity2: Array
+    angular_velocity1: Array
+    angular_velocity2: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Simulation:
+    """What `simulate` returns; images are rendered when asked for."""
+
+    config: SimulationConfig
+    camera: RollingShutterCamera
+    trajectory: Trajectory
+    renderer: Renderer
+    imu: ImuSeries
+    calibrated_gyro_bias: Array
+
+    # -- frames ------------------------------------------------------------------------------
+
+    def reference_ns(self, index: int) -> int:
+        """Instant of frame `index`'s stamped row on the IMU clock [ns]."""
+        return self.config.start_ns + round(index * 1e9 / self.config.fps)
+
+    def stamp_ns(self, index: int) -> int:
+        """Header stamp of frame `index`, camera clock [ns]."""
+        return self.reference_ns(index) - to_nanoseconds(self.config.time_offset)
+
+    def frame(self, index: int) -> SimulatedFrame:
+        """Render frame `index`."""
+        reference_ns = self.reference_ns(index)
+        gray = self.renderer.render(self.seconds(reference_ns))
+        rng = _stream(self.config.seed, _IMAGE, index)
+        gray = gray + np.float32(self.config.pixel_noise) * rng.standard_normal(
+            gray.shape, dtype=np.float32)
+        image = np.clip(np.rint(gray), 0, 255).astype(np.uint8)
+        return SimulatedFrame(index, self.stamp_ns(index), reference_ns, image)
+
+    def frames(self) -> Iterator[SimulatedFrame]:
+        """Render every frame in turn."""
+        for index in range(self.config.frame_count):
+            yield self.frame(index)
+
+    # -- truth -------------------------------------------------------------------------------
+
+    def seconds(self, instant_ns: int) -> float:
+        """Time on the trajectory of an instant on the IMU clock [s]."""
+        return seconds_between(self.config.start_ns, instant_ns)
+
+    def states(self, instants_ns: ArrayLike) -> CameraStates:
+        """True poses and derivatives at instants (N,) on the IMU clock [ns]."""
+        offsets = np.atleast_1d(np.asarray(instants_ns, dtype=np.int64)) - self.config.start_ns
+        return self.trajectory.states(offsets * 1e-9)
+
+    def true_pose(self, reference1_ns: int, reference2_ns: int) -> TruePose:
+        """Relative pose of the camera at two instants on the IMU clock."""
+        states = self.states([reference1_ns, reference2_ns])
+        R1, R2 = states.R_world_cam
+        return TruePose(
+            R=R1.T @ R2, t=R1.T @ (states.position[1] - states.position[0]),
+            linear_velocity1=R1.T @ states.velocity[0], linear_velocity2=R2.T @ states.velocity[1],
+            angular_velocity1=states.angular_velocity[0],
+            angular_velocity2=states.angular_velocity[1])
+
+    def true_matches(self, index1: int, index2: int, points1: ArrayLike) -> Array:
+        """Where frame `index2` shows what frame `index1` shows at `points1` (N, 2) [px].
+
+        NaN for a point that is hidden or outside of frame `index2`.
+        """
+        first, second = (self.seconds(self.reference_ns(i)) for i in (index1, index2))
+        world, _ = self.renderer.locate(first, points1)
+        points2 = self.renderer.project(second, world)
+        size = (self.camera.width, self.camera.height)
+        inside = np.all((points2 > -0.5) & (points2 < np.subtract(size, 0.5)), axis=1)
+        seen, _ = self.renderer.locate(second, np.where(inside[:, None], points2, 0.0))
+        visible = inside & (np.linalg.norm(seen - world, axis=1) < 1e-3)
+        points2[~visible] = np.nan
+        return points2
+
+
+def simulate(config: SimulationConfig | None = None, *, scene: Scene | None = None,
+             trajectory: Trajectory | None = None) -> Simulation:
+    """Set up a recording; nothing is rendered yet.
+
+    Parameters
+    ----------
+    config : SimulationConfig, optional
+        Defaults where omitted.
+    scene, trajectory : optional
+        Instead of those that the configuration describes.
+    """
+    config = SimulationConfig() if config is None else config
+    camera = config.camera
+    before = -camera.row_time_span[0] + _MARGIN
+    after = config.frame_count / config.fps + camera.row_time_span[1] + _MARGIN
+    if trajectory is None:
+        rng = _stream(config.seed, _MOTION)
+        plan = Plan.parse(config.plan) if config.plan else Plan.drawn(rng, config.duration)
+        speed, rotation_rate = rng.uniform(1.5, 1.8), math.radians(rng.uniform(25.0, 45.0))
+        # Wider than any camera needs: the motion must not depend on read-out or stamped row.
+        trajectory = hand_held(rng, -_MOTION_MARGIN, config.duration + _MOTION_MARGIN, plan,
+                               speed=config.speed or speed,
+                               rotation_rate=config.rotation_rate or rotation_rate)
+    if scene is None:
+        scene = make_scene(config.scene, _stream(config.seed, _SCENE), config.fx)
+    renderer = Renderer(scene, camera, trajectory, config.edge_samples)
+    model = ImuModel(
+        config.R_cam_imu, config.lever_arm, config.gyro_bias, config.accel_bias,
+        config.gyro_noise_density * math.sqrt(config.imu_rate),
+        config.accel_noise_density * math.sqrt(config.imu_rate))
+    samples = np.arange(math.ceil(-before * config.imu_rate),
+                        math.floor(after * config.imu_rate) + 1)
+    offsets_ns = np.rint(samples * (1e9 / config.imu_rate)).astype(np.int64)
+    gyro, accel = model.measure(trajectory.states(offsets_ns * 1e-9), _stream(config.seed, _IMU))
+    bias_error = config.gyro_bias_error * _stream(config.seed, _BIAS).standard_normal(3)
+    return Simulation(config, camera, trajectory, renderer,
+                      ImuSeries(config.start_ns + offsets_ns, gyro, accel),
+                      np.array(config.gyro_bias) + bias_error)
+
+
+def _stream(seed: int, *key: int) -> np.random.Generator:
+    return np.random.default_rng((seed, *key))

@@ -1,0 +1,165 @@
+"""Tracks and gyro of a bag, for `rs_relpose_ros.calibrate.procedure.calibrate`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import logging
+from typing import Any
+
+from rs_relpose_ros.bags.reader import Bag, COMPRESSED_IMAGE, SensorTopics
+from rs_relpose_ros.calibrate.follow import PointFollower
+from rs_relpose_ros.calibrate.gyro_path import GyroSeries
+from rs_relpose_ros.calibrate.procedure import CalibrationConfig
+from rs_relpose_ros.calibrate.tracks import Tracks
+from rs_relpose_ros.config.tracking import TrackingConfig
+from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.intrinsics import Calibration
+from rs_relpose_ros.messages.incoming import (
+    calibration_from_info,
+    image_from_compressed,
+    image_from_message,
+    imu_sample_from_message,
+    stamp_ns,
+)
+
+# Guess of an unknown focal length, share of the longer side: 64 deg of view.
+_FOCAL_GUESS = 0.8
+
+# What KLT adds to the errors of a calibration, found on rendered bags: its errors are not
+# independent from frame to frame.
+TRACKED_IN_IMAGES = CalibrationConfig(
+    tracking_time_sigma=5e-5, tracking_rotation_sigma=1e-3, tracking_bias_sigma=2.5e-4)
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording:
+    """What a calibration needs of a bag.
+
+    Attributes
+    ----------
+    tracks : Tracks
+        Pixels of the full sensor.
+    gyro : GyroSeries
+    camera : RollingShutterCamera
+        Of the full sensor, its read-out time 0.
+    focal_known : bool
+        Whether the CameraInfo has intrinsics; else `camera` is a guess.
+    unused : dict
+        Number of messages that were not used, by the sentence that says why.
+    """
+
+    tracks: Tracks
+    gyro: GyroSeries
+    camera: RollingShutterCamera
+    focal_known: bool
+    unused: dict[str, int]
+
+
+def read_recording(bag: Bag, topics: SensorTopics, tracking: TrackingConfig | None = None, *,
+                   on_image: Callable[[], object] = lambda: None) -> Recording:
+    """Follow points through the images of a bag, and collect its gyro.
+
+    Parameters
+    ----------
+    bag : Bag
+        Open.
+    topics : SensorTopics
+    tracking : TrackingConfig, optional
+        KLT is used whatever its detector.
+    on_image : callable
+        Called after each image, for a progress bar.
+
+    Raises
+    ------
+    InputError, MissingInputError
+        The bag is damaged, or has no usable image or no gyro.
+    """
+    reader = _Reader(topics, TrackingConfig() if tracking is None else tracking)
+    for message in bag.messages([topics.image, topics.camera_info, topics.imu]):
+        reader.take(message.topic, message.message)
+        if message.topic == topics.image.name:
+            on_image()
+    return reader.recording()
+
+
+class _Reader:
+    def __init__(self, topics: SensorTopics, tracking: TrackingConfig) -> None:
+        self._topics = topics
+        self._follower = PointFollower(tracking)
+        self._calibration: Calibration | None = None
+        self._uncalibrated = False
+        self._size: tuple[int, int] | None = None
+        self._gyro: dict[int, tuple[float, float, float]] = {}
+        self._unused: dict[str, int] = {}
+
+    def take(self, topic: str, msg: Any) -> None:
+        try:
+            if topic == self._topics.imu.name:
+                sample = imu_sample_from_message(msg)
+                if sample.angular_velocity is None:
+                    raise MissingInputError('an IMU message has no gyro')
+                self._gyro.setdefault(sample.stamp_ns, sample.angular_velocity)
+            elif topic == self._topics.camera_info.name:
+                self._take_info(msg)
+            else:
+                self._take_image(msg)
+        except RsRelposeError as error:
+            reason = f'{topic}: {error}'
+            if reason not in self._unused:
+                _logger.info('not used: %s', reason)
+            self._unused[reason] = self._unused.get(reason, 0) + 1
+
+    def _take_info(self, msg: Any) -> None:
+        k = msg.k if hasattr(msg, 'k') else msg.K
+        if float(k[0]) == 0.0:
+            self._uncalibrated = True
+        else:
+            self._calibration = calibration_from_info(msg)
+
+    def _take_image(self, msg: Any) -> None:
+        stamp = stamp_ns(msg.header)
+        last = self._follower.last_stamp_ns
+        if last is not None and stamp <= last:
+            raise InputError('the stamp of an image is not later than that of the one before')
+        if self._topics.image.msgtype == COMPRESSED_IMAGE:
+            image = image_from_compressed(msg)
+        else:
+            image = image_from_message(msg)
+        self._follower.add(stamp, image)
+        self._size = image.shape[1], image.shape[0]
+
+    def recording(self) -> Recording:
+        images, imu = self._topics.image.name, self._topics.imu.name
+        why = ''.join(f'; {reason}' for reason in list(self._unused)[:2])
+        if self._size is None:
+            raise InputError(f'no image of {images} can be used{why}')
+        if not self._gyro:
+            raise MissingInputError(f'no message of {imu} has a gyro{why}: record the angular '
+                                    'velocity together with the images')
+        camera = self._camera(self._size)
+        calibration = self._calibration
+        tracks = (self._follower.tracks() if calibration is None
+                  else self._follower.tracks(calibration.to_sensor))
+        return Recording(tracks, GyroSeries.by_stamp(self._gyro), camera,
+                         calibration is not None, self._unused)
+
+    def _camera(self, size: tuple[int, int]) -> RollingShutterCamera:
+        calibration = self._calibration
+        if calibration is not None:
+            if size != (calibration.image_width, calibration.image_height):
+                raise InputError(
+                    f'the images are {size[0]}x{size[1]}, but the CameraInfo is for '
+                    f'{calibration.image_width}x{calibration.image_height}: a resized image '
+                    'needs a CameraInfo of its own')
+            return calibration.global_shutter_camera()
+        if not self._uncalibrated:
+            raise MissingInputError(f'no message of {self._topics.camera_info.name} can be used'
+                                    + ''.join(f'; {reason}' for reason in list(self._unused)[:2]))
+        guess = _FOCAL_GUESS * max(size)
+        return RollingShutterCamera(
+            width=size[0], height=size[1], fx=guess, fy=guess, cx=0.5 * (size[0] - 1),
+            cy=0.5 * (size[1] - 1), readout_time=0.0)

@@ -1,0 +1,186 @@
+"""A calibration in words, as the node's parameter file, as JSON and as a picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure as Picture
+import numpy as np
+
+from rs_relpose_ros.calibrate.axis_maps import axes_text
+from rs_relpose_ros.calibrate.result import AXES, CalibrationResult, Estimate
+from rs_relpose_ros.config.commented_file import Figure, parameter_text
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.picture_files import save_picture
+
+_BLUE, _ORANGE = '#0072B2', '#E69F00'
+_MS = 1e3
+
+
+def report(result: CalibrationResult, camera: RollingShutterCamera) -> list[str]:
+    """Lines for a reader: each figure with its 1 sigma and its verdict."""
+    readout, offset = result.readout_time, result.time_offset
+    rates = ', '.join(f'{axis} {np.degrees(rate):.1f}'
+                      for axis, rate in zip(AXES, result.rotation_rates, strict=True))
+    lines = [
+        (f'{result.frames} frames, {result.pairs} pairs, {result.matches} matches; '
+         f'{100 * result.inlier_ratio:.0f} % inliers, noise of a match '
+         f'{result.pixel_sigma:.2f} px'),
+        f'rotation of the camera, rms [deg/s]: {rates}',
+        f'shutter: {shutter_text(result)}',
+        _line('read-out time', f'{_MS * abs(readout.value):.2f} +- {_MS * readout.sigma:.2f} ms'
+              + (', read upwards' if _upwards(result) else ''), readout),
+        _line('time offset (row 0)', f'{_MS * offset.value:.2f} +- {_MS * offset.sigma:.2f} ms',
+              offset)]
+    if result.offset_by_interval is not None:
+        slope = result.offset_by_interval
+        lines.append(_line(
+            'offset by interval', f'{slope.value:.3f} +- {slope.sigma:.3f} ms per ms of the '
+            f'interval to the next frame ({exposure_text(slope)})', slope))
+    sigmas = ', '.join(f'{np.degrees(sigma):.3f}' for sigma in result.rotation_sigma)
+    lines += [
+        _line('rotation IMU to camera', f'{axes_text(result.axis_map)}, and '
+              f"{np.degrees(result.rotation.value):.2f} deg off it; 1 sigma about the camera's "
+              f'x, y, z: {sigmas} deg', result.rotation),
+        '  quaternion x y z w: ' + ', '.join(f'{v:.6f}' for v in result.quat_cam_imu_xyzw)]
+    lines += [
+        _line(f'gyro bias {axis}', f'{bias.value:.5f} +- {bias.sigma:.5f} rad/s', bias)
+        for axis, bias in zip('xyz', result.gyro_bias, strict=True)]
+    if result.focal_factor is not None:
+        focal = result.focal_factor
+        lines.append(_line('focal length', f'{camera.fx * focal.value:.1f} +- '
+                           f'{camera.fx * focal.sigma:.1f} px (CameraInfo has none: write it '
+                           'there)', focal))
+    lines += [f'note: {warning}' for warning in result.warnings]
+    return lines
+
+
+def shutter_text(result: CalibrationResult) -> str:
+    """Rolling or global, and how sure."""
+    readout = result.readout_time
+    sigmas = abs(readout.value) / max(readout.sigma, 1e-9)
+    at_zero = float(np.interp(0.0, result.curve.readout_times, result.curve.costs))
+    if result.shutter == 'rolling':
+        return (f'rolling: the read-out time is {sigmas:.0f} sigma from 0, and the log-likelihood '
+                f'of a global shutter is lower by {at_zero:.0f}')
+    if result.shutter == 'global':
+        return (f'global: the read-out time is {_MS * readout.value:.2f} +- '
+                f'{_MS * readout.sigma:.2f} ms')
+    return (f'not sure: {_MS * readout.value:.2f} +- {_MS * readout.sigma:.2f} ms; record longer, '
+            'and turn faster')
+
+
+def exposure_text(slope: Estimate) -> str:
+    """What a dependence of the offset on the frame interval means."""
+    if abs(slope.value) < 3.0 * slope.sigma:
+        return 'none that is sure'
+    return 'the stamp moves with the exposure'
+
+
+def parameter_file(result: CalibrationResult, title: str, *, compressed: bool,
+                   feature_rows: tuple[float, ...] = (0.0, 0.0)) -> str:
+    """The node's parameter file; figures that are not observable are left out, and named."""
+    readout, offset = result.readout_time, result.time_offset
+    figures = [Figure('image_transport', 'compressed' if compressed else 'raw',
+                      'As the bag has them.')]
+    missing = []
+    if readout.observable:
+        global_shutter = result.shutter == 'global'
+        figures.append(Figure(
+            'readout_time', 0.0 if global_shutter else round(abs(readout.value), 6),
+            f'{_capital(shutter_text(result))}. Estimate {_MS * readout.value:.2f} +- '
+            f'{_MS * readout.sigma:.2f} ms (1 sigma).'))
+        figures.append(Figure('readout_direction',
+                              'up' if _upwards(result) and not global_shutter else 'down',
+                              'By the sign of that estimate.'))
+    else:
+        missing.append(f'readout_time ({readout.remark})')
+    if offset.observable:
+        figures.append(Figure('stamp_row', 'first', 'Convention of time_offset here.'))
+        figures.append(Figure('time_offset', round(offset.value, 6),
+                              f'1 sigma {_MS * offset.sigma:.2f} ms.'))
+    else:
+        missing.append(f'time_offset ({offset.remark})')
+    if result.rotation.observable:
+        figures.append(Figure(
+            'quat_cam_imu_xyzw', tuple(round(v, 7) for v in result.quat_cam_imu_xyzw),
+            f'{axes_text(result.axis_map)}, {np.degrees(result.rotation.value):.2f} deg off; '
+            f'1 sigma {np.degrees(result.rotation.sigma):.3f} deg at most.'))
+    else:
+        missing.append(f'quat_cam_imu_xyzw ({result.rotation.remark})')
+    if all(bias.observable for bias in result.gyro_bias):
+        figures.append(Figure(
+            'gyro_bias', tuple(round(bias.value, 5) for bias in result.gyro_bias), '1 sigma '
+            + ', '.join(f'{bias.sigma:.5f}' for bias in result.gyro_bias) + ' rad/s.'))
+    else:
+        missing.append('gyro_bias')
+    if feature_rows[1] > 0.0:
+        figures.append(Figure('feature_rows', tuple(feature_rows), 'As given to calibrate.'))
+    if missing:
+        title += ' Not observable in this recording, so left out: ' + '; '.join(missing) + '.'
+    return parameter_text(title, figures)
+
+
+def as_mapping(result: CalibrationResult, camera: RollingShutterCamera) -> dict[str, Any]:
+    """The result for a JSON file; seconds, radians, pixels."""
+    def told(estimate: Estimate) -> dict[str, Any]:
+        return {'value': estimate.value, 'sigma': estimate.sigma,
+                'observable': estimate.observable, 'remark': estimate.remark}
+    focal = None
+    if result.focal_factor is not None:
+        focal = told(result.focal_factor)
+        focal['value'] *= camera.fx
+        focal['sigma'] *= camera.fx
+    return {
+        'observable': result.observable, 'shutter': result.shutter,
+        'readout_time_s': told(result.readout_time), 'time_offset_s': told(result.time_offset),
+        'offset_by_interval': None if result.offset_by_interval is None
+        else told(result.offset_by_interval),
+        'quat_cam_imu_xyzw': list(result.quat_cam_imu_xyzw),
+        'rotation_sigma_rad': result.rotation_sigma.tolist(),
+        'rotation_from_axis_map_rad': told(result.rotation),
+        'axis_map': result.axis_map.tolist(),
+        'gyro_bias_rad_per_s': [told(bias) for bias in result.gyro_bias], 'focal_px': focal,
+        'rotation_rate_rms_rad_per_s': result.rotation_rates.tolist(),
+        'frames': result.frames, 'pairs': result.pairs, 'matches': result.matches,
+        'inlier_ratio': result.inlier_ratio, 'pixel_sigma': result.pixel_sigma,
+        'frame_interval_s': result.frame_interval, 'warnings': list(result.warnings),
+        'cost_over_readout': {'readout_s': result.curve.readout_times.tolist(),
+                              'cost': result.curve.costs.tolist()}}
+
+
+def draw_curve(result: CalibrationResult, path: Path) -> None:
+    """Cost over the read-out time."""
+    picture = Picture(figsize=(7.5, 4.5), dpi=110, layout='constrained')
+    axes = picture.subplots()
+    readout = result.readout_time
+    # A parabola's root: straight on both sides of the best, so that a few points draw it.
+    axes.plot(_MS * result.curve.readout_times, np.sqrt(2.0 * result.curve.costs), 'o-',
+              color=_BLUE)
+    axes.axvline(0.0, color='0.6', linewidth=0.8)
+    axes.axvline(_MS * readout.value, color=_ORANGE,
+                 label=f'{_MS * readout.value:.2f} +- {_MS * readout.sigma:.2f} ms')
+    axes.axvspan(_MS * (readout.value - 3 * readout.sigma),
+                 _MS * (readout.value + 3 * readout.sigma), color=_ORANGE, alpha=0.25,
+                 label='3 sigma')
+    axes.set_ylim(bottom=0.0)
+    axes.set_xlabel('read-out time [ms], negative: upwards; to +- one frame interval')
+    axes.set_ylabel('cost: sqrt(2 x log-likelihood lost) [sigma]')
+    axes.set_title(f'{result.shutter} shutter; everything else fitted anew at each point')
+    axes.legend()
+    axes.grid(alpha=0.3)
+    save_picture(picture, path)
+
+
+def _upwards(result: CalibrationResult) -> bool:
+    return result.readout_time.value < 0.0
+
+
+def _line(name: str, text: str, estimate: Estimate) -> str:
+    verdict = 'observable' if estimate.observable else f'NOT OBSERVABLE: {estimate.remark}'
+    return f'{name}: {text} [{verdict}]'
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]

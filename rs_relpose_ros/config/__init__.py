@@ -1,0 +1,1 @@
+"""Every setting: declarations, configuration classes, parameter files."""

@@ -1,0 +1,105 @@
+"""Parameters of the node from a ROS parameter file and from the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from rs_relpose_ros.config.declarations import Declared
+from rs_relpose_ros.config.parameters import Parameters
+from rs_relpose_ros.errors import InputError, MissingInputError
+
+_NODE = 'relpose_node'
+# Parameters of every ROS node, which mean nothing offline.
+_ROS_OWN = ('use_sim_time', 'start_type_description_service')
+# No parameter file comes near this size.
+_MAX_BYTES = 1 << 20
+
+
+def read_parameters(path: Path | str | None, assignments: Sequence[str] = ()) -> Parameters:
+    """Parameters at their defaults, then from a file, then from ``NAME=VALUE`` assignments.
+
+    Parameters
+    ----------
+    path : path-like or None
+        As ``ros2 run --params-file`` takes it: ``/**`` or the node's name, then
+        ``ros__parameters``.
+    assignments : sequence of str
+        Values in YAML, such as ``gyro_bias=[0.01, 0, 0]``.
+
+    Raises
+    ------
+    InputError, MissingInputError
+        The file is absent or no parameter file; an unknown name (with near matches) or an illegal
+        value.
+    """
+    parameters = Parameters()
+    if path is not None:
+        values = _values(Path(path))
+        try:
+            parameters = parameters.updated(_converted(values))
+        except InputError as error:
+            raise InputError(f'{path}: {error}') from error
+    given = {}
+    for assignment in assignments:
+        name, separator, text = assignment.partition('=')
+        if not separator or not name:
+            raise InputError(f'--set takes NAME=VALUE, got {assignment!r}')
+        try:
+            given[name.strip()] = yaml.safe_load(text)
+        except (yaml.YAMLError, RecursionError):
+            raise InputError(f'--set {name}: the value {text!r} is no YAML') from None
+    return parameters.updated(_converted(given))
+
+
+def _values(path: Path) -> dict[str, Any]:
+    """Flat values of a parameter file that are meant for the node."""
+    if not path.is_file():
+        raise MissingInputError(f'there is no parameter file {path}')
+    if path.stat().st_size > _MAX_BYTES:
+        raise InputError(f'{path} is no parameter file: it has more than {_MAX_BYTES} bytes')
+    try:
+        text = path.read_text(encoding='utf-8')
+        # Aliases of aliases, printed in an error, have no end; ROS does not know them either.
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
+            raise InputError(f'{path} has YAML aliases, which parameter files must not have')
+        document = yaml.safe_load(text)
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f'{path} is no YAML file: {error}') from error
+    if not isinstance(document, dict):
+        raise InputError(f'{path} is no ROS parameter file: it must begin with "/**:" and '
+                         '"ros__parameters:"')
+    values: dict[str, Any] = {}
+    for node in document:
+        if node in ('/**', _NODE) or str(node).endswith(f'/{_NODE}'):
+            section = document[node]
+            inner = section.get('ros__parameters') if isinstance(section, dict) else None
+            if not isinstance(inner, dict):
+                raise InputError(f'{path}: below {node!r} there must be "ros__parameters:" with '
+                                 'names and values')
+            values |= {str(name): value for name, value in inner.items()
+                       if name not in _ROS_OWN and not str(name).startswith('qos_overrides')}
+    if not values:
+        raise InputError(f'{path} has no parameters for {_NODE}: they must stand below "/**:" or '
+                         f'"{_NODE}:" and "ros__parameters:"')
+    return values
+
+
+def _converted(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Lists to tuples, and 1e-5 to a number as in ROS (to PyYAML it is a text)."""
+    declared = {name: declaration for name, _, declaration in Parameters.declarations()}
+    return {name: _convert(value, declared.get(name)) for name, value in values.items()}
+
+
+def _convert(value: Any, declared: Declared | None) -> Any:
+    if isinstance(value, list):
+        return tuple(_convert(item, declared) for item in value)
+    if isinstance(value, str) and declared is not None and declared.kind in (float, tuple):
+        try:
+            return float(value)
+        except ValueError:
+            return value
+    return value

@@ -1,0 +1,94 @@
+"""Numbers in text files, each error with its file and line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+import math
+from pathlib import Path
+
+from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.geometry.timing import NANOSECONDS
+
+# Far above any log of a few minutes; what is bigger is another file.
+_MAX_BYTES = 1 << 28
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """The words of one line of a table."""
+
+    path: Path
+    line: int
+    words: tuple[str, ...]
+
+    def error(self, what: str) -> InputError:
+        """An error that says where it is."""
+        return InputError(f'{self.path}, line {self.line}: {what}')
+
+    def real(self, column: int) -> float:
+        """A finite number."""
+        try:
+            value = float(self.words[column])
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise self.error(f'column {column + 1} must be a finite number, got '
+                             f'{self.words[column][:40]!r}')
+        return value
+
+    def reals(self, first: int, count: int) -> tuple[float, ...]:
+        """`count` finite numbers from column `first` on."""
+        return tuple(self.real(column) for column in range(first, first + count))
+
+    def nanoseconds(self, column: int) -> int:
+        """A stamp [ns] that is written as such."""
+        text = self.words[column]
+        if not (text.isascii() and text.isdigit()):
+            raise self.error(f'column {column + 1} must be a stamp in nanoseconds, an integer, '
+                             f'got {text[:40]!r}')
+        return int(text)
+
+    def seconds_as_nanoseconds(self, column: int) -> int:
+        """A stamp [ns] that is written in decimal seconds; rounded, never a float on the way."""
+        text = self.words[column]
+        try:
+            seconds = Decimal(text)
+        except InvalidOperation:
+            seconds = Decimal('NaN')
+        # The seconds of a ROS stamp are an int32.
+        if not seconds.is_finite() or not 0 <= seconds < 2**31:
+            raise self.error(f'column {column + 1} must be a stamp in seconds, got {text[:40]!r}')
+        return int((seconds * NANOSECONDS).to_integral_value())
+
+
+def read_rows(path: Path, columns: int, separator: str | None = None) -> Iterator[Row]:
+    """Lines of a text file, without the empty ones and those that begin with '#'.
+
+    Parameters
+    ----------
+    path : Path
+    columns : int
+        Number of columns that every line must have.
+    separator : str, optional
+        White space by default.
+
+    Raises
+    ------
+    InputError, MissingInputError
+        No such file, or a line with another number of columns.
+    """
+    if not path.is_file():
+        raise MissingInputError(f'{path.name} is missing: there is no file {path}')
+    if path.stat().st_size > _MAX_BYTES:
+        raise InputError(f'{path} has more than {_MAX_BYTES} bytes: it is another file')
+    with path.open(encoding='utf-8', errors='replace') as file:
+        for number, line in enumerate(file, start=1):
+            text = line.strip()
+            if not text or text.startswith('#'):
+                continue
+            row = Row(path, number, tuple(word.strip() for word in text.split(separator)))
+            if len(row.words) != columns:
+                raise row.error(f'there must be {columns} columns, got {len(row.words)}')
+            yield row

@@ -1,0 +1,106 @@
+"""The relative pose of two frames, or the reason why there is none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.geometry.so3 import skew
+
+Array = NDArray[np.float64]
+
+
+class Status(str, Enum):
+    """Outcome of a frame pair; only `OK` carries a full pose."""
+
+    OK = 'OK'
+    TOO_FEW_MATCHES = 'TOO_FEW_MATCHES'
+    NO_CONSENSUS = 'NO_CONSENSUS'
+    LOW_PARALLAX = 'LOW_PARALLAX'
+    PURE_ROTATION = 'PURE_ROTATION'
+    BAD_INPUT = 'BAD_INPUT'
+    NO_IMU = 'NO_IMU'
+
+
+def _nan(*shape: int) -> Array:
+    return np.full(shape, np.nan)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RelativePose:
+    """Pose of camera 2 in camera 1, ``X1 = R X2 + t`` with ``|t| = 1``; falsy without a pose.
+
+    Attributes
+    ----------
+    status : Status
+        `PURE_ROTATION` still fills `R` and its part of `covariance`.
+    reason : str
+        One sentence; empty when there is a pose.
+    R : (3, 3) ndarray
+        ``R_1^T R_2``, between the two frames' reference rows.
+    t : (3,) ndarray
+        Unit direction of ``R_1^T (p_2 - p_1)``; NaN where it is not known.
+    linear_velocity1, linear_velocity2 : (3,) ndarray
+        Each in its own camera's frame [baselines per second].
+    angular_velocity1, angular_velocity2 : (3,) ndarray
+        As corrected by the estimate [rad/s], each in its own camera's frame.
+    inliers : (N,) ndarray of bool
+        One per match.
+    covariance : (6, 6) ndarray
+        Of ``(dt, dtheta)`` with ``t_true = t + dt`` (dt perpendicular to t) and
+        ``R_true = Exp(dtheta) R``, both in camera 1.
+    velocity_covariance : (6, 6) ndarray
+        Of `linear_velocity2` and `angular_velocity2`, in camera 2.
+    model : str
+        'uniform', 'angular', 'linear' or 'global'.
+    velocity_sigma : float
+        Prior sigma of the linear velocities that was used [baselines per second].
+    iterations : int
+        Hypothesis samples drawn.
+    residual_rms : float
+        Root mean square Sampson error of the inliers [px].
+    duration : float
+        Time of the estimate [s].
+    """
+
+    status: Status
+    reason: str = ''
+    R: Array = field(default_factory=lambda: _nan(3, 3))
+    t: Array = field(default_factory=lambda: _nan(3))
+    linear_velocity1: Array = field(default_factory=lambda: _nan(3))
+    linear_velocity2: Array = field(default_factory=lambda: _nan(3))
+    angular_velocity1: Array = field(default_factory=lambda: _nan(3))
+    angular_velocity2: Array = field(default_factory=lambda: _nan(3))
+    inliers: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    covariance: Array = field(default_factory=lambda: _nan(6, 6))
+    velocity_covariance: Array = field(default_factory=lambda: _nan(6, 6))
+    model: str = ''
+    velocity_sigma: float = float('nan')
+    iterations: int = 0
+    residual_rms: float = float('nan')
+    duration: float = float('nan')
+
+    def __bool__(self) -> bool:
+        """Whether there is a pose."""
+        return self.status is Status.OK
+
+    def inverse(self) -> RelativePose:
+        """Pose of camera 1 in camera 2, covariance and velocities exchanged accordingly."""
+        R_inv = self.R.T
+        # t' = -R^T t: dt' = -R^T (dt + t x dtheta); theta' = -R^T theta.
+        tx = skew(self.t)
+        jacobian = np.zeros((6, 6))
+        jacobian[:3, :3] = -R_inv
+        jacobian[:3, 3:] = -R_inv @ tx
+        jacobian[3:, 3:] = -R_inv
+        return RelativePose(
+            status=self.status, reason=self.reason, R=R_inv, t=-R_inv @ self.t,
+            linear_velocity1=self.linear_velocity2, linear_velocity2=self.linear_velocity1,
+            angular_velocity1=self.angular_velocity2, angular_velocity2=self.angular_velocity1,
+            inliers=self.inliers, covariance=jacobian @ self.covariance @ jacobian.T,
+            model=self.model, velocity_sigma=self.velocity_sigma, iterations=self.iterations,
+            residual_rms=self.residual_rms, duration=self.duration)
+

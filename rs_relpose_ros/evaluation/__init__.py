@@ -1,1 +1,0 @@
-"""The experiments of the paper: synthetic figures, and the PennCOSYVIO data set."""

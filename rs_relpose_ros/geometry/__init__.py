@@ -1,0 +1,1 @@
+"""Rotations, camera models, intrinsics, row times and the motion of a frame."""

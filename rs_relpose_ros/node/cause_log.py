@@ -1,0 +1,46 @@
+"""Log lines once per cause: the first at once, repetitions now and then with their number."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import threading
+import time
+
+from rs_relpose_ros.messages.causes import cause_of, MOST_CAUSES
+
+
+class CauseLog:
+    """Passes a text on unless its like was passed on shortly before; thread-safe.
+
+    Parameters
+    ----------
+    write : callable
+        Receives the text, e.g. a logger's ``warning``.
+    period : float
+        Shortest time [s] between two texts of one cause.
+    clock : callable
+        Monotonic seconds; for tests.
+    """
+
+    def __init__(self, write: Callable[[str], object], period: float = 30.0,
+                 clock: Callable[[], float] = time.monotonic) -> None:
+        self._write = write
+        self._period = period
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._last: dict[str, tuple[float, int]] = {}
+
+    def __call__(self, text: str) -> None:
+        """Log `text`, or count it."""
+        cause = cause_of(text)
+        now = self._clock()
+        with self._lock:
+            if cause not in self._last and len(self._last) >= MOST_CAUSES:
+                cause, text = '', 'further problems of other kinds (see /diagnostics)'
+            last = self._last.get(cause)
+            if last is not None and now - last[0] < self._period:
+                self._last[cause] = (last[0], last[1] + 1)
+                return
+            self._last[cause] = (now, 0)
+        repeated = f' ({last[1]} more since the last such line)' if last and last[1] else ''
+        self._write(text + repeated)

@@ -1,0 +1,212 @@
+"""What the node tells of itself: figures collected as they come, and a report once a second."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+import threading
+import time
+
+import numpy as np
+
+from rs_relpose_ros.front_end.drift import Drift
+from rs_relpose_ros.front_end.pair import PairResult
+from rs_relpose_ros.front_end.sequencer import Refusal, SequencerCounts
+from rs_relpose_ros.geometry.timing import NANOSECONDS
+
+OK, WARN, ERROR = 0, 1, 2
+
+# Pairs that the latency, and frames that the time of a frame is taken from.
+_RECENT_PAIRS = 300
+_RECENT_FRAMES = 900
+# An input that is silent for so long is missing.
+SILENCE = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """A diagnostic status: level, one sentence, and the figures in the order to show them."""
+
+    level: int
+    text: str
+    values: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """What has come so far; of each topic the number of messages."""
+
+    images: int
+    camera_infos: int
+    imu: int
+    accelerometer: int
+    invalid: int
+
+
+class Statistics:
+    """Figures of the node; thread-safe.
+
+    Parameters
+    ----------
+    clock : callable
+        Monotonic time [ns]; for tests.
+    """
+
+    def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._latencies: deque[float] = deque(maxlen=_RECENT_PAIRS)
+        self._pairs = self._poses = self._failures = 0
+        self._last_pair: PairResult | None = None
+        self._last_pose: PairResult | None = None
+        self._last_no_pose = ''
+        self._since_ns = clock()
+        self._counted = Inputs(0, 0, 0, 0, 0)
+        self._refused_before = self._overload_before = 0
+        self._frame_times: deque[float] = deque(maxlen=_RECENT_FRAMES)
+        self._busy_ns = 0
+        self._last_input_ns: dict[str, int] = {}
+
+    def add_frame(self, taken_ns: int) -> None:
+        """Count a frame; call it when all is done for it.
+
+        Parameters
+        ----------
+        taken_ns : int
+            When the worker took it, on the monotonic clock.
+        """
+        spent_ns = self._clock() - taken_ns
+        with self._lock:
+            self._frame_times.append(spent_ns / NANOSECONDS)
+            self._busy_ns += spent_ns
+
+    def add_pair(self, result: PairResult, ready_ns: int) -> None:
+        """Count a pair; call it right after its publication.
+
+        Parameters
+        ----------
+        result : PairResult
+        ready_ns : int
+            When everything that the pair needs had come, on the monotonic clock.
+        """
+        now_ns = self._clock()
+        with self._lock:
+            self._pairs += 1
+            self._last_pair = result
+            if result.pose:
+                self._poses += 1
+                self._last_pose = result
+                self._latencies.append((now_ns - ready_ns) / NANOSECONDS)
+            else:
+                self._last_no_pose = f'{result.pose.status.value}: {result.pose.reason}'
+
+    def add_failure(self, reason: str) -> None:
+        """Count a frame whose processing failed."""
+        with self._lock:
+            self._failures += 1
+            self._last_no_pose = reason
+
+    def report(self, inputs: Inputs, counts: SequencerCounts | None, *, problem: str,
+               missing: tuple[str, ...]) -> Report:
+        """The state since the last report.
+
+        Parameters
+        ----------
+        inputs : Inputs
+        counts : SequencerCounts or None
+            None while nothing is estimated.
+        problem : str
+            Why nothing can be estimated, told by the node; empty for none.
+        missing : tuple of str
+            Names of parameters and inputs that are missing.
+        """
+        now_ns = self._clock()
+        with self._lock:
+            elapsed = max((now_ns - self._since_ns) / NANOSECONDS, 1e-3)
+            rates = {name: (getattr(inputs, name) - getattr(self._counted, name)) / elapsed
+                     for name in ('images', 'camera_infos', 'imu', 'accelerometer')}
+            self._since_ns, self._counted = now_ns, inputs
+            refused = {} if counts is None else dict(counts.refused)
+            dropped = sum(refused.values()) - self._refused_before
+            self._refused_before = sum(refused.values())
+            overload = refused.get(Refusal.OVERLOAD, 0) - self._overload_before
+            self._overload_before = refused.get(Refusal.OVERLOAD, 0)
+            busy, self._busy_ns = self._busy_ns / NANOSECONDS / elapsed, 0
+            level, text = self._judge(problem, dropped, overload)
+            last, pose = self._last_pair, self._last_pose
+            latency, frame_time = _milliseconds(self._latencies), _milliseconds(self._frame_times)
+            values = [
+                ('state', {OK: 'ok', WARN: 'degraded', ERROR: 'not estimating'}[level]),
+                ('missing', ', '.join(missing)),
+                ('image_rate_hz', f'{rates["images"]:.1f}'),
+                ('camera_info_rate_hz', f'{rates["camera_infos"]:.1f}'),
+                ('imu_rate_hz', f'{rates["imu"]:.1f}'),
+                ('accel_rate_hz', f'{rates["accelerometer"]:.1f}'),
+                ('frames_received', str(counts.frames if counts else inputs.images)),
+                ('frames_processed', str(counts.frames_taken if counts else 0)),
+                *((f'frames_refused_{cause.value}', str(refused.get(cause, 0)))
+                  for cause in Refusal),
+                ('frames_failed', str(self._failures)),
+                ('messages_invalid', str(inputs.invalid)),
+                ('imu_samples', str(counts.imu_samples if counts else 0)),
+                ('imu_gaps', str(counts.imu_gaps if counts else 0)),
+                ('imu_repeated', str(counts.imu_repeated if counts else 0)),
+                ('imu_late', str(counts.imu_late if counts else 0)),
+                ('clock_jumps', str(counts.clock_jumps if counts else 0)),
+                ('pairs', str(self._pairs)),
+                ('poses', str(self._poses)),
+                ('matches', str(len(last.pose.inliers)) if last else ''),
+                ('inliers', str(int(last.pose.inliers.sum())) if last else ''),
+                ('inlier_ratio', f'{_inlier_ratio(last):.3f}' if last else ''),
+                ('parallax_px', f'{last.parallax:.1f}' if last else ''),
+                ('model', pose.pose.model if pose else ''),
+                *_drift_values(last.drift if last else None),
+                ('latency_p50_ms', latency[0]),
+                ('latency_p99_ms', latency[1]),
+                ('frame_time_p50_ms', frame_time[0]),
+                ('frame_time_p99_ms', frame_time[1]),
+                ('worker_busy_percent', f'{100.0 * busy:.0f}'),
+                ('last_reason_no_pose', self._last_no_pose),
+            ]
+        return Report(level, text, tuple(values))
+
+    def _judge(self, problem: str, dropped: int, overload: int) -> tuple[int, str]:
+        if problem:
+            return ERROR, problem
+        if overload > 0:
+            return WARN, (f'{dropped} frames were not used since the last report, {overload} of '
+                          'them because the worker is too slow for the camera')
+        if dropped > 0:
+            return WARN, f'{dropped} frames were not used since the last report'
+        last = self._last_pair
+        if last is None:
+            return OK, 'no keyframe pair yet'
+        if not last.pose:
+            return WARN, f'no pose of the last pair: {self._last_no_pose}'
+        return OK, f'estimating: {self._poses} poses of {self._pairs} pairs'
+
+
+def _milliseconds(seconds: Collection[float]) -> tuple[str, str]:
+    """Median and 99th percentile; empty where there is none."""
+    if not seconds:
+        return '', ''
+    median, p99 = 1e3 * np.percentile(list(seconds), (50, 99))
+    return f'{median:.1f}', f'{p99:.1f}'
+
+
+def _inlier_ratio(result: PairResult) -> float:
+    return float(result.pose.inliers.mean()) if len(result.pose.inliers) else 0.0
+
+
+def _drift_values(drift: Drift | None) -> tuple[tuple[str, str], ...]:
+    """Bias and time offset as tracked; to be compared with the parameters."""
+    names = ('tracked_gyro_bias_rad_s', 'tracked_gyro_bias_sigma_rad_s', 'tracked_time_offset_ms',
+             'tracked_time_offset_sigma_ms', 'applied_time_offset_ms')
+    if drift is None or not drift.pairs:
+        return tuple((name, '') for name in names)
+    texts = (' '.join(f'{value:.5f}' for value in drift.gyro_bias),
+             ' '.join(f'{value:.5f}' for value in drift.gyro_bias_sigma),
+             *(f'{1e3 * seconds:.2f}' for seconds in (
+                 drift.time_offset, drift.time_offset_sigma, drift.applied)))
+    return tuple(zip(names, texts, strict=True))

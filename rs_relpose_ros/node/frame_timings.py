@@ -1,0 +1,53 @@
+"""When each frame was ready, taken and done: a line per frame, for measurements."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import time
+
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.front_end.pair import PairResult
+from rs_relpose_ros.front_end.sequencer import ReadyFrame
+
+COLUMNS = ('stamp_ns', 'ready_ns', 'taken_ns', 'done_ns', 'cpu_ns', 'outcome')
+# The frame closed no pair.
+NO_PAIR = 'none'
+
+
+class FrameTimings:
+    """Writes the file of the parameter `timings_file`; to be used by the worker thread.
+
+    Of each frame: its stamp; on the monotonic clock when it was `ready` (the later of image and
+    the IMU sample that covers its last row had come), `taken` from the mailbox and `done` (after
+    publication); processor time that the thread spent since the frame before; the status of the
+    pair that it closed, or ``none``.
+
+    Raises
+    ------
+    InputError
+        The file cannot be written.
+    """
+
+    def __init__(self, path: str) -> None:
+        try:
+            self._file = Path(path).open('w', buffering=1, encoding='ascii')  # noqa: SIM115
+        except OSError as error:
+            raise InputError(f'timings_file {path} cannot be written: {error.strerror}') from error
+        self._file.write(','.join(COLUMNS) + '\n')
+        self._spent_ns = 0
+
+    def start(self) -> None:
+        """What the thread did until now belongs to no frame."""
+        self._spent_ns = time.thread_time_ns()
+
+    def add(self, ready: ReadyFrame, result: PairResult | None) -> None:
+        """Write a frame; call it right after its result was published."""
+        done_ns, spent_ns = time.monotonic_ns(), time.thread_time_ns()
+        outcome = NO_PAIR if result is None else result.pose.status.value
+        self._file.write(f'{ready.frame.stamp_ns},{ready.ready_ns},{ready.taken_ns},{done_ns},'
+                         f'{spent_ns - self._spent_ns},{outcome}\n')
+        self._spent_ns = spent_ns
+
+    def close(self) -> None:
+        """No more frames."""
+        self._file.close()

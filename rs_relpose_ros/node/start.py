@@ -1,0 +1,39 @@
+"""Entry of the console script: a signal ends the node quietly even while it still imports.
+
+Imports nothing heavy itself. Before rclpy runs, SIGINT would end the process with a traceback and
+SIGTERM with a signal's exit code.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from types import FrameType
+from typing import NoReturn
+
+_started = False
+
+
+def main() -> NoReturn:
+    """Run the node, and end the process with its exit code."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _on_signal)
+    from rs_relpose_ros.node.node import leave
+    from rs_relpose_ros.node.node import main as run
+    leave(run(on_started=_on_started))
+
+
+def _on_started() -> None:
+    """From here on rclpy's own handlers end the node; they call this one too."""
+    global _started
+    _started = True
+
+
+def _on_signal(number: int, frame: FrameType | None) -> None:
+    if not _started:
+        # Nothing was begun that would need an end.
+        os._exit(0)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,6 +1,0 @@
-"""Simulated recordings: rolling-shutter images and IMU along a known motion."""
-
-from rs_relpose_ros.simulation.config import SimulationConfig
-from rs_relpose_ros.simulation.simulation import simulate, Simulation
-
-__all__ = ['Simulation', 'SimulationConfig', 'simulate']
