@@ -239,9 +239,9 @@ def _run_speed(args: argparse.Namespace) -> int:
 def _run_live(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
-    from rs_relpose_lab.live.clip import FPS, PERIOD, prepare_clip
-    from rs_relpose_lab.live.courses import run_cell, select_cells
-    from rs_relpose_lab.live.report import write_report, write_soak_report
+    from rs_relpose_lab.experiments.live import run_cell, select_cells
+    from rs_relpose_lab.experiments.live_clip import FPS, PERIOD, prepare_clip
+    from rs_relpose_lab.experiments.live_report import write_report, write_soak_report
 
     # Shorter than a turn of the motion, hardly anything is measured.
     _check_at_least(5, args, 'duration')

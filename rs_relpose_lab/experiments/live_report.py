@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_lab.experiments.live import Course, LiveStatistics, Percentiles
 from rs_relpose_lab.experiments.tables import markdown_table, write_csv
-from rs_relpose_lab.live.courses import Course, LiveStatistics, Percentiles
 from rs_relpose_ros.picture_files import save_picture
 
 REPORT_FILE, STATISTICS_FILE = 'live.md', 'live.csv'

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.experiments.cell_names import matching_cells
-from rs_relpose_lab.experiments.tables import write_csv
-from rs_relpose_lab.live.clip import (
+from rs_relpose_lab.experiments.live_clip import (
     Clip,
     configuration,
     IMU_RATES,
@@ -22,6 +21,7 @@ from rs_relpose_lab.live.clip import (
     PERIOD,
     seconds_into_loop,
 )
+from rs_relpose_lab.experiments.tables import write_csv
 from rs_relpose_lab.live.process_figures import ProcessFigures
 from rs_relpose_lab.simulation.closed_loop import closed_loop
 from rs_relpose_ros.bags.layout import CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, RAW_TOPIC
