@@ -12,10 +12,8 @@ import pytest
 import ros_graph
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_lab.experiments import live, live_clip, live_report
 from rs_relpose_lab.experiments.live import Course, LiveCell, Percentiles
-from rs_relpose_lab.live import clip as live_clip
-from rs_relpose_lab.live import courses as live
-from rs_relpose_lab.live import report as live_report
 from rs_relpose_lab.live.loop import in_turns, Outgoing, stamp_of
 from rs_relpose_lab.live.measured_run import ReceivedPose
 from rs_relpose_lab.live.process_figures import process_figures
