@@ -21,7 +21,7 @@ from rs_relpose_ros.bags.reader import Bag, open_bag, TopicOptions
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
-from rs_relpose_ros.messages.incoming import calibration_from_info, imu_sample_from_message
+from rs_relpose_ros.messages.incoming import imu_sample_from_message, intrinsics_from_info
 
 STAMP_NS = 1_700_000_000_123_456_789
 IMAGE, INFO, IMU, POSE = (
@@ -132,7 +132,7 @@ def check_content(bag: Bag) -> None:
     sample = imu_sample_from_message(read[2].message)
     assert sample.angular_velocity == (pytest.approx(0.3), 0.2, 0.3)
     assert sample.linear_acceleration == (0.0, 0.5, 9.8)
-    calibration = calibration_from_info(read[1].message)
+    calibration = intrinsics_from_info(read[1].message)
     assert (calibration.fx, calibration.cy, calibration.distortion) == (5.0, 2.5, (0.0,) * 5)
     np.testing.assert_array_equal(read[3].message.data.reshape(6, 8), PIXELS)
     for array in (read[3].message.data, read[2].message.orientation_covariance):

@@ -19,9 +19,9 @@ from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.convert import xiaomi
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.messages.incoming import (
-    calibration_from_info,
     image_from_compressed,
     imu_sample_from_message,
+    intrinsics_from_info,
     stamp_ns,
 )
 
@@ -115,7 +115,7 @@ def test_realsense_folder(tmp_path):
     check_delays(read, 28 * MILLISECOND)
     check_images(read, [folder / 'images' / f'{stamp}.jpg' for stamp in REALSENSE_STAMPS],
                  REALSENSE_STAMPS)
-    calibration = calibration_from_info(read['/camera/camera_info'][0].message)
+    calibration = intrinsics_from_info(read['/camera/camera_info'][0].message)
     assert (calibration.width, calibration.height) == (64, 48)
     assert (calibration.fx, calibration.fy, calibration.cx, calibration.cy) == (
         60.5, 61.5, 32.25, 24.75)
@@ -141,7 +141,7 @@ def test_xiaomi_folder(tmp_path):
     check_delays(read, 31_100_000)
     check_images(read, [folder / 'images' / f'RE_frame-{number}.jpg' for number in (2, 3)],
                  [4_328_040_459_559_000, 4_328_040_492_872_000])
-    calibration = calibration_from_info(read['/camera/camera_info'][0].message)
+    calibration = intrinsics_from_info(read['/camera/camera_info'][0].message)
     assert (calibration.width, calibration.height, calibration.fx, calibration.cy) == (
         800, 600, 573.8534, 309.0112)
     samples = [imu_sample_from_message(message.message) for message in read['/imu/data_raw']]

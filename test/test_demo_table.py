@@ -28,7 +28,7 @@ from rs_relpose_lab.experiments.opencv_baseline import (
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
-from rs_relpose_ros.geometry.intrinsics import Calibration
+from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.replay.record import pair_record
 from rs_relpose_ros.replay.run import ReplayedPair
 from rs_relpose_ros.replay.tables import relative_pose_cells, RELATIVE_POSE_COLUMNS, TableWriter
@@ -41,7 +41,7 @@ SIZE = {'width': 640, 'height': 480}
 INTRINSICS = {'fx': 450.0, 'fy': 452.0, 'cx': 322.0, 'cy': 238.0,
               'distortion': (-0.12, 0.05, 0.0008, -0.0005, 0.0)}
 CAMERA = RollingShutterCamera(**SIZE, **INTRINSICS, readout_time=0.0)
-CALIBRATION = Calibration(**SIZE, **INTRINSICS, image_width=640, image_height=480)
+CALIBRATION = Intrinsics(**SIZE, **INTRINSICS, image_width=640, image_height=480)
 # Camera 2 is half a metre to the right of camera 1, a little ahead, and turned.
 R_TRUE = Rotation.from_rotvec([0.02, -0.08, 0.03]).as_matrix()
 T_TRUE = np.array([0.5, 0.05, 0.1])

@@ -5,9 +5,9 @@ import pytest
 
 from rs_relpose_ros import FrameMotion, RollingShutterCamera
 from rs_relpose_ros.front_end.derotated_rays import DerotatedRays
-from rs_relpose_ros.geometry.intrinsics import Calibration
+from rs_relpose_ros.geometry.intrinsics import Intrinsics
 
-CALIBRATION = Calibration(width=640, height=480, fx=450.0, fy=450.0, cx=320.0, cy=240.0,
+CALIBRATION = Intrinsics(width=640, height=480, fx=450.0, fy=450.0, cx=320.0, cy=240.0,
                           distortion_model='plumb_bob', distortion=(-0.2, 0.05, 0.0, 0.0),
                           image_width=640, image_height=480)
 CAMERA = RollingShutterCamera(width=640, height=480, fx=450.0, fy=450.0, cx=320.0, cy=240.0,

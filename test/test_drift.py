@@ -16,7 +16,7 @@ from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.front_end.drift import DriftTracker, OFFSET_SIGMA, PairRotation
 from rs_relpose_ros.front_end.frame import Frame
 from rs_relpose_ros.front_end.sequencer import Refusal, Sequencer
-from rs_relpose_ros.geometry.intrinsics import Calibration
+from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.imu.frame_imu import GyroSegment
 from rs_relpose_ros.imu.integration import bias_jacobian, integrate_rotation
 from rs_relpose_ros.imu.samples import ImuSample
@@ -181,7 +181,7 @@ def test_a_shifted_frame_waits_for_its_shifted_rows(offline):
     sequencer = Sequencer(Parameters.from_mapping(
         {'readout_time': 0.02, 'quat_cam_imu_xyzw': (0.0, 0.0, 0.0, 1.0)}), offline=offline,
         clock=lambda: 0)
-    calibration = Calibration(width=32, height=20, fx=30.0, fy=30.0, cx=16.0, cy=10.0,
+    calibration = Intrinsics(width=32, height=20, fx=30.0, fy=30.0, cx=16.0, cy=10.0,
                               image_width=32, image_height=20)
 
     def turn_until(ms):

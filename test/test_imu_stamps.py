@@ -8,13 +8,13 @@ from rs_relpose_ros.config.imu import ImuConfig
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.front_end.frame import Frame
 from rs_relpose_ros.front_end.sequencer import ReadyFrame, Refusal, Sequencer
-from rs_relpose_ros.geometry.intrinsics import Calibration
+from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.imu.integration import integrate_rotation
 from rs_relpose_ros.imu.samples import ImuSample
 
 MS = 1_000_000
-CALIBRATION = Calibration(width=32, height=20, fx=30.0, fy=30.0, cx=16.0, cy=10.0,
+CALIBRATION = Intrinsics(width=32, height=20, fx=30.0, fy=30.0, cx=16.0, cy=10.0,
                           image_width=32, image_height=20)
 
 

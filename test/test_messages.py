@@ -185,7 +185,7 @@ def test_unusable_compressed_image_is_refused(data, sentence):
 
 
 def test_calibration_of_the_full_sensor(types):
-    calibration = incoming.calibration_from_info(build.camera_info(
+    calibration = incoming.intrinsics_from_info(build.camera_info(
         types, d=(0.1, -0.2, 0.001, 0.002, 0.05)))
     assert (calibration.fx, calibration.fy, calibration.cx, calibration.cy) == (
         450.0, 451.0, 319.5, 239.5)
@@ -196,7 +196,7 @@ def test_calibration_of_the_full_sensor(types):
 
 
 def test_region_and_binning_shift_rows(types):
-    calibration = incoming.calibration_from_info(build.camera_info(
+    calibration = incoming.intrinsics_from_info(build.camera_info(
         types, roi=(100, 60, 400, 300), binning=(2, 2)))
     assert (calibration.image_width, calibration.image_height) == (200, 150)
     # The first published pixel covers sensor pixels 100 and 101: its centre lies between them.
@@ -212,7 +212,7 @@ def test_region_and_binning_shift_rows(types):
     ('rational_polynomial', 8), ('equidistant', 4)])
 def test_known_distortion(types, model, count):
     coefficients = tuple(0.001 * (i + 1) for i in range(count))
-    calibration = incoming.calibration_from_info(
+    calibration = incoming.intrinsics_from_info(
         build.camera_info(types, model=model, d=coefficients))
     assert (calibration.distortion_model, calibration.distortion) == (model, coefficients)
 
@@ -222,7 +222,7 @@ def test_capital_fields_of_ros_1():
     old = SimpleNamespace(
         header=new.header, height=480, width=640, distortion_model='plumb_bob', D=new.d, K=new.k,
         binning_x=0, binning_y=0, roi=new.roi)
-    assert incoming.calibration_from_info(old) == incoming.calibration_from_info(new)
+    assert incoming.intrinsics_from_info(old) == incoming.intrinsics_from_info(new)
 
 
 @pytest.mark.parametrize(('change', 'error', 'sentence'), [
@@ -241,7 +241,7 @@ def test_capital_fields_of_ros_1():
 ])
 def test_unusable_calibration_is_refused(change, error, sentence):
     with pytest.raises(error) as caught:
-        incoming.calibration_from_info(build.camera_info(build.rosbags_types, **change))
+        incoming.intrinsics_from_info(build.camera_info(build.rosbags_types, **change))
     assert sentence in str(caught.value)
 
 

@@ -24,7 +24,7 @@ from rs_relpose_ros.front_end.sequencer import (
     Refusal,
     Sequencer,
 )
-from rs_relpose_ros.geometry.intrinsics import Calibration
+from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.imu.frame_imu import FrameImu
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.node.diagnostics import Inputs, Statistics, WARN
@@ -38,7 +38,7 @@ FRAME_NS, IMU_NS, READOUT_NS = SECOND // 30, SECOND // 400, SECOND // 50
 START_NS = 1_700_000_000 * SECOND
 WIDTH, HEIGHT = 64, 48
 FRAMES = 40
-CALIBRATION = Calibration(width=WIDTH, height=HEIGHT, fx=60.0, fy=60.0, cx=32.0, cy=24.0,
+CALIBRATION = Intrinsics(width=WIDTH, height=HEIGHT, fx=60.0, fy=60.0, cx=32.0, cy=24.0,
                           image_width=WIDTH, image_height=HEIGHT)
 IMAGE = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH), dtype=np.uint8)
 VALUES: dict[str, Any] = {'readout_time': READOUT_NS / SECOND,

@@ -21,14 +21,14 @@ from rs_relpose_ros.front_end.sequencer import (
     Sequencer,
     WAITING_FRAMES,
 )
-from rs_relpose_ros.geometry.intrinsics import Calibration
+from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.imu.samples import ImuSample
 
 MS = 1_000_000
 SECOND = 1000 * MS
 READOUT_NS = 20 * MS
 START = 1_700_000_000 * SECOND
-CALIBRATION = Calibration(width=32, height=20, fx=30.0, fy=30.0, cx=16.0, cy=10.0,
+CALIBRATION = Intrinsics(width=32, height=20, fx=30.0, fy=30.0, cx=16.0, cy=10.0,
                           image_width=32, image_height=20)
 IMAGE = np.zeros((20, 32), dtype=np.uint8)
 

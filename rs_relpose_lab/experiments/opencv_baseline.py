@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_lab.experiments.comparison import Score, score
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
-from rs_relpose_ros.geometry.intrinsics import Calibration
+from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.replay.run import ReplayedPair
 from rs_relpose_ros.replay.truth import TrueTrajectory
 
@@ -82,7 +82,7 @@ def opencv_five_point(points1: Array, points2: Array, camera: RollingShutterCame
     return GlobalPose(np.asarray(R.T), np.asarray(-R.T @ t).ravel(), inliers)
 
 
-def best_opencv_score(method: str, pairs: Sequence[ReplayedPair], calibration: Calibration,
+def best_opencv_score(method: str, pairs: Sequence[ReplayedPair], calibration: Intrinsics,
                       truth: TrueTrajectory) -> Score:
     """Score of a method at that of `THRESHOLDS` which suits it best.
 
@@ -94,7 +94,7 @@ def best_opencv_score(method: str, pairs: Sequence[ReplayedPair], calibration: C
     method : {'RANSAC', 'USAC_MAGSAC'}
     pairs : sequence of ReplayedPair
         Those that the pipeline answered: the same matches, and none of a camera that stands.
-    calibration : Calibration
+    calibration : Intrinsics
     truth : TrueTrajectory
     """
     camera = calibration.global_shutter_camera()

@@ -15,12 +15,12 @@ from rs_relpose_ros.calibrate.tracks import Tracks
 from rs_relpose_ros.config.tracking import TrackingConfig
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
-from rs_relpose_ros.geometry.intrinsics import Calibration
+from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.messages.incoming import (
-    calibration_from_info,
     image_from_compressed,
     image_from_message,
     imu_sample_from_message,
+    intrinsics_from_info,
     stamp_ns,
 )
 
@@ -90,7 +90,7 @@ class _Reader:
     def __init__(self, topics: SensorTopics, tracking: TrackingConfig) -> None:
         self._topics = topics
         self._follower = PointFollower(tracking)
-        self._calibration: Calibration | None = None
+        self._calibration: Intrinsics | None = None
         self._uncalibrated = False
         self._size: tuple[int, int] | None = None
         self._gyro: dict[int, tuple[float, float, float]] = {}
@@ -118,7 +118,7 @@ class _Reader:
         if float(k[0]) == 0.0:
             self._uncalibrated = True
         else:
-            self._calibration = calibration_from_info(msg)
+            self._calibration = intrinsics_from_info(msg)
 
     def _take_image(self, msg: Any) -> None:
         stamp = stamp_ns(msg.header)

@@ -13,14 +13,14 @@ from rs_relpose_ros.check.inertial import Inertial
 from rs_relpose_ros.check.streams import Stamps
 from rs_relpose_ros.check.turning import TurningImages
 from rs_relpose_ros.errors import RsRelposeError
-from rs_relpose_ros.geometry.intrinsics import Calibration
+from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.messages.incoming import (
     accelerometer_sample_from_message,
-    calibration_from_info,
     image_from_compressed,
     image_from_message,
     imu_sample_from_message,
+    intrinsics_from_info,
     stamp_ns,
 )
 
@@ -68,7 +68,7 @@ class Scan:
     largest_image: int = 0
     image_problem: str = ''
     bad_images: int = 0
-    calibration: Calibration | None = None
+    calibration: Intrinsics | None = None
     calibrations: int = 0
     calibration_problem: str = ''
     imu_problem: str = ''
@@ -134,7 +134,7 @@ class _Reader:
     def _camera_info(self, msg: Any) -> None:
         seen = self._seen
         try:
-            calibration = calibration_from_info(msg)
+            calibration = intrinsics_from_info(msg)
         except RsRelposeError as error:
             seen.calibration_problem = seen.calibration_problem or str(error)
             return

@@ -21,7 +21,7 @@ from rs_relpose_ros.calibrate.follow import PointFollower
 from rs_relpose_ros.calibrate.gyro_path import GyroSeries
 from rs_relpose_ros.calibrate.observations import evenly, Observations
 from rs_relpose_ros.config.tracking import TrackingConfig
-from rs_relpose_ros.geometry.intrinsics import Calibration
+from rs_relpose_ros.geometry.intrinsics import Intrinsics
 
 Array = NDArray[np.float64]
 
@@ -94,7 +94,7 @@ class TurningImages:
         self._follower: PointFollower | None = None
         self._shape: tuple[int, ...] = ()
         self._reduction = 1.0
-        self._calibration: Calibration | None = None
+        self._calibration: Intrinsics | None = None
         self._recent: list[tuple[int, Array]] = []
         self._gyro: dict[int, Array] = {}
         self._keep_until_ns = 0
@@ -106,7 +106,7 @@ class TurningImages:
         return self._index in self._wanted
 
     def add_image(self, stamp_ns: int, recorded_ns: int, image: NDArray[np.uint8],
-                  calibration: Calibration) -> None:
+                  calibration: Intrinsics) -> None:
         """Take in an image that was wanted."""
         self._keep_until_ns = recorded_ns + int(2e9 * _WIDEST_OFFSET)
         self._calibration = calibration

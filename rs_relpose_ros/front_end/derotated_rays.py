@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
-from rs_relpose_ros.geometry.intrinsics import Calibration
+from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.geometry.motion import FrameMotion
 
 Array = NDArray[np.float64]
@@ -38,7 +38,7 @@ class DerotatedRays:
 
     @classmethod
     def from_points(cls, track_ids: Ids, points: Array, camera: RollingShutterCamera,
-                    calibration: Calibration, motion: FrameMotion) -> DerotatedRays:
+                    calibration: Intrinsics, motion: FrameMotion) -> DerotatedRays:
         """Rays of points (N, 2) of a published image."""
         pixels = calibration.to_sensor(points)
         row_times = camera.row_times(pixels[:, 1])

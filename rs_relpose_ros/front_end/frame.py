@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry.intrinsics import Calibration
+from rs_relpose_ros.geometry.intrinsics import Intrinsics
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,7 +23,7 @@ class Frame:
     image : (H, W) ndarray of uint8
         As published: not rectified, not resized.
     frame_id : str
-    calibration : Calibration
+    calibration : Intrinsics
 
     Raises
     ------
@@ -34,7 +34,7 @@ class Frame:
     stamp_ns: int
     image: NDArray[np.uint8]
     frame_id: str
-    calibration: Calibration
+    calibration: Intrinsics
 
     def __post_init__(self) -> None:
         if self.image.dtype != np.uint8 or self.image.ndim != 2:
@@ -66,7 +66,7 @@ class EncodedFrame:
 
     stamp_ns: int
     frame_id: str
-    calibration: Calibration
+    calibration: Intrinsics
     decode: Callable[[], NDArray[np.uint8]]
 
     def decoded(self) -> Frame:

@@ -18,7 +18,7 @@ from rs_relpose_ros.front_end.frame import Frame
 from rs_relpose_ros.front_end.keyframes import decide_keyframe, KeyframeDecision
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
-from rs_relpose_ros.geometry.intrinsics import Calibration
+from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.geometry.so3 import aligning_rotation
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between
 from rs_relpose_ros.imu.frame_imu import FrameImu, GyroSegment
@@ -66,7 +66,7 @@ class Pipeline:
         self._keep_images = keep_images
         self._tracker = make_tracker(parameters.tracking)
         self._drift = DriftTracker(parameters)
-        self._calibration: Calibration | None = None
+        self._calibration: Intrinsics | None = None
         self._camera: RollingShutterCamera | None = None
         self._reference: _View | None = None
         self._previous: _View | None = None
@@ -247,8 +247,8 @@ class Pipeline:
         return predict
 
 
-def sensor_camera(calibration: Calibration, parameters: Parameters) -> RollingShutterCamera:
-    """Camera model of the full sensor; published pixels map to it by `Calibration.to_sensor`."""
+def sensor_camera(calibration: Intrinsics, parameters: Parameters) -> RollingShutterCamera:
+    """Camera model of the full sensor; published pixels map to it by `Intrinsics.to_sensor`."""
     sensor = parameters.sensor
     if sensor.readout_time is None:
         raise MissingInputError('parameter readout_time is not set: give image height times line '

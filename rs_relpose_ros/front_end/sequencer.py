@@ -19,7 +19,7 @@ from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.front_end.frame import EncodedFrame, Frame
 from rs_relpose_ros.front_end.pipeline import sensor_camera
-from rs_relpose_ros.geometry.intrinsics import Calibration
+from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.geometry.timing import ImageClock, NANOSECONDS, seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.buffer import AddResult, Coverage, ImuBuffer
 from rs_relpose_ros.imu.frame_imu import frame_imu, FrameImu
@@ -177,7 +177,7 @@ class Sequencer:
         self._buffer = ImuBuffer(parameters.imu)
         self._waiting: deque[_Waiting] = deque()
         self._refusals: deque[FrameRefused] = deque(maxlen=None if offline else _REFUSALS_KEPT)
-        self._calibration: Calibration | None = None
+        self._calibration: Intrinsics | None = None
         self._image_clock: ImageClock | None = None
         self._last_stamp_ns: int | None = None
         self._previous_reference_ns: int | None = None
@@ -418,7 +418,7 @@ class Sequencer:
         return (accelerometer_ns is None or accelerometer_ns >= end_ns
                 or gyro_ns - accelerometer_ns > _ACCELEROMETER_STALE_NS)
 
-    def _clock_of(self, calibration: Calibration) -> ImageClock:
+    def _clock_of(self, calibration: Intrinsics) -> ImageClock:
         if self._image_clock is None or calibration != self._calibration:
             sensor = self._parameters.sensor
             self._image_clock = ImageClock(

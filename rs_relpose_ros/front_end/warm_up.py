@@ -25,13 +25,13 @@ from rs_relpose_ros.estimator.estimate import (
 from rs_relpose_ros.front_end.frame import Frame
 from rs_relpose_ros.front_end.pipeline import Pipeline
 from rs_relpose_ros.front_end.sequencer import ReadyFrame, Sequencer
-from rs_relpose_ros.geometry.intrinsics import Calibration
+from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.imu.samples import ImuSample
 
 _WIDTH, _HEIGHT = 320, 240
 # With a distortion: its kernels, too, must be there before the first frame.
-_CALIBRATION = Calibration(width=_WIDTH, height=_HEIGHT, fx=250.0, fy=250.0, cx=159.5, cy=119.5,
+_CALIBRATION = Intrinsics(width=_WIDTH, height=_HEIGHT, fx=250.0, fy=250.0, cx=159.5, cy=119.5,
                            image_width=_WIDTH, image_height=_HEIGHT,
                            distortion_model='plumb_bob', distortion=(-0.02, 0.01, 0.0, 0.0))
 _FRAME_NS = NANOSECONDS // 30

@@ -12,7 +12,7 @@ from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Calibration:
+class Intrinsics:
     """Intrinsics of the full sensor, and which part of it is published at which binning.
 
     A published pixel ``u`` covers `binning_x` sensor columns, and pixel centres lie at integer

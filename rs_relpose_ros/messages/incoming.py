@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.errors import InputError, MissingInputError
-from rs_relpose_ros.geometry.intrinsics import Calibration
+from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.imu.samples import ImuSample, Orientation
 from rs_relpose_ros.messages.image_headers import encoded_image_size
@@ -168,7 +168,7 @@ def _to_8_bit(image: NDArray[np.uint16]) -> Gray:
 # -- calibration -----------------------------------------------------------------------------
 
 
-def calibration_from_info(msg: Any) -> Calibration:
+def intrinsics_from_info(msg: Any) -> Intrinsics:
     """Calibration of a sensor_msgs/CameraInfo, region of interest and binning honoured.
 
     Raises
@@ -198,7 +198,7 @@ def calibration_from_info(msg: Any) -> Calibration:
     binning_x, binning_y = max(int(msg.binning_x), 1), max(int(msg.binning_y), 1)
     roi = msg.roi
     roi_width, roi_height = int(roi.width) or width, int(roi.height) or height
-    return Calibration(
+    return Intrinsics(
         width=width, height=height, fx=k[0], fy=k[4], cx=k[2], cy=k[5],
         distortion_model=str(msg.distortion_model)[:40],
         distortion=tuple(float(value) for value in coefficients),

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.front_end.frame import EncodedFrame
 from rs_relpose_ros.front_end.sequencer import Refusal, Sequencer
-from rs_relpose_ros.geometry.intrinsics import Calibration
+from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.messages.hanging import HangingCamera, HangingGyro
 from rs_relpose_ros.messages.incoming import (
     accelerometer_sample_from_message,
-    calibration_from_info,
     image_from_compressed,
     image_from_message,
     imu_sample_from_message,
+    intrinsics_from_info,
     stamp_ns,
 )
 
@@ -43,14 +43,14 @@ class MessageIntake:
 
     def __init__(self, sequencer: Sequencer, stuck_gyro_time: float = 0.0) -> None:
         self._sequencer = sequencer
-        self._calibration: Calibration | None = None
+        self._calibration: Intrinsics | None = None
         self._problem = ''
         self._held: deque[tuple[Any, Decode]] = deque()
         self._camera = HangingCamera()
         self._gyro = HangingGyro(stuck_gyro_time)
 
     @property
-    def calibration(self) -> Calibration | None:
+    def calibration(self) -> Intrinsics | None:
         """The calibration in force."""
         return self._calibration
 
@@ -68,7 +68,7 @@ class MessageIntake:
             It cannot be used. Then no calibration is in force, rather than an outdated one.
         """
         try:
-            self._calibration = calibration_from_info(msg)
+            self._calibration = intrinsics_from_info(msg)
         except RsRelposeError as error:
             self._calibration, self._problem = None, str(error)
             self.refuse_held()

@@ -14,7 +14,7 @@ from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.front_end.drift import Drift
 from rs_relpose_ros.front_end.pair import PairResult
-from rs_relpose_ros.geometry.intrinsics import Calibration
+from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.messages.outgoing import pair_messages, PAIR_TOPICS
 from rs_relpose_ros.replay.record import pair_record, PairRecord
 from rs_relpose_ros.replay.run import read_truth, Replay, ReplayCounts, ReplayedPair
@@ -41,7 +41,7 @@ class ReplayOutcome:
     ----------
     records : list of PairRecord
     counts : ReplayCounts
-    calibration : Calibration or None
+    calibration : Intrinsics or None
         In force at the end.
     figures : dict
         As in summary.json, without provenance.
@@ -51,7 +51,7 @@ class ReplayOutcome:
 
     records: list[PairRecord]
     counts: ReplayCounts
-    calibration: Calibration | None
+    calibration: Intrinsics | None
     figures: dict[str, Any]
     files: list[Path]
 

@@ -17,7 +17,7 @@ from rs_relpose_ros.estimator.estimate import warm_up
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.front_end.pipeline import Pipeline
 from rs_relpose_ros.front_end.sequencer import FrameRefused, ReadyFrame, Sequencer, SequencerCounts
-from rs_relpose_ros.geometry.intrinsics import Calibration
+from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.messages.causes import CauseCounts
 from rs_relpose_ros.messages.incoming import stamp_ns
 from rs_relpose_ros.messages.intake import MessageIntake
@@ -105,7 +105,7 @@ class Replay:
         self._first_ns = self._last_ns = 0
 
     @property
-    def calibration(self) -> Calibration | None:
+    def calibration(self) -> Intrinsics | None:
         """The calibration in force."""
         return self._intake.calibration
 
