@@ -199,8 +199,8 @@ def _direction_variance(length: float, acceleration: float) -> float:
 def _predict(state: _State, noise: _Noise, rate: Array, dt: float) -> None:
     """Turn by the measured `rate` (3,), with ``E = Exp(-(w - b) dt)``.
 
-        u <- E u        F = | E  dt I |        P <- F P F^T + Q dt
-                            | 0     I |
+    u <- E u        F = | E  dt I |        P <- F P F^T + Q dt
+                        | 0     I |
     """
     up, bias, P, residual = state
     # A direction that is fixed in the world turns backwards in the IMU frame.
@@ -221,9 +221,9 @@ def _predict(state: _State, noise: _Noise, rate: Array, dt: float) -> None:
 def _correct(state: _State, measured: Array, variance: float, dt: float) -> None:
     """Kalman update by a measured direction (3,) with its variance per axis.
 
-        H = | -[u]x  0 |        S = H P H^T + variance I        K = P H^T S^-1
-        (d, e) = K (f / |f| - u)        P <- P - K H P
-        u <- Exp(d) u        b <- b + e
+    H = | -[u]x  0 |        S = H P H^T + variance I        K = P H^T S^-1
+    (d, e) = K (f / |f| - u)        P <- P - K H P
+    u <- Exp(d) u        b <- b + e
     """
     up, bias, P, residual = state
     innovation = measured - up
@@ -268,7 +268,7 @@ def _product(A: Array, B: Array) -> Array:
 
 @kernel
 def _add_product(A: Array, B: Array, out: Array) -> None:
-    """``out <- out + A B``, term by term in this order: BLAS costs more for matrices this small."""
+    """``out <- out + A B``, term by term in this order; BLAS costs more for small matrices."""
     for i in range(A.shape[0]):
         for j in range(B.shape[1]):
             total = out[i, j]
