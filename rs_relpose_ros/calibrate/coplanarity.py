@@ -24,9 +24,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.calibrate.gyro_path import GyroPath, knot_before, product, rotation_at
+from rs_relpose_ros.calibrate.gyro_path import GyroPath, knot_before, rotation_at
 from rs_relpose_ros.compiled import kernel
-from rs_relpose_ros.geometry.so3 import exp_so3
+from rs_relpose_ros.geometry.so3 import exp_so3, multiply
 from rs_relpose_ros.geometry.vectors import cross, dot, norm, rotated, rotated_back, Vector
 
 Array = NDArray[np.float64]
@@ -126,8 +126,8 @@ def _look(path: GyroPath, R_imu_cam: Array, correction: Array, instant: float, n
     """Fill Q, M and rate of `sight` for an instant, and return the gyro's knot before it."""
     k = knot_before(path.times, instant, near)
     rotation_at(path, instant, k, sight.M, sight.rate)
-    product(correction, sight.M, sight.Q)
-    product(sight.Q, R_imu_cam, sight.M)
+    multiply(correction, sight.M, sight.Q)
+    multiply(sight.Q, R_imu_cam, sight.M)
     return k
 
 

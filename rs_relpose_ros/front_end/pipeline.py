@@ -99,10 +99,10 @@ class Pipeline:
         one's, or that a gap of the gyro parts from it, starts anew.
         """
         self.prepare()
-        if frame.calibration != self._calibration:
+        if frame.intrinsics != self._calibration:
             self.reset()
-            self._calibration = frame.calibration
-            self._camera = sensor_camera(frame.calibration, self._parameters)
+            self._calibration = frame.intrinsics
+            self._camera = sensor_camera(frame.intrinsics, self._parameters)
         view = _View(frame.stamp_ns, imu, frame.image)
         # Over a gap of the gyro tracks are not predicted, and what is found by chance looks good.
         if self._reference is None or self._previous is None or imu.since_previous is None:
