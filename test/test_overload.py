@@ -166,7 +166,7 @@ def test_a_busy_worker_costs_the_node_no_imu(held, module_ros_domain_id):
         publishers[CameraInfo].publish(build.camera_info(
             build.rclpy_types, width=WIDTH, height=HEIGHT,
             k=(60.0, 0.0, 32.0, 0.0, 60.0, 24.0, 0.0, 0.0, 1.0)))
-        spin_until(lambda: node._intake.calibration is not None, 'the calibration')
+        spin_until(lambda: node._intake.intrinsics is not None, 'the calibration')
         samples = 0
         for k in range(FRAMES):
             until_ns = frame_stamp(k) + READOUT_NS + IMU_NS
