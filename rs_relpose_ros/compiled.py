@@ -15,3 +15,6 @@ kernel_cache.install()
 kernel = numba.njit(cache=True, nogil=True, error_model='numpy')
 # Put into its callers by Numba: for the innermost loops, whose arrays' shapes must be known there.
 inlined_kernel = numba.njit(cache=True, nogil=True, error_model='numpy', forceinline=True)
+# Copied into its callers before types are inferred, so that it costs them no compilation of its
+# own: for functions of a few lines, such as a cross product.
+small_kernel = numba.njit(cache=True, nogil=True, error_model='numpy', inline='always')

@@ -19,7 +19,7 @@ from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.convert import xiaomi
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.messages.incoming import (
-    image_from_compressed,
+    image_from_message,
     imu_sample_from_message,
     intrinsics_from_info,
     stamp_ns,
@@ -121,7 +121,7 @@ def test_realsense_folder(tmp_path):
         60.5, 61.5, 32.25, 24.75)
     image = read['/camera/image_raw/compressed'][0].message
     assert image.format.startswith('mono8; jpeg')
-    assert image_from_compressed(image).shape == (48, 64)
+    assert image_from_message(image).image.decoded().shape == (48, 64)
     samples = [imu_sample_from_message(message.message) for message in read['/imu/data_raw']]
     stamps = [sample.stamp_ns for sample in samples]
     assert stamps == sorted(set(stamps))

@@ -20,7 +20,8 @@ from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.imu.frame_imu import GyroSegment
 from rs_relpose_ros.imu.integration import bias_jacobian, integrate_rotation
 from rs_relpose_ros.imu.samples import ImuSample
-from rs_relpose_ros.messages.intake import MessageIntake
+from rs_relpose_ros.messages.intake import Intake
+from rs_relpose_ros.messages.sensor_feed import Role
 from rs_relpose_ros.node.diagnostics import Inputs, Statistics
 from rs_relpose_ros.node.worker import Worker
 from rs_relpose_ros.replay.run import Replay
@@ -260,18 +261,15 @@ def test_live_and_replay_agree_while_the_offset_is_applied(bundled_bag):
     while not worker.warm:
         assert worker.is_alive(), problems
         time.sleep(0.01)
-    intake, rng = MessageIntake(sequencer), np.random.default_rng(5)
+    intake, rng = Intake(sequencer), np.random.default_rng(5)
     images = 0
     with open_bag(bundled_bag) as bag:
         topics = bag.find_topics()
-        for message in bag.messages([topics.image, topics.camera_info, topics.imu]):
-            if message.topic == topics.imu.name:
-                intake.add_imu(message.message)
-            elif message.topic == topics.camera_info.name:
-                intake.add_camera_info(message.message)
-            elif rng.random() > 0.1:
+        for role, message in intake.feed.messages(bag, topics):
+            if role is not Role.IMAGE or rng.random() > 0.1:
+                intake.receive(role, message.message)
+            if role is Role.IMAGE:
                 images += 1
-                intake.add_compressed_image(message.message)
                 # Sometimes behind, sometimes ahead of the worker.
                 while len(taken) < images - rng.integers(1, 4) and images < 1000:
                     time.sleep(0.002)

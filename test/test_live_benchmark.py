@@ -7,9 +7,9 @@ import mmap
 import os
 import sys
 
+from conftest import ROOT
 import numpy as np
 import pytest
-import ros_graph
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.experiments import live, live_clip, live_report
@@ -20,10 +20,9 @@ from rs_relpose_lab.live.process_figures import process_figures
 from rs_relpose_lab.simulation.closed_loop import closed_loop
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.estimator.estimate import warm_up
 from rs_relpose_ros.node.frame_timings import COLUMNS, FrameTimings
 
-# Whoever comes first compiles the kernels.
+# The node may have to compile the kernels.
 pytestmark = pytest.mark.timeout(600)
 
 SECOND = 10**9
@@ -175,12 +174,11 @@ def test_frame_timings_name_what_cannot_be_written(tmp_path):
 def measured(tmp_path_factory, module_ros_domain_id):
     """Six seconds of small images, as any cell is run."""
     folder = tmp_path_factory.mktemp('live')
-    warm_up()
     cell = LiveCell(320, 240, 'bgr8', 200)
     clip = live_clip.prepare_clip(folder / 'clips', cell.width, cell.height)
     seconds: list[None] = []
     statistics, over_time = live.run_cell(
-        cell, clip, 6.0, folder / cell.name, ros_graph.ROOT / 'config' / 'fastdds.xml',
+        cell, clip, 6.0, folder / cell.name, ROOT / 'config' / 'fastdds.xml',
         lambda: seconds.append(None))
     return folder, clip, statistics, over_time, seconds
 

@@ -6,7 +6,7 @@ import pytest
 from scipy.ndimage import map_coordinates
 from tracking_images import errors, moved, WarpedScene
 
-from rs_relpose_ros.config.tracking import TrackingConfig
+from rs_relpose_ros.config.tracking import TRACKERS, TrackingConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.tracking.registry import make_tracker
 from rs_relpose_ros.tracking.windows import correlations, window_homography
@@ -70,17 +70,10 @@ def test_prediction_carries_over_60_px(scene, levels):
     tracker = make_tracker(TrackingConfig(klt_levels=levels))
     tracker.start(images[0])
     # Two pixels off, and unknown for a tenth of the points.
-    calls = []
-
-    def predict(points):
-        calls.append(points.dtype)
-        expected = moved(points, H1, H2) + 1.4
-        expected[::10] = np.nan
-        return expected
-
-    matches = tracker.track(images[1], predict)
+    expected = moved(tracker.points, H1, H2) + 1.4
+    expected[::10] = np.nan
+    matches = tracker.track(images[1], expected)
     visible = moved(matches.points1, H1, H2)
-    assert calls == [np.float64]
     assert len(matches) > 180
     assert np.median(np.linalg.norm(visible - matches.points2, axis=1)) < 0.15
 
@@ -103,8 +96,8 @@ def test_motion_goes_on_in_proportion_to_the_time_between_images(scene):
         tracker = make_tracker(TrackingConfig(klt_levels=1))
         tracker.start(scene.view(views[0]))
         # The prediction knows 80 % of the motion.
-        tracker.track(scene.view(views[1]), lambda points: points + 0.8 * flow, 1.0)
-        tracker.track(scene.view(views[2]), lambda points: points + 12.0 * 0.8 * flow, gap)
+        tracker.track(scene.view(views[1]), tracker.points + 0.8 * flow, 1.0)
+        tracker.track(scene.view(views[2]), tracker.points + 12.0 * 0.8 * flow, gap)
         found.append(np.count_nonzero(
             errors(tracker.refined_matches(), views[0], views[2]) < 0.5))
     assert found[0] > 200
@@ -116,7 +109,7 @@ def test_a_wrong_prediction_is_overcome_or_drops_the_track(scene):
     images = [scene.view(H1), scene.view(H2)]
     tracker = make_tracker(TrackingConfig())
     tracker.start(images[0])
-    tracker.track(images[1], lambda points: moved(points, H1, H2) + np.array([18.0, -11.0]))
+    tracker.track(images[1], moved(tracker.points, H1, H2) + np.array([18.0, -11.0]))
     matches = tracker.refined_matches()
     error = errors(matches, H1, H2)
     assert len(matches) > 150
@@ -150,7 +143,7 @@ def test_promotion_fills_up_and_reset_never_uses_an_id_again(scene):
     images = [scene.view(np.eye(3)), scene.view(scene.similarity(0.0, 1.0, (120.0, 0.0)))]
     tracker = make_tracker(TrackingConfig())
     tracker.start(images[0])
-    tracker.track(images[1], lambda points: points - (120.0, 0.0))
+    tracker.track(images[1], tracker.points - (120.0, 0.0))
     assert 0.6 < tracker.tracked_fraction < 0.9
     tracker.promote()
     assert tracker.tracked_fraction == 1.0
@@ -224,7 +217,7 @@ def test_a_frozen_image_stands_still(scene):
     np.testing.assert_allclose(matches.points2, matches.points1, atol=1e-3)
 
 
-@pytest.mark.parametrize('detector', ['klt', 'orb', 'sift'])
+@pytest.mark.parametrize('detector', TRACKERS)
 @pytest.mark.parametrize('shape', [(1, 1), (8, 8), (17, 400), (40, 33), (64, 48)])
 def test_tiny_images_do_no_harm(detector, shape):
     image = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)

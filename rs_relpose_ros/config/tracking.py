@@ -7,7 +7,13 @@ from dataclasses import dataclass
 from rs_relpose_ros.config.declarations import check_settings, setting
 from rs_relpose_ros.errors import InputError
 
-DETECTORS = ('klt', 'orb', 'sift')
+# Tracker by name: the class that implements `rs_relpose_ros.tracking.tracker.Tracker`, imported
+# when it is chosen. A new tracker is its module and a row here.
+TRACKERS = {
+    'klt': 'rs_relpose_ros.tracking.klt:KltTracker',
+    'orb': 'rs_relpose_ros.tracking.descriptors:DescriptorTracker',
+    'sift': 'rs_relpose_ros.tracking.descriptors:DescriptorTracker',
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,7 +22,7 @@ class TrackingConfig:
 
     detector: str = setting(
         'klt', 'klt follows corners from frame to frame; orb and sift match descriptors, for '
-        'baselines that are too wide to follow', choices=DETECTORS)
+        'baselines that are too wide to follow', choices=tuple(TRACKERS))
     max_features: int = setting(
         300, 'corners that a reference keyframe starts with', low=8, high=5000)
     max_descriptors: int = setting(

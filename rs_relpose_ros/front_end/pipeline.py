@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -100,10 +99,10 @@ class Pipeline:
         one's, or that a gap of the gyro parts from it, starts anew.
         """
         self.prepare()
-        if frame.calibration != self._calibration:
+        if frame.intrinsics != self._calibration:
             self.reset()
-            self._calibration = frame.calibration
-            self._camera = sensor_camera(frame.calibration, self._parameters)
+            self._calibration = frame.intrinsics
+            self._camera = sensor_camera(frame.intrinsics, self._parameters)
         view = _View(frame.stamp_ns, imu, frame.image)
         # Over a gap of the gyro tracks are not predicted, and what is found by chance looks good.
         if self._reference is None or self._previous is None or imu.since_previous is None:
@@ -113,7 +112,7 @@ class Pipeline:
         self._frames += 1
         self._gyro = self._extended(imu.since_previous)
         matches = self._tracker.track(
-            frame.image, self._predictor(self._previous.imu, imu),
+            frame.image, self._predicted(self._previous.imu, imu),
             seconds_between(self._previous.stamp_ns, frame.stamp_ns))
         self._previous = view
         parallax, _ = self._parallax(matches, view)
@@ -217,34 +216,33 @@ class Pipeline:
         return _GyroTurn(*integrate_rotation(segment.stamps_ns, segment.angular_velocities,
                                              self._parameters.imu, segment.bias_sigma), segment)
 
-    def _predictor(self, previous: FrameImu, current: FrameImu) -> Callable[[Array], Array] | None:
-        """Where the gyro expects previous-image points in the current image; None without gyro."""
-        if current.since_previous is None:
+    def _predicted(self, previous: FrameImu, current: FrameImu) -> Array | None:
+        """Where the gyro expects the tracker's points (N, 2) in the current image [px].
+
+        None without gyro, and for a tracker that looks for no points.
+        """
+        points = self._tracker.points
+        if current.since_previous is None or not len(points):
             return None
         camera, calibration = self._camera, self._calibration
         assert camera is not None and calibration is not None
         rotation, _ = integrate_rotation(
             current.since_previous.stamps_ns, current.since_previous.angular_velocities,
             self._parameters.imu)
-
         known = self._current_rays
-
-        def predict(points: Array) -> Array:
-            if known is not None and np.array_equal(known.points, points):
-                rays, row_times = known.rays @ rotation, known.row_times
-            else:
-                pixels = calibration.to_sensor(points)
-                row_times = camera.row_times(pixels[:, 1])
-                rays = previous.motion.derotate(camera.unproject(pixels), row_times) @ rotation
-            first, last = camera.row_time_span
-            for _ in range(2):   # the row that sees the point depends on where the point is
-                turned = current.motion.rotations(np.clip(row_times, first, last))
-                predicted = camera.project(np.einsum('nji,nj->ni', turned, rays))
-                row_times = np.where(np.isfinite(predicted[:, 1]),
-                                     camera.row_times(predicted[:, 1]), row_times)
-            return calibration.to_image(predicted)
-
-        return predict
+        if known is not None and np.array_equal(known.points, points):
+            rays, row_times = known.rays @ rotation, known.row_times
+        else:
+            pixels = calibration.to_sensor(points)
+            row_times = camera.row_times(pixels[:, 1])
+            rays = previous.motion.derotate(camera.unproject(pixels), row_times) @ rotation
+        first, last = camera.row_time_span
+        for _ in range(2):   # the row that sees the point depends on where the point is
+            turned = current.motion.rotations(np.clip(row_times, first, last))
+            predicted = camera.project(np.einsum('nji,nj->ni', turned, rays))
+            row_times = np.where(np.isfinite(predicted[:, 1]),
+                                 camera.row_times(predicted[:, 1]), row_times)
+        return calibration.to_image(predicted)
 
 
 def sensor_camera(calibration: Intrinsics, parameters: Parameters) -> RollingShutterCamera:

@@ -234,7 +234,7 @@ class Sequencer:
         """Take a frame into the mailbox, or refuse it for its stamp."""
         with self._changed:
             self._frames += 1
-            image_clock = self._clock_of(frame.calibration)
+            image_clock = self._clock_of(frame.intrinsics)
             start_ns, end_ns = image_clock.row_span_ns(frame.stamp_ns)
             set_back = self._frames_back.add(frame.stamp_ns, self._last_stamp_ns)
             if self._last_stamp_ns is not None and frame.stamp_ns <= self._last_stamp_ns:

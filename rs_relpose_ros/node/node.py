@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
+from functools import partial
 import gc
 import logging
 import os
@@ -31,7 +32,7 @@ from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.front_end.sequencer import FrameRefused, ReadyFrame, Refusal, Sequencer
 from rs_relpose_ros.geometry.timing import NANOSECONDS
-from rs_relpose_ros.messages.intake import MessageIntake
+from rs_relpose_ros.messages.intake import Intake
 from rs_relpose_ros.messages.outgoing import (
     color_image_message,
     diagnostics_message,
@@ -39,6 +40,7 @@ from rs_relpose_ros.messages.outgoing import (
     PAIR_TOPICS,
     status_message,
 )
+from rs_relpose_ros.messages.sensor_feed import Role
 from rs_relpose_ros.node.cause_log import CauseLog
 from rs_relpose_ros.node.debug_image import draw_debug_image
 from rs_relpose_ros.node.diagnostics import Inputs, SILENCE, Statistics
@@ -90,7 +92,7 @@ class RelposeNode(Node):
         self._counts = dict.fromkeys(
             ('images', 'camera_infos', 'imu', 'accelerometer', 'invalid'), 0)
         self._sequencer: Sequencer | None = None
-        self._intake: MessageIntake | None = None
+        self._intake: Intake | None = None
         self._worker: Worker | None = None
         self._stamps: TextIO | None = None
         self._ready_ns = 0
@@ -132,7 +134,7 @@ class RelposeNode(Node):
         if parameters.pair.stamps_file:
             self._stamps = _opened(parameters.pair.stamps_file)
         self._sequencer = Sequencer(parameters)
-        self._intake = MessageIntake(self._sequencer, parameters.imu.stuck_gyro_time)
+        self._intake = Intake(self._sequencer, parameters.imu.stuck_gyro_time)
         self._worker = Worker(parameters, self._sequencer, self._on_taken, self._on_result,
                               self._on_refused, self._on_failure)
         self._worker.start()
@@ -165,25 +167,27 @@ class RelposeNode(Node):
             f'ready: {self._image_topic}, {self.resolve_topic_name("camera_info")} and '
             f'{self.resolve_topic_name("imu")}')
 
-    def _subscribe(self, intake: MessageIntake, sequencer: Sequencer) -> None:
+    def _subscribe(self, intake: Intake, sequencer: Sequencer) -> None:
         image_type: type = Image
-        image_topic, add_image = self.resolve_topic_name('image'), intake.add_image
+        image_topic = self.resolve_topic_name('image')
         if self._settings.current.pair.image_transport == 'compressed':
             # As image_transport does: the transport's name follows the remapped one.
             image_type = CompressedImage
-            image_topic, add_image = f'{image_topic}/compressed', intake.add_compressed_image
+            image_topic = f'{image_topic}/compressed'
         self._image_topic = image_topic
         waiting = sequencer.waits_for_imu
         self._info_subscription = PolledSubscription(
             self, CameraInfo, 'camera_info', _best_effort(_IMAGE_DEPTH), self._receiver(
-                'camera_infos', WhenChanged(CameraInfo, intake.add_camera_info)),
-            lambda: intake.calibration is None, raw=True)
+                'camera_infos',
+                WhenChanged(CameraInfo, partial(intake.receive, Role.CAMERA_INFO))),
+            lambda: intake.intrinsics is None, raw=True)
         self._imu_subscriptions = [
             PolledSubscription(self, Imu, 'imu', _best_effort(_IMU_DEPTH),
-                               self._receiver('imu', intake.add_imu), waiting),
+                               self._receiver('imu', partial(intake.receive, Role.IMU)), waiting),
             PolledSubscription(self, Imu, 'accel', _best_effort(_IMU_DEPTH),
-                               self._receiver('accelerometer', intake.add_accelerometer), waiting)]
-        receive_image = self._receiver('images', add_image)
+                               self._receiver('accelerometer', partial(intake.receive, Role.ACCEL)),
+                               waiting)]
+        receive_image = self._receiver('images', partial(intake.receive, Role.IMAGE))
 
         def with_all_before(image: Any) -> None:
             # What came before it counts for it.
@@ -318,12 +322,12 @@ class RelposeNode(Node):
                   'camera_infos': self.resolve_topic_name('camera_info'),
                   'imu': self.resolve_topic_name('imu')}
         missing = tuple(topics[kind] for kind, is_silent in silent.items() if is_silent)
-        if self._intake.calibration_problem:
-            return f'not estimating: {self._intake.calibration_problem}', ('calibration',)
+        if self._intake.camera_info_problem:
+            return f'not estimating: {self._intake.camera_info_problem}', ('calibration',)
         # Where nothing comes at all the driver is not running yet: worth a status, not a warning.
         if silent['images']:
             return f'not estimating: no image on {topics["images"]} for {SILENCE:g} s', missing
-        if self._intake.calibration is None and silent['camera_infos']:
+        if self._intake.intrinsics is None and silent['camera_infos']:
             text = (f'not estimating: no CameraInfo on {topics["camera_infos"]}; remap '
                     'camera_info to the topic of the driver, which must publish a calibration')
             self._error(text)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rs_relpose_ros.bags.reader import Bag, COMPRESSED_IMAGE, SensorTopics
+from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.estimator.estimate import warm_up
@@ -19,8 +19,9 @@ from rs_relpose_ros.front_end.pipeline import Pipeline
 from rs_relpose_ros.front_end.sequencer import FrameRefused, ReadyFrame, Sequencer, SequencerCounts
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.messages.causes import CauseCounts
-from rs_relpose_ros.messages.incoming import stamp_ns
-from rs_relpose_ros.messages.intake import MessageIntake
+from rs_relpose_ros.messages.incoming import stamp_ns, TruePose
+from rs_relpose_ros.messages.intake import Intake
+from rs_relpose_ros.messages.sensor_feed import Role, SensorFeed
 from rs_relpose_ros.replay.truth import TrueTrajectory
 
 _logger = logging.getLogger(__name__)
@@ -95,7 +96,7 @@ class Replay:
         self._bag, self._topics, self._stamps = bag, topics, stamps
         self._on_image = on_image
         self._sequencer = Sequencer(parameters, offline=True)
-        self._intake = MessageIntake(self._sequencer, parameters.imu.stuck_gyro_time)
+        self._intake = Intake(self._sequencer, parameters.imu.stuck_gyro_time)
         self._pipeline = Pipeline(parameters, keep_images=keep_images)
         self._references_ns: dict[int, int] = {}
         self._stamps_found: set[int] = set()
@@ -107,7 +108,7 @@ class Replay:
     @property
     def calibration(self) -> Intrinsics | None:
         """The calibration in force."""
-        return self._intake.calibration
+        return self._intake.intrinsics
 
     def pairs(self) -> Iterator[ReplayedPair]:
         """Run over the bag; every pair as it closes.
@@ -119,13 +120,10 @@ class Replay:
         """
         warm_up()
         started = time.perf_counter()
-        topics = [self._topics.image, self._topics.camera_info, self._topics.imu]
-        if self._topics.accel is not None:
-            topics.append(self._topics.accel)
-        for message in self._bag.messages(topics):
+        for role, message in self._intake.feed.messages(self._bag, self._topics):
             self._first_ns = self._first_ns or message.bag_time_ns
             self._last_ns = message.bag_time_ns
-            self._hand_over(message.topic, message.message)
+            self._hand_over(role, message)
             yield from self._drain()
         self._intake.refuse_held()
         self._sequencer.close()
@@ -144,37 +142,29 @@ class Replay:
 
     # -- inside ------------------------------------------------------------------------------
 
-    def _hand_over(self, topic: str, msg: Any) -> None:
-        topics, intake = self._topics, self._intake
+    def _hand_over(self, role: Role, message: BagMessage) -> None:
         try:
-            if topic == topics.imu.name:
-                intake.add_imu(msg)
-            elif topics.accel is not None and topic == topics.accel.name:
-                intake.add_accelerometer(msg)
-            elif topic == topics.camera_info.name:
-                intake.add_camera_info(msg)
-            else:
-                self._hand_over_image(msg)
+            if role is not Role.IMAGE or self._is_chosen(message.message):
+                self._intake.receive(role, message.message)
         except RsRelposeError as error:
-            if topic == topics.camera_info.name and not self._sequencer.counts().frames_taken:
+            if role is Role.CAMERA_INFO and not self._sequencer.counts().frames_taken:
                 # Nothing was estimated and nothing can be: say so now.
-                raise type(error)(f'{topic}: {error}') from error
+                raise type(error)(f'{message.topic}: {error}') from error
             self._invalid += 1
-            self._not_used(f'{topic}: {error}')
+            self._not_used(f'{message.topic}: {error}')
 
-    def _hand_over_image(self, msg: Any) -> None:
+    def _is_chosen(self, image: Any) -> bool:
+        """Whether an image message is among the stamps that were asked for."""
         self._images += 1
         self._on_image()
-        if self._stamps is not None:
-            stamp = stamp_ns(msg.header)
-            if stamp not in self._stamps:
-                self._skipped += 1
-                return
-            self._stamps_found.add(stamp)
-        if self._topics.image.msgtype == COMPRESSED_IMAGE:
-            self._intake.add_compressed_image(msg)
-        else:
-            self._intake.add_image(msg)
+        if self._stamps is None:
+            return True
+        stamp = stamp_ns(image.header)
+        if stamp not in self._stamps:
+            self._skipped += 1
+            return False
+        self._stamps_found.add(stamp)
+        return True
 
     def _drain(self) -> Iterator[ReplayedPair]:
         while (taken := self._sequencer.take()) is not None:
@@ -231,14 +221,13 @@ def read_truth(bag: Bag, topics: SensorTopics) -> TrueTrajectory | None:
     """The camera's true trajectory; None where the bag has none."""
     if topics.truth is None:
         return None
-    stamps, positions, quats = [], [], []
-    for message in bag.messages([topics.truth]):
-        pose = message.message.pose
-        stamps.append(stamp_ns(message.message.header))
-        positions.append((pose.position.x, pose.position.y, pose.position.z))
-        quats.append((pose.orientation.x, pose.orientation.y, pose.orientation.z,
-                      pose.orientation.w))
+    poses: list[TruePose] = []
+    feed = SensorFeed({Role.TRUTH: poses.append})
+    for role, message in feed.messages(bag, topics):
+        feed.receive(role, message.message)
     try:
-        return TrueTrajectory(stamps, np.array(positions), np.array(quats))
+        return TrueTrajectory([pose.stamp_ns for pose in poses],
+                              np.array([pose.position for pose in poses]),
+                              np.array([pose.quat_xyzw for pose in poses]))
     except InputError as error:
         raise InputError(f'{topics.truth.name}: {error}') from error

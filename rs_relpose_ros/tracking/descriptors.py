@@ -13,7 +13,6 @@ from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.tracking.corners import feature_rows
 from rs_relpose_ros.tracking.images import checked, Image
 from rs_relpose_ros.tracking.matches import Matches
-from rs_relpose_ros.tracking.tracker import Predict
 
 Array = NDArray[np.float64]
 Descriptors = NDArray[np.uint8] | NDArray[np.float32]
@@ -71,12 +70,14 @@ class DescriptorTracker:
         self._shape = image.shape
         self._reference = self._current = self._detect(image)
 
-    def track(self, image: Image, predict: Predict | None = None,
-              interval: float = 1.0) -> Matches:
-        """Match `image`, which then is the current one, with the reference.
+    @property
+    def points(self) -> Array:
+        """None (0, 2): all keypoints of the next image are compared, wherever they lie."""
+        return np.empty((0, 2))
 
-        `predict` speaks of the previous image, and is not needed: the search is not local.
-        """
+    def track(self, image: Image, predicted: Array | None = None,
+              interval: float = 1.0) -> Matches:
+        """Match `image`, which then is the current one, with the reference."""
         if self._reference is None:
             raise InputError('the tracker has no reference keyframe: call start() first')
         image = checked(image, self._shape)

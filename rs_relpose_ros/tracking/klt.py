@@ -21,7 +21,6 @@ from rs_relpose_ros.tracking.lucas_kanade import (
 )
 from rs_relpose_ros.tracking.matches import Matches
 from rs_relpose_ros.tracking.patches import cut, cut_warped
-from rs_relpose_ros.tracking.tracker import Predict
 from rs_relpose_ros.tracking.windows import (
     brightness_table,
     correlations,
@@ -80,34 +79,30 @@ class KltTracker:
         self._current = image
         self._renew()
 
-    def track(self, image: Image, predict: Predict | None = None,
+    @property
+    def points(self) -> Array:
+        """Corners (N, 2) in the current image [px] that `track` will look for."""
+        return self._points
+
+    def track(self, image: Image, predicted: Array | None = None,
               interval: float = 1.0) -> Matches:
         """Follow the corners from the current image into `image`, which then is the current one.
 
-        Parameters
-        ----------
-        image : (H, W) ndarray of uint8
-        predict : callable, optional
-            Maps points of the previous image to where they are expected in this one.
-        interval : float
-            Time since the previous image, in any unit: what is not predicted goes on in
-            proportion to it.
+        Parameters are those of `rs_relpose_ros.tracking.tracker.Tracker.track`.
         """
         if self._current is None:
             raise InputError('the tracker has no reference keyframe: call start() first')
         previous, points = self._current, self._points
         current = checked(image, previous.shape)
-        predicted = points
-        if predict is not None and len(points):
-            predicted = np.asarray(predict(points), dtype=np.float64)
-            predicted = np.where(np.isfinite(predicted).all(axis=1, keepdims=True), predicted,
-                                 points)
+        expected = predicted is not None or self._residual_flow.any()
+        if predicted is None:
+            predicted = points
+        predicted = np.where(np.isfinite(predicted).all(axis=1, keepdims=True), predicted, points)
         # What the gyro did not tell (parallax) goes on as it did.
         guess = predicted + interval * self._residual_flow
         seen = with_brightness(current, brightness_table(
             previous, current, points, guess, self._config.klt_window))
         levels = self._config.klt_levels
-        expected = predict is not None or self._residual_flow.any()
         depth = levels
         if expected:
             depth = min(_NEAR_LEVELS if self._guessed_well else _EXPECTED_LEVELS, levels)

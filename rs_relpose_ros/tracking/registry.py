@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from rs_relpose_ros.config.tracking import TrackingConfig
-from rs_relpose_ros.tracking.descriptors import DescriptorTracker
-from rs_relpose_ros.tracking.klt import KltTracker
+import pkgutil
+
+from rs_relpose_ros.config.tracking import TRACKERS, TrackingConfig
 from rs_relpose_ros.tracking.tracker import Tracker
 
 
 def make_tracker(config: TrackingConfig) -> Tracker:
-    """The tracker that `config.detector` names."""
-    return KltTracker(config) if config.detector == 'klt' else DescriptorTracker(config)
+    """Tracker that `config.detector` names; its module is imported now."""
+    tracker: Tracker = pkgutil.resolve_name(TRACKERS[config.detector])(config)
+    return tracker

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -12,9 +11,6 @@ from rs_relpose_ros.tracking.matches import Matches
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
-
-# Points (N, 2) of the previous image -> (N, 2) where they are expected now; NaN where unknown.
-Predict = Callable[[Array], Array]
 
 
 class Tracker(Protocol):
@@ -30,9 +26,26 @@ class Tracker(Protocol):
     def start(self, image: Image) -> None:
         """Make `image` (H, W) the reference keyframe."""
 
-    def track(self, image: Image, predict: Predict | None = None,
+    @property
+    def points(self) -> Array:
+        """Points (N, 2) of the current image [px] that `track` will look for in the next one.
+
+        None (0, 2) where the search is not local and a prediction is of no use.
+        """
+
+    def track(self, image: Image, predicted: Array | None = None,
               interval: float = 1.0) -> Matches:
-        """Make `image` the current one; its matches with the reference."""
+        """Make `image` the current one; its matches with the reference.
+
+        Parameters
+        ----------
+        image : (H, W) ndarray of uint8
+        predicted : (N, 2) ndarray, optional
+            Where each of `points` is expected in `image` [px]; NaN where that is unknown.
+        interval : float
+            Time since the image before, in any unit: the part of a track's motion that was not
+            predicted is extrapolated in proportion to it.
+        """
 
     def refined_matches(self) -> Matches:
         """Matches of reference and current image, as exact as they get; for a closing pair."""

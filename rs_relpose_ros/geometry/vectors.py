@@ -1,0 +1,52 @@
+"""Vectors of three numbers in compiled code, without allocation.
+
+An argument is a tuple or an array (3,), such as the row ``rays[k]`` of an array of rays; a result
+is a tuple. The kernels are copied into their callers, so that a call costs no more than sums
+written out. Every sum runs over x, y, z in this order, so that the bits are those of such sums.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.compiled import small_kernel
+
+Array = NDArray[np.float64]
+Vector = tuple[float, float, float]
+
+
+@small_kernel
+def dot(a: Vector | Array, b: Vector | Array) -> float:
+    """``a . b``."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@small_kernel
+def cross(a: Vector | Array, b: Vector | Array) -> Vector:
+    """``a x b``."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+@small_kernel
+def norm(v: Vector | Array) -> float:
+    """``|v|``; for vectors whose squares neither overflow nor vanish."""
+    return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+
+
+@small_kernel
+def rotated(R: Array, v: Vector | Array) -> Vector:
+    """``R v``, of any matrix (3, 3)."""
+    return (R[0, 0] * v[0] + R[0, 1] * v[1] + R[0, 2] * v[2],
+            R[1, 0] * v[0] + R[1, 1] * v[1] + R[1, 2] * v[2],
+            R[2, 0] * v[0] + R[2, 1] * v[1] + R[2, 2] * v[2])
+
+
+@small_kernel
+def rotated_back(R: Array, v: Vector | Array) -> Vector:
+    """``R^T v``, of any matrix (3, 3)."""
+    return (R[0, 0] * v[0] + R[1, 0] * v[1] + R[2, 0] * v[2],
+            R[0, 1] * v[0] + R[1, 1] * v[1] + R[2, 1] * v[2],
+            R[0, 2] * v[0] + R[1, 2] * v[1] + R[2, 2] * v[2])
