@@ -1,4 +1,4 @@
-"""The drive loop: what becomes of errors, and that a parameter changed in mid-run has its effect."""
+"""The drive loop: what becomes of errors, and parameters that change in mid-run."""
 
 from __future__ import annotations
 

@@ -12,9 +12,9 @@ from typing import Any
 import message_builders as build
 import numpy as np
 import pytest
-import ros_graph
 from sensor_msgs.msg import CameraInfo, Image, Imu
 
+from rs_relpose_lab.live.processes import wait_until
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.estimator.estimate import warm_up
 from rs_relpose_ros.front_end.frame import Frame
@@ -110,7 +110,7 @@ def test_the_oldest_frame_goes_and_the_latest_wait(held):
                 if stamp_ns <= frame_stamp(k) + READOUT_NS < stamp_ns + IMU_NS:
                     sequencer.add_frame(Frame(frame_stamp(k), IMAGE, 'camera', CALIBRATION))
                     if k == 0:
-                        ros_graph.wait_until(held.started.is_set, 'the first frame')
+                        wait_until(held.started.is_set, 'the first frame')
         # All of this came while the worker held the first frame.
         counts = sequencer.counts()
         lost = FRAMES - 1 - MAILBOX_FRAMES
@@ -125,7 +125,7 @@ def test_the_oldest_frame_goes_and_the_latest_wait(held):
         assert report.text.startswith(f'{lost} frames were not used')
         assert dict(report.values)['frames_refused_overload'] == str(lost)
         held.let_go.set()
-        ros_graph.wait_until(lambda: len(done()) == 1 + MAILBOX_FRAMES, 'the frames that waited')
+        wait_until(lambda: len(done()) == 1 + MAILBOX_FRAMES, 'the frames that waited')
     finally:
         held.let_go.set()
         assert worker.stop(10.0)
@@ -166,7 +166,7 @@ def test_a_busy_worker_costs_the_node_no_imu(held, module_ros_domain_id):
         def spun() -> Any:
             executor.spin_once(timeout_sec=0.02)
             return condition()
-        ros_graph.wait_until(spun, what)
+        wait_until(spun, what)
 
     try:
         spin_until(lambda: all(p.get_subscription_count() for p in publishers.values()),

@@ -6,8 +6,8 @@ import json
 import subprocess
 import sys
 
+from conftest import ROOT
 import pytest
-import ros_graph
 
 # In a process of its own: other tests compile kernels in this one.
 PROGRAM = """
@@ -50,8 +50,8 @@ print(json.dumps([sorted(statuses), [k for k in after if after[k] != before[k]],
 def test_nothing_is_compiled_after_the_warm_up(bundled_bag):
     out = subprocess.run(
         [sys.executable, '-c', PROGRAM, str(bundled_bag),
-         str(ros_graph.ROOT / 'bags' / 'hand_held.yaml')],
-        check=True, capture_output=True, text=True, timeout=590, cwd=ros_graph.ROOT)
+         str(ROOT / 'bags' / 'hand_held.yaml')],
+        check=True, capture_output=True, text=True, timeout=590, cwd=ROOT)
     statuses, compiled_late, kernels = json.loads(out.stdout)
     # The bag holds motion, standstill and pure rotation: every path of the estimator.
     assert {'OK', 'PURE_ROTATION'} <= set(statuses)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
+from rs_relpose_ros.geometry.so3 import exp_so3, log_so3, multiply
 
 Array = NDArray[np.float64]
 
@@ -170,12 +170,7 @@ def rotations_between(knot_times: Array, knot_rotations: Array,
         k = min(max(after[i] - 1, 0), len(steps) - 1)
         fraction = (time - knot_times[k]) / (knot_times[k + 1] - knot_times[k])
         turn = exp_so3(fraction * steps[k])
-        # By hand: a call of BLAS costs more than nine sums of three products.
-        for a in range(3):
-            for b in range(3):
-                out[i, a, b] = (knot_rotations[k, a, 0] * turn[0, b]
-                                + knot_rotations[k, a, 1] * turn[1, b]
-                                + knot_rotations[k, a, 2] * turn[2, b])
+        multiply(knot_rotations[k], turn, out[i])
     return out, covered
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel
+from rs_relpose_ros.geometry.vectors import rotated_back
 
 Array = NDArray[np.float64]
 
@@ -100,6 +101,13 @@ def left_jacobian_so3(v: Array) -> Array:
     jacobian[1, 2] = c * y * z - b * x
     jacobian[2, 1] = c * y * z + b * x
     return jacobian
+
+
+@kernel
+def multiply(A: Array, B: Array, out: Array) -> None:
+    """Write ``A B`` of two matrices (3, 3) into a third one: for BLAS they are too small."""
+    for i in range(3):
+        out[i, 0], out[i, 1], out[i, 2] = rotated_back(B, A[i])  # row of A B: B^T a_i
 
 
 def skew(v: Array) -> Array:

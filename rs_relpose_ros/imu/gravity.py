@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.config.imu import ImuConfig
 from rs_relpose_ros.geometry.so3 import exp_so3
 from rs_relpose_ros.geometry.timing import to_nanoseconds
+from rs_relpose_ros.geometry.vectors import cross, dot, norm, rotated
 from rs_relpose_ros.imu.bias import BIAS_MEMORY
 
 Array = NDArray[np.float64]
@@ -47,30 +49,58 @@ class GravityEstimate:
     sigma: float
 
 
+class _Noise(NamedTuple):
+    """Noise of the filter.
+
+    Attributes
+    ----------
+    acceleration : float
+        Variance of the camera's own acceleration per axis [m^2/s^4].
+    turning, bias : float
+        Growth of the variance of direction [rad^2/s] and gyro bias [rad^2/s^3] per axis.
+    """
+
+    acceleration: float
+    turning: float
+    bias: float
+
+
+class _State(NamedTuple):
+    """State of the filter, which the kernels update in place; all in the IMU frame.
+
+    Attributes
+    ----------
+    up, bias : (3,) ndarray
+        Direction ``u`` and bias ``b`` [rad/s].
+    covariance : (6, 6) ndarray
+        P, of ``(d, e)``.
+    residual : (3,) ndarray
+        Mean of ``f / |f| - u`` over about the last second.
+    """
+
+    up: Array
+    bias: Array
+    covariance: Array
+    residual: Array
+
+
 class GravityFilter:
-    """Runs over samples in the order of their stamps; its state depends on nothing else."""
+    """Causal filter of the direction of gravity; its state depends on the samples alone."""
 
     def __init__(self, config: ImuConfig) -> None:
         self._config = config
         self._gap_ns = to_nanoseconds(config.max_imu_gap)
         across = (config.gravity_acceleration_sigma / STANDARD_GRAVITY)**2
         # The growth of the direction's variance that makes the stationary gain dt / time constant.
-        growth = (across * _CORRELATION_TIME / config.gravity_time_constant**2
-                  + config.gyro_noise_density**2)
-        self._noise = np.array([config.gravity_acceleration_sigma**2, growth,
-                                config.gyro_bias_sigma**2 / BIAS_MEMORY])
-        self._bias = np.zeros(3)
-        self._bias_covariance = config.gyro_bias_sigma**2 * np.eye(3)
-        self._restart()
-
-    def _restart(self) -> None:
-        """The direction is unknown; the bias is what it was."""
+        turning = (across * _CORRELATION_TIME / config.gravity_time_constant**2
+                   + config.gyro_noise_density**2)
+        self._noise = _Noise(config.gravity_acceleration_sigma**2, turning,
+                             config.gyro_bias_sigma**2 / BIAS_MEMORY)
+        self._state = _State(np.zeros(3), np.zeros(3), np.zeros((6, 6)), np.zeros(3))
+        self._state.covariance[3:, 3:] = config.gyro_bias_sigma**2 * np.eye(3)
+        # Of the last sample: None while the direction is unknown.
         self._stamp_ns: int | None = None
-        self._up = np.zeros(3)
         self._rate = np.zeros(3)
-        self._covariance = np.zeros((6, 6))
-        # Residual of the last second, in the IMU frame.
-        self._residual = np.zeros(3)
 
     @property
     def stamp_ns(self) -> int | None:
@@ -94,156 +124,165 @@ class GravityFilter:
             if self._stamp_ns is None:
                 k = self._begin(k, stamps_ns, rates, forces)
                 continue
-            done = _advance(self._up, self._bias, self._residual, self._covariance,
-                            self._stamp_ns, self._rate, stamps_ns[k:], rates[k:], forces[k:],
-                            self._noise, self._gap_ns)
+            done = _advance(self._state, self._noise, self._stamp_ns, self._rate, stamps_ns[k:],
+                            rates[k:], forces[k:], self._gap_ns)
             if done:
                 k += done
                 self._stamp_ns, self._rate = int(stamps_ns[k - 1]), rates[k - 1].copy()
             if k < len(stamps_ns):
-                # Nobody knows how the IMU turned in the gap.
-                self._bias_covariance = self._covariance[3:, 3:].copy()
-                self._restart()
+                # The turn of the IMU during a gap is unknown: the direction is lost.
+                self._stamp_ns = None
 
     def estimate(self) -> GravityEstimate | None:
         """Gravity at the stamp of the last sample; None without accelerometer."""
         if self._stamp_ns is None:
             return None
+        up = self._state.up
         # An error along the direction itself turns nothing.
-        spread = self._covariance[:3, :3]
-        variance = 0.5 * float(np.trace(spread) - self._up @ spread @ self._up)
-        dragged = (float(np.linalg.norm(self._residual))
+        spread = self._state.covariance[:3, :3]
+        variance = 0.5 * float(np.trace(spread) - up @ spread @ up)
+        dragged = (float(np.linalg.norm(self._state.residual))
                    * min(_LASTING / self._config.gravity_time_constant, 1.0))
-        return GravityEstimate(-self._up, math.sqrt(variance + dragged * dragged))
+        return GravityEstimate(-up, math.sqrt(variance + dragged * dragged))
 
     def _begin(self, k: int, stamps_ns: NDArray[np.int64], rates: Array, forces: Array) -> int:
-        """Start from the first specific force at or after sample `k`; the index after it."""
-        lengths = np.linalg.norm(forces[k:], axis=1)
-        usable = np.flatnonzero(lengths > 0.0)
+        """Start from the first specific force at or after sample `k`; the index after it.
+
+        The bias and its variance stay what they were.
+        """
+        usable = np.flatnonzero(np.linalg.norm(forces[k:], axis=1) > 0.0)
         if len(usable) == 0:
             return len(stamps_ns)
         first = k + int(usable[0])
-        length = float(lengths[first - k])
-        self._up = forces[first] / length
-        excess = length - STANDARD_GRAVITY
-        variance = (self._config.gravity_acceleration_sigma**2
-                    + 4.0 * excess**2) / STANDARD_GRAVITY**2
-        self._covariance[:3, :3] = variance * np.eye(3)
-        self._covariance[3:, 3:] = self._bias_covariance
+        length = float(np.linalg.norm(forces[first]))
+        up, _, covariance, residual = self._state
+        up[:], residual[:] = forces[first] / length, 0.0
+        covariance[:3, 3:] = covariance[3:, :3] = 0.0
+        covariance[:3, :3] = _direction_variance(length, self._noise.acceleration) * np.eye(3)
         self._stamp_ns, self._rate = int(stamps_ns[first]), rates[first].copy()
         return first + 1
 
 
 @kernel
-def _advance(up: Array, bias: Array, residual: Array, covariance: Array, stamp_ns: int,
-             rate: Array, stamps_ns: NDArray[np.int64], rates: Array, forces: Array, noise: Array,
-             gap_ns: int) -> int:
-    """Filter samples up to the first gap; their number. The first four are updated in place.
+def _advance(state: _State, noise: _Noise, stamp_ns: int, rate: Array,
+             stamps_ns: NDArray[np.int64], rates: Array, forces: Array, gap_ns: int) -> int:
+    """Filter samples up to the first gap; their number.
 
-    `noise`: variance of the acceleration, growth per second of the variances of direction and
-    bias.
+    `stamp_ns` and `rate` (3,) are those of the sample before.
     """
-    transition = np.eye(6)
-    turned = np.empty((6, 6))
-    slope = np.empty((3, 3))
-    gain = np.empty((6, 3))
-    cross = np.empty((6, 3))
-    for k in range(stamps_ns.shape[0]):
+    for k in range(len(stamps_ns)):
         if stamps_ns[k] - stamp_ns > gap_ns:
             return k
         dt = (stamps_ns[k] - stamp_ns) * 1e-9
-        # A direction that is fixed in the world turns backwards in the IMU frame.
-        back = exp_so3(-(0.5 * (rate + rates[k]) - bias) * dt)
+        _predict(state, noise, 0.5 * (rate + rates[k]), dt)
         stamp_ns, rate = stamps_ns[k], rates[k]
-        up[:] = _product(back, up)
-        residual[:] = _product(back, residual)
-        for i in range(3):
-            for j in range(3):
-                transition[i, j] = back[i, j]
-            transition[i, 3 + i] = dt
-        for i in range(6):
-            for j in range(6):
-                total = 0.0
-                for m in range(6):
-                    total += transition[i, m] * covariance[m, j]
-                turned[i, j] = total
-        for i in range(6):
-            for j in range(6):
-                total = 0.0
-                for m in range(6):
-                    total += turned[i, m] * transition[j, m]
-                covariance[i, j] = total
-            covariance[i, i] += noise[1 if i < 3 else 2] * dt
-        force = forces[k]
-        length = math.sqrt(force[0] * force[0] + force[1] * force[1] + force[2] * force[2])
+        length = norm(forces[k])
         if length > 0.0:
-            # |f| off by some acceleration along gravity means about as much across it.
-            excess = length - STANDARD_GRAVITY
-            sigma2 = (noise[0] + 4.0 * excess * excess) / (STANDARD_GRAVITY * STANDARD_GRAVITY)
             # Samples closer than the correlation time share one measurement's weight.
-            sigma2 *= max(_CORRELATION_TIME / dt, 1.0)
-            _correct(up, bias, residual, covariance, force / length, sigma2, dt, slope, cross,
-                     gain)
-    return stamps_ns.shape[0]
+            variance = (_direction_variance(length, noise.acceleration)
+                        * max(_CORRELATION_TIME / dt, 1.0))
+            _correct(state, forces[k] / length, variance, dt)
+    return len(stamps_ns)
 
 
 @kernel
-def _correct(up: Array, bias: Array, residual: Array, covariance: Array, measured: Array,
-             sigma2: float, dt: float, slope: Array, cross: Array, gain: Array) -> None:
-    """Kalman update by a measured direction (3,) of variance `sigma2` per axis."""
-    # H = -[u]x, the derivative of the residual by d.
-    slope[0, 0] = slope[1, 1] = slope[2, 2] = 0.0
-    slope[0, 1], slope[1, 0] = up[2], -up[2]
-    slope[0, 2], slope[2, 0] = -up[1], up[1]
-    slope[1, 2], slope[2, 1] = up[0], -up[0]
-    for i in range(6):
-        for j in range(3):
-            cross[i, j] = (covariance[i, 0] * slope[j, 0] + covariance[i, 1] * slope[j, 1]
-                           + covariance[i, 2] * slope[j, 2])
-    # S = H P H^T + sigma2 I, inverted by its cofactors.
-    s00, s01, s02 = sigma2, 0.0, 0.0
-    s11, s12, s22 = sigma2, 0.0, sigma2
-    for m in range(3):
-        s00 += slope[0, m] * cross[m, 0]
-        s01 += slope[0, m] * cross[m, 1]
-        s02 += slope[0, m] * cross[m, 2]
-        s11 += slope[1, m] * cross[m, 1]
-        s12 += slope[1, m] * cross[m, 2]
-        s22 += slope[2, m] * cross[m, 2]
-    i00, i01, i02 = s11 * s22 - s12 * s12, s02 * s12 - s01 * s22, s01 * s12 - s02 * s11
-    i11, i12, i22 = s00 * s22 - s02 * s02, s01 * s02 - s00 * s12, s00 * s11 - s01 * s01
-    determinant = s00 * i00 + s01 * i01 + s02 * i02
-    for i in range(6):
-        a, b, c = cross[i, 0], cross[i, 1], cross[i, 2]
-        gain[i, 0] = (a * i00 + b * i01 + c * i02) / determinant
-        gain[i, 1] = (a * i01 + b * i11 + c * i12) / determinant
-        gain[i, 2] = (a * i02 + b * i12 + c * i22) / determinant
+def _direction_variance(length: float, acceleration: float) -> float:
+    """Variance per axis of the direction of a specific force of some length [m/s^2].
+
+    |f| off by some acceleration along gravity means about as much across it.
+    """
+    excess = length - STANDARD_GRAVITY
+    return (acceleration + 4.0 * excess * excess) / (STANDARD_GRAVITY * STANDARD_GRAVITY)
+
+
+@kernel
+def _predict(state: _State, noise: _Noise, rate: Array, dt: float) -> None:
+    """Turn by the measured `rate` (3,), with ``E = Exp(-(w - b) dt)``.
+
+    u <- E u        F = | E  dt I |        P <- F P F^T + Q dt
+                        | 0     I |
+    """
+    up, bias, P, residual = state
+    # A direction that is fixed in the world turns backwards in the IMU frame.
+    E = exp_so3(-(rate - bias) * dt)
+    up[:] = rotated(E, up)
+    residual[:] = rotated(E, residual)
+    F = np.eye(6)
+    F[:3, :3] = E
+    for i in range(3):
+        F[i, 3 + i] = dt
+    P[:] = _product(_product(F, P), F.T)
+    for i in range(3):
+        P[i, i] += noise.turning * dt
+        P[3 + i, 3 + i] += noise.bias * dt
+
+
+@kernel
+def _correct(state: _State, measured: Array, variance: float, dt: float) -> None:
+    """Kalman update by a measured direction (3,) with its variance per axis.
+
+    H = | -[u]x  0 |        S = H P H^T + variance I        K = P H^T S^-1
+    (d, e) = K (f / |f| - u)        P <- P - K H P
+    u <- Exp(d) u        b <- b + e
+    """
+    up, bias, P, residual = state
+    innovation = measured - up
+    residual += min(dt / _LASTING, 1.0) * (innovation - residual)
+    H = np.zeros((3, 6))
+    H[0, 1], H[1, 0] = up[2], -up[2]
+    H[0, 2], H[2, 0] = -up[1], up[1]
+    H[1, 2], H[2, 1] = up[0], -up[0]
+    PHt = _product(P, H.T)
+    S = variance * np.eye(3)
+    _add_product(H, PHt, S)
+    _mirror(S)
+    adjugate, determinant = _symmetric_adjugate(S)
+    K = _product(PHt, adjugate) / determinant
     turn = np.zeros(3)
-    share = min(dt / _LASTING, 1.0)
     for j in range(3):
-        off = measured[j] - up[j]
-        residual[j] += share * (off - residual[j])
-        for i in range(3):
-            turn[i] += gain[i, j] * off
-            bias[i] += gain[3 + i, j] * off
-    for i in range(6):
-        for j in range(i, 6):
-            covariance[i, j] -= (gain[i, 0] * cross[j, 0] + gain[i, 1] * cross[j, 1]
-                                 + gain[i, 2] * cross[j, 2])
-            covariance[j, i] = covariance[i, j]
-    moved = _product(exp_so3(turn), up)
-    norm = math.sqrt(moved[0] * moved[0] + moved[1] * moved[1] + moved[2] * moved[2])
+        turn += K[:3, j] * innovation[j]
+        bias += K[3:, j] * innovation[j]
+    P -= _product(K, PHt.T)
+    _mirror(P)
+    moved = rotated(exp_so3(turn), up)
+    length = norm(moved)
     for i in range(3):
-        up[i] = moved[i] / norm
+        up[i] = moved[i] / length
 
 
 @kernel
-def _product(matrix: Array, vector: Array) -> Array:
-    out = np.empty(3)
+def _symmetric_adjugate(S: Array) -> tuple[Array, float]:
+    """Adjugate of a symmetric matrix (3, 3) and its determinant: ``S^-1 = adj S / det S``."""
+    adjugate = np.empty((3, 3))
     for i in range(3):
-        out[i] = (matrix[i, 0] * vector[0] + matrix[i, 1] * vector[1]
-                  + matrix[i, 2] * vector[2])
+        adjugate[i] = cross(S[(i + 1) % 3], S[(i + 2) % 3])
+    return adjugate, dot(S[0], adjugate[0])
+
+
+@kernel
+def _product(A: Array, B: Array) -> Array:
+    out = np.zeros((A.shape[0], B.shape[1]))
+    _add_product(A, B, out)
     return out
+
+
+@kernel
+def _add_product(A: Array, B: Array, out: Array) -> None:
+    """``out <- out + A B``, term by term in this order; BLAS costs more for small matrices."""
+    for i in range(A.shape[0]):
+        for j in range(B.shape[1]):
+            total = out[i, j]
+            for k in range(A.shape[1]):
+                total += A[i, k] * B[k, j]
+            out[i, j] = total
+
+
+@kernel
+def _mirror(S: Array) -> None:
+    """Copy the upper triangle of a matrix into the lower one, which rounding made another."""
+    for i in range(1, len(S)):
+        for j in range(i):
+            S[i, j] = S[j, i]
 
 
 def mean_gravity(forces: Array) -> GravityEstimate | None:

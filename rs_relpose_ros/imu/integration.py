@@ -1,4 +1,4 @@
-"""Integration of the gyro on SO(3), with covariance."""
+"""Rotation by the gyro between two instants, with its covariance."""
 
 from __future__ import annotations
 
@@ -8,49 +8,33 @@ from numpy.typing import ArrayLike, NDArray
 from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.config.imu import ImuConfig
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry.so3 import exp_so3, left_jacobian_so3
+from rs_relpose_ros.geometry.gyro import integrated_rotations, step_turn
+from rs_relpose_ros.geometry.so3 import left_jacobian_so3, multiply
+from rs_relpose_ros.geometry.vectors import dot
 
 Array = NDArray[np.float64]
-
-
-@kernel
-def _product(a: Array, b: Array, out: Array) -> None:
-    # By hand: a call of BLAS costs more than nine sums of three products.
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
 
 
 @kernel
 def _integrate(seconds: Array, rates: Array) -> tuple[Array, Array, Array]:
     """Rotation ``R_start^T R_end``, its derivative by a constant rate error, and noise growth.
 
-    ``R <- R Exp(turn)`` with the rate linear within a step (Magnus expansion, fourth order;
-    Blanes, Casas, Oteo and Ros, Physics Reports 470, 2009):
+    An error dw of the rate of step k turns the result by ``L_k dw dt`` on the left (in the start
+    frame), where ``L_k = R_k J_l(phi_k)``:
 
-        turn = (w_0 + w_1) dt / 2 + (w_0 x w_1) dt^2 / 12
-
-    An error dw of a step's rate turns the result by ``R J_l(turn) dw dt`` on the left (in the
-    start frame).
+        derivative = sum L_k dt        noise = sum L_k L_k^T dt
     """
-    rotation, by_bias, noise = np.eye(3), np.zeros((3, 3)), np.zeros((3, 3))
-    turn, left, turned = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
-    for k in range(seconds.shape[0] - 1):
+    rotations = integrated_rotations(seconds, rates)
+    derivative, noise, L = np.zeros((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
+    for k in range(len(seconds) - 1):
         dt = seconds[k + 1] - seconds[k]
-        for i in range(3):
-            a, b = (i + 1) % 3, (i + 2) % 3
-            turn[i] = (0.5 * (rates[k, i] + rates[k + 1, i]) * dt
-                       + (rates[k, a] * rates[k + 1, b] - rates[k, b] * rates[k + 1, a])
-                       * dt * dt / 12.0)
-        _product(rotation, left_jacobian_so3(turn), left)
+        turn = step_turn(rates[k], rates[k + 1], dt)
+        multiply(rotations[k], left_jacobian_so3(turn), L)
         for i in range(3):
             for j in range(3):
-                by_bias[i, j] += left[i, j] * dt
-                noise[i, j] += (left[i, 0] * left[j, 0] + left[i, 1] * left[j, 1]
-                                + left[i, 2] * left[j, 2]) * dt
-        _product(rotation, exp_so3(turn), turned)
-        rotation, turned = turned, rotation
-    return rotation, by_bias, noise
+                derivative[i, j] += L[i, j] * dt
+                noise[i, j] += dot(L[i], L[j]) * dt
+    return rotations[-1], derivative, noise
 
 
 def integrate_rotation(stamps_ns: NDArray[np.int64], rates: ArrayLike, config: ImuConfig,
@@ -82,10 +66,10 @@ def integrate_rotation(stamps_ns: NDArray[np.int64], rates: ArrayLike, config: I
     seconds = (stamps_ns - stamps_ns[0]) * 1e-9
     if not (np.diff(seconds) > 0.0).all():
         raise InputError('stamps_ns must be strictly increasing')
-    rotation, by_bias, noise = _integrate(seconds, rates)
+    rotation, derivative, noise = _integrate(seconds, rates)
     if bias_sigma is None:
         bias_sigma = config.gyro_bias_sigma
-    covariance = config.gyro_noise_density**2 * noise + bias_sigma**2 * by_bias @ by_bias.T
+    covariance = config.gyro_noise_density**2 * noise + bias_sigma**2 * derivative @ derivative.T
     return rotation, covariance
 
 
