@@ -17,10 +17,10 @@ from rs_relpose_ros.geometry.timing import NANOSECONDS
 
 OK, WARN, ERROR = 0, 1, 2
 
-# Pairs that the latency, and frames that the time of a frame is taken from.
+# Numbers of the latest pairs and frames over which latency and time per frame are taken.
 _RECENT_PAIRS = 300
 _RECENT_FRAMES = 900
-# An input that is silent for so long is missing.
+# Time without a message [s] after which an input counts as missing.
 SILENCE = 2.0
 
 
