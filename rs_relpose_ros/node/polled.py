@@ -1,8 +1,8 @@
 """Topics that are read when their messages are needed, instead of waking the process each time.
 
-A wake-up costs rclpy more than the message itself, because it builds a new wait set of all that the
-node has. An IMU would wake it hundreds of times a second, while its samples are needed only when a
-frame asks for them, some thirty times. Until then they stay in the queue of the middleware.
+A wake-up costs rclpy more than the message itself, because it builds a new wait set of all that
+the node has. An IMU would wake it hundreds of times a second, while its samples are needed only
+when a frame asks for them, some thirty times. Until then they stay in the queue of the middleware.
 """
 
 from __future__ import annotations
