@@ -110,7 +110,7 @@ BASE = {'geometry', 'config'}
 CORE = BASE | {'solvers', 'estimator', 'imu', 'tracking'}
 MAY_IMPORT = {
     'geometry': set(),
-    'config': {'geometry'},
+    'config': {'geometry', 'solvers'},
     'solvers': {'geometry'},
     'imu': BASE,
     'tracking': BASE,
