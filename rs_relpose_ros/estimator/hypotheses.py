@@ -82,18 +82,19 @@ def draw_hypotheses(problem: TwoViewProblem, mode: SolverMode, config: Estimator
     matches = Matches(problem.points, order, (config.threshold * SCALES / problem.focal)**2)
     stop = Stop(config.confidence, config.max_iterations)
     has_gravity = problem.motion1.gravity is not None and problem.motion2.gravity is not None
+    # All addresses first: what a later pair asks is compiled with the first pair.
+    able = [(solver, solver.address) for solver in mode.solvers
+            if (known.predicted or not solver.needs_rotation)
+            and (has_gravity or not solver.needs_gravity)]
     pool = empty_pool(POOL_SIZE)
     samples = inliers = 0
     some_unasked = False
-    for solver in mode.solvers:
-        if (solver.needs_rotation and not known.predicted) or (
-                solver.needs_gravity and not has_gravity):
-            continue
+    for solver, address in able:
         some_unasked = inliers > enough * len(order)
         if some_unasked:
             break
         drawn, inliers = sample_hypotheses(
-            solver.address, solver.sample_size, matches, known, stop, inliers,
+            address, solver.sample_size, matches, known, stop, inliers,
             empty_solutions(solver.most_solutions), pool, seed)
         samples += drawn
     found = np.argsort(pool.cost)[:np.isfinite(pool.cost).sum()]

@@ -1,23 +1,20 @@
-"""What a minimal solver is: compiled code behind one signature, called by its address.
+"""What a minimal solver is: a kernel behind one signature, called by its address.
 
-Through an address the robust loop is compiled once, and a solver only when somebody chooses it:
-called by name, each would be compiled into the loop.
+So the robust loop is compiled once, and a solver only when somebody chooses it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from llvmlite import ir
 import numba
-from numba.extending import intrinsic
 import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel
+from rs_relpose_ros.kernel_interface import KernelInterface
 
 Array = NDArray[np.float64]
 
@@ -111,31 +108,14 @@ class Solver:
     @property
     def address(self) -> int:
         """Of the compiled kernel, for `solve_at`; it is compiled when first asked for."""
-        address: int = _compiled(self.solve).address
-        return address
+        return _INTERFACE.address(self.solve)
 
 
-_SIGNATURE = numba.int64(numba.typeof(Sample(*np.empty((2, 1, 3)), *np.empty((2, 1)))),
-                         numba.typeof(no_knowledge()), numba.typeof(empty_solutions(1)))
-
-
-@functools.cache
-def _compiled(solve: Any) -> Any:
-    return numba.cfunc(_SIGNATURE, cache=True, error_model='numpy')(solve.py_func)
-
-
-def _typed_call(_typing: Any, address: Any, _sample: Any, _known: Any, _out: Any) -> Any:
-    def call(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        result, *arguments = (context.get_value_type(t) for t in (
-            signature.return_type, *signature.args[1:]))
-        function = ir.FunctionType(result, arguments).as_pointer()
-        return builder.call(builder.inttoptr(args[0], function), args[1:])
-
-    return _SIGNATURE.return_type(address, *_SIGNATURE.args), call
-
-
-# In compiled code: call the solver at an address.
-solve_at: Callable[[int, Sample, Knowledge, Solutions], int] = intrinsic(_typed_call)
+_INTERFACE = KernelInterface(
+    numba.int64, Sample(*np.empty((2, 1, 3)), *np.empty((2, 1))), no_knowledge(),
+    empty_solutions(1))
+# In compiled code: solve_at(address, sample, known, out).
+solve_at: Callable[[int, Sample, Knowledge, Solutions], int] = _INTERFACE.call
 
 
 @kernel
