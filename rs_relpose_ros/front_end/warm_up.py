@@ -29,7 +29,7 @@ from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.imu.samples import ImuSample
 
 _WIDTH, _HEIGHT = 320, 240
-# With a distortion: its kernels, too, must be there before the first frame.
+# With distortion, so that its kernels are compiled, too.
 _INTRINSICS = Intrinsics(width=_WIDTH, height=_HEIGHT, fx=250.0, fy=250.0, cx=159.5, cy=119.5,
                          image_width=_WIDTH, image_height=_HEIGHT,
                          distortion_model='plumb_bob', distortion=(-0.02, 0.01, 0.0, 0.0))
@@ -56,7 +56,7 @@ def warm_up_pipeline(parameters: Parameters) -> None:
         sequencer = front_end.sequencer
         images = list(_images())
         for image in images:
-            # A raw image is tracked in its message's memory; kernels for that are others.
+            # A raw image is read-only memory of its message: kernels for that are apart.
             image.flags.writeable = force is None
         for stamp_ns in range(NANOSECONDS, NANOSECONDS + (len(images) + 3) * _FRAME_NS, _IMU_NS):
             sequencer.add_imu(ImuSample(stamp_ns, (0.01, 0.02, 0.03), force))
