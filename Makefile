@@ -31,12 +31,16 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 demo: $(stamp)
 	$(bin)/python demo/run_demo.py
 
-# Message types are checked in tests; in Jazzy that is off unless asked for.
+# Message types are checked in tests; in Jazzy that is off unless asked for. Two processes: one runs
+# the live tests, which wait most of the time (test/conftest.py); PYTEST_ARGS='-n 0 ...' for one.
+pytest := ROS_PYTHON_CHECK_FIELDS=1 $(bin)/python -m pytest -n 2 --dist loadgroup \
+    --no-loadscope-reorder
+
 test: $(stamp)
-	ROS_PYTHON_CHECK_FIELDS=1 $(bin)/python -m pytest $(PYTEST_ARGS)
+	$(pytest) $(PYTEST_ARGS)
 
 test-all: $(stamp)
-	ROS_PYTHON_CHECK_FIELDS=1 $(bin)/python -m pytest -m 'long or not long' $(PYTEST_ARGS)
+	$(pytest) -m 'long or not long' $(PYTEST_ARGS)
 
 lint: $(stamp)
 	$(bin)/ruff check .
