@@ -27,12 +27,13 @@ from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.calibrate.axis_maps import axes_text, nearest_axis_map
 from rs_relpose_ros.check import judge_turning
 from rs_relpose_ros.check.check import check_bag, choose_topics
-from rs_relpose_ros.check.findings import Finding, Report, Verdict
+from rs_relpose_ros.check.findings import CheckReport, Finding, Verdict
 from rs_relpose_ros.check.scan import scan
 from rs_relpose_ros.check.streams import Stamps, Thinned
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.config.parameters import Parameters
+from rs_relpose_ros.config.tracking import TrackingConfig
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
@@ -300,7 +301,7 @@ def good(bundled_bag, tmp_path_factory):
 def seen(good):
     """What one pass saw of it."""
     with open_bag(good) as bag:
-        return scan(bag, choose_topics(bag, TopicOptions()), lambda: None)
+        return scan(bag, choose_topics(bag, TopicOptions()), TrackingConfig(), lambda: None)
 
 
 def judged(seen, parameters):
@@ -488,7 +489,7 @@ def test_memory_does_not_grow_with_the_stream():
 
 
 def test_lines_hold_verdict_text_and_remedy():
-    report = Report('b', (Finding('short', Verdict.OK, 'fine'),
+    report = CheckReport('b', (Finding('short', Verdict.OK, 'fine'),
                           Finding('much longer', Verdict.FAILURE, 'x' * 10, 'do this')))
     assert report.lines() == ['ok       short        fine',
                               'failure  much longer  xxxxxxxxxx -> do this',
