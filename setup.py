@@ -1,8 +1,14 @@
 """Installs the package, for colcon (ament_python) and for pip."""
 
+import logging
+import os
 from pathlib import Path
+import subprocess
+import sys
 
 from setuptools import find_packages, setup
+from setuptools.command.build_py import build_py
+from setuptools.command.develop import develop
 
 NAME = 'rs_relpose_ros'
 LABORATORY = 'rs_relpose_lab'
@@ -11,6 +17,42 @@ LABORATORY = 'rs_relpose_lab'
 def files_in(folder: str) -> list[str]:
     """Files directly in `folder`, relative to the package root, as data_files takes them."""
     return sorted(str(path) for path in Path(folder).glob('[!.]*') if path.is_file())
+
+
+def compile_kernels(folder: str) -> None:
+    """Fill the kernel cache of the package in `folder`, so that no start of the node has to.
+
+    In a process of its own that sees what the installed package will see: build environments (pip
+    without its option --no-build-isolation, colcon) put a sitecustomize.py in front.
+    """
+    paths = [path for path in os.environ.get('PYTHONPATH', '').split(os.pathsep)
+             if path and not (Path(path) / 'sitecustomize.py').exists()]
+    environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(paths)}
+    filled = subprocess.run([sys.executable, '-m', f'{NAME}.front_end.warm_up'], cwd=folder,
+                            env=environment, stderr=subprocess.PIPE, text=True, check=False)
+    if filled.returncode:
+        reason = (filled.stderr.splitlines() or ['no reason given'])[-1]
+        logging.getLogger(NAME).warning(
+            'kernels will be compiled by the first start of the node: %s', reason)
+
+
+class BuildWithKernels(build_py):
+    """What pip and colcon run; editable (pip), the package is used where its source lies."""
+
+    def run(self) -> None:
+        """Copy the modules and compile their kernels."""
+        super().run()
+        compile_kernels('.' if self.editable_mode else self.build_lib)
+
+
+class DevelopWithKernels(develop):
+    """What ``colcon build --symlink-install`` runs."""
+
+    def run(self) -> None:
+        """Link the modules and compile their kernels."""
+        super().run()
+        if not self.uninstall:
+            compile_kernels('.')
 
 
 setup(
@@ -34,6 +76,7 @@ setup(
     install_requires=['setuptools'],
     extras_require={'test': ['pytest']},
     zip_safe=False,
+    cmdclass={'build_py': BuildWithKernels, 'develop': DevelopWithKernels},
     entry_points={
         'console_scripts': [
             'relpose_node = rs_relpose_ros.node.start:main',

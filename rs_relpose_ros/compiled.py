@@ -9,6 +9,9 @@ from __future__ import annotations
 
 import numba
 
+from rs_relpose_ros import kernel_cache
+
+kernel_cache.install()
 kernel = numba.njit(cache=True, nogil=True, error_model='numpy')
 # Put into its callers by Numba: for the innermost loops, whose arrays' shapes must be known there.
 inlined_kernel = numba.njit(cache=True, nogil=True, error_model='numpy', forceinline=True)

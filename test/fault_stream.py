@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 import copy
 from dataclasses import dataclass
 from pathlib import Path
+import time
 from typing import Any
 
 import cv2
@@ -15,14 +16,18 @@ import rclpy.serialization
 from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 
+from rs_relpose_ros.bags.layout import CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMU_TOPIC, RAW_TOPIC
+from rs_relpose_ros.messages.incoming import stamp_ns
+
 SECOND = 10**9
-_TYPES = {'/imu/data_raw': Imu, '/camera/camera_info': CameraInfo,
-          '/camera/image_raw/compressed': CompressedImage}
+# Topics of the node -> those of the bag.
+BAG_TOPICS = {'image': RAW_TOPIC, 'camera_info': CAMERA_INFO_TOPIC, 'imu': IMU_TOPIC}
+_TYPES = {IMU_TOPIC: Imu, CAMERA_INFO_TOPIC: CameraInfo, COMPRESSED_TOPIC: CompressedImage}
 
 # Of a phase [s]: when its fault begins and ends, and how much of the bag it plays.
-FAULT_FROM, FAULT_UNTIL, PHASE = 0.35, 0.85, 1.8
+FAULT_FROM, FAULT_UNTIL, PHASE = 0.25, 0.65, 1.55
 # Between two phases, on all clocks [s].
-PAUSE = 0.2
+PAUSE = 0.15
 
 # A message and its time [s] in the phase -> what is sent instead, with delays [s].
 Edit = Callable[[Any, float], Iterable[tuple[float, Any]]]
@@ -32,13 +37,15 @@ Edit = Callable[[Any, float], Iterable[tuple[float, Any]]]
 class Fault:
     """What is done to the messages of a phase while it lasts.
 
-    `jump` is added to all stamps [s] from its beginning on, `said` must be logged.
+    It begins at `begin` [s] of the phase. `jump` is added to all stamps [s] from its beginning on,
+    `said` must be logged.
     """
 
     name: str
     edit: Edit
     said: str = ''
     jump: float = 0.0
+    begin: float = FAULT_FROM
 
 
 @dataclass(frozen=True)
@@ -81,13 +88,13 @@ class Stream:
                 if seconds > PHASE:
                     break
                 out = with_stamp(message, stamp_of(message) + later_ns + round(
-                    fault.jump * SECOND if seconds >= FAULT_FROM else 0))
+                    fault.jump * SECOND if seconds >= fault.begin else 0))
                 if isinstance(out, Image):
                     self.phase_of[stamp_of(out)] = phase
                     known = self.taken_at.setdefault(stamp_of(out), stamp_of(message))
                     if known != stamp_of(message):
                         self.taken_at[stamp_of(out)] = None
-                faulty = FAULT_FROM <= seconds < FAULT_UNTIL
+                faulty = fault.begin <= seconds < FAULT_UNTIL
                 for delay, item in (fault.edit(out, seconds) if faulty else [(0.0, out)]):
                     self.sent.append(Sent(start_ns + bag_time_ns - bag_start_ns
                                           + round(delay * SECOND), phase, item))
@@ -116,6 +123,17 @@ def read_messages(bag: Path, seconds: float) -> list[tuple[int, Any]]:
     return messages
 
 
+def publish_in_time(messages: Iterable[tuple[Any, int, Any]]) -> None:
+    """Publish (publisher, bag time [ns], message) at bag time."""
+    first_ns, started = None, time.monotonic()
+    for publisher, bag_time_ns, message in messages:
+        first_ns = bag_time_ns if first_ns is None else first_ns
+        delay = started + (bag_time_ns - first_ns) * 1e-9 - time.monotonic()
+        if delay > 0.0:
+            time.sleep(delay)
+        publisher.publish(message)
+
+
 def gray_image(header: Any, pixels: np.ndarray) -> Image:
     data = array('B')
     data.frombytes(np.ascontiguousarray(pixels).tobytes())
@@ -128,14 +146,14 @@ def pixels_of(image: Image) -> np.ndarray:
 
 
 def stamp_of(message: Any) -> int:
-    return message.header.stamp.sec * SECOND + message.header.stamp.nanosec
+    return stamp_ns(message.header)
 
 
-def with_stamp(message: Any, stamp_ns: int) -> Any:
+def with_stamp(message: Any, new_stamp_ns: int) -> Any:
     """A copy with another stamp; it shares the data."""
     out = copy.copy(message)
     out.header = copy.deepcopy(message.header)
-    out.header.stamp.sec, out.header.stamp.nanosec = divmod(stamp_ns, SECOND)
+    out.header.stamp.sec, out.header.stamp.nanosec = divmod(new_stamp_ns, SECOND)
     return out
 
 

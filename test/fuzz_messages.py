@@ -7,7 +7,6 @@ package's own with one sentence. The seed and the number of a message give it ag
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 import copy
 import json
 import resource
@@ -23,8 +22,9 @@ from rosbags.typesys import get_typestore, Stores
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.front_end.sequencer import FrameRefused, ReadyFrame, Sequencer, WAITING_FRAMES
-from rs_relpose_ros.messages.incoming import ENCODINGS
-from rs_relpose_ros.messages.intake import MessageIntake
+from rs_relpose_ros.images.encoded import ENCODINGS
+from rs_relpose_ros.messages.intake import Intake
+from rs_relpose_ros.messages.sensor_feed import Role
 
 TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
 START_NS = 1_700_000_000 * 10**9
@@ -47,14 +47,14 @@ class Fuzzer:
         parameters = Parameters.from_mapping({
             'readout_time': 0.02, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0]})
         self.sequencer = Sequencer(parameters, clock=lambda: self.now_ns)
-        self.intake = MessageIntake(self.sequencer, parameters.imu.stuck_gyro_time)
+        self.intake = Intake(self.sequencer, parameters.imu.stuck_gyro_time)
         self.outcomes: Counter[str] = Counter()
         self.slowest = 0.0
 
     def run(self, count: int) -> None:
         for number in range(count):
             self.now_ns += 5_000_000
-            add, message = self.message(number)
+            role, message = self.message(number)
             if self.rng.random() < 0.5:
                 message = self.mutated(message)
             if message is None:
@@ -62,7 +62,7 @@ class Fuzzer:
                 continue
             started = time.perf_counter()
             try:
-                add(message)
+                self.intake.receive(role, message)
                 self.outcomes['taken'] += 1
             except RsRelposeError as error:
                 self.outcomes['refused'] += 1
@@ -89,28 +89,28 @@ class Fuzzer:
 
     # -- messages ----------------------------------------------------------------------------
 
-    def message(self, number: int) -> tuple[Callable[[Any], None], Any]:
+    def message(self, number: int) -> tuple[Role, Any]:
         rng, types = self.rng, build.rosbags_types
         stamp_ns = START_NS + number * 5_000_000
         kind = number % (IMU_PER_IMAGE + 2)
         if kind == 0:
-            return self.intake.add_camera_info, build.camera_info(
+            return Role.CAMERA_INFO, build.camera_info(
                 types, width=WIDTH, height=HEIGHT, stamp_ns=stamp_ns,
                 k=(30.0, 0.0, 15.5, 0.0, 30.0, 11.5, 0.0, 0.0, 1.0))
         if kind == 1:
             pixels = rng.integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)
             if rng.random() < 0.5:
                 extension = '.jpg' if rng.random() < 0.7 else '.png'
-                return self.intake.add_compressed_image, build.compressed(
+                return Role.IMAGE, build.compressed(
                     types, cv2.imencode(extension, pixels)[1].tobytes(), stamp_ns)
             # Enough bytes for any encoding.
             encoding = 'mono8' if rng.random() < 0.5 else str(rng.choice(ENCODINGS))
-            return self.intake.add_image, build.image(
+            return Role.IMAGE, build.image(
                 types, WIDTH, HEIGHT, encoding, rng.bytes(4 * WIDTH * HEIGHT), step=4 * WIDTH,
                 stamp_ns=stamp_ns)
-        add = self.intake.add_accelerometer if rng.random() < 0.1 else self.intake.add_imu
+        role = Role.ACCEL if rng.random() < 0.1 else Role.IMU
         gyro, force = rng.normal(size=3), rng.normal(size=3)
-        return add, build.imu(types, stamp_ns, tuple(gyro.tolist()), tuple(force.tolist()))
+        return role, build.imu(types, stamp_ns, tuple(gyro.tolist()), tuple(force.tolist()))
 
     # -- damage ------------------------------------------------------------------------------
 

@@ -6,16 +6,17 @@ import ast
 import py_compile
 from xml.etree import ElementTree
 
+from conftest import ROOT
 import pytest
-import ros_graph
 import yaml
 
+from rs_relpose_lab.live.processes import node_process, Process
 from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.config.template import parameter_template
 
-CONFIG = ros_graph.ROOT / 'config'
-LAUNCH_FILE = ros_graph.ROOT / 'launch' / 'relpose.launch.py'
+CONFIG = ROOT / 'config'
+LAUNCH_FILE = ROOT / 'launch' / 'relpose.launch.py'
 NAMESPACE = '{http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles}'
 
 
@@ -38,9 +39,10 @@ def test_template_holds_every_parameter_at_its_default():
     assert max(map(len, text.splitlines())) <= 99
 
 
+@pytest.mark.live
 def test_node_takes_the_template(ros_domain_id):
     """Rcl's own YAML parser makes of it what ours does."""
-    with ros_graph.node_process(CONFIG / 'relpose.yaml') as node:
+    with node_process(CONFIG / 'relpose.yaml') as node:
         node.wait_for('readout_time and quat_cam_imu_xyzw must be given')
         assert 'there is no parameter' not in node.output
 
@@ -60,15 +62,16 @@ def test_profile_takes_big_images():
     assert participant.get('is_default_profile') == 'true'
 
 
+@pytest.mark.live
 def test_profile_loses_no_big_image(ros_domain_id, monkeypatch):
     """1920x1080 bgr8 at 30 Hz; with the default transports most of them are lost."""
     monkeypatch.setenv('FASTRTPS_DEFAULT_PROFILES_FILE', str(CONFIG / 'fastdds.xml'))
-    script, count = ros_graph.ROOT / 'test' / 'big_images.py', 90
+    script, count = ROOT / 'test' / 'big_images.py', 90
     # A queue of five is a sixth of a second: a busy machine may stop a process for longer.
     for _ in range(4):
-        with ros_graph.Script(script, 'receive', str(count)) as receiver:
+        with Process(str(script), 'receive', str(count)) as receiver:
             receiver.wait_for('ready')
-            with ros_graph.Script(script, 'send', str(count)) as sender:
+            with Process(str(script), 'send', str(count)) as sender:
                 assert sender.wait() == 0, sender.output
             assert receiver.wait() == 0, receiver.output
             lost = count - int(receiver.output.split()[-1])

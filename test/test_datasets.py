@@ -14,12 +14,15 @@ import yaml
 
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.cli import convert, main
-from rs_relpose_ros.config.commented_file import parameter_text, write_parameters
-from rs_relpose_ros.config.parameter_file import read_parameters
+from rs_relpose_ros.config.parameter_file import (
+    parameter_text,
+    read_parameters,
+    write_parameters,
+)
 from rs_relpose_ros.convert import xiaomi
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.messages.incoming import (
-    image_from_compressed,
+    image_from_message,
     imu_sample_from_message,
     intrinsics_from_info,
     stamp_ns,
@@ -121,7 +124,7 @@ def test_realsense_folder(tmp_path):
         60.5, 61.5, 32.25, 24.75)
     image = read['/camera/image_raw/compressed'][0].message
     assert image.format.startswith('mono8; jpeg')
-    assert image_from_compressed(image).shape == (48, 64)
+    assert image_from_message(image).image.decoded().shape == (48, 64)
     samples = [imu_sample_from_message(message.message) for message in read['/imu/data_raw']]
     stamps = [sample.stamp_ns for sample in samples]
     assert stamps == sorted(set(stamps))
@@ -287,9 +290,9 @@ def test_parameter_file_is_what_the_command_writes(tmp_path, dataset):
     parameters = read_parameters(file)
     assert parameters.sensor.missing() == []
     mapping = parameters.to_mapping()
-    for figure in source.parameters:
-        assert mapping[figure.name] == figure.value
-        assert len(figure.source) > 10
+    for item in source.parameters:
+        assert mapping[item.name] == item.value
+        assert len(item.source) > 10
     write_parameters(tmp_path / 'a.yaml', source.title, source.parameters)
     with pytest.raises(InputError, match='exists already'):
         write_parameters(tmp_path / 'a.yaml', source.title, source.parameters)

@@ -6,29 +6,31 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 import signal
-from typing import Any
 
+from conftest import BUNDLED_PARAMETERS, ROOT
 from nav_msgs.msg import Path as PathMessage
 import numpy as np
 import pytest
-import ros_graph
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_lab.live.graph import Graph
+from rs_relpose_lab.live.processes import Process, wait_until
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.config.parameter_file import read_parameters
+from rs_relpose_ros.messages.incoming import stamp_ns
 from rs_relpose_ros.messages.outgoing import pair_messages, PAIR_TOPICS, PairMessages
 from rs_relpose_ros.node.message_types import message_class
 from rs_relpose_ros.replay.run import read_truth, Replay
 from rs_relpose_ros.replay.truth import TrueTrajectory
 
-# Whoever comes first compiles the kernels.
-pytestmark = pytest.mark.timeout(600)
+# The replay may have to compile the kernels.
+pytestmark = [pytest.mark.live, pytest.mark.timeout(600)]
 
-EXAMPLE = ros_graph.ROOT / 'docs' / 'examples' / 'chain_poses.py'
+EXAMPLE = ROOT / 'docs' / 'examples' / 'chain_poses.py'
 
 
 @dataclass(frozen=True)
-class Run:
+class Chained:
     """Paths that the example published, each with its last stamp, and what it said."""
 
     pairs: list[PairMessages]
@@ -38,10 +40,6 @@ class Run:
     exit_code: int
 
 
-def to_ns(time: Any) -> int:
-    return time.sec * 10**9 + time.nanosec
-
-
 @pytest.fixture(scope='module')
 def recorded(bundled_bag: Path) -> tuple[list[PairMessages], TrueTrajectory]:
     """What the node publishes of the bundled bag."""
@@ -49,32 +47,31 @@ def recorded(bundled_bag: Path) -> tuple[list[PairMessages], TrueTrajectory]:
         topics = bag.find_topics()
         truth = read_truth(bag, topics)
         assert truth is not None
-        replay = Replay(bag, topics, read_parameters(bundled_bag.with_suffix('.yaml')))
+        replay = Replay(bag, topics, read_parameters(BUNDLED_PARAMETERS))
         return [pair_messages(pair.result, message_class) for pair in replay.pairs()
                 if pair.result.pose], truth
 
 
 @pytest.fixture(scope='module')
 def run(module_ros_domain_id: int,
-        recorded: tuple[list[PairMessages], TrueTrajectory]) -> Iterator[Run]:
+        recorded: tuple[list[PairMessages], TrueTrajectory]) -> Iterator[Chained]:
     pairs, truth = recorded
-    with ros_graph.Graph() as graph, ros_graph.Script(
-            EXAMPLE, '--ros-args', '-r', '__ns:=/relpose_node') as example:
+    with Graph() as graph, Process(
+            str(EXAMPLE), '--ros-args', '-r', '__ns:=/relpose_node') as example:
         paths = graph.listen(PathMessage, '/relpose_node/pose_chain/path')
         publishers = {name: graph.publisher(message_class(kind), f'/relpose_node/{name}')
                       for name, kind in PAIR_TOPICS.items()}
-        ros_graph.wait_until(
-            lambda: graph.node.count_publishers('/relpose_node/pose_chain/path'), 'discovery')
+        graph.wait_for_publisher('/relpose_node/pose_chain/path')
         for count, pair in enumerate(pairs):
             # In any order: their stamps say what belongs together.
             for name in sorted(PAIR_TOPICS, reverse=count % 2 == 1):
                 publishers[name].publish(getattr(pair, name))
-            ros_graph.wait_until(lambda n=count: len(paths) > n, 'a path')
+            wait_until(lambda n=count: len(paths) > n, 'a path', example)
         code, _ = example.signal(signal.SIGINT)
-        yield Run(pairs, paths, truth, example.output, code)
+        yield Chained(pairs, paths, truth, example.output, code)
 
 
-def whole_paths(run: Run) -> list[PathMessage]:
+def whole_paths(run: Chained) -> list[PathMessage]:
     """The longest of each that was begun."""
     return [path for path, later in zip(run.paths, [*run.paths[1:], None], strict=True)
             if later is None or len(later.poses) <= len(path.poses)]
@@ -93,13 +90,13 @@ def test_it_says_where_it_cannot_go_on(run):
     paths = whole_paths(run)
     assert len(paths) == 2
     assert run.output.count('a pair is missing: the path starts anew, at another scale') == 1
-    assert to_ns(paths[1].poses[0].header.stamp) > to_ns(paths[0].poses[-1].header.stamp)
+    assert stamp_ns(paths[1].poses[0].header) > stamp_ns(paths[0].poses[-1].header)
 
 
 def test_shape_of_the_paths(run):
     """After one similarity each: scale is carried from pair to pair."""
     for path in whole_paths(run):
-        stamps = [to_ns(pose.header.stamp) for pose in path.poses]
+        stamps = [stamp_ns(pose.header) for pose in path.poses]
         found = np.array([[p.x, p.y, p.z] for p in (pose.pose.position for pose in path.poses)])
         true = true_positions(run.truth, stamps)
         aligned, scale = after_similarity(found, true)

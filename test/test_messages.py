@@ -20,7 +20,8 @@ from rs_relpose_ros.front_end.sequencer import FrameRefused, ReadyFrame, Refusal
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.messages import incoming, outgoing
 from rs_relpose_ros.messages.hanging import HangingCamera, HangingGyro
-from rs_relpose_ros.messages.intake import MessageIntake
+from rs_relpose_ros.messages.intake import Intake
+from rs_relpose_ros.messages.sensor_feed import Role
 from rs_relpose_ros.tracking.matches import Matches
 
 # Luma of ITU-R BT.601.
@@ -47,12 +48,16 @@ def padded(rows: np.ndarray, padding: int) -> tuple[bytes, int]:
 # -- images ----------------------------------------------------------------------------------
 
 
+def decoded(message: object) -> np.ndarray:
+    return incoming.image_from_message(message).image.decoded()
+
+
 @pytest.mark.parametrize('padding', [0, 3])
 @pytest.mark.parametrize(('encoding', 'order'), [
     ('rgb8', [0, 1, 2]), ('bgr8', [2, 1, 0]), ('rgba8', [0, 1, 2, 0]), ('bgra8', [2, 1, 0, 0])])
 def test_color_becomes_luma(types, rgb, encoding, order, padding):
     data, step = padded(np.ascontiguousarray(rgb[:, :, order]), padding)
-    gray = incoming.image_from_message(build.image(types, 10, 7, encoding, data, step=step))
+    gray = decoded(build.image(types, 10, 7, encoding, data, step=step))
     assert gray.dtype == np.uint8
     np.testing.assert_allclose(gray, rgb @ WEIGHTS, atol=0.51)
 
@@ -60,13 +65,13 @@ def test_color_becomes_luma(types, rgb, encoding, order, padding):
 @pytest.mark.parametrize('padding', [0, 5])
 def test_mono8_is_passed_on(types, rgb, padding):
     data, step = padded(rgb[:, :, 0], padding)
-    gray = incoming.image_from_message(build.image(types, 10, 7, 'mono8', data, step=step))
+    gray = decoded(build.image(types, 10, 7, 'mono8', data, step=step))
     np.testing.assert_array_equal(gray, rgb[:, :, 0])
 
 
 def test_last_row_needs_no_padding(types, rgb):
     data, step = padded(rgb[:, :, 0], 5)
-    gray = incoming.image_from_message(build.image(types, 10, 7, 'mono8', data[:-5], step=step))
+    gray = decoded(build.image(types, 10, 7, 'mono8', data[:-5], step=step))
     np.testing.assert_array_equal(gray, rgb[:, :, 0])
 
 
@@ -74,7 +79,7 @@ def test_last_row_needs_no_padding(types, rgb):
 def test_mono16_honours_byte_order(types, order, is_bigendian):
     values = np.arange(0, 65536, 977, dtype=np.uint16)[:60].reshape(6, 10)
     data, step = padded(values.astype(order), 2)
-    gray = incoming.image_from_message(
+    gray = decoded(
         build.image(types, 10, 6, 'mono16', data, step=step, is_bigendian=is_bigendian))
     np.testing.assert_array_equal(gray, values // 256)
 
@@ -85,7 +90,7 @@ def test_packed_yuv_gives_its_luma(types, rgb, encoding, luma_first):
     luma = rgb[:, :, 0]
     packed = np.full((7, 10, 2), 128, np.uint8)
     packed[:, :, 0 if luma_first else 1] = luma
-    gray = incoming.image_from_message(
+    gray = decoded(
         build.image(types, 10, 7, encoding, packed.tobytes(), step=20))
     np.testing.assert_array_equal(gray, luma)
 
@@ -98,7 +103,7 @@ def test_bayer_knows_its_colors(types, pattern, bits):
     tile = np.array([level[c] for c in pattern], dtype=np.uint8).reshape(2, 2)
     mosaic = np.tile(tile, (4, 5))
     raw = mosaic if bits == 8 else mosaic.astype('<u2') * 256
-    gray = incoming.image_from_message(build.image(
+    gray = decoded(build.image(
         types, 10, 8, f'bayer_{pattern}{bits}', raw.tobytes(), step=10 * bits // 8))
     np.testing.assert_allclose(gray[2:-2, 2:-2], WEIGHTS @ [200, 100, 50], atol=1.0)
 
@@ -121,7 +126,7 @@ def test_unusable_image_is_refused(change, sentence):
     fields = {'width': 10, 'height': 7, 'encoding': 'mono8', 'step': 10, **change}
     message = build.image(build.rosbags_types, data=bytes(70), **fields)
     with pytest.raises(InputError) as caught:
-        incoming.image_from_message(message)
+        decoded(message)
     assert sentence in str(caught.value)
 
 
@@ -129,13 +134,13 @@ def test_unusable_image_is_refused(change, sentence):
 def test_compressed_image_is_decoded(types, extension):
     ramp = np.tile(np.arange(64, dtype=np.uint8) * 3, (48, 1))
     data = cv2.imencode(extension, ramp)[1].tobytes()
-    gray = incoming.image_from_compressed(build.compressed(types, data))
+    gray = decoded(build.compressed(types, data))
     np.testing.assert_allclose(gray, ramp, atol=4 if extension == '.jpg' else 0)
 
 
 def test_trailing_bytes_of_a_camera_are_no_fault():
     data = build.jpeg(np.full((48, 64), 77, np.uint8)) + bytes(100)
-    gray = incoming.image_from_compressed(build.compressed(build.rosbags_types, data))
+    gray = decoded(build.compressed(build.rosbags_types, data))
     assert gray.shape == (48, 64)
 
 
@@ -146,7 +151,7 @@ def test_orientation_tag_does_not_turn_the_rows():
     plain = build.jpeg(np.zeros((48, 64), np.uint8))
     data = plain[:2] + b'\xff\xe1' + struct.pack('>H', len(segment) + 2) + segment + plain[2:]
     assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE).shape == (64, 48)
-    gray = incoming.image_from_compressed(build.compressed(build.rosbags_types, data))
+    gray = decoded(build.compressed(build.rosbags_types, data))
     assert gray.shape == (48, 64)
 
 
@@ -177,7 +182,7 @@ JPEG = build.jpeg(np.random.default_rng(1).integers(0, 256, (48, 64), dtype=np.u
 ])
 def test_unusable_compressed_image_is_refused(data, sentence):
     with pytest.raises(InputError) as caught:
-        incoming.image_from_compressed(build.compressed(build.rosbags_types, data))
+        decoded(build.compressed(build.rosbags_types, data))
     assert sentence in str(caught.value)
 
 
@@ -317,6 +322,7 @@ def pair(count: int = 40, status: Status = Status.OK) -> PairResult:
     rays1, rays2 = rng.normal(size=(2, count, 3))
     return PairResult(
         reference_stamp_ns=1_700_000_000_100_000_000, stamp_ns=1_700_000_000_999_999_999,
+        reference_ns1=1_700_000_000_100_000_000, reference_ns2=1_700_000_000_999_999_999,
         frame_id='camera_optical_frame', interval=0.9, pose=pose, matches=matches,
         row_times1=rng.uniform(0, 0.03, count), row_times2=rng.uniform(0, 0.03, count),
         rays1=rays1, rays2=rays2, parallax=12.0)
@@ -395,15 +401,15 @@ def test_no_message_without_a_pose():
 # -- intake ----------------------------------------------------------------------------------
 
 
-def intake() -> tuple[MessageIntake, Sequencer]:
+def intake() -> tuple[Intake, Sequencer]:
     sequencer = Sequencer(Parameters.from_mapping({
         'readout_time': 0.02, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0]}), offline=True)
-    return MessageIntake(sequencer), sequencer
+    return Intake(sequencer), sequencer
 
 
-def feed_imu(target: MessageIntake, start_ns: int, end_ns: int) -> None:
+def feed_imu(target: Intake, start_ns: int, end_ns: int) -> None:
     for stamp_ns in range(start_ns, end_ns, 5_000_000):
-        target.add_imu(build.imu(build.rosbags_types, stamp_ns))
+        target.receive(Role.IMU, build.imu(build.rosbags_types, stamp_ns))
 
 
 def taken(sequencer: Sequencer) -> list[ReadyFrame | FrameRefused]:
@@ -419,9 +425,10 @@ PIXELS = np.random.default_rng(5).integers(0, 256, (480, 640), dtype=np.uint8)
 def test_image_before_its_camera_info_is_kept():
     target, sequencer = intake()
     feed_imu(target, 0, 10**9)
-    target.add_image(build.gray_image(build.rosbags_types, PIXELS, stamp_ns=500_000_000))
+    image = build.gray_image(build.rosbags_types, PIXELS, stamp_ns=500_000_000)
+    target.receive(Role.IMAGE, image)
     assert taken(sequencer) == []
-    target.add_camera_info(build.camera_info(build.rosbags_types))
+    target.receive(Role.CAMERA_INFO, build.camera_info(build.rosbags_types))
     [frame] = taken(sequencer)
     np.testing.assert_array_equal(frame.frame.image, PIXELS)
     assert frame.frame.frame_id == 'camera'
@@ -431,7 +438,8 @@ def test_images_without_camera_info_are_counted():
     target, sequencer = intake()
     feed_imu(target, 0, 10**9)
     for k in range(6):
-        target.add_image(build.gray_image(build.rosbags_types, PIXELS, stamp_ns=k * 10**8))
+        image = build.gray_image(build.rosbags_types, PIXELS, stamp_ns=k * 10**8)
+        target.receive(Role.IMAGE, image)
     target.refuse_held()
     refused = taken(sequencer)
     assert [item.stamp_ns for item in refused] == [k * 10**8 for k in range(6)]
@@ -442,11 +450,11 @@ def test_images_without_camera_info_are_counted():
 def test_no_outdated_calibration_is_used():
     target, sequencer = intake()
     feed_imu(target, 0, 10**9)
-    target.add_camera_info(build.camera_info(build.rosbags_types))
+    target.receive(Role.CAMERA_INFO, build.camera_info(build.rosbags_types))
     with pytest.raises(MissingInputError):
-        target.add_camera_info(build.camera_info(build.rosbags_types, k=(0.0,) * 9))
-    assert 'uncalibrated' in target.calibration_problem
-    target.add_image(build.gray_image(build.rosbags_types, PIXELS, stamp_ns=10**8))
+        target.receive(Role.CAMERA_INFO, build.camera_info(build.rosbags_types, k=(0.0,) * 9))
+    assert 'uncalibrated' in target.camera_info_problem
+    target.receive(Role.IMAGE, build.gray_image(build.rosbags_types, PIXELS, stamp_ns=10**8))
     [refused] = taken(sequencer)
     assert refused.cause is Refusal.NO_CALIBRATION
     assert 'uncalibrated' in refused.reason
@@ -455,15 +463,26 @@ def test_no_outdated_calibration_is_used():
 def test_image_of_another_size_is_refused():
     target, sequencer = intake()
     feed_imu(target, 0, 10**9)
-    target.add_camera_info(build.camera_info(build.rosbags_types))
-    target.add_image(build.gray_image(build.rosbags_types, PIXELS[:240], stamp_ns=10**8))
-    target.add_compressed_image(
-        build.compressed(build.rosbags_types, build.jpeg(PIXELS), stamp_ns=2 * 10**8))
+    target.receive(Role.CAMERA_INFO, build.camera_info(build.rosbags_types))
+    image = build.gray_image(build.rosbags_types, PIXELS[:240], stamp_ns=10**8)
+    target.receive(Role.IMAGE, image)
+    target.receive(
+        Role.IMAGE, build.compressed(build.rosbags_types, build.jpeg(PIXELS), stamp_ns=2 * 10**8))
     refused, ready = taken(sequencer)
     assert refused.cause is Refusal.BAD_IMAGE
     assert 'image is 640x240, but its CameraInfo tells 640x480' in refused.reason
     assert ready.frame.image.shape == (480, 640)
     assert sequencer.counts().refused == {Refusal.BAD_IMAGE: 1}
+
+
+def test_image_whose_stamp_is_out_of_range_is_refused():
+    target, sequencer = intake()
+    image = build.gray_image(build.rosbags_types, PIXELS, stamp_ns=10**8)
+    image.header.stamp.nanosec = 10**9
+    target.receive(Role.IMAGE, image)
+    [refused] = taken(sequencer)
+    assert (refused.cause, refused.stamp_ns) == (Refusal.BAD_IMAGE, 0)
+    assert 'out of range' in refused.reason
 
 
 # -- sensors that hang -----------------------------------------------------------------------

@@ -1,4 +1,8 @@
-"""The node ends at once and quietly, whatever it is doing when the signal comes."""
+"""A signal ends the node at once and quietly, whatever it is doing.
+
+That a node ends well which estimates poses is tested with what it published (`test_node_live`,
+`test_node_faults`), and here again and again.
+"""
 
 from __future__ import annotations
 
@@ -9,20 +13,20 @@ import signal
 import threading
 import time
 
+from conftest import BUNDLED_PARAMETERS
 import fault_stream as faults
 from geometry_msgs.msg import PoseWithCovarianceStamped
 import pytest
-import ros_graph
 from sensor_msgs.msg import CameraInfo, Image, Imu
 
-from rs_relpose_ros.estimator.estimate import warm_up
+from rs_relpose_lab.live.graph import Graph
+from rs_relpose_lab.live.processes import node_process, Process, wait_until
 
-# Whoever comes first compiles the kernels.
-pytestmark = pytest.mark.timeout(600)
+# The first node may have to compile the kernels.
+pytestmark = [pytest.mark.live, pytest.mark.timeout(600)]
 
-PARAMETER_FILE = ros_graph.ROOT / 'bags' / 'hand_held.yaml'
-ENTRY = 'rs_relpose_ros.node.start'
-SIGNALS = [signal.SIGINT, signal.SIGTERM]
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+LONG = pytest.mark.long
 
 
 def catches(pid: int, number: int) -> bool:
@@ -33,26 +37,54 @@ def catches(pid: int, number: int) -> bool:
     return False
 
 
-@pytest.mark.parametrize('number', SIGNALS)
-@pytest.mark.parametrize('delay', [0.0, 0.1, 0.3, 0.6, 1.0])
-def test_a_signal_ends_a_node_that_imports(ros_domain_id, number, delay):
-    with ros_graph.Process(ENTRY, '--ros-args', '--params-file', str(PARAMETER_FILE)) as node:
-        ros_graph.wait_until(lambda: catches(node.pid, signal.SIGTERM), 'a handler')
+def end(node: Process, number: signal.Signals, every: float = 30.0) -> float:
+    """End a node by a signal, without a complaint; seconds until then."""
+    code, seconds = node.signal(number, every=every)
+    assert code == 0
+    assert 'Traceback' not in node.output
+    return seconds
+
+
+@pytest.mark.parametrize(('delay', 'number'), [
+    (0.0, signal.SIGINT), (0.1, signal.SIGTERM), (0.3, signal.SIGINT), (0.6, signal.SIGTERM),
+    (1.0, signal.SIGINT), *(pytest.param(delay, number, marks=LONG) for delay, number in (
+        (0.0, signal.SIGTERM), (0.1, signal.SIGINT), (0.3, signal.SIGTERM), (0.6, signal.SIGINT),
+        (1.0, signal.SIGTERM)))])
+def test_a_signal_ends_a_node_that_imports(ros_domain_id, delay, number):
+    with node_process(BUNDLED_PARAMETERS) as node:
+        wait_until(lambda: catches(node.pid, signal.SIGTERM), 'a handler', node)
         time.sleep(delay)
-        code, _ = node.signal(number)
-        assert code == 0, node.output
-        assert 'Traceback' not in node.output
+        end(node, number)
+
+
+@pytest.mark.parametrize(('every', 'number'), [
+    (0.002, signal.SIGINT), (0.02, signal.SIGTERM),
+    *(pytest.param(every, number, marks=LONG) for every, number in (
+        (0.002, signal.SIGTERM), (0.02, signal.SIGINT), (0.1, signal.SIGINT),
+        (0.1, signal.SIGTERM)))])
+def test_signals_that_come_again_and_again(ros_domain_id, every, number):
+    """Ctrl-C under ros2 launch: the terminal signals the whole group, and so does launch."""
+    with node_process(BUNDLED_PARAMETERS) as node:
+        node.wait_for('ready')
+        end(node, number, every)
+
+
+def test_a_signal_ends_a_node_that_compiles(ros_domain_id, tmp_path, monkeypatch):
+    monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path))
+    with node_process(BUNDLED_PARAMETERS) as node:
+        node.wait_for('compiling kernels')
+        # The compiler lets go of the interpreter only now and then.
+        assert end(node, signal.SIGTERM) <= 5.0
 
 
 @pytest.fixture
-def drivers(module_ros_domain_id: int, bundled_bag: Path) -> Iterator[ros_graph.Graph]:
+def drivers(ros_domain_id: int, bundled_bag: Path) -> Iterator[Graph]:
     """A camera and an IMU that go on and on."""
     messages = faults.read_messages(bundled_bag, 2.6)
     ended = threading.Event()
-    with ros_graph.Graph() as graph:
-        publishers = {kind: graph.node.create_publisher(kind, topic, 100) for kind, topic in (
-            (Image, '/camera/image_raw'), (CameraInfo, '/camera/camera_info'),
-            (Imu, '/imu/data_raw'))}
+    with Graph() as graph:
+        publishers = {kind: graph.node.create_publisher(kind, topic, 100) for kind, topic in zip(
+            (Image, CameraInfo, Imu), faults.BAG_TOPICS.values(), strict=True)}
 
         def publish() -> None:
             for turn in itertools.count():
@@ -71,23 +103,17 @@ def drivers(module_ros_domain_id: int, bundled_bag: Path) -> Iterator[ros_graph.
         thread.join(10.0)
 
 
-@pytest.mark.parametrize('count', [3, pytest.param(
-    50, marks=[pytest.mark.long, pytest.mark.timeout(3600)])])
+@pytest.mark.long
+@pytest.mark.timeout(3600)
 @pytest.mark.parametrize('number', SIGNALS)
-def test_a_working_node_ends_within_a_second(drivers, number, count):
-    warm_up()
+def test_a_working_node_ends_within_a_second(drivers, number):
     poses = drivers.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
     times = []
-    for _ in range(count):
-        with ros_graph.Process(
-                ENTRY, '--ros-args', '--params-file', str(PARAMETER_FILE), '-p',
-                'image_transport:=raw', *(word for source, target in ros_graph.BAG_TOPICS.items()
-                                          for word in ('-r', f'{source}:={target}'))) as node:
+    for _ in range(50):
+        with node_process(BUNDLED_PARAMETERS, remap=faults.BAG_TOPICS,
+                          parameters={'image_transport': 'raw'}) as node:
             poses.clear()
-            ros_graph.wait_until(lambda: poses, 'a pose')
-            code, seconds = node.signal(number)
-            times.append(seconds)
-            assert code == 0, node.output
-            assert 'Traceback' not in node.output
-    print(f'{len(times)} of {count}: at most {max(times):.2f} s')
+            wait_until(lambda: poses, 'a pose', node)
+            times.append(end(node, number))
+    print(f'of {len(times)}: at most {max(times):.2f} s')
     assert max(times) <= 1.0

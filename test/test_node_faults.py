@@ -1,402 +1,413 @@
-"""Bad input to the running node: one clear message each, no traceback, no pose made up.
+"""One running node, one fault of its sensors after the other in mid-stream, and the way back.
 
-One node takes one fault after the other, as it would in the field, and works again after them.
+After each fault a pose comes within a second of good data, and no pose that was published is
+wrong: those of frames during the faults are compared with the truth as well.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-import copy
-from dataclasses import dataclass, field
-import importlib.util
-import itertools
-import os
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 import re
 import signal
+import time
 from typing import Any
 
+from conftest import BUNDLED_PARAMETERS
+import cv2
 from diagnostic_msgs.msg import DiagnosticArray
-from fault_stream import gray_image, read_messages
-from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+import fault_stream as faults
+from fault_stream import BAG_TOPICS, Fault, publish_in_time, SECOND, Sent, Stream
+from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
 import pytest
-from rcl_interfaces.msg import Parameter, ParameterDescriptor, ParameterType, ParameterValue
-from rcl_interfaces.srv import DescribeParameters, SetParameters
-from rclpy.qos import ReliabilityPolicy
-import ros_graph
+from rosgraph_msgs.msg import Clock
 from scipy.spatial.transform import Rotation
-from sensor_msgs.msg import CameraInfo, Image, Imu
+from sensor_msgs.msg import CameraInfo, Image, Imu, TimeReference
+from std_srvs.srv import Trigger
 
-from rs_relpose_ros.estimator.estimate import warm_up
+from rs_relpose_lab.live.graph import diagnostic_values, Graph
+from rs_relpose_lab.live.processes import node_process, Process, wait_until
+from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.messages.incoming import time_ns
+from rs_relpose_ros.replay.run import read_truth
+from rs_relpose_ros.replay.truth import TrueTrajectory
 
-# Whoever comes first compiles the kernels.
-pytestmark = pytest.mark.timeout(600)
+# The first node may have to compile the kernels.
+pytestmark = [pytest.mark.live, pytest.mark.timeout(600)]
 
-SECOND = 10**9
-# Of the bag, and between one phase and the next on the camera's clock.
-PHASE_SECONDS = 2.6
-PAUSE_SECONDS = 1.0
-
-Edit = Callable[[Any, float], Any]
+FIRST_STAMP_NS = 10_000 * SECOND
+_rng = np.random.default_rng(0)
 
 
-@dataclass
-class Field:
-    """The node under test, and the drivers that feed it."""
+def put(name: str, value: Any) -> Any:
+    """Set a field of a message."""
+    return lambda message: setattr(message, name, value)
 
-    graph: ros_graph.Graph
-    node: ros_graph.Process
-    publishers: dict[type, Any]
-    messages: list[tuple[int, Any]]
+
+def cropped(message: Any) -> Any:
+    """Of the image, and of the CameraInfo alike."""
+    if isinstance(message, CameraInfo):
+        roi = message.roi
+        roi.x_offset, roi.y_offset, roi.width, roi.height = 40, 100, 600, 380
+        return message
+    return faults.gray_image(message.header, faults.pixels_of(message)[100:, 40:])
+
+
+def nan(message: Imu) -> None:
+    message.angular_velocity.y = float('nan')
+
+
+def zero(message: Imu) -> None:
+    for part in (message.angular_velocity, message.linear_acceleration):
+        part.x = part.y = part.z = 0.0
+
+
+def hang_imu(message: Imu, first: Imu) -> Imu:
+    message.angular_velocity = first.angular_velocity
+    message.linear_acceleration = first.linear_acceleration
+    return message
+
+
+def blurred(sigma: float) -> Any:
+    return faults.pixels(lambda image: cv2.GaussianBlur(image, (0, 0), sigma))
+
+
+GAP = 'the gyro does not cover the read-out of the frame'
+HANGS = 'the gyro repeats the same values bit by bit'
+SAME = 'the image repeats the one before bit by bit'
+FAULTS = [
+    # Only before the first one there is no calibration.
+    Fault('late CameraInfo', faults.without(CameraInfo), begin=0.0),
+    Fault('IMU stops', faults.without(Imu), GAP),
+    Fault('IMU gap inside a frame', faults.without(Imu, 0.52, 0.58), GAP),
+    Fault('clocks back', faults.nothing, jump=-20.0),
+    Fault('clocks ahead', faults.nothing, GAP, jump=20.0),
+    Fault('clocks back by less than a second', faults.nothing, 'older than the one before',
+          jump=-0.4),
+    Fault('one image far ahead', faults.first_ahead(Image, 100.0), 'image stamps jumped back'),
+    Fault('one IMU sample far ahead', faults.first_ahead(Imu, 100.0)),
+    Fault('camera stops', faults.without(Image)),
+    Fault('camera slows down', faults.every(Image, 3)),
+    Fault('image and CameraInfo are cropped', faults.changed((Image, CameraInfo), cropped)),
+    Fault('image is smaller', faults.changed(Image, faults.pixels(lambda i: i[::2, ::2])),
+          'image is 320x240, but its CameraInfo tells 640x480'),
+    Fault('unknown encoding', faults.changed(Image, put('encoding', 'mono12')),
+          "image encoding 'mono12' is not known; publish one of mono8"),
+    Fault('CameraInfo stops', faults.without(CameraInfo)),
+    Fault('CameraInfo uncalibrated', faults.changed(CameraInfo, put('k', np.zeros(9))),
+          'the camera is uncalibrated (k[0] of its CameraInfo is 0)'),
+    Fault('unknown distortion model', faults.changed(
+        CameraInfo, put('distortion_model', 'double_sphere')),
+          "distortion_model must be one of ('plumb_bob', 'rational_polynomial', 'equidistant'), "
+          "got 'double_sphere'"),
+    Fault('every message twice', faults.twice, 'a frame of this stamp came before'),
+    Fault('messages overtake each other', faults.delayed(
+        object, lambda: float(_rng.uniform(0.0, 0.04)))),
+    Fault('late IMU', faults.delayed(Imu, lambda: 0.3)),
+    Fault('late images', faults.delayed(Image, lambda: 0.3)),
+    Fault('NaN', faults.changed(Imu, nan), 'angular_velocity of an IMU message must be finite'),
+    Fault('IMU of zeros', faults.changed(Imu, zero), HANGS),
+    Fault('IMU hangs', faults.changed(Imu, faults.repeating(lambda m: m, hang_imu)), HANGS),
+    Fault('gyro saturated', faults.changed(Imu, faults.vector('angular_velocity', z=4.36)),
+          'the z axis of the gyro repeats 4.36 rad/s bit by bit: it is saturated'),
+    Fault('accelerometer saturated', faults.changed(
+        Imu, faults.vector('linear_acceleration', x=39.2))),
+    Fault('black', faults.changed(Image, faults.pixels(np.zeros_like)), SAME),
+    Fault('frozen', faults.changed(Image, faults.repeating(
+        faults.pixels_of, lambda m, first: faults.gray_image(m.header, first))), SAME),
+    Fault('blurred', faults.changed(Image, blurred(4.0))),
+    Fault('blurred beyond use', faults.changed(Image, blurred(20.0))),
+    Fault('the end', faults.nothing),
+]
+
+
+@dataclass(frozen=True)
+class Session:
+    """What the node published and wrote while all phases were played."""
+
+    stream: Stream
     poses: list[PoseWithCovarianceStamped]
+    references: dict[int, int]
     diagnostics: list[DiagnosticArray]
-    phase: Iterator[int] = field(default_factory=itertools.count)
+    output: str
+    memory_growth: float
+    restarted: Any
+    debug_images: list[Image]
+    exit_code: int
 
-    def play(self, edit: Edit) -> tuple[list[str], int]:
-        """Play the bag's beginning at real time.
 
-        `edit` gets each message with its time [s] since the start and gives the one to publish or
-        None. Returns the warnings and errors that the node logged meanwhile, and the number of
-        poses.
-        """
-        written, poses = len(self.node.output), len(self.poses)
-        later_ns = round(next(self.phase) * (PHASE_SECONDS + PAUSE_SECONDS) * SECOND)
-        first_ns = self.messages[0][0]
+def drivers(graph: Graph, namespace: str = '') -> dict[tuple[type, bool], Any]:
+    """Publishers of each kind of message, reliable ones and those of best effort."""
+    return {(kind, best_effort): graph.publisher(kind, f'{namespace}{topic}', best_effort)
+            for kind, topic in ((Image, '/camera/image_raw'),
+                                (CameraInfo, '/camera/camera_info'), (Imu, '/imu/data_raw'))
+            for best_effort in (False, True)}
 
-        def edited() -> Iterator[tuple[Any, int, Any]]:
-            for bag_time_ns, message in self.messages:
-                out = edit(copy.deepcopy(message), (bag_time_ns - first_ns) / SECOND)
-                if out is not None:
-                    stamp_ns = out.header.stamp.sec * SECOND + out.header.stamp.nanosec + later_ns
-                    out.header.stamp.sec, out.header.stamp.nanosec = divmod(stamp_ns, SECOND)
-                    yield self.publishers[type(out)], bag_time_ns, out
 
-        ros_graph.publish_in_time(edited())
-        # Two reports later everything has been processed and told.
-        count = len(self.diagnostics)
-        ros_graph.wait_until(lambda: len(self.diagnostics) >= count + 2, 'diagnostics')
-        output = self.node.output[written:]
-        assert 'Traceback' not in output
-        lines = [line for line in output.splitlines() if re.match(r'\[(WARN|ERROR|FATAL)\]', line)]
-        # A busy machine is no fault of the input.
-        print(output, ros_graph.diagnostic_values(self.diagnostics[-1]))
-        return [line for line in lines if '(overload)' not in line], len(self.poses) - poses
+def play(publishers: dict[tuple[type, bool], Any], sent: list[Sent]) -> None:
+    """Publish in real time; from phase to phase with the other quality of service."""
+    publish_in_time((publishers[type(item.message), item.phase % 2 == 1], item.time_ns,
+                               item.message) for item in sent)
 
-    @property
-    def status(self) -> Any:
-        return self.diagnostics[-1].status[0]
+
+def resident(pid: int) -> float:
+    """Memory [MB] of a process."""
+    return int(Path(f'/proc/{pid}/statm').read_text().split()[1]) * 4096 / 2**20
 
 
 @pytest.fixture(scope='module')
-def field_(module_ros_domain_id: int, bundled_bag: Path) -> Iterator[Field]:
-    warm_up()
-    with ros_graph.Graph() as graph, ros_graph.node_process(
-            ros_graph.ROOT / 'bags' / 'hand_held.yaml', remap=ros_graph.BAG_TOPICS,
+def bag_messages(bundled_bag: Path) -> list[tuple[int, Any]]:
+    return faults.read_messages(bundled_bag, faults.PHASE + 0.1)
+
+
+@pytest.fixture(scope='module')
+def truth(bundled_bag: Path) -> TrueTrajectory:
+    with open_bag(bundled_bag) as bag:
+        truth = read_truth(bag, bag.find_topics())
+    assert truth is not None
+    return truth
+
+
+@pytest.fixture(scope='module')
+def session(module_ros_domain_id: int, bag_messages: list[tuple[int, Any]]) -> Iterator[Session]:
+    stream = Stream(bag_messages, FAULTS, FIRST_STAMP_NS)
+    last = len(FAULTS) - 1
+    with Graph() as graph, node_process(
+            BUNDLED_PARAMETERS, remap=BAG_TOPICS,
             parameters={'image_transport': 'raw'}) as node:
         poses = graph.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
+        references = graph.listen(TimeReference, '/relpose_node/reference')
         diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
         node.wait_for('ready')
-        publishers = {
-            Image: graph.publisher(Image, '/camera/image_raw'),
-            # Either kind of publisher will do.
-            CameraInfo: graph.publisher(CameraInfo, '/camera/camera_info', best_effort=True),
-            Imu: graph.publisher(Imu, '/imu/data_raw', best_effort=True)}
-        yield Field(graph, node, publishers, read_messages(bundled_bag, PHASE_SECONDS), poses,
-                    diagnostics)
-        code, seconds = node.signal(signal.SIGINT)
-        assert code == 0, node.output
-        assert seconds <= 1.0
+        publishers = drivers(graph)
+        play(publishers, [item for item in stream.sent if item.phase <= 2])
+        memory = resident(node.pid)
+        play(publishers, [item for item in stream.sent if 2 < item.phase < last])
+        growth = resident(node.pid) - memory
+        restarted = graph.call(Trigger, '/relpose_node/reset', Trigger.Request())
+        debug_images = graph.listen(Image, '/relpose_node/debug_image')
+        wait_until(
+            lambda: graph.node.count_publishers('/relpose_node/debug_image'), 'discovery')
+        play(publishers, [item for item in stream.sent if item.phase == last])
+        count = len(diagnostics)
+        wait_until(lambda: len(diagnostics) >= count + 2, 'diagnostics')
+        code, _ = node.signal(signal.SIGINT)
+        print(node.output)
+        yield Session(stream, poses, {
+            faults.stamp_of(item): time_ns(item.time_ref)
+            for item in references}, diagnostics, node.output, growth, restarted, debug_images,
+            code)
 
 
-def edit_only(kind: type, edit: Callable[[Any], None]) -> Edit:
-    """Change every message of one type in place."""
-    def edited(message: Any, _: float) -> Any:
-        if isinstance(message, kind):
-            edit(message)
-        return message
-    return edited
+def wrong(message: PoseWithCovarianceStamped, begin_ns: int, end_ns: int,
+          truth: TrueTrajectory) -> str:
+    """How a pose is wrong: by more than its covariance claims, and enough to do harm."""
+    position, q = message.pose.pose.position, message.pose.pose.orientation
+    errors = truth.errors(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(),
+                          np.array([position.x, position.y, position.z]), begin_ns, end_ns)
+    assert errors is not None
+    variances = np.diag(np.reshape(message.pose.covariance, (6, 6)))
+    translation_sigma, rotation_sigma = np.degrees(np.sqrt(
+        [variances[:3].sum(), variances[3:].sum()]))
+    if (errors.rotation_error <= max(1.0, 4.0 * rotation_sigma)
+            and errors.translation_error <= max(5.0, 4.0 * translation_sigma)):
+        return ''
+    return (f'rotation by {errors.rotation_error:.3f} deg (sigma {rotation_sigma:.3f}), '
+            f'translation by {errors.translation_error:.2f} deg (sigma {translation_sigma:.2f})')
 
 
-def is_like(lines: list[str], sentence: str) -> bool:
-    return len(lines) == 1 and sentence in lines[0]
+@pytest.mark.parametrize('name', [fault.name for fault in FAULTS])
+def test_a_pose_comes_within_a_second_of_good_data(session, name):
+    number = [fault.name for fault in FAULTS].index(name)
+    begin_ns, end_ns = session.stream.good[number]
+    assert end_ns - begin_ns <= SECOND
+    found = [stamp for stamp in map(faults.stamp_of, session.poses) if begin_ns <= stamp <= end_ns]
+    print([(stamp - begin_ns) / SECOND for stamp in found])
+    assert found
 
 
-def test_no_camera_info(field_):
-    # The first test: once there was one, it stays in force.
-    lines, poses = field_.play(lambda m, _: None if isinstance(m, CameraInfo) else m)
-    assert is_like(lines, 'no CameraInfo on /camera/camera_info'), lines
-    assert poses == 0
-    values = ros_graph.diagnostic_values(field_.diagnostics[-1])
-    assert '/camera/camera_info' in values['missing']
-    assert int(values['frames_refused_no_calibration']) > 50
+def test_no_pose_comes_without_a_calibration(session):
+    assert faults.stamp_of(session.poses[0]) > session.stream.good[0][0]
+    values = diagnostic_values(session.diagnostics[-1])
+    # Those of the first phase; later a CameraInfo that cannot be used ends the one in force.
+    assert int(values['frames_refused_no_calibration']) > 15
 
 
-def test_uncalibrated(field_):
-    lines, poses = field_.play(edit_only(
-        CameraInfo, lambda m: setattr(m, 'k', np.zeros(9))))
-    assert is_like(lines, 'uncalibrated (k[0] of its CameraInfo is 0)'), lines
-    assert poses == 0
-    assert field_.status.level == b'\x02'
-    assert 'uncalibrated' in field_.status.message
-    assert ros_graph.diagnostic_values(field_.diagnostics[-1])['missing'] == 'calibration'
+def test_no_wrong_pose_is_published(session, truth):
+    stream, checked, found = session.stream, 0, []
+    for message in session.poses:
+        stamp = faults.stamp_of(message)
+        reference = session.references[stamp]
+        begin_ns, end_ns = stream.taken_at[reference], stream.taken_at[stamp]
+        # A stamp that two images carry says of none when it was taken.
+        if begin_ns is None or end_ns is None:
+            continue
+        checked += 1
+        how = wrong(message, begin_ns, end_ns, truth)
+        if how:
+            phases = [FAULTS[stream.phase_of[item]].name for item in (reference, stamp)]
+            found.append(f'{phases[0]} to {phases[1]}: images of '
+                         f'{(begin_ns - stream.bag_start_ns) / SECOND:.3f} s and '
+                         f'{(end_ns - stream.bag_start_ns) / SECOND:.3f} s: {how}')
+    assert found == []
+    assert checked > 5 * len(FAULTS)
 
 
-def test_unknown_distortion_model(field_):
-    lines, poses = field_.play(edit_only(
-        CameraInfo, lambda m: setattr(m, 'distortion_model', 'double_sphere')))
-    assert is_like(lines, "distortion_model must be one of ('plumb_bob', 'rational_polynomial', "
-                          "'equidistant'), got 'double_sphere'"), lines
-    assert poses == 0
+@pytest.mark.parametrize('name', [fault.name for fault in FAULTS if fault.said])
+def test_a_fault_is_told(session, name):
+    [fault] = [fault for fault in FAULTS if fault.name == name]
+    # Once, and after half a minute once more if it lasts or comes back.
+    assert 1 <= len([line for line in told(session) if fault.said in line]) <= 4
 
 
-def test_no_imu(field_):
-    lines, poses = field_.play(lambda m, _: None if isinstance(m, Imu) else m)
-    assert is_like(lines, 'no IMU message on /imu/data_raw'), lines
-    assert poses == 0
-    assert 'no I' in field_.status.message
+def test_nothing_else_is_told(session):
+    said = [fault.said for fault in FAULTS if fault.said]
+    # While clocks and sensors change, frames wait in vain, come late or in between.
+    said += ['newer frames wait for the gyro', 'no gyro sample that covers', '(overload)',
+             'frame is ', 'stamps jumped', 'image is ', '(reset)']
+    assert [line for line in told(session) if not any(text in line for text in said)] == []
+    assert 'Traceback' not in session.output
+    assert session.exit_code == 0
 
 
-def test_unknown_encoding(field_):
-    lines, poses = field_.play(edit_only(Image, lambda m: setattr(m, 'encoding', 'mono12')))
-    assert is_like(lines, "image encoding 'mono12' is not known; publish one of mono8"), lines
-    assert poses == 0
+def told(session: Session) -> list[str]:
+    """Warnings and errors of the log."""
+    return [line for line in session.output.splitlines()
+            if re.match(r'\[(WARN|ERROR|FATAL)\]', line)]
 
 
-def test_image_size_changes_in_mid_stream(field_):
-    def edit(message: Any, seconds: float) -> Any:
-        if isinstance(message, Image) and seconds > 1.5:
-            pixels = np.frombuffer(message.data, np.uint8).reshape(480, 640)[::2, ::2]
-            return gray_image(message.header, pixels)
-        return message
-
-    lines, _ = field_.play(edit)
-    assert is_like(lines, 'image is 320x240, but its CameraInfo tells 640x480'), lines
-    first = field_.poses[-1].header.stamp if field_.poses else None
-    # Back at the right size it goes on.
-    lines, poses = field_.play(lambda m, _: m)
-    assert lines == []
-    assert poses > 0
-    assert field_.poses[-1].header.stamp != first
-
-
-def test_image_and_camera_info_change_together(field_):
-    def edit(message: Any, seconds: float) -> Any:
-        if seconds > 1.0 and isinstance(message, Image):
-            pixels = np.frombuffer(message.data, np.uint8).reshape(480, 640)[100:, 40:]
-            return gray_image(message.header, np.ascontiguousarray(pixels))
-        if seconds > 1.0 and isinstance(message, CameraInfo):
-            roi = message.roi
-            roi.x_offset, roi.y_offset, roi.width, roi.height = 40, 100, 600, 380
-        return message
-
-    lines, poses = field_.play(edit)
-    # One image may cross the CameraInfo that belongs to it, and is refused for its size.
-    assert len(lines) <= 1, lines
-    assert poses > 0
+def test_diagnostics_count_what_happened(session):
+    values = diagnostic_values(session.diagnostics[-1])
+    refused = {key.removeprefix('frames_refused_'): int(value) for key, value in values.items()
+               if key.startswith('frames_refused_')}
+    assert int(values['frames_received']) == int(values['frames_processed']) + sum(
+        refused.values())
+    for cause in ('imu_gap', 'duplicate', 'out_of_order', 'clock_jump', 'bad_image',
+                  'no_calibration'):
+        assert refused[cause] > 0, cause
+    assert int(values['imu_gaps']) >= 5
+    assert int(values['clock_jumps']) >= 4
+    assert int(values['messages_invalid']) > 200
+    assert values['frames_failed'] == '0'
+    # A listener that got no processor time may have missed one.
+    assert 0 <= int(values['poses']) - len(session.poses) <= 2
+    assert values['last_reason_no_pose'].split(':')[0] in (
+        'TOO_FEW_MATCHES', 'NO_CONSENSUS', 'LOW_PARALLAX', 'PURE_ROTATION')
 
 
-def test_nan_in_imu(field_):
-    count = itertools.count()
-
-    def edit(message: Imu) -> None:
-        if next(count) % 20 == 0:
-            message.angular_velocity.y = float('nan')
-
-    lines, poses = field_.play(edit_only(Imu, edit))
-    assert is_like(lines, 'angular_velocity of an IMU message must be finite'), lines
-    # A sample that is missing now and then is bridged.
-    assert poses > 0
-    assert int(ros_graph.diagnostic_values(field_.diagnostics[-1])['messages_invalid']) >= 20
+def test_memory_stays(session):
+    assert session.memory_growth < 60.0
 
 
-def test_a_bag_that_starts_again(field_):
-    lines, poses = field_.play(lambda m, _: m)
-    assert (lines, poses > 0) == ([], True)
-    jumps = int(ros_graph.diagnostic_values(field_.diagnostics[-1])['clock_jumps'])
-    field_.phase = itertools.count()
-    lines, poses = field_.play(lambda m, _: m)
-    assert poses > 0
-    after = int(ros_graph.diagnostic_values(field_.diagnostics[-1])['clock_jumps'])
-    # IMU and images jump one after the other.
-    assert jumps < after <= jumps + 2
-    assert field_.status.level in (b'\x00', b'\x01')
+def test_reset_starts_anew(session):
+    """What was before the call is not referred to after it."""
+    assert session.restarted.success
+    begin_ns = session.stream.good[-2][1]
+    later = [stamp for stamp in map(faults.stamp_of, session.poses) if stamp > begin_ns]
+    assert later
+    assert all(session.references[stamp] > begin_ns for stamp in later)
 
 
-# -- settings --------------------------------------------------------------------------------
+def test_debug_images_show_pairs(session):
+    """Published only while somebody subscribes: in the last phase."""
+    begin_ns = session.stream.good[-2][1]
+    stamps = [faults.stamp_of(message) for message in session.debug_images]
+    # A busy node may still have been at the end of the phase before.
+    assert min(stamps) > session.stream.good[-2][0]
+    assert len([stamp for stamp in stamps if stamp > begin_ns]) >= 5
+    assert {stamp for stamp in map(faults.stamp_of, session.poses) if stamp > begin_ns} <= set(
+        stamps)
+    for message in session.debug_images:
+        assert (message.encoding, message.width, message.step) == ('bgr8', 640, 1920)
+        assert message.header.frame_id == 'camera_optical_frame'
+        image = np.frombuffer(message.data, np.uint8).reshape(message.height, 640, 3)
+        colored = (np.ptp(image.astype(int), axis=2) > 40)[:480, 20:].sum()
+        # 270 tracks of some pixels each, and the caption.
+        assert 1000 < colored < 30_000
+        assert image[480:].max() == 255
 
 
-def set_parameter(graph: ros_graph.Graph, name: str, **value: Any) -> Any:
-    kind = {'double_value': ParameterType.PARAMETER_DOUBLE,
-            'string_value': ParameterType.PARAMETER_STRING}[next(iter(value))]
-    request = SetParameters.Request(parameters=[
-        Parameter(name=name, value=ParameterValue(type=kind, **value))])
-    [result] = graph.call(SetParameters, '/relpose_node/set_parameters', request).results
-    return result
+# -- two nodes -------------------------------------------------------------------------------
 
 
-def test_live_parameters(field_):
-    """Each legal change takes effect, each other one is refused with its reason."""
-    refused = set_parameter(field_.graph, 'threshold', double_value=-1.0)
-    assert not refused.successful
-    assert 'threshold' in refused.reason
-    refused = set_parameter(field_.graph, 'threshold', string_value='wide')
-    assert not refused.successful
-    assert refused.reason == "threshold must be of type float, got 'wide'"
-    refused = set_parameter(field_.graph, 'readout_time', double_value=0.02)
-    assert not refused.successful
-    assert 'read-only' in refused.reason
-    # Pairs that close at a parallax that is not reached, and by age only.
-    assert set_parameter(field_.graph, 'min_keyframe_parallax', double_value=900.0).successful
-    assert set_parameter(field_.graph, 'max_keyframe_interval', double_value=0.9).successful
-    before = ros_graph.diagnostic_values(field_.diagnostics[-1])
-    field_.play(lambda m, _: m)
-    after = ros_graph.diagnostic_values(field_.diagnostics[-1])
-    # 2.5 s of images.
-    assert 1 <= int(after['pairs']) - int(before['pairs']) <= 4
+class Namespaces:
+    """Nodes in the namespaces /a and /b, which get the same messages, and what they publish."""
+
+    def __init__(self, graph: Graph, messages: list[tuple[int, Any]]) -> None:
+        self.graph = graph
+        self.phase = Stream(messages, [Fault('', faults.nothing)], FIRST_STAMP_NS)
+        self.poses, self.references = (
+            {name: graph.listen(kind, f'/{name}/relpose_node/{topic}') for name in 'ab'}
+            for kind, topic in ((PoseWithCovarianceStamped, 'relative_pose'),
+                                (TimeReference, 'reference')))
+        self.diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
+        self.clock = graph.node.create_publisher(Clock, '/clock', 10)
+        self.publishers: dict[str, Any] = {}
+
+    def start(self, name: str, **parameters: Any) -> Process:
+        return node_process(
+            BUNDLED_PARAMETERS, parameters={'image_transport': 'raw', **parameters},
+            remap={'__ns': f'/{name}', **{source: f'/{name}{target}'
+                                          for source, target in BAG_TOPICS.items()}})
+
+    def messages(self) -> Iterator[tuple[Any, int, Any]]:
+        """For both nodes, with the clock of the bag."""
+        for item in self.phase.sent:
+            for name in 'ab':
+                yield (self.publishers[name][type(item.message), False], item.time_ns,
+                       item.message)
+            tick = Clock()
+            tick.clock.sec, tick.clock.nanosec = divmod(FIRST_STAMP_NS + item.time_ns, SECOND)
+            yield self.clock, item.time_ns, tick
+
+    def play_until_poses(self, *names: str) -> None:
+        """The same stamps again and again: a busy machine leaves most frames out."""
+        known = {name: len(self.poses[name]) for name in names}
+        for _ in range(8):
+            publish_in_time(self.messages())
+            time.sleep(0.1)
+            if all(len(self.poses[name]) > known[name] for name in names):
+                return
+        pytest.fail(f'no poses of {names}')
+
+    def wrong_poses(self, name: str, truth: TrueTrajectory) -> list[str]:
+        references = {faults.stamp_of(item): time_ns(item.time_ref)
+                      for item in self.references[name]}
+        # A node that was killed between two messages leaves a pose without its reference.
+        return [how for message in self.poses[name]
+                if (stamp := faults.stamp_of(message)) in references
+                and (how := wrong(message, self.phase.taken_at[references[stamp]],
+                                  self.phase.taken_at[stamp], truth))]
 
 
-def test_parameters_are_described(field_):
-    [threshold, readout] = field_.graph.call(
-        DescribeParameters, '/relpose_node/describe_parameters',
-        DescribeParameters.Request(names=['threshold', 'readout_time'])).descriptors
-    assert isinstance(threshold, ParameterDescriptor)
-    assert (threshold.read_only, readout.read_only) == (False, True)
-    assert threshold.description.endswith('[px]')
-    [bounds] = threshold.floating_point_range
-    assert (bounds.from_value, bounds.to_value) == (0.05, 50.0)
-
-
-@pytest.mark.parametrize(('parameters', 'remap', 'sentence', 'missing'), [
-    ({'quat_cam_imu_xyzw': '[0.0, 0.0, 0.0, 1.0]'}, {},
-     'not estimating: readout_time must be given as parameter', 'readout_time'),
-    ({'readout_time': 0.03}, {},
-     'not estimating: quat_cam_imu_xyzw must be given as parameter', 'quat_cam_imu_xyzw'),
-    ({'readout_time': 0, 'quat_cam_imu_xyzw': '[0, 0, 0, 1]'},
-     {'image': '/camera/image_rect'}, '/camera/image_rect is a rectified image', ''),
-])
-def test_what_is_needed_is_told_and_the_node_stays(ros_domain_id, parameters, remap, sentence,
-                                                   missing):
-    with ros_graph.Graph() as graph, ros_graph.node_process(
-            parameters=parameters, remap=remap) as node:
-        diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
-        ros_graph.wait_until(lambda: len(diagnostics) >= 2, 'diagnostics')
-        [status] = diagnostics[-1].status
-        assert status.level == b'\x02'
-        assert sentence in status.message
-        assert ros_graph.diagnostic_values(diagnostics[-1])['missing'] == missing
-        code, _ = node.signal(signal.SIGTERM)
-        assert code == 0
-        assert node.output.count(sentence) == 1
-        assert 'Traceback' not in node.output
-
-
-@pytest.mark.parametrize(('parameters', 'sentence'), [
-    ({'readout_time': 3.0}, 'readout_time'),
-    ({'readout_time': 'fast'}, 'readout_time must be of type float'),
-    ({'solver': '7pt'}, 'solver must be one of auto, uniform_9pt'),
-    ({'quat_cam_imu_xyzw': '[0.0, 0.0, 0.0, 2.0]'}, 'quat_cam_imu_xyzw'),
-    ({'quat_cam_imu_xyzw': '[0.0, 0.0, 1.0]'}, 'quat_cam_imu_xyzw must be 4 values'),
-    ({'readout_time': 0.03, 'quat_cam_imu_xyzw': '[0.0, 0.0, 0.0, 1.0]',
-      'stamps_file': '/nowhere/stamps.txt'}, 'stamps_file /nowhere/stamps.txt cannot be written'),
-])
-def test_an_illegal_parameter_ends_the_node_with_one_line(ros_domain_id, parameters, sentence):
-    with ros_graph.node_process(parameters=parameters) as node:
-        assert node.wait() == 2
-        lines = node.output.strip().splitlines()
-        assert len(lines) == 1, lines
-        assert '[FATAL]' in lines[0]
-        assert sentence in lines[0]
-
-
-def test_a_misspelt_parameter_is_told(ros_domain_id):
-    with ros_graph.node_process(parameters={'readout_tme': 0.03}) as node:
-        node.wait_for("there is no parameter 'readout_tme'; did you mean readout_time")
-        assert node.signal(signal.SIGINT)[0] == 0
-
-
-@pytest.mark.parametrize('reliable', [
-    ['/camera/image_raw'], ['/imu/data_raw', '/camera/camera_info']])
-def test_quality_of_service_can_be_overridden(ros_domain_id, reliable):
-    """Reliable subscriptions, which a publisher of best effort does not match; one by one."""
-    unknown = 'qos_overrides./camera/nothing.subscription.depth'
-    parameters = {f'qos_overrides.{topic}.subscription.reliability': 'reliable'
-                  for topic in reliable}
-    with ros_graph.Graph() as graph, ros_graph.node_process(
-            ros_graph.ROOT / 'bags' / 'hand_held.yaml', remap=ros_graph.BAG_TOPICS,
-            parameters={'image_transport': 'raw', unknown: 3, **parameters}) as node:
-        node.wait_for('ready')
-        for topic in [*ros_graph.BAG_TOPICS.values(), '/accel']:
-            [info] = ros_graph.wait_until(
-                lambda topic=topic: graph.node.get_subscriptions_info_by_topic(topic), 'discovery')
-            assert info.qos_profile.reliability is (
-                ReliabilityPolicy.RELIABLE if topic in reliable else ReliabilityPolicy.BEST_EFFORT)
-        assert node.signal(signal.SIGINT)[0] == 0
-        assert 'there is no parameter' not in node.output
-        assert node.output.count('is no QoS override of this node') == 1
-        assert f'{unknown} is no QoS override of this node' in node.output
-
-
-@pytest.mark.parametrize(('policy', 'value', 'sentence'), [
-    ('reliability', 'sometimes', 'override for policy `reliability`: `sometimes`'),
-    ('depth', 'many', 'qos_overrides./camera/image_raw.subscription.depth')])
-def test_an_illegal_override_ends_the_node_with_one_line(ros_domain_id, policy, value, sentence):
-    override = f'qos_overrides./camera/image_raw.subscription.{policy}'
-    with ros_graph.node_process(
-            ros_graph.ROOT / 'bags' / 'hand_held.yaml', remap=ros_graph.BAG_TOPICS,
-            parameters={'image_transport': 'raw', override: value}) as node:
-        assert node.wait() == 2
-        lines = [line for line in node.output.strip().splitlines() if '[INFO]' not in line]
-        assert len(lines) == 1, lines
-        assert '[FATAL]' in lines[0]
-        assert 'a QoS override is not legal' in lines[0]
-        assert sentence in lines[0]
-
-
-# -- transform -------------------------------------------------------------------------------
-
-# In place of tf2_ros, which is in no wheel: says what it is asked to send.
-FAKE_TF2_ROS = """
-class TransformBroadcaster:
-    def __init__(self, node):
-        self._publisher = node.create_publisher(__import__(
-            'geometry_msgs.msg').msg.TransformStamped, '/sent_transform', 10)
-
-    def sendTransform(self, transform):
-        self._publisher.publish(transform)
-"""
-
-
-def test_transform_is_the_inverse_of_the_pose(ros_domain_id, bundled_bag, tmp_path, monkeypatch):
-    """The camera has a parent in the robot's tree, so the reference keyframe is its child."""
-    (tmp_path / 'tf2_ros.py').write_text(FAKE_TF2_ROS)
-    monkeypatch.setenv('PYTHONPATH', os.pathsep.join(
-        [str(tmp_path), *filter(None, [os.environ.get('PYTHONPATH')])]))
-    with ros_graph.Graph() as graph, ros_graph.node_process(
-            ros_graph.ROOT / 'bags' / 'hand_held.yaml', remap=ros_graph.BAG_TOPICS,
-            parameters={'publish_tf': True}) as node:
-        poses = graph.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
-        transforms = graph.listen(TransformStamped, '/sent_transform')
-        with ros_graph.Process('rs_relpose_lab.live.player', str(bundled_bag),
-                               '--wait-for-subscribers', '300'):
-            ros_graph.wait_until(lambda: len(poses) >= 3 and len(transforms) >= 3, 'poses')
-        assert node.signal(signal.SIGINT)[0] == 0
-    for message, sent in zip(poses, transforms, strict=False):
-        assert sent.header.stamp == message.header.stamp
-        assert (sent.header.frame_id, sent.child_frame_id) == (
-            'camera_optical_frame', 'camera_optical_frame_reference')
-        t, q = message.pose.pose.position, message.pose.pose.orientation
-        found, r = sent.transform.translation, sent.transform.rotation
-        inverse = Rotation.from_quat([q.x, q.y, q.z, q.w]).inv()
-        np.testing.assert_allclose([found.x, found.y, found.z], -inverse.apply([t.x, t.y, t.z]))
-        np.testing.assert_allclose(
-            Rotation.from_quat([r.x, r.y, r.z, r.w]).as_matrix(), inverse.as_matrix(), atol=1e-12)
-
-
-def test_a_transform_without_tf2_ros(ros_domain_id):
-    if importlib.util.find_spec('tf2_ros'):
-        pytest.skip('tf2_ros is installed')
-    with ros_graph.node_process(parameters={'publish_tf': True}) as node:
-        assert node.wait() == 2
-        assert 'publish_tf needs tf2_ros, which is not installed' in node.output
-        assert 'Traceback' not in node.output
+def test_two_nodes_one_is_killed_and_the_other_lives_in_a_looping_bag(
+        ros_domain_id, bag_messages, truth):
+    """Two namespaces; one on the clock of a bag that starts again, one killed and restarted."""
+    with Graph() as graph:
+        both = Namespaces(graph, bag_messages)
+        with both.start('b', use_sim_time=True) as looping:
+            with both.start('a') as killed:
+                for node in (killed, looping):
+                    node.wait_for('ready')
+                both.publishers = {name: drivers(graph, f'/{name}') for name in 'ab'}
+                both.play_until_poses('a', 'b')
+                assert killed.signal(signal.SIGKILL)[0] == -signal.SIGKILL
+            with both.start('a') as restarted:
+                both.play_until_poses('b')
+                restarted.wait_for('ready')
+                wait_until(lambda: all(
+                    publisher.get_subscription_count() == 1
+                    for publisher in both.publishers['a'].values()), 'the restarted node')
+                both.play_until_poses('a', 'b')
+                for node in (restarted, looping):
+                    assert node.signal(signal.SIGTERM)[0] == 0
+                    assert 'Traceback' not in node.output
+        assert [both.wrong_poses(name, truth) for name in 'ab'] == [[], []]
+        last = {name: [item for item in both.diagnostics
+                       if item.status[0].name.startswith(f'/{name}/')][-1] for name in 'ab'}
+        assert int(diagnostic_values(last['b'])['clock_jumps']) >= 2
+        # Stamped by the clock of the graph.
+        assert faults.stamp_of(last['b']) < FIRST_STAMP_NS + 10 * SECOND
+        assert faults.stamp_of(last['a']) > FIRST_STAMP_NS + 10 * SECOND

@@ -6,8 +6,8 @@ import json
 import subprocess
 import sys
 
+from conftest import ROOT
 import pytest
-import ros_graph
 
 # In a process of its own: other tests compile kernels in this one.
 PROGRAM = """
@@ -16,9 +16,9 @@ import json
 import sys
 from numba.core.dispatcher import Dispatcher
 from rs_relpose_ros.bags.reader import open_bag
-from rs_relpose_ros.front_end.pipeline import Pipeline
-from rs_relpose_ros.front_end.sequencer import ReadyFrame, Sequencer
-from rs_relpose_ros.messages.intake import MessageIntake
+from rs_relpose_ros.front_end.front_end import FrameProcessed, FrontEnd
+from rs_relpose_ros.messages.intake import Intake
+from rs_relpose_ros.messages.sensor_feed import Role
 from rs_relpose_ros.front_end.warm_up import warm_up_pipeline
 from rs_relpose_ros.config.parameter_file import read_parameters
 
@@ -30,20 +30,16 @@ def kernels():
 parameters = read_parameters(sys.argv[2], sys.argv[3:])
 warm_up_pipeline(parameters)
 before = kernels()
-sequencer = Sequencer(parameters, offline=True)
-intake = MessageIntake(sequencer)
-pipeline = Pipeline(parameters)
+front_end = FrontEnd(parameters, offline=True)
+intake = Intake(front_end.sequencer)
 statuses = set()
 with open_bag(sys.argv[1]) as bag:
     topics = bag.find_topics()
-    add = {topics.image.name: intake.add_compressed_image,
-           topics.camera_info.name: intake.add_camera_info, topics.imu.name: intake.add_imu}
-    for item in bag.messages([topics.image, topics.camera_info, topics.imu]):
-        add[item.topic](item.message)
-        while isinstance(ready := sequencer.take(), ReadyFrame):
-            pair = pipeline.process(ready.frame, ready.imu)
-            if pair is not None:
-                statuses.add(pair.pose.status.value)
+    for role, item in intake.feed.messages(bag, topics):
+        intake.receive(role, item.message)
+        while isinstance(outcome := front_end.step(), FrameProcessed):
+            if outcome.pair is not None:
+                statuses.add(outcome.pair.pose.status.value)
 after = kernels()
 print(json.dumps([sorted(statuses), [k for k in after if after[k] != before[k]],
                   sum(before.values())]))
@@ -54,8 +50,8 @@ print(json.dumps([sorted(statuses), [k for k in after if after[k] != before[k]],
 def test_nothing_is_compiled_after_the_warm_up(bundled_bag):
     out = subprocess.run(
         [sys.executable, '-c', PROGRAM, str(bundled_bag),
-         str(ros_graph.ROOT / 'bags' / 'hand_held.yaml')],
-        check=True, capture_output=True, text=True, timeout=590, cwd=ros_graph.ROOT)
+         str(ROOT / 'bags' / 'hand_held.yaml')],
+        check=True, capture_output=True, text=True, timeout=590, cwd=ROOT)
     statuses, compiled_late, kernels = json.loads(out.stdout)
     # The bag holds motion, standstill and pure rotation: every path of the estimator.
     assert {'OK', 'PURE_ROTATION'} <= set(statuses)

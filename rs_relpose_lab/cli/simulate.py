@@ -6,14 +6,11 @@ import argparse
 import dataclasses
 import math
 from pathlib import Path
-import sys
-
-from tqdm import tqdm
 
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.bag import write_bag, write_parameters
+from rs_relpose_ros.cli.options import progress_bar, refuse_existing
 from rs_relpose_ros.config.declarations import Declared, declared
-from rs_relpose_ros.errors import InputError
 
 HELP = ('Render true rolling-shutter images (every row at its own instant) of a textured scene '
         'along a hand-held-like walk, with IMU and ground truth, into a rosbag2 directory (MCAP) '
@@ -63,13 +60,10 @@ def run(args: argparse.Namespace) -> int:
     """Write the bag and its parameter file."""
     config = configuration(args)
     parameters = args.out_bag.with_name(args.out_bag.name + '.yaml')
-    for path in (args.out_bag, parameters):
-        # Asked before the scene is made, which takes seconds.
-        if path.exists():
-            raise InputError(f'{path} exists already: remove it or choose another path')
+    # Asked before the scene is made, which takes seconds.
+    refuse_existing(args.out_bag, parameters)
     simulation = simulate(config)
-    with tqdm(total=config.frame_count, unit='frame', desc=args.out_bag.name,
-              disable=not sys.stderr.isatty()) as bar:
+    with progress_bar(config.frame_count, 'frame', args.out_bag.name) as bar:
         write_bag(simulation, args.out_bag, jpeg_quality=args.jpeg_quality, raw=args.raw,
                   on_frame=bar.update)
     write_parameters(simulation, parameters, raw=args.raw)

@@ -6,11 +6,9 @@ This process only listens: to the poses, to the diagnostics, and once a second t
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import dataclass
 import os
 from pathlib import Path
-import threading
 import time
 from typing import Any
 
@@ -18,21 +16,22 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
 from numpy.typing import NDArray
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import TimeReference
 
+from rs_relpose_lab.live.graph import diagnostic_values, Graph, private_domain
 from rs_relpose_lab.live.process_figures import process_figures, ProcessFigures
-from rs_relpose_lab.live.processes import LiveRunError, private_graph, Process
+from rs_relpose_lab.live.processes import (
+    LiveRunError,
+    node_process,
+    player_process,
+    Process,
+    wait_until,
+    wait_until_quiet,
+)
 from rs_relpose_ros.messages.incoming import stamp_ns, time_ns
 
-# Compiling all kernels takes minutes, where nobody has done it ahead.
-_START_TIMEOUT = 600.0
 # The node is done when no pose has come for so long, and has reported its counters [s].
 _QUIET = 2.5
-_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100,
-                  reliability=ReliabilityPolicy.RELIABLE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,56 +102,26 @@ class MeasuredRun:
 
 
 class _Listener:
-    """A node of this process, spun by a thread of its own."""
+    """What the node publishes, with the instants of receipt."""
 
-    def __init__(self) -> None:
-        self._context = rclpy.Context()
-        rclpy.init(context=self._context)
-        self.node = rclpy.create_node('live_benchmark', context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self.node)
+    def __init__(self, graph: Graph) -> None:
         self.poses: dict[int, tuple[int, PoseWithCovarianceStamped]] = {}
-        self.references: dict[int, int] = {}
+        self.references = graph.listen(TimeReference, '/relpose_node/reference')
         self.diagnostics: list[tuple[int, dict[str, str]]] = []
-        self.heard = threading.Event()
-        for msgtype, topic, receive in (
-                (PoseWithCovarianceStamped, '/relpose_node/relative_pose', self._on_pose),
-                (TimeReference, '/relpose_node/reference', self._on_reference),
-                (DiagnosticArray, '/diagnostics', self._on_diagnostics)):
-            self.node.create_subscription(msgtype, topic, receive, _QOS)
-        self._stopping = False
-        self._thread = threading.Thread(target=self._spin)
-
-    def __enter__(self) -> _Listener:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stopping = True
-        self._thread.join()
-        self._executor.shutdown()
-        self.node.destroy_node()
-        self._context.try_shutdown()
-
-    def received(self) -> list[ReceivedPose]:
-        """Poses whose reference came as well, in the order of their stamps."""
-        return [_received(self.references[stamp], stamp, *self.poses[stamp])
-                for stamp in sorted(self.poses.keys() & self.references.keys())]
-
-    def _spin(self) -> None:
-        while not self._stopping:
-            self._executor.spin_once(timeout_sec=0.1)
+        graph.subscribe(PoseWithCovarianceStamped, '/relpose_node/relative_pose', self._on_pose)
+        graph.subscribe(DiagnosticArray, '/diagnostics', self._on_diagnostics)
 
     def _on_pose(self, msg: Any) -> None:
         self.poses[stamp_ns(msg.header)] = time.monotonic_ns(), msg
-        self.heard.set()
-
-    def _on_reference(self, msg: Any) -> None:
-        self.references[stamp_ns(msg.header)] = time_ns(msg.time_ref)
 
     def _on_diagnostics(self, msg: Any) -> None:
-        self.diagnostics.append((time.monotonic_ns(), {
-            item.key: item.value for item in msg.status[0].values}))
+        self.diagnostics.append((time.monotonic_ns(), diagnostic_values(msg)))
+
+    def received(self) -> list[ReceivedPose]:
+        """Poses whose reference came as well, in the order of their stamps."""
+        references = {stamp_ns(msg.header): time_ns(msg.time_ref) for msg in self.references}
+        return [_received(references[stamp], stamp, *self.poses[stamp])
+                for stamp in sorted(self.poses.keys() & references.keys())]
 
 
 def _received(reference: int, stamp: int, received_ns: int, msg: Any) -> ReceivedPose:
@@ -178,69 +147,45 @@ def measure(play: Play, folder: Path,
     LiveRunError
         A process failed.
     """
-    # For the listener in this process; the other two get the same.
-    os.environ.update(private_graph())
-    if play.profile is not None:
-        os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(play.profile)
-    else:
-        os.environ.pop('FASTRTPS_DEFAULT_PROFILES_FILE', None)
     timings, log = folder / 'frames.csv', folder / 'player.npy'
     log.unlink(missing_ok=True)
-    with ExitStack() as stack:
-        listener = stack.enter_context(_Listener())
-        started_ns = time.monotonic_ns()
-        node = stack.enter_context(Process(
-            folder, 'relpose_node', 'rs_relpose_ros.node.node', '--ros-args', '--params-file',
-            str(play.parameters), '-p', f'timings_file:={timings}',
-            '-p', f'image_transport:={play.transport}',
-            *(word for name, topic in play.remap.items() for word in ('-r', f'{name}:={topic}'))))
-        _wait_for(lambda: listener.node.count_subscribers(play.remap['imu']) > 0, node)
-        ready_ns = time.monotonic_ns()
-        player = stack.enter_context(Process(
-            folder, 'player', 'rs_relpose_lab.live.player', str(play.bag),
-            '--wait-for-subscribers', str(_START_TIMEOUT), '--log', str(log), *play.player))
-        figures, player_figures = _watch(node, player, listener, on_second)
-        _wait_until_quiet(listener, node)
-        node.stop()
-        return MeasuredRun(listener.received(), listener.diagnostics, figures, player_figures,
-                           started_ns, ready_ns, timings, log)
+    with private_domain():
+        if play.profile is not None:
+            os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(play.profile)
+        else:
+            os.environ.pop('FASTRTPS_DEFAULT_PROFILES_FILE', None)
+        with Graph() as graph:
+            listener = _Listener(graph)
+            started_ns = time.monotonic_ns()
+            with node_process(play.parameters, remap=play.remap, log=folder / 'relpose_node.log',
+                              parameters={'timings_file': timings,
+                                          'image_transport': play.transport}) as node:
+                wait_until(lambda: graph.node.count_subscribers(play.remap['imu']),
+                           'a subscription of the node', node)
+                ready_ns = time.monotonic_ns()
+                with player_process(play.bag, '--log', str(log), *play.player,
+                                    log=folder / 'player.log') as player:
+                    figures = _watch(node, player, listener, on_second)
+                wait_until_quiet(lambda: len(listener.poses), _QUIET, node)
+                node.stop()
+        return MeasuredRun(listener.received(), listener.diagnostics, *figures, started_ns,
+                           ready_ns, timings, log)
 
 
 def _watch(node: Process, player: Process, listener: _Listener,
            on_second: Callable[[], object]) -> tuple[list[ProcessFigures], list[ProcessFigures]]:
     """Figures of node and player from the first pose to the end of the player."""
-    figures, player_figures = [], []
-    while not listener.heard.wait(0.05):
-        node.check()
-        if player.ended():
-            raise LiveRunError(f'the node published no pose; see {node.log}')
-    while not player.ended():
-        node.check()
+    figures: list[tuple[ProcessFigures, ProcessFigures]] = []
+    wait_until(lambda: listener.poses or player.ended(), 'a pose', node)
+    while not (player.ended() or node.ended()):
         try:
-            figures.append(process_figures(node.pid))
-            player_figures.append(process_figures(player.pid))
+            figures.append((process_figures(node.pid), process_figures(player.pid)))
         except (OSError, KeyError):   # it has just ended
             break
         on_second()
         time.sleep(1.0)
-    player.wait(30.0)
-    return figures, player_figures[:len(figures)]
-
-
-def _wait_for(condition: Callable[[], bool], *processes: Process) -> None:
-    deadline = time.monotonic() + _START_TIMEOUT
-    while not condition():
-        for process in processes:
-            process.check()
-        if time.monotonic() > deadline:
-            raise LiveRunError(f'the node was not ready within {_START_TIMEOUT:g} s')
-        time.sleep(0.01)
-
-
-def _wait_until_quiet(listener: _Listener, node: Process) -> None:
-    count, since = -1, time.monotonic()
-    while time.monotonic() - since < _QUIET:
-        node.check()
-        if len(listener.poses) != count:
-            count, since = len(listener.poses), time.monotonic()
-        time.sleep(0.1)
+    if not figures:
+        raise LiveRunError(f'the node published no pose:\n{node.output}')
+    wait_until(player.ended, 'the end of the player')
+    of_node, of_player = zip(*figures, strict=True)
+    return list(of_node), list(of_player)

@@ -1,64 +1,62 @@
-"""Processes of a live run: node, player, recorder, each with a log."""
+"""Processes of a live run, the node and a player: start, log, wait, signals, end."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 import os
 from pathlib import Path
 import signal
 import subprocess
 import sys
+import tempfile
+import time
+from types import TracebackType
+from typing import BinaryIO, TypeVar
 
 from rs_relpose_ros.errors import RsRelposeError
 
+Value = TypeVar('Value')
+
+# Longest wait [s] for anything: compiling all kernels on a busy machine takes minutes.
+PATIENCE = 600.0
+# The node ends within a second of a signal; a busy machine may take longer [s].
+_END_TIMEOUT = 30.0
+
 
 class LiveRunError(RsRelposeError):
-    """A process failed or did not become ready; the text says which, with the end of its log."""
-
-
-def private_graph() -> dict[str, str]:
-    """Environment of a ROS graph that only this process and its children take part in.
-
-    Nothing leaves this machine. The domain id is below 102, as the DDS ports of higher ones run
-    into those of other programs.
-    """
-    return {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-            'ROS_DOMAIN_ID': str(1 + os.getpid() % 100)}
+    """A process failed or was not ready in time; the text names it and ends with its output."""
 
 
 class Process:
-    """A Python process of the project with its log file.
+    """A Python process with a log. Leaving the ``with`` block kills it if it still runs.
 
     Parameters
     ----------
-    folder : Path
-        Directory of the log.
-    name : str
-        For the log and for error messages.
-    module, *arguments : str
-        What ``python -m`` runs.
-    environment : mapping, optional
-        Variables to add.
+    *arguments : str
+        Of the interpreter: a file, or ``-m`` and a module, and what that is given.
+    log : Path, optional
+        File of standard output and error; a temporary one by default.
     """
 
-    def __init__(self, folder: Path, name: str, module: str, *arguments: str,
-                 environment: Mapping[str, str] | None = None) -> None:
-        self.name, self.log = name, folder / f'{name}.log'
-        variables = {**os.environ, **private_graph(), 'PYTHONUNBUFFERED': '1',
-                     'AMENT_PREFIX_PATH': os.environ.get('AMENT_PREFIX_PATH', sys.prefix),
-                     **(environment or {})}
-        with self.log.open('wb') as log:
-            self._process = subprocess.Popen(
-                [sys.executable, '-m', module, *arguments], env=variables, stdout=log,
-                stderr=subprocess.STDOUT)
+    def __init__(self, *arguments: str, log: Path | None = None) -> None:
+        self._name = arguments[arguments[0] == '-m']
+        # A file, as a pipe that nobody reads would block the process.
+        self._log: BinaryIO = log.open('w+b') if log else tempfile.TemporaryFile()  # noqa: SIM115
+        self._process = subprocess.Popen(
+            [sys.executable, *arguments], stdout=self._log, stderr=subprocess.STDOUT,
+            env={**os.environ, 'PYTHONUNBUFFERED': '1'})
 
     def __enter__(self) -> Process:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 traceback: TracebackType | None) -> None:
         if self._process.poll() is None:
             self._process.kill()
             self._process.wait()
+        if error is not None:
+            error.add_note(f'--- output of {self._name}:\n{self.output}')
+        self._log.close()
 
     @property
     def pid(self) -> int:
@@ -66,33 +64,110 @@ class Process:
         return self._process.pid
 
     @property
-    def text(self) -> str:
-        """What it has said so far."""
-        return self.log.read_text(encoding='utf-8', errors='replace')
+    def output(self) -> str:
+        """What it has written so far."""
+        return os.pread(self._log.fileno(), 1 << 22, 0).decode(errors='replace')
 
     def ended(self) -> bool:
-        """Whether it has ended; raises if with an error."""
-        self.check()
-        return self._process.poll() is not None
-
-    def check(self) -> None:
-        """Raise if it has ended with an error."""
+        """Whether it has ended well; raises where it has failed."""
         if self._process.poll() not in (None, 0):
             raise self._failure(f'ended with code {self._process.returncode}')
+        return self._process.returncode is not None
 
-    def wait(self, timeout: float) -> None:
-        """Wait for its end."""
+    def wait(self, timeout: float = PATIENCE) -> int:
+        """Wait for its end; its exit code."""
         try:
-            self._process.wait(timeout)
+            return self._process.wait(timeout)
         except subprocess.TimeoutExpired:
             raise self._failure(f'did not end within {timeout:g} s') from None
-        self.check()
+
+    def wait_for(self, text: str) -> None:
+        """Wait until it has written `text`."""
+        def written() -> bool:
+            ended = self._process.poll() is not None
+            if ended and text not in self.output:
+                raise self._failure(f'ended before it wrote {text!r}')
+            return text in self.output
+        wait_until(written, f'{text!r} in the output of {self._name}')
+
+    def signal(self, number: signal.Signals, *,
+               every: float = _END_TIMEOUT) -> tuple[int, float]:
+        """Send a signal, again every so many seconds; exit code and seconds until the end."""
+        started = time.monotonic()
+        while (seconds := time.monotonic() - started) < _END_TIMEOUT:
+            self._process.send_signal(number)
+            try:
+                return self._process.wait(every), time.monotonic() - started
+            except subprocess.TimeoutExpired:
+                continue
+        raise self._failure(f'did not end within {seconds:g} s of {number.name}')
 
     def stop(self) -> None:
-        """Ask it to end, as Ctrl-C does."""
-        self._process.send_signal(signal.SIGINT)
-        self.wait(15.0)
+        """End it as Ctrl-C does; raises where it fails."""
+        self.signal(signal.SIGINT)
+        self.ended()
 
     def _failure(self, what: str) -> LiveRunError:
-        tail = '\n'.join(self.text.splitlines()[-15:])
-        return LiveRunError(f'{self.name} {what}; the end of {self.log}:\n{tail}')
+        tail = '\n'.join(self.output.splitlines()[-15:])
+        return LiveRunError(f'{self._name} {what}; the end of its output:\n{tail}')
+
+
+def node_process(parameter_file: Path | None = None, *, remap: Mapping[str, str] | None = None,
+                 parameters: Mapping[str, object] | None = None,
+                 log: Path | None = None) -> Process:
+    """Start `relpose_node`; `remap` takes topics, ``__ns`` and ``__node``."""
+    words = [] if parameter_file is None else ['--params-file', str(parameter_file)]
+    for name, value in (parameters or {}).items():
+        words += ['-p', f'{name}:={value}']
+    for source, target in (remap or {}).items():
+        words += ['-r', f'{source}:={target}']
+    return Process('-m', 'rs_relpose_ros.node.start', '--ros-args', *words, log=log)
+
+
+def player_process(bag: Path, *options: str, log: Path | None = None) -> Process:
+    """Start a player of `bag`, which waits until the node subscribes."""
+    return Process('-m', 'rs_relpose_lab.live.player', str(bag), '--wait-for-subscribers',
+                   str(PATIENCE), *options, log=log)
+
+
+def wait_until(condition: Callable[[], Value], what: str, *processes: Process,
+               timeout: float = PATIENCE) -> Value:
+    """Wait for a condition while processes run.
+
+    Parameters
+    ----------
+    condition : callable
+        Asked until its answer is true.
+    what : str
+        For the error message.
+    *processes : Process
+        Must not fail meanwhile.
+    timeout : float
+        Longest wait [s].
+
+    Returns
+    -------
+    The true answer.
+
+    Raises
+    ------
+    LiveRunError
+    """
+    deadline = time.monotonic() + timeout
+    while not (value := condition()):
+        for process in processes:
+            process.ended()
+        if time.monotonic() > deadline:
+            raise LiveRunError(f'{what} did not happen within {timeout:g} s')
+        time.sleep(0.01)
+    return value
+
+
+def wait_until_quiet(count: Callable[[], int], seconds: float, process: Process) -> None:
+    """Wait until `count()` has stayed the same for so many seconds."""
+    known, since = count(), time.monotonic()
+    while time.monotonic() - since < seconds:
+        process.ended()
+        if count() != known:
+            known, since = count(), time.monotonic()
+        time.sleep(0.05)

@@ -5,32 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 import logging
-from typing import Any
 
-from rs_relpose_ros.bags.reader import Bag, COMPRESSED_IMAGE, SensorTopics
+from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics
 from rs_relpose_ros.calibrate.follow import PointFollower
 from rs_relpose_ros.calibrate.gyro_path import GyroSeries
-from rs_relpose_ros.calibrate.procedure import CalibrationConfig
 from rs_relpose_ros.calibrate.tracks import Tracks
 from rs_relpose_ros.config.tracking import TrackingConfig
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
-from rs_relpose_ros.messages.incoming import (
-    image_from_compressed,
-    image_from_message,
-    imu_sample_from_message,
-    intrinsics_from_info,
-    stamp_ns,
-)
+from rs_relpose_ros.imu.samples import ImuSample
+from rs_relpose_ros.messages.incoming import PublishedImage
+from rs_relpose_ros.messages.sensor_feed import Role, SensorFeed
 
 # Guess of an unknown focal length, share of the longer side: 64 deg of view.
 _FOCAL_GUESS = 0.8
-
-# What KLT adds to the errors of a calibration, found on rendered bags: its errors are not
-# independent from frame to frame.
-TRACKED_IN_IMAGES = CalibrationConfig(
-    tracking_time_sigma=5e-5, tracking_rotation_sigma=1e-3, tracking_bias_sigma=2.5e-4)
 
 _logger = logging.getLogger(__name__)
 
@@ -79,9 +68,9 @@ def read_recording(bag: Bag, topics: SensorTopics, tracking: TrackingConfig | No
         The bag is damaged, or has no usable image or no gyro.
     """
     reader = _Reader(topics, TrackingConfig() if tracking is None else tracking)
-    for message in bag.messages([topics.image, topics.camera_info, topics.imu]):
-        reader.take(message.topic, message.message)
-        if message.topic == topics.image.name:
+    for role, message in reader.feed.messages(bag, topics):
+        reader.take(role, message)
+        if role is Role.IMAGE:
             on_image()
     return reader.recording()
 
@@ -90,46 +79,41 @@ class _Reader:
     def __init__(self, topics: SensorTopics, tracking: TrackingConfig) -> None:
         self._topics = topics
         self._follower = PointFollower(tracking)
+        self.feed = SensorFeed({Role.IMU: self._take_sample, Role.CAMERA_INFO: self._take_info,
+                                Role.IMAGE: self._take_image})
         self._calibration: Intrinsics | None = None
         self._uncalibrated = False
         self._size: tuple[int, int] | None = None
         self._gyro: dict[int, tuple[float, float, float]] = {}
         self._unused: dict[str, int] = {}
 
-    def take(self, topic: str, msg: Any) -> None:
+    def take(self, role: Role, message: BagMessage) -> None:
         try:
-            if topic == self._topics.imu.name:
-                sample = imu_sample_from_message(msg)
-                if sample.angular_velocity is None:
-                    raise MissingInputError('an IMU message has no gyro')
-                self._gyro.setdefault(sample.stamp_ns, sample.angular_velocity)
-            elif topic == self._topics.camera_info.name:
-                self._take_info(msg)
-            else:
-                self._take_image(msg)
+            self.feed.receive(role, message.message)
         except RsRelposeError as error:
-            reason = f'{topic}: {error}'
+            # The camera is not calibrated: its focal length is guessed.
+            if role is Role.CAMERA_INFO and isinstance(error, MissingInputError):
+                self._uncalibrated = True
+                return
+            reason = f'{message.topic}: {error}'
             if reason not in self._unused:
                 _logger.info('not used: %s', reason)
             self._unused[reason] = self._unused.get(reason, 0) + 1
 
-    def _take_info(self, msg: Any) -> None:
-        k = msg.k if hasattr(msg, 'k') else msg.K
-        if float(k[0]) == 0.0:
-            self._uncalibrated = True
-        else:
-            self._calibration = intrinsics_from_info(msg)
+    def _take_sample(self, sample: ImuSample) -> None:
+        if sample.angular_velocity is None:
+            raise MissingInputError('an IMU message has no gyro')
+        self._gyro.setdefault(sample.stamp_ns, sample.angular_velocity)
 
-    def _take_image(self, msg: Any) -> None:
-        stamp = stamp_ns(msg.header)
+    def _take_info(self, intrinsics: Intrinsics) -> None:
+        self._calibration = intrinsics
+
+    def _take_image(self, published: PublishedImage) -> None:
         last = self._follower.last_stamp_ns
-        if last is not None and stamp <= last:
+        if last is not None and published.stamp_ns <= last:
             raise InputError('the stamp of an image is not later than that of the one before')
-        if self._topics.image.msgtype == COMPRESSED_IMAGE:
-            image = image_from_compressed(msg)
-        else:
-            image = image_from_message(msg)
-        self._follower.add(stamp, image)
+        image = published.image.decoded()
+        self._follower.add(published.stamp_ns, image)
         self._size = image.shape[1], image.shape[0]
 
     def recording(self) -> Recording:

@@ -4,25 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 
-from rs_relpose_ros.bags.reader import Bag, COMPRESSED_IMAGE, Topic
+from rs_relpose_ros.bags.reader import Bag, BagMessage, Topic
 from rs_relpose_ros.check.inertial import Inertial
 from rs_relpose_ros.check.streams import Stamps
 from rs_relpose_ros.check.turning import TurningImages
 from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.imu.samples import ImuSample
-from rs_relpose_ros.messages.incoming import (
-    accelerometer_sample_from_message,
-    image_from_compressed,
-    image_from_message,
-    imu_sample_from_message,
-    intrinsics_from_info,
-    stamp_ns,
-)
+from rs_relpose_ros.messages.incoming import PublishedImage
+from rs_relpose_ros.messages.sensor_feed import Role, SensorFeed
+
+_MOST_KEYS = 20
+_Key = TypeVar('_Key')
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,9 +83,9 @@ def scan(bag: Bag, chosen: Chosen, on_message: Callable[[], object]) -> Scan:
         The bag is damaged.
     """
     seen = Scan(turning=TurningImages(chosen.image.count if chosen.image else 0))
-    reader = _Reader(seen, chosen)
-    for message in bag.messages(chosen.all):
-        reader.take(message.topic, message.message, message.bag_time_ns)
+    reader = _Reader(seen)
+    for role, message in reader.feed.messages(bag, chosen):
+        reader.take(role, message)
         on_message()
     return seen
 
@@ -96,71 +93,61 @@ def scan(bag: Bag, chosen: Chosen, on_message: Callable[[], object]) -> Scan:
 class _Reader:
     """Sorts messages into a `Scan`."""
 
-    def __init__(self, seen: Scan, chosen: Chosen) -> None:
-        self._seen, self._chosen = seen, chosen
-        self._compressed = chosen.image is not None and chosen.image.msgtype == COMPRESSED_IMAGE
+    def __init__(self, seen: Scan) -> None:
+        self._seen = seen
+        self._recorded_ns = 0
+        self.feed = SensorFeed({Role.IMU: self._imu, Role.ACCEL: self._accel,
+                                Role.CAMERA_INFO: self._camera_info, Role.IMAGE: self._image})
 
-    def take(self, topic: str, msg: Any, recorded_ns: int) -> None:
-        chosen, seen = self._chosen, self._seen
-        if chosen.image is not None and topic == chosen.image.name:
-            self._image(msg, recorded_ns)
-        elif chosen.camera_info is not None and topic == chosen.camera_info.name:
-            self._camera_info(msg)
-        elif chosen.accel is not None and topic == chosen.accel.name:
-            sample = self._sample(msg, accelerometer_sample_from_message)
-            if sample is not None:
-                seen.accel_stamps.add(sample.stamp_ns, recorded_ns)
-                seen.accel_samples += 1
-                seen.inertial.add(sample)
-        else:
-            sample = self._sample(msg, imu_sample_from_message)
-            if sample is not None:
-                seen.imu_stamps.add(sample.stamp_ns, recorded_ns)
-                seen.inertial.add(sample)
-                seen.accel_samples += sample.linear_acceleration is not None
-                if sample.angular_velocity is not None:
-                    seen.gyro_samples += 1
-                    seen.turning.add_rate(sample.stamp_ns, recorded_ns,
-                                          np.array(sample.angular_velocity))
-
-    def _sample(self, msg: Any, read: Callable[[Any], ImuSample]) -> ImuSample | None:
+    def take(self, role: Role, message: BagMessage) -> None:
+        seen, self._recorded_ns = self._seen, message.bag_time_ns
         try:
-            return read(msg)
+            self.feed.receive(role, message.message)
         except RsRelposeError as error:
-            self._seen.bad_imu += 1
-            self._seen.imu_problem = self._seen.imu_problem or str(error)
-            return None
+            if role is Role.IMAGE:
+                seen.bad_images += 1
+                seen.image_problem = seen.image_problem or str(error)
+            elif role is Role.CAMERA_INFO:
+                seen.calibration_problem = seen.calibration_problem or str(error)
+            else:
+                seen.bad_imu += 1
+                seen.imu_problem = seen.imu_problem or str(error)
 
-    def _camera_info(self, msg: Any) -> None:
+    def _imu(self, sample: ImuSample) -> None:
         seen = self._seen
-        try:
-            calibration = intrinsics_from_info(msg)
-        except RsRelposeError as error:
-            seen.calibration_problem = seen.calibration_problem or str(error)
-            return
-        seen.calibrations += calibration != seen.calibration
-        seen.calibration = calibration
+        seen.imu_stamps.add(sample.stamp_ns, self._recorded_ns)
+        seen.inertial.add(sample)
+        seen.accel_samples += sample.linear_acceleration is not None
+        if sample.angular_velocity is not None:
+            seen.gyro_samples += 1
+            seen.turning.add_rate(sample.stamp_ns, self._recorded_ns,
+                                  np.array(sample.angular_velocity))
 
-    def _image(self, msg: Any, recorded_ns: int) -> None:
+    def _accel(self, sample: ImuSample) -> None:
+        self._seen.accel_stamps.add(sample.stamp_ns, self._recorded_ns)
+        self._seen.accel_samples += 1
+        self._seen.inertial.add(sample)
+
+    def _camera_info(self, intrinsics: Intrinsics) -> None:
+        self._seen.calibrations += intrinsics != self._seen.calibration
+        self._seen.calibration = intrinsics
+
+    def _image(self, published: PublishedImage) -> None:
         seen = self._seen
-        name = str(msg.format if self._compressed else msg.encoding)[:60]
-        if name in seen.encodings or len(seen.encodings) < 20:
-            seen.encodings[name] = seen.encodings.get(name, 0) + 1
-        seen.largest_image = max(seen.largest_image, len(msg.data))
-        try:
-            stamp = stamp_ns(msg.header)
-            seen.image_stamps.add(stamp, recorded_ns)
-            if not seen.turning.wants_next():
-                return
-            image = (image_from_compressed if self._compressed else image_from_message)(msg)
-        except RsRelposeError as error:
-            seen.bad_images += 1
-            seen.image_problem = seen.image_problem or str(error)
+        _count(seen.encodings, published.image.encoding[:60])
+        seen.largest_image = max(seen.largest_image, len(published.image.data))
+        seen.image_stamps.add(published.stamp_ns, self._recorded_ns)
+        if not seen.turning.wants_next():
             return
+        image = published.image.decoded()
         size = image.shape[1], image.shape[0]
-        if size in seen.sizes or len(seen.sizes) < 20:
-            seen.sizes[size] = seen.sizes.get(size, 0) + 1
-        calibration = seen.calibration
-        if calibration is not None and (
-                calibration.image_width, calibration.image_height) == size:
-            seen.turning.add_image(stamp, recorded_ns, image, calibration)
+        _count(seen.sizes, size)
+        intrinsics = seen.calibration
+        if intrinsics is not None and (intrinsics.image_width, intrinsics.image_height) == size:
+            seen.turning.add_image(published.stamp_ns, self._recorded_ns, image, intrinsics)
+
+
+def _count(counts: dict[_Key, int], key: _Key) -> None:
+    """Count `key` in a dictionary that a source of ever new keys cannot fill."""
+    if key in counts or len(counts) < _MOST_KEYS:
+        counts[key] = counts.get(key, 0) + 1

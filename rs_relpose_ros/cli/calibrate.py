@@ -7,14 +7,19 @@ from dataclasses import replace
 import json
 import logging
 from pathlib import Path
-import sys
 
-from tqdm import tqdm
-
-from rs_relpose_ros.bags.reader import COMPRESSED_IMAGE, open_bag, TopicOptions
-from rs_relpose_ros.calibrate.bag_streams import read_recording, TRACKED_IN_IMAGES
-from rs_relpose_ros.calibrate.procedure import calibrate, CalibrationConfig
+from rs_relpose_ros.bags.reader import COMPRESSED_IMAGE, open_bag
+from rs_relpose_ros.calibrate.bag_streams import read_recording
+from rs_relpose_ros.calibrate.procedure import calibrate
 from rs_relpose_ros.calibrate.report import as_mapping, draw_curve, parameter_file, report
+from rs_relpose_ros.cli.options import (
+    add_bag_argument,
+    add_topic_arguments,
+    bag_name,
+    progress_bar,
+    topic_options,
+)
+from rs_relpose_ros.config.calibration import CalibrationConfig, TRACKED_IN_IMAGES
 from rs_relpose_ros.config.tracking import TrackingConfig
 from rs_relpose_ros.errors import InputError
 
@@ -34,8 +39,7 @@ _logger = logging.getLogger(__name__)
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument('bag', metavar='BAG', type=Path,
-                        help='rosbag2 directory, or a .mcap, .db3 or ROS 1 .bag file')
+    add_bag_argument(parser)
     parser.add_argument('--out', metavar='DIR', type=Path,
                         help='directory of the results (default: BAGNAME_calibration in the '
                         'current one); those of an earlier run are replaced')
@@ -46,29 +50,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         default=CalibrationConfig().max_time_offset,
                         help='largest clock offset that is searched for [s] (default: '
                         '%(default)s)')
-    topics = parser.add_argument_group('topics')
-    for role, what in (('image', 'Image or CompressedImage'), ('camera-info', 'CameraInfo'),
-                       ('imu', 'Imu')):
-        topics.add_argument(f'--{role}-topic', metavar='TOPIC', default='', help=what)
+    add_topic_arguments(parser, 'image', 'camera_info', 'imu')
 
 
 def run(args: argparse.Namespace) -> int:
     """Calibrate; 1 when something could not be told."""
-    options = TopicOptions(image=args.image_topic, camera_info=args.camera_info_topic,
-                           imu=args.imu_topic)
     try:
         tracking = TrackingConfig(feature_rows=tuple(args.rows))
         config = replace(TRACKED_IN_IMAGES, max_time_offset=args.max_offset)
     except InputError as error:   # which names the settings behind the options
         raise InputError(str(error).replace('feature_rows', '--rows').replace(
             'max_time_offset', '--max-offset')) from None
-    name = args.bag.resolve().stem if args.bag.is_file() else args.bag.resolve().name
-    folder: Path = args.out if args.out is not None else Path(f'{name}_calibration')
-    quiet = not sys.stderr.isatty()
+    folder: Path = args.out or Path(f'{bag_name(args.bag)}_calibration')
     with open_bag(args.bag) as bag:
-        topics = bag.find_topics(options)
-        with tqdm(total=topics.image.count, unit='image', desc='tracking', leave=False,
-                  disable=quiet) as bar:
+        topics = bag.find_topics(topic_options(args))
+        with progress_bar(topics.image.count, 'image', 'tracking') as bar:
             recording = read_recording(bag, topics, tracking, on_image=bar.update)
     first, last = args.rows
     if first >= recording.camera.height:
@@ -76,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
                          f'{recording.camera.height} rows: give the first and the last to use')
     for reason, count in recording.unused.items():
         _logger.warning('not used, %d times: %s', count, reason)
-    with tqdm(total=100, unit='%', desc='fitting', leave=False, disable=quiet) as bar:
+    with progress_bar(100, '%', 'fitting') as bar:
         result = calibrate(recording.tracks, recording.gyro, recording.camera,
                            focal_known=recording.focal_known, config=config,
                            progress=lambda share: bar.update(round(100 * share) - bar.n))

@@ -6,14 +6,12 @@ import argparse
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-import sys
 
-from tqdm import tqdm
-
-from rs_relpose_ros.config.commented_file import Figure, write_parameters
+from rs_relpose_ros.cli.options import progress_bar, refuse_existing
+from rs_relpose_ros.config.parameter_file import SourcedValue, write_parameters
 from rs_relpose_ros.convert import realsense, xiaomi
 from rs_relpose_ros.convert.recording import Recording, write_bag
-from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.errors import MissingInputError
 
 HELP = ('Turn a public recording into a rosbag2 directory (MCAP) with the topics '
         '/camera/image_raw/compressed, /camera/camera_info and /imu/data_raw, and write '
@@ -30,7 +28,7 @@ class Dataset:
 
     read: Callable[[Path], Recording]
     title: str
-    parameters: tuple[Figure, ...]
+    parameters: tuple[SourcedValue, ...]
 
 
 DATASETS: Mapping[str, Dataset] = {
@@ -54,12 +52,9 @@ def run(args: argparse.Namespace) -> int:
     parameters = args.out_bag.with_name(args.out_bag.name + '.yaml')
     if not folder.is_dir():
         raise MissingInputError(f'there is no folder {folder}')
-    for path in (args.out_bag, parameters):
-        if path.exists():
-            raise InputError(f'{path} exists already: remove it or choose another path')
+    refuse_existing(args.out_bag, parameters)
     recording = dataset.read(folder)
-    with tqdm(total=len(recording.images), unit='image', desc=args.out_bag.name, leave=False,
-              disable=not sys.stderr.isatty()) as bar:
+    with progress_bar(len(recording.images), 'image', args.out_bag.name) as bar:
         write_bag(recording, args.out_bag, on_image=bar.update)
     write_parameters(parameters, dataset.title, dataset.parameters)
     size = sum(file.stat().st_size for file in args.out_bag.iterdir())

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import argparse
-from importlib.metadata import PackageNotFoundError, version
 import logging
 from pathlib import Path
 import sys
 from typing import Any
 
-from tqdm import tqdm
-
-from rs_relpose_ros.bags.reader import open_bag, TopicOptions
+from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.cli.options import (
+    add_bag_argument,
+    add_parameter_arguments,
+    add_topic_arguments,
+    bag_name,
+    package_version,
+    progress_bar,
+    topic_options,
+)
 from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.errors import MissingInputError
 from rs_relpose_ros.replay.outputs import replay_into, ReplayOutcome, SUMMARY_FILE
@@ -32,12 +38,8 @@ _logger = logging.getLogger(__name__)
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument('bag', metavar='BAG', type=Path,
-                        help='rosbag2 directory, or a .mcap, .db3 or ROS 1 .bag file')
-    parser.add_argument('--params', metavar='FILE', type=Path,
-                        help="the node's parameter file (ROS format)")
-    parser.add_argument('--set', metavar='NAME=VALUE', action='append', default=[],
-                        help='set a parameter, after --params; may be repeated')
+    add_bag_argument(parser)
+    add_parameter_arguments(parser)
     parser.add_argument('--out', metavar='DIR', type=Path,
                         help='directory of the results (default: BAGNAME_relpose in the current '
                         'one); those of an earlier run are replaced')
@@ -48,36 +50,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--no-pictures', action='store_true', help='tables and summary only')
     parser.add_argument('--bag', dest='with_bag', action='store_true',
                         help="write the node's topics as an MCAP bag, too")
-    topics = parser.add_argument_group('topics')
-    for role, what in (('image', 'Image or CompressedImage'), ('camera-info', 'CameraInfo'),
-                       ('imu', 'Imu'), ('accel', 'Imu of the accelerometer, where it is apart'),
-                       ('truth', "PoseStamped of the camera's true poses")):
-        topics.add_argument(f'--{role}-topic', metavar='TOPIC', default='', help=what)
+    add_topic_arguments(parser, 'image', 'camera_info', 'imu', 'accel', 'truth')
 
 
 def run(args: argparse.Namespace) -> int:
     """Replay a bag; 1 when no pair got a pose."""
-    options = TopicOptions(image=args.image_topic, camera_info=args.camera_info_topic,
-                           imu=args.imu_topic, accel=args.accel_topic, truth=args.truth_topic)
     parameters = read_parameters(args.params, args.set)
     stamps = None if args.stamps is None else read_stamps(args.stamps)
-    bag_name = args.bag.resolve().stem if args.bag.is_file() else args.bag.resolve().name
-    folder = args.out if args.out is not None else Path(f'{bag_name}_relpose')
+    name = bag_name(args.bag)
+    folder = args.out or Path(f'{name}_relpose')
     with open_bag(args.bag) as bag:
-        topics = bag.find_topics(options)
+        topics = bag.find_topics(topic_options(args))
         missing = parameters.sensor.missing()
-        beside = args.bag.resolve().with_name(f'{bag_name}.yaml')
+        beside = args.bag.resolve().with_name(f'{name}.yaml')
         if missing and args.params is None and beside.is_file():
             raise MissingInputError(f'parameter {" and ".join(missing)} must be given; use '
                                     f'--params {beside}, which lies beside the bag')
-        with tqdm(total=topics.image.count, unit='image', desc=bag_name, leave=False,
-                  disable=not sys.stderr.isatty()) as bar:
+        with progress_bar(topics.image.count, 'image', name) as bar:
             outcome = replay_into(folder, bag, topics, parameters, stamps=stamps,
                                   pictures=not args.no_pictures, with_bag=args.with_bag,
                                   on_image=bar.update)
         summary = with_provenance(
             outcome.figures, bag=args.bag, topics=topics, parameters=parameters, command=sys.argv,
-            package_version=_version())
+            package_version=package_version())
     write_summary(folder / SUMMARY_FILE, summary)
     for reason, count in outcome.counts.reasons.items():
         _logger.warning('not used, %d times: %s', count, reason)
@@ -121,10 +116,3 @@ def report(outcome: ReplayOutcome, folder: Path) -> list[str]:
 
 def _text(value: Any, unit: str) -> str:
     return f'no {unit}' if value is None else f'{value:.3g} {unit}'
-
-
-def _version() -> str:
-    try:
-        return version('rs_relpose_ros')
-    except PackageNotFoundError:   # run from a source tree
-        return 'not installed'

@@ -24,8 +24,8 @@ from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
+from rs_relpose_ros.images.headers import encoded_image_size
 from rs_relpose_ros.imu.samples import ImuSample
-from rs_relpose_ros.messages.image_headers import encoded_image_size
 
 # IMU samples after the last image serve nothing but its rows; those before it, the gravity filter.
 _IMU_AFTER_NS = 3 * NANOSECONDS

@@ -1,15 +1,17 @@
-"""An image with its stamp and the calibration in force."""
+"""An image with its stamp and the intrinsics in force, before and after decoding; its camera."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.config.parameters import Parameters
+from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
+from rs_relpose_ros.images.encoded import EncodedImage
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,24 +25,24 @@ class Frame:
     image : (H, W) ndarray of uint8
         As published: not rectified, not resized.
     frame_id : str
-    calibration : Intrinsics
+    intrinsics : Intrinsics
 
     Raises
     ------
     InputError
-        The image is not of the size that the calibration tells.
+        The image is not of the size that the intrinsics tell.
     """
 
     stamp_ns: int
     image: NDArray[np.uint8]
     frame_id: str
-    calibration: Intrinsics
+    intrinsics: Intrinsics
 
     def __post_init__(self) -> None:
         if self.image.dtype != np.uint8 or self.image.ndim != 2:
             raise InputError('image must be (H, W) of uint8, '
                              f'got {self.image.shape} of {self.image.dtype}')
-        expected = (self.calibration.image_height, self.calibration.image_width)
+        expected = (self.intrinsics.image_height, self.intrinsics.image_width)
         if self.image.shape != expected:
             raise InputError(
                 f'image is {self.image.shape[1]}x{self.image.shape[0]}, but its CameraInfo tells '
@@ -54,21 +56,23 @@ class Frame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EncodedFrame:
-    """A frame whose image is decoded only once the frame's turn has come.
-
-    Parameters
-    ----------
-    stamp_ns, frame_id, calibration
-        As in `Frame`.
-    decode : callable
-        Returns the (H, W) gray image; raises InputError where that is not possible.
-    """
+    """A frame whose image is decoded only when its turn has come; fields as in `Frame`."""
 
     stamp_ns: int
+    image: EncodedImage
     frame_id: str
-    calibration: Intrinsics
-    decode: Callable[[], NDArray[np.uint8]]
+    intrinsics: Intrinsics
 
     def decoded(self) -> Frame:
-        """The frame with its image."""
-        return Frame(self.stamp_ns, self.decode(), self.frame_id, self.calibration)
+        """The frame with its image; raises InputError where it cannot be decoded."""
+        return Frame(self.stamp_ns, self.image.decoded(), self.frame_id, self.intrinsics)
+
+
+def sensor_camera(intrinsics: Intrinsics, parameters: Parameters) -> RollingShutterCamera:
+    """Camera model of the full sensor; published pixels map to it by `Intrinsics.to_sensor`."""
+    sensor = parameters.sensor
+    if sensor.readout_time is None:
+        raise MissingInputError('parameter readout_time is not set: give image height times line '
+                                'delay in seconds (0 for a global shutter)')
+    return replace(intrinsics.global_shutter_camera(), readout_time=sensor.readout_time,
+                   readout_direction=sensor.readout_direction, reference_row=sensor.stamp_row)

@@ -1,4 +1,4 @@
-"""Camera, calibration and IMU messages to data.
+"""Image, CameraInfo, IMU and pose messages to data.
 
 Messages are read by field name only, so those of rclpy and of rosbags (ROS 2 and ROS 1) do alike.
 Nothing of a message is trusted: sizes are checked before memory is taken, and whatever cannot be
@@ -7,51 +7,43 @@ used raises `InputError` with one sentence.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.geometry.timing import NANOSECONDS
+from rs_relpose_ros.images.encoded import (
+    check_image_size,
+    CompressedImage,
+    EncodedImage,
+    RawImage,
+)
 from rs_relpose_ros.imu.samples import ImuSample, Orientation
-from rs_relpose_ros.messages.image_headers import encoded_image_size
-
-Gray = NDArray[np.uint8]
-
-# Longest side of an image [px]: far above any camera, far below what exhausts memory.
-MAX_IMAGE_SIDE = 16384
-MAX_IMAGE_PIXELS = 64 * 1024 * 1024
 
 # Largest values of an IMU, far above any sensor, far below what filters overflow at.
 MAX_ANGULAR_VELOCITY = 1e3   # rad/s
 MAX_LINEAR_ACCELERATION = 1e4   # m/s^2
 
-# Encoding -> (channels, conversion of OpenCV). The order of a '8UC3' is not told; as cv_bridge.
-_COLOR = {
-    'bgr8': (3, cv2.COLOR_BGR2GRAY),
-    '8UC3': (3, cv2.COLOR_BGR2GRAY),
-    'rgb8': (3, cv2.COLOR_RGB2GRAY),
-    'bgra8': (4, cv2.COLOR_BGRA2GRAY),
-    'rgba8': (4, cv2.COLOR_RGBA2GRAY),
-}
-# OpenCV names a Bayer pattern by the second row from its second pixel on, ROS from the corner.
-_BAYER = {
-    'bayer_rggb': cv2.COLOR_BayerBG2GRAY,
-    'bayer_bggr': cv2.COLOR_BayerRG2GRAY,
-    'bayer_gbrg': cv2.COLOR_BayerGR2GRAY,
-    'bayer_grbg': cv2.COLOR_BayerGB2GRAY,
-}
-# Packed YUV 4:2:2 -> which of two successive bytes is the luma.
-_PACKED_YUV = {'yuv422_yuy2': 0, 'yuyv': 0, 'yuv422': 1, 'uyvy': 1}
-# Planar YUV begins with the whole luma plane.
-_PLANAR_YUV = ('nv21', 'nv12', 'nv24')
 
-ENCODINGS = ('mono8', '8UC1', 'mono16', *_COLOR, *(f'{name}8' for name in _BAYER),
-             *(f'{name}16' for name in _BAYER), *_PACKED_YUV, *_PLANAR_YUV)
+@dataclass(frozen=True, slots=True, eq=False)
+class PublishedImage:
+    """An image message: its header and the image, not decoded yet."""
+
+    stamp_ns: int
+    frame_id: str
+    image: EncodedImage
+
+
+class TruePose(NamedTuple):
+    """Pose of the camera in the world: position [m], rotation as quaternion."""
+
+    stamp_ns: int
+    position: tuple[float, float, float]
+    quat_xyzw: tuple[float, float, float, float]
 
 
 def stamp_ns(header: Any) -> int:
@@ -67,109 +59,39 @@ def time_ns(stamp: Any) -> int:
     return seconds * NANOSECONDS + nanoseconds
 
 
-# -- images ----------------------------------------------------------------------------------
+# -- images and poses ------------------------------------------------------------------------
 
 
-def image_from_message(msg: Any) -> Gray:
-    """Gray image (H, W) of a sensor_msgs/Image.
-
-    A mono8 image without padding is a view of the message's memory.
+def image_from_message(msg: Any) -> PublishedImage:
+    """Image of a sensor_msgs/Image or CompressedImage; its `data` is a view of the message's.
 
     Raises
     ------
     InputError
-        Unknown encoding, zero or absurd size, or less data than its size needs.
+        The stamp is out of range. What else may be wrong is found when the image is decoded.
     """
-    height, width, step = int(msg.height), int(msg.width), int(msg.step)
-    encoding = str(msg.encoding)
-    _check_image_size(width, height)
-    if encoding in ('mono8', '8UC1'):
-        return np.ascontiguousarray(_rows(msg, height, width, step))
-    if encoding == 'mono16':
-        return _to_8_bit(_rows16(msg, height, width, step))
-    if encoding in _COLOR:
-        channels, conversion = _COLOR[encoding]
-        rows = _rows(msg, height, width * channels, step)
-        pixels = np.ascontiguousarray(rows).reshape(height, width, channels)
-        return np.asarray(cv2.cvtColor(pixels, conversion), dtype=np.uint8)
-    if encoding in _PACKED_YUV:
-        return np.ascontiguousarray(
-            _rows(msg, height, 2 * width, step)[:, _PACKED_YUV[encoding]::2])
-    if encoding in _PLANAR_YUV:
-        return np.ascontiguousarray(_rows(msg, height, width, step))
-    pattern = encoding.removesuffix('16').removesuffix('8')
-    if encoding in ENCODINGS and pattern in _BAYER:
-        if height < 3 or width < 3:
-            raise InputError(f'a Bayer image must be at least 3x3, got {width}x{height}')
-        if encoding.endswith('16'):
-            mosaic = _to_8_bit(_rows16(msg, height, width, step))
-        else:
-            mosaic = np.ascontiguousarray(_rows(msg, height, width, step))
-        return np.asarray(cv2.cvtColor(mosaic, _BAYER[pattern]), dtype=np.uint8)
-    raise InputError(f'image encoding {encoding[:40]!r} is not known; '
-                     f'publish one of {", ".join(ENCODINGS)}')
+    data = np.frombuffer(msg.data, dtype=np.uint8)
+    image: EncodedImage
+    if hasattr(msg, 'format'):
+        image = CompressedImage(data, str(msg.format))
+    else:
+        image = RawImage(data, str(msg.encoding), int(msg.width), int(msg.height), int(msg.step),
+                         bool(msg.is_bigendian))
+    return PublishedImage(stamp_ns(msg.header), str(msg.header.frame_id), image)
 
 
-def image_from_compressed(msg: Any) -> Gray:
-    """Gray image (H, W) of a sensor_msgs/CompressedImage (JPEG or PNG).
-
-    Raises
-    ------
-    InputError
-        Neither JPEG nor PNG, truncated or corrupt, or of zero or absurd size.
-    """
-    data = _bytes(msg.data)
-    width, height = encoded_image_size(data)
-    _check_image_size(width, height)
-    # A rotated image would have its rows in another order than they were read.
-    try:
-        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error:
-        image = None
-    if image is None or image.shape != (height, width):
-        raise InputError(f'compressed image of {len(data)} bytes cannot be decoded: it is corrupt')
-    return np.asarray(image, dtype=np.uint8)
+def pose_from_message(msg: Any) -> TruePose:
+    """Pose of a geometry_msgs/PoseStamped."""
+    position, q = msg.pose.position, msg.pose.orientation
+    return TruePose(stamp_ns(msg.header), (position.x, position.y, position.z),
+                    (q.x, q.y, q.z, q.w))
 
 
-def _check_image_size(width: int, height: int) -> None:
-    if not (0 < width <= MAX_IMAGE_SIDE and 0 < height <= MAX_IMAGE_SIDE
-            and width * height <= MAX_IMAGE_PIXELS):
-        raise InputError(f'image size {width}x{height} is not usable: sides must be 1 to '
-                         f'{MAX_IMAGE_SIDE} px and the area at most {MAX_IMAGE_PIXELS} px')
-
-
-def _bytes(data: Any) -> NDArray[np.uint8]:
-    return np.frombuffer(data, dtype=np.uint8)
-
-
-def _rows(msg: Any, height: int, row_bytes: int, step: int) -> NDArray[np.uint8]:
-    """View (height, row_bytes) of an image message's data, padding left out."""
-    if step < row_bytes:
-        raise InputError(f'image step is {step} bytes, but a row of {msg.width} px in '
-                         f'{msg.encoding} has {row_bytes}')
-    data = _bytes(msg.data)
-    needed = step * (height - 1) + row_bytes
-    if len(data) < needed:
-        raise InputError(f'image has {len(data)} bytes of data, but {msg.width}x{msg.height} in '
-                         f'{msg.encoding} with step {step} needs {needed}')
-    return np.lib.stride_tricks.as_strided(
-        data, shape=(height, row_bytes), strides=(step, 1), writeable=False)
-
-
-def _rows16(msg: Any, height: int, width: int, step: int) -> NDArray[np.uint16]:
-    order = '>u2' if msg.is_bigendian else '<u2'
-    return np.ascontiguousarray(_rows(msg, height, 2 * width, step)).view(order)
-
-
-def _to_8_bit(image: NDArray[np.uint16]) -> Gray:
-    return (image >> 8).astype(np.uint8)
-
-
-# -- calibration -----------------------------------------------------------------------------
+# -- intrinsics ------------------------------------------------------------------------------
 
 
 def intrinsics_from_info(msg: Any) -> Intrinsics:
-    """Calibration of a sensor_msgs/CameraInfo, region of interest and binning honoured.
+    """Intrinsics of a sensor_msgs/CameraInfo, region of interest and binning honoured.
 
     Raises
     ------
@@ -190,7 +112,7 @@ def intrinsics_from_info(msg: Any) -> Intrinsics:
     if any(k[i] != 0.0 for i in (1, 3, 6, 7)) or k[8] != 1.0:
         raise InputError(f'k of CameraInfo must be [fx 0 cx 0 fy cy 0 0 1], got {k}')
     width, height = int(msg.width), int(msg.height)
-    _check_image_size(width, height)
+    check_image_size(width, height)
     coefficients = _field(msg, 'd')
     if len(coefficients) > 64:
         raise InputError(f'd of CameraInfo has {len(coefficients)} coefficients')

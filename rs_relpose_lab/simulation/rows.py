@@ -1,0 +1,157 @@
+"""Where a moving rolling-shutter camera sees points: each by the row that really sees it.
+
+It uses nothing of the estimator's geometry, so that an error in one cannot hide behind the same
+error in the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+# Points (N, 3) of the world [m] and instants (N,) [s] -> points (N, 3) in the camera frame as it
+# is at each one's instant. Time 0 is that of the reference row.
+Motion = Callable[[Array, Array], Array]
+
+_SETTLED_ROWS = 1e-9
+_MAX_ROUNDS = 30
+_LEAST_DEPTH = 0.1  # [m]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """What a camera sees while it stands still, and when it reads its rows.
+
+    Attributes
+    ----------
+    project : callable
+        Points (N, 3) in the camera frame to pixels (N, 2); NaN where the lens cannot see.
+    unproject : callable
+        Pixels (N, 2) to directions (N, 3) in the camera frame, of any length.
+    width, height : int
+        Size of the image [px].
+    line_delay : float
+        Time from one row to the row below [s].
+    reference_row : float
+        Row that is read at time 0.
+    """
+
+    project: Callable[[Array], Array]
+    unproject: Callable[[Array], Array]
+    width: int
+    height: int
+    line_delay: float
+    reference_row: float
+
+
+def uniform_motion(attitude: Rotation, position: Array, rate: Array, velocity: Array) -> Motion:
+    """Constant angular [rad/s] and linear velocity [m/s], both in the camera's frame at time 0.
+
+    ``x(t) = Exp(-t w) (R_0^T (X - p_0) - t v)``
+    """
+    def to_camera(world: Array, times: Array) -> Array:
+        moved = attitude.inv().apply(world - position) - times[:, None] * velocity
+        return np.asarray(Rotation.from_rotvec(-times[:, None] * rate).apply(moved))
+    return to_camera
+
+
+def see(world: Array, motion: Motion, view: View, margin: float = 0.0) -> Array:
+    """Pixels of points seen by a camera that moves while it reads its rows.
+
+    A point is seen in row v if it is projected into row v from where the camera is when that row
+    is read: a root of ``projected_row(v) - v``, found by secants.
+
+    Parameters
+    ----------
+    world : (N, 3) ndarray
+        Points [m].
+    motion : callable
+    view : View
+    margin : float
+        How far beyond the centres of the outermost pixels a point still counts as seen [px].
+
+    Returns
+    -------
+    (N, 2) ndarray
+        Pixels; NaN for a point outside of the image or nearer than 0.1 m, and for one that
+        crosses the rows as fast as they are read, whose row is not unique.
+    """
+    def project(which: NDArray[np.intp], rows: Array) -> Array:
+        local = motion(world[which], (rows - view.reference_row) * view.line_delay)
+        with np.errstate(divide='ignore', invalid='ignore'):
+            return np.where(local[:, 2:] > _LEAST_DEPTH, view.project(local), np.nan)
+
+    seen = np.full((len(world), 2), np.nan)
+    left = np.arange(len(world))
+    before = np.full(len(world), 0.5 * (view.height - 1))
+    projected = project(left, before)[:, 1]
+    rows, slope = projected, np.zeros(len(world))
+    for _ in range(_MAX_ROUNDS):
+        # A row far outside only says "not in the image"; the motion need not reach there.
+        rows = np.clip(rows, -view.height, 2 * view.height)
+        pixels = project(left, rows)
+        change = rows - before
+        moved = np.abs(change) > _SETTLED_ROWS
+        slope = np.where(moved, (pixels[:, 1] - projected) / np.where(moved, change, 1.0), slope)
+        slow = np.abs(slope) < 1.0
+        settled = np.abs(pixels[:, 1] - rows) < _SETTLED_ROWS
+        seen[left[settled & slow]] = pixels[settled & slow]
+        # Seen from the last of those rows still further outside: no row in between sees it.
+        beyond = ((rows <= -view.height) & (pixels[:, 1] < rows)
+                  | (rows >= 2 * view.height) & (pixels[:, 1] > rows))
+        again = ~settled & ~beyond & np.isfinite(pixels[:, 1])
+        if not again.any():
+            break
+        left, before, projected, slope, slow = (
+            values[again] for values in (left, rows, pixels[:, 1], slope, slow))
+        step = (projected - before) / np.where(slow, 1.0 - slope, 1.0)
+        rows = before + step
+    inside = ((seen >= -margin)
+              & (seen <= np.array([view.width - 1, view.height - 1]) + margin)).all(axis=1)
+    seen[~inside] = np.nan
+    return seen
+
+
+def in_front(view: View, attitude: Rotation, position: Array, count: int,
+             depths: tuple[float, float], rng: np.random.Generator) -> Array:
+    """World points (count, 3) spread evenly over the image of a camera that stands still.
+
+    `depths` [m]: range from which each point's depth is drawn.
+    """
+    depth = rng.uniform(*depths, (count, 1))
+    pixels = rng.uniform([0.0, 0.0], (view.width - 1, view.height - 1), (count, 2))
+    rays = view.unproject(pixels)
+    return np.asarray(attitude.apply(depth * rays / rays[:, 2:]) + position)
+
+
+def seen_by_both(candidates: Callable[[], Array], motion1: Motion, motion2: Motion, view: View,
+                 count: int) -> tuple[Array, Array]:
+    """Pixels (count, 2) in each of two cameras of the first `candidates` that both see."""
+    most = 1_000_000
+    pixels = np.empty((0, 4))
+    drawn = 0
+    while len(pixels) < count:
+        if drawn > most:
+            raise RuntimeError(f'{len(pixels)} of {drawn} points are seen by both cameras')
+        world = candidates()
+        drawn += len(world)
+        both = np.hstack([see(world, motion, view) for motion in (motion1, motion2)])
+        pixels = np.concatenate([pixels, both[np.isfinite(both).all(axis=1)]])
+    return pixels[:count, :2], pixels[:count, 2:]
+
+
+def measured(points: tuple[Array, Array], view: View, sigma: float, outliers: float,
+             rng: np.random.Generator) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Matches with noise, 1 sigma of each coordinate [px], and which of them are random."""
+    points1, points2 = (exact + sigma * rng.standard_normal(exact.shape) for exact in points)
+    is_outlier = np.zeros(len(points1), dtype=bool)
+    is_outlier[rng.permutation(len(points1))[:round(outliers * len(points1))]] = True
+    points2[is_outlier] = rng.uniform(0.0, [view.width - 1, view.height - 1],
+                                      (int(is_outlier.sum()), 2))
+    return points1, points2, is_outlier

@@ -1,0 +1,1 @@
+"""Published images as data: encodings, headers of compressed ones, decoding."""

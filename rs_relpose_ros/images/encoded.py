@@ -1,0 +1,155 @@
+"""An image as it was published, and the gray image that it is decoded to.
+
+Nothing of an image is trusted: sizes are checked before memory is taken, and whatever cannot be
+used raises `InputError` with one sentence.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.images.headers import encoded_image_size
+
+Bytes = NDArray[np.uint8]
+Gray = NDArray[np.uint8]
+
+# Longest side of an image [px]: far above any camera, far below what exhausts memory.
+MAX_IMAGE_SIDE = 16384
+MAX_IMAGE_PIXELS = 64 * 1024 * 1024
+
+# Encoding -> (channels, conversion of OpenCV). The order of a '8UC3' is not told; as cv_bridge.
+_COLOR = {
+    'bgr8': (3, cv2.COLOR_BGR2GRAY),
+    '8UC3': (3, cv2.COLOR_BGR2GRAY),
+    'rgb8': (3, cv2.COLOR_RGB2GRAY),
+    'bgra8': (4, cv2.COLOR_BGRA2GRAY),
+    'rgba8': (4, cv2.COLOR_RGBA2GRAY),
+}
+# OpenCV names a Bayer pattern by the second row from its second pixel on, ROS from the corner.
+_BAYER = {
+    'bayer_rggb': cv2.COLOR_BayerBG2GRAY,
+    'bayer_bggr': cv2.COLOR_BayerRG2GRAY,
+    'bayer_gbrg': cv2.COLOR_BayerGR2GRAY,
+    'bayer_grbg': cv2.COLOR_BayerGB2GRAY,
+}
+# Packed YUV 4:2:2 -> which of two successive bytes is the luma.
+_PACKED_YUV = {'yuv422_yuy2': 0, 'yuyv': 0, 'yuv422': 1, 'uyvy': 1}
+# Planar YUV begins with the whole luma plane.
+_PLANAR_YUV = ('nv21', 'nv12', 'nv24')
+# One byte a pixel, row by row, from the first byte on: the gray image itself.
+_GRAY = ('mono8', '8UC1', *_PLANAR_YUV)
+
+ENCODINGS = ('mono8', '8UC1', 'mono16', *_COLOR, *(f'{name}8' for name in _BAYER),
+             *(f'{name}16' for name in _BAYER), *_PACKED_YUV, *_PLANAR_YUV)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawImage:
+    """Pixels as sensor_msgs/Image has them: `height` rows of `step` bytes each in `data` (K,)."""
+
+    data: Bytes
+    encoding: str
+    width: int
+    height: int
+    step: int
+    is_bigendian: bool
+
+    def decoded(self) -> Gray:
+        """Gray image (H, W); of a mono8 image without padding a view of `data`.
+
+        Raises
+        ------
+        InputError
+            Unknown encoding, zero or absurd size, or less data than its size needs.
+        """
+        height, width, encoding = self.height, self.width, self.encoding
+        check_image_size(width, height)
+        if encoding in _GRAY:
+            return np.ascontiguousarray(self._rows(width))
+        if encoding == 'mono16':
+            return self._high_bytes()
+        if encoding in _COLOR:
+            channels, conversion = _COLOR[encoding]
+            pixels = np.ascontiguousarray(self._rows(width * channels))
+            return np.asarray(cv2.cvtColor(pixels.reshape(height, width, channels), conversion),
+                              dtype=np.uint8)
+        if encoding in _PACKED_YUV:
+            return np.ascontiguousarray(self._rows(2 * width)[:, _PACKED_YUV[encoding]::2])
+        if encoding in ENCODINGS:
+            return self._from_bayer()
+        raise InputError(f'image encoding {encoding[:40]!r} is not known; '
+                         f'publish one of {", ".join(ENCODINGS)}')
+
+    def _from_bayer(self) -> Gray:
+        if self.height < 3 or self.width < 3:
+            raise InputError(
+                f'a Bayer image must be at least 3x3, got {self.width}x{self.height}')
+        pattern = self.encoding.removesuffix('16').removesuffix('8')
+        mosaic = (self._high_bytes() if self.encoding.endswith('16')
+                  else np.ascontiguousarray(self._rows(self.width)))
+        return np.asarray(cv2.cvtColor(mosaic, _BAYER[pattern]), dtype=np.uint8)
+
+    def _high_bytes(self) -> Gray:
+        """The upper byte of pixels of 16 bits."""
+        order = '>u2' if self.is_bigendian else '<u2'
+        pixels = np.ascontiguousarray(self._rows(2 * self.width)).view(order)
+        return (pixels >> 8).astype(np.uint8)
+
+    def _rows(self, row_bytes: int) -> Bytes:
+        """View (height, row_bytes) of the data, padding left out."""
+        height, step = self.height, self.step
+        if step < row_bytes:
+            raise InputError(f'image step is {step} bytes, but a row of {self.width} px in '
+                             f'{self.encoding} has {row_bytes}')
+        needed = step * (height - 1) + row_bytes
+        if len(self.data) < needed:
+            raise InputError(
+                f'image has {len(self.data)} bytes of data, but {self.width}x{height} in '
+                f'{self.encoding} with step {step} needs {needed}')
+        return np.lib.stride_tricks.as_strided(
+            self.data, shape=(height, row_bytes), strides=(step, 1), writeable=False)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CompressedImage:
+    """A JPEG or PNG file in `data` (K,); `encoding` is what its publisher calls it."""
+
+    data: Bytes
+    encoding: str
+
+    def decoded(self) -> Gray:
+        """Gray image (H, W).
+
+        Raises
+        ------
+        InputError
+            Neither JPEG nor PNG, truncated or corrupt, or of zero or absurd size.
+        """
+        width, height = encoded_image_size(self.data)
+        check_image_size(width, height)
+        # A rotated image would have its rows in another order than they were read.
+        try:
+            image = cv2.imdecode(self.data,
+                                 cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+        except cv2.error:
+            image = None
+        if image is None or image.shape != (height, width):
+            raise InputError(
+                f'compressed image of {len(self.data)} bytes cannot be decoded: it is corrupt')
+        return np.asarray(image, dtype=np.uint8)
+
+
+EncodedImage = RawImage | CompressedImage
+
+
+def check_image_size(width: int, height: int) -> None:
+    """Raise InputError for a size that no camera has."""
+    if not (0 < width <= MAX_IMAGE_SIDE and 0 < height <= MAX_IMAGE_SIDE
+            and width * height <= MAX_IMAGE_PIXELS):
+        raise InputError(f'image size {width}x{height} is not usable: sides must be 1 to '
+                         f'{MAX_IMAGE_SIDE} px and the area at most {MAX_IMAGE_PIXELS} px')

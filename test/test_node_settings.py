@@ -1,0 +1,288 @@
+"""Parameters, QoS overrides and sensors that do not come: what the node says and does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+import importlib.util
+import os
+from pathlib import Path
+import signal
+import time
+from typing import Any
+
+from conftest import BUNDLED_PARAMETERS
+from diagnostic_msgs.msg import DiagnosticArray
+from fault_stream import BAG_TOPICS, publish_in_time, read_messages, SECOND, stamp_of, with_stamp
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+import numpy as np
+import pytest
+from rcl_interfaces.msg import Parameter, ParameterDescriptor, ParameterType, ParameterValue
+from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rclpy.qos import ReliabilityPolicy
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import CameraInfo, Image, Imu
+from std_srvs.srv import Trigger
+
+from rs_relpose_lab.live.graph import diagnostic_values, Graph
+from rs_relpose_lab.live.processes import node_process, player_process, Process, wait_until
+from rs_relpose_ros.node import node as node_module
+
+# The first node may have to compile the kernels.
+pytestmark = [pytest.mark.live, pytest.mark.timeout(600)]
+
+ERROR = b'\x02'
+# Of the bag [s].
+PLAYED = 2.6
+# Reliable subscriptions, which a publisher of best effort does not match.
+RELIABLE = ('/camera/image_raw', '/camera/camera_info')
+UNKNOWN_OVERRIDE = 'qos_overrides./camera/nothing.subscription.depth'
+
+
+@dataclass(frozen=True)
+class Running:
+    """A node that is ready, its drivers, and what the bag's beginning sends."""
+
+    graph: Graph
+    node: Process
+    publishers: dict[type, Any]
+    diagnostics: list[DiagnosticArray]
+    messages: list[tuple[int, Any]]
+
+    def play(self, *kinds: type, later: float = 0.0) -> None:
+        """Publish the bag's messages of these types at bag time, their stamps moved on [s]."""
+        publish_in_time(
+            (self.publishers[type(message)], bag_time_ns,
+             with_stamp(message, stamp_of(message) + round(later * SECOND)))
+            for bag_time_ns, message in self.messages if isinstance(message, kinds))
+
+    def wait_for_status(self, sentence: str) -> DiagnosticArray:
+        """The first report from now on that says so."""
+        count = len(self.diagnostics)
+        return wait_until(lambda: next(
+            (item for item in self.diagnostics[count:] if sentence in item.status[0].message),
+            None), sentence, self.node, timeout=30.0)
+
+
+@pytest.fixture(scope='module')
+def running(module_ros_domain_id: int, bundled_bag: Path) -> Iterator[Running]:
+    parameters = {f'qos_overrides.{topic}.subscription.reliability': 'reliable'
+                  for topic in RELIABLE}
+    with Graph() as graph, node_process(
+            BUNDLED_PARAMETERS, remap=BAG_TOPICS,
+            parameters={'image_transport': 'raw', UNKNOWN_OVERRIDE: 3, **parameters}) as node:
+        diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
+        node.wait_for('ready')
+        publishers = {kind: graph.publisher(kind, topic, best_effort=topic not in RELIABLE)
+                      for kind, topic in zip((Image, CameraInfo, Imu), BAG_TOPICS.values(),
+                                             strict=True)}
+        yield Running(graph, node, publishers, diagnostics, read_messages(bundled_bag, PLAYED))
+        assert node.signal(signal.SIGTERM)[0] == 0
+        assert 'Traceback' not in node.output
+
+
+# -- settings of a running node --------------------------------------------------------------
+
+
+def test_quality_of_service_can_be_overridden_topic_by_topic(running):
+    for topic in [*BAG_TOPICS.values(), '/accel']:
+        [info] = wait_until(
+            lambda topic=topic: running.graph.node.get_subscriptions_info_by_topic(topic), topic)
+        assert info.qos_profile.reliability is (
+            ReliabilityPolicy.RELIABLE if topic in RELIABLE else ReliabilityPolicy.BEST_EFFORT)
+    assert 'there is no parameter' not in running.node.output
+    assert running.node.output.count('is no QoS override of this node') == 1
+    assert f'{UNKNOWN_OVERRIDE} is no QoS override of this node' in running.node.output
+
+
+def test_what_does_not_come_is_told(running):
+    """No CameraInfo yet, one that cannot be used, then no IMU: each with its reason."""
+    running.play(Image)
+    [status] = running.wait_for_status('not estimating: no CameraInfo on /camera').status
+    assert status.level == ERROR
+    running.play(Image, Imu)
+    values = diagnostic_values(running.diagnostics[-1])
+    assert (values['missing'], values['poses']) == ('/camera/camera_info', '0')
+    assert int(values['frames_refused_no_calibration']) > 50
+    running.publishers[CameraInfo].publish(CameraInfo(width=640, height=480))
+    report = running.wait_for_status('uncalibrated (k[0] of its CameraInfo is 0)')
+    assert report.status[0].level == ERROR
+    assert diagnostic_values(report)['missing'] == 'calibration'
+    time.sleep(1.0)   # more than two seconds without an IMU, with what is played next
+    running.play(Image, CameraInfo, later=10.0)
+    [status] = running.wait_for_status('not estimating: no IMU message on /imu/data_raw').status
+    assert status.level == ERROR
+    assert diagnostic_values(running.diagnostics[-1])['poses'] == '0'
+    lines = [line for line in running.node.output.splitlines() if line.startswith('[ERROR]')]
+    assert [sum(text in line for line in lines) for text in (
+        'no CameraInfo on', 'uncalibrated', 'no IMU message on')] == [1, 1, 1], lines
+
+
+def set_parameter(graph: Graph, name: str, **value: Any) -> Any:
+    kind = {'double_value': ParameterType.PARAMETER_DOUBLE,
+            'string_value': ParameterType.PARAMETER_STRING}[next(iter(value))]
+    request = SetParameters.Request(parameters=[
+        Parameter(name=name, value=ParameterValue(type=kind, **value))])
+    [result] = graph.call(SetParameters, '/relpose_node/set_parameters', request).results
+    return result
+
+
+@pytest.mark.parametrize(('name', 'value', 'reason'), [
+    ('threshold', {'double_value': -1.0}, 'threshold'),
+    ('threshold', {'string_value': 'wide'}, "threshold must be of type float, got 'wide'"),
+    ('readout_time', {'double_value': 0.02}, 'read-only')])
+def test_an_illegal_change_is_refused_with_its_reason(running, name, value, reason):
+    refused = set_parameter(running.graph, name, **value)
+    assert not refused.successful
+    assert reason in refused.reason
+
+
+def test_a_live_parameter_takes_effect(running):
+    """Pairs that close at a parallax that is not reached, and so by their age only."""
+    assert set_parameter(running.graph, 'min_keyframe_parallax', double_value=900.0).successful
+    assert set_parameter(running.graph, 'max_keyframe_interval', double_value=0.9).successful
+    running.play(Image, CameraInfo, Imu, later=20.0)
+    # The report that counts the last frame.
+    count = len(running.diagnostics)
+    wait_until(lambda: len(running.diagnostics) >= count + 2, 'diagnostics')
+    assert 1 <= int(diagnostic_values(running.diagnostics[-1])['pairs']) <= PLAYED / 0.9 + 1
+
+
+def test_parameters_are_described(running):
+    [threshold, readout] = running.graph.call(
+        DescribeParameters, '/relpose_node/describe_parameters',
+        DescribeParameters.Request(names=['threshold', 'readout_time'])).descriptors
+    assert isinstance(threshold, ParameterDescriptor)
+    assert (threshold.read_only, readout.read_only) == (False, True)
+    assert threshold.description.endswith('[px]')
+    [bounds] = threshold.floating_point_range
+    assert (bounds.from_value, bounds.to_value) == (0.05, 50.0)
+
+
+# -- settings that keep a node from estimating -----------------------------------------------
+
+
+CANNOT_ESTIMATE = {
+    'no_readout': ({'quat_cam_imu_xyzw': '[0.0, 0.0, 0.0, 1.0]', 'readout_tme': 0.03}, {},
+                   'not estimating: readout_time must be given as parameter', 'readout_time'),
+    'no_rotation': ({'readout_time': 0.03}, {},
+                    'not estimating: quat_cam_imu_xyzw must be given as parameter',
+                    'quat_cam_imu_xyzw'),
+    'rectified': ({'readout_time': 0, 'quat_cam_imu_xyzw': '[0, 0, 0, 1]'},
+                  {'image': '/camera/image_rect'}, '/camera/image_rect is a rectified image', ''),
+}
+
+
+def test_what_is_needed_is_told_and_the_node_stays(ros_domain_id):
+    """Three nodes at once, each without something."""
+    with ExitStack() as stack:
+        graph = stack.enter_context(Graph())
+        diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
+        nodes = {name: stack.enter_context(node_process(
+            parameters=parameters, remap={**remap, '__node': name}))
+            for name, (parameters, remap, _, _) in CANNOT_ESTIMATE.items()}
+        for name, node in nodes.items():
+            _, _, sentence, missing = CANNOT_ESTIMATE[name]
+            report = wait_until(lambda name=name: next(
+                (item for item in diagnostics if f'/{name}:' in item.status[0].name), None),
+                'diagnostics', node)
+            assert report.status[0].level == ERROR
+            assert sentence in report.status[0].message
+            assert diagnostic_values(report)['missing'] == missing
+            answer = graph.call(Trigger, f'/{name}/reset', Trigger.Request())
+            assert not answer.success
+            assert sentence in answer.message
+            assert node.signal(signal.SIGTERM)[0] == 0
+            assert node.output.count(sentence) == 1
+            assert 'Traceback' not in node.output
+            assert ("there is no parameter 'readout_tme'; did you mean readout_time"
+                    in node.output) == (name == 'no_readout')
+
+
+ESTIMATES = {'readout_time': 0.03, 'quat_cam_imu_xyzw': '[0.0, 0.0, 0.0, 1.0]'}
+OVERRIDE = 'qos_overrides./image.subscription'
+
+
+@pytest.mark.parametrize(('parameters', 'sentence'), [
+    ({'readout_time': 3.0}, 'readout_time'),
+    ({'readout_time': 'fast'}, 'readout_time must be of type float'),
+    ({'solver': '7pt'}, 'solver must be one of auto, uniform_9pt'),
+    ({'quat_cam_imu_xyzw': '[0.0, 0.0, 0.0, 2.0]'}, 'quat_cam_imu_xyzw'),
+    ({'quat_cam_imu_xyzw': '[0.0, 0.0, 1.0]'}, 'quat_cam_imu_xyzw must be 4 values'),
+    ({**ESTIMATES, 'stamps_file': '/nowhere/stamps.txt'},
+     'stamps_file /nowhere/stamps.txt cannot be written'),
+    pytest.param(
+        {'publish_tf': True}, 'publish_tf needs tf2_ros, which is not installed',
+        marks=pytest.mark.skipif(importlib.util.find_spec('tf2_ros') is not None,
+                                 reason='tf2_ros is installed')),
+    ({**ESTIMATES, f'{OVERRIDE}.reliability': 'sometimes'},
+     'a QoS override is not legal: Unexpected QoS override for policy `reliability`: `sometimes`'),
+    ({**ESTIMATES, f'{OVERRIDE}.depth': 'many'}, f'{OVERRIDE}.depth'),
+])
+def test_an_illegal_parameter_ends_the_node_with_one_line(
+        ros_domain_id, parameters, sentence, capfd, monkeypatch, signal_handlers):
+    """In this process, as a node of its own takes seconds to start."""
+    # It would end this process.
+    monkeypatch.setattr(node_module, 'leave', lambda code: pytest.fail(f'left with {code}'))
+    words = [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
+    assert node_module.main(['--ros-args', *words]) == 2
+    # Of this process's earlier nodes of the same name rcl warns.
+    lines = [line for line in capfd.readouterr().err.strip().splitlines()
+             if '[INFO]' not in line and 'rcl.logging_rosout' not in line]
+    assert len(lines) == 1, lines
+    assert '[FATAL]' in lines[0]
+    assert sentence in lines[0]
+
+
+@pytest.fixture
+def signal_handlers() -> Iterator[None]:
+    """Those of this process, which a node's end replaces."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+def test_exit_code_of_an_illegal_parameter(ros_domain_id):
+    with node_process(parameters={'readout_time': 3.0}) as node:
+        assert node.wait() == 2
+        assert node.output.count('\n') == 1
+
+
+# -- transform -------------------------------------------------------------------------------
+
+# In place of tf2_ros, which is in no wheel: says what it is asked to send.
+FAKE_TF2_ROS = """
+class TransformBroadcaster:
+    def __init__(self, node):
+        self._publisher = node.create_publisher(__import__(
+            'geometry_msgs.msg').msg.TransformStamped, '/sent_transform', 10)
+
+    def sendTransform(self, transform):
+        self._publisher.publish(transform)
+"""
+
+
+def test_transform_is_the_inverse_of_the_pose(ros_domain_id, bundled_bag, tmp_path, monkeypatch):
+    """The camera has a parent in the robot's tree, so the reference keyframe is its child."""
+    (tmp_path / 'tf2_ros.py').write_text(FAKE_TF2_ROS)
+    monkeypatch.setenv('PYTHONPATH', os.pathsep.join(
+        [str(tmp_path), *filter(None, [os.environ.get('PYTHONPATH')])]))
+    with Graph() as graph, node_process(
+            BUNDLED_PARAMETERS, remap=BAG_TOPICS, parameters={'publish_tf': True}) as node:
+        poses = graph.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
+        transforms = graph.listen(TransformStamped, '/sent_transform')
+        with player_process(bundled_bag):
+            wait_until(lambda: len(poses) >= 3 and len(transforms) >= 3, 'poses', node)
+        assert node.signal(signal.SIGINT)[0] == 0
+    for message, sent in zip(poses, transforms, strict=False):
+        assert sent.header.stamp == message.header.stamp
+        assert (sent.header.frame_id, sent.child_frame_id) == (
+            'camera_optical_frame', 'camera_optical_frame_reference')
+        t, q = message.pose.pose.position, message.pose.pose.orientation
+        found, r = sent.transform.translation, sent.transform.rotation
+        inverse = Rotation.from_quat([q.x, q.y, q.z, q.w]).inv()
+        np.testing.assert_allclose([found.x, found.y, found.z], -inverse.apply([t.x, t.y, t.z]))
+        np.testing.assert_allclose(
+            Rotation.from_quat([r.x, r.y, r.z, r.w]).as_matrix(), inverse.as_matrix(), atol=1e-12)
