@@ -15,10 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros import solvers
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.estimator.estimate import (
-    warm_up,
     warm_up_refinement,
     warm_up_sampling,
 )
@@ -78,16 +76,14 @@ def _images() -> Iterator[NDArray[np.uint8]]:
 
 
 def fill_cache() -> None:
-    """Compile all kernels, on two cores: in one process Numba compiles one at a time."""
-    down = np.array([0.0, 1.0, 0.0])
+    """Compile what the default parameters need, on two cores: one process compiles one at a time.
+
+    Other solvers are compiled when they are chosen.
+    """
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context('spawn')) as pool:
         other_half = pool.submit(_compile_all_but_sampling)
-        for solver, count in ((solvers.uniform_11pt, 11), (solvers.angular_5pt, 5),
-                              (solvers.uniform_9pt, 9), (solvers.angular_3pt, 3)):
-            solver(*_rays(count), gravity1=down, gravity2=down, start_rotations=np.eye(3)[None])
         warm_up_sampling()
         other_half.result()
-    warm_up()
     warm_up_pipeline(Parameters())
 
 
@@ -95,13 +91,6 @@ def _compile_all_but_sampling() -> None:
     warm_up_refinement()
     # No pair has that many matches: everything but the estimate.
     warm_up_pipeline(Parameters.from_mapping({'min_inliers': 10_000}))
-
-
-def _rays(count: int) -> list[NDArray[np.float64]]:
-    """Rays and row times of two frames."""
-    rng = np.random.default_rng(0)
-    ahead = np.array([0.0, 0.0, 3.0])
-    return [*(ahead + rng.normal(size=(2, count, 3))), *rng.uniform(0.0, 0.03, (2, count))]
 
 
 if __name__ == '__main__':

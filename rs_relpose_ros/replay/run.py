@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics
+from rs_relpose_ros.bags.reader import Bag, BagMessage
+from rs_relpose_ros.bags.topics import SensorTopics
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.estimator.estimate import warm_up

@@ -15,7 +15,7 @@ import numba
 import numpy as np
 import scipy
 
-from rs_relpose_ros.bags.reader import SensorTopics
+from rs_relpose_ros.bags.topics import SensorTopics
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.front_end.drift import Drift
