@@ -165,7 +165,7 @@ def nothing(message: Any, _: float) -> Iterator[tuple[float, Any]]:
     yield 0.0, message
 
 
-def without(kind: type, begin: float = FAULT_FROM, end: float = FAULT_UNTIL) -> Edit:
+def without(kind: type, begin: float = 0.0, end: float = FAULT_UNTIL) -> Edit:
     """The driver of one kind of message stops."""
     def edit(message: Any, seconds: float) -> Iterator[tuple[float, Any]]:
         if not (isinstance(message, kind) and begin <= seconds < end):

@@ -23,7 +23,8 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.bags.reader import open_bag, TopicOptions
+from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.bags.topics import TopicOptions
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.calibrate.axis_maps import axes_text, nearest_axis_map
 from rs_relpose_ros.check import judge_turning

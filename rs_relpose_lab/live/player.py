@@ -30,16 +30,8 @@ from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import CompressedImage, Image
 
 from rs_relpose_lab.live.loop import in_turns, Outgoing, stamp_of
-from rs_relpose_ros.bags.reader import (
-    Bag,
-    CAMERA_INFO,
-    COMPRESSED_IMAGE,
-    IMAGE,
-    IMU,
-    open_bag,
-    RawMessage,
-    Topic,
-)
+from rs_relpose_ros.bags.reader import Bag, open_bag, RawMessage
+from rs_relpose_ros.bags.topics import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, IMU, Topic
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 from rs_relpose_ros.node.message_types import message_class
@@ -63,14 +55,13 @@ class PlayerOptions:
     """How a bag is played: the options of `parse`, which describes them."""
 
     bag: Path
-    rate: float = 1.0
-    best_effort: bool = False
-    decode: str = ''
-    topics: tuple[str, ...] = ()
-    wait_for_subscribers: float = 0.0
-    loop: float = 0.0
-    duration: float = 60.0
-    log: Path | None = None
+    best_effort: bool
+    decode: str
+    topics: Sequence[str]
+    wait_for_subscribers: float
+    loop: float
+    duration: float
+    log: Path | None
 
 
 def play(node: Node, options: PlayerOptions) -> int:
@@ -167,8 +158,8 @@ def _publish(messages: Iterator[Outgoing], publishers: dict[str, Publisher],
     log: list[tuple[bool, int, int, int]] = []
     for message in messages:
         if count == 0:
-            start_ns = time.monotonic_ns() - round(message.due_ns / options.rate)
-        due_ns = start_ns + round(message.due_ns / options.rate)
+            start_ns = time.monotonic_ns() - message.due_ns
+        due_ns = start_ns + message.due_ns
         wait_ns = due_ns - time.monotonic_ns()
         if wait_ns > 0:
             time.sleep(wait_ns / NANOSECONDS)
@@ -193,7 +184,6 @@ def parse(arguments: Sequence[str]) -> PlayerOptions:
     parser = argparse.ArgumentParser(
         prog='player', description='Play a bag into the ROS graph at bag time.')
     parser.add_argument('bag', type=Path, help='rosbag2 directory, MCAP file or ROS 1 bag')
-    parser.add_argument('--rate', type=_rate, default=1.0, help='speed against bag time')
     parser.add_argument('--best-effort', action='store_true',
                         help='best-effort publishers instead of reliable ones')
     parser.add_argument('--decode', choices=('mono8', 'bgr8'), default='',
@@ -215,16 +205,7 @@ def parse(arguments: Sequence[str]) -> PlayerOptions:
     given = parser.parse_args(arguments)
     if given.loop < 0.0 or given.duration <= 0.0:
         parser.error('--loop and --duration must be positive')
-    return PlayerOptions(given.bag, given.rate, given.best_effort, given.decode,
-                         tuple(given.topics), given.wait_for_subscribers, given.loop,
-                         given.duration, given.log)
-
-
-def _rate(text: str) -> float:
-    rate = float(text)
-    if not 0.0 < rate <= 1000.0:
-        raise argparse.ArgumentTypeError(f'must lie in (0, 1000], got {text}')
-    return rate
+    return PlayerOptions(**vars(given))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

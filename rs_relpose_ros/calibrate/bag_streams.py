@@ -6,7 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 import logging
 
-from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics
+from rs_relpose_ros.bags.reader import Bag, BagMessage
+from rs_relpose_ros.bags.topics import SensorTopics
 from rs_relpose_ros.calibrate.follow import PointFollower
 from rs_relpose_ros.calibrate.gyro_path import GyroSeries
 from rs_relpose_ros.calibrate.tracks import Tracks

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from rs_relpose_ros.bags.reader import (
-    Bag,
+from rs_relpose_ros.bags.reader import Bag
+from rs_relpose_ros.bags.topics import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     IMAGE,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rs_relpose_ros.bags.reader import COMPRESSED_IMAGE, Topic
+from rs_relpose_ros.bags.topics import COMPRESSED_IMAGE, Topic
 from rs_relpose_ros.check.findings import Finding, Verdict
 from rs_relpose_ros.check.scan import Scan
 from rs_relpose_ros.check.streams import Stamps, StampSummary

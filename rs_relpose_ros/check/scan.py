@@ -8,7 +8,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from rs_relpose_ros.bags.reader import Bag, BagMessage, Topic
+from rs_relpose_ros.bags.reader import Bag, BagMessage
+from rs_relpose_ros.bags.topics import Topic
 from rs_relpose_ros.check.inertial import Inertial
 from rs_relpose_ros.check.streams import Stamps
 from rs_relpose_ros.check.turning import TurningImages

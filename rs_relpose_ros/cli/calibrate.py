@@ -8,7 +8,8 @@ import json
 import logging
 from pathlib import Path
 
-from rs_relpose_ros.bags.reader import COMPRESSED_IMAGE, open_bag
+from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.bags.topics import COMPRESSED_IMAGE
 from rs_relpose_ros.calibrate.bag_streams import read_recording
 from rs_relpose_ros.calibrate.procedure import calibrate
 from rs_relpose_ros.calibrate.report import as_mapping, draw_curve, parameter_file, report
