@@ -29,7 +29,8 @@ from rs_relpose_ros.calibrate.result import CalibrationResult
 from rs_relpose_ros.calibrate.tracks import make_pairs, Tracks
 from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry.camera import DISTORTION_COEFFICIENTS, RollingShutterCamera
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.distortion.models import DISTORTION_MODELS
 
 SHORT = {'frames': 120}
 # Coefficients of each camera model that bend a picture visibly.
@@ -345,7 +346,7 @@ def test_direction_is_that_of_the_walk():
     assert evaluate(problem, found).cost < evaluate(problem, lost).cost
 
 
-@pytest.mark.parametrize('model', DISTORTION_COEFFICIENTS)
+@pytest.mark.parametrize('model', DISTORTION_MODELS)
 def test_fit_sees_the_same_rays_through_every_camera_model(model):
     """Normalised points of the pixels of a distorted camera, and their derivative by them."""
     recorded, _ = usual()

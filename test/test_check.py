@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 import json
 import re
 
@@ -299,9 +300,11 @@ def good(bundled_bag, tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def seen(good):
-    """What one pass saw of it."""
+    """What one pass saw of it; images and gyro are aligned once for all tests."""
     with open_bag(good) as bag:
-        return scan(bag, choose_topics(bag, TopicOptions()), TrackingConfig(), lambda: None)
+        seen = scan(bag, choose_topics(bag, TopicOptions()), TrackingConfig(), lambda: None)
+    seen.turning.align = cache(seen.turning.align)
+    return seen
 
 
 def judged(seen, parameters):

@@ -66,7 +66,8 @@ def judged(data: Observations, final: Fit, free: NDArray[np.bool_], curve: CostC
     unsettled = '' if final.converged else 'the fit had not settled when it was stopped'
     return CalibrationResult(
         readout_time=_estimate(parameters[READOUT], sigmas[READOUT], config.max_readout_sigma),
-        time_offset=_estimate(to_first @ parameters, math.sqrt(to_first @ covariance @ to_first),
+        time_offset=_estimate(float(to_first @ parameters),
+                              math.sqrt(to_first @ covariance @ to_first),
                               config.max_offset_sigma),
         R_cam_imu=R_cam_imu, rotation_sigma=rotation_sigma,
         rotation=_estimate(math.acos(np.clip(cosine, -1.0, 1.0)), rotation_sigma.max(),
