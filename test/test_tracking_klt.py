@@ -8,8 +8,9 @@ from tracking_images import errors, moved, WarpedScene
 
 from rs_relpose_ros.config.tracking import TRACKERS, TrackingConfig
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.tracking.alignment import window_homography
+from rs_relpose_ros.tracking.correlation import correlations
 from rs_relpose_ros.tracking.registry import make_tracker
-from rs_relpose_ros.tracking.windows import correlations, window_homography
 
 
 @pytest.fixture(scope='module')

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.bags.reader import Bag, SensorTopics
+from rs_relpose_ros.bags.reader import Bag
+from rs_relpose_ros.bags.topics import SensorTopics
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.replay.record import pair_record, PairRecord

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import struct
 
-from rs_relpose_ros.bags.reader import COMPRESSED_IMAGE, IMAGE
+from rs_relpose_ros.bags.topics import COMPRESSED_IMAGE, IMAGE
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 

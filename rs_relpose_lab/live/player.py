@@ -30,16 +30,8 @@ from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import CompressedImage, Image
 
 from rs_relpose_lab.live.loop import in_turns, Outgoing, stamp_of
-from rs_relpose_ros.bags.reader import (
-    Bag,
-    CAMERA_INFO,
-    COMPRESSED_IMAGE,
-    IMAGE,
-    IMU,
-    open_bag,
-    RawMessage,
-    Topic,
-)
+from rs_relpose_ros.bags.reader import Bag, open_bag, RawMessage
+from rs_relpose_ros.bags.topics import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, IMU, Topic
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 from rs_relpose_ros.node.message_types import message_class

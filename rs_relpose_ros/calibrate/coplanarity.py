@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.calibrate.gyro_path import GyroPath, knot_before, rotation_at
-from rs_relpose_ros.compiled import kernel
+from rs_relpose_ros.compiled import inlined_kernel, kernel
 from rs_relpose_ros.geometry.so3 import exp_so3, multiply
 from rs_relpose_ros.geometry.vectors import cross, dot, norm, rotated, rotated_back, Vector
 
@@ -120,7 +120,7 @@ def _new_sight() -> _Sight:
     return _Sight(np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty((3, 3)))
 
 
-@kernel
+@inlined_kernel
 def _look(path: GyroPath, R_imu_cam: Array, correction: Array, instant: float, near: int,
           sight: _Sight) -> int:
     """Fill Q, M and rate of `sight` for an instant, and return the gyro's knot before it."""
@@ -131,25 +131,25 @@ def _look(path: GyroPath, R_imu_cam: Array, correction: Array, instant: float, n
     return k
 
 
-@kernel
+@inlined_kernel
 def _start(view: View, p: int, parameters: Array) -> float:
     """Instant of the middle row on the clock of the gyro [s]."""
     return view.times[p] + parameters[OFFSET] + parameters[SLOPE] * view.covariates[p]
 
 
-@kernel
+@inlined_kernel
 def _off_axis(M: Array, point: Array, stretch: float) -> Vector:
     """``M (x, y, 0)`` of a point (2,), which shrinks as the focal length grows."""
     return rotated(M, (point[0] / stretch, point[1] / stretch, 0.0))
 
 
-@kernel
+@inlined_kernel
 def _ray(M: Array, off_axis: Vector) -> Vector:
     """``m = M (x, y, 1)``."""
     return (off_axis[0] + M[0, 2], off_axis[1] + M[1, 2], off_axis[2] + M[2, 2])
 
 
-@kernel
+@inlined_kernel
 def _by_pixels(M: Array, by_pixel: Array, stretch: float, c: Vector) -> tuple[float, Vector]:
     """``|P^T M^T c|^2`` and ``k = M P P^T M^T c`` with P the derivative by the pixel."""
     h = rotated_back(M, c)
@@ -160,14 +160,14 @@ def _by_pixels(M: Array, by_pixel: Array, stretch: float, c: Vector) -> tuple[fl
     return q0 * q0 + q1 * q1, k
 
 
-@kernel
+@inlined_kernel
 def _less(a: Vector, factor: float, b: Vector, divisor: float) -> Vector:
     """``(a - factor b) / divisor``."""
     return ((a[0] - factor * b[0]) / divisor, (a[1] - factor * b[1]) / divisor,
             (a[2] - factor * b[2]) / divisor)
 
 
-@kernel
+@inlined_kernel
 def _residual(M1: Array, M2: Array, m1: Vector, m2: Vector, b: Vector, by_pixel1: Array,
               by_pixel2: Array, stretch: float) -> _Residual:
     """``r = e / s`` with ``dr = (de - (e / s^2) (k_1 . dc_1 + k_2 . dc_2)) / s``.
@@ -189,7 +189,7 @@ def _residual(M1: Array, M2: Array, m1: Vector, m2: Vector, b: Vector, by_pixel1
     return _Residual(e / s, by_m1, by_m2, by_1, by_2, by_b)
 
 
-@kernel
+@inlined_kernel
 def _add_view(J: Array, by_turn: Vector, sight: _Sight, row: float, covariate: float, share: float,
               Q_middle: Array) -> None:
     """Add the derivatives through the orientation of one frame.
@@ -209,7 +209,7 @@ def _add_view(J: Array, by_turn: Vector, sight: _Sight, row: float, covariate: f
         J[TURN + i] += share * by_own_turn[i]
 
 
-@kernel
+@inlined_kernel
 def _integral_since(path: GyroPath, middle: int, k: int, instant: float, out: Array) -> None:
     """Integral (3, 3) of the rotations from knot `middle` to an instant after knot `k` [s]."""
     dt = instant - path.times[k]
@@ -279,7 +279,7 @@ def accumulate(problem: Problem, path: GyroPath, unknowns: Unknowns, tangent: Ar
         sums.losses[p] = loss
 
 
-@kernel
+@inlined_kernel
 def _add_weighted(J: Array, residual: float, weight: float, gradient: Array,
                   hessian: Array) -> None:
     for i in range(ALL):
@@ -296,7 +296,9 @@ def find_directions(problem: Problem, path: GyroPath, unknowns: Unknowns,
     `chosen` (K, 2) are large random numbers that pick the matches. The best has the least
     truncated cost.
     """
-    most = np.max(np.diff(problem.begin))
+    most = 0
+    for p in range(len(problem.middle)):
+        most = max(most, problem.begin[p + 1] - problem.begin[p])
     normals, squares = np.empty((most, 3)), np.empty((most, 3, 3))
     for p in range(len(problem.middle)):
         count = problem.begin[p + 1] - problem.begin[p]
@@ -347,7 +349,7 @@ def _constraints(problem: Problem, path: GyroPath, unknowns: Unknowns, p: int, n
         _add_squares(sight2.M, m1, view2.by_pixel[n], stretch, squares[i])
 
 
-@kernel
+@inlined_kernel
 def _add_squares(M: Array, other: Vector, by_pixel: Array, stretch: float, square: Array) -> None:
     """Add ``g g^T`` of both pixel coordinates of one frame, with ``de/dpixel = g . b``."""
     for r in range(2):
@@ -357,7 +359,7 @@ def _add_squares(M: Array, other: Vector, by_pixel: Array, stretch: float, squar
                 square[c, d] += g[c] * g[d]
 
 
-@kernel
+@inlined_kernel
 def _truncated_cost(normals: Array, squares: Array, count: int, b: Vector, limit: float,
                     least: float) -> float:
     """Sum of ``min((e / s)^2, limit)``; any number from `least` on where it is not less."""

@@ -69,7 +69,7 @@ def judged(data: Observations, final: Fit, free: NDArray[np.bool_], curve: CostC
         time_offset=_estimate(to_first @ parameters, math.sqrt(to_first @ covariance @ to_first),
                               config.max_offset_sigma),
         R_cam_imu=R_cam_imu, rotation_sigma=rotation_sigma,
-        rotation=_estimate(np.arccos(np.clip(cosine, -1.0, 1.0)), rotation_sigma.max(),
+        rotation=_estimate(math.acos(np.clip(cosine, -1.0, 1.0)), rotation_sigma.max(),
                            config.max_rotation_sigma, one_axis),
         axis_map=axis_map, gyro_bias=(bias_x, bias_y, bias_z), focal_factor=focal,
         offset_by_interval=slope, rotation_rates=rates, curve=curve,

@@ -183,7 +183,7 @@ class Pipeline:
     def _derotate(self, matches: Matches, motion1: FrameMotion, motion2: FrameMotion,
                   sensor: Sensor) -> None:
         """Keep the rays of matches in the reference and in the current image."""
-        # Points of the reference stay where they are; from frame to frame there are fewer.
+        # In the reference image points do not move: their rays are kept for the tracks that go on.
         known = self._reference_rays
         first = None if known is None else known.of(matches.track_ids)
         if first is None:
@@ -257,6 +257,6 @@ def _gravity_prior(imu1: FrameImu, imu2: FrameImu, parameters: Parameters) -> _G
     if not parameters.pair.use_gravity or sigma1 is None or sigma2 is None:
         return _GravityPrior(replace(imu1.motion, gravity=None),
                              replace(imu2.motion, gravity=None), told)
-    # One figure for both frames; the filter's own, where it is worse than the parameter.
+    # One sigma for both frames: that of the filter where it is larger than the parameter.
     return _GravityPrior(imu1.motion, imu2.motion,
                          min(max(told, sigma1, sigma2), _LARGEST_GRAVITY_SIGMA))

@@ -190,8 +190,8 @@ class Sequencer:
         self._offline = offline
         self._now: Callable[[], int] = (lambda: 0) if offline else clock
         self._max_gap_ns = to_nanoseconds(parameters.imu.max_imu_gap)
-        # How much of the history is left depends on when it is asked for; half of it always is,
-        # so that live and replay agree.
+        # Longest turn between two frames. How much of the history is left depends on when a frame
+        # is taken; half of it is left in any case, so that live and replay agree.
         self._longest_turn_ns = to_nanoseconds(0.5 * parameters.imu.imu_buffer_seconds)
         self._changed = threading.Condition()
         self._closed = False
@@ -235,7 +235,7 @@ class Sequencer:
             self._count['imu_repeated'] += added is AddResult.DUPLICATE
             before_ns = self._newest.gyro_ns
             if has_gyro and before_ns is not None:
-                # Of two topics one is always behind; a gyro sample behind the gyro is late.
+                # Of two topics one is always behind; late is a gyro sample behind another one.
                 self._count['imu_late'] += added is AddResult.LATE and stamp_ns < before_ns
                 self._count['imu_gaps'] += stamp_ns - before_ns > self._max_gap_ns
             self._newest.add(sample)
@@ -304,7 +304,7 @@ class Sequencer:
             with self._changed:
                 return self._counted(head.frame.stamp_ns, Refusal.BAD_IMAGE, str(error))
         with self._changed:
-            # While it was decoded time may have jumped, and the buffer belongs to another time.
+            # Meanwhile stamps may have jumped, and the buffer then belongs to another time.
             if (head.generation != self._generation
                     or self._coverage(head) is not Coverage.AVAILABLE):
                 return self._counted(
@@ -323,12 +323,12 @@ class Sequencer:
                 field.name: self._count[field.name] for field in fields(SequencerCounts)
                 if field.name != 'refused'})
 
-    # -- waiting (under the lock from here on, but for `_await_head`) --------------------------
+    # -- waiting (all below are called under the lock, but for `_await_head`) ------------------
 
     def _await_head(self, timeout: float) -> _Waiting | FrameRefused | None:
         """The oldest frame as soon as it is ready or refused; None after `timeout` seconds."""
         with self._changed:
-            # Offline, what is not there yet does not come by waiting.
+            # Offline nothing comes while one waits.
             deadline_ns = self._now() + (0 if self._offline else round(timeout * NANOSECONDS))
             while True:
                 head = self._decided_head()
@@ -376,7 +376,7 @@ class Sequencer:
                 if not self._newest.covers(self._span(waiting)[1]):
                     break
                 if self._buffer.coverage(waiting.start_ns, waiting.end_ns) is Coverage.NEVER:
-                    # Here, not when its turn comes: it must not count as waiting for the worker.
+                    # Refused at once: it must not count as a frame that waits for the worker.
                     self._waiting.remove(waiting)
                     self._refuse(waiting.frame.stamp_ns, Refusal.IMU_GAP, _IMU_GAP)
                     continue

@@ -15,10 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros import solvers
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.estimator.estimate import (
-    warm_up,
     warm_up_refinement,
     warm_up_sampling,
 )
@@ -29,7 +27,7 @@ from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.imu.samples import ImuSample
 
 _WIDTH, _HEIGHT = 320, 240
-# With a distortion: its kernels, too, must be there before the first frame.
+# With distortion, so that its kernels are compiled, too.
 _INTRINSICS = Intrinsics(width=_WIDTH, height=_HEIGHT, fx=250.0, fy=250.0, cx=159.5, cy=119.5,
                          image_width=_WIDTH, image_height=_HEIGHT,
                          distortion_model='plumb_bob', distortion=(-0.02, 0.01, 0.0, 0.0))
@@ -56,7 +54,7 @@ def warm_up_pipeline(parameters: Parameters) -> None:
         sequencer = front_end.sequencer
         images = list(_images())
         for image in images:
-            # A raw image is tracked in its message's memory; kernels for that are others.
+            # A raw image is read-only memory of its message: kernels for that are apart.
             image.flags.writeable = force is None
         for stamp_ns in range(NANOSECONDS, NANOSECONDS + (len(images) + 3) * _FRAME_NS, _IMU_NS):
             sequencer.add_imu(ImuSample(stamp_ns, (0.01, 0.02, 0.03), force))
@@ -78,16 +76,14 @@ def _images() -> Iterator[NDArray[np.uint8]]:
 
 
 def fill_cache() -> None:
-    """Compile all kernels, on two cores: in one process Numba compiles one at a time."""
-    down = np.array([0.0, 1.0, 0.0])
+    """Compile what the default parameters need, on two cores: one process compiles one at a time.
+
+    Other solvers are compiled when they are chosen.
+    """
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context('spawn')) as pool:
         other_half = pool.submit(_compile_all_but_sampling)
-        for solver, count in ((solvers.uniform_11pt, 11), (solvers.angular_5pt, 5),
-                              (solvers.uniform_9pt, 9), (solvers.angular_3pt, 3)):
-            solver(*_rays(count), gravity1=down, gravity2=down, start_rotations=np.eye(3)[None])
         warm_up_sampling()
         other_half.result()
-    warm_up()
     warm_up_pipeline(Parameters())
 
 
@@ -95,13 +91,6 @@ def _compile_all_but_sampling() -> None:
     warm_up_refinement()
     # No pair has that many matches: everything but the estimate.
     warm_up_pipeline(Parameters.from_mapping({'min_inliers': 10_000}))
-
-
-def _rays(count: int) -> list[NDArray[np.float64]]:
-    """Rays and row times of two frames."""
-    rng = np.random.default_rng(0)
-    ahead = np.array([0.0, 0.0, 3.0])
-    return [*(ahead + rng.normal(size=(2, count, 3))), *rng.uniform(0.0, 0.03, (2, count))]
 
 
 if __name__ == '__main__':

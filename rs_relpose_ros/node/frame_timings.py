@@ -10,7 +10,7 @@ from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.front_end.front_end import FrameProcessed
 
 COLUMNS = ('stamp_ns', 'ready_ns', 'taken_ns', 'done_ns', 'cpu_ns', 'outcome')
-# The frame closed no pair.
+# Outcome of a frame that closed no pair.
 NO_PAIR = 'none'
 
 

@@ -20,10 +20,10 @@ from rs_relpose_ros.node.diagnostics import Inputs, SILENCE
 from rs_relpose_ros.node.message_types import message_class
 from rs_relpose_ros.node.polled import PolledSubscription, WhenChanged
 
-# Half a second of images: where the process had to wait for a processor its mailbox drops them,
-# which is counted, and not the middleware, which is not.
+# Queue of half a second of images: an overloaded node then drops them in its own mailbox, where
+# they are counted, and not in the middleware, where they are not.
 _IMAGE_DEPTH = 15
-# Samples of some seconds, so that no stall loses any.
+# Queue of some seconds of samples, so that none is lost while the process is stalled.
 _IMU_DEPTH = 2000
 # Period [s] at which IMU and CameraInfo are read where no image asks for them.
 _DRAIN_PERIOD = 0.1

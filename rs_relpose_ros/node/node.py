@@ -40,11 +40,11 @@ from rs_relpose_ros.node.outputs import PairPublishers, SHUT_DOWN
 from rs_relpose_ros.node.params import NodeParameters, unknown_overrides, unknown_qos_overrides
 from rs_relpose_ros.node.worker import CannotStart, Event, Warm, Worker
 
-# The worker ends within a frame, unless it compiles.
+# Time [s] that the worker gets to end: a frame takes less, compiling takes longer.
 _JOIN_TIMEOUT = 0.4
-# Silence of an IMU [s] that no working one has.
+# Gap between IMU messages [s] above which the sensor has stopped.
 _SUSPICIOUS_SILENCE = 0.3
-# Time [s] that loading kernels from the cache does not take.
+# Time [s] of a start above which kernels are being compiled, not loaded from the cache.
 _TELL_COMPILING = 4.0
 
 
@@ -61,7 +61,7 @@ class RelposeNode(Node):
 
     def __init__(self) -> None:
         super().__init__('relpose_node')
-        # rclpy ties the severity to the line that logs: a line each.
+        # A line of code each: rclpy raises where one line logs at two severities.
         logger = self.get_logger()
         self._info = CauseLog(lambda text: logger.info(text))
         self._warn = CauseLog(lambda text: logger.warning(text))
@@ -76,7 +76,7 @@ class RelposeNode(Node):
         self._stamps: TextIO | None = None
         self._timings: FrameTimings | None = None
         self._warm = threading.Event()
-        # Diagnostics and time-outs go by the wall's pace also where /clock stands still.
+        # For diagnostics and time-outs, which must run although /clock may stand still.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._outputs = PairPublishers(self, self._settings.current.pair)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
@@ -107,13 +107,13 @@ class RelposeNode(Node):
         files = parameters.pair
         self._stamps = opened('stamps_file', files.stamps_file) if files.stamps_file else None
         self._timings = FrameTimings(files.timings_file) if files.timings_file else None
-        # Images for ~/debug_image; references only.
+        # The images are for ~/debug_image; only references to them are kept.
         self._front_end = FrontEnd(parameters, keep_images=True)
         self._intake = Intake(self._front_end.sequencer, parameters.imu.stuck_gyro_time)
         self._worker = Worker(self._front_end, self._consume)
         self._worker.start()
         self._started_ns = self._now_ns()
-        # Subscribed only when warm: what comes earlier would be dropped.
+        # No subscription before the kernels are there: messages that come earlier are dropped.
         self._warm_timer = self.create_timer(0.02, self._subscribe_when_warm, clock=self._steady)
 
     def _subscribe_when_warm(self) -> None:
@@ -134,7 +134,7 @@ class RelposeNode(Node):
             raise InputError(f'a QoS override is not legal: {error}') from error
         for sentence in unknown_qos_overrides(self):
             self._warn(sentence)
-        # All that exists by now lives to the end: collections need not look at it again.
+        # Objects that exist by now live to the end: the garbage collector need not scan them.
         gc.collect()
         gc.freeze()
         self._inputs = inputs
@@ -191,7 +191,7 @@ class RelposeNode(Node):
                 self._statistics.add_pair(frame.pair, frame.ready_ns)
                 self._outputs.publish_picture(frame.pair, config)
             except SHUT_DOWN:
-                if self.context.ok():   # else the node is being shut down
+                if self.context.ok():   # otherwise the node is being shut down
                     raise
         self._statistics.add_frame(frame.taken_ns)
         if self._timings is not None:
@@ -199,10 +199,10 @@ class RelposeNode(Node):
 
     def _tell_refused(self, refused: FrameRefused) -> None:
         if refused.cause is Refusal.NO_CALIBRATION:
-            return   # told where the CameraInfo is missed or refused
+            return   # `_missing_input` tells it
         if refused.cause is Refusal.NO_IMU:
             if self._inputs is not None and self._inputs.silent(Role.IMU, _SUSPICIOUS_SILENCE):
-                return   # told once it lasts
+                return   # `_missing_input` tells it after `SILENCE`
             self._warn(f'a frame was not used: {refused.reason}; is '
                        f'{self.resolve_topic_name("imu")} published, with a gyro, and are its '
                        'stamps on the clock of the images (time_offset)?')
@@ -249,7 +249,7 @@ class RelposeNode(Node):
                         if role is not Role.ACCEL and inputs.silent(role))
         if self._intake.camera_info_problem:
             return f'not estimating: {self._intake.camera_info_problem}', ('calibration',)
-        # Where nothing comes at all the driver is not running yet: worth a status, not a warning.
+        # Without any image the driver is probably not running yet: a status, but no log line.
         if image in missing:
             return f'not estimating: no image on {image} for {SILENCE:g} s', missing
         if self._intake.intrinsics is None and camera_info in missing:
@@ -317,11 +317,11 @@ def _finish(node: RelposeNode | None) -> None:
     _ignore_signals()
     if node is not None:
         if not node.stop():
-            # Compiling or loading kernels cannot be interrupted.
+            # The thread compiles or loads kernels, which cannot be interrupted.
             leave(0)
         node.destroy_node()
     rclpy.try_shutdown()
-    # It brought back the handlers of before.
+    # rclpy has restored the handlers that were there before it.
     _ignore_signals()
 
 

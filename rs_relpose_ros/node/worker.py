@@ -9,7 +9,8 @@ import threading
 from rs_relpose_ros.front_end.front_end import FrameFailed, FrontEnd, Outcome
 from rs_relpose_ros.front_end.warm_up import warm_up_pipeline
 
-_STEP_TIMEOUT = 0.1   # s; after so long without a frame it looks whether it is to end
+# Longest wait for a frame [s] before the thread looks whether it is to end.
+_STEP_TIMEOUT = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,7 +39,7 @@ class Worker(threading.Thread):
     """
 
     def __init__(self, front_end: FrontEnd, consume: Callable[[Event], object]) -> None:
-        # A thread that compiles cannot be stopped; a daemon does not hold up the exit.
+        # A daemon: a thread that compiles cannot be stopped, and must not hold up the exit.
         super().__init__(name='relpose_worker', daemon=True)
         self._front_end = front_end
         self._consume = consume

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rs_relpose_ros.bags.reader import Bag, SensorTopics
+from rs_relpose_ros.bags.reader import Bag
+from rs_relpose_ros.bags.topics import SensorTopics
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics
+from rs_relpose_ros.bags.reader import Bag, BagMessage
+from rs_relpose_ros.bags.topics import SensorTopics
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.estimator.estimate import warm_up
@@ -144,7 +145,7 @@ class Replay:
                 self._intake.receive(role, message.message)
         except RsRelposeError as error:
             if role is Role.CAMERA_INFO and not self._front_end.sequencer.counts().frames_taken:
-                # Nothing was estimated and nothing can be: say so now.
+                # Without intrinsics no frame can be estimated: end now, not after the whole bag.
                 raise type(error)(f'{message.topic}: {error}') from error
             self._invalid += 1
             self._not_used(f'{message.topic}: {error}')
