@@ -33,8 +33,7 @@ demo: $(stamp)
 
 # Message types are checked in tests; in Jazzy that is off unless asked for. Two processes: one runs
 # the live tests, which wait most of the time (test/conftest.py); PYTEST_ARGS='-n 0 ...' for one.
-pytest := ROS_PYTHON_CHECK_FIELDS=1 $(bin)/python -m pytest -n 2 --dist loadgroup \
-    --no-loadscope-reorder
+pytest := ROS_PYTHON_CHECK_FIELDS=1 $(bin)/python -m pytest -n 2 --no-loadscope-reorder
 
 test: $(stamp)
 	$(pytest) $(PYTEST_ARGS)

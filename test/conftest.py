@@ -20,19 +20,30 @@ os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Tests with real processes first and one after the other: two processes share the rest.
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
+    """Of two processes of pytest, one runs all modules with live tests; no module is shared out.
 
-    They wait more than they calculate, so the other process hardly slows them down. A module is
-    never shared out, as its fixtures are set up once.
+    Live tests wait more than they calculate, so the other process hardly slows them down. Fixtures
+    of a module are set up once.
     """
-    if not getattr(config.option, 'loadgroup', False):   # not one of several processes
-        return
-    items.sort(key=lambda item: item.get_closest_marker('live') is None)
-    for item in items:
-        live = item.get_closest_marker('live')
-        item.add_marker(pytest.mark.xdist_group('live' if live else item.path.stem))
+    from xdist.scheduler import LoadScopeScheduling
+
+    live = {path.name for path in Path(__file__).parent.glob('test_*.py')
+            if 'pytest.mark.live' in path.read_text(encoding='utf-8')}
+
+    class LiveTogether(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            name = Path(nodeid.partition('::')[0]).name
+            return 'live' if name in live else name
+
+    return LiveTogether(config, log)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Modules with live tests first, which are the longest part."""
+    live = {item.path for item in items if item.get_closest_marker('live')}
+    items.sort(key=lambda item: item.path not in live)
 
 
 def _recordings() -> Path:
