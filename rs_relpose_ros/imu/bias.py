@@ -1,12 +1,12 @@
-"""Bias of the gyro, taken anew whenever the IMU stands still, and carried on in between.
+"""Bias of the gyro, measured whenever the IMU stands still.
 
-Samples are looked at in windows of half a second. One in which gyro and accelerometer hardly vary,
-and whose mean rate the bias can explain, is at rest. Its mean is a measurement of the bias:
+Samples are judged in windows of half a second. A window is at rest where gyro and accelerometer
+hardly vary and the mean rate is within the bias' uncertainty. Its mean measures the bias:
 
     P <- min(P + q dt, P_0)        K = P / (P + s^2)        b <- b + K (mean - b)
 
-`P_0` is the square of ``gyro_bias_sigma``. Only the older of two windows at rest is taken: the
-newer one may hold the beginning of a motion.
+`P_0` is the square of ``gyro_bias_sigma``. Of two consecutive windows at rest only the older one
+is used: the newer one may hold the beginning of a motion.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from rs_relpose_ros.geometry.timing import to_nanoseconds
 
 Array = NDArray[np.float64]
 
-# Time after which the bias may be another one again, as far as `gyro_bias_sigma` [s].
+# Time in which the variance of a measured bias grows back to `gyro_bias_sigma` squared [s].
 BIAS_MEMORY = 600.0
 
 _WINDOW_NS = 500_000_000
 _LEAST_SAMPLES = 10
-# Spread within a window at rest, per axis: some times that of MEMS on a table (0.003 rad/s and
-# 0.03 m/s^2), a third of that of a hand that tries to be still.
+# Largest standard deviation in a window at rest, per axis [rad/s], [m/s^2]: three times that of a
+# MEMS IMU on a table, a third of that of a hand that tries to be still.
 _REST_RATE = 0.01
 _REST_FORCE = 0.1
-# Time over which what is left of motion at rest stays correlated [s].
+# Correlation time of the remaining motion at rest [s].
 _SWAY_TIME = 0.1
-# A mean rate further from the bias, in sigmas, is a slow turn.
+# Largest distance of the mean rate from the bias, in sigmas; beyond it is a slow turn.
 _GATE = 4.0
 
 
@@ -55,7 +55,7 @@ class _Rest:
 
 
 class BiasTracker:
-    """Runs over samples in the order of their stamps; its state depends on nothing else."""
+    """Causal estimate of the gyro's bias; its state depends on the samples alone."""
 
     def __init__(self, config: ImuConfig) -> None:
         self._gap_ns = to_nanoseconds(config.max_imu_gap)
@@ -87,7 +87,7 @@ class BiasTracker:
         stamps_ns = np.concatenate([old[0], stamps_ns])
         rates, forces = np.concatenate([old[1], rates]), np.concatenate([old[2], forces])
         start = 0
-        # A window is known once a sample lies behind its end.
+        # A window is complete once a sample lies behind its end.
         while start < len(stamps_ns) and stamps_ns[-1] >= stamps_ns[start] + _WINDOW_NS:
             end = int(np.searchsorted(stamps_ns, stamps_ns[start] + _WINDOW_NS))
             self._judge(stamps_ns[start:end + 1], rates[start:end], forces[start:end])

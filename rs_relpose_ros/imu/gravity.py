@@ -31,13 +31,13 @@ Array = NDArray[np.float64]
 
 STANDARD_GRAVITY = 9.80665
 MEAN_WINDOW_NS = 100_000_000
-# Time over which hand-held acceleration stays correlated [s]: samples within it are one.
+# Correlation time of hand-held acceleration [s]: samples within it count as one measurement.
 _CORRELATION_TIME = 0.2
-# Acceleration that lasts longer than this [s] drags the filter along.
+# Averaging time of the residual [s]: acceleration that lasts longer biases the direction.
 _LASTING = 1.0
-# No IMU knows the direction better than so while it is carried about [rad].
+# Least sigma of an orientation that the IMU computes, while it is carried about [rad].
 _LEAST_OWN_SIGMA = 0.01
-# Further from the direction of the accelerometer, in sigmas, it counts from another world.
+# Largest distance of such a direction from the accelerometer's, in sigmas.
 _OWN_GATE = 4.0
 
 
@@ -302,8 +302,8 @@ def agreed_gravity(own: GravityEstimate | None,
                    measured: GravityEstimate | None) -> GravityEstimate | None:
     """The IMU's own estimate, unless it is absent or contradicts the accelerometer's.
 
-    An orientation may count from another world (north-east-down), from the start, or be a filler:
-    it is believed only where the accelerometer allows it.
+    An orientation may refer to another world frame (north-east-down, that of the start) or be a
+    filler: it is used only where it agrees with the accelerometer.
     """
     if own is None:
         return measured

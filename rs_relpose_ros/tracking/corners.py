@@ -19,7 +19,7 @@ Image = NDArray[np.uint8]
 _BLOCK = 5
 # Images with a side shorter than this are searched at full size.
 _SHORTEST_HALVED = 240
-# OpenCV's own threshold is relative to the best corner and must be positive; ours is absolute.
+# OpenCV's threshold, relative to the best corner, must be positive; the one used is absolute.
 _ALL = 1e-9
 
 
@@ -39,31 +39,40 @@ def find_corners(image: Image, taken: Array, count: int, config: TrackingConfig)
     -------
     (K, 2) ndarray
         Whole pixels of the full image: the best of each cell of a grid first, then the second
-        best, and so on. No sub-pixel refinement: a match is as exact as the second point follows
-        the first, wherever that lies.
+        best, and so on. Not refined to sub-pixels: the accuracy of a match is that of the second
+        point relative to the first one.
     """
     height, width = image.shape
-    # Half size: noise counts for less, and the search costs a quarter.
+    # Half size: less noise, and the search costs a quarter.
     scale = 2 if min(height, width) >= _SHORTEST_HALVED else 1
     if scale == 2:
         image = cv2.pyrDown(image)  # type: ignore[assignment]
     margin = -(-(config.klt_window // 2 + 2) // scale)
     if count <= 0 or min(image.shape) <= 2 * margin + _BLOCK:
         return np.empty((0, 2))
-    distance = config.min_feature_distance / scale
     first, last = feature_rows(config, height)
+    distance = config.min_feature_distance / scale
     free = np.zeros(image.shape, dtype=np.uint8)
     free[max(margin, math.ceil(first / scale)):math.floor(last / scale) + 1, margin:-margin] = 255
     free[-margin:] = 0
     _occupy(free, taken / scale, math.ceil(distance))
+    points = scale * _strong_corners(image, free, distance, config.feature_quality)
+    cell = math.sqrt(height * width / config.max_features)
+    return points[_spread(points, taken, cell)[:count]]
+
+
+def _strong_corners(image: Image, free: Image, distance: float, least: float) -> Array:
+    """Corners (N, 2) where `free` (H, W) is not 0, best first, at a distance from each other.
+
+    `least`: least eigenvalue of the structure tensor [gray^2/px^2].
+    """
     corners, quality = cv2.goodFeaturesToTrackWithQuality(
         image, 0, _ALL, distance, free, blockSize=_BLOCK)
     if corners is None:  # where there is none
         return np.empty((0, 2))  # type: ignore[unreachable]
     # OpenCV's value is the mean of (2 dI/dx / 255)^2 over the block.
-    strong = np.ravel(quality) >= config.feature_quality * 4.0 / 255.0**2
-    points = np.reshape(corners, (-1, 2))[strong].astype(np.float64) * scale
-    return points[_spread(points, taken, math.sqrt(height * width / config.max_features))[:count]]
+    strong = np.ravel(quality) >= least * 4.0 / 255.0**2
+    return np.reshape(corners, (-1, 2))[strong].astype(np.float64)
 
 
 @kernel

@@ -1,4 +1,4 @@
-"""How far matches moved beyond what the camera's turn explains."""
+"""Parallax: motion of matches that the rotation of the camera does not explain."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel
+from rs_relpose_ros.geometry.vectors import cross, norm, rotated
 
 Array = NDArray[np.float64]
 
@@ -26,15 +27,7 @@ def median_parallax(rays1: Array, rays2: Array, rotation: Array) -> float:
     values = np.empty(len(rays1))
     count = 0
     for i in range(len(rays1)):
-        x, y, z = rays1[i, 0], rays1[i, 1], rays1[i, 2]
-        u = (rotation[0, 0] * rays2[i, 0] + rotation[0, 1] * rays2[i, 1]
-             + rotation[0, 2] * rays2[i, 2])
-        v = (rotation[1, 0] * rays2[i, 0] + rotation[1, 1] * rays2[i, 1]
-             + rotation[1, 2] * rays2[i, 2])
-        w = (rotation[2, 0] * rays2[i, 0] + rotation[2, 1] * rays2[i, 1]
-             + rotation[2, 2] * rays2[i, 2])
-        a, b, c = y * w - z * v, z * u - x * w, x * v - y * u
-        value = math.sqrt(a * a + b * b + c * c)
+        value = norm(cross(rays1[i], rotated(rotation, rays2[i])))
         if not math.isnan(value):
             values[count] = value
             count += 1

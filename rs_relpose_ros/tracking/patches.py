@@ -1,7 +1,7 @@
 """Patches around points, laid side by side in one small image.
 
-What is done to windows then costs the same whatever the size of the image: OpenCV's Lucas-Kanade,
-for one, prepares all of an image for the sake of a few hundred windows.
+The cost of OpenCV's Lucas-Kanade on it does not depend on the size of the image, of which it
+would prepare the whole for a few hundred windows.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ class Patches:
     image : (H, W) ndarray of uint8
         Patch by patch, in rows.
     shifts : (N, 2) ndarray
-        What takes a point near the centre of patch k from the pixels of the whole image to those
-        of `image`.
+        Added to a point near the centre of patch k [px of the whole image] they give its place in
+        `image`.
     """
 
     image: Image
@@ -45,7 +45,7 @@ def cut(image: Image, points: Array, radius: int) -> Patches:
     centres = _whole(points)
     side = 2 * radius + 1
     shape, corners = _layout(len(points), side)
-    # Of what lies beside the patches nothing is read.
+    # The unused places of the last row are not read, so not initialised.
     mosaic = np.empty(shape, dtype=np.uint8)
     _copy(image, centres - radius, side, corners, mosaic)
     return Patches(mosaic, (corners + radius - centres).astype(np.float64))
