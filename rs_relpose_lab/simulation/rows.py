@@ -108,10 +108,8 @@ def see(world: Array, motion: Motion, view: View, margin: float = 0.0) -> Array:
         again = ~settled & ~beyond & np.isfinite(pixels[:, 1])
         if not again.any():
             break
-        left, before, projected, slope, slow = (
-            values[again] for values in (left, rows, pixels[:, 1], slope, slow))
-        step = (projected - before) / np.where(slow, 1.0 - slope, 1.0)
-        rows = before + step
+        left, before, projected, slope = left[again], rows[again], pixels[again, 1], slope[again]
+        rows = before + (projected - before) / np.where(slow[again], 1.0 - slope, 1.0)
     inside = ((seen >= -margin)
               & (seen <= np.array([view.width - 1, view.height - 1]) + margin)).all(axis=1)
     seen[~inside] = np.nan
