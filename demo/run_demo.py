@@ -2,8 +2,8 @@
 
     make demo
 
-Starts relpose_node, a recorder and a player as processes of their own, plays bags/hand_held in
-real time, replays the same bag offline with several methods, and prints a table.
+Starts relpose_node and a player as processes of their own, plays bags/hand_held in real time and
+records the poses, replays the same bag offline with several methods, and prints a table.
 """
 
 from __future__ import annotations

@@ -18,13 +18,18 @@ if TYPE_CHECKING:
     from rs_relpose_ros.estimator.result import RelativePose, Status
     from rs_relpose_ros.geometry.camera import RollingShutterCamera
     from rs_relpose_ros.geometry.motion import FrameMotion
+    from rs_relpose_ros.messages.pose_chain import PoseChain
+    from rs_relpose_ros.messages.published_pair import PairSynchronizer
 
-__all__ = ['EstimatorConfig', 'FrameMotion', 'InputError', 'MissingInputError', 'RelativePose',
-           'RollingShutterCamera', 'RsRelposeError', 'Status', 'estimate_relative_pose', 'warm_up']
+__all__ = ['EstimatorConfig', 'FrameMotion', 'InputError', 'MissingInputError',
+           'PairSynchronizer', 'PoseChain', 'RelativePose', 'RollingShutterCamera',
+           'RsRelposeError', 'Status', 'estimate_relative_pose', 'warm_up']
 
 _HOMES = {
     'EstimatorConfig': 'config.estimator', 'FrameMotion': 'geometry.motion',
-    'InputError': 'errors', 'MissingInputError': 'errors', 'RelativePose': 'estimator.result',
+    'InputError': 'errors', 'MissingInputError': 'errors',
+    'PairSynchronizer': 'messages.published_pair', 'PoseChain': 'messages.pose_chain',
+    'RelativePose': 'estimator.result',
     'RollingShutterCamera': 'geometry.camera', 'RsRelposeError': 'errors',
     'Status': 'estimator.result', 'estimate_relative_pose': 'estimator.estimate',
     'warm_up': 'estimator.estimate',

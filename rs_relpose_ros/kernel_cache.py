@@ -24,7 +24,6 @@ import sys
 import tempfile
 from typing import Any
 
-import numba
 from numba.core import caching
 
 _PACKAGE = __name__.partition('.')[0]
@@ -88,12 +87,12 @@ def source_digest(module: str) -> str:
 
 def _folder(module: str, digest: str) -> Path:
     """Folder of a module's kernels: beside the package, or the user's where that is read-only."""
-    beside = _BESIDE / module
-    if _beside_is_writable() and not numba.config.CACHE_DIR:
+    beside, chosen = _BESIDE / module, 'NUMBA_CACHE_DIR' in os.environ
+    if _beside_is_writable() and not chosen:
         return beside
     own = _users_folder() / f'{module}-{digest[:16]}'
     # Who chooses another folder has it to himself.
-    if beside.is_dir() and not own.exists() and not numba.config.CACHE_DIR:
+    if beside.is_dir() and not own.exists() and not chosen:
         own.parent.mkdir(parents=True, exist_ok=True)
         # Complete at once for other processes; the slower of two that start together gives way.
         with tempfile.TemporaryDirectory(dir=own.parent) as there:
@@ -118,7 +117,7 @@ def _beside_is_writable() -> bool:
 @functools.cache
 def _users_folder() -> Path:
     """NUMBA_CACHE_DIR, the user's cache directory, or for who has none one of this process."""
-    chosen = numba.config.CACHE_DIR or os.environ.get('XDG_CACHE_HOME')
+    chosen = os.environ.get('NUMBA_CACHE_DIR') or os.environ.get('XDG_CACHE_HOME')
     try:
         folder = Path(chosen or Path.home() / '.cache') / _PACKAGE
         folder.mkdir(parents=True, exist_ok=True)

@@ -17,7 +17,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, storage_mcap, St
 from rosbags.typesys import get_typestore, Stores
 
 from rs_relpose_ros.bags import limits, reader
-from rs_relpose_ros.bags.reader import Bag, open_bag, TopicOptions
+from rs_relpose_ros.bags.reader import Bag, open_bag
+from rs_relpose_ros.bags.topics import TopicOptions
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera

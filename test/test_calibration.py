@@ -19,18 +19,23 @@ from rs_relpose_lab.experiments.calibration_tracks import (
 )
 from rs_relpose_ros.calibrate.alignment import find_starts, Start
 from rs_relpose_ros.calibrate.axis_maps import axis_maps, nearest_axis_map
-from rs_relpose_ros.calibrate.coplanarity import GLOBAL, LOCAL
-from rs_relpose_ros.calibrate.fit import evaluate, Problem, redirected, State
+from rs_relpose_ros.calibrate.coplanarity import GLOBAL, Problem, Unknowns, View
+from rs_relpose_ros.calibrate.fit import evaluate, initial, LOCAL, redirected, stepped
 from rs_relpose_ros.calibrate.gyro_path import GyroPath, GyroSeries
+from rs_relpose_ros.calibrate.observations import Observations
 from rs_relpose_ros.calibrate.procedure import calibrate
 from rs_relpose_ros.calibrate.report import parameter_file
 from rs_relpose_ros.calibrate.result import CalibrationResult
 from rs_relpose_ros.calibrate.tracks import make_pairs, Tracks
 from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.camera import DISTORTION_COEFFICIENTS, RollingShutterCamera
 
 SHORT = {'frames': 120}
+# Coefficients of each camera model that bend a picture visibly.
+MODELS = {'plumb_bob': (-0.2, 0.05, 0.001, -0.001, 0.0),
+          'rational_polynomial': (0.3, 0.1, 0.001, -0.001, 0.0, 0.4, 0.15, 0.01),
+          'equidistant': (0.02, -0.01, 0.003, 0.0)}
 
 
 def camera_of(truth: Truth, focal: float | None = None) -> RollingShutterCamera:
@@ -112,6 +117,7 @@ def test_camera_read_upwards_with_unknown_focal_length():
     assert 'readout_direction: "up"' in parameter_file(result, 'A test.', compressed=False)
 
 
+@pytest.mark.long
 def test_slow_camera_is_not_confidently_wrong():
     rng = np.random.default_rng(17)
     truth = drawn(rng, readout_time=0.02, speed=0.2, rotation_rate=math.radians(6.0),
@@ -124,6 +130,7 @@ def test_slow_camera_is_not_confidently_wrong():
     assert readout.sigma > 3.0 * usual()[1].readout_time.sigma
 
 
+@pytest.mark.long
 def test_noise_does_not_make_the_read_out_time_longer():
     """Freedom that grows with the read-out time would."""
     rng = np.random.default_rng(18)
@@ -133,11 +140,17 @@ def test_noise_does_not_make_the_read_out_time_longer():
     assert result.readout_time.value == pytest.approx(0.02, abs=1.5e-3)
 
 
-def test_global_shutter_is_told():
+def test_global_shutter_is_told_through_a_fisheye():
+    """All rows of a global shutter are of one instant: its pixels may be bent afterwards."""
     rng = np.random.default_rng(13)
     recorded = record(drawn(rng, readout_time=0.0, fps=30.0, **SHORT), rng)
-    result = calibrate(recorded.tracks, recorded.gyro, camera_of(recorded.truth))
-    assert abs(result.readout_time.value) < 1e-3
+    pinhole = camera_of(recorded.truth)
+    fisheye = dataclasses.replace(pinhole, distortion_model='equidistant',
+                                  distortion=MODELS['equidistant'])
+    bent = dataclasses.replace(recorded.tracks, points=fisheye.project(
+        pinhole.unproject(recorded.tracks.points)))
+    result = calibrate(bent, recorded.gyro, fisheye)
+    assert_right(result, recorded.truth)
     assert result.shutter == 'global'
     assert 'readout_time: 0.0' in parameter_file(result, 'A test.', compressed=False)
 
@@ -212,7 +225,7 @@ def test_gyro_of_another_time_is_refused():
 def test_readout_longer_than_the_interval_is_refused():
     rng = np.random.default_rng(16)
     # No camera can do this: the simulation can.
-    truth = dataclasses.replace(drawn(rng, readout_time=0.03, fps=30.0, **SHORT),
+    truth = dataclasses.replace(drawn(rng, readout_time=0.03, fps=30.0, frames=70),
                                 readout_time=0.045)
     recorded = record(truth, rng)
     with pytest.raises(InputError, match='longer than the interval'):
@@ -271,40 +284,34 @@ def test_gyro_path_is_the_rotation_of_an_even_turn():
 
 
 @lru_cache(maxsize=1)
-def few_pairs() -> tuple[Problem, State, Truth]:
-    """Pairs, and a state a little off the truth."""
+def few_pairs() -> tuple[Problem, Unknowns, Truth]:
+    """Pairs, and a calibration a little off the truth."""
     rng = np.random.default_rng(1)
     recorded = record(drawn(rng, frames=10, outliers=0.0), rng)
     truth, tracks = recorded.truth, recorded.tracks
     pairs = make_pairs(tracks, (2,), max_matches=60, min_matches=20, max_interval=0.1, rng=rng)
-    origin = int(tracks.stamps_ns[0])
-    times, middle = tracks.seconds(origin), 0.5 * (truth.height - 1)
-    center = 0.5 * np.array([truth.width - 1, truth.height - 1])
-    by_pixel = np.tile(np.eye(2) / truth.focal, (len(pairs.points1), 1, 1))
-    problem = Problem(
-        recorded.gyro.seconds(origin), recorded.gyro.rates, pairs.begin,
-        np.searchsorted(recorded.gyro.seconds(origin), times[pairs.first] + 0.05), pairs.first,
-        pairs.second, times[pairs.first], times[pairs.second], 0.01 * np.arange(len(pairs)),
-        0.02 * np.arange(len(pairs)), (pairs.points1 - center) / truth.focal,
-        (pairs.points2 - center) / truth.focal, (pairs.points1[:, 1] - middle) / truth.height,
-        (pairs.points2[:, 1] - middle) / truth.height, by_pixel, by_pixel,
-        truth.gyro_noise, np.full(len(pairs), 0.1))
-    state = State.start(problem, truth.R_cam_imu.T, truth.time_offset
-                        + middle / truth.height * truth.readout_time + 1e-3,
-                        truth.readout_time + 2e-3, np.array(truth.gyro_bias), 0.01, noise=1.0)
-    return problem, state, truth
+    problem = Observations.of(tracks, recorded.gyro, camera_of(truth)).problem(pairs, 0.05)
+    # As of intervals that vary.
+    covariates = 0.01 * np.arange(len(pairs))
+    problem = problem._replace(view1=problem.view1._replace(covariates=covariates),
+                               view2=problem.view2._replace(covariates=2.0 * covariates))
+    middle_row = 0.5 * (truth.height - 1) / truth.height
+    unknowns = initial(
+        problem, truth.R_cam_imu.T, truth.time_offset + middle_row * truth.readout_time + 1e-3,
+        truth.readout_time + 2e-3, np.array(truth.gyro_bias), 0.01, noise=1.0)
+    return problem, unknowns, truth
 
 
 def test_gradient_is_that_of_finite_differences():
-    problem, state, _ = few_pairs()
+    problem, unknowns, _ = few_pairs()
     # At the optimum of the pairs' own unknowns the total derivative is the partial one.
     still = np.zeros(GLOBAL)
     for _ in range(40):
-        state = state.moved(still, -0.5 * evaluate(problem, state).back[:, :, GLOBAL])
-    analytic = evaluate(problem, state).score.sum(axis=0)
+        unknowns = stepped(unknowns, still, 0.5 * evaluate(problem, unknowns).local_step(still))
+    analytic = evaluate(problem, unknowns).score.sum(axis=0)
 
     def cost(step: np.ndarray) -> float:
-        moved = state.moved(step, np.zeros((problem.pairs, LOCAL)))
+        moved = stepped(unknowns, step, np.zeros((problem.pairs, LOCAL)))
         return evaluate(problem, moved, derivatives=False).cost
 
     h = 1e-6
@@ -313,27 +320,54 @@ def test_gradient_is_that_of_finite_differences():
 
 
 def test_residual_is_the_distance_in_pixels_to_the_nearest_pair_that_fits():
-    problem, state, truth = few_pairs()
-    residuals = evaluate(problem, state, derivatives=False).residuals
+    problem, unknowns, truth = few_pairs()
+    residuals = evaluate(problem, unknowns, derivatives=False).residuals
     # Moved against its gradient by the residual, a match of two ends fits: first order in 0.3 px.
     h, n = 1e-4, 17
     gradient = np.zeros(4)
     for k in range(4):
-        points = [problem.points1.copy(), problem.points2.copy()]
-        points[k // 2][n, k % 2] += h / truth.focal
-        moved = dataclasses.replace(problem, points1=points[0], points2=points[1])
-        change = evaluate(moved, state, derivatives=False).residuals[n] - residuals[n]
+        name = f'view{1 + k // 2}'
+        view = getattr(problem, name)
+        points = view.points.copy()
+        points[n, k % 2] += h / truth.focal
+        moved = problem._replace(**{name: view._replace(points=points)})
+        change = evaluate(moved, unknowns, derivatives=False).residuals[n] - residuals[n]
         gradient[k] = change / h
     assert np.linalg.norm(gradient) == pytest.approx(1.0, abs=0.01)
 
 
 def test_direction_is_that_of_the_walk():
-    problem, state, _ = few_pairs()
+    problem, unknowns, _ = few_pairs()
     # From directions at right angles to the best ones, the search comes back to them.
-    lost = dataclasses.replace(state, direction=np.tile([0.0, 0.0, 1.0], (problem.pairs, 1)))
-    found = redirected(problem, lost).direction
-    assert np.abs((found * state.direction).sum(axis=1)).min() > 0.99
-    assert evaluate(problem, redirected(problem, lost)).cost < evaluate(problem, lost).cost
+    lost = unknowns._replace(direction=np.tile([0.0, 0.0, 1.0], (problem.pairs, 1)))
+    found = redirected(problem, lost)
+    assert np.abs((found.direction * unknowns.direction).sum(axis=1)).min() > 0.99
+    assert evaluate(problem, found).cost < evaluate(problem, lost).cost
+
+
+@pytest.mark.parametrize('model', DISTORTION_COEFFICIENTS)
+def test_fit_sees_the_same_rays_through_every_camera_model(model):
+    """Normalised points of the pixels of a distorted camera, and their derivative by them."""
+    recorded, _ = usual()
+    pinhole = camera_of(recorded.truth)
+    tracks = few_frames(recorded, 3)
+    camera = dataclasses.replace(pinhole, distortion_model=model, distortion=MODELS[model])
+
+    def view(points: np.ndarray, camera: RollingShutterCamera) -> View:
+        seen = dataclasses.replace(tracks, points=points)
+        data = Observations.of(seen, recorded.gyro, camera)
+        pairs = make_pairs(data.tracks, (1,), max_matches=500, min_matches=1, max_interval=1.0,
+                           rng=np.random.default_rng(0))
+        return data.problem(pairs, 0.0).view1
+
+    straight = view(tracks.points, pinhole).points
+    pixels = camera.project(pinhole.unproject(tracks.points))
+    np.testing.assert_allclose(view(pixels, camera).points, straight, atol=1e-9)
+    h, by_pixel = 1e-3, view(pixels, camera).by_pixel
+    for k in range(2):
+        step = h * np.eye(2)[k]
+        change = view(pixels + step, camera).points - view(pixels - step, camera).points
+        np.testing.assert_allclose(by_pixel[:, :, k], change / (2.0 * h), atol=1e-9)
 
 
 def test_pairs_have_the_tracks_points_in_common():

@@ -18,9 +18,11 @@ from rs_relpose_lab.simulation.bag import write_bag
 from rs_relpose_lab.simulation.trajectory import Trajectory
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.bags.writer import BagWriter
+from rs_relpose_ros.calibrate import follow
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.errors import MissingInputError
+from rs_relpose_ros.tracking.registry import make_tracker
 
 IMAGE, IMU = '/camera/image_raw/compressed', '/imu/data_raw'
 
@@ -63,6 +65,19 @@ def test_bag_gives_a_parameter_file_that_the_node_takes(bag, tmp_path, capsys):
     assert picture is not None and picture.std() > 5.0
 
 
+def test_chosen_tracker_follows_the_points(bag, tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(follow, 'make_tracker', lambda config: made.append(config) or make_tracker(
+        config))
+    assert main(['calibrate', str(bag), '--detector', 'sift', '--out', str(tmp_path)]) in (0, 1)
+    figures = json.loads((tmp_path / 'calibration.json').read_text())
+    assert [config.detector for config in made] == ['sift']
+    assert figures['readout_time_s']['value'] == pytest.approx(0.02, abs=4e-3)
+    assert figures['time_offset_s']['value'] == pytest.approx(0.03, abs=4e-3)
+    assert figures['shutter'] == 'rolling'
+
+
+@pytest.mark.long
 def test_bag_of_a_global_shutter_and_of_one_axis(tmp_path, capsys):
     """The rotation about the only axis cannot be told, read-out time and offset can."""
     config = small(readout_time=0.0)

@@ -4,8 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
+from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.distortion.models import DISTORTION_MODELS, DistortionModel
 
 # EuRoC's factory calibration, a wide rational model, a fisheye lens.
 MODELS = [
@@ -51,6 +53,34 @@ def test_ray_derivative_equals_finite_differences(model, distortion, pixels):
         step[k] = 1e-4
         numeric = (camera.unproject(pixels + step) - camera.unproject(pixels - step)) / 2e-4
         np.testing.assert_allclose(jacobian[:, :, k], numeric, atol=1e-9)
+
+
+@kernel
+def distort_by_division(x, y, k, out):
+    """A model that the package does not have: x' = x / (1 + k r^2)."""
+    scale = 1.0 / (1.0 + k[0] * (x * x + y * y))
+    slope = -2.0 * k[0] * scale * scale
+    out[0], out[1] = scale * x, scale * y
+    out[2], out[3] = scale + slope * x * x, slope * x * y
+    out[4], out[5] = slope * x * y, scale + slope * y * y
+
+
+@kernel
+def start_at_the_point(u, v, out):
+    out[0], out[1] = u, v
+
+
+def test_a_model_of_the_registry_is_a_model_of_the_camera(pixels, monkeypatch):
+    monkeypatch.setitem(DISTORTION_MODELS, 'division', DistortionModel(
+        'division', (1,), 1, distort_by_division, start_at_the_point))
+    camera = make_camera('division', (0.3,))
+    rays = camera.unproject(pixels)
+    undistorted = rays[:, :2] / rays[:, 2:]
+    distorted = undistorted / (1.0 + 0.3 * (undistorted**2).sum(axis=1, keepdims=True))
+    np.testing.assert_allclose(
+        distorted * (camera.fx, camera.fy) + (camera.cx, camera.cy), pixels, atol=1e-8)
+    np.testing.assert_allclose(camera.project(3.0 * rays), pixels, atol=1e-8)
+    assert make_camera('division', (0.0,)).is_undistorted
 
 
 def test_a_pixel_outside_the_invertible_region_is_nan_not_a_mirror_image():

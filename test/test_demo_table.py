@@ -86,10 +86,10 @@ def pair_of(noise: float, outliers: int, seed: int = 0) -> ReplayedPair:
                         inliers=np.ones(count, dtype=bool), covariance=1e-6 * np.eye(6),
                         model='uniform')
     result = PairResult(
-        START_NS, START_NS + 10**9, 'camera', 1.0, pose,
+        START_NS, START_NS + 10**9, START_NS, START_NS + 10**9, 'camera', 1.0, pose,
         Matches(np.arange(count, dtype=np.uint32), points1, points2, np.ones(count)),
         np.zeros(count), np.zeros(count), np.zeros((count, 3)), np.zeros((count, 3)), 20.0)
-    return ReplayedPair(result, START_NS, START_NS + 10**9, 0)
+    return ReplayedPair(result, 0)
 
 
 @pytest.fixture
@@ -119,8 +119,7 @@ def test_best_threshold_is_the_best(truth):
 
 
 def test_scores_of_a_table_and_of_its_records_agree(truth, tmp_path):
-    records = [pair_record(pair.result, pair.reference_ns1, pair.reference_ns2, truth)
-               for pair in [pair_of(0.1, 10)]]
+    records = [pair_record(pair_of(0.1, 10).result, truth)]
     with TableWriter(tmp_path / 'a.csv', RELATIVE_POSE_COLUMNS) as table:
         table.write(relative_pose_cells(records[0]))
     told = score_of_table('live', tmp_path / 'a.csv', records, truth)
@@ -138,7 +137,8 @@ def test_differing_poses_are_found(tmp_path):
     row = '1,2,0.6,0.8,0,0,0,0,1,0.1,0.1,0.1,0.1,0.1,50,{},{},OK'
     live = write('live.csv', row.format('', ''), row.format('', '').replace('1,2,', '2,3,'))
     same = write('same.csv', row.format(60, 'uniform'),
-                 row.format(60, 'uniform').replace('1,2,', '2,3,'), '3,4' + ',' * 14 + '9,,NO_IMU')
+                 row.format(60, 'uniform').replace('1,2,', '2,3,'),
+                 '3,4' + ',' * 14 + '9,,BAD_INPUT')
     assert differing_poses(live, same) == (0, 2)
     off = row.format(60, 'uniform').replace('0.6,', '0.6000000000000001,')
     one_digit = write('digit.csv', off, row.format(60, 'uniform').replace('1,2,', '2,3,'))

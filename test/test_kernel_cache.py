@@ -136,13 +136,11 @@ def test_every_import_of_a_kernels_module_counts(monkeypatch):
     with_kernels = [name for name, path in MODULES.items()
                     if 'rs_relpose_ros.compiled import' in path.read_text()]
     assert len(with_kernels) > 20
+    read_bytes, read = Path.read_bytes, set()
+    monkeypatch.setattr(Path, 'read_bytes', lambda path: (read.add(path), read_bytes(path))[1])
     for module in with_kernels:
         __import__(module)
         source_digest.cache_clear()
-        read = []
-        monkeypatch.setattr(Path, 'read_bytes', lambda path, read=read: (
-            read.append(path), path.open('rb').read())[1])
+        read.clear()
         source_digest(module)
-        monkeypatch.undo()
-        assert set(read) == {MODULES[name] for name in {module, *reached(module)}}
-    source_digest.cache_clear()
+        assert read == {MODULES[name] for name in {module, *reached(module)}}

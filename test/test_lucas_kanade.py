@@ -6,9 +6,9 @@ import pytest
 from tracking_images import WarpedScene
 
 from rs_relpose_ros.tracking import lucas_kanade
+from rs_relpose_ros.tracking.alignment import window_jacobians
 from rs_relpose_ros.tracking.lucas_kanade import follow, whole_images
 from rs_relpose_ros.tracking.patches import cut, cut_warped
-from rs_relpose_ros.tracking.windows import window_jacobians
 
 CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02)
 # How points move [px].

@@ -40,7 +40,8 @@ EXPECTED = {
     'frames_processed': '1064', 'frames_failed': '3', 'messages_invalid': '15',
     'imu_samples': '9000', 'imu_gaps': '11', 'imu_repeated': '13', 'imu_late': '14',
     'clock_jumps': '12', 'pairs': '3', 'poses': '2', 'matches': '20', 'inliers': '15',
-    'inlier_ratio': '0.750', 'parallax_px': '3.2', 'model': 'uniform',
+    'inlier_ratio': '0.750', 'parallax_px': '3.2', 'residual_rms_px': '',
+    'interval_s': '0.100', 'rotation_difference_to_gyro_deg': '', 'model': 'uniform',
     'tracked_gyro_bias_rad_s': '0.01000 -0.02000 0.03000',
     'tracked_gyro_bias_sigma_rad_s': '0.00100 0.00200 0.00300', 'tracked_time_offset_ms': '4.00',
     'tracked_time_offset_sigma_ms': '0.50', 'applied_time_offset_ms': '-1.50',
@@ -88,7 +89,8 @@ def pair(status: Status = Status.OK, reason: str = '') -> PairResult:
     inliers[:15] = True
     zeros2, zeros3 = np.zeros((count, 2)), np.zeros((count, 3))
     return PairResult(
-        reference_stamp_ns=0, stamp_ns=1, frame_id='', interval=0.1,
+        reference_stamp_ns=0, stamp_ns=1, reference_ns1=0, reference_ns2=1, frame_id='',
+        interval=0.1,
         pose=RelativePose(status=status, reason=reason, inliers=inliers, model='uniform'),
         matches=Matches(np.arange(count, dtype=np.uint32), zeros2, zeros2, np.ones(count)),
         row_times1=np.zeros(count), row_times2=np.zeros(count), rays1=zeros3, rays2=zeros3,

@@ -9,9 +9,8 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
+from rs_relpose_ros import PairSynchronizer, PoseChain
 from rs_relpose_ros.messages.outgoing import PAIR_TOPICS, pose_stamped_message
-from rs_relpose_ros.messages.pose_chain import PoseChain
-from rs_relpose_ros.messages.published_pair import PairSynchronizer
 from rs_relpose_ros.node.message_types import message_class
 
 

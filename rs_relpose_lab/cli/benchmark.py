@@ -10,7 +10,7 @@ import sys
 from typing import NamedTuple
 
 from rs_relpose_ros.cli.options import progress_bar
-from rs_relpose_ros.config.estimator import SOLVERS
+from rs_relpose_ros.config.estimator import SOLVER_CHOICES
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 
 HELP = ('Measure the estimator on simulated frame pairs, one thread each: "accuracy" against an '
@@ -94,7 +94,7 @@ def _accuracy_arguments(parser: argparse.ArgumentParser) -> None:
                              '(default: both)')
     parser.add_argument('--sigma-factor', nargs='+', type=float, default=[1.0], metavar='X',
                         help='tell the estimator so many times the true sigmas (default: 1)')
-    parser.add_argument('--solver', choices=SOLVERS, default='auto', help='(default: auto)')
+    parser.add_argument('--solver', choices=SOLVER_CHOICES, default='auto', help='(default: auto)')
     parser.add_argument('--cache', type=Path, metavar='DIR',
                         help="folder that keeps the oracle's results (default: OUTPUT/oracle)")
 

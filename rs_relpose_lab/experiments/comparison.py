@@ -12,7 +12,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.experiments.methods import OPENCV_ESTIMATORS, opencv_five_point, undistorted
-from rs_relpose_ros.bags.reader import Bag, open_bag, SensorTopics
+from rs_relpose_ros.bags.reader import Bag, open_bag
+from rs_relpose_ros.bags.topics import SensorTopics
 from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import MissingInputError
@@ -126,9 +127,9 @@ def compare_live(table: Path, stamps_file: Path, bag_path: Path, parameter_file:
         outcome = replay_into(folder, bag, topics, read_parameters(parameter_file), stamps=stamps,
                               pictures=pictures, on_pair=pairs.append)
     unequal, poses = differing_poses(table, folder / POSES_FILE)
-    assert outcome.calibration is not None
+    assert outcome.intrinsics is not None
     return LiveComparison(score_of_table('relpose_node, live', table, outcome.records, truth),
-                          outcome.records, pairs, truth, outcome.calibration, topics.image.count,
+                          outcome.records, pairs, truth, outcome.intrinsics, topics.image.count,
                           len(stamps), poses, unequal)
 
 
@@ -145,7 +146,7 @@ def score_of_replay(name: str, bag_path: Path, parameters: Parameters) -> Score:
     with open_bag(bag_path) as bag:
         topics, truth = _topics_and_truth(bag)
         return score_of_records(name, [
-            pair_record(pair.result, pair.reference_ns1, pair.reference_ns2, truth)
+            pair_record(pair.result, truth)
             for pair in Replay(bag, topics, parameters).pairs()])
 
 
@@ -214,8 +215,9 @@ def best_opencv_score(estimator: str, pairs: Sequence[ReplayedPair], intrinsics:
     for threshold in (0.5, 1.0, 2.0):
         poses = [opencv_five_point(pixels1, pixels2, camera, threshold, estimator=estimator)
                  for pixels1, pixels2 in matches]
-        errors = [truth.errors(pose.R, pose.t, pair.reference_ns1, pair.reference_ns2)
-                  if pose else None for pair, pose in zip(pairs, poses, strict=True)]
+        errors = [truth.errors(pose.R, pose.t, pair.result.reference_ns1,
+                               pair.result.reference_ns2) if pose else None
+                  for pair, pose in zip(pairs, poses, strict=True)]
         scores.append(score(f'OpenCV 5-point, {estimator}, {threshold:g} px', errors))
     return min(scores, key=lambda s: np.nan_to_num(s.rotation[0], nan=np.inf))
 

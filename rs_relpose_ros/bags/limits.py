@@ -21,17 +21,18 @@ import yaml
 
 from rs_relpose_ros.errors import InputError
 
-# No recorder makes chunks near this size.
+# Bytes of the largest chunk that is decompressed; recorders make chunks of megabytes.
 MAX_CHUNK_BYTES = 1 << 30
-# Largest message that is decoded: above any image that is accepted (64 Mpx in four channels).
+# Bytes of the largest message that is decoded: above any image that is accepted (64 Mpx in four
+# channels).
 MAX_MESSAGE_BYTES = 1 << 29
 # A compressed storage file is decompressed to a temporary one: this and so many times its size.
 MAX_FILE_BYTES = 1 << 30
 _MAX_FILE_GROWTH = 200
-# Thousands of topics take less.
+# Bytes of the largest metadata.yaml that is parsed: thousands of topics take less.
 _MAX_METADATA_BYTES = 1 << 24
 
-# Python's own from 3.14 on, a package before: what rosbags uses.
+# The zstd module that rosbags uses: Python's own from 3.14 on, a package before.
 _zstd: Any = vars(mcap)['zstd']
 
 
@@ -60,18 +61,30 @@ def has_aliases(content: bytes | str) -> bool:
 
 
 def bound_decompression() -> None:
-    """Let rosbags decompress to bounded sizes only."""
-    mcap.DECOMPRESSORS['zstd'] = lambda data, size: _bounded(
-        _zstd.ZstdDecompressor, data, min(size, MAX_CHUNK_BYTES))
-    mcap.DECOMPRESSORS['lz4'] = lambda data, size: _bounded(
-        LZ4FrameDecompressor, data, min(size, MAX_CHUNK_BYTES))
-    rosbag1.decompressors['lz4'] = lambda data: _bounded(
-        LZ4FrameDecompressor, data, MAX_CHUNK_BYTES)
-    rosbag1.decompressors['bz2'] = lambda data: _bounded(
-        bz2.BZ2Decompressor, data, MAX_CHUNK_BYTES)
-    vars(rosbag2)['zstd'] = SimpleNamespace(
-        open=_BoundedFile, decompress=lambda data: _bounded(
-            _zstd.ZstdDecompressor, data, MAX_MESSAGE_BYTES))
+    """Let rosbags decompress to bounded sizes only, in all bags that this process reads.
+
+    rosbags has no setting for it, so the entries of its tables of decompressors are replaced.
+
+    Raises
+    ------
+    ImportError
+        This version of rosbags has no such entry: nothing would be bounded.
+    """
+    def of_chunk(decompressor: Callable[[], Any]) -> Callable[..., bytes]:
+        # MCAP tells the size of a chunk, ROS 1 does not.
+        return lambda data, *size: _bounded(decompressor, data, min([*size, MAX_CHUNK_BYTES]))
+
+    whole_file = SimpleNamespace(open=_BoundedFile, decompress=lambda data: _bounded(
+        _zstd.ZstdDecompressor, data, MAX_MESSAGE_BYTES))
+    tables: Any = ((mcap.DECOMPRESSORS, 'zstd', of_chunk(_zstd.ZstdDecompressor)),
+                   (mcap.DECOMPRESSORS, 'lz4', of_chunk(LZ4FrameDecompressor)),
+                   (rosbag1.decompressors, 'lz4', of_chunk(LZ4FrameDecompressor)),
+                   (rosbag1.decompressors, 'bz2', of_chunk(bz2.BZ2Decompressor)),
+                   (vars(rosbag2), 'zstd', whole_file))
+    for table, name, bounded in tables:
+        if name not in table:
+            raise ImportError(f'rosbags decompresses {name} in another way than 0.11 does')
+        table[name] = bounded
 
 
 class _BoundedFile:

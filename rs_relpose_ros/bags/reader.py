@@ -1,4 +1,4 @@
-"""Read rosbag2 bags (SQLite3, MCAP, compressed) and ROS 1 bags, and find the sensors' topics."""
+"""Read rosbag2 bags (SQLite3, MCAP, compressed) and ROS 1 bags."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 import functools
-import logging
 from pathlib import Path
 from typing import Any
 
@@ -17,56 +16,13 @@ from rosbags.typesys import get_typestore, Stores
 
 from rs_relpose_ros.bags.limits import bound_decompression, check_metadata, MAX_MESSAGE_BYTES
 from rs_relpose_ros.bags.mcap_check import check_mcap
+from rs_relpose_ros.bags.topics import find_sensor_topics, SensorTopics, Topic, TopicOptions
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 
-IMAGE = 'sensor_msgs/msg/Image'
-COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
-CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
-IMU = 'sensor_msgs/msg/Imu'
-POSE_STAMPED = 'geometry_msgs/msg/PoseStamped'
-
-# Where the project's own bags keep the truth; taken where several topics could be it.
-_GROUND_TRUTH = '/ground_truth/pose'
 _STORAGE_SUFFIXES = ('.mcap', '.db3')
 
-_logger = logging.getLogger(__name__)
-
 bound_decompression()
-
-
-@dataclass(frozen=True, slots=True)
-class Topic:
-    """A topic of a bag with the number of its messages."""
-
-    name: str
-    msgtype: str
-    count: int
-
-    def __str__(self) -> str:
-        return f'{self.name} ({self.msgtype})'
-
-
-@dataclass(frozen=True, slots=True)
-class TopicOptions:
-    """Topics that the user chose; an empty name is found by its type."""
-
-    image: str = ''
-    camera_info: str = ''
-    imu: str = ''
-    accel: str = ''
-    truth: str = ''
-
-
-@dataclass(frozen=True, slots=True)
-class SensorTopics:
-    """Topics to read; `accel` only where the driver publishes the accelerometer apart."""
-
-    image: Topic
-    camera_info: Topic
-    imu: Topic
-    accel: Topic | None
-    truth: Topic | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,26 +113,8 @@ class Bag:
         return 'reliable' if QosReliability.RELIABLE in offered else ''
 
     def find_topics(self, options: TopicOptions | None = None) -> SensorTopics:
-        """The sensors' topics: as chosen, or by type where only one can be meant.
-
-        Of several CameraInfo topics the one beside the image is taken, and of two Imu topics one
-        with 'gyro' and one with 'accel' in its name make a pair (RealSense).
-
-        Raises
-        ------
-        MissingInputError
-            A topic is absent; says which there are.
-        InputError
-            Several could be meant, or the chosen one has another type or is rectified.
-        """
-        options = TopicOptions() if options is None else options
-        image = self._find(options.image, (IMAGE, COMPRESSED_IMAGE), 'image', '--image-topic')
-        if 'image_rect' in image.name:
-            raise InputError(f'{image.name} is a rectified image, in which a row no longer has '
-                             'one instant: choose the raw one with --image-topic')
-        imu, accel = self._find_imu(options)
-        return SensorTopics(image, self._find_camera_info(options, image), imu, accel,
-                            self._find_truth(options))
+        """The sensors' topics; see `find_sensor_topics`."""
+        return find_sensor_topics(self.path, self.topics, options or TopicOptions())
 
     def messages(self, topics: Sequence[Topic]) -> Iterator[BagMessage]:
         """Messages of `topics` in the order of bag time; their arrays are read-only.
@@ -249,79 +187,6 @@ class Bag:
             raise InputError(
                 f'a message of {connection.topic} in {self.path} is corrupt, it is no '
                 f'{connection.msgtype}: {_sentence(error)}') from error
-
-    # -- finding topics ----------------------------------------------------------------------
-
-    def _of_type(self, *msgtypes: str) -> list[Topic]:
-        return [topic for topic in self.topics if topic.msgtype in msgtypes and topic.count]
-
-    def _find(self, chosen: str, msgtypes: tuple[str, ...], what: str, option: str) -> Topic:
-        if chosen:
-            return self._chosen(chosen, msgtypes, option)
-        candidates = self._of_type(*msgtypes)
-        if len(candidates) == 1:
-            return candidates[0]
-        if not candidates:
-            raise MissingInputError(f'{self.path} has no {what} topic ({" or ".join(msgtypes)}); '
-                                    f'{self._listed()}')
-        raise InputError(f'{self.path} has several {what} topics, choose one with {option}: '
-                         f'{", ".join(map(str, candidates))}')
-
-    def _chosen(self, name: str, msgtypes: tuple[str, ...], option: str) -> Topic:
-        found = [topic for topic in self.topics if topic.name.lstrip('/') == name.lstrip('/')]
-        if not found:
-            raise MissingInputError(f'{self.path} has no topic {name} ({option}); '
-                                    f'{self._listed()}')
-        if found[0].msgtype not in msgtypes:
-            raise InputError(f'topic {name} ({option}) is of type {found[0].msgtype}, but must be '
-                             f'{" or ".join(msgtypes)}')
-        if not found[0].count:
-            raise MissingInputError(f'topic {name} ({option}) of {self.path} has no messages')
-        return found[0]
-
-    def _find_camera_info(self, options: TopicOptions, image: Topic) -> Topic:
-        if not options.camera_info:
-            folder = image.name.removesuffix('/compressed').rpartition('/')[0]
-            for topic in self._of_type(CAMERA_INFO):
-                if topic.name == f'{folder}/camera_info':
-                    return topic
-        return self._find(options.camera_info, (CAMERA_INFO,), 'CameraInfo',
-                          '--camera-info-topic')
-
-    def _find_imu(self, options: TopicOptions) -> tuple[Topic, Topic | None]:
-        accel = self._chosen(options.accel, (IMU,), '--accel-topic') if options.accel else None
-        if options.imu:
-            return self._chosen(options.imu, (IMU,), '--imu-topic'), accel
-        candidates = [topic for topic in self._of_type(IMU) if topic != accel]
-        if len(candidates) == 2 and accel is None:
-            gyros = [topic for topic in candidates if 'gyro' in topic.name]
-            accels = [topic for topic in candidates if 'accel' in topic.name]
-            if len(gyros) == 1 and len(accels) == 1 and gyros != accels:
-                return gyros[0], accels[0]
-        if len(candidates) > 1:
-            raise InputError(
-                f'{self.path} has several IMU topics, choose one with --imu-topic (and '
-                '--accel-topic where the accelerometer is apart): '
-                f'{", ".join(map(str, candidates))}')
-        if not candidates:
-            raise MissingInputError(f'{self.path} has no IMU topic ({IMU}); {self._listed()}')
-        return candidates[0], accel
-
-    def _find_truth(self, options: TopicOptions) -> Topic | None:
-        if options.truth:
-            return self._chosen(options.truth, (POSE_STAMPED,), '--truth-topic')
-        candidates = self._of_type(POSE_STAMPED)
-        named = [topic for topic in candidates if topic.name == _GROUND_TRUTH]
-        if named:
-            return named[0]
-        if len(candidates) > 1:
-            _logger.warning('several topics could be the ground truth and none is used; choose '
-                            'one with --truth-topic: %s', ', '.join(map(str, candidates)))
-        return candidates[0] if len(candidates) == 1 else None
-
-    def _listed(self) -> str:
-        there = ', '.join(map(str, self.topics))
-        return f'it has {there}' if there else 'it has no topics at all'
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.calibrate.axis_maps import nearest_axis_map
 from rs_relpose_ros.calibrate.tracks import Pairs
+from rs_relpose_ros.geometry.so3 import aligning_rotation
 
 Array = NDArray[np.float64]
 
@@ -154,14 +155,14 @@ def _aligned(seen: Array, measured: Array, offset: float, focal_factor: float,
 
 
 def _rotation_onto(seen: Array, measured: Array) -> Array:
-    """Rotation R with ``seen = R measured`` (Kabsch); from one axis, that next to an axis map."""
+    """Rotation R with ``seen = R measured``; from one axis, the one nearest to an axis map."""
     C = seen.T @ measured
     u, s, vt = np.linalg.svd(C)
     if s[1] < _ONE_AXIS * s[0]:
         nearest = nearest_axis_map(C)
         tilt, _ = Rotation.align_vectors(u[:, :1].T, vt[:1] @ nearest.T)
         return np.asarray(tilt.as_matrix() @ nearest)
-    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
+    return aligning_rotation(C)
 
 
 def _best_apart(starts: list[Start], count: int, apart: float) -> list[Start]:

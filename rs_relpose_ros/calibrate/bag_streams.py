@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 import logging
 
-from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics
+from rs_relpose_ros.bags.reader import Bag, BagMessage
+from rs_relpose_ros.bags.topics import SensorTopics
 from rs_relpose_ros.calibrate.follow import PointFollower
 from rs_relpose_ros.calibrate.gyro_path import GyroSeries
-from rs_relpose_ros.calibrate.procedure import CalibrationConfig
 from rs_relpose_ros.calibrate.tracks import Tracks
 from rs_relpose_ros.config.tracking import TrackingConfig
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
@@ -22,17 +22,12 @@ from rs_relpose_ros.messages.sensor_feed import Role, SensorFeed
 # Guess of an unknown focal length, share of the longer side: 64 deg of view.
 _FOCAL_GUESS = 0.8
 
-# What KLT adds to the errors of a calibration, found on rendered bags: its errors are not
-# independent from frame to frame.
-TRACKED_IN_IMAGES = CalibrationConfig(
-    tracking_time_sigma=5e-5, tracking_rotation_sigma=1e-3, tracking_bias_sigma=2.5e-4)
-
 _logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Recording:
-    """What a calibration needs of a bag.
+class CalibrationInput:
+    """Tracks, gyro and camera of a bag.
 
     Attributes
     ----------
@@ -55,7 +50,7 @@ class Recording:
 
 
 def read_recording(bag: Bag, topics: SensorTopics, tracking: TrackingConfig | None = None, *,
-                   on_image: Callable[[], object] = lambda: None) -> Recording:
+                   on_image: Callable[[], object] = lambda: None) -> CalibrationInput:
     """Follow points through the images of a bag, and collect its gyro.
 
     Parameters
@@ -64,7 +59,6 @@ def read_recording(bag: Bag, topics: SensorTopics, tracking: TrackingConfig | No
         Open.
     topics : SensorTopics
     tracking : TrackingConfig, optional
-        KLT is used whatever its detector.
     on_image : callable
         Called after each image, for a progress bar.
 
@@ -87,7 +81,7 @@ class _Reader:
         self._follower = PointFollower(tracking)
         self.feed = SensorFeed({Role.IMU: self._take_sample, Role.CAMERA_INFO: self._take_info,
                                 Role.IMAGE: self._take_image})
-        self._calibration: Intrinsics | None = None
+        self._intrinsics: Intrinsics | None = None
         self._uncalibrated = False
         self._size: tuple[int, int] | None = None
         self._gyro: dict[int, tuple[float, float, float]] = {}
@@ -112,7 +106,7 @@ class _Reader:
         self._gyro.setdefault(sample.stamp_ns, sample.angular_velocity)
 
     def _take_info(self, intrinsics: Intrinsics) -> None:
-        self._calibration = intrinsics
+        self._intrinsics = intrinsics
 
     def _take_image(self, published: PublishedImage) -> None:
         last = self._follower.last_stamp_ns
@@ -122,33 +116,35 @@ class _Reader:
         self._follower.add(published.stamp_ns, image)
         self._size = image.shape[1], image.shape[0]
 
-    def recording(self) -> Recording:
+    def recording(self) -> CalibrationInput:
         images, imu = self._topics.image.name, self._topics.imu.name
-        why = ''.join(f'; {reason}' for reason in list(self._unused)[:2])
         if self._size is None:
-            raise InputError(f'no image of {images} can be used{why}')
+            raise InputError(f'no image of {images} can be used{self._why()}')
         if not self._gyro:
-            raise MissingInputError(f'no message of {imu} has a gyro{why}: record the angular '
-                                    'velocity together with the images')
+            raise MissingInputError(f'no message of {imu} has a gyro{self._why()}: record the '
+                                    'angular velocity together with the images')
         camera = self._camera(self._size)
-        calibration = self._calibration
-        tracks = (self._follower.tracks() if calibration is None
-                  else self._follower.tracks(calibration.to_sensor))
-        return Recording(tracks, GyroSeries.by_stamp(self._gyro), camera,
-                         calibration is not None, self._unused)
+        intrinsics = self._intrinsics
+        tracks = (self._follower.tracks() if intrinsics is None
+                  else self._follower.tracks(intrinsics.to_sensor))
+        return CalibrationInput(tracks, GyroSeries.by_stamp(self._gyro), camera,
+                                intrinsics is not None, self._unused)
+
+    def _why(self) -> str:
+        return ''.join(f'; {reason}' for reason in list(self._unused)[:2])
 
     def _camera(self, size: tuple[int, int]) -> RollingShutterCamera:
-        calibration = self._calibration
-        if calibration is not None:
-            if size != (calibration.image_width, calibration.image_height):
+        intrinsics = self._intrinsics
+        if intrinsics is not None:
+            if size != (intrinsics.image_width, intrinsics.image_height):
                 raise InputError(
                     f'the images are {size[0]}x{size[1]}, but the CameraInfo is for '
-                    f'{calibration.image_width}x{calibration.image_height}: a resized image '
+                    f'{intrinsics.image_width}x{intrinsics.image_height}: a resized image '
                     'needs a CameraInfo of its own')
-            return calibration.global_shutter_camera()
+            return intrinsics.global_shutter_camera()
         if not self._uncalibrated:
             raise MissingInputError(f'no message of {self._topics.camera_info.name} can be used'
-                                    + ''.join(f'; {reason}' for reason in list(self._unused)[:2]))
+                                    f'{self._why()}')
         guess = _FOCAL_GUESS * max(size)
         return RollingShutterCamera(
             width=size[0], height=size[1], fx=guess, fy=guess, cx=0.5 * (size[0] - 1),

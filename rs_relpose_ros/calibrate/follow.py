@@ -1,4 +1,4 @@
-"""Points followed through the images of a recording."""
+"""Points followed through the images of a recording, by the chosen tracker."""
 
 from __future__ import annotations
 
@@ -9,25 +9,20 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.calibrate.tracks import Tracks
 from rs_relpose_ros.config.tracking import TrackingConfig
-from rs_relpose_ros.tracking.klt import KltTracker
+from rs_relpose_ros.tracking.registry import make_tracker
 
 Array = NDArray[np.float64]
 
-# New corners are looked for when so many of the last ones are lost, or so many frames went by.
+# The current image becomes the reference when this share of the points is left, or after so many
+# images.
 _KEPT, _RENEWED_AFTER = 0.8, 30
 
 
 class PointFollower:
-    """Follows corners from image to image and keeps where they were seen.
-
-    Parameters
-    ----------
-    tracking : TrackingConfig
-        KLT is used whatever its detector.
-    """
+    """Follows points from image to image and keeps where they were seen."""
 
     def __init__(self, tracking: TrackingConfig) -> None:
-        self._tracker = KltTracker(tracking)
+        self._tracker = make_tracker(tracking)
         self._started = False
         self._since_renewed = 0
         self._stamps: list[int] = []
@@ -53,8 +48,7 @@ class PointFollower:
             self._tracker.start(image)
             self._started = True
             self._since_renewed = 0
-        # Matches with the reference, which holds every point that is followed: aligned with it,
-        # their errors do not add up from frame to frame.
+        # Matches with the reference, so that errors do not add up from frame to frame.
         self._tracker.track(image)
         matches = self._tracker.refined_matches()
         self._since_renewed += 1

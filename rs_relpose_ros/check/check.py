@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from rs_relpose_ros.bags.reader import (
-    Bag,
+from rs_relpose_ros.bags.reader import Bag
+from rs_relpose_ros.bags.topics import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     IMAGE,
@@ -14,7 +14,7 @@ from rs_relpose_ros.bags.reader import (
     TopicOptions,
 )
 from rs_relpose_ros.check import judge_images, judge_imu, judge_turning
-from rs_relpose_ros.check.findings import Finding, Report, Verdict
+from rs_relpose_ros.check.findings import CheckReport, Finding, Verdict
 from rs_relpose_ros.check.scan import Chosen, scan
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
@@ -47,7 +47,7 @@ def choose_topics(bag: Bag, options: TopicOptions) -> Chosen:
 
 
 def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters,
-              on_message: Callable[[], object] = lambda: None) -> Report:
+              on_message: Callable[[], object] = lambda: None) -> CheckReport:
     """Read the chosen topics once and judge them.
 
     Parameters
@@ -65,7 +65,7 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters,
     InputError
         The bag is damaged.
     """
-    seen = scan(bag, chosen, on_message)
+    seen = scan(bag, chosen, parameters.tracking, on_message)
     findings = [_topics(bag, chosen), _parameters(parameters)]
     if chosen.image is not None:
         findings += judge_images.findings(
@@ -74,7 +74,7 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters,
         findings += judge_imu.findings(seen, bag.reliability(chosen.imu), parameters)
     if chosen.image is not None and chosen.imu is not None:
         findings += judge_turning.findings(seen, parameters)
-    return Report(str(bag.path), tuple(findings))
+    return CheckReport(str(bag.path), tuple(findings))
 
 
 def _first(bag: Bag, name: str, *msgtypes: str) -> Topic | None:

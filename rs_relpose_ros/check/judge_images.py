@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rs_relpose_ros.bags.reader import COMPRESSED_IMAGE, Topic
+from rs_relpose_ros.bags.topics import COMPRESSED_IMAGE, Topic
 from rs_relpose_ros.check.findings import Finding, Verdict
 from rs_relpose_ros.check.scan import Scan
 from rs_relpose_ros.check.streams import Stamps, StampSummary
@@ -103,24 +103,24 @@ def _rate(stream: Stamps, stamps: StampSummary) -> Finding:
 
 
 def _calibration(seen: Scan) -> Finding:
-    name, calibration = 'calibration', seen.calibration
-    if calibration is None:
+    name, intrinsics = 'calibration', seen.intrinsics
+    if intrinsics is None:
         text = seen.calibration_problem or 'no CameraInfo'
         return Finding(name, Verdict.FAILURE, text, 'calibrate the camera (camera_calibration, '
                        'OpenCV) and let its driver publish the CameraInfo')
-    text = (f'{calibration.width}x{calibration.height}, f {calibration.fx:.1f} '
-            f'{calibration.fy:.1f} px, {calibration.distortion_model}')
-    figures = {'fx': calibration.fx, 'fy': calibration.fy,
-               'distortion_model': calibration.distortion_model,
+    text = (f'{intrinsics.width}x{intrinsics.height}, f {intrinsics.fx:.1f} '
+            f'{intrinsics.fy:.1f} px, {intrinsics.distortion_model}')
+    figures = {'fx': intrinsics.fx, 'fy': intrinsics.fy,
+               'distortion_model': intrinsics.distortion_model,
                'different': seen.calibrations}
-    size = calibration.image_width, calibration.image_height
+    size = intrinsics.image_width, intrinsics.image_height
     if seen.sizes and size not in seen.sizes:
         width, height = next(iter(seen.sizes))
         return Finding(name, Verdict.FAILURE, f'{text}: for images of {size[0]}x{size[1]}, but '
                        f'they are {width}x{height}', 'publish the CameraInfo of this resolution, '
                        'region of interest and binning included', figures)
-    if not any(calibration.distortion):
-        wide = calibration.width > 2.0 * calibration.fx   # more than 90 deg
+    if intrinsics.global_shutter_camera().is_undistorted:
+        wide = intrinsics.width > 2.0 * intrinsics.fx   # more than 90 deg
         return Finding(name, Verdict.WARNING if wide else Verdict.OK, f'{text} without '
                        'distortion', 'right for a simulated or a rectifying camera only: '
                        'otherwise calibrate it' if wide else '', figures)

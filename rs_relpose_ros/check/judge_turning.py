@@ -83,7 +83,7 @@ def _texture(seen: Scan) -> Finding:
     median = float(np.median(points))
     poor = float(np.mean(np.array(points) < 30))
     figures = {'median_points': median, 'poor_share': poor}
-    text = f'{median:.0f} points of 150 tracked from image to image in the median'
+    text = f'{median:.0f} points tracked from image to image in the median'
     if median < 15:
         return Finding('texture', Verdict.FAILURE, text, 'record a textured scene, in focus, with '
                        'an exposure below 10 ms', figures)
@@ -194,8 +194,8 @@ def _words(down: np.ndarray) -> str:
 
 def _effect(seen: Scan, parameters: Parameters) -> Finding | None:
     """Displacement of the last against the first row by rotation alone [px]."""
-    calibration, summary = seen.calibration, seen.inertial.summary()
-    if calibration is None or not len(summary.rates):
+    intrinsics, summary = seen.intrinsics, seen.inertial.summary()
+    if intrinsics is None or not len(summary.rates):
         return None
     given = parameters.sensor.readout_time
     readout = _EXAMPLE_READOUT if given is None else given
@@ -203,7 +203,7 @@ def _effect(seen: Scan, parameters: Parameters) -> Finding | None:
     if bias is None:
         bias = np.array(parameters.imu.gyro_bias)
     rates = np.linalg.norm(summary.rates - bias, axis=1)
-    median, high = (readout * calibration.fx * float(np.percentile(rates, p)) for p in (50, 95))
+    median, high = (readout * intrinsics.fx * float(np.percentile(rates, p)) for p in (50, 95))
     figures = {'readout_s': readout, 'given': given is not None, 'median_px': median,
                'p95_px': high}
     name = 'rolling shutter'

@@ -8,10 +8,12 @@ from typing import TypeVar
 
 import numpy as np
 
-from rs_relpose_ros.bags.reader import Bag, BagMessage, Topic
+from rs_relpose_ros.bags.reader import Bag, BagMessage
+from rs_relpose_ros.bags.topics import Topic
 from rs_relpose_ros.check.inertial import Inertial
 from rs_relpose_ros.check.streams import Stamps
 from rs_relpose_ros.check.turning import TurningImages
+from rs_relpose_ros.config.tracking import TrackingConfig
 from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.imu.samples import ImuSample
@@ -55,17 +57,16 @@ class Scan:
         Number of different ones in turn.
     """
 
+    turning: TurningImages
     image_stamps: Stamps = field(default_factory=Stamps)
     imu_stamps: Stamps = field(default_factory=Stamps)
-    accel_stamps: Stamps = field(default_factory=Stamps)
     inertial: Inertial = field(default_factory=Inertial)
-    turning: TurningImages = field(default_factory=lambda: TurningImages(0))
     encodings: dict[str, int] = field(default_factory=dict)
     sizes: dict[tuple[int, int], int] = field(default_factory=dict)
     largest_image: int = 0
     image_problem: str = ''
     bad_images: int = 0
-    calibration: Intrinsics | None = None
+    intrinsics: Intrinsics | None = None
     calibrations: int = 0
     calibration_problem: str = ''
     imu_problem: str = ''
@@ -74,15 +75,16 @@ class Scan:
     accel_samples: int = 0
 
 
-def scan(bag: Bag, chosen: Chosen, on_message: Callable[[], object]) -> Scan:
-    """Read `chosen` topics of a bag once.
+def scan(bag: Bag, chosen: Chosen, tracking: TrackingConfig,
+         on_message: Callable[[], object]) -> Scan:
+    """Read `chosen` topics of a bag once, and follow points by the detector of `tracking`.
 
     Raises
     ------
     InputError
         The bag is damaged.
     """
-    seen = Scan(turning=TurningImages(chosen.image.count if chosen.image else 0))
+    seen = Scan(turning=TurningImages(chosen.image.count if chosen.image else 0, tracking))
     reader = _Reader(seen)
     for role, message in reader.feed.messages(bag, chosen):
         reader.take(role, message)
@@ -124,13 +126,12 @@ class _Reader:
                                   np.array(sample.angular_velocity))
 
     def _accel(self, sample: ImuSample) -> None:
-        self._seen.accel_stamps.add(sample.stamp_ns, self._recorded_ns)
         self._seen.accel_samples += 1
         self._seen.inertial.add(sample)
 
     def _camera_info(self, intrinsics: Intrinsics) -> None:
-        self._seen.calibrations += intrinsics != self._seen.calibration
-        self._seen.calibration = intrinsics
+        self._seen.calibrations += intrinsics != self._seen.intrinsics
+        self._seen.intrinsics = intrinsics
 
     def _image(self, published: PublishedImage) -> None:
         seen = self._seen
@@ -142,7 +143,7 @@ class _Reader:
         image = published.image.decoded()
         size = image.shape[1], image.shape[0]
         _count(seen.sizes, size)
-        intrinsics = seen.calibration
+        intrinsics = seen.intrinsics
         if intrinsics is not None and (intrinsics.image_width, intrinsics.image_height) == size:
             seen.turning.add_image(published.stamp_ns, self._recorded_ns, image, intrinsics)
 

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.calibrate.alignment import find_starts, Start
 from rs_relpose_ros.calibrate.coplanarity import BIAS, GLOBAL, OFFSET, READOUT, ROTATION
-from rs_relpose_ros.calibrate.fit import fit, State, with_bends
+from rs_relpose_ros.calibrate.fit import fit, initial, refit
 from rs_relpose_ros.calibrate.follow import PointFollower
 from rs_relpose_ros.calibrate.gyro_path import GyroSeries
-from rs_relpose_ros.calibrate.observations import evenly, Observations
+from rs_relpose_ros.calibrate.observations import Observations, PairSelection
 from rs_relpose_ros.config.tracking import TrackingConfig
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 
@@ -30,6 +30,8 @@ _BLOCKS, _BLOCK_FRAMES = 10, 25
 _WORKING_SIDE = 640
 _POINTS = 150
 _LEAST_POINTS = 15
+# Keypoints of an image where descriptors are matched: some of them are found in the next one.
+_MOST_DESCRIPTORS = 500
 # Distance of points from each other, in image sides.
 _APART = 0.015
 # Clock offsets that are tried [s].
@@ -39,9 +41,7 @@ _OFFSET_STEP = 0.005
 _GYRO_GAP = 0.1
 _LEAST_PAIRS = 20
 _WORTH_REFINING = 0.5
-# Pairs for the refinement: how far apart [s], how many, and of how many points.
-_SPANS = (0.033, 0.067, 0.133)
-_MOST_PAIRS, _REFINED_POINTS = 160, 80
+_REFINED = PairSelection((0.033, 0.067, 0.133), 80, _LEAST_POINTS, 160)
 # What rows, blur and moving things leave open at least [s].
 _LEAST_SIGMA = 7e-4
 
@@ -83,18 +83,21 @@ class TurningImages:
     Parameters
     ----------
     images : int
-        How many there are.
+        Their number.
+    tracking : TrackingConfig
+        Its detector is used, with settings for small images.
     """
 
-    def __init__(self, images: int) -> None:
+    def __init__(self, images: int, tracking: TrackingConfig) -> None:
         stride = max(images // _BLOCKS, 1)
         self._wanted = {first + k for first in range(0, images, stride)
                         for k in range(min(_BLOCK_FRAMES, stride + 1))}
         self._index = self._index_before = -1
+        self._detector = tracking.detector
         self._follower: PointFollower | None = None
         self._shape: tuple[int, ...] = ()
         self._reduction = 1.0
-        self._calibration: Intrinsics | None = None
+        self._intrinsics: Intrinsics | None = None
         self._recent: list[tuple[int, Array]] = []
         self._gyro: dict[int, Array] = {}
         self._keep_until_ns = 0
@@ -106,16 +109,17 @@ class TurningImages:
         return self._index in self._wanted
 
     def add_image(self, stamp_ns: int, recorded_ns: int, image: NDArray[np.uint8],
-                  calibration: Intrinsics) -> None:
+                  intrinsics: Intrinsics) -> None:
         """Take in an image that was wanted."""
         self._keep_until_ns = recorded_ns + int(2e9 * _WIDEST_OFFSET)
-        self._calibration = calibration
+        self._intrinsics = intrinsics
         if self._follower is None or image.shape != self._shape:
             # Of images of several sizes the last ones count.
             self._shape = image.shape
             self._reduction = min(_WORKING_SIDE / max(image.shape), 1.0)
             self._follower = PointFollower(TrackingConfig(
-                max_features=_POINTS, klt_levels=5, min_feature_distance=max(
+                detector=self._detector, max_features=_POINTS, max_descriptors=_MOST_DESCRIPTORS,
+                klt_levels=5, min_feature_distance=max(
                     _APART * self._reduction * max(image.shape), 1.0)))
         follows = len(self._follower) > 0 and self._index == self._index_before + 1
         self._index_before = self._index
@@ -171,33 +175,30 @@ class TurningImages:
             balance=float(singular[1] / max(singular[0], 1e-12)), pairs=len(pairs))
 
     def _observations(self) -> Observations | None:
-        calibration, reduction = self._calibration, self._reduction
-        if self._follower is None or calibration is None or len(self._gyro) < 2:
+        intrinsics, reduction = self._intrinsics, self._reduction
+        if self._follower is None or intrinsics is None or len(self._gyro) < 2:
             return None
         # Pixel centres lie at integers in both sizes.
         tracks = self._follower.tracks(
-            lambda points: calibration.to_sensor((points + 0.5) / reduction - 0.5))
+            lambda points: intrinsics.to_sensor((points + 0.5) / reduction - 0.5))
         if len(tracks) < 2:
             return None
         return Observations.of(tracks, GyroSeries.by_stamp(self._gyro),
-                               calibration.global_shutter_camera())
+                               intrinsics.global_shutter_camera())
 
 
 def _refined(data: Observations, start: Start, readout: float | None,
              rng: np.random.Generator) -> tuple[Array, float, float]:
     """Rotation IMU to camera, offset of the middle row and its sigma [s], by the fit."""
-    pairs = data.pairs(data.frames_in(_SPANS), max_matches=_REFINED_POINTS,
-                       min_matches=_LEAST_POINTS, rng=rng)
-    pairs = evenly(pairs.chosen(data.covered(pairs, start.offset, _GYRO_GAP)), _MOST_PAIRS)
+    pairs = data.selected(_REFINED, start.offset, _GYRO_GAP, rng)
     if len(pairs) < _LEAST_PAIRS:
         return start.R_cam_imu, start.offset, _OFFSET_STEP
     free = np.zeros(GLOBAL, dtype=bool)
     free[OFFSET] = free[ROTATION:ROTATION + 3] = free[BIAS:BIAS + 3] = True
     free[READOUT] = readout is None
     problem = data.problem(pairs, start.offset)
-    state = State.start(problem, start.R_cam_imu.T, start.offset,
-                        0.0 if readout is None else readout)
-    near = fit(problem, state, free, rounds=20, tolerance=0.3).state.restarted(problem, 2.0)
-    fitted = fit(with_bends(problem, near), near, free, rounds=20, tolerance=0.3)
-    return (fitted.state.R_imu_cam.T, float(fitted.state.parameters[OFFSET]),
+    begin = initial(problem, start.R_cam_imu.T, start.offset, 0.0 if readout is None else readout)
+    coarse = fit(problem, begin, free, rounds=20, tolerance=0.3)
+    fitted = refit(problem, coarse.unknowns, free, rounds=20, tolerance=0.3)
+    return (fitted.unknowns.R_imu_cam.T, float(fitted.unknowns.parameters[OFFSET]),
             math.hypot(_LEAST_SIGMA, math.sqrt(fitted.covariance[OFFSET, OFFSET])))

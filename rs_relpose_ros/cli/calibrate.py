@@ -8,9 +8,10 @@ import json
 import logging
 from pathlib import Path
 
-from rs_relpose_ros.bags.reader import COMPRESSED_IMAGE, open_bag
-from rs_relpose_ros.calibrate.bag_streams import read_recording, TRACKED_IN_IMAGES
-from rs_relpose_ros.calibrate.procedure import calibrate, CalibrationConfig
+from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.bags.topics import COMPRESSED_IMAGE
+from rs_relpose_ros.calibrate.bag_streams import read_recording
+from rs_relpose_ros.calibrate.procedure import calibrate
 from rs_relpose_ros.calibrate.report import as_mapping, draw_curve, parameter_file, report
 from rs_relpose_ros.cli.options import (
     add_bag_argument,
@@ -19,7 +20,8 @@ from rs_relpose_ros.cli.options import (
     progress_bar,
     topic_options,
 )
-from rs_relpose_ros.config.tracking import TrackingConfig
+from rs_relpose_ros.config.calibration import CalibrationConfig, TRACKED_IN_IMAGES
+from rs_relpose_ros.config.tracking import TRACKERS, TrackingConfig
 from rs_relpose_ros.errors import InputError
 
 HELP = (
@@ -45,6 +47,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--rows', metavar=('FIRST', 'LAST'), type=float, nargs=2,
                         default=(0.0, 0.0), help='use only these image rows, such as those above '
                         'a dashboard that moves with the camera')
+    parser.add_argument('--detector', choices=tuple(TRACKERS), default=TrackingConfig().detector,
+                        help='tracker that follows the points, as the parameter of the node '
+                        '(default: %(default)s)')
     parser.add_argument('--max-offset', metavar='S', type=float,
                         default=CalibrationConfig().max_time_offset,
                         help='largest clock offset that is searched for [s] (default: '
@@ -55,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Calibrate; 1 when something could not be told."""
     try:
-        tracking = TrackingConfig(feature_rows=tuple(args.rows))
+        tracking = TrackingConfig(detector=args.detector, feature_rows=tuple(args.rows))
         config = replace(TRACKED_IN_IMAGES, max_time_offset=args.max_offset)
     except InputError as error:   # which names the settings behind the options
         raise InputError(str(error).replace('feature_rows', '--rows').replace(

@@ -9,7 +9,7 @@ import sys
 
 from tqdm import tqdm
 
-from rs_relpose_ros.bags.reader import TopicOptions
+from rs_relpose_ros.bags.topics import TopicOptions
 from rs_relpose_ros.errors import InputError
 
 # Role of a topic -> what it holds.

@@ -26,6 +26,7 @@ from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.estimator import sampson
 from rs_relpose_ros.estimator.sampson import D1, D2, DW1, DW2, PARAMETERS, TANGENT, THETA
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
+from rs_relpose_ros.solvers.linear_algebra import cholesky, cholesky_solve
 
 Array = NDArray[np.float64]
 
@@ -200,40 +201,6 @@ def step_between(state: State, other: State) -> Array:
     step[DW1:DW1 + 3] = other.dw1 - state.dw1
     step[DW2:DW2 + 3] = other.dw2 - state.dw2
     return step
-
-
-@kernel
-def cholesky(matrix: Array, factor: Array) -> bool:
-    """Lower Cholesky factor of a symmetric matrix; False unless it is positive definite."""
-    n = matrix.shape[0]
-    for i in range(n):
-        for j in range(i + 1):
-            value = matrix[i, j]
-            for k in range(j):
-                value -= factor[i, k] * factor[j, k]
-            if i == j:
-                if not value > 0.0:
-                    return False
-                factor[i, i] = math.sqrt(value)
-            else:
-                factor[i, j] = value / factor[j, j]
-    return True
-
-
-@kernel
-def cholesky_solve(factor: Array, right: Array) -> Array:
-    """Solution of ``L L^T x = right``."""
-    n = right.shape[0]
-    x = right.copy()
-    for i in range(n):
-        for k in range(i):
-            x[i] -= factor[i, k] * x[k]
-        x[i] /= factor[i, i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            x[i] -= factor[k, i] * x[k]
-        x[i] /= factor[i, i]
-    return x
 
 
 @kernel

@@ -27,19 +27,19 @@ from rs_relpose_ros.imu.integration import bias_jacobian
 
 Array = NDArray[np.float64]
 
-# Of the time offset before the first pair [s]; what is far beyond it is for a calibration.
+# 1 sigma of the time offset before the first pair [s]; larger ones are for `calibrate` to find.
 OFFSET_SIGMA = 0.02
-# Growth of its standard deviation [s per square root of a second]: clocks drift by some ppm.
+# Random walk of the time offset [s per square root of a second]: clocks drift by some ppm.
 _OFFSET_WALK = 1.5e-4
-# Systematic errors (calibration, read-out) make no rotation better than this [rad].
+# 1 sigma [rad] of systematic errors of a rotation by images (intrinsics, read-out).
 _LEAST_ROTATION_SIGMA = 3e-4
-# Measurements further off, in sigmas, count less, as if their noise explained them.
+# Innovation, in sigmas, above which the noise of a measurement is inflated to explain it.
 _SURPRISE = 3.0
-# Share of what a pair knows of its rotation that must come from the images.
+# Least share of the information on a pair's rotation that must come from the images.
 _LEAST_SHARE = 0.02
-# The offset is applied once it is known to this [s], ...
+# 1 sigma [s] from which on the offset is applied.
 _APPLIED_SIGMA = 2e-3
-# ... never more than this [s], and in small steps [s per pair].
+# Largest offset that is applied [s], and largest change of it [s per pair].
 _LARGEST_APPLIED = 0.05
 _LARGEST_STEP = 1e-3
 
@@ -162,7 +162,7 @@ class DriftTracker:
     def _pass_time(self, stamp_ns: int) -> None:
         if self._last_ns is not None:
             seconds = max(stamp_ns - self._last_ns, 0) / NANOSECONDS
-            # Never less certain than at the start.
+            # The uncertainty grows to that of the start, not beyond.
             grown = self._covariance + seconds * self._growth
             excess = np.sqrt(np.minimum(
                 np.diag(self._prior) / np.maximum(np.diag(grown), 1e-30), 1.0))
@@ -184,12 +184,13 @@ def _by_images(pair: PairRotation) -> tuple[Array, Array] | None:
     if pair.gyro_covariance is not None:
         of_images = information - np.linalg.inv(pair.gyro_covariance)
     values, axes = np.linalg.eigh(0.5 * (of_images + of_images.T))
-    # Information of both along these axes: where the gyro has it all, the rest is rounding.
+    # Information of images and gyro along these axes; where the gyro has all of it, what is left
+    # for the images is rounding.
     total = np.einsum('ij,ik,kj->j', axes, information, axes)
     if not (values > _LEAST_SHARE * total).all():
         return None
     by_images = axes @ ((axes.T @ (information @ difference)) / values)
     noise = (axes / values) @ axes.T + _LEAST_ROTATION_SIGMA**2 * np.eye(3)
     if math.sqrt(float(by_images @ by_images)) > 0.2:
-        return None   # no drift, an estimate gone wrong
+        return None   # more than any drift: the estimate is wrong
     return by_images, noise

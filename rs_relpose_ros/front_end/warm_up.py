@@ -15,25 +15,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros import solvers
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.estimator.estimate import (
-    warm_up,
     warm_up_refinement,
     warm_up_sampling,
 )
 from rs_relpose_ros.front_end.frame import Frame
-from rs_relpose_ros.front_end.pipeline import Pipeline
-from rs_relpose_ros.front_end.sequencer import ReadyFrame, Sequencer
+from rs_relpose_ros.front_end.front_end import FrameProcessed, FrontEnd
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.imu.samples import ImuSample
 
 _WIDTH, _HEIGHT = 320, 240
-# With a distortion: its kernels, too, must be there before the first frame.
-_CALIBRATION = Intrinsics(width=_WIDTH, height=_HEIGHT, fx=250.0, fy=250.0, cx=159.5, cy=119.5,
-                           image_width=_WIDTH, image_height=_HEIGHT,
-                           distortion_model='plumb_bob', distortion=(-0.02, 0.01, 0.0, 0.0))
+# With distortion, so that its kernels are compiled, too.
+_INTRINSICS = Intrinsics(width=_WIDTH, height=_HEIGHT, fx=250.0, fy=250.0, cx=159.5, cy=119.5,
+                         image_width=_WIDTH, image_height=_HEIGHT,
+                         distortion_model='plumb_bob', distortion=(-0.02, 0.01, 0.0, 0.0))
 _FRAME_NS = NANOSECONDS // 30
 _IMU_NS = NANOSECONDS // 200
 
@@ -53,19 +50,18 @@ def warm_up_pipeline(parameters: Parameters) -> None:
         'readout_time': 0.02, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0], 'time_offset': 0.0,
         'stamp_exposure': 'middle', 'feature_rows': [0.0, 0.0], 'max_keyframe_frames': 1})
     for force in ((0.0, -9.81, 0.0), None):
-        sequencer = Sequencer(parameters, offline=True)
-        pipeline = Pipeline(parameters)
+        front_end = FrontEnd(parameters, offline=True)
+        sequencer = front_end.sequencer
         images = list(_images())
         for image in images:
-            # A raw image is tracked in its message's memory; kernels for that are others.
+            # A raw image is read-only memory of its message: kernels for that are apart.
             image.flags.writeable = force is None
         for stamp_ns in range(NANOSECONDS, NANOSECONDS + (len(images) + 3) * _FRAME_NS, _IMU_NS):
             sequencer.add_imu(ImuSample(stamp_ns, (0.01, 0.02, 0.03), force))
         for k, image in enumerate(images):
-            sequencer.add_frame(Frame(NANOSECONDS + (k + 1) * _FRAME_NS, image, '', _CALIBRATION))
-            taken = sequencer.take()
-            assert isinstance(taken, ReadyFrame)
-            pipeline.process(taken.frame, taken.imu)
+            sequencer.add_frame(Frame(NANOSECONDS + (k + 1) * _FRAME_NS, image, '', _INTRINSICS))
+            outcome = front_end.step()
+            assert isinstance(outcome, FrameProcessed), outcome
 
 
 def _images() -> Iterator[NDArray[np.uint8]]:
@@ -80,16 +76,14 @@ def _images() -> Iterator[NDArray[np.uint8]]:
 
 
 def fill_cache() -> None:
-    """Compile all kernels, on two cores: in one process Numba compiles one at a time."""
-    down = np.array([0.0, 1.0, 0.0])
+    """Compile what the default parameters need, on two cores: one process compiles one at a time.
+
+    Other solvers are compiled when they are chosen.
+    """
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context('spawn')) as pool:
         other_half = pool.submit(_compile_all_but_sampling)
-        for solver, count in ((solvers.uniform_11pt, 11), (solvers.angular_5pt, 5),
-                              (solvers.uniform_9pt, 9), (solvers.angular_3pt, 3)):
-            solver(*_rays(count), gravity1=down, gravity2=down, start_rotations=np.eye(3)[None])
         warm_up_sampling()
         other_half.result()
-    warm_up()
     warm_up_pipeline(Parameters())
 
 
@@ -97,13 +91,6 @@ def _compile_all_but_sampling() -> None:
     warm_up_refinement()
     # No pair has that many matches: everything but the estimate.
     warm_up_pipeline(Parameters.from_mapping({'min_inliers': 10_000}))
-
-
-def _rays(count: int) -> list[NDArray[np.float64]]:
-    """Rays and row times of two frames."""
-    rng = np.random.default_rng(0)
-    ahead = np.array([0.0, 0.0, 3.0])
-    return [*(ahead + rng.normal(size=(2, count, 3))), *rng.uniform(0.0, 0.03, (2, count))]
 
 
 if __name__ == '__main__':

@@ -18,11 +18,12 @@ from rs_relpose_ros.images.headers import encoded_image_size
 Bytes = NDArray[np.uint8]
 Gray = NDArray[np.uint8]
 
-# Longest side of an image [px]: far above any camera, far below what exhausts memory.
+# Largest side [px] and area [px^2] of an image: far above any camera, far below what exhausts
+# memory.
 MAX_IMAGE_SIDE = 16384
 MAX_IMAGE_PIXELS = 64 * 1024 * 1024
 
-# Encoding -> (channels, conversion of OpenCV). The order of a '8UC3' is not told; as cv_bridge.
+# Encoding -> (channels, conversion of OpenCV). '8UC3' names no order; it is read as by cv_bridge.
 _COLOR = {
     'bgr8': (3, cv2.COLOR_BGR2GRAY),
     '8UC3': (3, cv2.COLOR_BGR2GRAY),
@@ -132,7 +133,7 @@ class CompressedImage:
         """
         width, height = encoded_image_size(self.data)
         check_image_size(width, height)
-        # A rotated image would have its rows in another order than they were read.
+        # Not turned upright: rows must stay in the order in which the sensor reads them.
         try:
             image = cv2.imdecode(self.data,
                                  cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)

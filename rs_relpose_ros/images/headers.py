@@ -13,7 +13,7 @@ _JPEG_SIGNATURE = b'\xff\xd8\xff'
 _START_OF_FRAME = frozenset(range(0xc0, 0xd0)) - {0xc4, 0xc8, 0xcc}
 # Markers without a length field: TEM and RST0 to RST7.
 _STANDALONE = frozenset({0x01, *range(0xd0, 0xd8)})
-# Cameras pad their JPEGs; the end marker lies within so many bytes of the end.
+# Most bytes after the end marker of a JPEG: cameras pad their files.
 _PADDING = 4096
 
 
@@ -40,7 +40,7 @@ def _png_size(start: bytes, data: NDArray[np.uint8]) -> tuple[int, int]:
 
 
 def _jpeg_size(data: NDArray[np.uint8]) -> tuple[int, int]:
-    # The decoder fills what is missing with gray and calls it an image.
+    # The decoder would fill missing rows with gray and report no error.
     if b'\xff\xd9' not in data[-_PADDING:].tobytes():
         raise InputError(f'JPEG image of {len(data)} bytes is truncated')
     at = 2

@@ -1,12 +1,12 @@
-"""Which sentences about bad input mean the same: what comes from outside must not fill memory."""
+"""Sentences about bad input grouped by their cause, in bounded memory."""
 
 from __future__ import annotations
 
 import re
 
-# Numbers vary from message to message, the cause does not.
+# Numbers in a sentence: they differ from message to message of one cause.
 _NUMBERS = re.compile(r'[-+]?\d[\d.e+-]*')
-# Causes told apart; a source that makes up new texts must not fill log or memory.
+# Most causes that are told apart: a source that makes up new texts must not fill log or memory.
 MOST_CAUSES = 64
 
 

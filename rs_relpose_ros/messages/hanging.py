@@ -1,6 +1,6 @@
-"""Sensors that hang or are saturated: they repeat themselves bit by bit, which noise never does.
+"""Sensors that hang or are saturated: they repeat their values bit by bit, which noise never does.
 
-What they say under ever new stamps would make wrong poses that look good.
+Repeated values under new stamps would give wrong poses that look good.
 """
 
 from __future__ import annotations
@@ -14,13 +14,14 @@ from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.timing import to_nanoseconds
 from rs_relpose_ros.imu.samples import ImuSample
 
+# Every so many bytes of two images are compared first: nearly always one of them differs.
 _STRIDE = 1009
-# Of a slow IMU two or three equal ones may be chance.
+# Fewest equal samples of a hanging gyro: two or three of a slow one may be equal by chance.
 _FEWEST_SAMPLES = 4
-# No gyro has a range below 125 deg/s [rad/s].
+# Smallest range of a gyro [rad/s]: no product has less than 125 deg/s.
 _LEAST_RANGE = 2.0
-# A driver or a filter may clip below it: at the largest value that ever came, and above what the
-# bias of a coarse gyro repeats at rest [rad/s].
+# Smallest value [rad/s] at which a driver or filter clips: it is the largest value seen so far,
+# and larger than the bias that a gyro of coarse resolution repeats at rest.
 _LEAST_CLIPPING = 0.2
 
 
@@ -34,9 +35,8 @@ class HangingCamera:
     def problem(self, stamp_ns: int, data: NDArray[np.uint8]) -> str:
         """Why an image message's data (K,) shows nothing new; empty for no reason."""
         previous, self._previous = self._previous, data
-        # A message that comes twice is no fault of the camera.
+        # A message that is delivered twice is no fault of the camera.
         again, self._stamp_ns = stamp_ns == self._stamp_ns, stamp_ns
-        # A few bytes tell nearly always.
         if (previous is not None and not again and len(previous) == len(data)
                 and np.array_equal(previous[::_STRIDE], data[::_STRIDE])
                 and np.array_equal(previous, data)):
@@ -75,7 +75,7 @@ class HangingGyro:
         if sample.angular_velocity is None or self._longest_ns == 0:
             return False
         for axis, value in enumerate(sample.angular_velocity):
-            # A clock that was set back begins anew.
+            # After the clock was set back the time of repetition counts from here.
             if value != self._values[axis] or sample.stamp_ns < self._since_ns[axis]:
                 self._values[axis], self._since_ns[axis] = value, sample.stamp_ns
                 self._counts[axis] = 0

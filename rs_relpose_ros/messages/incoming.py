@@ -24,7 +24,7 @@ from rs_relpose_ros.images.encoded import (
 )
 from rs_relpose_ros.imu.samples import ImuSample, Orientation
 
-# Largest values of an IMU, far above any sensor, far below what filters overflow at.
+# Largest values of an IMU: far above any sensor, far below an overflow of the filters.
 MAX_ANGULAR_VELOCITY = 1e3   # rad/s
 MAX_LINEAR_ACCELERATION = 1e4   # m/s^2
 
@@ -116,7 +116,7 @@ def intrinsics_from_info(msg: Any) -> Intrinsics:
     coefficients = _field(msg, 'd')
     if len(coefficients) > 64:
         raise InputError(f'd of CameraInfo has {len(coefficients)} coefficients')
-    # 0 means "not told" in both fields: no binning, and the full sensor.
+    # 0 in these fields means "not set": no binning, and the full sensor.
     binning_x, binning_y = max(int(msg.binning_x), 1), max(int(msg.binning_y), 1)
     roi = msg.roi
     roi_width, roi_height = int(roi.width) or width, int(roi.height) or height

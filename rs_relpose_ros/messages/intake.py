@@ -14,7 +14,7 @@ from rs_relpose_ros.messages.hanging import HangingCamera, HangingGyro
 from rs_relpose_ros.messages.incoming import PublishedImage
 from rs_relpose_ros.messages.sensor_feed import Role, SensorFeed
 
-# Images that wait for the first CameraInfo: it comes with the first image, before or after it.
+# Most images that wait for the first CameraInfo, which may come before or after its image.
 _HELD_IMAGES = 4
 
 
@@ -98,7 +98,7 @@ class Intake:
                 self._refuse_without_intrinsics(self._held.popleft())
 
     def _add_frame(self, image: PublishedImage, intrinsics: Intrinsics) -> None:
-        # Compared here, before any image is dropped: the one after it would pass for new.
+        # Compared before any image is dropped: after a gap a repeated image would pass for new.
         problem = self._camera.problem(image.stamp_ns, image.image.data)
         if problem:
             self._sequencer.refuse(image.stamp_ns, Refusal.BAD_IMAGE, problem)

@@ -79,7 +79,8 @@ def relative_pose_message(result: PairResult, types: MessageTypes,
     """
     frame_id = reference_frame or f'{result.frame_id}_reference'
     pose = types('geometry_msgs/msg/Pose')(
-        position=_point(result.pose.t, types), orientation=_quaternion(result.pose.R, types))
+        position=_xyz('Point', result.pose.t, types),
+        orientation=_quaternion(result.pose.R, types))
     return types('geometry_msgs/msg/PoseWithCovarianceStamped')(
         header=header(result.stamp_ns, frame_id, types),
         pose=types('geometry_msgs/msg/PoseWithCovariance')(
@@ -99,8 +100,8 @@ def velocity_message(result: PairResult, types: MessageTypes) -> Any:
     Angular in rad/s, linear in baselines per second.
     """
     twist = types('geometry_msgs/msg/Twist')(
-        linear=_vector(result.pose.linear_velocity2, types),
-        angular=_vector(result.pose.angular_velocity2, types))
+        linear=_xyz('Vector3', result.pose.linear_velocity2, types),
+        angular=_xyz('Vector3', result.pose.angular_velocity2, types))
     return types('geometry_msgs/msg/TwistWithCovarianceStamped')(
         header=header(result.stamp_ns, result.frame_id, types),
         twist=types('geometry_msgs/msg/TwistWithCovariance')(
@@ -128,7 +129,7 @@ def pose_stamped_message(stamp_ns: int, frame_id: str, R: NDArray[np.float64],
                          position: NDArray[np.float64], types: MessageTypes) -> Any:
     """geometry_msgs/PoseStamped."""
     pose = types('geometry_msgs/msg/Pose')(
-        position=_point(position, types), orientation=_quaternion(R, types))
+        position=_xyz('Point', position, types), orientation=_quaternion(R, types))
     return types('geometry_msgs/msg/PoseStamped')(
         header=header(stamp_ns, frame_id, types), pose=pose)
 
@@ -198,14 +199,10 @@ def _quaternion(R: NDArray[np.float64], types: MessageTypes) -> Any:
     return types('geometry_msgs/msg/Quaternion')(x=x, y=y, z=z, w=w)
 
 
-def _point(vector: NDArray[np.float64], types: MessageTypes) -> Any:
+def _xyz(name: str, vector: NDArray[np.float64], types: MessageTypes) -> Any:
+    """geometry_msgs/Point or Vector3."""
     x, y, z = (float(value) for value in vector)
-    return types('geometry_msgs/msg/Point')(x=x, y=y, z=z)
-
-
-def _vector(vector: NDArray[np.float64], types: MessageTypes) -> Any:
-    x, y, z = (float(value) for value in vector)
-    return types('geometry_msgs/msg/Vector3')(x=x, y=y, z=z)
+    return types(f'geometry_msgs/msg/{name}')(x=x, y=y, z=z)
 
 
 def _covariance(covariance: NDArray[np.float64]) -> NDArray[np.float64]:

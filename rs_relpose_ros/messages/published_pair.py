@@ -25,9 +25,9 @@ from rs_relpose_ros.messages.outgoing import (
 
 Array = NDArray[np.float64]
 
-# How far what is published with length 1 may be from it.
+# Largest deviation from 1 of the length of directions, quaternions and rays.
 _UNIT_TOLERANCE = 1e-3
-# Largest velocity, far above any camera, far below what overflows.
+# Largest velocity [baselines/s, rad/s]: far above any camera, far below an overflow.
 _MAX_VELOCITY = 1e9
 
 
@@ -179,7 +179,7 @@ def match_records(cloud: Any) -> NDArray[np.void]:
 
 def _unit(name: str, message: Any, axes: str) -> Array:
     values = np.array([getattr(message, axis) for axis in axes], dtype=np.float64)
-    # What is not finite has no such length either.
+    # Written so that NaN fails it.
     if not abs(math.hypot(*values) - 1.0) <= _UNIT_TOLERANCE:
         raise InputError(f'{name} must have length 1, got {values.tolist()}')
     return values

@@ -20,7 +20,7 @@ class Role(str, Enum):
     """Part that a topic plays.
 
     The value is the name of the topic that the node subscribes to, and of the field that holds
-    the topic of a bag in `rs_relpose_ros.bags.reader.SensorTopics`.
+    the topic of a bag in `rs_relpose_ros.bags.topics.SensorTopics`.
     """
 
     IMU = 'imu'

@@ -10,13 +10,13 @@ from rs_relpose_ros.front_end.pair import PairResult
 
 Color = NDArray[np.uint8]
 
-# Wider images are shrunk: it is a picture for people, and big messages cost.
+# Largest width [px]; wider images are shrunk, because publishing large messages is slow.
 _MAX_WIDTH = 960
 _BAR_WIDTH = 14
 _CAPTION_HEIGHT = 24
 _OUTLIER = (255, 255, 0)
 _WHITE = (255, 255, 255)
-# Fractions of a pixel, as OpenCV's drawing takes them.
+# Fractional bits of the coordinates that OpenCV draws at.
 _SHIFT = 4
 
 
@@ -31,7 +31,7 @@ def draw_debug_image(result: PairResult) -> Color:
     height, width = result.image2.shape
     scale = min(1.0, _MAX_WIDTH / width)
     size = (round(scale * width), round(scale * height))
-    # Darker, so that the lines stand out.
+    # Two thirds of the brightness, so that the lines stand out.
     gray = cv2.resize(result.image2, size, interpolation=cv2.INTER_AREA) // 3 * 2
     canvas = np.asarray(cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
     points1, points2 = result.matches.points1, result.matches.points2

@@ -11,16 +11,16 @@ import time
 import numpy as np
 
 from rs_relpose_ros.front_end.drift import Drift
-from rs_relpose_ros.front_end.pair import PairResult
+from rs_relpose_ros.front_end.pair import PAIR_FIGURES, PairResult
 from rs_relpose_ros.front_end.sequencer import Refusal, SequencerCounts
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 
 OK, WARN, ERROR = 0, 1, 2
 
-# Pairs that the latency, and frames that the time of a frame is taken from.
+# Numbers of the latest pairs and frames over which latency and time per frame are taken.
 _RECENT_PAIRS = 300
 _RECENT_FRAMES = 900
-# An input that is silent for so long is missing.
+# Time without a message [s] after which an input counts as missing.
 SILENCE = 2.0
 
 
@@ -37,11 +37,11 @@ class Report:
 class Inputs:
     """What has come so far; of each topic the number of messages."""
 
-    images: int
-    camera_infos: int
-    imu: int
-    accelerometer: int
-    invalid: int
+    images: int = 0
+    camera_infos: int = 0
+    imu: int = 0
+    accelerometer: int = 0
+    invalid: int = 0
 
 
 class Statistics:
@@ -62,7 +62,7 @@ class Statistics:
         self._last_pose: PairResult | None = None
         self._last_no_pose = ''
         self._since_ns = clock()
-        self._counted = Inputs(0, 0, 0, 0, 0)
+        self._counted = Inputs()
         self._refused_before = self._overload_before = 0
         self._frame_times: deque[float] = deque(maxlen=_RECENT_FRAMES)
         self._busy_ns = 0
@@ -156,10 +156,7 @@ class Statistics:
                 ('clock_jumps', str(counts.clock_jumps if counts else 0)),
                 ('pairs', str(self._pairs)),
                 ('poses', str(self._poses)),
-                ('matches', str(len(last.pose.inliers)) if last else ''),
-                ('inliers', str(int(last.pose.inliers.sum())) if last else ''),
-                ('inlier_ratio', f'{_inlier_ratio(last):.3f}' if last else ''),
-                ('parallax_px', f'{last.parallax:.1f}' if last else ''),
+                *((figure.name, figure.text(last)) for figure in PAIR_FIGURES),
                 ('model', pose.pose.model if pose else ''),
                 *_drift_values(last.drift if last else None),
                 ('latency_p50_ms', latency[0]),
@@ -193,10 +190,6 @@ def _milliseconds(seconds: Collection[float]) -> tuple[str, str]:
         return '', ''
     median, p99 = 1e3 * np.percentile(list(seconds), (50, 99))
     return f'{median:.1f}', f'{p99:.1f}'
-
-
-def _inlier_ratio(result: PairResult) -> float:
-    return float(result.pose.inliers.mean()) if len(result.pose.inliers) else 0.0
 
 
 def _drift_values(drift: Drift | None) -> tuple[tuple[str, str], ...]:

@@ -21,7 +21,7 @@ from rs_relpose_ros.config.declarations import Declared
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError
 
-# What rclpy's names of QoS overrides begin with.
+# Prefix of the parameters by which rclpy overrides the QoS of a topic.
 _QOS = 'qos_overrides.'
 
 

@@ -1,8 +1,8 @@
 """Topics that are read when their messages are needed, instead of waking the process each time.
 
-Waking up for a message costs rclpy more than the message itself: it builds a new wait set of all
-that the node has. An IMU wakes hundreds of times a second, while its samples are needed thirty
-times: when a frame asks for them. Until then the middleware keeps them.
+A wake-up costs rclpy more than the message itself, because it builds a new wait set of all that
+the node has. An IMU would wake it hundreds of times a second, while its samples are needed only
+when a frame asks for them, some thirty times. Until then they stay in the queue of the middleware.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import deserialize_message
 
-# Most messages that are taken in one go: others have their turn in between.
+# Most messages that are taken at once, so that other callbacks get their turn.
 _MOST_AT_ONCE = 2000
-# CDR of a message that begins with a header: encapsulation and stamp.
+# Bytes of CDR before the frame_id of a message with a header: encapsulation (4) and stamp (8).
 _STAMPED = 12
 
 

@@ -104,7 +104,8 @@ def draw_residuals(records: Sequence[PairRecord], path: Path) -> None:
     series = (
         ([r.residual_rms for r in known], 'residual of inliers,\nrms [px]'),
         ([100.0 * r.inliers / max(r.matches, 1) for r in known], 'inliers [%]'),
-        ([r.gyro_difference for r in known], 'rotation: estimate\nagainst gyro [deg]'))
+        ([r.figures['rotation_difference_to_gyro_deg'] for r in known],
+         'rotation: estimate\nagainst gyro [deg]'))
     for axis, (values, label) in zip(axes, series, strict=True):
         finite = np.isfinite(np.array(values, dtype=np.float64))
         if finite.any():

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.estimator.result import Status
-from rs_relpose_ros.front_end.pair import PairResult
-from rs_relpose_ros.replay.truth import PairErrors, rotation_angle, TrueTrajectory
+from rs_relpose_ros.front_end.pair import PAIR_FIGURES, PairResult
+from rs_relpose_ros.replay.truth import PairErrors, TrueTrajectory
 
 Array = NDArray[np.float64]
 
@@ -22,8 +23,8 @@ class PairRecord:
     ----------
     reference_ns1, reference_ns2 : int
         Instants of the two stamped rows on the IMU clock.
-    gyro_difference : float
-        Angle between the estimated rotation and the integrated gyro [deg]; NaN without either.
+    figures : dict
+        Values of `PAIR_FIGURES` by name.
     errors : PairErrors or None
         Against the truth; None without it.
     """
@@ -40,33 +41,29 @@ class PairRecord:
     t: Array
     covariance: Array
     gyro_rotation: Array | None
-    gyro_difference: float
+    figures: Mapping[str, float]
     matches: int
     inliers: int
-    parallax: float
     residual_rms: float
     iterations: int
     duration: float
     errors: PairErrors | None
 
 
-def pair_record(result: PairResult, reference_ns1: int, reference_ns2: int,
-                truth: TrueTrajectory | None = None) -> PairRecord:
+def pair_record(result: PairResult, truth: TrueTrajectory | None = None) -> PairRecord:
     """Figures of a pair, and its errors where there is a truth."""
     pose = result.pose
-    difference = float('nan')
-    if result.gyro_rotation is not None:
-        difference = rotation_angle(pose.R.T @ result.gyro_rotation)
     errors = None
     if truth is not None:
-        errors = truth.errors(pose.R, pose.t, reference_ns1, reference_ns2)
+        errors = truth.errors(pose.R, pose.t, result.reference_ns1, result.reference_ns2)
     return PairRecord(
         reference_stamp_ns=result.reference_stamp_ns, stamp_ns=result.stamp_ns,
-        reference_ns1=reference_ns1, reference_ns2=reference_ns2, interval=result.interval,
+        reference_ns1=result.reference_ns1, reference_ns2=result.reference_ns2,
+        interval=result.interval,
         status=pose.status, reason=pose.reason, model=pose.model, R=pose.R, t=pose.t,
         covariance=pose.covariance, gyro_rotation=result.gyro_rotation,
-        gyro_difference=difference, matches=len(result.matches.points1),
-        inliers=int(np.count_nonzero(pose.inliers)), parallax=result.parallax,
+        figures={figure.name: figure.of(result) for figure in PAIR_FIGURES},
+        matches=len(result.matches), inliers=int(np.count_nonzero(pose.inliers)),
         residual_rms=pose.residual_rms, iterations=pose.iterations, duration=pose.duration,
         errors=errors)
 

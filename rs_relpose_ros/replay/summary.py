@@ -15,10 +15,11 @@ import numba
 import numpy as np
 import scipy
 
-from rs_relpose_ros.bags.reader import SensorTopics
+from rs_relpose_ros.bags.topics import SensorTopics
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.front_end.drift import Drift
+from rs_relpose_ros.front_end.pair import PAIR_FIGURES
 from rs_relpose_ros.replay.record import PairRecord
 from rs_relpose_ros.replay.run import ReplayCounts
 from rs_relpose_ros.replay.truth import median_and_p90
@@ -64,14 +65,8 @@ def summarize(records: Sequence[PairRecord], counts: ReplayCounts,
         'invalid_messages': counts.invalid_messages,
         'not_used': counts.reasons,
         'medians': {
-            'matches': _median([r.matches for r in answered]),
-            'inliers': _median([r.inliers for r in answered]),
-            'inlier_ratio': _median([r.inliers / r.matches for r in answered if r.matches]),
-            'residual_rms_px': _median([r.residual_rms for r in answered]),
-            'parallax_px': _median([r.parallax for r in answered]),
-            'interval_s': _median([r.interval for r in answered]),
-            'rotation_difference_to_gyro_deg': _median([r.gyro_difference for r in answered]),
-        },
+            figure.name: _median([record.figures[figure.name] for record in answered])
+            for figure in PAIR_FIGURES},
         'errors_against_truth': _errors(answered),
         'timing': {
             'bag_s': _finite(counts.bag_seconds),

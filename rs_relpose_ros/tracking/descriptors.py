@@ -12,7 +12,7 @@ from rs_relpose_ros.config.tracking import TrackingConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.tracking.corners import feature_rows
 from rs_relpose_ros.tracking.images import checked, Image
-from rs_relpose_ros.tracking.matches import Matches
+from rs_relpose_ros.tracking.matches import Matches, TrackIds
 
 Array = NDArray[np.float64]
 Descriptors = NDArray[np.uint8] | NDArray[np.float32]
@@ -44,7 +44,7 @@ class DescriptorTracker:
         else:
             self._detector = cv2.ORB.create(nfeatures=config.max_descriptors)
             self._norm, self._depth = cv2.NORM_HAMMING, cv2.CV_32S
-        self._next_id = 0
+        self._ids = TrackIds()
         self.reset()
 
     def reset(self) -> None:
@@ -52,7 +52,7 @@ class DescriptorTracker:
         self._shape: tuple[int, ...] | None = None
         self._reference: _Keypoints | None = None
         self._current: _Keypoints | None = None
-        self._matches = _no_matches()
+        self._matches = Matches.none()
         self._most = 0
 
     @property
@@ -100,7 +100,7 @@ class DescriptorTracker:
         if self._current is None:
             raise InputError('the tracker has no current image: call start() first')
         self._reference = self._current
-        self._matches = _no_matches()
+        self._matches = Matches.none()
         self._most = 0
 
     # -- inside ------------------------------------------------------------------------------
@@ -117,9 +117,8 @@ class DescriptorTracker:
         _, once = np.unique(points, axis=0, return_index=True)
         kept = np.sort(once)
         kept = kept[(points[kept, 1] >= first) & (points[kept, 1] <= last)]
-        ids = (np.arange(self._next_id, self._next_id + len(kept)) % 2**32).astype(np.uint32)
-        self._next_id += len(kept)
-        return _Keypoints(ids, points[kept], np.ascontiguousarray(descriptors[kept]))
+        return _Keypoints(self._ids.take(len(kept)), points[kept],
+                          np.ascontiguousarray(descriptors[kept]))
 
     def _match(self, first: _Keypoints,
                second: _Keypoints) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
@@ -149,7 +148,3 @@ class DescriptorTracker:
 def _no_keypoints() -> _Keypoints:
     return _Keypoints(np.empty(0, dtype=np.uint32), np.empty((0, 2)),
                       np.empty((0, 0), dtype=np.uint8))
-
-
-def _no_matches() -> Matches:
-    return Matches(np.empty(0, dtype=np.uint32), np.empty((0, 2)), np.empty((0, 2)), np.empty(0))

@@ -1,0 +1,203 @@
+"""The drive loop: what becomes of errors, and parameters that change in mid-run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.config.parameter_file import read_parameters
+from rs_relpose_ros.config.parameters import Parameters
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.front_end.frame import Frame
+from rs_relpose_ros.front_end.front_end import FrameFailed, FrameProcessed, FrontEnd, Outcome
+from rs_relpose_ros.front_end.pair import PairResult
+from rs_relpose_ros.front_end.sequencer import FrameRefused
+from rs_relpose_ros.geometry.intrinsics import Intrinsics
+from rs_relpose_ros.imu.samples import ImuSample
+from rs_relpose_ros.messages.intake import Intake
+from rs_relpose_ros.node.outputs import PairPublishers
+
+MS = 1_000_000
+INTRINSICS = Intrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=32.0, cy=24.0,
+                        image_width=64, image_height=48)
+SENSOR = {'readout_time': 0.02, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0]}
+
+
+# -- errors ----------------------------------------------------------------------------------
+
+
+def front_end_with(error: Exception, monkeypatch: pytest.MonkeyPatch, *,
+                   offline: bool) -> FrontEnd:
+    """Three frames are ready, and the tracking of the second one fails."""
+    front_end = FrontEnd(Parameters.from_mapping(SENSOR), offline=offline)
+    process = front_end._pipeline.process
+
+    def failing(frame: Frame, *others: Any) -> PairResult | None:
+        if frame.stamp_ns == 100 * MS:
+            raise error
+        return process(frame, *others)
+
+    monkeypatch.setattr(front_end._pipeline, 'process', failing)
+    for ms in range(0, 300, 5):
+        front_end.sequencer.add_imu(ImuSample(ms * MS, (0.0, 0.1, 0.0), (0.0, -9.81, 0.0)))
+    rng = np.random.default_rng(0)
+    for ms in (50, 100, 150):
+        image = rng.integers(0, 256, (48, 64), dtype=np.uint8)
+        front_end.sequencer.add_frame(Frame(ms * MS, image, 'camera', INTRINSICS))
+    return front_end
+
+
+@pytest.mark.parametrize('offline', [False, True])
+def test_an_error_of_the_package_fails_its_frame_alone(monkeypatch, offline):
+    error = InputError('no such image')
+    front_end = front_end_with(error, monkeypatch, offline=offline)
+    first, failed, third = (front_end.step() for _ in range(3))
+    assert isinstance(first, FrameProcessed) and isinstance(third, FrameProcessed)
+    assert isinstance(failed, FrameFailed)
+    assert (failed.stamp_ns, failed.error) == (100 * MS, error)
+    assert front_end.step() is None
+
+
+def test_a_programming_error_is_an_outcome_live_and_leaves_a_replay(monkeypatch):
+    error = ZeroDivisionError()
+    live = front_end_with(error, monkeypatch, offline=False)
+    assert [type(live.step()) for _ in range(3)] == [FrameProcessed, FrameFailed, FrameProcessed]
+    offline = front_end_with(error, monkeypatch, offline=True)
+    assert isinstance(offline.step(), FrameProcessed)
+    with pytest.raises(ZeroDivisionError):
+        offline.step()
+
+
+def test_a_refusal_is_an_outcome():
+    front_end = FrontEnd(Parameters.from_mapping(SENSOR), offline=True)
+    image = np.zeros((48, 64), dtype=np.uint8)
+    front_end.sequencer.add_frame(Frame(50 * MS, image, 'camera', INTRINSICS))
+    assert front_end.step() is None
+    front_end.sequencer.close()
+    assert isinstance(front_end.step(), FrameRefused)
+
+
+# -- parameters that may change while running ------------------------------------------------
+
+
+LIVE = [name for name, _, declared in Parameters.declarations() if declared.live]
+# Of each a value that must show in the pairs that close after it was set.
+CHANGED: dict[str, Any] = {
+    'threshold': 0.3, 'pixel_sigma': 1.5, 'gravity_sigma': 0.3, 'gyro_sigma': 0.1,
+    'confidence': 0.6, 'max_iterations': 2, 'time_limit': 1e-9, 'min_inliers': 5000,
+    'min_parallax': 400.0, 'min_keyframe_parallax': 2.0, 'max_keyframe_interval': 0.01,
+    'max_keyframe_frames': 2, 'min_tracked_fraction': 1.0, 'track_time_offset': True}
+# Shows in what the node publishes.
+OF_THE_NODE = {'publish_debug_image'}
+FRAMES = 60
+CHANGE_AFTER = 2   # pairs
+
+
+@pytest.fixture(scope='module')
+def parameters(bundled_bag) -> Parameters:
+    """With a time offset to be tracked, and so narrow a threshold that sampling goes on."""
+    return read_parameters(bundled_bag.with_name('hand_held.yaml'), [
+        'time_offset=0.01', 'threshold=0.1', 'min_inliers=10'])
+
+
+@pytest.fixture(scope='module')
+def recorded(bundled_bag) -> list[Any]:
+    """Role and message of the first frames of the bundled bag."""
+    messages: list[Any] = []
+    images = 0
+    with open_bag(bundled_bag) as bag:
+        feed = Intake(FrontEnd(Parameters.from_mapping(SENSOR)).sequencer).feed
+        for role, message in feed.messages(bag, bag.find_topics()):
+            messages.append((role, message.message))
+            images += role.value == 'image'
+            if images > FRAMES:
+                break
+    return messages
+
+
+def outcomes(recorded: list[Any], front_end: FrontEnd) -> Iterator[Outcome]:
+    intake = Intake(front_end.sequencer)
+    for role, message in recorded:
+        intake.receive(role, message)
+        while (outcome := front_end.step()) is not None:
+            yield outcome
+
+
+def figures(pair: PairResult) -> tuple[Any, ...]:
+    pose = pair.pose
+    return (pair.reference_stamp_ns, pair.stamp_ns, pose.status, pose.iterations,
+            pose.R.tobytes(), pose.t.tobytes(), pose.covariance.tobytes(),
+            pose.inliers.tobytes(), pair.drift.applied)
+
+
+def pairs_of_run(recorded: list[Any], parameters: Parameters,
+                 changed: Parameters) -> Iterator[tuple[Any, ...]]:
+    """Figures of each pair; `changed` is set when the one of `CHANGE_AFTER` has closed."""
+    front_end = FrontEnd(parameters, offline=True)
+    pairs = 0
+    for outcome in outcomes(recorded, front_end):
+        assert isinstance(outcome, FrameProcessed)
+        if outcome.pair is not None:
+            yield figures(outcome.pair)
+            pairs += 1
+            if pairs == CHANGE_AFTER:
+                front_end.parameters = changed
+
+
+@pytest.fixture(scope='module')
+def unchanged(recorded, parameters) -> list[tuple[Any, ...]]:
+    return list(pairs_of_run(recorded, parameters, parameters))
+
+
+def test_every_live_parameter_is_tried():
+    assert set(LIVE) == CHANGED.keys() | OF_THE_NODE
+
+
+@pytest.mark.parametrize('name', CHANGED)
+def test_a_live_parameter_has_its_effect_from_the_next_frame_on(
+        recorded, parameters, unchanged, name):
+    changed = parameters.updated({name: CHANGED[name]})
+    pairs = pairs_of_run(recorded, parameters, changed)
+    for before in unchanged[:CHANGE_AFTER]:
+        assert next(pairs) == before
+    assert any(now != before for now, before in zip(
+        pairs, unchanged[CHANGE_AFTER:], strict=False))
+
+
+class Publisher:
+    """Stands for a publisher that somebody listens to."""
+
+    def __init__(self) -> None:
+        self.published: list[Any] = []
+
+    def get_subscription_count(self) -> int:
+        return 1
+
+    def publish(self, message: Any) -> None:
+        self.published.append(message)
+
+
+class Publishers:
+    """Stands for a node: makes publishers."""
+
+    def __init__(self) -> None:
+        self.by_topic: dict[str, Publisher] = {}
+
+    def create_publisher(self, msgtype: Any, topic: str, depth: int) -> Publisher:
+        return self.by_topic.setdefault(topic, Publisher())
+
+
+def test_publishing_of_debug_images_can_be_switched_while_running(recorded, parameters):
+    front_end = FrontEnd(parameters, offline=True, keep_images=True)
+    pair = next(o.pair for o in outcomes(recorded, front_end)
+                if isinstance(o, FrameProcessed) and o.pair is not None)
+    node = Publishers()
+    outputs = PairPublishers(node, parameters.pair)  # type: ignore[arg-type]
+    for wanted, pictures in ((True, 1), (False, 1), (True, 2)):
+        config = parameters.updated({'publish_debug_image': wanted}).pair
+        outputs.publish_picture(pair, config)
+        assert len(node.by_topic['~/debug_image'].published) == pictures
