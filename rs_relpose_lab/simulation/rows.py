@@ -91,7 +91,9 @@ def see(world: Array, motion: Motion, view: View, margin: float = 0.0) -> Array:
     left = np.arange(len(world))
     before = np.full(len(world), 0.5 * (view.height - 1))
     projected = project(left, before)[:, 1]
-    rows, slope = projected, np.zeros(len(world))
+    ahead = np.isfinite(projected)
+    left, before, projected = left[ahead], before[ahead], projected[ahead]
+    rows, slope = projected, np.zeros(len(left))
     for _ in range(_MAX_ROUNDS):
         # A row far outside only says "not in the image"; the motion need not reach there.
         rows = np.clip(rows, -view.height, 2 * view.height)
