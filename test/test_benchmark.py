@@ -2,25 +2,28 @@
 
 import csv
 from dataclasses import replace
+from operator import attrgetter
 
 import numpy as np
 import pytest
 
-from rs_relpose_lab.experiments import accuracy
-from rs_relpose_lab.experiments.accuracy import (
-    estimate,
-    Experiment,
-    run_experiment,
-    told_config,
-    Trial,
-)
+from rs_relpose_lab.experiments import accuracy, accuracy_report, speed_report
+from rs_relpose_lab.experiments.accuracy import AccuracyRun, OracleCache, run_accuracy, Trial
 from rs_relpose_lab.experiments.accuracy_report import cell_statistics, consistency, summary
 from rs_relpose_lab.experiments.cell_names import matching_cells
-from rs_relpose_lab.experiments.oracle_cache import OracleCache
-from rs_relpose_lab.experiments.peers import available_methods, derotated, LIBRARY
+from rs_relpose_lab.experiments.methods import as_pair, METHODS, prepared, run_method
 from rs_relpose_lab.experiments.problems import Cell, CELLS, make_problem
-from rs_relpose_lab.experiments.scoring import NO_POSE, pose_error, PoseError
-from rs_relpose_lab.experiments.speed import compare, exponent, FirstEstimate, medians, Run, soak
+from rs_relpose_lab.experiments.scoring import NO_POSE, PoseError
+from rs_relpose_lab.experiments.speed import (
+    compare,
+    COMPARED,
+    exponent,
+    LIBRARY,
+    medians,
+    REFERENCE,
+    soak,
+    Timing,
+)
 from rs_relpose_lab.experiments.speed_report import method_statistics, write_report
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.errors import InputError
@@ -75,32 +78,55 @@ def test_consistency_tells_right_from_overconfident(overconfidence):
     assert found.above == pytest.approx({1.0: 0.05, 2.0: 0.355}[overconfidence], abs=0.01)
 
 
-def test_experiment_keeps_the_oracle(tmp_path, monkeypatch):
-    experiment = Experiment(('forward-base',), ('paper',), (1.0, 2.0), trials=2)
+@pytest.fixture(scope='module')
+def run(tmp_path_factory):
+    """Two problems of a cell, told right and double sigmas; the folder keeps the oracle."""
+    folder = tmp_path_factory.mktemp('oracle')
+    asked = AccuracyRun(('sideways-base',), ('gaussian',), (1.0, 2.0), trials=2)
     counts = []
-    first = run_experiment(experiment, OracleCache(tmp_path), on_trials=counts.append)
-    assert sum(counts) == len(first) == 4
-    assert {(t.seed, t.sigma_factor) for t in first} == {(0, 1.0), (0, 2.0), (1, 1.0), (1, 2.0)}
-    assert all(t.error.rotation < 0.5 for t in first)
+    trials = run_accuracy(asked, OracleCache(folder), on_trials=counts.append)
+    assert sum(counts) == asked.estimates == len(trials) == 4
+    return asked, folder, trials
+
+
+def test_the_oracle_is_kept(run, monkeypatch):
+    asked, folder, trials = run
+    assert {(t.seed, t.sigma_factor) for t in trials} == {(0, 1.0), (0, 2.0), (1, 1.0), (1, 2.0)}
+    assert all(t.error.rotation < 0.5 for t in trials)
 
     def forbidden(*args):
         raise AssertionError('asked again')
     monkeypatch.setattr(accuracy, 'oracle_estimate', forbidden)
-    again = run_experiment(experiment, OracleCache(tmp_path))
-    assert [(t.error, t.oracle) for t in again] == [(t.error, t.oracle) for t in first]
+    again = run_accuracy(asked, OracleCache(folder))
+    assert [(t.error, t.oracle) for t in again] == [(t.error, t.oracle) for t in trials]
 
 
-def test_accuracy_writes_tables_and_a_plot(tmp_path, capsys):
-    code = main(['benchmark', 'accuracy', '--trials', '2', '--cells', 'sideways-base', '--noise',
-                 'gaussian', '--output', str(tmp_path)])
-    assert code == 0
+def test_plot_of_accuracy_shows_the_statistics(run, tmp_path):
+    _, _, trials = run
+    cells = [cell_statistics([t for t in trials if t.sigma_factor == factor])
+             for factor in (1.0, 2.0)]
+    figure = accuracy_report.draw(tmp_path / 'accuracy.png', cells)
+    assert (tmp_path / 'accuracy.png').read_bytes().startswith(b'\x89PNG')
+    for axis, value in zip(figure.axes, ('rotation_ratio.median', 'translation_ratio.median',
+                                         'nees.mean'), strict=True):
+        shown = [line.get_xdata()[0] for line in axis.lines if line.get_marker() == 'o']
+        assert shown == [attrgetter(value)(cell) for cell in cells]
+    assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == ['sideways-base']
+
+
+def test_command_writes_tables_and_a_plot(run, tmp_path, capsys):
+    _, oracle, trials = run
+    assert main(['benchmark', 'accuracy', '--trials', '2', '--cells', 'sideways-base', '--noise',
+                 'gaussian', '--cache', str(oracle), '--output', str(tmp_path)]) == 0
     report = (tmp_path / 'accuracy.md').read_text()
     assert report in capsys.readouterr().out
-    assert 'sideways-base' in report
+    statistics = cell_statistics([t for t in trials if t.sigma_factor == 1.0])
+    assert f'| sideways-base | {statistics.rotation.text(3)} |' in report
     with (tmp_path / 'trials.csv').open() as file:
-        assert [row['seed'] for row in csv.DictReader(file)] == ['0', '1']
-    assert (tmp_path / 'cells.csv').is_file()
-    assert (tmp_path / 'accuracy.png').stat().st_size > 10_000
+        assert [float(row['error_rotation']) for row in csv.DictReader(file)] == [
+            t.error.rotation for t in trials if t.sigma_factor == 1.0]
+    assert {path.name for path in tmp_path.iterdir()} == {
+        'accuracy.md', 'accuracy.png', 'trials.csv', 'cells.csv'}
 
 
 @pytest.mark.parametrize(('arguments', 'complaint'), [
@@ -114,15 +140,25 @@ def test_bad_input_is_one_line(arguments, complaint, capsys, tmp_path):
     assert complaint in capsys.readouterr().err
 
 
-@pytest.mark.parametrize('method', available_methods(), ids=lambda method: method.name)
-def test_every_method_answers_in_our_convention(method):
+@pytest.mark.parametrize('name', [name for name, m in METHODS.items() if not m.continuous_gyro])
+def test_every_method_answers_in_our_convention(name):
     # A camera at rest in each frame: a global shutter, on which all of them are right.
-    problem = make_problem(STILL, 1)
-    pose = method.prepare(problem, STILL, 1)()
-    assert pose is not None
-    error = pose_error(*pose, problem.R, problem.t)
-    assert error.rotation < 0.02
-    assert error.translation < 0.1
+    status, error = run_method(name, as_pair(make_problem(STILL, 1), STILL), 1)
+    assert status.value == 'OK'
+    assert error.rotation < 0.1
+    assert error.translation < 0.5
+
+
+@pytest.mark.parametrize('name', ['opencv_derotated', 'poselib_derotated'])
+def test_derotated_points_make_a_turning_camera_a_global_shutter(name):
+    cell = replace(STILL, rate=3.0)
+    pair = as_pair(make_problem(cell, 1), cell)
+    if name not in METHODS:
+        pytest.skip('PoseLib is not installed')
+    error, raw = (run_method(method, pair, 1)[1]
+                  for method in (name, name.removesuffix('_derotated')))
+    assert error.rotation < 0.1 < 1.0 < raw.rotation
+    assert error.translation < 0.5
 
 
 @pytest.mark.parametrize('seed', [60, 88, 89])
@@ -130,46 +166,46 @@ def test_gravity_off_by_a_degree_does_not_end_the_search(seed):
     # Angular hypotheses from gravity explain half of the matches of these problems, wrongly.
     cell = CELLS['sideways-gravity-1']
     problem = make_problem(cell, seed, 'gaussian')
-    pose = estimate(problem, told_config(cell, 1.0, 'auto'), seed)
-    assert pose_error(pose.R, pose.t, problem.R, problem.t, pose.covariance).rotation < 0.3
+    pair = as_pair(problem, cell)
+    pose = prepared(METHODS['auto'], pair, seed)()
+    assert pair.error(pose).rotation < 0.3
     assert pose.inliers[~problem.is_outlier].mean() > 0.95
 
 
-def test_derotated_points_are_where_row_0_would_have_seen_them():
-    cell = replace(STILL, rate=1.0, pixel_noise=0.0, gyro_noise=0.0)
-    turning, still = make_problem(cell, 2), make_problem(replace(cell, rate=0.0), 2)
-    # The scenes are equal; the first points of both see the same world where both see it.
-    near = derotated(turning.points1, turning.measured_rate1)
-    gaps = np.linalg.norm(near[:, None] - still.points1[None], axis=2).min(axis=1)
-    assert np.median(gaps) < 1e-3
-    assert np.median(np.linalg.norm(
-        turning.points1[:, None] - still.points1[None], axis=2).min(axis=1)) > 1.0
-
-
 def test_comparison_and_its_report(tmp_path):
-    runs = compare('forward-base', 100, trials=1, repeats=1)
-    names = [method.name for method in available_methods()]
-    assert [run.method for run in runs] == names
-    assert all(run.matches == 100 and run.duration > 0.0 for run in runs)
-    report = write_report(tmp_path, runs, runs, [FirstEstimate(50.0, 3.0)], soak(10))
-    assert all(name in report for name in names)
+    timings = compare('forward-base', 100, trials=1, repeats=1)
+    assert [timing.method for timing in timings] == list(COMPARED)
+    assert all(timing.matches == 100 and timing.duration > 0.0 for timing in timings)
+    report = write_report(tmp_path, timings, timings, [(50.0, 3.0)], soak(10))
+    statistics = {entry.method: entry for entry in method_statistics(timings)}
+    for name in COMPARED:
+        row = next(line for line in report.splitlines() if line.startswith(f'| {name} '))
+        assert [cell.strip() for cell in row.split('|')[2:6:2]] == [
+            statistics[name].time.text(2), statistics[name].rotation.text(3)]
     assert 'First estimate 50 ms' in report
     assert 'after 10 estimates' in report
     assert {path.name for path in tmp_path.iterdir()} == {
         'runs.csv', 'methods.csv', 'scaling.csv', 'speed.md', 'speed.png'}
 
 
+def timings_of(method, factor):
+    """Five problems each, of times in proportion to the square of the number of matches."""
+    return [Timing('forward-base', n, method, seed, factor * n**2 * (1.0 + 0.1 * seed), 0.1, 0.1)
+            for n in (300, 1000, 3000) for seed in range(5)]
+
+
 def test_growth_is_the_slope_of_the_logarithms():
-    runs = [Run('forward-base', n, LIBRARY, seed, 1e-3 * n**2 * (1.0 + 0.1 * seed), 0.1, 0.1)
-            for n in (300, 1000, 3000) for seed in (0, 1, 2)]
-    assert medians(runs, LIBRARY)[1000] == pytest.approx(1100.0)
-    assert exponent(medians(runs, LIBRARY)) == pytest.approx(2.0)
+    timings = timings_of(LIBRARY, 1e-3)
+    assert medians(timings, LIBRARY)[1000] == pytest.approx(1200.0)
+    assert exponent(medians(timings, LIBRARY)) == pytest.approx(2.0)
 
 
-def test_times_are_compared_problem_by_problem():
-    runs = [Run('forward-base', 300, name, seed, factor * (1.0 + seed), 0.1, 0.1)
-            for name, factor in (('PoseLib, derotated points', 10.0), (LIBRARY, 4.0))
-            for seed in range(5)]
-    ratios = {entry.method: entry.time_ratio for entry in method_statistics(runs)}
-    assert ratios == {'PoseLib, derotated points': pytest.approx(1.0),
-                      LIBRARY: pytest.approx(0.4)}
+def test_times_are_compared_problem_by_problem(tmp_path):
+    timings = [*timings_of(REFERENCE, 10.0), *timings_of(LIBRARY, 4.0)]
+    statistics = method_statistics(timings)
+    assert {(entry.method, round(entry.time_ratio, 9)) for entry in statistics} == {
+        (REFERENCE, 1.0), (LIBRARY, 0.4)}
+    _, right = speed_report.draw(tmp_path / 'speed.png', statistics, timings).axes
+    assert [(list(line.get_xdata()), list(line.get_ydata())) for line in right.lines] == [
+        (list(times), list(times.values()))
+        for times in (medians(timings, REFERENCE), medians(timings, LIBRARY))]

@@ -11,23 +11,24 @@ from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.experiments import oracle, problems
+from rs_relpose_lab.experiments.accuracy import OracleCache
 from rs_relpose_lab.experiments.oracle import Objective, oracle_estimate, start_at
-from rs_relpose_lab.experiments.oracle_cache import OracleCache
 from rs_relpose_lab.experiments.problems import Cell, CELLS, make_problem
 from rs_relpose_lab.experiments.scoring import pose_error, PoseError
+from rs_relpose_lab.simulation import rows
 
 NO_NOISE = {'pixel_noise': 0.0, 'gravity_noise': 0.0, 'gyro_noise': 0.0, 'outliers': 0.0}
 SIGMAS = 0.5, np.radians(0.2), np.radians(0.1)
 
 
-@pytest.mark.parametrize('module', [oracle, problems])
+@pytest.mark.parametrize('module', [oracle, problems, rows])
 def test_it_uses_nothing_of_the_package(module):
     tree = ast.parse(Path(module.__file__).read_text(encoding='utf-8'))
     imported = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import)
                 for alias in node.names}
     imported |= {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
     assert {name for name in imported if name.startswith('rs_relpose')} <= {
-        'rs_relpose_lab.experiments.problems'}
+        'rs_relpose_lab.experiments.problems', 'rs_relpose_lab.simulation.rows'}
 
 
 @pytest.mark.parametrize('cell', ['forward-base', 'sideways-v10-w3', 'forward-v0-w3'])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm, t
 
-from rs_relpose_lab.experiments.calibration_accuracy import CalibrationRun, Figure, write_report
+from rs_relpose_lab.experiments.calibration_accuracy import CalibrationRun, Found, write_report
 from rs_relpose_ros.calibrate.covariance import jackknife, stretches
 from rs_relpose_ros.calibrate.gyro_path import noise_density
 
@@ -63,14 +63,14 @@ def test_noise_density_of_a_moving_gyro():
 
 
 def test_table_of_the_benchmark(tmp_path):
-    good = Figure(0.1, 0.2, True)
+    good = Found(0.1, 0.2, True)
     run = CalibrationRun(
         seed=0, axis_map=3, readout_time=20.0, time_offset=5.0, rotation_rate=30.0, speed=1.0,
         gyro_rate=200.0, readout=good, offset=good, rotation_error=0.05, rotation_x=good,
         rotation_y=good, rotation_z=good, bias_x=good, bias_y=good, bias_z=good,
-        focal=Figure(math.nan, math.nan, False), axis_map_right=True, observable=True,
+        focal=Found(math.nan, math.nan, False), axis_map_right=True, observable=True,
         shutter='rolling')
-    off = dataclasses.replace(run, seed=1, readout=Figure(-0.6, 0.2, True), axis_map_right=False)
+    off = dataclasses.replace(run, seed=1, readout=Found(-0.6, 0.2, True), axis_map_right=False)
     text = write_report(tmp_path, [run, off])
     row = next(line for line in text.splitlines() if 'read-out' in line)
     # Within the limit, within 1 sigma and within 2 sigma [%].

@@ -12,16 +12,10 @@ import pytest
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_lab.experiments.boxes import Box, by_box, Record, tables, with_totals
+from rs_relpose_lab.experiments.methods import run_method
 from rs_relpose_lab.experiments.omnidirectional import OmnidirectionalCamera
 from rs_relpose_lab.experiments.pair_imu import PairImu
-from rs_relpose_lab.experiments.paper_methods import run_method
-from rs_relpose_lab.experiments.paper_results import (
-    by_cell,
-    Cell,
-    Record,
-    table_lines,
-    with_totals,
-)
 from rs_relpose_lab.experiments.penncosyvio import (
     EXPERIMENT,
     Pair,
@@ -43,12 +37,14 @@ from rs_relpose_lab.experiments.penncosyvio_simulated import (
     SimulatedSequence,
 )
 from rs_relpose_lab.experiments.recorded_motion import RecordedMotion
+from rs_relpose_lab.experiments.scoring import NO_POSE, PoseError
 from rs_relpose_lab.simulation.inertial import ImuModel
 from rs_relpose_lab.simulation.render import Renderer
 from rs_relpose_lab.simulation.scene import make_scene
 from rs_relpose_ros.cli import main
 from rs_relpose_ros.config.imu import ImuConfig
 from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.geometry.timing import ImageClock
 from rs_relpose_ros.imu.samples import ImuSample
 
@@ -290,9 +286,9 @@ def test_recorded_pair_is_estimated_with_the_imu_as_mounted(made, tmp_path):
     assert np.degrees(Rotation.from_matrix(gyro.rotation.T @ problem.R).magnitude()) < 0.05
     assert gyro.interval == pytest.approx(1.0, abs=1e-6)
     for method in run.methods:
-        outcome = run_method(method, problem, 0)
-        assert outcome.rotation_error < 0.2, method
-        assert outcome.translation_error < 3.0, method
+        _, error = run_method(method, problem, 0)
+        assert error.rotation < 0.2, method
+        assert error.translation < 3.0, method
     # The IMU the wrong way round: the gyro's rotation is off by far.
     text = (made / 'tools/misc/extrinsic_calibration.txt').read_text()
     wrong = overwritten(made, tmp_path, 'tools/misc/extrinsic_calibration.txt',
@@ -368,19 +364,19 @@ def test_simulated_points_without_noise_are_exact(made):
     sequence = SimulatedSequence(made, 'as', run, Simulated(pixel_noise=0.0, outliers=0.0))
     problem = sequence.problem(Pair('as', 1, 11, 41))
     assert len(problem.points1) == 300
-    outcome = run_method('auto_gyro', problem, 0)
+    _, error = run_method('auto_gyro', problem, 0)
     # What is left is the gyro's: a bias of 0.1 deg/s over a second, and its noise.
-    assert outcome.rotation_error < 0.05
-    assert outcome.translation_error < 1.0
+    assert error.rotation < 0.05
+    assert error.translation < 1.0
 
 
 def test_rendered_pair_is_estimated(made):
     run = PennCosyvioRun(('as',), ('auto',))
     problem = SimulatedSequence(made, 'as', run, Simulated(rendered=True)).problem(
         Pair('as', 1, 3, 18))
-    outcome = run_method('auto', problem, 0)
+    _, error = run_method('auto', problem, 0)
     assert len(problem.points1) > 60
-    assert outcome.rotation_error < 0.5
+    assert error.rotation < 0.5
 
 
 @pytest.mark.parametrize('values', [{'pixel_noise': -1.0}, {'outliers': 0.99}, {'scene': 'none'}])
@@ -432,23 +428,20 @@ def test_bad_input_is_one_line_and_exit_code_2(made, tmp_path, arguments, said, 
 
 
 def test_totals_are_of_all_levels_of_a_case():
-    from rs_relpose_lab.experiments.paper_methods import Outcome
-    from rs_relpose_ros.estimator.result import Status
-    records = [Record(Cell('x', 'as', str(level)), 'auto', 0, Outcome(Status.OK, 1.0 * level, 2.0))
-               for level in (1, 2, 3)]
-    records.append(Record(Cell('x', 'af', '1'), 'auto', 0,
-                          Outcome.without_pose(Status.NO_CONSENSUS)))
-    cells = with_totals(by_cell(records))
-    assert [(cell.case, cell.level) for cell in cells] == [
+    records = [Record(Box('x', 'as', str(level)), 'auto', 0, Status.OK,
+                      PoseError(1.0 * level, 2.0)) for level in (1, 2, 3)]
+    records.append(Record(Box('x', 'af', '1'), 'auto', 0, Status.NO_CONSENSUS, NO_POSE))
+    boxes = with_totals(by_box(records))
+    assert [(box.case, box.level) for box in boxes] == [
         ('as', '1'), ('as', '2'), ('as', '3'), ('as', 'all'), ('af', '1'), ('af', 'all')]
-    assert list(cells[Cell('x', 'as', 'all')]['auto'].rotation) == [1.0, 2.0, 3.0]
-    shown = table_lines(cells, {('x', 'as'): '', ('x', 'af'): ''}, 'part')
-    assert 'no pose: auto, 1 of 1' in shown
+    assert list(boxes[Box('x', 'as', 'all')]['auto'].rotation) == [1.0, 2.0, 3.0]
+    shown = tables(boxes, {('x', 'as'): '', ('x', 'af'): ''}, 'part')
+    assert 'no pose: auto, 1 of 1\n' in shown
 
 
 @pytest.mark.recordings
 def test_recorded_trajectories_carry_a_simulation(recordings, tmp_path, capsys):
-    """Every hundredth frame only: 24 pairs; figures of all pairs stand in docs/evaluation.md."""
+    """Every hundredth frame: 24 pairs; figures of more stand in docs/lab/evaluation.md."""
     assert penncosyvio(recordings / 'penncosyvio', '--trajectory-only', '--every', '100',
                        '--solvers', 'auto_gyro', 'global_5pt', '--output', tmp_path) == 0
     with (tmp_path / 'cells.csv').open() as file:

@@ -237,7 +237,7 @@ def test_overview_names_every_command_and_imports_none():
     ended = run(sys.executable, '-m', f'{NAME}.cli.main', '--help',
                 env={**os.environ, 'COLUMNS': '400'})
     assert ended.returncode == 0
-    for name, one_line in command_line.COMMANDS.items():
+    for name, (_, one_line) in command_line.COMMANDS.items():
         assert re.search(rf'{name}\s+{one_line}', ' '.join(ended.stdout.split()))
     package = loaded_after(f'import {NAME}')
     overview = loaded_after(f'import {NAME}.cli.main as m; m.main(["--help"])')

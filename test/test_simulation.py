@@ -281,22 +281,6 @@ def test_clocks_and_coverage():
     assert imu_ns[-1] > simulation.reference_ns(5) + 50_000_000
 
 
-def test_true_pose_relates_the_frames():
-    simulation = simulate(SimulationConfig(seed=3, **TINY), scene=blob_wall()[0])
-    first_ns, second_ns = simulation.reference_ns(10), simulation.reference_ns(25)
-    pose = simulation.true_pose(first_ns, second_ns)
-    states = simulation.states([first_ns, second_ns])
-    world = np.random.default_rng(0).normal((8.0, 0.0, 1.0), size=(10, 3))
-    in1, in2 = ((world - p) @ R for p, R in zip(states.position, states.R_world_cam, strict=True))
-    np.testing.assert_allclose(in2 @ pose.R.T + pose.t, in1, atol=1e-12)
-    later = simulation.true_pose(first_ns, first_ns + 1_000_000)
-    np.testing.assert_allclose(later.t / 1e-3, pose.linear_velocity1, atol=0.02)
-    np.testing.assert_allclose(Rotation.from_matrix(later.R).as_rotvec() / 1e-3,
-                               pose.angular_velocity1, atol=0.02)
-    back = simulation.true_pose(second_ns, second_ns - 1_000_000)
-    np.testing.assert_allclose(-back.t / 1e-3, pose.linear_velocity2, atol=0.02)
-
-
 @pytest.fixture(scope='module')
 def bundled():
     """Arguments in bags/README.md and the simulation that they describe."""

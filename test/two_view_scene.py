@@ -71,13 +71,20 @@ def expose(world, R, p, w, v, reference_row, iterations):
 
     Of one camera, or of N: `R` a rotation or N of them, `p`, `w`, `v` (3,) or (N, 3).
     """
-    rows = np.full(len(world), HEIGHT / 2)
+    rows, tau = np.full(len(world), HEIGHT / 2), np.empty(len(world))
+    local, settled = np.empty((len(world), 3)), np.empty(len(world), dtype=bool)
+    left = np.arange(len(world))
     for _ in range(iterations):
-        tau = (rows - reference_row) * LINE_DELAY
-        local = seen_from(world, R, p, w, v, tau)
-        moved = FOCAL * local[:, 1] / local[:, 2] + CENTRE[1]
-        settled = np.abs(moved - rows) < 1e-9
-        rows = moved
+        turn = R if R.single else R[left]
+        at, velocity, rate = (x if np.ndim(x) == 1 else x[left] for x in (p, v, w))
+        tau[left] = (rows[left] - reference_row) * LINE_DELAY
+        local[left] = seen_from(world[left], turn, at, rate, velocity, tau[left])
+        moved = FOCAL * local[left, 1] / local[left, 2] + CENTRE[1]
+        settled[left] = np.abs(moved - rows[left]) < 1e-9
+        # Another round would leave the others where they are, to the last bit.
+        again = moved != rows[left]
+        rows[left] = moved
+        left = left[again]
     return local, tau, settled
 
 

@@ -1,82 +1,89 @@
-"""``rs_relpose benchmark``: accuracy against an oracle, speed beside others, the live node."""
+"""``rs_relpose benchmark``: what the package reaches, measured; see benchmarks/README.md."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 import sys
+from typing import NamedTuple
 
+from rs_relpose_ros.cli.options import progress_bar
 from rs_relpose_ros.config.estimator import SOLVER_CHOICES
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 
 HELP = ('Measure the estimator on simulated frame pairs, one thread each: "accuracy" against an '
         'oracle that knows the true matches and starts at the truth, "speed" beside OpenCV and '
         'PoseLib, "all" both as the project reports them. "live" measures the node: latency, '
-        'dropped frames, processor time and memory at camera rate. "calibration" compares that of '
-        'simulated recordings with the truth. Writes tables (CSV, Markdown) and plots into a '
-        'folder.')
+        'dropped frames, processor time and memory at camera rate; "unseen" its poses on other '
+        'bags. "calibration" compares that of simulated tracks with the truth, "calibration-bags" '
+        'that of rendered bags. Writes tables (CSV, Markdown) and plots into a folder.')
+
+
+class Benchmark(NamedTuple):
+    """A benchmark: one line of help, its description, its arguments, its run.
+
+    `seed_of`, `jobs`: what its options of these names are for, where it has them.
+    """
+
+    help: str
+    description: str
+    add_arguments: Callable[[argparse.ArgumentParser], object]
+    run: Callable[[argparse.Namespace], int]
+    folder: str
+    first_seed: int = 0
+    seed_of: str = ''
+    jobs: str = ''
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the benchmarks and their arguments."""
     benchmarks = parser.add_subparsers(dest='benchmark', metavar='BENCHMARK', required=True)
-    _add_accuracy_arguments(benchmarks.add_parser(
-        'accuracy', help='errors, covariance and lost poses in every cell of the experiment',
-        description='Errors by those of the oracle, normalised errors and lost poses, over many '
-                    'random problems (300 matches) in every cell of the experiment.'))
-    _add_speed_arguments(benchmarks.add_parser(
-        'speed', help='time and accuracy beside OpenCV and PoseLib',
-        description='Time and accuracy of this library, OpenCV (USAC_MAGSAC) and PoseLib on the '
-                    'same problems, how time grows with matches, and the first estimate of a new '
-                    'process.'))
-    _add_live_arguments(benchmarks.add_parser(
-        'live', help='the node at camera rate: latency, drops, processor time, memory',
-        description='Plays simulated recordings at 30 Hz to a relpose_node, two processes over '
-                    'Fast DDS. Needs ROS. A cell is an image size, a format (mono8, bgr8, jpeg) '
-                    'and a rate of the IMU; each is rendered once into OUTPUT/clips.'))
-    _add_calibration_arguments(benchmarks.add_parser(
-        'calibration', help='`rs_relpose calibrate` on simulated tracks, against the truth',
-        description='Errors, sigmas and verdicts of the calibration over many simulated '
-                    'recordings of 300 frames: read-out time, offset, axes, gyro and motion are '
-                    'drawn, the focal length is asked for in every other round of the 24 axis '
-                    'maps.'))
-    _add_all_arguments(benchmarks.add_parser(
-        'all', help='accuracy and speed, as the project reports them',
-        description='Both with their defaults, told sigmas also half and twice the '
-                    'true ones, and memory over 100,000 estimates: some hours on one core.'))
+    for name, benchmark in BENCHMARKS.items():
+        one = benchmarks.add_parser(name, help=benchmark.help, description=benchmark.description)
+        benchmark.add_arguments(one)
+        if benchmark.seed_of:
+            one.add_argument('--seed', type=int, default=benchmark.first_seed, metavar='N',
+                             help=f'seed of the first {benchmark.seed_of} (default: %(default)s)')
+        if benchmark.jobs:
+            one.add_argument('--jobs', type=int, default=1, metavar='N',
+                             help=f'{benchmark.jobs} (default: %(default)s)')
+        one.add_argument('--output', type=Path, default=Path('out', benchmark.folder),
+                         metavar='DIR', help='folder of the tables (default: %(default)s)')
 
 
-def _add_common_arguments(parser: argparse.ArgumentParser, folder: str, *, seed_of: str = '',
-                          jobs: str = '') -> None:
-    """``--output``, and what a benchmark has of ``--seed`` and ``--jobs``."""
-    if seed_of:
-        parser.add_argument('--seed', type=int, default=0, metavar='N',
-                            help=f'seed of the first {seed_of} (default: %(default)s)')
-    if jobs:
-        parser.add_argument('--jobs', type=int, default=1, metavar='N',
-                            help=f'{jobs} (default: %(default)s)')
-    parser.add_argument('--output', type=Path, default=Path(folder), metavar='DIR',
-                        help='folder of the tables (default: %(default)s)')
+def run(args: argparse.Namespace) -> int:
+    """Run the benchmark that was asked for."""
+    if args.benchmark not in ('live', 'unseen'):
+        from rs_relpose_lab.experiments.workers import use_one_thread
+        use_one_thread()
+    for name in ('jobs', 'seed'):
+        if name in args:
+            _check_at_least(int(name == 'jobs'), args, name)
+    return BENCHMARKS[args.benchmark].run(args)
 
 
-def _add_all_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('--trials', type=int, default=200, metavar='N',
-                        help='problems a cell of the accuracy benchmark (default: 200)')
-    parser.add_argument('--soak', type=int, default=100_000, metavar='N',
-                        help='see whether memory grows over N estimates (default: 100000)')
-    _add_common_arguments(parser, 'out/benchmark', jobs='processes of the accuracy benchmark')
+def _check_at_least(low: int, args: argparse.Namespace, *names: str) -> None:
+    for name in names:
+        value = getattr(args, name)
+        if min(value) < low if isinstance(value, list) else value < low:
+            raise InputError(f'--{name} must be at least {low}, got {value}')
 
 
-def _add_calibration_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('--runs', type=int, default=240, metavar='N',
-                        help='recordings (default: 240)')
-    _add_common_arguments(parser, 'out/calibration', seed_of='recording', jobs='processes')
+def _tell(report: str, folder: Path) -> int:
+    print(report)
+    print(f'written to {folder}')
+    return 0
 
 
-def _add_accuracy_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('--trials', type=int, default=200, metavar='N',
-                        help='problems a cell (default: 200)')
+def _number(parser: argparse.ArgumentParser, option: str, default: int, text: str) -> None:
+    parser.add_argument(option, type=int, default=default, metavar='N',
+                        help=f'{text} (default: %(default)s)')
+
+
+def _accuracy_arguments(parser: argparse.ArgumentParser) -> None:
+    _number(parser, '--trials', 200, 'problems a cell')
     parser.add_argument('--cells', nargs='+', default=['all'], metavar='NAME',
                         help='cells by name, with * as in file names, e.g. "forward-*" '
                              '(default: all)')
@@ -88,34 +95,69 @@ def _add_accuracy_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--sigma-factor', nargs='+', type=float, default=[1.0], metavar='X',
                         help='tell the estimator so many times the true sigmas (default: 1)')
     parser.add_argument('--solver', choices=SOLVER_CHOICES, default='auto', help='(default: auto)')
-    _add_common_arguments(
-        parser, 'out/accuracy', seed_of='problem of a cell', jobs='processes; times are '
-        'comparable only where each has a core of its own')
     parser.add_argument('--cache', type=Path, metavar='DIR',
                         help="folder that keeps the oracle's results (default: OUTPUT/oracle)")
 
 
-def _add_speed_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('--trials', type=int, default=50, metavar='N',
-                        help='problems a cell (default: 50)')
+def _run_accuracy(args: argparse.Namespace) -> int:
+    from rs_relpose_lab.experiments.accuracy import AccuracyRun, OracleCache, run_accuracy
+    from rs_relpose_lab.experiments.accuracy_report import write_report
+    from rs_relpose_lab.experiments.cell_names import matching_cells
+    from rs_relpose_lab.experiments.problems import CELLS
+
+    _check_at_least(1, args, 'trials')
+    if min(args.sigma_factor) <= 0.0:
+        raise InputError(f'--sigma-factor must be positive, got {min(args.sigma_factor)}')
+    accuracy = AccuracyRun(
+        matching_cells(args.cells, CELLS), tuple(dict.fromkeys(args.noise)),
+        tuple(dict.fromkeys(args.sigma_factor)), args.trials, args.seed, args.solver)
+    with progress_bar(accuracy.estimates, 'estimate') as bar:
+        trials = run_accuracy(accuracy, OracleCache(args.cache or args.output / 'oracle'),
+                              args.jobs, bar.update)
+    return _tell(write_report(args.output, accuracy, trials), args.output)
+
+
+def _speed_arguments(parser: argparse.ArgumentParser) -> None:
+    _number(parser, '--trials', 50, 'problems a cell')
     parser.add_argument('--cells', nargs='+', metavar='NAME',
                         default=['*-base', '*-v0-w0', '*-outliers-60'],
                         help='cells by name, with * as in file names (default: the base cells, '
                              'cameras at rest, 60 %% outliers)')
     parser.add_argument('--matches', nargs='+', type=int, default=[300, 1000, 3000, 10000],
-                        metavar='N',
-                        help='numbers of matches over which time is shown (default: 300 1000 '
-                             '3000 10000)')
-    parser.add_argument('--repeats', type=int, default=3, metavar='N',
-                        help='the shortest of so many repeats counts (default: 3)')
-    parser.add_argument('--processes', type=int, default=3, metavar='N',
-                        help='new processes whose first estimate is timed (default: 3)')
-    parser.add_argument('--soak', type=int, default=0, metavar='N',
-                        help='see whether memory grows over N estimates (default: 0, do not)')
-    _add_common_arguments(parser, 'out/speed', seed_of='problem')
+                        metavar='N', help='numbers of matches over which time is shown (default: '
+                        '300 1000 3000 10000)')
+    _number(parser, '--repeats', 3, 'the shortest of so many repeats counts')
+    _number(parser, '--processes', 3, 'new processes whose first estimate is timed')
+    _number(parser, '--soak', 0, 'see whether memory grows over N estimates')
 
 
-def _add_live_arguments(parser: argparse.ArgumentParser) -> None:
+def _run_speed(args: argparse.Namespace) -> int:
+    from rs_relpose_lab.experiments.cell_names import matching_cells
+    from rs_relpose_lab.experiments.problems import Cell, CELLS
+    from rs_relpose_lab.experiments.speed import compare, first_estimates, soak
+    from rs_relpose_lab.experiments.speed_report import write_report
+
+    _check_at_least(1, args, 'trials', 'repeats')
+    _check_at_least(0, args, 'processes', 'soak')
+    _check_at_least(50, args, 'matches')
+    cells = matching_cells(args.cells, CELLS)
+    # Large problems need fewer: their times scatter less.
+    few = max(args.trials // 5, 1)
+    # First, so that nothing else of this process holds the processor's caches.
+    first = first_estimates(args.processes)
+    with progress_bar(len(cells) * args.trials + len(args.matches) * few, 'problem') as bar:
+        comparison = [timing for cell in cells for timing in compare(
+            cell, Cell().matches, args.trials, args.repeats, args.seed, bar.update)]
+        scaling = [timing for count in sorted(set(args.matches)) for timing in compare(
+            cells[0], count, few, args.repeats, args.seed, bar.update)]
+    soaked = None
+    if args.soak:
+        with progress_bar(args.soak + args.soak // 10, 'estimate') as bar:
+            soaked = soak(args.soak, bar.update)
+    return _tell(write_report(args.output, comparison, scaling, first, soaked), args.output)
+
+
+def _live_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--cells', nargs='+', default=['all'], metavar='NAME',
                         help='cells by name, with * as in file names, e.g. "640x480-*" or '
                              '1280x720-mono8-imu400 (default: all)')
@@ -128,117 +170,18 @@ def _add_live_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--profile', type=Path, metavar='FILE',
                         help='Fast DDS profile for images above 512 KB (default: the shipped '
                              'config/fastdds.xml)')
-    _add_common_arguments(parser, 'out/live')
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run the benchmark that was asked for."""
-    if args.benchmark == 'live':
-        return _run_live(args)
-    from rs_relpose_lab.experiments.threads import use_one_thread
-    use_one_thread()
-    return {'accuracy': _run_accuracy, 'speed': _run_speed, 'calibration': _run_calibration,
-            'all': _run_all}[args.benchmark](args)
-
-
-def _run_all(args: argparse.Namespace) -> int:
-    """Each benchmark as its own command line would run it."""
-    parser = argparse.ArgumentParser()
-    add_arguments(parser)
-    accuracy = ['--trials', str(args.trials), '--jobs', str(args.jobs), '--sigma-factor', '1',
-                '0.5', '2', '--output', str(args.output / 'accuracy')]
-    speed = ['--soak', str(args.soak), '--output', str(args.output / 'speed')]
-    parsed = [parser.parse_args(['accuracy', *accuracy]), parser.parse_args(['speed', *speed])]
-    return max(run(one) for one in parsed)
-
-
-def _check_at_least(low: int, args: argparse.Namespace, *names: str) -> None:
-    for name in names:
-        value = getattr(args, name)
-        if min(value) < low if isinstance(value, list) else value < low:
-            raise InputError(f'--{name} must be at least {low}, got {value}')
-
-
-def _run_accuracy(args: argparse.Namespace) -> int:
-    from tqdm import tqdm
-
-    from rs_relpose_lab.experiments.accuracy import Experiment, run_experiment
-    from rs_relpose_lab.experiments.accuracy_report import write_report
-    from rs_relpose_lab.experiments.cell_names import matching_cells
-    from rs_relpose_lab.experiments.oracle_cache import OracleCache
-    from rs_relpose_lab.experiments.problems import CELLS
-
-    _check_at_least(1, args, 'trials', 'jobs')
-    _check_at_least(0, args, 'seed')
-    if min(args.sigma_factor) <= 0.0:
-        raise InputError(f'--sigma-factor must be positive, got {min(args.sigma_factor)}')
-    experiment = Experiment(
-        matching_cells(args.cells, CELLS), tuple(dict.fromkeys(args.noise)),
-        tuple(dict.fromkeys(args.sigma_factor)), args.trials, args.seed, args.solver)
-    total = (len(experiment.cells) * len(experiment.noises) * len(experiment.sigma_factors)
-             * experiment.trials)
-    with tqdm(total=total, unit='estimate', disable=not sys.stderr.isatty()) as bar:
-        trials = run_experiment(experiment, OracleCache(args.cache or args.output / 'oracle'),
-                                args.jobs, bar.update)
-    print(write_report(args.output, experiment, trials))
-    print(f'written to {args.output}')
-    return 0
-
-
-def _run_calibration(args: argparse.Namespace) -> int:
-    from tqdm import tqdm
-
-    from rs_relpose_lab.experiments.calibration_accuracy import run_calibrations, write_report
-
-    _check_at_least(1, args, 'runs', 'jobs')
-    _check_at_least(0, args, 'seed')
-    seeds = range(args.seed, args.seed + args.runs)
-    runs = []
-    for run in tqdm(run_calibrations(seeds, args.jobs), total=args.runs, unit='recording',
-                    disable=not sys.stderr.isatty()):
-        runs.append(run)
-        # A run that is stopped leaves what it has.
-        text = write_report(args.output, runs)
-    print(text)
-    print(f'written to {args.output}')
-    return 0
-
-
-def _run_speed(args: argparse.Namespace) -> int:
-    from tqdm import tqdm
-
-    from rs_relpose_lab.experiments.cell_names import matching_cells
-    from rs_relpose_lab.experiments.problems import Cell, CELLS
-    from rs_relpose_lab.experiments.speed import compare, first_estimates, soak
-    from rs_relpose_lab.experiments.speed_report import write_report
-
-    _check_at_least(1, args, 'trials', 'repeats')
-    _check_at_least(0, args, 'processes', 'soak', 'seed')
-    _check_at_least(50, args, 'matches')
-    cells = matching_cells(args.cells, CELLS)
-    # Large problems need fewer: their times scatter less.
-    few = max(args.trials // 5, 1)
-    quiet = not sys.stderr.isatty()
-    # First, so that nothing else of this process holds the processor's caches.
-    first = first_estimates(args.processes)
-    with tqdm(total=len(cells) * args.trials + len(args.matches) * few, unit='problem',
-              disable=quiet) as bar:
-        comparison = [run for cell in cells for run in compare(
-            cell, Cell().matches, args.trials, args.repeats, args.seed, bar.update)]
-        scaling = [run for count in sorted(set(args.matches)) for run in compare(
-            cells[0], count, few, args.repeats, args.seed, bar.update)]
-    soaked = None
-    if args.soak:
-        with tqdm(total=args.soak + args.soak // 10, unit='estimate', disable=quiet) as bar:
-            soaked = soak(args.soak, bar.update)
-    print(write_report(args.output, comparison, scaling, first, soaked))
-    print(f'written to {args.output}')
-    return 0
+def _need_ros(module: str) -> None:
+    """Say before minutes of rendering that a live benchmark cannot run."""
+    try:
+        import_module(f'rs_relpose_lab.live.{module}')
+    except ImportError as error:
+        raise MissingInputError(f'the live benchmark needs ROS 2 (rclpy, Fast DDS): {error}; '
+                                'source its setup.bash, or use the environment of make') from error
 
 
 def _run_live(args: argparse.Namespace) -> int:
-    from tqdm import tqdm
-
     from rs_relpose_lab.experiments.live import run_cell, select_cells
     from rs_relpose_lab.experiments.live_clip import FPS, PERIOD, prepare_clip
     from rs_relpose_lab.experiments.live_report import write_report, write_soak_report
@@ -247,23 +190,16 @@ def _run_live(args: argparse.Namespace) -> int:
     _check_at_least(5, args, 'duration')
     _check_at_least(0, args, 'soak')
     cells = select_cells(args.cells)
-    # Said before minutes of rendering.
-    try:
-        import_module('rs_relpose_lab.live.measured_run')
-    except ImportError as error:
-        raise MissingInputError(f'the live benchmark needs ROS 2 (rclpy, Fast DDS): {error}; '
-                                'source its setup.bash, or use the environment of make') from error
+    _need_ros('measured_run')
     duration = 60.0 * args.soak or args.duration
     profile = args.profile or _shipped('fastdds.xml')
     if not profile.is_file():
         raise InputError(f'there is no Fast DDS profile {profile}: choose one with --profile')
-    quiet = not sys.stderr.isatty()
     sizes = sorted({(cell.width, cell.height) for cell in cells})
-    with tqdm(total=len(sizes) * round(FPS * PERIOD), unit='frame', desc='rendering',
-              disable=quiet) as bar:
+    with progress_bar(len(sizes) * round(FPS * PERIOD), 'frame', 'rendering') as bar:
         clips = {size: prepare_clip(args.output / 'clips', *size, bar.update) for size in sizes}
     results, failed = [], False
-    with tqdm(total=round(len(cells) * duration), unit='s', disable=quiet) as bar:
+    with progress_bar(round(len(cells) * duration), 's') as bar:
         for cell in cells:
             bar.set_description(cell.name)
             try:
@@ -278,8 +214,7 @@ def _run_live(args: argparse.Namespace) -> int:
             if args.soak:
                 print(write_soak_report(args.output / cell.name, statistics, course))
     if results:
-        print(write_report(args.output, results))
-        print(f'written to {args.output}')
+        _tell(write_report(args.output, results), args.output)
     return int(failed)
 
 
@@ -290,4 +225,106 @@ def _shipped(name: str) -> Path:
     if checkout.is_file():
         return checkout
     # PREFIX/lib/pythonX/site-packages/PACKAGE, by pip and by colcon.
-    return package.parents[3] / 'share' / package.name / 'config' / name
+    return package.parents[3] / 'share' / 'rs_relpose_ros' / 'config' / name
+
+
+def _run_unseen(args: argparse.Namespace) -> int:
+    from rs_relpose_lab.experiments.unseen_bags import configurations, measure, write_report
+
+    _check_at_least(1, args, 'bags')
+    _need_ros('live_run')
+    bags = []
+    with progress_bar(args.bags, 'bag') as bar:
+        for config in configurations(args.bags, args.seed):
+            bags.append(measure(config, args.output / f'seed_{config.seed}'))
+            bar.update()
+    return _tell(write_report(args.output, bags), args.output)
+
+
+def _run_calibration(args: argparse.Namespace) -> int:
+    from rs_relpose_lab.experiments.calibration_accuracy import run_calibration, write_report
+    from rs_relpose_lab.experiments.workers import in_processes
+
+    _check_at_least(1, args, 'runs')
+    runs, report = [], ''
+    with progress_bar(args.runs, 'recording') as bar:
+        for found in in_processes(run_calibration, range(args.seed, args.seed + args.runs),
+                                  args.jobs):
+            runs.append(found)
+            # A run that is stopped leaves what it has.
+            report = write_report(args.output, runs)
+            bar.update()
+    return _tell(report, args.output)
+
+
+def _run_calibration_bags(args: argparse.Namespace) -> int:
+    from rs_relpose_lab.experiments.calibration_bags import measure, runs, write_report
+
+    _check_at_least(1, args, 'bags')
+    asked = runs(args.bags, args.seed)
+    bags = []
+    with progress_bar(len(asked), 'bag') as bar:
+        for seed, kind in asked:
+            bags.append(measure(seed, kind, args.output / f'{seed}'))
+            bar.update()
+    return _tell(write_report(args.output, bags), args.output)
+
+
+def _all_arguments(parser: argparse.ArgumentParser) -> None:
+    _number(parser, '--trials', 200, 'problems a cell of the accuracy benchmark')
+    _number(parser, '--soak', 100_000, 'see whether memory grows over N estimates')
+
+
+def _run_all(args: argparse.Namespace) -> int:
+    """Each benchmark as its own command line would run it."""
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    accuracy = ['accuracy', '--trials', str(args.trials), '--jobs', str(args.jobs),
+                '--sigma-factor', '1', '0.5', '2', '--output', str(args.output / 'accuracy')]
+    speed = ['speed', '--soak', str(args.soak), '--output', str(args.output / 'speed')]
+    return max([run(parser.parse_args(words)) for words in (accuracy, speed)])
+
+
+BENCHMARKS = {
+    'accuracy': Benchmark(
+        'errors, covariance and lost poses in every cell of the experiment',
+        'Errors by those of the oracle, normalised errors and lost poses, over many random '
+        'problems (300 matches) in every cell of the experiment.',
+        _accuracy_arguments, _run_accuracy, 'accuracy', seed_of='problem of a cell',
+        jobs='processes; times are comparable only where each has a core of its own'),
+    'speed': Benchmark(
+        'time and accuracy beside OpenCV and PoseLib',
+        'Time and accuracy of this library, OpenCV (USAC_MAGSAC) and PoseLib on the same '
+        'problems, how time grows with matches, and the first estimate of a new process.',
+        _speed_arguments, _run_speed, 'speed', seed_of='problem'),
+    'live': Benchmark(
+        'the node at camera rate: latency, drops, processor time, memory',
+        'Plays simulated recordings at 30 Hz to a relpose_node, two processes over Fast DDS. '
+        'Needs ROS. A cell is an image size, a format (mono8, bgr8, jpeg) and a rate of the IMU; '
+        'each is rendered once into OUTPUT/clips.', _live_arguments, _run_live, 'live'),
+    'unseen': Benchmark(
+        'the live node on bags that nobody tuned on',
+        'Renders bags of other seeds, scenes and read-outs than the demo has, plays each in real '
+        'time to a node of its own over Fast DDS, and compares node and OpenCV (at the threshold '
+        'that suits it best) with the truth. Needs ROS.',
+        lambda parser: _number(parser, '--bags', 10, 'number of bags'), _run_unseen, 'unseen',
+        first_seed=201, seed_of='bag'),
+    'calibration': Benchmark(
+        '`rs_relpose calibrate` on simulated tracks, against the truth',
+        'Errors, sigmas and verdicts of the calibration over many simulated recordings of 300 '
+        'frames: read-out time, offset, axes, gyro and motion are drawn, the focal length is '
+        'asked for in every other round of the 24 axis maps.',
+        lambda parser: _number(parser, '--runs', 240, 'recordings'), _run_calibration,
+        'calibration', seed_of='recording', jobs='processes'),
+    'calibration-bags': Benchmark(
+        '`rs_relpose calibrate` on rendered bags, end to end',
+        'Renders bags of walks with other scenes, read-outs, offsets and axes, one of a global '
+        'shutter and one whose camera turns about one axis only, and runs the command on each.',
+        lambda parser: _number(parser, '--bags', 6, 'bags of a walk'), _run_calibration_bags,
+        'calibration_bags', first_seed=301, seed_of='bag'),
+    'all': Benchmark(
+        'accuracy and speed, as the project reports them',
+        'Both with their defaults, told sigmas also half and twice the true ones, and memory over '
+        '100,000 estimates: some hours on one core.',
+        _all_arguments, _run_all, 'benchmark', jobs='processes of the accuracy benchmark'),
+}

@@ -3,44 +3,47 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 import dataclasses
-from importlib.metadata import PackageNotFoundError, version
 import json
-import math
 from pathlib import Path
 import platform
 import sys
 from typing import Any
 
-from tqdm import tqdm
-
-from rs_relpose_lab.experiments.paper import EXPERIMENTS, PAPER_EXPERIMENTS, PaperRun, run_paper
-from rs_relpose_lab.experiments.paper_methods import METHODS, PAPER_METHODS, PENNCOSYVIO_METHODS
-from rs_relpose_lab.experiments.paper_plots import draw_boxes
-from rs_relpose_lab.experiments.paper_results import (
-    by_cell,
+from rs_relpose_lab.experiments.boxes import (
+    by_box,
+    draw_boxes,
     Record,
-    table_lines,
+    tables,
     with_totals,
-    write_cells,
+    write_boxes,
     write_trials,
 )
-from rs_relpose_lab.experiments.paper_scenes import MOTIONS, SceneSettings
+from rs_relpose_lab.experiments.methods import METHODS
+from rs_relpose_lab.experiments.paper import (
+    EXACT,
+    METHODS_OF_THE_PAPER,
+    PaperRun,
+    run_paper,
+    Sweep,
+    SWEEPS,
+)
 from rs_relpose_lab.experiments.penncosyvio import (
-    DISTANCE,
-    EVERY,
     EXPERIMENT,
     GOPRO_READOUT,
+    METHODS_OF_THE_EXPERIMENT,
+    PairSource,
     PennCosyvioRun,
     RecordedSequence,
     run_penncosyvio,
-    Sequence,
     STRETCHES,
 )
 from rs_relpose_lab.experiments.penncosyvio_files import CAMERAS, GOPROS, IMUS
 from rs_relpose_lab.experiments.penncosyvio_simulated import Simulated, SimulatedSequence
+from rs_relpose_lab.experiments.problems import BASELINES
 from rs_relpose_lab.simulation.scene import SCENES
+from rs_relpose_ros.cli.options import package_version, progress_bar
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.camera import REFERENCE_ROWS
 
@@ -61,35 +64,22 @@ _PENNCOSYVIO_HELP = (
     'and IMU are not needed: points, or rendered images, and the IMU are simulated on the '
     'ground-truth trajectories. Writes the same files as evaluate paper.')
 
-_TRIALS_FILE, _CELLS_FILE, _RUN_FILE = 'trials.csv', 'cells.csv', 'run.json'
-_FAILED = 1
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class Sheet:
-    """Picture of an experiment: its title, what its axis shows, and that in a table's column."""
-
-    experiment: str
-    title: str
-    axis: str
-    column: str
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of both experiments."""
     experiments = parser.add_subparsers(dest='experiment', metavar='EXPERIMENT', required=True)
     paper = experiments.add_parser('paper', help='the synthetic experiments',
                                    description=_PAPER_HELP)
-    _add_common(paper, PAPER_METHODS, [name for name, method in METHODS.items()
+    _add_common(paper, METHODS_OF_THE_PAPER, [name for name, method in METHODS.items()
                                        if not method.continuous_gyro])
     paper.add_argument('--trials', type=int, default=100, metavar='N',
                        help='scenes of each level of each motion (default: 100, as in the paper)')
-    paper.add_argument('--figures', nargs='+', choices=EXPERIMENTS,
-                       default=list(PAPER_EXPERIMENTS), metavar='FIGURE',
-                       help=f'any of {", ".join(EXPERIMENTS)} (default: those of the paper, all '
+    paper.add_argument('--figures', nargs='+', choices=SWEEPS, metavar='FIGURE',
+                       default=[sweep.name for sweep in SWEEPS.values() if sweep.in_paper],
+                       help=f'any of {", ".join(SWEEPS)} (default: those of the paper, all '
                        'but the last)')
-    paper.add_argument('--motions', nargs='+', choices=MOTIONS, default=list(MOTIONS),
-                       metavar='MOTION', help=f'any of {", ".join(MOTIONS)} (default: both)')
+    paper.add_argument('--motions', nargs='+', choices=BASELINES, default=list(BASELINES),
+                       metavar='MOTION', help=f'any of {", ".join(BASELINES)} (default: both)')
     paper.add_argument('--jobs', type=int, default=1, metavar='N',
                        help='processes to run in (default: 1)')
     noise = paper.add_argument_group(
@@ -101,8 +91,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                        help='1 sigma [deg/s]')
     noise.add_argument('--outliers', type=float, default=0.0, metavar='SHARE',
                        help='share of the matches that are random, 0 to 0.95')
-
-
     cosyvio = experiments.add_parser('penncosyvio', help="the paper's experiment on real images",
                                      description=_PENNCOSYVIO_HELP)
     _add_penncosyvio(cosyvio)
@@ -111,7 +99,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _add_penncosyvio(parser: argparse.ArgumentParser) -> None:
     defaults = {field.name: field.default for field in dataclasses.fields(PennCosyvioRun)}
     parser.add_argument('folder', type=Path, metavar='FOLDER')
-    _add_common(parser, PENNCOSYVIO_METHODS, list(METHODS))
+    _add_common(parser, METHODS_OF_THE_EXPERIMENT, list(METHODS))
     parser.add_argument('--sequences', nargs='+', choices=STRETCHES, default=list(STRETCHES),
                         metavar='SEQUENCE', help=f'any of {", ".join(STRETCHES)} (default: both)')
     parser.add_argument('--camera', choices=CAMERAS, default=defaults['camera'],
@@ -121,9 +109,9 @@ def _add_penncosyvio(parser: argparse.ArgumentParser) -> None:
                         f'{GOPRO_READOUT:g} for the GoPros, what the authors quote)')
     parser.add_argument('--stamp-row', choices=REFERENCE_ROWS, default=defaults['stamp_row'],
                         help='row that a stamp marks (default: %(default)s)')
-    parser.add_argument('--every', type=int, default=EVERY, metavar='N',
+    parser.add_argument('--every', type=int, default=defaults['every'], metavar='N',
                         help='frames from one pair to the next (default: %(default)s)')
-    parser.add_argument('--distance', type=int, default=DISTANCE, metavar='N',
+    parser.add_argument('--distance', type=int, default=defaults['distance'], metavar='N',
                         help='frames from the first of a pair to the second (default: '
                         '%(default)s)')
     recorded = parser.add_argument_group('the recorded IMU')
@@ -174,19 +162,19 @@ def run(args: argparse.Namespace) -> int:
 
 def _run_paper(args: argparse.Namespace) -> int:
     run = PaperRun(
-        experiments=_once(args.figures), motions=_once(args.motions), methods=_once(args.solvers),
-        trials=args.trials, seed=args.seed, base=SceneSettings(
-            pixel_noise=args.pixel_noise, gravity_noise=math.radians(args.gravity_noise),
-            gyro_noise=math.radians(args.gyro_noise), outliers=args.outliers))
+        sweeps=_once(args.figures), directions=_once(args.motions), methods=_once(args.solvers),
+        trials=args.trials, seed=args.seed, base=dataclasses.replace(
+            EXACT, pixel_noise=args.pixel_noise, gravity_noise=args.gravity_noise,
+            gyro_noise=args.gyro_noise, outliers=args.outliers))
     args.output.mkdir(parents=True, exist_ok=True)
-    with _progress(len(run.tasks()), 'scene') as bar:
-        records = run_paper(run, args.jobs, on_scene=bar.update)
-    scenes = f'{run.trials} scenes a row'
-    titles = {(name, motion): f'{EXPERIMENTS[name].title}; {motion} motion, {scenes}'
-              for name in run.experiments for motion in run.motions}
-    sheets = [Sheet(name, f'{EXPERIMENTS[name].title} ({run.trials} scenes a box)',
-                    EXPERIMENTS[name].axis, EXPERIMENTS[name].column) for name in run.experiments]
-    return _report(args.output, records, titles, sheets,
+    with progress_bar(len(run.tasks()), 'scene') as bar:
+        records = run_paper(run, args.jobs, on_problem=bar.update)
+    titles = {(name, motion): f'{SWEEPS[name].title}; {motion} motion, {run.trials} scenes a row'
+              for name in run.sweeps for motion in run.directions}
+    pictures = [dataclasses.replace(SWEEPS[name],
+                                    title=f'{SWEEPS[name].title} ({run.trials} scenes a box)')
+                for name in run.sweeps]
+    return _report(args.output, records, titles, pictures,
                    {**dataclasses.asdict(run), 'jobs': args.jobs})
 
 
@@ -202,14 +190,14 @@ def _run_penncosyvio(args: argparse.Namespace) -> int:
         gyro_bias=tuple(args.gyro_bias), every=args.every, distance=args.distance, seed=args.seed)
     simulated = Simulated(args.rendered, args.scene, args.pixel_noise, args.outliers)
 
-    def open_sequence(name: str) -> Sequence:
+    def open_sequence(name: str) -> PairSource:
         if args.trajectory_only:
             return SimulatedSequence(args.folder, name, run, simulated)
         return RecordedSequence(args.folder, name, run)
 
     if not args.folder.is_dir():
         raise MissingInputError(f'there is no folder {args.folder}')
-    with _progress(len(run.pairs()), 'pair') as bar:
+    with progress_bar(len(run.pairs()), 'pair') as bar:
         records = run_penncosyvio(run, open_sequence, on_pair=bar.update)
     source = 'recorded images' if not args.trajectory_only else \
         f'images rendered of a {args.scene}' if args.rendered else 'simulated points'
@@ -217,49 +205,34 @@ def _run_penncosyvio(args: argparse.Namespace) -> int:
     titles = {(EXPERIMENT, name): f"{title}; sequence '{name}'" for name in run.sequences}
     args.output.mkdir(parents=True, exist_ok=True)
     return _report(args.output, records, titles,
-                   [Sheet(EXPERIMENT, title, 'stretch of the sequence', 'part')],
+                   [Sweep(EXPERIMENT, title, 'stretch of the sequence', 'part', '', ())],
                    {**dataclasses.asdict(run), 'trajectory_only': args.trajectory_only,
                     'simulated': dataclasses.asdict(simulated)}, totals=True)
 
 
 def _report(folder: Path, records: list[Record], titles: Mapping[tuple[str, str], str],
-            sheets: Iterable[Sheet], arguments: Mapping[str, Any], *,
+            sweeps: Sequence[Sweep], arguments: Mapping[str, Any], *,
             totals: bool = False) -> int:
     """Print the tables (`titles`: by experiment and case), write tables and pictures.
 
     `totals`: a box of all levels together, too.
     """
-    cells = with_totals(by_cell(records)) if totals else by_cell(records)
-    write_trials(records, folder / _TRIALS_FILE)
-    write_cells(cells, folder / _CELLS_FILE)
-    files = [_TRIALS_FILE, _CELLS_FILE]
-    for sheet in sheets:
-        files.append(f'{sheet.experiment}.png')
-        part = {cell: methods for cell, methods in cells.items()
-                if cell.experiment == sheet.experiment}
-        draw_boxes(part, sheet.title, sheet.axis, folder / files[-1])
-        for line in table_lines(part, titles, sheet.column):
-            print(line)
-    files.append(_RUN_FILE)
-    (folder / _RUN_FILE).write_text(json.dumps(
-        {**arguments, 'command': sys.argv, 'rs_relpose_ros': _version(),
+    boxes = with_totals(by_box(records)) if totals else by_box(records)
+    files = ['trials.csv', 'cells.csv', *(f'{sweep.name}.png' for sweep in sweeps), 'run.json']
+    write_trials(records, folder / files[0])
+    write_boxes(boxes, folder / files[1])
+    for sweep in sweeps:
+        part = {box: methods for box, methods in boxes.items() if box.experiment == sweep.name}
+        draw_boxes(part, sweep.title, sweep.axis, folder / f'{sweep.name}.png')
+        print(tables(part, titles, sweep.unit))
+    (folder / files[-1]).write_text(json.dumps(
+        {**arguments, 'command': sys.argv, 'rs_relpose_ros': package_version(),
          'python': platform.python_version()}, indent=2) + '\n', encoding='utf-8')
     print(f'in {folder}: {", ".join(files)}')
-    posed = any(len(errors.rotation) for methods in cells.values() for errors in methods.values())
-    return 0 if posed else _FAILED
-
-
-def _progress(total: int, unit: str) -> tqdm:
-    return tqdm(total=total, unit=unit, leave=False, disable=not sys.stderr.isatty())
+    posed = any(len(errors.rotation) for methods in boxes.values() for errors in methods.values())
+    return 0 if posed else 1
 
 
 def _once(names: list[str]) -> tuple[str, ...]:
     """Each name once, in the order given."""
     return tuple(dict.fromkeys(names))
-
-
-def _version() -> str:
-    try:
-        return version('rs_relpose_ros')
-    except PackageNotFoundError:   # run from a source tree
-        return 'not installed'

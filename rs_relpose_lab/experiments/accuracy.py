@@ -2,43 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
-from multiprocessing import get_context
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, replace
+import functools
+import hashlib
+import json
+from pathlib import Path
 import time
 
 import numpy as np
 
+from rs_relpose_lab.experiments import oracle, problems
+from rs_relpose_lab.experiments.methods import as_pair, METHODS, prepared
 from rs_relpose_lab.experiments.oracle import oracle_estimate
-from rs_relpose_lab.experiments.oracle_cache import OracleCache
-from rs_relpose_lab.experiments.problems import (
-    Cell,
-    CELLS,
-    CENTRE_U,
-    CENTRE_V,
-    FOCAL,
-    HEIGHT,
-    LINE_DELAY,
-    make_problem,
-    Noise,
-    TwoViewProblem,
-    WIDTH,
-)
-from rs_relpose_lab.experiments.scoring import NO_POSE, pose_error, PoseError
-from rs_relpose_ros import (
-    estimate_relative_pose,
-    EstimatorConfig,
-    FrameMotion,
-    RelativePose,
-    RollingShutterCamera,
-    warm_up,
-)
-
-CAMERA = RollingShutterCamera(width=WIDTH, height=HEIGHT, fx=FOCAL, fy=FOCAL, cx=CENTRE_U,
-                              cy=CENTRE_V, readout_time=HEIGHT * LINE_DELAY)
-
-_CHUNK = 10  # trials a task of a process
+from rs_relpose_lab.experiments.problems import Cell, CELLS, make_problem, Noise, TwoViewProblem
+from rs_relpose_lab.experiments.scoring import pose_error, PoseError
+from rs_relpose_lab.experiments.workers import in_processes
+from rs_relpose_lab.simulation import rows
+from rs_relpose_ros import RelativePose, warm_up
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +50,7 @@ class Trial:
 
 
 @dataclass(frozen=True, slots=True)
-class Experiment:
+class AccuracyRun:
     """What is run: every cell with every kind of noise and every factor of the told sigmas."""
 
     cells: tuple[str, ...]
@@ -79,53 +60,41 @@ class Experiment:
     first_seed: int = 0
     solver: str = 'auto'
 
+    @property
+    def estimates(self) -> int:
+        """Number of estimates."""
+        return len(self.cells) * len(self.noises) * len(self.sigma_factors) * self.trials
+
 
 @dataclass(frozen=True, slots=True)
 class _Task:
+    run: AccuracyRun
     cell: str
     noise: Noise
     seeds: tuple[int, ...]
-    sigma_factors: tuple[float, ...]
-    solver: str
     known: dict[int, PoseError]
 
 
-def told_config(cell: Cell, sigma_factor: float, solver: str) -> EstimatorConfig:
-    """The default configuration with the cell's own sigmas, times a factor."""
-    return EstimatorConfig(
-        solver=solver, pixel_sigma=cell.pixel_noise * sigma_factor,
-        gravity_sigma=float(np.radians(cell.gravity_noise)) * sigma_factor,
-        gyro_sigma=float(np.radians(cell.gyro_noise)) * sigma_factor)
-
-
-def estimate(problem: TwoViewProblem, config: EstimatorConfig, seed: int) -> RelativePose:
-    """The library's estimate of a problem."""
-    return estimate_relative_pose(
-        problem.points1, problem.points2, CAMERA,
-        FrameMotion(problem.measured_rate1, problem.measured_gravity1),
-        FrameMotion(problem.measured_rate2, problem.measured_gravity2), config=config, rng=seed)
-
-
-def run_experiment(experiment: Experiment, cache: OracleCache, jobs: int = 1,
-                   on_trials: Callable[[int], object] = lambda count: None) -> list[Trial]:
+def run_accuracy(run: AccuracyRun, cache: OracleCache, jobs: int = 1,
+                 on_trials: Callable[[int], object] = lambda count: None) -> list[Trial]:
     """Run all trials.
 
     Parameters
     ----------
-    experiment : Experiment
+    run : AccuracyRun
     cache : OracleCache
     jobs : int
         Processes; durations are comparable only where each has a core of its own.
     on_trials : callable
         Called with the number of estimates that have been added.
     """
-    seeds = range(experiment.first_seed, experiment.first_seed + experiment.trials)
-    tasks = [_Task(cell, noise, tuple(seeds[first:first + _CHUNK]), experiment.sigma_factors,
-                   experiment.solver, cache.load(CELLS[cell], noise))
-             for cell in experiment.cells for noise in experiment.noises
-             for first in range(0, experiment.trials, _CHUNK)]
+    seeds, chunk = range(run.first_seed, run.first_seed + run.trials), 10
+    tasks = [_Task(run, cell, noise, tuple(seeds[first:first + chunk]),
+                   cache.load(CELLS[cell], noise))
+             for cell in run.cells for noise in run.noises
+             for first in range(0, run.trials, chunk)]
     trials: list[Trial] = []
-    for task, done in zip(tasks, _run_all(tasks, jobs), strict=True):
+    for task, done in zip(tasks, in_processes(_run, tasks, jobs, warm_up), strict=True):
         trials += done
         cache.add(CELLS[task.cell], task.noise,
                   {trial.seed: trial.oracle for trial in done if trial.seed not in task.known})
@@ -133,30 +102,22 @@ def run_experiment(experiment: Experiment, cache: OracleCache, jobs: int = 1,
     return trials
 
 
-def _run_all(tasks: Sequence[_Task], jobs: int) -> Iterator[list[Trial]]:
-    if jobs == 1:
-        warm_up()
-        yield from map(_run, tasks)
-        return
-    with ProcessPoolExecutor(jobs, mp_context=get_context('spawn'), initializer=warm_up) as pool:
-        yield from pool.map(_run, tasks)
-
-
 def _run(task: _Task) -> list[Trial]:
     cell = CELLS[task.cell]
+    method = replace(METHODS['auto'], solver=task.run.solver)
     trials = []
     for seed in task.seeds:
         problem = make_problem(cell, seed, task.noise)
-        oracle = task.known.get(seed) or _oracle_error(cell, problem)
-        for factor in task.sigma_factors:
+        best = task.known.get(seed) or _oracle_error(cell, problem)
+        for factor in task.run.sigma_factors:
+            pair = as_pair(problem, cell, factor)
+            call = prepared(method, pair, seed)
             started = time.perf_counter()
-            pose = estimate(problem, told_config(cell, factor, task.solver), seed)
+            pose = call()
             duration = time.perf_counter() - started
-            error = NO_POSE
-            if pose:
-                error = pose_error(pose.R, pose.t, problem.R, problem.t, pose.covariance)
-            trials.append(Trial(task.cell, task.noise, factor, seed, pose.status.value, error,
-                                oracle, duration))
+            assert isinstance(pose, RelativePose)
+            trials.append(Trial(task.cell, task.noise, factor, seed, pose.status.value,
+                                pair.error(pose), best, duration))
     return trials
 
 
@@ -172,3 +133,48 @@ def by_setting(trials: Iterable[Trial]) -> dict[tuple[Noise, float, str], list[T
     for trial in trials:
         groups.setdefault((trial.noise, trial.sigma_factor, trial.cell), []).append(trial)
     return groups
+
+
+@dataclass(frozen=True, slots=True)
+class OracleCache:
+    """The oracle's errors on disk: it need not run again while the estimator is worked on.
+
+    A folder with one file per cell and kind of noise, or none. A file's name holds the digest of
+    all that decides its content: the cell, the noise, and the source of generator and oracle.
+    """
+
+    folder: Path | None
+
+    def load(self, cell: Cell, noise: Noise) -> dict[int, PoseError]:
+        """Errors of the oracle by seed."""
+        path = self._path(cell, noise)
+        if path is None or not path.is_file():
+            return {}
+        stored = json.loads(path.read_text())
+        return {int(seed): PoseError(*error) for seed, error in stored.items()}
+
+    def add(self, cell: Cell, noise: Noise, errors: dict[int, PoseError]) -> None:
+        """Keep errors by seed, beside those that are kept already."""
+        path = self._path(cell, noise)
+        if path is None or not errors:
+            return
+        path.parent.mkdir(parents=True, exist_ok=True)
+        merged = {**self.load(cell, noise), **errors}
+        # Replaced as a whole, so that a run that is stopped leaves no half of a file.
+        new = path.with_suffix('.new')
+        new.write_text(json.dumps({
+            seed: (error.rotation, error.translation, error.nees)
+            for seed, error in sorted(merged.items())}))
+        new.replace(path)
+
+    def _path(self, cell: Cell, noise: Noise) -> Path | None:
+        if self.folder is None:
+            return None
+        digest = hashlib.sha256(json.dumps([asdict(cell), noise]).encode() + _source())
+        return self.folder / f'{digest.hexdigest()[:24]}.json'
+
+
+@functools.cache
+def _source() -> bytes:
+    """Of generator and oracle, as they were when first asked for."""
+    return b''.join(Path(str(module.__file__)).read_bytes() for module in (rows, problems, oracle))

@@ -2,35 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 
+from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2, trim_mean
 
-from rs_relpose_lab.experiments.accuracy import by_setting, Experiment, Trial
-from rs_relpose_lab.experiments.scoring import POSE_FREEDOM
+from rs_relpose_lab.experiments.accuracy import AccuracyRun, by_setting, Trial
+from rs_relpose_lab.experiments.scoring import POSE_FREEDOM, Quantiles
 from rs_relpose_lab.experiments.tables import markdown_table, write_csv
 from rs_relpose_ros.picture_files import save_picture
 
 Array = NDArray[np.float64]
 
-TRIALS_FILE, CELLS_FILE = 'trials.csv', 'cells.csv'
-REPORT_FILE, PLOT_FILE = 'accuracy.md', 'accuracy.png'
-
 # A rotation this wrong [deg] is no noise in any of the cells.
 GROSS_ERROR = 2.0
-
-
-@dataclass(frozen=True, slots=True)
-class Quantiles:
-    """Of errors [deg]; infinite where too many poses are lost."""
-
-    median: float
-    p90: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,10 +77,10 @@ class CellStatistics:
 
 def cell_statistics(trials: Sequence[Trial]) -> CellStatistics:
     """Statistics of trials of one setting."""
-    rotation = _quantiles(trial.error.rotation for trial in trials)
-    translation = _quantiles(trial.error.translation for trial in trials)
-    best_rotation = _quantiles(trial.oracle.rotation for trial in trials)
-    best_translation = _quantiles(trial.oracle.translation for trial in trials)
+    rotation = Quantiles.of(trial.error.rotation for trial in trials)
+    translation = Quantiles.of(trial.error.translation for trial in trials)
+    best_rotation = Quantiles.of(trial.oracle.rotation for trial in trials)
+    best_translation = Quantiles.of(trial.oracle.translation for trial in trials)
     return CellStatistics(
         noise=trials[0].noise, sigma_factor=trials[0].sigma_factor, cell=trials[0].cell,
         trials=len(trials),
@@ -111,12 +101,6 @@ def consistency(nees: Sequence[float]) -> Consistency:
         return Consistency(float('nan'), float('nan'))
     return Consistency(float(trim_mean(known, 0.01)) / POSE_FREEDOM,
                        float((known > chi2.ppf(0.95, POSE_FREEDOM)).mean()))
-
-
-def _quantiles(errors: Iterable[float]) -> Quantiles:
-    # Not interpolated: between a number and infinity there is nothing.
-    median, p90 = np.quantile(list(errors), [0.5, 0.9], method='higher')
-    return Quantiles(float(median), float(p90))
 
 
 def _ratio(error: Quantiles, reference: Quantiles) -> Quantiles:
@@ -157,14 +141,14 @@ def _median(values: Array) -> float:
     return float(np.median(values))
 
 
-def write_report(folder: Path, experiment: Experiment, trials: Sequence[Trial]) -> str:
+def write_report(folder: Path, run: AccuracyRun, trials: Sequence[Trial]) -> str:
     """Write every trial, the statistics of every cell, the report and the plot.
 
     Parameters
     ----------
     folder : pathlib.Path
         Made where it is missing.
-    experiment : Experiment
+    run : AccuracyRun
     trials : sequence of Trial
 
     Returns
@@ -174,11 +158,11 @@ def write_report(folder: Path, experiment: Experiment, trials: Sequence[Trial]) 
     """
     folder.mkdir(parents=True, exist_ok=True)
     cells = [cell_statistics(group) for group in by_setting(trials).values()]
-    write_csv(folder / TRIALS_FILE, trials)
-    write_csv(folder / CELLS_FILE, cells)
-    report = _report(experiment, cells)
-    (folder / REPORT_FILE).write_text(report)
-    _plot(folder / PLOT_FILE, cells)
+    write_csv(folder / 'trials.csv', trials)
+    write_csv(folder / 'cells.csv', cells)
+    report = _report(run, cells)
+    (folder / 'accuracy.md').write_text(report)
+    draw(folder / 'accuracy.png', cells)
     return report
 
 
@@ -189,10 +173,10 @@ def _settings(cells: Sequence[CellStatistics]) -> dict[tuple[str, float], list[C
     return groups
 
 
-def _report(experiment: Experiment, cells: Sequence[CellStatistics]) -> str:
+def _report(run: AccuracyRun, cells: Sequence[CellStatistics]) -> str:
     parts = [
         '# Accuracy against the oracle\n',
-        (f'{experiment.trials} trials a cell, solver `{experiment.solver}`, errors in degrees '
+        (f'{run.trials} trials a cell, solver `{run.solver}`, errors in degrees '
          '(median / 90th percentile); a ratio is estimator by oracle. NEES / 5 is the mean of the '
          'inner 98 %; "above" is the share above the 95 % quantile of chi-square(5).\n')]
     settings = _settings(cells)
@@ -211,15 +195,12 @@ def _report(experiment: Experiment, cells: Sequence[CellStatistics]) -> str:
 
 
 def _row(cell: CellStatistics) -> tuple[str, ...]:
-    def pair(quantiles: Quantiles, digits: int = 3) -> str:
-        return f'{quantiles.median:.{digits}f} / {quantiles.p90:.{digits}f}'
-
     return (
-        cell.cell, pair(cell.rotation), pair(cell.oracle_rotation), pair(cell.rotation_ratio, 2),
-        pair(cell.translation), pair(cell.oracle_translation), pair(cell.translation_ratio, 2),
-        f'{cell.lost}', f'{cell.gross}', f'{cell.nees.mean:.2f}', f'{cell.oracle_nees.mean:.2f}',
-        f'{100 * cell.nees.above:.1f}', f'{100 * cell.oracle_nees.above:.1f}',
-        f'{cell.duration:.1f}')
+        cell.cell, cell.rotation.text(3), cell.oracle_rotation.text(3),
+        cell.rotation_ratio.text(2), cell.translation.text(3), cell.oracle_translation.text(3),
+        cell.translation_ratio.text(2), f'{cell.lost}', f'{cell.gross}', f'{cell.nees.mean:.2f}',
+        f'{cell.oracle_nees.mean:.2f}', f'{100 * cell.nees.above:.1f}',
+        f'{100 * cell.oracle_nees.above:.1f}', f'{cell.duration:.1f}')
 
 
 def _against_true_sigmas(group: Sequence[CellStatistics], reference: Sequence[CellStatistics],
@@ -236,10 +217,8 @@ def _against_true_sigmas(group: Sequence[CellStatistics], reference: Sequence[Ce
     return markdown_table(('over all cells', 'median', 'largest', 'wanted'), rows)
 
 
-def _plot(path: Path, cells: Sequence[CellStatistics]) -> None:
+def draw(path: Path, cells: Sequence[CellStatistics]) -> Figure:
     """Ratios to the oracle and NEES of every cell."""
-    from matplotlib.figure import Figure
-
     panels = (('rotation_ratio.median', 'median rotation error / oracle', 1.6),
               ('translation_ratio.median', 'median translation error / oracle', 1.6),
               ('nees.mean', 'NEES / 5', 1.25))
@@ -259,3 +238,4 @@ def _plot(path: Path, cells: Sequence[CellStatistics]) -> None:
     axes[0].invert_yaxis()
     axes[-1].legend(fontsize='small')
     save_picture(figure, path)
+    return figure

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
-import multiprocessing
 from pathlib import Path
 
 import numpy as np
@@ -18,14 +16,9 @@ from rs_relpose_ros.calibrate.axis_maps import axis_maps
 from rs_relpose_ros.calibrate.procedure import calibrate
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
-RUNS_FILE, REPORT_FILE = 'calibration_runs.csv', 'calibration.md'
-
-# Focal length that a run without intrinsics starts from, share of the image's width.
-_FOCAL_GUESS = 0.8
-
 
 @dataclass(frozen=True, slots=True)
-class Figure:
+class Found:
     """Error of a figure, its told 1 sigma, and whether it was called observable."""
 
     error: float
@@ -48,16 +41,16 @@ class CalibrationRun:
     rotation_rate: float
     speed: float
     gyro_rate: float
-    readout: Figure
-    offset: Figure
+    readout: Found
+    offset: Found
     rotation_error: float
-    rotation_x: Figure
-    rotation_y: Figure
-    rotation_z: Figure
-    bias_x: Figure
-    bias_y: Figure
-    bias_z: Figure
-    focal: Figure
+    rotation_x: Found
+    rotation_y: Found
+    rotation_z: Found
+    bias_x: Found
+    bias_y: Found
+    bias_z: Found
+    focal: Found
     axis_map_right: bool
     observable: bool
     shutter: str
@@ -81,29 +74,30 @@ def run_calibration(seed: int) -> CalibrationRun:
     number, asked = seed % 24, seed // 24 % 2 == 1
     truth = drawn(rng, axis_map=number)
     recorded = record(truth, rng)
-    focal = _FOCAL_GUESS * truth.width if asked else truth.focal
+    # Where the focal length is asked for, the search starts from 0.8 widths.
+    focal = 0.8 * truth.width if asked else truth.focal
     camera = RollingShutterCamera(
         width=truth.width, height=truth.height, fx=focal, fy=focal, cx=0.5 * (truth.width - 1),
         cy=0.5 * (truth.height - 1), readout_time=0.0)
     result = calibrate(recorded.tracks, recorded.gyro, camera, focal_known=not asked)
     turn = np.degrees(Rotation.from_matrix(result.R_cam_imu @ truth.R_cam_imu.T).as_rotvec())
-    rotation = [Figure(float(error), math.degrees(sigma), result.rotation.observable)
+    rotation = [Found(float(error), math.degrees(sigma), result.rotation.observable)
                 for error, sigma in zip(turn, result.rotation_sigma, strict=True)]
-    bias = [Figure(1e3 * (found.value - true), 1e3 * found.sigma, found.observable)
+    bias = [Found(1e3 * (found.value - true), 1e3 * found.sigma, found.observable)
             for found, true in zip(result.gyro_bias, truth.gyro_bias, strict=True)]
     readout, offset = result.readout_time, result.time_offset
-    found_focal = Figure(math.nan, math.nan, False)
+    found_focal = Found(math.nan, math.nan, False)
     if result.focal_factor is not None:
         scale = 100.0 * focal / truth.focal
-        found_focal = Figure(result.focal_factor.value * scale - 100.0,
+        found_focal = Found(result.focal_factor.value * scale - 100.0,
                              result.focal_factor.sigma * scale, result.focal_factor.observable)
     return CalibrationRun(
         seed=seed, axis_map=number, readout_time=1e3 * truth.readout_time,
         time_offset=1e3 * truth.time_offset, rotation_rate=math.degrees(truth.rotation_rate),
         speed=truth.speed, gyro_rate=float(truth.gyro_rate),
-        readout=Figure(1e3 * (readout.value - truth.readout_time), 1e3 * readout.sigma,
+        readout=Found(1e3 * (readout.value - truth.readout_time), 1e3 * readout.sigma,
                        readout.observable),
-        offset=Figure(1e3 * (offset.value - truth.time_offset), 1e3 * offset.sigma,
+        offset=Found(1e3 * (offset.value - truth.time_offset), 1e3 * offset.sigma,
                       offset.observable),
         rotation_error=float(np.linalg.norm(turn)), rotation_x=rotation[0],
         rotation_y=rotation[1], rotation_z=rotation[2], bias_x=bias[0], bias_y=bias[1],
@@ -112,19 +106,10 @@ def run_calibration(seed: int) -> CalibrationRun:
         observable=result.observable, shutter=result.shutter)
 
 
-def run_calibrations(seeds: Sequence[int], jobs: int) -> Iterator[CalibrationRun]:
-    """The runs of these seeds, as they are done."""
-    if jobs == 1:
-        yield from map(run_calibration, seeds)
-        return
-    with ProcessPoolExecutor(jobs, multiprocessing.get_context('spawn')) as pool:
-        yield from pool.map(run_calibration, seeds)
-
-
 def write_report(folder: Path, runs: Sequence[CalibrationRun]) -> str:
     """Write the runs (CSV) and the table (Markdown), and return the latter."""
     folder.mkdir(parents=True, exist_ok=True)
-    write_csv(folder / RUNS_FILE, runs)
+    write_csv(folder / 'calibration_runs.csv', runs)
     rows = [row for row in (_row(runs, *figure) for figure in FIGURES) if row]
     whole = np.array([run.rotation_error for run in runs])
     rows.insert(5, ['rotation, whole angle', str(len(runs)), 'deg', f'{np.median(whole):.3f}',
@@ -139,7 +124,7 @@ def write_report(folder: Path, runs: Sequence[CalibrationRun]) -> str:
              f'({len({run.axis_map for run in called})} maps); all figures called observable in '
              f'{sum(run.observable for run in runs)} of {len(runs)} runs; rolling shutter said in '
              f"{sum(run.shutter == 'rolling' for run in runs)}.\n")
-    (folder / REPORT_FILE).write_text(text, encoding='utf-8')
+    (folder / 'calibration.md').write_text(text, encoding='utf-8')
     return text
 
 
@@ -155,4 +140,3 @@ def _row(runs: Sequence[CalibrationRun], name: str, title: str, unit: str,
             '' if limit is None else f'{limit:g}',
             '' if limit is None else f'{100 * (errors <= limit).mean():.1f}',
             f'{100 * (ratios <= 1.0).mean():.1f}', f'{100 * (ratios <= 2.0).mean():.1f}']
-

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.simulation.hand_held import hand_held, Plan
+from rs_relpose_lab.simulation.rows import Motion, see, View
 from rs_relpose_lab.simulation.trajectory import Trajectory
 from rs_relpose_ros.calibrate.axis_maps import axis_maps
 from rs_relpose_ros.calibrate.gyro_path import GyroSeries
@@ -141,33 +142,33 @@ class _Path:
         self.turns = Rotation.from_matrix(
             np.einsum('nji,njk->nik', self.rotations[:-1], self.rotations[1:])).as_rotvec()
 
-    def to_camera(self, points: Array, times: Array) -> Array:
-        """Points (N, 3) in the camera at their instants (N,)."""
-        at = (times - self.begin) / self.step
-        k = np.clip(at.astype(int), 0, len(self.turns) - 1)
-        share = (at - k)[:, None]
-        position = self.positions[k] + share * (self.positions[k + 1] - self.positions[k])
-        turned = np.einsum('nji,nj->ni', self.rotations[k], points - position)
-        return turned - share * np.cross(self.turns[k], turned)  # of 1e-3 rad: exact to 1e-6
+    def from_instant(self, instant: float) -> Motion:
+        """Motion of a frame, whose times count from the `instant` of its first row."""
+        def to_camera(points: Array, times: Array) -> Array:
+            at = (instant + times - self.begin) / self.step
+            k = np.clip(at.astype(int), 0, len(self.turns) - 1)
+            share = (at - k)[:, None]
+            position = self.positions[k] + share * (self.positions[k + 1] - self.positions[k])
+            turned = np.einsum('nji,nj->ni', self.rotations[k], points - position)
+            # Of 1e-3 rad: exact to 1e-6.
+            return np.asarray(turned - share * np.cross(self.turns[k], turned))
+        return to_camera
 
 
 def _frames(truth: Truth, trajectory: Trajectory, instants: Array, world: Array,
             rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    size = np.array([truth.width, truth.height])
-    center = 0.5 * (size - 1.0)
+    center = 0.5 * (np.array([truth.width, truth.height]) - 1.0)
+    view = View(lambda local: center + truth.focal * local[:, :2] / local[:, 2:],
+                lambda pixels: np.column_stack([(pixels - center) / truth.focal,
+                                                np.ones(len(pixels))]),
+                truth.width, truth.height, truth.readout_time / truth.height, reference_row=0.0)
     path = _Path(trajectory, instants[0] - 0.1, instants[-1] + 0.15)
     ids = np.full(len(world), -1, dtype=np.int64)       # track of a point that is followed
     drift, start = np.zeros((len(world), 2)), np.zeros(len(world))
     next_id, frame, track, pixels = 0, [], [], []
     for index, instant in enumerate(instants):
-        rows = np.full(len(world), center[1])
-        for _ in range(3):
-            seen = path.to_camera(world, instant + rows / truth.height * truth.readout_time)
-            depth = np.maximum(seen[:, 2:], 0.1)
-            points = center + truth.focal * seen[:, :2] / depth
-            rows = np.clip(points[:, 1], 0.0, truth.height - 1.0)
-        inside = (points > 2.0).all(axis=1) & (points < size - 3.0).all(axis=1)
-        visible = (seen[:, 2] > 0.3) & inside
+        points = see(world, path.from_instant(instant), view, margin=-2.0)
+        visible = np.isfinite(points).all(axis=1)
         # A track is lost now and then, even in sight.
         ids[~visible | (rng.uniform(size=len(world)) < 0.02)] = -1
         free = truth.features - int((ids >= 0).sum())

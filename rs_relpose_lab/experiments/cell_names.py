@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable, Mapping
 from fnmatch import fnmatchcase
 
 from rs_relpose_ros.errors import InputError
 
 
-def matching_cells(patterns: Iterable[str], names: Collection[str]) -> tuple[str, ...]:
+def matching_cells(patterns: Iterable[str], names: Mapping[str, object]) -> tuple[str, ...]:
     """Those of the names that match any of the patterns ('all', or with ``*`` as in file names).
 
     Raises

@@ -1,4 +1,4 @@
-"""Methods side by side: their errors over the same pairs, as a table to read."""
+"""A live run, its replay and other methods side by side: errors over the same pairs."""
 
 from __future__ import annotations
 
@@ -11,26 +11,25 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.bags.reader import Bag
+from rs_relpose_lab.experiments.methods import OPENCV_ESTIMATORS, opencv_five_point, undistorted
+from rs_relpose_ros.bags.reader import Bag, open_bag
 from rs_relpose_ros.bags.topics import SensorTopics
+from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.config.parameters import Parameters
+from rs_relpose_ros.errors import MissingInputError
 from rs_relpose_ros.estimator.result import Status
+from rs_relpose_ros.geometry.intrinsics import Intrinsics
+from rs_relpose_ros.replay.outputs import POSES_FILE, replay_into
 from rs_relpose_ros.replay.record import pair_record, PairRecord
-from rs_relpose_ros.replay.run import Replay
+from rs_relpose_ros.replay.run import read_truth, Replay, ReplayedPair
+from rs_relpose_ros.replay.stamps import read_stamps
 from rs_relpose_ros.replay.truth import median_and_p90, PairErrors, TrueTrajectory
 
-# The algorithms of the paper with its refinement, and what they leave out of the default: the gyro
-# derotates rows, and is no prior of the rotation between the frames.
-_PAPER: Mapping[str, str | bool] = {'refinement': 'alternating', 'use_gyro_rotation': False}
-PAPER_METHODS: Mapping[str, Mapping[str, str | bool]] = {
-    'uniform 9-point': {'solver': 'uniform_9pt', **_PAPER},
-    'uniform 11-point': {'solver': 'uniform_11pt', **_PAPER},
-    '5-point on derotated rays': {'solver': 'angular_5pt', **_PAPER},
-}
-
-
-# Below this baseline [m] between two keyframes the camera stands or only turns.
-STILL_BASELINE = 0.03
+# The algorithms of the paper, by solver: its refinement, and the gyro only derotates rows.
+PAPER_ALGORITHMS: Mapping[str, Mapping[str, str | bool]] = {
+    name: {'solver': solver, 'refinement': 'alternating', 'use_gyro_rotation': False}
+    for name, solver in (('uniform 9-point', 'uniform_9pt'), ('uniform 11-point', 'uniform_11pt'),
+                         ('5-point on derotated rays', 'angular_5pt'))}
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,22 +51,103 @@ class Score:
     translation: tuple[float, float]
 
 
-def is_still(record: PairRecord) -> bool:
-    """Whether, by the truth, the camera hardly moved from one keyframe to the other."""
-    return record.errors is not None and record.errors.baseline < STILL_BASELINE
-
-
-def score(name: str, pairs: int, errors: Sequence[PairErrors | None]) -> Score:
-    """Score from the errors of the pairs, None for a pair without a pose."""
+def score(name: str, errors: Sequence[PairErrors | None], pairs: int | None = None) -> Score:
+    """Score from errors, None for a pair without a pose; `pairs`: where not all are among them."""
     known = [error for error in errors if error is not None]
-    return Score(name, pairs, len(known), median_and_p90([e.rotation_error for e in known]),
+    return Score(name, len(errors) if pairs is None else pairs, len(known),
+                 median_and_p90([e.rotation_error for e in known]),
                  median_and_p90([e.translation_error for e in known]))
 
 
 def score_of_records(name: str, records: Sequence[PairRecord]) -> Score:
     """Score of a replay."""
-    return score(name, len(records),
-                 [r.errors if r.status is Status.OK else None for r in records])
+    return score(name, [r.errors if r.status is Status.OK else None for r in records])
+
+
+def is_still(record: PairRecord) -> bool:
+    """Whether, by the truth, the camera hardly moved from one keyframe to the other."""
+    return record.errors is not None and record.errors.baseline < 0.03
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LiveComparison:
+    """What a live node published, beside the replay of the frames that it processed.
+
+    Attributes
+    ----------
+    node : Score
+    records, pairs : list
+        Of the replay.
+    truth : TrueTrajectory
+    intrinsics : Intrinsics
+        In force at the end.
+    frames, processed : int
+        In the bag, and by the node.
+    poses, unequal : int
+        Poses of both, and those that are not bit by bit the same in the two.
+    """
+
+    node: Score
+    records: list[PairRecord]
+    pairs: list[ReplayedPair]
+    truth: TrueTrajectory
+    intrinsics: Intrinsics
+    frames: int
+    processed: int
+    poses: int
+    unequal: int
+
+    def opencv_scores(self) -> list[Score]:
+        """Scores of OpenCV's estimators on the matches of the replay's poses."""
+        answered = [pair for pair in self.pairs if pair.result.pose]
+        return [best_opencv_score(estimator, answered, self.intrinsics, self.truth)
+                for estimator in OPENCV_ESTIMATORS]
+
+
+def compare_live(table: Path, stamps_file: Path, bag_path: Path, parameter_file: Path,
+                 folder: Path, *, pictures: bool = False) -> LiveComparison:
+    """Replay into `folder` the frames that a live node processed.
+
+    Parameters
+    ----------
+    table : Path
+        Relative poses that the node published, as its recorder wrote them.
+    stamps_file : Path
+        Stamps of the frames that it processed.
+    bag_path, parameter_file : Path
+        What it was given.
+    folder : Path
+    pictures : bool
+        Whether to draw those of the replay.
+    """
+    stamps = read_stamps(stamps_file)
+    pairs: list[ReplayedPair] = []
+    with open_bag(bag_path) as bag:
+        topics, truth = _topics_and_truth(bag)
+        outcome = replay_into(folder, bag, topics, read_parameters(parameter_file), stamps=stamps,
+                              pictures=pictures, on_pair=pairs.append)
+    unequal, poses = differing_poses(table, folder / POSES_FILE)
+    assert outcome.intrinsics is not None
+    return LiveComparison(score_of_table('relpose_node, live', table, outcome.records, truth),
+                          outcome.records, pairs, truth, outcome.intrinsics, topics.image.count,
+                          len(stamps), poses, unequal)
+
+
+def _topics_and_truth(bag: Bag) -> tuple[SensorTopics, TrueTrajectory]:
+    topics = bag.find_topics()
+    truth = read_truth(bag, topics)
+    if truth is None:
+        raise MissingInputError(f'{bag.path} has no ground truth')
+    return topics, truth
+
+
+def score_of_replay(name: str, bag_path: Path, parameters: Parameters) -> Score:
+    """Score of a bag's replay with other parameters, nothing written."""
+    with open_bag(bag_path) as bag:
+        topics, truth = _topics_and_truth(bag)
+        return score_of_records(name, [
+            pair_record(pair.result, truth)
+            for pair in Replay(bag, topics, parameters).pairs()])
 
 
 def score_of_table(name: str, path: Path, pairs: Sequence[PairRecord],
@@ -92,7 +172,7 @@ def score_of_table(name: str, path: Path, pairs: Sequence[PairRecord],
                 R = Rotation.from_quat([float(row[c]) for c in ('qx', 'qy', 'qz', 'qw')])
                 t = np.array([float(row[c]) for c in ('tx', 'ty', 'tz')])
                 errors.append(truth.errors(R.as_matrix(), t, *instants[key]))
-    return score(name, len(pairs), errors)
+    return score(name, errors, len(pairs))
 
 
 def differing_poses(live: Path, replayed: Path) -> tuple[int, int]:
@@ -100,23 +180,46 @@ def differing_poses(live: Path, replayed: Path) -> tuple[int, int]:
 
     A pose that only one of the two has counts as different.
     """
+    columns = ('tx', 'ty', 'tz', 'qx', 'qy', 'qz', 'qw', 'sigma_t1', 'sigma_t2', 'sigma_rx',
+               'sigma_ry', 'sigma_rz', 'inliers')
     tables = []
     for path in (live, replayed):
         with path.open(newline='', encoding='ascii') as file:
             tables.append({(row['reference_stamp_ns'], row['stamp_ns']):
-                           [row[c] for c in ('tx', 'ty', 'tz', 'qx', 'qy', 'qz', 'qw', 'sigma_t1',
-                                             'sigma_t2', 'sigma_rx', 'sigma_ry', 'sigma_rz',
-                                             'inliers')]
+                           [row[column] for column in columns]
                            for row in csv.DictReader(file) if row['status'] == Status.OK.value})
     keys = tables[0].keys() | tables[1].keys()
     return sum(tables[0].get(key) != tables[1].get(key) for key in keys), len(keys)
 
 
-def replay_records(bag: Bag, topics: SensorTopics, parameters: Parameters,
-                   truth: TrueTrajectory) -> list[PairRecord]:
-    """Records of a replay, nothing written."""
-    return [pair_record(pair.result, truth)
-            for pair in Replay(bag, topics, parameters).pairs()]
+def best_opencv_score(estimator: str, pairs: Sequence[ReplayedPair], intrinsics: Intrinsics,
+                      truth: TrueTrajectory) -> Score:
+    """Score of an OpenCV estimator at that of three thresholds which suits it best.
+
+    Best in the median rotation error against the truth: a choice that no user could make, in the
+    baseline's favour.
+
+    Parameters
+    ----------
+    estimator : {'RANSAC', 'USAC_MAGSAC'}
+    pairs : sequence of ReplayedPair
+        Those that the pipeline answered: the same matches, and none of a camera that stands.
+    intrinsics : Intrinsics
+    truth : TrueTrajectory
+    """
+    camera = intrinsics.global_shutter_camera()
+    matches = [tuple(undistorted(intrinsics.to_sensor(points), camera) for points in
+                     (pair.result.matches.points1, pair.result.matches.points2))
+               for pair in pairs]
+    scores = []
+    for threshold in (0.5, 1.0, 2.0):
+        poses = [opencv_five_point(pixels1, pixels2, camera, threshold, estimator=estimator)
+                 for pixels1, pixels2 in matches]
+        errors = [truth.errors(pose.R, pose.t, pair.result.reference_ns1,
+                               pair.result.reference_ns2) if pose else None
+                  for pair, pose in zip(pairs, poses, strict=True)]
+        scores.append(score(f'OpenCV 5-point, {estimator}, {threshold:g} px', errors))
+    return min(scores, key=lambda s: np.nan_to_num(s.rotation[0], nan=np.inf))
 
 
 def score_table(scores: Sequence[Score]) -> list[str]:

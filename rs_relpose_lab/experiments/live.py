@@ -21,6 +21,7 @@ from rs_relpose_lab.experiments.live_clip import (
     PERIOD,
     seconds_into_loop,
 )
+from rs_relpose_lab.experiments.scoring import pose_error
 from rs_relpose_lab.experiments.tables import write_csv
 from rs_relpose_lab.live.process_figures import ProcessFigures
 from rs_relpose_lab.simulation.closed_loop import closed_loop
@@ -36,14 +37,6 @@ Array = NDArray[np.float64]
 
 SIZES = ((640, 480), (1280, 720), (1920, 1080))
 FORMATS = ('mono8', 'bgr8', 'jpeg')
-# Processor time and memory of the node, a line per second; frames.csv and logs lie beside it.
-FIGURES_FILE = 'node.csv'
-# JPEG as the clips have it, which are rich in texture.
-_BYTES_PER_PIXEL = {'mono8': 1.0, 'bgr8': 3.0, 'jpeg': 0.3}
-# Images above this [bytes] do not get through Fast DDS's default transports.
-_BIG_IMAGE = 512 * 1024
-# A pose that is wrong by more than this is no noise [deg].
-_WRONG_ROTATION, _WRONG_TRANSLATION = 1.0, 15.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,8 +64,10 @@ class LiveCell:
 
     @property
     def is_big(self) -> bool:
-        """Whether the images need the Fast DDS profile."""
-        return self.width * self.height * _BYTES_PER_PIXEL[self.image_format] > _BIG_IMAGE
+        """Whether the images need the Fast DDS profile: its default transports lose them."""
+        # JPEG as the clips have it, which are rich in texture.
+        bytes_per_pixel = {'mono8': 1.0, 'bgr8': 3.0, 'jpeg': 0.3}[self.image_format]
+        return self.width * self.height * bytes_per_pixel > 512 * 1024
 
 
 CELLS = {cell.name: cell for cell in (
@@ -221,7 +216,8 @@ def run_cell(cell: LiveCell, clip: Clip, duration: float, folder: Path, profile:
         {'image': RAW_TOPIC, 'camera_info': CAMERA_INFO_TOPIC, 'imu': topics[2]},
         'compressed' if compressed else 'raw', tuple(player), profile if cell.is_big else None),
         folder, on_second)
-    write_csv(folder / FIGURES_FILE, run.figures)
+    # Processor time and memory of the node, a line per second.
+    write_csv(folder / 'node.csv', run.figures)
     return statistics_of(cell, duration, run), course_of(run)
 
 
@@ -253,8 +249,7 @@ def statistics_of(cell: LiveCell, duration: float, run: MeasuredRun) -> LiveStat
         seconds_to_ready=(run.ready_ns - run.started_ns) / NANOSECONDS,
         seconds_to_pose=(run.poses[0].received_ns - images['published_ns'][0]) / NANOSECONDS,
         rotation_error=Percentiles.of(rotation), translation_error=Percentiles.of(translation),
-        wrong=int(np.count_nonzero((rotation > _WRONG_ROTATION)
-                                   | (translation > _WRONG_TRANSLATION))),
+        wrong=int(np.count_nonzero((rotation > 1.0) | (translation > 15.0))),
         player_late=Percentiles.of((log['published_ns'] - log['due_ns']) / 1e6))
 
 
@@ -272,18 +267,15 @@ def course_of(run: MeasuredRun) -> Course:
 
 def errors(poses: Sequence[ReceivedPose]) -> tuple[Array, Array]:
     """Errors [deg] of rotation and direction of translation (N,) against the clip's motion."""
-    if not poses:
-        return np.empty(0), np.empty(0)
     motion = closed_loop(PERIOD)
-    position1, R1 = motion.poses([seconds_into_loop(pose.reference_stamp_ns) for pose in poses])
-    position2, R2 = motion.poses([seconds_into_loop(pose.stamp_ns) for pose in poses])
-    true_R = np.einsum('nji,njk->nik', R1, R2)
-    true_t = np.einsum('nji,nj->ni', R1, position2 - position1)
-    R = Rotation.from_quat([pose.quat_xyzw for pose in poses])
-    rotation = (Rotation.from_matrix(true_R).inv() * R).magnitude()
-    t = np.array([pose.t for pose in poses])
-    cosine = (t * true_t).sum(axis=1) / np.linalg.norm(true_t, axis=1)
-    return np.degrees(rotation), np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    found = []
+    for pose in poses:
+        (p1, p2), (R1, R2) = motion.poses(
+            [seconds_into_loop(stamp) for stamp in (pose.reference_stamp_ns, pose.stamp_ns)])
+        found.append(pose_error(Rotation.from_quat(pose.quat_xyzw).as_matrix(), np.array(pose.t),
+                                R1.T @ R2, R1.T @ (p2 - p1)))
+    return (np.array([error.rotation for error in found]),
+            np.array([error.translation for error in found]))
 
 
 def _end_to_end(poses: Sequence[ReceivedPose], images: NDArray[np.void],

@@ -4,26 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-import heapq
 from pathlib import Path
-import shutil
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_lab.simulation import simulate, Simulation, SimulationConfig
-from rs_relpose_lab.simulation.bag import write_parameters
-from rs_relpose_lab.simulation.closed_loop import closed_loop
-from rs_relpose_ros.bags.layout import (
-    CAMERA_FRAME,
-    CAMERA_INFO_TOPIC,
-    COMPRESSED_TOPIC,
-    IMAGE_DELAY,
-    IMU_DELAY,
-    IMU_FRAME,
+from rs_relpose_lab.simulation.bag import (
+    Entry,
+    image_entries,
+    imu_entries,
+    jpeg,
+    made_once,
+    write_in_order,
+    write_parameters,
 )
+from rs_relpose_lab.simulation.closed_loop import closed_loop
+from rs_relpose_ros.bags.layout import CAMERA_FRAME, COMPRESSED_TOPIC, IMU_DELAY
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 
@@ -31,11 +29,6 @@ from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 PERIOD = 4.0
 FPS = 30.0
 IMU_RATES = (200, 400)
-# Field of view of 71 deg across, whatever the size.
-_FOCAL_BY_WIDTH = 0.7
-_JPEG_QUALITY = 95
-# A lid of colour, so that a colour image is no gray one three times.
-_TINT = np.array([0.75, 1.0, 1.15])
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +54,9 @@ def imu_topic(rate: int) -> str:
 
 def configuration(width: int, height: int, imu_rate: int = IMU_RATES[0]) -> SimulationConfig:
     """What a clip shows: 4 s of a hand-held-like walk in a hall, read out in 30 ms."""
-    return SimulationConfig(duration=PERIOD, fps=FPS, width=width, height=height,
-                            fx=_FOCAL_BY_WIDTH * width, imu_rate=float(imu_rate))
+    # Field of view of 71 deg across, whatever the size.
+    return SimulationConfig(duration=PERIOD, fps=FPS, width=width, height=height, fx=0.7 * width,
+                            imu_rate=float(imu_rate))
 
 
 def prepare_clip(folder: Path, width: int, height: int,
@@ -78,63 +72,40 @@ def prepare_clip(folder: Path, width: int, height: int,
     on_frame : callable
         Called after each of the images.
     """
-    clip = Clip(folder / f'{width}x{height}', folder / f'{width}x{height}.yaml')
-    if clip.parameters.exists() and clip.bag.exists():
-        return clip
-    # What a run that was stopped has left.
-    shutil.rmtree(clip.bag, ignore_errors=True)
-    clip.parameters.unlink(missing_ok=True)
-    folder.mkdir(parents=True, exist_ok=True)
-    trajectory = closed_loop(PERIOD)
-    simulations = {rate: simulate(configuration(width, height, rate), trajectory=trajectory)
-                   for rate in IMU_RATES[:1]}
-    for rate in IMU_RATES[1:]:
-        # The scene, which takes the time, is that of the first.
-        simulations[rate] = simulate(configuration(width, height, rate), trajectory=trajectory,
-                                     scene=simulations[IMU_RATES[0]].renderer.scene)
-    with BagWriter(clip.bag) as bag:
-        series = [_images(simulations[IMU_RATES[0]], bag, on_frame),
-                  *(_imu(simulation, bag, imu_topic(rate))
-                    for rate, simulation in simulations.items())]
-        for bag_time_ns, topic, msgtype, message in heapq.merge(
-                *series, key=lambda entry: entry[0]):
-            bag.write(topic, msgtype, message, bag_time_ns)
-    write_parameters(simulations[IMU_RATES[0]], clip.parameters)
-    return clip
+    def render(path: Path, parameters: Path) -> None:
+        trajectory = closed_loop(PERIOD)
+        first = simulate(configuration(width, height), trajectory=trajectory)
+        # The scene, which takes the time, is the same for each rate of the IMU.
+        others = [simulate(configuration(width, height, rate), trajectory=trajectory,
+                           scene=first.renderer.scene) for rate in IMU_RATES[1:]]
+        with BagWriter(path) as bag:
+            write_in_order(bag, _images(first, bag, on_frame),
+                           *(_imu_of_one_period(simulation, bag)
+                             for simulation in (first, *others)))
+        write_parameters(first, parameters)
+
+    return Clip(*made_once(folder, f'{width}x{height}', render))
 
 
 def coloured(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A (H, W, 3) image, blue green red, of about the same brightness."""
-    return np.clip(np.rint(gray[..., None] * _TINT), 0, 255).astype(np.uint8)
+    """A (H, W, 3) image, blue green red, whose channels differ, of about the same brightness."""
+    return np.clip(np.rint(gray[..., None] * [0.75, 1.0, 1.15]), 0, 255).astype(np.uint8)
 
 
 def _images(simulation: Simulation, bag: BagWriter,
-            on_frame: Callable[[], object]) -> Iterator[tuple[int, str, str, Any]]:
-    delay_ns = to_nanoseconds(simulation.config.readout_time + IMAGE_DELAY)
-    for frame in simulation.frames():
-        done, jpeg = cv2.imencode('.jpg', coloured(frame.image),
-                                  [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-        if not done:
-            raise RuntimeError('OpenCV could not encode an image as JPEG')
-        bag_time_ns = frame.stamp_ns + delay_ns
-        yield (bag_time_ns, CAMERA_INFO_TOPIC, 'sensor_msgs/msg/CameraInfo',
-               bag.camera_info(frame.stamp_ns, CAMERA_FRAME, simulation.camera))
-        yield (bag_time_ns, COMPRESSED_TOPIC, 'sensor_msgs/msg/CompressedImage',
-               bag.compressed_image(frame.stamp_ns, CAMERA_FRAME, jpeg.tobytes(),
-                                    'bgr8; jpeg compressed bgr8'))
-        on_frame()
+            on_frame: Callable[[], object]) -> Iterator[Entry]:
+    def encode(stamp_ns: int, pixels: NDArray[np.uint8]) -> tuple[str, str, Any]:
+        return (COMPRESSED_TOPIC, 'sensor_msgs/msg/CompressedImage', bag.compressed_image(
+            stamp_ns, CAMERA_FRAME, jpeg(coloured(pixels), quality=95),
+            'bgr8; jpeg compressed bgr8'))
+    return image_entries(simulation, bag, encode, on_frame)
 
 
-def _imu(simulation: Simulation, bag: BagWriter,
-         topic: str) -> Iterator[tuple[int, str, str, Any]]:
-    """The samples of one period."""
-    start_ns, delay_ns = simulation.config.start_ns, to_nanoseconds(IMU_DELAY)
-    imu = simulation.imu
-    for stamp_ns, rate, force in zip(imu.stamps_ns.tolist(), imu.angular_velocities,
-                                     imu.linear_accelerations, strict=True):
-        if start_ns <= stamp_ns < start_ns + to_nanoseconds(PERIOD):
-            yield (stamp_ns + delay_ns, topic, 'sensor_msgs/msg/Imu',
-                   bag.imu(stamp_ns, IMU_FRAME, rate, force))
+def _imu_of_one_period(simulation: Simulation, bag: BagWriter) -> Iterator[Entry]:
+    start_ns = simulation.config.start_ns + to_nanoseconds(IMU_DELAY)
+    for entry in imu_entries(simulation, bag, imu_topic(round(simulation.config.imu_rate))):
+        if start_ns <= entry[0] < start_ns + to_nanoseconds(PERIOD):
+            yield entry
 
 
 def seconds_into_loop(stamp_ns: int) -> float:

@@ -2,27 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 import os
 from pathlib import Path
 import platform
-from typing import Any
 
+from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_lab.experiments.live import Course, LiveStatistics, Percentiles
 from rs_relpose_lab.experiments.tables import markdown_table, write_csv
 from rs_relpose_ros.picture_files import save_picture
-
-REPORT_FILE, STATISTICS_FILE = 'live.md', 'live.csv'
-PLOT_FILE, SOAK_PLOT_FILE = 'live.png', 'soak.png'
-
-_LEGEND: Mapping[str, Any] = {'fontsize': 'small', 'ncols': 2}
-# Percentiles over time are those of windows of this length [s]; a short run has ten of them.
-_WINDOW = 60.0
-# The first part of a run, in which caches and pools fill, says nothing of leaks.
-_SETTLING = 0.1
 
 
 def write_report(folder: Path, cells: Sequence[LiveStatistics]) -> str:
@@ -34,7 +25,7 @@ def write_report(folder: Path, cells: Sequence[LiveStatistics]) -> str:
         The report (Markdown).
     """
     folder.mkdir(parents=True, exist_ok=True)
-    write_csv(folder / STATISTICS_FILE, cells)
+    write_csv(folder / 'live.csv', cells)
     report = '\n'.join([
         '# The live node\n',
         (f'Node and player on {os.cpu_count()} cores of {platform.machine()}, Python '
@@ -65,8 +56,8 @@ def write_report(folder: Path, cells: Sequence[LiveStatistics]) -> str:
          'player to the receipt of the pose by a third process. A frame that closes no pair '
          'publishes nothing and counts in the time of a frame, which is that of all frames, from '
          'its turn to its end.\n')])
-    (folder / REPORT_FILE).write_text(report)
-    _plot(folder / PLOT_FILE, cells)
+    (folder / 'live.md').write_text(report)
+    draw(folder / 'live.png', cells)
     return report
 
 
@@ -86,16 +77,16 @@ def write_soak_report(folder: Path, cell: LiveStatistics, course: Course) -> str
             ('from [min]', 'latency p50 [ms]', 'p99 [ms]'),
             [(f'{start / 60.0:.1f}', f'{latency.p50:.1f}', f'{latency.p99:.1f}')
              for start, latency in windows])])
-    (folder / REPORT_FILE).write_text(report)
-    write_csv(folder / STATISTICS_FILE, [cell])
-    _plot_soak(folder / SOAK_PLOT_FILE, cell, course)
+    (folder / 'live.md').write_text(report)
+    write_csv(folder / 'live.csv', [cell])
+    draw_soak(folder / 'soak.png', cell, course)
     return report
 
 
 def latency_over_time(course: Course) -> list[tuple[float, Percentiles]]:
-    """Start [s] and latency of successive windows."""
+    """Start [s] and latency of successive minutes; a run below 5 min is cut into ten windows."""
     end = float(course.latency_seconds[-1])
-    length = _WINDOW if end >= 5.0 * _WINDOW else max(end / 10.0, 1e-3)
+    length = 60.0 if end >= 300.0 else max(end / 10.0, 1e-3)
     starts = np.arange(0.0, end, length)
     return [(float(start), Percentiles.of(course.latencies[
         (course.latency_seconds >= start) & (course.latency_seconds < start + length)]))
@@ -104,7 +95,8 @@ def latency_over_time(course: Course) -> list[tuple[float, Percentiles]]:
 
 def memory_drift(course: Course) -> float:
     """Slope of the private memory [MB/h] after a settling time; NaN for too few samples."""
-    settled = course.memory_seconds >= _SETTLING * course.memory_seconds[-1]
+    # In the first tenth caches and pools fill, which says nothing of leaks.
+    settled = course.memory_seconds >= 0.1 * course.memory_seconds[-1]
     if np.count_nonzero(settled) < 3:
         return float('nan')
     slope, _ = np.polyfit(course.memory_seconds[settled], course.private[settled], 1)
@@ -115,10 +107,8 @@ def _two(values: Percentiles, digits: int = 1) -> str:
     return f'{values.p50:.{digits}f} / {values.p99:.{digits}f}'
 
 
-def _plot(path: Path, cells: Sequence[LiveStatistics]) -> None:
+def draw(path: Path, cells: Sequence[LiveStatistics]) -> Figure:
     """Latency and processor time of every cell."""
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(10.0, 1.9 + 0.36 * len(cells)), dpi=110, layout='constrained')
     left, right = figure.subplots(1, 2, sharey=True)
     at: NDArray[np.float64] = np.arange(len(cells), dtype=np.float64)
@@ -142,15 +132,16 @@ def _plot(path: Path, cells: Sequence[LiveStatistics]) -> None:
     right.set_xlabel('processor time [percent of one core]')
     for axis in (left, right):
         axis.grid(visible=True, axis='x', alpha=0.3)
-    figure.legend(*left.get_legend_handles_labels(), loc='outside lower left', **_LEGEND)
-    figure.legend(*right.get_legend_handles_labels(), loc='outside lower right', **_LEGEND)
+    for axis, place in ((left, 'outside lower left'), (right, 'outside lower right')):
+        handles, labels = axis.get_legend_handles_labels()
+        figure.legend(handles=handles, labels=labels, loc=place,  # type: ignore[call-overload]
+                      fontsize='small', ncols=2)
     save_picture(figure, path)
+    return figure
 
 
-def _plot_soak(path: Path, cell: LiveStatistics, course: Course) -> None:
+def draw_soak(path: Path, cell: LiveStatistics, course: Course) -> Figure:
     """Latency of every pair, and memory, over time."""
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(10.0, 6.0), dpi=110, layout='constrained')
     top, bottom = figure.subplots(2, 1, sharex=True)
     top.plot(course.latency_seconds / 60.0, course.latencies, '.', color='0.75', markersize=2.0,
@@ -174,3 +165,4 @@ def _plot_soak(path: Path, cell: LiveStatistics, course: Course) -> None:
         axis.grid(visible=True, alpha=0.3)
         axis.legend(fontsize='small')
     save_picture(figure, path)
+    return figure

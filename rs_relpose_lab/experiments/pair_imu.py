@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_lab.experiments.paper_methods import ContinuousGyro
+from rs_relpose_lab.experiments.methods import ContinuousGyro
 from rs_relpose_ros.config.estimator import EstimatorConfig
 from rs_relpose_ros.config.imu import ImuConfig
 from rs_relpose_ros.errors import MissingInputError
@@ -21,16 +21,6 @@ from rs_relpose_ros.imu.gravity import mean_gravity
 from rs_relpose_ros.imu.samples import ImuSample
 
 Array = NDArray[np.float64]
-
-# The paper: 'an average of the inertial measurements within 0.1 s near the image frame'. Here it
-# is centred on the middle row.
-_HALF_WINDOW_NS = to_nanoseconds(0.05)
-# Gravity is filtered from this long before the first frame on.
-_WARM_UP_NS = to_nanoseconds(5.0)
-# Noise may carry a match a few rows out of the image.
-_EDGE_NS = to_nanoseconds(1e-3)
-# Samples after the last row that interpolation may need.
-_AFTER_NS = to_nanoseconds(0.1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,9 +67,11 @@ class PairImu:
     def mean(self, stamp_ns: int) -> MeanMotion:
         """The paper's motion of a frame."""
         start_ns, end_ns = self._clock.row_span_ns(stamp_ns)
-        middle_ns = (start_ns + end_ns) // 2
-        window = self._samples[bisect_left(self._stamps, middle_ns - _HALF_WINDOW_NS):
-                               bisect_right(self._stamps, middle_ns + _HALF_WINDOW_NS)]
+        # The paper: 'an average of the inertial measurements within 0.1 s near the image frame'.
+        # Here it is centred on the middle row.
+        middle_ns, half_ns = (start_ns + end_ns) // 2, to_nanoseconds(0.05)
+        window = self._samples[bisect_left(self._stamps, middle_ns - half_ns):
+                               bisect_right(self._stamps, middle_ns + half_ns)]
         rates = [s.angular_velocity for s in window if s.angular_velocity is not None]
         forces = [s.linear_acceleration for s in window if s.linear_acceleration is not None]
         gravity = mean_gravity(np.array(forces))
@@ -95,14 +87,18 @@ class PairImu:
     def continuous(self, stamp1_ns: int, stamp2_ns: int) -> ContinuousGyro:
         """All that the gyro says of two frames, as the node would ask for it."""
         buffer = ImuBuffer(self._config)
-        spans = [(start_ns - _EDGE_NS, end_ns + _EDGE_NS) for start_ns, end_ns in
+        # Noise may carry a match a few rows out of the image.
+        edge_ns = to_nanoseconds(1e-3)
+        spans = [(start_ns - edge_ns, end_ns + edge_ns) for start_ns, end_ns in
                  (self._clock.row_span_ns(stamp) for stamp in (stamp1_ns, stamp2_ns))]
         references = [self._clock.reference_ns(stamp) for stamp in (stamp1_ns, stamp2_ns)]
-        fed = bisect_left(self._stamps, spans[0][0] - _WARM_UP_NS)
+        # Gravity is filtered from 5 s before the first frame on.
+        fed = bisect_left(self._stamps, spans[0][0] - to_nanoseconds(5.0))
         found = []
         for stamp_ns, span, reference_ns in zip((stamp1_ns, stamp2_ns), spans, references,
                                                 strict=True):
-            until = bisect_right(self._stamps, span[1] + _AFTER_NS)
+            # Interpolation needs a sample after the last row.
+            until = bisect_right(self._stamps, span[1] + to_nanoseconds(0.1))
             for sample in self._samples[fed:until]:
                 buffer.add(sample)
             fed = until

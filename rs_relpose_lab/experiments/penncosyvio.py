@@ -6,7 +6,7 @@ frames later; SIFT matches; angular velocity and gravity are means over 0.1 s.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 import math
 from pathlib import Path
@@ -15,9 +15,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_lab.experiments.boxes import Box, Record
+from rs_relpose_lab.experiments.methods import METHODS, PairProblem, run_method
 from rs_relpose_lab.experiments.pair_imu import PairImu
-from rs_relpose_lab.experiments.paper_methods import METHODS, PairProblem, run_method
-from rs_relpose_lab.experiments.paper_results import Cell, Record
 from rs_relpose_lab.experiments.penncosyvio_files import (
     CAMERAS,
     IMUS,
@@ -48,14 +48,12 @@ STRETCHES: Mapping[str, tuple[tuple[int, int], ...]] = {
     'as': ((206, 567), (1319, 1679), (2581, 2971), (4358, 4599)),
     'af': ((101, 551), (913, 1123), (1604, 1815), (2539, 2810)),
 }
-DISTANCE, EVERY = 30, 5
+METHODS_OF_THE_EXPERIMENT = ('global_5pt', 'uniform_9pt', 'uniform_11pt', 'auto', 'auto_gyro',
+                             'opencv_derotated', 'opencv_gyro')
 
 # Nobody has measured it. What the data set's authors quote for a GoPro Hero 4 [s]:
 # https://github.com/daniilidis-group/penncosyvio/issues/3
 GOPRO_READOUT = 0.03
-
-# The most that the estimator can be told [rad], [rad/s].
-_MAX_GRAVITY_SIGMA, _MAX_GYRO_SIGMA = 1.5, 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,8 +97,8 @@ class PennCosyvioRun:
     stamp_row: str = 'first'
     time_offset: float = 0.0
     gyro_bias: tuple[float, ...] = (0.0, 0.0, 0.0)
-    every: int = EVERY
-    distance: int = DISTANCE
+    every: int = 5
+    distance: int = 30
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -118,14 +116,14 @@ class PennCosyvioRun:
                 for first in range(start, end - self.distance + 1, self.every)]
 
 
-class Sequence(Protocol):
+class PairSource(Protocol):
     """Where the pairs of one sequence come from."""
 
     def problem(self, pair: Pair) -> PairProblem:
         """The pair as the methods get it."""
 
 
-def run_penncosyvio(run: PennCosyvioRun, open_sequence: Callable[[str], Sequence],
+def run_penncosyvio(run: PennCosyvioRun, open_sequence: Callable[[str], PairSource],
                     on_pair: Callable[[], object] = lambda: None) -> list[Record]:
     """Estimate every pair by every method.
 
@@ -138,21 +136,14 @@ def run_penncosyvio(run: PennCosyvioRun, open_sequence: Callable[[str], Sequence
         Called after each pair.
     """
     records = []
-    for pair, problem in _problems(run, open_sequence):
-        cell = Cell(EXPERIMENT, pair.sequence, str(pair.stretch))
-        records += [Record(cell, name, pair.first, run_method(name, problem, pair.first))
+    sequences = {name: open_sequence(name) for name in run.sequences}
+    for pair in run.pairs():
+        problem = sequences[pair.sequence].problem(pair)
+        box = Box(EXPERIMENT, pair.sequence, str(pair.stretch))
+        records += [Record(box, name, pair.first, *run_method(name, problem, pair.first))
                     for name in run.methods]
         on_pair()
     return records
-
-
-def _problems(run: PennCosyvioRun, open_sequence: Callable[[str], Sequence],
-              ) -> Iterator[tuple[Pair, PairProblem]]:
-    for name in run.sequences:
-        sequence = open_sequence(name)
-        for pair in run.pairs():
-            if pair.sequence == name:
-                yield pair, sequence.problem(pair)
 
 
 class RecordedSequence:
@@ -209,11 +200,10 @@ def pair_problem(matches: Matches, camera: RollingShutterCamera, imu: PairImu,
                  with_gyro: bool) -> PairProblem:
     """A pair with the IMU of the paper's protocol; the estimator is told how bad the means are."""
     first, second = (imu.mean(stamp) for stamp in stamps_ns)
+    # The most that the estimator can be told is 1.5 rad and 1 rad/s.
     told = replace(
-        told, gravity_sigma=min(max(first.gravity_sigma, second.gravity_sigma),
-                                _MAX_GRAVITY_SIGMA),
-        gyro_sigma=min(math.hypot(told.gyro_sigma, max(first.rate_sigma, second.rate_sigma)),
-                       _MAX_GYRO_SIGMA))
+        told, gravity_sigma=min(max(first.gravity_sigma, second.gravity_sigma), 1.5),
+        gyro_sigma=min(math.hypot(told.gyro_sigma, max(first.rate_sigma, second.rate_sigma)), 1.0))
     gyro = imu.continuous(*stamps_ns) if with_gyro else None
     return PairProblem(matches.points1, matches.points2, camera, first.motion, second.motion,
                        *truth, told, matches.quality, gyro)

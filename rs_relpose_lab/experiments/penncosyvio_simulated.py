@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_lab.experiments.methods import PairProblem
 from rs_relpose_lab.experiments.pair_imu import PairImu
-from rs_relpose_lab.experiments.paper_methods import PairProblem
-from rs_relpose_lab.experiments.paper_scenes import measured, seen_by_both
 from rs_relpose_lab.experiments.penncosyvio import (
     camera_poses,
     Pair,
@@ -25,29 +24,21 @@ from rs_relpose_lab.experiments.penncosyvio import (
 )
 from rs_relpose_lab.experiments.penncosyvio_files import read_camera
 from rs_relpose_lab.experiments.recorded_motion import RecordedMotion
-from rs_relpose_lab.experiments.row_by_row import Motion, Shutter, View
+from rs_relpose_lab.simulation.config import SimulationConfig
+from rs_relpose_lab.simulation.hand_held import EYE_HEIGHT
 from rs_relpose_lab.simulation.inertial import ImuModel
-from rs_relpose_lab.simulation.render import Renderer
+from rs_relpose_lab.simulation.render import Renderer, view_of
+from rs_relpose_lab.simulation.rows import in_front, measured, Motion, seen_by_both
 from rs_relpose_lab.simulation.scene import make_scene, Scene, SCENES
 from rs_relpose_lab.simulation.trajectory import Trajectory
 from rs_relpose_ros.config.estimator import EstimatorConfig
 from rs_relpose_ros.config.imu import ImuConfig
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.timing import ImageClock, to_nanoseconds
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.tracking.matches import Matches
 
 Array = NDArray[np.float64]
-
-_IMU_RATE = 200.0
-# Of a small MEMS IMU, as `simulation.SimulationConfig` has it; what a calibration leaves of the
-# gyro's bias is the 0.1 deg/s that the paper gives for a low-cost sensor.
-_GYRO_DENSITY, _ACCEL_DENSITY = 1.7e-4, 2.0e-3
-_BIAS_ERROR = math.radians(0.1)
-_EYE_HEIGHT = 1.6
-# White noise of the rendered images [gray values].
-_IMAGE_NOISE = 2.0
 
 # Independent random streams of one seed.
 _IMU, _POINTS, _NOISE, _SCENE, _IMAGE = range(5)
@@ -118,29 +109,39 @@ class SimulatedSequence:
 
     def _measure(self) -> tuple[ImuSample, ...]:
         rng = self._stream(_IMU)
-        times = np.arange(math.ceil(self._motion.span[0] * _IMU_RATE),
-                          math.floor(self._motion.span[1] * _IMU_RATE) + 1) / _IMU_RATE
-        model = ImuModel(np.eye(3), gyro_bias=_BIAS_ERROR * rng.standard_normal(3),
-                         gyro_sigma=_GYRO_DENSITY * math.sqrt(_IMU_RATE),
-                         accel_sigma=_ACCEL_DENSITY * math.sqrt(_IMU_RATE))
+        config = SimulationConfig()
+        rate = config.imu_rate
+        times = np.arange(math.ceil(self._motion.span[0] * rate),
+                          math.floor(self._motion.span[1] * rate) + 1) / rate
+        # A calibration leaves a bias of 0.1 deg/s, which the paper gives for a low-cost sensor.
+        model = ImuModel(np.eye(3), gyro_bias=math.radians(0.1) * rng.standard_normal(3),
+                         gyro_sigma=config.gyro_noise_density * math.sqrt(rate),
+                         accel_sigma=config.accel_noise_density * math.sqrt(rate))
         rates, forces = model.measure(self._motion.states(times), rng)
         start_ns = int(self._stamps_ns[0])
-        return tuple(ImuSample(start_ns + to_nanoseconds(time), tuple(rate), tuple(force))
-                     for time, rate, force in zip(times.tolist(), rates.tolist(),
-                                                  forces.tolist(), strict=True))
+        return tuple(ImuSample(start_ns + to_nanoseconds(time), tuple(w), tuple(force))
+                     for time, w, force in zip(times.tolist(), rates.tolist(), forces.tolist(),
+                                               strict=True))
 
     def _points(self, pair: Pair, seconds: list[float]) -> Matches:
-        view = view_of(self._camera)
-        points = seen_by_both(self._motion_from(seconds[0]), self._motion_from(seconds[1]), view,
-                              self._stream(_POINTS, pair.first))
-        points1, points2 = measured(points, view, self._simulated.pixel_noise,
-                                    self._simulated.outliers, self._stream(_NOISE, pair.first))
+        view, rng = view_of(self._camera), self._stream(_POINTS, pair.first)
+        (start, _), (origin, _) = self._motion.at(seconds)
+
+        def candidates() -> Array:
+            return in_front(view, start, origin, 600, (6.0, 34.0), rng)
+
+        exact = seen_by_both(candidates, self._motion_from(seconds[0]),
+                             self._motion_from(seconds[1]), view, 300)
+        points1, points2, _ = measured(exact, view, self._simulated.pixel_noise,
+                                       self._simulated.outliers, self._stream(_NOISE, pair.first))
         return Matches(np.arange(len(points1), dtype=np.uint32), points1, points2,
                        np.ones(len(points1)))
 
     def _motion_from(self, start: float) -> Motion:
-        """Poses at times that count from a frame's reference row."""
-        return lambda times: self._motion.at(start + times)
+        def to_camera(world: Array, times: Array) -> Array:
+            orientations, positions = self._motion.at(start + times)
+            return np.asarray(orientations.inv().apply(world - positions))
+        return to_camera
 
     def _rendered(self, scene: Scene, pair: Pair, seconds: list[float]) -> Matches:
         placed = PlacedMotion(self._motion, seconds[0])
@@ -150,7 +151,8 @@ class SimulatedSequence:
         for number, second in zip((pair.first, pair.second), seconds, strict=True):
             gray = renderer.render(second)
             noise = self._stream(_IMAGE, number).standard_normal(gray.shape, dtype=np.float32)
-            images.append(np.clip(np.rint(gray + _IMAGE_NOISE * noise), 0, 255).astype(np.uint8))
+            # White noise of 2 gray values.
+            images.append(np.clip(np.rint(gray + 2.0 * noise), 0, 255).astype(np.uint8))
         return sift_matches(*images)
 
     def _stream(self, *key: int) -> np.random.Generator:
@@ -174,14 +176,5 @@ class PlacedMotion:
         """Positions (N, 3) [m] and orientations (N, 3, 3) at times (N,) [s]."""
         orientations, positions = self._motion.at(times)
         moved = self._turn.apply(positions - self._origin)
-        moved[:, 2] += _EYE_HEIGHT
+        moved[:, 2] += EYE_HEIGHT
         return moved, (self._turn * orientations).as_matrix()
-
-
-def view_of(camera: RollingShutterCamera) -> View:
-    """A camera, as the simulation of points needs it."""
-    def directions(pixels: Array) -> Array:
-        rays = camera.unproject(pixels)
-        return rays / rays[:, 2:]
-    return View(camera.project, directions, Shutter(
-        camera.width, camera.height, camera.line_delay, camera.reference_row_index))

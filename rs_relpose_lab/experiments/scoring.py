@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
+# Of a relative pose: three of the rotation, two of the direction of translation.
 POSE_FREEDOM = 5
 
 
@@ -28,10 +31,10 @@ class PoseError:
 
     rotation: float
     translation: float
-    nees: float
+    nees: float = math.nan
 
 
-NO_POSE = PoseError(float('inf'), float('inf'), float('nan'))
+NO_POSE = PoseError(math.inf, math.inf)
 
 
 def pose_error(R: Array, t: Array, true_R: Array, true_t: Array, covariance: Array | None = None,
@@ -41,12 +44,15 @@ def pose_error(R: Array, t: Array, true_R: Array, true_t: Array, covariance: Arr
     Parameters
     ----------
     R, true_R : (3, 3) ndarray
-    t, true_t : (3,) ndarray
-        Unit vectors.
+    t : (3,) ndarray
+        Unit vector.
+    true_t : (3,) ndarray
+        Of any length but zero.
     covariance : (6, 6) ndarray, optional
         Of ``(dt, dtheta)`` with ``t_true = t + dt`` (dt perpendicular to t) and
         ``R_true = Exp(dtheta) R``, both in camera 1.
     """
+    true_t = true_t / np.linalg.norm(true_t)
     turn = Rotation.from_matrix(true_R @ R.T).as_rotvec()
     away = true_t - (true_t @ t) * t
     sine = float(np.linalg.norm(away))
@@ -54,7 +60,7 @@ def pose_error(R: Array, t: Array, true_R: Array, true_t: Array, covariance: Arr
     rotation = float(np.degrees(np.linalg.norm(turn)))
     translation = float(np.degrees(angle))
     if covariance is None:
-        return PoseError(rotation, translation, float('nan'))
+        return PoseError(rotation, translation)
     # Along the great circle: the direction of t is no vector space once the error is large.
     shift = away * (angle / sine) if sine > 0.0 else away
     basis = np.zeros((6, POSE_FREEDOM))
@@ -63,3 +69,22 @@ def pose_error(R: Array, t: Array, true_R: Array, true_t: Array, covariance: Arr
     error = basis.T @ np.concatenate([shift, turn])
     nees = error @ np.linalg.solve(basis.T @ covariance @ basis, error)
     return PoseError(rotation, translation, float(nees))
+
+
+@dataclass(frozen=True, slots=True)
+class Quantiles:
+    """Median and 90th percentile; of errors, infinite where too many poses are lost."""
+
+    median: float
+    p90: float
+
+    @classmethod
+    def of(cls, values: Iterable[float]) -> Quantiles:
+        """Quantiles of values, infinite ones among them."""
+        # Not interpolated: between a number and infinity there is nothing.
+        median, p90 = np.quantile(list(values), [0.5, 0.9], method='higher')
+        return cls(float(median), float(p90))
+
+    def text(self, digits: int) -> str:
+        """Such as ``0.023 / 0.041``."""
+        return f'{self.median:.{digits}f} / {self.p90:.{digits}f}'

@@ -13,15 +13,23 @@ import time
 import cv2
 import numpy as np
 
-from rs_relpose_lab.experiments.accuracy import estimate, told_config
-from rs_relpose_lab.experiments.peers import available_methods, Pose
+from rs_relpose_lab.experiments.methods import as_pair, Estimate, METHODS, prepared
 from rs_relpose_lab.experiments.problems import Cell, CELLS, make_problem
-from rs_relpose_lab.experiments.scoring import NO_POSE, pose_error
 from rs_relpose_ros import warm_up
+
+THRESHOLD = 1.5  # [px], of OpenCV and PoseLib
+LIBRARY = 'rs_relpose_ros'
+REFERENCE = 'PoseLib, derotated points'
+# In the report; PoseLib's only where it is installed.
+COMPARED = {LIBRARY: METHODS['auto']} | {
+    name: replace(METHODS[key], threshold=THRESHOLD) for name, key in (
+        ('OpenCV USAC_MAGSAC, raw points', 'opencv'),
+        ('OpenCV USAC_MAGSAC, derotated points', 'opencv_derotated'),
+        ('PoseLib, raw points', 'poselib'), (REFERENCE, 'poselib_derotated')) if key in METHODS}
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class Timing:
     """One method on one problem.
 
     Attributes
@@ -44,16 +52,8 @@ class Run:
 
 
 @dataclass(frozen=True, slots=True)
-class FirstEstimate:
-    """Of a new process with compiled kernels on disk: first and second estimate [ms]."""
-
-    first: float
-    second: float
-
-
-@dataclass(frozen=True, slots=True)
 class Soak:
-    """Resident memory [MB] while estimates of ever new problems go on.
+    """Resident memory [MB] while estimates of twenty problems go on.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class Soak:
 
 
 def compare(cell_name: str, matches: int, trials: int, repeats: int, first_seed: int = 0,
-            on_run: Callable[[int], object] = lambda count: None) -> list[Run]:
+            on_problem: Callable[[], object] = lambda: None) -> list[Timing]:
     """Run every method on the same problems of a cell.
 
     The methods take turns on each problem, and each of them the shortest of a few repeats, so that
@@ -78,69 +78,67 @@ def compare(cell_name: str, matches: int, trials: int, repeats: int, first_seed:
     # OpenCV would take all cores.
     cv2.setNumThreads(1)
     warm_up()
-    runs = []
+    timings = []
     for seed in range(first_seed, first_seed + trials):
-        problem = make_problem(cell, seed)
-        for method in available_methods():
-            pose, duration = _timed(method.prepare(problem, cell, seed), repeats)
-            error = NO_POSE if pose is None else pose_error(*pose, problem.R, problem.t)
-            runs.append(Run(cell_name, matches, method.name, seed, duration * 1e3, error.rotation,
-                            error.translation))
-        on_run(1)
-    return runs
+        pair = as_pair(make_problem(cell, seed), cell)
+        for name, method in COMPARED.items():
+            call = prepared(method, pair, seed)
+            duration = 1e3 * _shortest(call, repeats)
+            error = pair.error(call())
+            timings.append(Timing(cell_name, matches, name, seed, duration, error.rotation,
+                                  error.translation))
+        on_problem()
+    return timings
 
 
-def _timed(call: Callable[[], Pose | None], repeats: int) -> tuple[Pose | None, float]:
-    """The pose, which repeats do not change, and the shortest time [s]."""
+def _shortest(call: Estimate, repeats: int) -> float:
+    """The shortest time of a call [s]."""
     durations = []
     gc.disable()
     try:
         for _ in range(repeats):
             started = time.perf_counter()
-            pose = call()
+            call()
             durations.append(time.perf_counter() - started)
     finally:
         gc.enable()
-    return pose, min(durations)
+    return min(durations)
 
 
-def first_estimates(processes: int) -> list[FirstEstimate]:
-    """Time the first estimate in new processes, one after the other; imports are not counted.
+def _base_problem(seed: int) -> Estimate:
+    cell = Cell()
+    return prepared(METHODS['auto'], as_pair(make_problem(cell, seed), cell), seed)
+
+
+def first_estimates(processes: int) -> list[tuple[float, float]]:
+    """First and second estimate [ms] of new processes, one after the other; without imports.
 
     The kernels' cache on disk is filled before, by an estimate in this process.
     """
     warm_up()
     results = []
     for _ in range(processes):
-        with ProcessPoolExecutor(1, mp_context=get_context('spawn')) as pool:
-            results.append(pool.submit(_first_estimate).result())
+        with ProcessPoolExecutor(1, get_context('spawn')) as pool:
+            results.append(pool.submit(_first_estimates).result())
     return results
 
 
-def _first_estimate() -> FirstEstimate:
-    cell = Cell()
-    problem, config = make_problem(cell, 0), told_config(cell, 1.0, 'auto')
-    durations = []
-    for _ in range(2):
-        started = time.perf_counter()
-        estimate(problem, config, 0)
-        durations.append((time.perf_counter() - started) * 1e3)
-    return FirstEstimate(*durations)
+def _first_estimates() -> tuple[float, float]:
+    call = _base_problem(0)
+    return 1e3 * _shortest(call, 1), 1e3 * _shortest(call, 1)
 
 
-def soak(estimates: int, on_estimates: Callable[[int], object] = lambda count: None) -> Soak:
+def soak(estimates: int, on_estimate: Callable[[], object] = lambda: None) -> Soak:
     """Estimate again and again and see whether memory grows.
 
     A tenth as many estimates go before, so that buffers have their size.
     """
-    cell = Cell()
-    config = told_config(cell, 1.0, 'auto')
-    problems = [make_problem(cell, seed) for seed in range(20)]
+    calls = [_base_problem(seed) for seed in range(20)]
 
     def work(count: int) -> None:
         for k in range(count):
-            estimate(problems[k % len(problems)], config, k)
-            on_estimates(1)
+            calls[k % len(calls)]()
+            on_estimate()
 
     work(estimates // 10)
     before = _resident()
@@ -156,12 +154,11 @@ def _resident() -> float:
     raise OSError('/proc/self/status has no VmRSS')
 
 
-def medians(runs: Sequence[Run], method: str) -> dict[int, float]:
+def medians(timings: Sequence[Timing], method: str) -> dict[int, float]:
     """Median time [ms] of a method by the number of matches."""
-    sizes = sorted({run.matches for run in runs})
-    return {size: float(np.median([run.duration for run in runs
-                                   if run.matches == size and run.method == method]))
-            for size in sizes}
+    return {size: float(np.median([timing.duration for timing in timings
+                                   if (timing.matches, timing.method) == (size, method)]))
+            for size in sorted({timing.matches for timing in timings})}
 
 
 def exponent(times: dict[int, float]) -> float:

@@ -5,19 +5,26 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
+import math
 from pathlib import Path
 import platform
 
 import cv2
+from matplotlib.figure import Figure
 import numpy as np
 
-from rs_relpose_lab.experiments.peers import LIBRARY, POSELIB_DEROTATED, THRESHOLD
-from rs_relpose_lab.experiments.speed import exponent, FirstEstimate, medians, Run, Soak
+from rs_relpose_lab.experiments.scoring import Quantiles
+from rs_relpose_lab.experiments.speed import (
+    exponent,
+    LIBRARY,
+    medians,
+    REFERENCE,
+    Soak,
+    THRESHOLD,
+    Timing,
+)
 from rs_relpose_lab.experiments.tables import markdown_table, write_csv
 from rs_relpose_ros.picture_files import save_picture
-
-RUNS_FILE, METHODS_FILE, SCALING_FILE = 'runs.csv', 'methods.csv', 'scaling.csv'
-REPORT_FILE, PLOT_FILE = 'speed.md', 'speed.png'
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,40 +40,34 @@ class MethodStatistics:
     method: str
     trials: int
     lost: int
-    time_median: float
-    time_p90: float
+    time: Quantiles
     time_ratio: float
-    rotation_median: float
-    rotation_p90: float
-    translation_median: float
-    translation_p90: float
+    rotation: Quantiles
+    translation: Quantiles
 
 
-def method_statistics(runs: Sequence[Run]) -> list[MethodStatistics]:
+def method_statistics(timings: Sequence[Timing]) -> list[MethodStatistics]:
     """Statistics of each method in each cell and number of matches."""
-    groups: dict[tuple[str, int, str], list[Run]] = {}
-    for run in runs:
-        groups.setdefault((run.cell, run.matches, run.method), []).append(run)
+    groups: dict[tuple[str, int, str], list[Timing]] = {}
+    for timing in timings:
+        groups.setdefault((timing.cell, timing.matches, timing.method), []).append(timing)
     result = []
     for (cell, matches, method), group in groups.items():
-        reference = {run.seed: run.duration
-                     for run in groups.get((cell, matches, POSELIB_DEROTATED), [])}
-        ratios = [run.duration / reference.get(run.seed, np.nan) for run in group]
+        reference = {timing.seed: timing.duration
+                     for timing in groups.get((cell, matches, REFERENCE), [])}
         result.append(MethodStatistics(
-            cell, matches, method, len(group), sum(bool(np.isinf(run.rotation)) for run in group),
-            *_quantiles([run.duration for run in group]), float(np.median(ratios)),
-            *_quantiles([run.rotation for run in group]),
-            *_quantiles([run.translation for run in group])))
+            cell, matches, method, trials=len(group),
+            lost=sum(math.isinf(timing.rotation) for timing in group),
+            time=Quantiles.of(timing.duration for timing in group),
+            time_ratio=float(np.median([timing.duration / reference.get(timing.seed, math.nan)
+                                        for timing in group])),
+            rotation=Quantiles.of(timing.rotation for timing in group),
+            translation=Quantiles.of(timing.translation for timing in group)))
     return result
 
 
-def _quantiles(values: Sequence[float]) -> tuple[float, float]:
-    median, p90 = np.quantile(values, [0.5, 0.9], method='higher')
-    return float(median), float(p90)
-
-
-def write_report(folder: Path, comparison: Sequence[Run], scaling: Sequence[Run],
-                 first: Sequence[FirstEstimate], soak: Soak | None) -> str:
+def write_report(folder: Path, comparison: Sequence[Timing], scaling: Sequence[Timing],
+                 first: Sequence[tuple[float, float]], soak: Soak | None) -> str:
     """Write runs, tables, report and plot into a folder, which is made where it is missing.
 
     Returns
@@ -76,17 +77,17 @@ def write_report(folder: Path, comparison: Sequence[Run], scaling: Sequence[Run]
     """
     folder.mkdir(parents=True, exist_ok=True)
     compared, scaled = method_statistics(comparison), method_statistics(scaling)
-    write_csv(folder / RUNS_FILE, [*comparison, *scaling])
-    write_csv(folder / METHODS_FILE, compared)
-    write_csv(folder / SCALING_FILE, scaled)
+    write_csv(folder / 'runs.csv', [*comparison, *scaling])
+    write_csv(folder / 'methods.csv', compared)
+    write_csv(folder / 'scaling.csv', scaled)
     report = _report(compared, scaling, first, soak)
-    (folder / REPORT_FILE).write_text(report)
-    _plot(folder / PLOT_FILE, compared, scaling)
+    (folder / 'speed.md').write_text(report)
+    draw(folder / 'speed.png', compared, scaling)
     return report
 
 
-def _report(compared: Sequence[MethodStatistics], scaling: Sequence[Run],
-            first: Sequence[FirstEstimate], soak: Soak | None) -> str:
+def _report(compared: Sequence[MethodStatistics], scaling: Sequence[Timing],
+            first: Sequence[tuple[float, float]], soak: Soak | None) -> str:
     parts = [
         '# Speed, side by side\n',
         (f'One thread of {_processor()}; {_versions()}. OpenCV and PoseLib with a threshold of '
@@ -97,14 +98,12 @@ def _report(compared: Sequence[MethodStatistics], scaling: Sequence[Run],
         parts.append(f'## {cell}, {rows[0].matches} matches, {rows[0].trials} problems\n')
         parts.append(markdown_table(
             ('method', 'time [ms]', 'by PoseLib, derotated', 'R [deg]', 't [deg]', 'lost'),
-            [(entry.method, f'{entry.time_median:.2f} / {entry.time_p90:.2f}',
-              f'{entry.time_ratio:.2f}', f'{entry.rotation_median:.3f} / {entry.rotation_p90:.3f}',
-              f'{entry.translation_median:.3f} / {entry.translation_p90:.3f}', f'{entry.lost}')
-             for entry in rows]))
+            [(entry.method, entry.time.text(2), f'{entry.time_ratio:.2f}', entry.rotation.text(3),
+              entry.translation.text(3), f'{entry.lost}') for entry in rows]))
     if scaling:
         parts.append(_scaling_table(scaling))
     if first:
-        firsts, seconds = zip(*((entry.first, entry.second) for entry in first), strict=True)
+        firsts, seconds = zip(*first, strict=True)
         parts.append('## A new process, kernels cached\n')
         parts.append(f'First estimate {np.median(firsts):.0f} ms (largest of {len(first)} '
                      f'processes: {max(firsts):.0f} ms), second {np.median(seconds):.1f} ms; '
@@ -116,9 +115,9 @@ def _report(compared: Sequence[MethodStatistics], scaling: Sequence[Run],
     return '\n'.join(parts)
 
 
-def _scaling_table(scaling: Sequence[Run]) -> str:
-    methods = list(dict.fromkeys(run.method for run in scaling))
-    sizes = sorted({run.matches for run in scaling})
+def _scaling_table(scaling: Sequence[Timing]) -> str:
+    methods = list(dict.fromkeys(timing.method for timing in scaling))
+    sizes = sorted({timing.matches for timing in scaling})
     rows = []
     for method in methods:
         times = medians(scaling, method)
@@ -131,10 +130,8 @@ def _scaling_table(scaling: Sequence[Run]) -> str:
 
 def _processor() -> str:
     """Name of the processor, where Linux tells it."""
-    try:
-        lines = Path('/proc/cpuinfo').read_text().splitlines()
-    except OSError:
-        lines = []
+    path = Path('/proc/cpuinfo')
+    lines = path.read_text().splitlines() if path.exists() else []
     names = [line.partition(':')[2].strip() for line in lines if line.startswith('model name')]
     return names[0] if names else platform.machine()
 
@@ -148,10 +145,9 @@ def _versions() -> str:
             f'Numba {version("numba")}, OpenCV {cv2.__version__}, {poselib}')
 
 
-def _plot(path: Path, compared: Sequence[MethodStatistics], scaling: Sequence[Run]) -> None:
+def draw(path: Path, compared: Sequence[MethodStatistics],
+         scaling: Sequence[Timing]) -> Figure:
     """Error over time of every method, and time over matches."""
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(12.0, 4.5), dpi=110, layout='constrained')
     left, right = figure.subplots(1, 2)
     markers = dict(zip(dict.fromkeys(entry.cell for entry in compared), 'osD^v<>Pp*h' * 5,
@@ -160,13 +156,13 @@ def _plot(path: Path, compared: Sequence[MethodStatistics], scaling: Sequence[Ru
         dict.fromkeys(entry.method for entry in compared))}
     for entry in compared:
         first = entry.cell == compared[0].cell
-        left.loglog(entry.time_median, entry.rotation_median, markers[entry.cell],
+        left.loglog(entry.time.median, entry.rotation.median, markers[entry.cell],
                     color=colours[entry.method], label=entry.method if first else None)
     left.set_title(', '.join(f'{marker}: {cell}' for cell, marker in markers.items()), fontsize=9)
     left.set_xlabel('median time [ms]')
     left.set_ylabel('median rotation error [deg]')
     left.legend(fontsize='small')
-    for method in dict.fromkeys(run.method for run in scaling):
+    for method in dict.fromkeys(timing.method for timing in scaling):
         times = medians(scaling, method)
         right.loglog(list(times), list(times.values()), 'o-', color=colours[method],
                      linewidth=2.5 if method == LIBRARY else 1.2)
@@ -175,3 +171,4 @@ def _plot(path: Path, compared: Sequence[MethodStatistics], scaling: Sequence[Ru
     for axis in (left, right):
         axis.grid(visible=True, which='both', alpha=0.3)
     save_picture(figure, path)
+    return figure

@@ -23,10 +23,14 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return '\n'.join([padded(lines[0]), padded(rule), *map(padded, lines[1:])]) + '\n'
 
 
-def write_csv(path: Path, records: Sequence[Any]) -> None:
-    """One line for each dataclass; one inside of another gives columns `outer_inner`."""
-    rows = [dict(_flat(asdict(record))) for record in records]
-    with path.open('w', newline='') as file:
+def write_csv(path: Path, records: Iterable[Any]) -> None:
+    """Write a line for each dataclass or mapping; NaN is an empty cell.
+
+    A dataclass inside of another gives columns ``outer_inner``.
+    """
+    rows = [dict(_flat(record if isinstance(record, Mapping) else asdict(record)))
+            for record in records]
+    with path.open('w', newline='', encoding='utf-8') as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
@@ -37,4 +41,4 @@ def _flat(values: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, An
         if isinstance(value, dict):
             yield from _flat(value, f'{prefix}{name}_')
         else:
-            yield prefix + name, value
+            yield prefix + name, '' if value != value else value

@@ -5,14 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 import heapq
 from pathlib import Path
+import shutil
 from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 import yaml
 
-from rs_relpose_lab.simulation.simulation import Simulation
+from rs_relpose_lab.simulation.config import SimulationConfig
+from rs_relpose_lab.simulation.simulation import simulate, Simulation
+from rs_relpose_lab.simulation.trajectory import Trajectory
 from rs_relpose_ros.bags.layout import (
     CAMERA_FRAME,
     CAMERA_INFO_TOPIC,
@@ -29,8 +33,8 @@ from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.timing import to_nanoseconds
 
-# Bag time [ns], topic, type and a function that makes the message.
-_Entry = tuple[int, str, str, Callable[[], Any]]
+# Bag time [ns], topic, type, message.
+Entry = tuple[int, str, str, Any]
 
 
 def write_bag(simulation: Simulation, path: Path | str, *, jpeg_quality: int = 88,
@@ -56,12 +60,45 @@ def write_bag(simulation: Simulation, path: Path | str, *, jpeg_quality: int = 8
     """
     if not 1 <= jpeg_quality <= 100:
         raise InputError(f'jpeg_quality must lie in [1, 100], got {jpeg_quality}')
+
+    def encode(stamp_ns: int, pixels: NDArray[np.uint8]) -> tuple[str, str, Any]:
+        if raw:
+            return RAW_TOPIC, 'sensor_msgs/msg/Image', bag.image(stamp_ns, CAMERA_FRAME, pixels)
+        return (COMPRESSED_TOPIC, 'sensor_msgs/msg/CompressedImage',
+                bag.compressed_image(stamp_ns, CAMERA_FRAME, jpeg(pixels, jpeg_quality)))
+
     with BagWriter(path) as bag:
-        entries = heapq.merge(
-            _images(simulation, bag, jpeg_quality, raw, on_frame), _imu(simulation, bag),
-            _ground_truth(simulation, bag), key=lambda entry: entry[0])
-        for bag_time_ns, topic, msgtype, make in entries:
-            bag.write(topic, msgtype, make(), bag_time_ns)
+        write_in_order(bag, image_entries(simulation, bag, encode, on_frame),
+                       imu_entries(simulation, bag, IMU_TOPIC), _truth_entries(simulation, bag))
+
+
+def write_in_order(bag: BagWriter, *series: Iterator[Entry]) -> None:
+    """Write several series of messages, each in the order of its bag times, as one."""
+    for bag_time_ns, topic, msgtype, message in heapq.merge(*series, key=lambda entry: entry[0]):
+        bag.write(topic, msgtype, message, bag_time_ns)
+
+
+def render_once(config: SimulationConfig, folder: Path,
+                trajectory: Trajectory | None = None) -> tuple[Path, Path]:
+    """A bag and its parameter file in `folder`, rendered unless they are there."""
+    def render(bag: Path, parameters: Path) -> None:
+        simulation = simulate(config, trajectory=trajectory)
+        write_bag(simulation, bag)
+        write_parameters(simulation, parameters)
+    return made_once(folder, 'bag', render)
+
+
+def made_once(folder: Path, name: str,
+              make: Callable[[Path, Path], object]) -> tuple[Path, Path]:
+    """A bag and its parameter file; `make` writes the file last, unless both are there."""
+    bag, parameters = folder / name, folder / f'{name}.yaml'
+    if not (bag.exists() and parameters.exists()):
+        # What a run that was stopped has left.
+        shutil.rmtree(bag, ignore_errors=True)
+        parameters.unlink(missing_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
+        make(bag, parameters)
+    return bag, parameters
 
 
 def node_parameters(simulation: Simulation, *, raw: bool = False) -> dict[str, Any]:
@@ -93,56 +130,47 @@ def write_parameters(simulation: Simulation, path: Path | str, *, raw: bool = Fa
         raise InputError(f'cannot write {path}: {error.strerror}') from error
 
 
-def _images(simulation: Simulation, bag: BagWriter, jpeg_quality: int, raw: bool,
-            on_frame: Callable[[], object]) -> Iterator[_Entry]:
+def jpeg(pixels: NDArray[np.uint8], quality: int) -> bytes:
+    """An image as JPEG."""
+    done, data = cv2.imencode('.jpg', pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not done:
+        raise RuntimeError('OpenCV could not encode an image as JPEG')
+    return data.tobytes()
+
+
+def image_entries(simulation: Simulation, bag: BagWriter,
+                  encode: Callable[[int, NDArray[np.uint8]], tuple[str, str, Any]],
+                  on_frame: Callable[[], object]) -> Iterator[Entry]:
+    """Images and their CameraInfo; `encode`: topic, type and message of a stamp and pixels."""
     delay_ns = to_nanoseconds(simulation.config.readout_time + IMAGE_DELAY)
-    for index in range(simulation.config.frame_count):
-        stamp_ns = simulation.stamp_ns(index)
-
-        def info(stamp_ns: int = stamp_ns) -> Any:
-            return bag.camera_info(stamp_ns, CAMERA_FRAME, simulation.camera)
-
-        def image(index: int = index, stamp_ns: int = stamp_ns) -> Any:
-            pixels = simulation.frame(index).image
-            on_frame()
-            if raw:
-                return bag.image(stamp_ns, CAMERA_FRAME, pixels)
-            done, jpeg = cv2.imencode('.jpg', pixels, [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality])
-            if not done:
-                raise RuntimeError('OpenCV could not encode an image as JPEG')
-            return bag.compressed_image(stamp_ns, CAMERA_FRAME, jpeg.tobytes())
-
-        yield stamp_ns + delay_ns, CAMERA_INFO_TOPIC, 'sensor_msgs/msg/CameraInfo', info
-        if raw:
-            yield stamp_ns + delay_ns, RAW_TOPIC, 'sensor_msgs/msg/Image', image
-        else:
-            yield (stamp_ns + delay_ns, COMPRESSED_TOPIC, 'sensor_msgs/msg/CompressedImage', image)
+    for frame in simulation.frames():
+        stamp_ns = frame.stamp_ns
+        topic, msgtype, message = encode(stamp_ns, frame.image)
+        info = bag.camera_info(stamp_ns, CAMERA_FRAME, simulation.camera)
+        yield (stamp_ns + delay_ns, CAMERA_INFO_TOPIC, 'sensor_msgs/msg/CameraInfo',
+               info)
+        yield stamp_ns + delay_ns, topic, msgtype, message
+        on_frame()
 
 
-def _imu(simulation: Simulation, bag: BagWriter) -> Iterator[_Entry]:
+def imu_entries(simulation: Simulation, bag: BagWriter, topic: str) -> Iterator[Entry]:
+    """IMU samples with their noise's variances."""
     config, imu = simulation.config, simulation.imu
-    delay_ns = to_nanoseconds(IMU_DELAY)
     gyro_variance = config.gyro_noise_density**2 * config.imu_rate
     accel_variance = config.accel_noise_density**2 * config.imu_rate
     for stamp_ns, rate, force in zip(imu.stamps_ns.tolist(), imu.angular_velocities,
                                      imu.linear_accelerations, strict=True):
-        def message(stamp_ns: int = stamp_ns, rate: Any = rate, force: Any = force) -> Any:
-            return bag.imu(stamp_ns, IMU_FRAME, rate, force,
-                           angular_velocity_variance=gyro_variance,
-                           linear_acceleration_variance=accel_variance)
-
-        yield stamp_ns + delay_ns, IMU_TOPIC, 'sensor_msgs/msg/Imu', message
+        yield (stamp_ns + to_nanoseconds(IMU_DELAY), topic, 'sensor_msgs/msg/Imu',
+               bag.imu(stamp_ns, IMU_FRAME, rate, force, angular_velocity_variance=gyro_variance,
+                       linear_acceleration_variance=accel_variance))
 
 
-def _ground_truth(simulation: Simulation, bag: BagWriter) -> Iterator[_Entry]:
+def _truth_entries(simulation: Simulation, bag: BagWriter) -> Iterator[Entry]:
     stamps_ns = simulation.imu.stamps_ns
     states = simulation.states(stamps_ns)
     quaternions = np.atleast_2d(Rotation.from_matrix(states.R_world_cam).as_quat())
-    delay_ns = to_nanoseconds(IMU_DELAY)
     for stamp_ns, position, quat_xyzw in zip(stamps_ns.tolist(), states.position, quaternions,
                                              strict=True):
-        def message(stamp_ns: int = stamp_ns, position: Any = position,
-                    quat_xyzw: Any = quat_xyzw) -> Any:
-            return bag.pose(stamp_ns, WORLD_FRAME, position, quat_xyzw)
-
-        yield stamp_ns + delay_ns, GROUND_TRUTH_TOPIC, 'geometry_msgs/msg/PoseStamped', message
+        yield (stamp_ns + to_nanoseconds(IMU_DELAY), GROUND_TRUTH_TOPIC,
+               'geometry_msgs/msg/PoseStamped',
+               bag.pose(stamp_ns, WORLD_FRAME, position, quat_xyzw))

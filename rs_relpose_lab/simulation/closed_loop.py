@@ -16,10 +16,6 @@ from rs_relpose_lab.simulation.trajectory import DEGREE, Trajectory
 
 Array = NDArray[np.float64]
 
-# Control points of one turn [1/s]; quintic splines through them follow steps of 2 Hz.
-_CONTROLS_PER_SECOND = 25
-
-
 
 def closed_loop(period: float, *, speed: float = 1.5) -> Trajectory:
     """Trajectory from -2 to `period` + 2 seconds that repeats itself after `period`.
@@ -34,7 +30,8 @@ def closed_loop(period: float, *, speed: float = 1.5) -> Trajectory:
     speed : float
         Mean speed along the ellipse [m/s].
     """
-    count = round(_CONTROLS_PER_SECOND * period)
+    # 25 control points a second: quintic splines through them follow steps of 2 Hz.
+    count = round(25 * period)
     phase = 2.0 * math.pi * np.arange(count) / count
     steps = max(round(1.8 * period), 2)
     # Ramanujan's perimeter of an ellipse with half axes 1 and 1/2.

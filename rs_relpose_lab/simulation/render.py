@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rs_relpose_lab.simulation.rows import see, View
 from rs_relpose_lab.simulation.scene import Scene
 from rs_relpose_lab.simulation.trajectory import Trajectory
 from rs_relpose_ros.errors import InputError
@@ -73,17 +75,16 @@ class Renderer:
         reference_time : float
             Time of the reference row on the trajectory [s].
         """
-        positions, rotations = self._row_poses(reference_time)
+        rows = np.arange(self.camera.height)
+        positions, rotations = self.trajectory.poses(reference_time + self.camera.row_times(rows))
+        exposure = _Exposure(self._rays, self._tile_angles, positions, rotations,
+                             1.0 / self.camera.fx)
         shape = (self.camera.height, self.camera.width)
         image = np.empty(shape, dtype=np.float32)
         hits = np.empty(shape, dtype=np.int32)
-        scene = self.scene
-        arrays = (self._rays, self._tile_angles, positions, rotations, scene.corners, scene.across,
-                  scene.down, scene.sizes, scene.texels, scene.pixels, scene.offsets,
-                  scene.shapes, scene.levels, 1.0 / self.camera.fx)
-        _render(*arrays, image, hits)
+        _render(exposure, self.scene.arrays, image, hits)
         if self.edge_samples > 1:
-            _smooth_edges(*arrays, self.edge_samples, image, hits)
+            _smooth_edges(exposure, self.scene.arrays, self.edge_samples, image, hits)
         return image
 
     def locate(self, reference_time: float,
@@ -96,42 +97,29 @@ class Renderer:
         times = reference_time + self.camera.row_times(points[:, 1])
         positions, rotations = self.trajectory.poses(times)
         rays = np.einsum('nij,nj->ni', rotations, self.camera.unproject(points))
-        scene = self.scene
         distances = np.empty(len(points))
         hits = np.empty(len(points), dtype=np.int64)
-        _trace_all(positions, rays, scene.corners, scene.across, scene.down, scene.sizes,
-                   distances, hits)
+        _trace_all(positions, rays, self.scene.arrays, distances, hits)
         return positions + distances[:, None] * rays, hits
 
     def project(self, reference_time: float, world_points: ArrayLike) -> Array:
         """Pixels (N, 2) at which world points (N, 3) are seen, hidden or not.
 
-        The row decides the instant and the instant the row: a fixed point. NaN where there is
-        none, or behind the camera or beyond half an image outside.
+        NaN for a point outside of the image, to the outer border of its pixels.
         """
+        def motion(world: Array, times: Array) -> Array:
+            positions, rotations = self.trajectory.poses(reference_time + times)
+            return np.asarray(np.einsum('nji,nj->ni', rotations, world - positions))
+
         points = np.asarray(world_points, dtype=np.float64).reshape(-1, 3)
-        height = self.camera.height
-        rows = np.full(len(points), height / 2)
-        for _ in range(_FIXED_POINT_STEPS):
-            times = reference_time + self.camera.row_times(np.clip(rows, -0.5 * height,
-                                                                   1.5 * height))
-            positions, rotations = self.trajectory.poses(times)
-            pixels = self.camera.project(
-                np.einsum('nji,nj->ni', rotations, points - positions))
-            change = np.abs(pixels[:, 1] - rows)
-            rows = np.where(np.isnan(pixels[:, 1]), rows, pixels[:, 1])
-            if not np.any(change > 1e-9):
-                break
-        outside = ~(np.abs(pixels[:, 1] - height / 2) < height) | ~(change < 1e-6)
-        pixels[outside] = np.nan
-        return pixels
-
-    def _row_poses(self, reference_time: float) -> tuple[Array, Array]:
-        rows = np.arange(self.camera.height)
-        return self.trajectory.poses(reference_time + self.camera.row_times(rows))
+        return see(points, motion, view_of(self.camera), margin=0.5)
 
 
-_FIXED_POINT_STEPS = 50
+def view_of(camera: RollingShutterCamera) -> View:
+    """What the camera sees, and when, for `rows.see`."""
+    line_delay = float(camera.row_times(1.0) - camera.row_times(0.0))
+    return View(camera.project, camera.unproject, camera.width, camera.height, line_delay,
+                camera.reference_row_index)
 
 
 def _tile_angles(rays: Array) -> Array:
@@ -147,6 +135,21 @@ def _tile_angles(rays: Array) -> Array:
         pixel = np.linalg.norm(tile[:, 1] - tile[:, 0], axis=1) if tile.shape[1] > 1 else 0.01
         angles[:, i] = np.arccos(np.minimum(cosine, 1.0)) + 2.0 * pixel
     return angles
+
+
+class _Exposure(NamedTuple):
+    """When and where each pixel is exposed.
+
+    `rays` (H, W, 3) in the camera frame, `tile_angles` (H, tiles) [rad] as `_tile_angles` has
+    them, `positions` (H, 3) and `rotations` (H, 3, 3) of the camera at each row, `pixel_angle`
+    [rad] in the middle of the image.
+    """
+
+    rays: Array
+    tile_angles: Array
+    positions: Array
+    rotations: Array
+    pixel_angle: float
 
 
 # Columns of a face, a surface as seen from one row's position: unit normal, height of the camera
@@ -171,8 +174,9 @@ def _turned(rotation, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def _find_faces(position, corners, across, down, sizes, faces):  # type: ignore[no-untyped-def]
+def _find_faces(position, scene, faces):  # type: ignore[no-untyped-def]
     """Surfaces that turn their face to `position`; fills `faces` and returns their number."""
+    corners, across, down, sizes = scene.corners, scene.across, scene.down, scene.sizes
     count = 0
     for s in range(len(corners)):
         i = count
@@ -268,9 +272,9 @@ def _bilinear(pixels, offset, height, width, x, y):  # type: ignore[no-untyped-d
 
 
 @_inline
-def _shade(faces, i, distance, a, b, x, y, z, pixel_angle, texels, pixels, offsets, shapes,  # type: ignore[no-untyped-def]
-           levels):
+def _shade(faces, i, distance, a, b, x, y, z, pixel_angle, scene):  # type: ignore[no-untyped-def]
     """Gray value of a pixel's footprint: trilinear lookups along its longer axis."""
+    offsets, shapes, levels = scene.offsets, scene.shapes, scene.levels
     s = int(faces[i, _INDEX])
     minor = distance * pixel_angle
     major = minor / max(-_dot(x, y, z, faces, i, _NORMAL), 1e-3)
@@ -282,8 +286,8 @@ def _shade(faces, i, distance, a, b, x, y, z, pixel_angle, texels, pixels, offse
     if norm > 1e-9:
         da *= major / norm
         db *= major / norm
-    texel_a = texels[s, 0]
-    texel_b = texels[s, 1]
+    texel_a = scene.texels[s, 0]
+    texel_b = scene.texels[s, 1]
     level = math.log2(max(minor, major / taps) / texel_a) + _LEVEL_BIAS
     level = min(max(level, 0.0), levels[s] - 1.0)
     low = int(level)
@@ -296,26 +300,26 @@ def _shade(faces, i, distance, a, b, x, y, z, pixel_angle, texels, pixels, offse
         along = (tap + 0.5) / taps - 0.5
         column = (a + along * da) / texel_a - 0.5
         row = (b + along * db) / texel_b - 0.5
-        value = _bilinear(pixels, offsets[s, low], shapes[s, low, 0], shapes[s, low, 1],
+        value = _bilinear(scene.pixels, offsets[s, low], shapes[s, low, 0], shapes[s, low, 1],
                           column * scale_low, row * scale_low)
         if mix > 0.0:
-            other = _bilinear(pixels, offsets[s, high], shapes[s, high, 0], shapes[s, high, 1],
-                              column * scale_high, row * scale_high)
+            other = _bilinear(scene.pixels, offsets[s, high], shapes[s, high, 0],
+                              shapes[s, high, 1], column * scale_high, row * scale_high)
             value += mix * (other - value)
         total += value
     return total / taps
 
 
 @_jit
-def _render(rays, tile_angles, positions, rotations, corners, across, down, sizes, texels, pixels,  # type: ignore[no-untyped-def]
-            offsets, shapes, levels, pixel_angle, image, hits):
+def _render(exposure, scene, image, hits):  # type: ignore[no-untyped-def]
     """Fill `image` and the index of the surface that every pixel shows."""
+    rays, tile_angles, positions, rotations, pixel_angle = exposure
     height, width = image.shape
-    faces = np.empty((len(corners) + 1, _FACE_COLUMNS))
-    chosen = np.empty(len(corners), dtype=np.int64)
+    faces = np.empty((len(scene.corners) + 1, _FACE_COLUMNS))
+    chosen = np.empty(len(scene.corners), dtype=np.int64)
     for v in range(height):
         rotation = rotations[v]
-        face_count = _find_faces(positions[v], corners, across, down, sizes, faces)
+        face_count = _find_faces(positions[v], scene, faces)
         for tile in range(tile_angles.shape[1]):
             start = tile * _TILE
             end = min(start + _TILE, width)
@@ -330,17 +334,16 @@ def _render(rays, tile_angles, positions, rotations, corners, across, down, size
                 else:
                     hits[v, u] = int(faces[hit, _INDEX])
                     image[v, u] = _shade(faces, hit, distance, a, b, x, y, z,
-                                         pixel_angle * rays[v, u, 2], texels, pixels, offsets,
-                                         shapes, levels)
+                                         pixel_angle * rays[v, u, 2], scene)
 
 
 @_jit
-def _smooth_edges(rays, tile_angles, positions, rotations, corners, across, down, sizes, texels,  # type: ignore[no-untyped-def]
-                  pixels, offsets, shapes, levels, pixel_angle, samples, image, hits):
+def _smooth_edges(exposure, scene, samples, image, hits):  # type: ignore[no-untyped-def]
     """Replace pixels on outlines by the mean of samples within them, at their row's instant."""
+    rays, tile_angles, positions, rotations, pixel_angle = exposure
     height, width = image.shape
-    faces = np.empty((len(corners) + 1, _FACE_COLUMNS))
-    chosen = np.empty(len(corners), dtype=np.int64)
+    faces = np.empty((len(scene.corners) + 1, _FACE_COLUMNS))
+    chosen = np.empty(len(scene.corners), dtype=np.int64)
     ray = np.empty(3)
     for v in range(height):
         rotation = rotations[v]
@@ -357,7 +360,7 @@ def _smooth_edges(rays, tile_angles, positions, rotations, corners, across, down
                     and hits[v, right] == here):
                 continue
             if face_count < 0:
-                face_count = _find_faces(positions[v], corners, across, down, sizes, faces)
+                face_count = _find_faces(positions[v], scene, faces)
             tile = u // _TILE
             if tile != listed:
                 start = tile * _TILE
@@ -379,17 +382,17 @@ def _smooth_edges(rays, tile_angles, positions, rotations, corners, across, down
                         total += _NOTHING
                     else:
                         total += _shade(faces, hit, distance, a, b, x, y, z, pixel_angle * ray[2],
-                                        texels, pixels, offsets, shapes, levels)
+                                        scene)
             image[v, u] = total / (samples * samples)
 
 
 @_jit
-def _trace_all(positions, rays, corners, across, down, sizes, distances, hits):  # type: ignore[no-untyped-def]
+def _trace_all(positions, rays, scene, distances, hits):  # type: ignore[no-untyped-def]
     """Nearest hits of rays (N, 3) in the world from positions (N, 3)."""
-    faces = np.empty((len(corners) + 1, _FACE_COLUMNS))
-    every = np.arange(len(corners))
+    faces = np.empty((len(scene.corners) + 1, _FACE_COLUMNS))
+    every = np.arange(len(scene.corners))
     for n in range(len(rays)):
-        count = _find_faces(positions[n], corners, across, down, sizes, faces)
+        count = _find_faces(positions[n], scene, faces)
         hit, distance, _, _ = _trace(rays[n, 0], rays[n, 1], rays[n, 2], faces, every, count)
         hits[n] = int(faces[hit, _INDEX]) if hit >= 0 else -1
         distances[n] = distance if hit >= 0 else np.nan

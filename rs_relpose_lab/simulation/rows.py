@@ -91,7 +91,9 @@ def see(world: Array, motion: Motion, view: View, margin: float = 0.0) -> Array:
     left = np.arange(len(world))
     before = np.full(len(world), 0.5 * (view.height - 1))
     projected = project(left, before)[:, 1]
-    rows, slope = projected, np.zeros(len(world))
+    ahead = np.isfinite(projected)
+    left, before, projected = left[ahead], before[ahead], projected[ahead]
+    rows, slope = projected, np.zeros(len(left))
     for _ in range(_MAX_ROUNDS):
         # A row far outside only says "not in the image"; the motion need not reach there.
         rows = np.clip(rows, -view.height, 2 * view.height)
@@ -108,10 +110,8 @@ def see(world: Array, motion: Motion, view: View, margin: float = 0.0) -> Array:
         again = ~settled & ~beyond & np.isfinite(pixels[:, 1])
         if not again.any():
             break
-        left, before, projected, slope, slow = (
-            values[again] for values in (left, rows, pixels[:, 1], slope, slow))
-        step = (projected - before) / np.where(slow, 1.0 - slope, 1.0)
-        rows = before + step
+        left, before, projected, slope = left[again], rows[again], pixels[again, 1], slope[again]
+        rows = before + (projected - before) / np.where(slow[again], 1.0 - slope, 1.0)
     inside = ((seen >= -margin)
               & (seen <= np.array([view.width - 1, view.height - 1]) + margin)).all(axis=1)
     seen[~inside] = np.nan

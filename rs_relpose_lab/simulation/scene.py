@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -61,20 +62,16 @@ class Surface:
         """Unit normal, towards the viewer."""
         return np.cross(self.down, self.across)
 
-    def point(self, x: ArrayLike, y: ArrayLike) -> Array:
-        """World points (..., 3) of texture coordinates `x` across and `y` down [m]."""
-        x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
-        return self.corner + x[..., None] * self.across + y[..., None] * self.down
 
+class SceneArrays(NamedTuple):
+    """S surfaces packed for the renderer, textures with their L mip levels.
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Scene:
-    """Surfaces packed for the renderer, textures with their mip levels.
-
-    Level l of a texture holds texel k of level 0 at index ``k / 2^l``.
+    `corners`, `across`, `down` (S, 3) and `sizes` (S, 2) [m] are those of `Surface`, `texels`
+    (S, 2) the size of a texel of level 0 [m]. Level l of texture s is the `shapes[s, l]` gray
+    values of `pixels` from `offsets[s, l]` on; its texel k is where level 0 has ``2^l k``. Texture
+    s has `levels[s]` of them.
     """
 
-    surfaces: tuple[Surface, ...]
     corners: Array
     across: Array
     down: Array
@@ -85,33 +82,35 @@ class Scene:
     shapes: NDArray[np.int64]
     levels: NDArray[np.int64]
 
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """Surfaces, and the same packed for the renderer."""
+
+    surfaces: tuple[Surface, ...]
+    arrays: SceneArrays
+
     @classmethod
     def of(cls, surfaces: tuple[Surface, ...]) -> Scene:
         """Pack `surfaces`."""
         if not surfaces:
             raise InputError('a scene needs at least one surface')
         pyramids = [list(_pyramid(surface.texture)) for surface in surfaces]
-        depth = max(len(pyramid) for pyramid in pyramids)
-        offsets = np.zeros((len(surfaces), depth), dtype=np.int64)
-        shapes = np.zeros((len(surfaces), depth, 2), dtype=np.int64)
-        chunks = []
+        levels = np.array([len(pyramid) for pyramid in pyramids], dtype=np.int64)
+        offsets = np.zeros((len(surfaces), levels.max()), dtype=np.int64)
+        shapes = np.zeros((*offsets.shape, 2), dtype=np.int64)
         total = 0
         for s, pyramid in enumerate(pyramids):
             for level, texture in enumerate(pyramid):
-                offsets[s, level] = total
-                shapes[s, level] = texture.shape
-                chunks.append(texture.ravel())
+                offsets[s, level], shapes[s, level] = total, texture.shape
                 total += texture.size
         sizes = np.array([[s.width, s.height] for s in surfaces])
-        across = np.array([s.across for s in surfaces], dtype=np.float64)
-        down = np.array([s.down for s in surfaces], dtype=np.float64)
-        corners = np.array([s.corner for s in surfaces], dtype=np.float64)
-        texture_shapes = np.array([s.texture.shape for s in surfaces])
-        return cls(
-            surfaces=surfaces, corners=corners, across=across, down=down,
-            sizes=sizes, texels=sizes / texture_shapes[:, ::-1], pixels=np.concatenate(chunks),
-            offsets=offsets, shapes=shapes,
-            levels=np.array([len(pyramid) for pyramid in pyramids], dtype=np.int64))
+        corners, across, down = (np.array([getattr(s, name) for s in surfaces], dtype=np.float64)
+                                 for name in ('corner', 'across', 'down'))
+        return cls(surfaces, SceneArrays(
+            corners, across, down, sizes, sizes / shapes[:, 0, ::-1],
+            np.concatenate([texture.ravel() for pyramid in pyramids for texture in pyramid]),
+            offsets, shapes, levels))
 
 
 def make_scene(kind: str, rng: np.random.Generator, focal_length: float) -> Scene:

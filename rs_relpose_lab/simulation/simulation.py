@@ -68,29 +68,6 @@ class SimulatedFrame:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TruePose:
-    """Relative pose of two frames' stamped rows: ``X1 = R X2 + t``.
-
-    Attributes
-    ----------
-    R : (3, 3) ndarray
-    t : (3,) ndarray
-        [m], camera 1.
-    linear_velocity1, linear_velocity2 : (3,) ndarray
-        [m/s], each in its own camera's frame.
-    angular_velocity1, angular_velocity2 : (3,) ndarray
-        [rad/s], likewise.
-    """
-
-    R: Array
-    t: Array
-    linear_velocity1: Array
-    linear_velocity2: Array
-    angular_velocity1: Array
-    angular_velocity2: Array
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Simulation:
     """What `simulate` returns; images are rendered when asked for."""
 
@@ -100,8 +77,6 @@ class Simulation:
     renderer: Renderer
     imu: ImuSeries
     calibrated_gyro_bias: Array
-
-    # -- frames ------------------------------------------------------------------------------
 
     def reference_ns(self, index: int) -> int:
         """Instant of frame `index`'s stamped row on the IMU clock [ns]."""
@@ -126,8 +101,6 @@ class Simulation:
         for index in range(self.config.frame_count):
             yield self.frame(index)
 
-    # -- truth -------------------------------------------------------------------------------
-
     def seconds(self, instant_ns: int) -> float:
         """Time on the trajectory of an instant on the IMU clock [s]."""
         return seconds_between(self.config.start_ns, instant_ns)
@@ -137,16 +110,6 @@ class Simulation:
         offsets = np.atleast_1d(np.asarray(instants_ns, dtype=np.int64)) - self.config.start_ns
         return self.trajectory.states(offsets * 1e-9)
 
-    def true_pose(self, reference1_ns: int, reference2_ns: int) -> TruePose:
-        """Relative pose of the camera at two instants on the IMU clock."""
-        states = self.states([reference1_ns, reference2_ns])
-        R1, R2 = states.R_world_cam
-        return TruePose(
-            R=R1.T @ R2, t=R1.T @ (states.position[1] - states.position[0]),
-            linear_velocity1=R1.T @ states.velocity[0], linear_velocity2=R2.T @ states.velocity[1],
-            angular_velocity1=states.angular_velocity[0],
-            angular_velocity2=states.angular_velocity[1])
-
     def true_matches(self, index1: int, index2: int, points1: ArrayLike) -> Array:
         """Where frame `index2` shows what frame `index1` shows at `points1` (N, 2) [px].
 
@@ -155,11 +118,10 @@ class Simulation:
         first, second = (self.seconds(self.reference_ns(i)) for i in (index1, index2))
         world, _ = self.renderer.locate(first, points1)
         points2 = self.renderer.project(second, world)
-        size = (self.camera.width, self.camera.height)
-        inside = np.all((points2 > -0.5) & (points2 < np.subtract(size, 0.5)), axis=1)
+        inside: NDArray[np.bool_] = np.isfinite(points2).all(axis=1)
         seen, _ = self.renderer.locate(second, np.where(inside[:, None], points2, 0.0))
-        visible = inside & (np.linalg.norm(seen - world, axis=1) < 1e-3)
-        points2[~visible] = np.nan
+        apart: Array = np.linalg.norm(seen - world, axis=1)
+        points2[~(apart < 1e-3)] = np.nan
         return points2
 
 

@@ -5,29 +5,35 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 import importlib
+import importlib.util
 import logging
 import os
 import sys
 from typing import Any, cast, Protocol
 
-from rs_relpose_ros.errors import RsRelposeError
+from rs_relpose_ros.errors import MissingInputError, RsRelposeError
 
 PROGRAM = 'rs_relpose'
 
-# Name -> one line of help. The module of this name is imported only when its command is asked for:
-# the overview does not wait for OpenCV and Numba.
-COMMANDS: Mapping[str, str] = {
-    'benchmark': 'measure accuracy and speed of the estimator: tables and plots',
-    'check': 'look through a bag for what would spoil the poses, with remedies',
-    'calibrate': 'read-out time, time offset, axes and gyro bias from a bag, without a target',
-    'convert': 'turn a public recording into a rosbag2 bag and its parameter file',
-    'evaluate': 'run the experiments of the paper: tables and box plots',
-    'replay': 'estimate relative poses from a bag: CSV, summary and pictures',
-    'simulate': 'render rolling-shutter images and IMU of a known motion into a bag',
+# Name -> module, one line of help. The module is imported only when its command is asked for: the
+# overview does not wait for OpenCV and Numba. Those of the laboratory, another package, are found
+# by name, so that the product does not depend on it.
+COMMANDS: Mapping[str, tuple[str, str]] = {
+    'benchmark': ('rs_relpose_lab.cli.benchmark',
+                  'measure accuracy and speed of the estimator: tables and plots'),
+    'check': ('rs_relpose_ros.cli.check',
+              'look through a bag for what would spoil the poses, with remedies'),
+    'calibrate': ('rs_relpose_ros.cli.calibrate',
+                  'read-out time, time offset, axes and gyro bias from a bag, without a target'),
+    'convert': ('rs_relpose_ros.cli.convert',
+                'turn a public recording into a rosbag2 bag and its parameter file'),
+    'evaluate': ('rs_relpose_lab.cli.evaluate',
+                 'run the experiments of the paper: tables and box plots'),
+    'replay': ('rs_relpose_ros.cli.replay',
+               'estimate relative poses from a bag: CSV, summary and pictures'),
+    'simulate': ('rs_relpose_lab.cli.simulate',
+                 'render rolling-shutter images and IMU of a known motion into a bag'),
 }
-# Commands of the laboratory: found by name, so that the product does not depend on it.
-_LABORATORY = 'rs_relpose_lab.cli'
-_OF_THE_LABORATORY = ('benchmark', 'evaluate', 'simulate')
 
 DONE, FAILED, BAD_INPUT = 0, 1, 2
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
@@ -58,9 +64,19 @@ class _Version(argparse.Action):
 
 
 def load_command(name: str) -> Command:
-    """Import the module of command `name`."""
-    package = _LABORATORY if name in _OF_THE_LABORATORY else __package__
-    return cast('Command', importlib.import_module(f'{package}.{name}'))
+    """Import the module of command `name`.
+
+    Raises
+    ------
+    MissingInputError
+        It belongs to the laboratory, which is not installed.
+    """
+    module, _ = COMMANDS[name]
+    package = module.partition('.')[0]
+    if importlib.util.find_spec(package) is None:
+        raise MissingInputError(f'the command {name} needs the package {package}, which is not '
+                                'installed')
+    return cast('Command', importlib.import_module(module))
 
 
 def make_parser(selected: str | None) -> argparse.ArgumentParser:
@@ -73,7 +89,7 @@ def make_parser(selected: str | None) -> argparse.ArgumentParser:
     parser.add_argument('--version', action=_Version, nargs=0, help='print the version and exit')
     _add_verbose(parser, default=0)
     commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
-    for name, one_line in COMMANDS.items():
+    for name, (_, one_line) in COMMANDS.items():
         command = commands.add_parser(name, help=one_line)
         if name == selected:
             module = load_command(name)
@@ -104,6 +120,8 @@ def _run(arguments: list[str]) -> int:
     selected = next((word for word in arguments if not word.startswith('-')), None)
     try:
         args = make_parser(selected).parse_args(arguments)
+    except MissingInputError as error:
+        return _complain(f'error: {error}', BAD_INPUT)
     except SystemExit as end:  # argparse has said why, or has printed the help
         return end.code if isinstance(end.code, int) else BAD_INPUT
     _set_up_logging(args.verbose)

@@ -1,0 +1,323 @@
+"""The estimators that are compared: this library, OpenCV's and PoseLib's, on the same matches.
+
+OpenCV and PoseLib know no rolling shutter. *Derotated* points have been turned by the gyro to the
+instant of the middle row, which is all that a user of theirs can do about it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+import importlib
+import importlib.util
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_lab.experiments.problems import (
+    Cell,
+    CENTRE_U,
+    CENTRE_V,
+    FOCAL,
+    HEIGHT,
+    LINE_DELAY,
+    TwoViewProblem,
+    WIDTH,
+)
+from rs_relpose_lab.experiments.scoring import NO_POSE, pose_error, PoseError
+from rs_relpose_ros.config.estimator import EstimatorConfig
+from rs_relpose_ros.estimator.estimate import estimate_relative_pose
+from rs_relpose_ros.estimator.result import RelativePose, Status
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.motion import FrameMotion
+
+Array = NDArray[np.float64]
+
+# Camera of the problems that are drawn at random.
+CAMERA = RollingShutterCamera(width=WIDTH, height=HEIGHT, fx=FOCAL, fy=FOCAL, cx=CENTRE_U,
+                              cy=CENTRE_V, readout_time=HEIGHT * LINE_DELAY)
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """How a pair is estimated.
+
+    Attributes
+    ----------
+    label : str
+        For tables and legends.
+    solver, refinement : str
+        Of this library, as in `EstimatorConfig`; without a solver another library is meant.
+    library : {'', 'opencv', 'poselib'}
+    derotated : bool
+        Whether another library gets the points as if all rows had been read with the middle one,
+        as far as the gyro knows.
+    continuous_gyro : bool
+        Whether the gyro over the rows and between the frames is used, too.
+    threshold : float
+        Of another library [px].
+    """
+
+    label: str
+    solver: str = ''
+    refinement: str = 'alternating'
+    library: Literal['', 'opencv', 'poselib'] = ''
+    derotated: bool = False
+    continuous_gyro: bool = False
+    threshold: float = 1.0
+
+
+# The paper's algorithms have the paper's refinement, as in its experiments; auto is the default.
+METHODS: Mapping[str, Method] = {
+    'global_5pt': Method('5-point', 'global_5pt'),
+    'uniform_9pt': Method('9-point', 'uniform_9pt'),
+    'uniform_11pt': Method('11-point', 'uniform_11pt'),
+    'auto': Method('auto', 'auto', 'map'),
+    'auto_gyro': Method('auto + gyro', 'auto', 'map', continuous_gyro=True),
+    'angular_5pt': Method('angular 5-pt', 'angular_5pt'),
+    'angular_3pt': Method('angular 3-pt', 'angular_3pt'),
+    'linear_9pt': Method('linear 9-pt', 'linear_9pt'),
+    'opencv': Method('OpenCV', library='opencv'),
+    'opencv_derotated': Method('OpenCV derot.', library='opencv', derotated=True),
+    'opencv_gyro': Method('OpenCV + gyro', library='opencv', derotated=True, continuous_gyro=True),
+} | ({
+    'poselib': Method('PoseLib', library='poselib', threshold=1.5),
+    'poselib_derotated': Method('PoseLib derot.', library='poselib', derotated=True,
+                                threshold=1.5),
+    'poselib_gyro': Method('PoseLib + gyro', library='poselib', derotated=True,
+                           continuous_gyro=True, threshold=1.5),
+} if importlib.util.find_spec('poselib') is not None else {})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ContinuousGyro:
+    """What a gyro that runs on knows of a pair, beyond one mean rate a frame.
+
+    Attributes
+    ----------
+    motion1, motion2 : FrameMotion
+        From the gyro over the rows.
+    rotation, covariance : (3, 3) ndarray
+        ``R_1^T R_2`` between the reference rows, and the covariance of its error [rad^2].
+    interval : float
+        Between the reference rows [s].
+    rate_sigma : float
+        Of the motions' rates, per axis [rad/s].
+    gravity_sigma : float or None
+        Of the motions' gravity, per axis [rad].
+    """
+
+    motion1: FrameMotion
+    motion2: FrameMotion
+    rotation: Array
+    covariance: Array
+    interval: float
+    rate_sigma: float
+    gravity_sigma: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairProblem:
+    """A pair of frames as every method gets it, and its truth.
+
+    Attributes
+    ----------
+    points1, points2 : (N, 2) ndarray
+        Matches [px].
+    camera : RollingShutterCamera
+    motion1, motion2 : FrameMotion
+        One angular velocity and one direction of gravity each.
+    R, t : (3, 3), (3,) ndarray
+        True pose between the reference rows, ``X1 = R X2 + t``; t of any length.
+    told : EstimatorConfig
+        Noise figures that the estimator is told, and its other settings.
+    quality : (N,) ndarray or None
+        Of the matches.
+    gyro : ContinuousGyro or None
+        For the methods that use it.
+    """
+
+    points1: Array
+    points2: Array
+    camera: RollingShutterCamera
+    motion1: FrameMotion
+    motion2: FrameMotion
+    R: Array
+    t: Array
+    told: EstimatorConfig
+    quality: Array | None = None
+    gyro: ContinuousGyro | None = None
+
+    def error(self, pose: Pose | RelativePose | None) -> PoseError:
+        """Error of a pose; `NO_POSE` where there is none."""
+        if not pose:
+            return NO_POSE
+        return pose_error(pose.R, pose.t, self.R, self.t, pose.covariance)
+
+
+def as_pair(problem: TwoViewProblem, cell: Cell, sigma_factor: float = 1.0) -> PairProblem:
+    """A random problem of a cell; methods are told its noise figures, times a factor."""
+    # Sigmas must be positive, also where there is no noise at all.
+    told = EstimatorConfig(
+        pixel_sigma=max(cell.pixel_noise * sigma_factor, 0.01),
+        gravity_sigma=max(float(np.radians(cell.gravity_noise)) * sigma_factor, 1e-5),
+        gyro_sigma=max(float(np.radians(cell.gyro_noise)) * sigma_factor, 1e-6))
+    return PairProblem(problem.points1, problem.points2, CAMERA,
+                       FrameMotion(problem.measured_rate1, problem.measured_gravity1),
+                       FrameMotion(problem.measured_rate2, problem.measured_gravity2),
+                       problem.R, problem.t, told)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pose:
+    """Pose ``X1 = R X2 + t``, t of unit length, of a library that tells no covariance.
+
+    `inliers` (N,): which of the matches agree with it.
+    """
+
+    R: Array
+    t: Array
+    inliers: NDArray[np.bool_]
+    covariance: None = None
+
+    @classmethod
+    def of_inverse(cls, R: Array, t: Array, inliers: NDArray[np.bool_]) -> Pose:
+        """From ``X2 = R X1 + t``, as OpenCV and PoseLib have it."""
+        return cls(np.asarray(R.T), np.asarray(-R.T @ t), inliers)
+
+
+# The call that is timed where time counts.
+Estimate = Callable[[], 'Pose | RelativePose | None']
+
+
+def prepared(method: Method, problem: PairProblem, seed: int) -> Estimate:
+    """The estimate of a pair by a method, as a call; `seed` is that of its sampling."""
+    if not method.library:
+        return _of_this_library(method, problem, seed)
+    motions = problem.motion1, problem.motion2
+    if method.continuous_gyro:
+        assert problem.gyro is not None, f'{method.label} needs a pair with a continuous gyro'
+        motions = problem.gyro.motion1, problem.gyro.motion2
+    points, turns = [problem.points1, problem.points2], (np.eye(3), np.eye(3))
+    if method.derotated:
+        points, turns = _derotated(points, problem.camera, motions)
+    pixels = [undistorted(p, problem.camera) for p in points]
+    five_point = opencv_five_point if method.library == 'opencv' else poselib_five_point
+
+    def call() -> Pose | None:
+        pose = five_point(pixels[0], pixels[1], problem.camera, method.threshold, seed=seed)
+        if pose is None:
+            return None
+        # From the middle rows to the reference rows; how the camera moved in between is unknown.
+        return replace(pose, R=turns[0] @ pose.R @ turns[1].T, t=turns[0] @ pose.t)
+    return call
+
+
+def run_method(name: str, problem: PairProblem, seed: int) -> tuple[Status, PoseError]:
+    """Estimate a pair by the method `name` of `METHODS`."""
+    pose = prepared(METHODS[name], problem, seed)()
+    status = pose.status if isinstance(pose, RelativePose) else (
+        Status.OK if pose else Status.NO_CONSENSUS)
+    return status, problem.error(pose)
+
+
+def _of_this_library(method: Method, problem: PairProblem, seed: int) -> Estimate:
+    motion1, motion2, gyro = problem.motion1, problem.motion2, None
+    config = replace(problem.told, solver=method.solver, refinement=method.refinement)
+    if method.continuous_gyro:
+        gyro = problem.gyro
+        assert gyro is not None, f'{method.label} needs a pair with a continuous gyro'
+        motion1, motion2 = gyro.motion1, gyro.motion2
+        config = replace(config, gyro_sigma=gyro.rate_sigma)
+        if gyro.gravity_sigma is not None:
+            config = replace(config, gravity_sigma=min(gyro.gravity_sigma, 1.5))
+    return lambda: estimate_relative_pose(
+        problem.points1, problem.points2, problem.camera, motion1, motion2,
+        relative_rotation=gyro.rotation if gyro else None,
+        relative_rotation_covariance=gyro.covariance if gyro else None,
+        interval=gyro.interval if gyro else None,
+        config=config, rng=seed, quality=problem.quality)
+
+
+def _derotated(points: list[Array], camera: RollingShutterCamera,
+               motions: tuple[FrameMotion, FrameMotion],
+               ) -> tuple[list[Array], tuple[Array, Array]]:
+    """Pixels at which cameras with the orientation of their middle rows would see the points.
+
+    Also each camera's turn from its reference row to its middle row. Matches of which one point
+    would not be seen are left out.
+    """
+    delay = float(camera.row_times((camera.height - 1) / 2))
+    turn1, turn2 = (motion.rotations([delay])[0] for motion in motions)
+    moved = [camera.project(motion.derotate(camera.unproject(p), camera.row_times(p[:, 1])) @ turn)
+             for p, motion, turn in zip(points, motions, (turn1, turn2), strict=True)]
+    seen = np.isfinite(np.hstack(moved)).all(axis=1)
+    return [p[seen] for p in moved], (turn1, turn2)
+
+
+def undistorted(points: Array, camera: RollingShutterCamera) -> Array:
+    """Pixels (N, 2) of the pinhole camera with the same focal lengths and centre."""
+    rays = camera.unproject(points)
+    return np.ascontiguousarray(
+        rays[:, :2] / rays[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy))
+
+
+OPENCV_ESTIMATORS = {'RANSAC': cv2.RANSAC, 'USAC_MAGSAC': cv2.USAC_MAGSAC}
+
+
+def opencv_five_point(pixels1: Array, pixels2: Array, camera: RollingShutterCamera,
+                      threshold: float, *, estimator: str = 'USAC_MAGSAC',
+                      seed: int = 0) -> Pose | None:
+    """Pose by OpenCV's essential matrix, as if both images had a global shutter.
+
+    Parameters
+    ----------
+    pixels1, pixels2 : (N, 2) ndarray
+        Undistorted.
+    camera : RollingShutterCamera
+        Of which the camera matrix is used.
+    threshold : float
+        [px].
+    estimator : {'RANSAC', 'USAC_MAGSAC'}
+    seed : int
+
+    Returns
+    -------
+    Pose or None
+        None where OpenCV finds nothing.
+    """
+    if len(pixels1) < 5:
+        return None
+    K = camera.camera_matrix
+    cv2.setRNGSeed(seed)
+    try:
+        essential, mask = cv2.findEssentialMat(
+            pixels1, pixels2, K, method=OPENCV_ESTIMATORS[estimator], prob=0.999,
+            threshold=threshold)
+        # Several solutions come stacked; none comes as None.
+        if np.shape(essential) != (3, 3):
+            return None
+        inliers = np.asarray(mask).ravel().astype(bool)
+        count, R, t, _ = cv2.recoverPose(essential, pixels1, pixels2, K, mask=mask)
+    except cv2.error:   # too few, or degenerate
+        return None
+    if not count:
+        return None
+    return Pose.of_inverse(np.asarray(R, dtype=np.float64),
+                           np.asarray(t, dtype=np.float64).ravel(), inliers)
+
+
+def poselib_five_point(pixels1: Array, pixels2: Array, camera: RollingShutterCamera,
+                       threshold: float, *, seed: int = 0) -> Pose | None:
+    """Pose by PoseLib's `estimate_relative_pose` with default options; else as OpenCV's."""
+    library: Any = importlib.import_module('poselib')
+    pinhole = {'model': 'PINHOLE', 'width': camera.width, 'height': camera.height,
+               'params': [camera.fx, camera.fy, camera.cx, camera.cy]}
+    pose, told = library.estimate_relative_pose(
+        pixels1, pixels2, pinhole, pinhole, {'max_epipolar_error': threshold, 'seed': seed}, {})
+    length = np.linalg.norm(pose.t)
+    if not length > 0.0:
+        return None
+    return Pose.of_inverse(pose.R, pose.t / length, np.asarray(told['inliers'], dtype=bool))
