@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry.gyro import integrated_rotations, step_turn
 from rs_relpose_ros.geometry.so3 import exp_so3, multiply
 
 Array = NDArray[np.float64]
@@ -96,15 +95,24 @@ class GyroPath(NamedTuple):
         """Integrate rates (K, 3) at times (K,) after subtracting a bias (3,)."""
         times = np.ascontiguousarray(times, dtype=np.float64)
         rates = np.ascontiguousarray(np.asarray(measured) - np.asarray(bias), dtype=np.float64)
-        rotations = integrated_rotations(times, rates)
-        turned = np.zeros_like(rotations)
-        np.cumsum(0.5 * np.diff(times)[:, None, None] * (rotations[:-1] + rotations[1:]), axis=0,
-                  out=turned[1:])
-        return cls(times, rates, rotations, turned)
+        return cls(times, rates, *_integrated(times, rates))
 
     def at(self, times: ArrayLike) -> Array:
         """Rotations (N, 3, 3) at instants (N,); those outside of the knots extrapolate."""
         return _evaluated(self, np.ascontiguousarray(times, dtype=np.float64))
+
+
+@kernel
+def _integrated(times: Array, rates: Array) -> tuple[Array, Array]:
+    """``R <- R Exp((w_0 + w_1) dt / 2)``, and the integral of R by the trapezoidal rule."""
+    count = len(times)
+    rotations, turned = np.empty((count, 3, 3)), np.zeros((count, 3, 3))
+    rotations[0] = np.eye(3)
+    for k in range(count - 1):
+        dt = times[k + 1] - times[k]
+        multiply(rotations[k], exp_so3(0.5 * dt * (rates[k] + rates[k + 1])), rotations[k + 1])
+        turned[k + 1] = turned[k] + 0.5 * dt * (rotations[k] + rotations[k + 1])
+    return rotations, turned
 
 
 @kernel
@@ -114,7 +122,7 @@ def rotation_at(path: GyroPath, instant: float, k: int, rotation: Array, rate: A
     share = dt / (path.times[k + 1] - path.times[k])
     for i in range(3):
         rate[i] = path.rates[k, i] + share * (path.rates[k + 1, i] - path.rates[k, i])
-    multiply(path.rotations[k], exp_so3(step_turn(path.rates[k], rate, dt)), rotation)
+    multiply(path.rotations[k], exp_so3(0.5 * dt * (path.rates[k] + rate)), rotation)
 
 
 @kernel
