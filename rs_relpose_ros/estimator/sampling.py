@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.estimator.consensus import multi_scale_cost
-from rs_relpose_ros.geometry.vectors import dot
+from rs_relpose_ros.geometry.vectors import copy_matrix, dot
 from rs_relpose_ros.solvers.solver import Knowledge, Sample, Solutions, solve_at
 
 Array = NDArray[np.float64]
@@ -117,8 +117,9 @@ def _offer(R: Array, x: Array, cost: float, pool: Pool) -> None:
     if place < 0:
         place = int(np.argmax(pool.cost))
     if cost < pool.cost[place]:
-        pool.R[place] = R
-        pool.x[place] = x
+        copy_matrix(R, pool.R[place])
+        for i in range(9):
+            pool.x[place, i] = x[i]
         pool.cost[place] = cost
 
 

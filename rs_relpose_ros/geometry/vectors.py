@@ -37,6 +37,14 @@ def norm(v: Vector | Array) -> float:
 
 
 @small_kernel
+def copy_matrix(source: Array, out: Array) -> None:
+    """``out[:] = source`` of (3, 3), which Numba takes seconds to compile (for its message)."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = source[i, j]
+
+
+@small_kernel
 def rotated(R: Array, v: Vector | Array) -> Vector:
     """``R v``, of any matrix (3, 3)."""
     return (R[0, 0] * v[0] + R[0, 1] * v[1] + R[0, 2] * v[2],

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.geometry.so3 import exp_so3
-from rs_relpose_ros.geometry.vectors import cross, dot, norm, rotated
+from rs_relpose_ros.geometry.vectors import copy_matrix, cross, dot, norm, rotated
 from rs_relpose_ros.solvers.cheirality import cheirality_votes
 from rs_relpose_ros.solvers.linear_algebra import null_direction, reflect, triangularise
 from rs_relpose_ros.solvers.polynomial import real_roots
@@ -286,7 +286,7 @@ def _decompose(E: Array, sample: Sample, R: Array, x: Array) -> bool:
         if votes > best:
             best = votes
             sign = 1.0 if front >= behind else -1.0
-            R[:] = candidate
+            copy_matrix(candidate, R)
     x *= sign
     return best >= 0
 
@@ -369,7 +369,7 @@ def _polish(sample: Sample, R: Array, t: Array) -> bool:
         # Rounding, not another solution, is what is corrected here.
         if not length2 < 0.01:
             return False
-        R[:] = exp_so3(step[:3]) @ R
+        copy_matrix(exp_so3(step[:3]) @ R, R)
         length = norm((1.0, step[3], step[4]))
         for i in range(3):
             t[i] = (t[i] + step[3] * u[i] + step[4] * v[i]) / length

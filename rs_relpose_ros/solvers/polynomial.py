@@ -75,7 +75,8 @@ def _write_derivatives(p: Array, derivatives: Array) -> None:
     """
     n = p.shape[0] - 1
     derivatives[:] = 0.0
-    derivatives[n] = p
+    for k in range(n + 1):
+        derivatives[n, k] = p[k]
     for m in range(n - 1, 0, -1):
         scale = 1.0 / (n - m)
         for k in range(m + 1):
@@ -146,7 +147,8 @@ def roots_in_unit_interval(p: Array, rule: PairRule, roots: Array, half_gaps: Ar
     _write_derivatives(p, derivatives)
     count = 0
     for m in range(1, n + 1):
-        cuts[:count] = roots[:count]
+        for k in range(count):
+            cuts[k] = roots[k]
         count = _roots_between_cuts(derivatives, m, cuts[:count], rule, roots, half_gaps)
         if count < 0:
             return 0

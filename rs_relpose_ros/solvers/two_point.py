@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rs_relpose_ros.compiled import kernel
-from rs_relpose_ros.geometry.vectors import cross, norm, rotated
+from rs_relpose_ros.geometry.vectors import copy_matrix, cross, norm, rotated
 from rs_relpose_ros.solvers.solver import Knowledge, Sample, Solutions
 
 
@@ -17,7 +17,7 @@ def solve_gyro_2pt(sample: Sample, known: Knowledge, out: Solutions) -> int:
     length = norm(t)
     if not length > 1e-14:
         return 0
-    out.R[0] = R
+    copy_matrix(R, out.R[0])
     for i in range(3):
         out.x[0, i] = t[i] / length
     return 1
