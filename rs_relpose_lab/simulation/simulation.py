@@ -118,7 +118,7 @@ class Simulation:
         first, second = (self.seconds(self.reference_ns(i)) for i in (index1, index2))
         world, _ = self.renderer.locate(first, points1)
         points2 = self.renderer.project(second, world)
-        inside: NDArray[np.bool_] = np.isfinite(points2).all(axis=1)
+        inside = np.asarray(np.isfinite(points2).all(axis=1))
         seen, _ = self.renderer.locate(second, np.where(inside[:, None], points2, 0.0))
         apart: Array = np.linalg.norm(seen - world, axis=1)
         points2[~(apart < 1e-3)] = np.nan

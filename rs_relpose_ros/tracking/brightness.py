@@ -86,7 +86,8 @@ def _statistics(image: Image, points: Array, side: int) -> tuple[Array, Array]:
 
 
 @small_kernel
-def _sums_inside(image: Image, left: int, top: int, side: int) -> tuple[int, int]:
+def _sums_inside(image: Image, left: int, top: int, side: int,
+                 ) -> tuple[np.int64, np.int64]:
     """Sum of the pixels of a window and of their squares."""
     total, squares = np.int64(0), np.int64(0)
     for i in range(side):
@@ -103,7 +104,8 @@ def _sums_inside(image: Image, left: int, top: int, side: int) -> tuple[int, int
 
 
 @kernel
-def _sums_at_border(image: Image, left: int, top: int, side: int) -> tuple[int, int]:
+def _sums_at_border(image: Image, left: int, top: int, side: int,
+                    ) -> tuple[np.int64, np.int64]:
     """The same, the border repeated."""
     height, width = image.shape
     total, squares = np.int64(0), np.int64(0)
