@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.compiled import kernel
+from rs_relpose_ros.compiled import kernel, linked_kernel
 from rs_relpose_ros.estimator import sampson
 from rs_relpose_ros.estimator.map_fit import prior_cost, Priors, State, stepped
 
@@ -50,7 +50,7 @@ def signed(state: State, sign: float) -> State:
     return State(state.R, sign * state.t, sign * state.d1, sign * state.d2, state.dw1, state.dw2)
 
 
-@kernel
+@linked_kernel
 def gate_depths(observations: Array, use: NDArray[np.bool_], state: State,
                 angle_sigma: float) -> None:
     """Remove from `use` what lies behind a camera or far from the others' depths.
@@ -110,7 +110,7 @@ def count_behind(observations: Array, use: NDArray[np.bool_], state: State,
     return count
 
 
-@kernel
+@linked_kernel
 def within(r: Array, observations: Array, valid: NDArray[np.bool_], state: State,
            threshold: float, angle_sigma: float) -> NDArray[np.bool_]:
     """Matches whose residuals `r` (N,) at `state` are below `threshold`, of plausible depths."""

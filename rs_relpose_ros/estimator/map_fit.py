@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.compiled import kernel
+from rs_relpose_ros.compiled import kernel, linked_kernel
 from rs_relpose_ros.estimator import sampson
 from rs_relpose_ros.estimator.sampson import D1, D2, DW1, DW2, PARAMETERS, TANGENT, THETA
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
@@ -64,7 +64,7 @@ class State(NamedTuple):
     dw2: Array
 
 
-@kernel
+@linked_kernel
 def _add_gravity_prior(state: State, priors: Priors, hessian: Array, gradient: Array) -> float:
     """``r = g x k`` of the two directions in frame 1; each is off by as much as one frame's."""
     # Gravity is known at a row from which the gyro, errors included, leads to the middle row.
@@ -98,7 +98,7 @@ def _add_gravity_prior(state: State, priors: Priors, hessian: Array, gradient: A
     return w * (r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
 
 
-@kernel
+@linked_kernel
 def _add_priors(state: State, priors: Priors, hessian: Array, gradient: Array) -> float:
     """Add the priors to the normal equations; their part of the cost."""
     cost = 0.0
@@ -176,7 +176,7 @@ def normal_equations(data: DataTerm, state: State, priors: Priors) -> tuple[Arra
     return hessian, gradient, cost
 
 
-@kernel
+@linked_kernel
 def moved(state: State, step: Array) -> State:
     """The state after a step (17,) of its local parameters."""
     basis = sampson.tangent_basis(state.t)
@@ -186,7 +186,7 @@ def moved(state: State, step: Array) -> State:
                  state.dw1 + step[DW1:DW1 + 3], state.dw2 + step[DW2:DW2 + 3])
 
 
-@kernel
+@linked_kernel
 def step_between(state: State, other: State) -> Array:
     """The step (17,) of local parameters from `state` to `other`: the inverse of `moved`."""
     step = np.empty(PARAMETERS)
@@ -202,7 +202,7 @@ def step_between(state: State, other: State) -> Array:
     return step
 
 
-@kernel
+@linked_kernel
 def cholesky(matrix: Array, factor: Array) -> bool:
     """Lower Cholesky factor of a symmetric matrix; False unless it is positive definite."""
     n = matrix.shape[0]
@@ -236,7 +236,7 @@ def cholesky_solve(factor: Array, right: Array) -> Array:
     return x
 
 
-@kernel
+@linked_kernel
 def fit(observations: Array, use: NDArray[np.bool_], start: State, data: DataTerm,
         priors: Priors, sigma: float,
         iterations: int) -> tuple[State, DataTerm, float, Array]:
@@ -290,7 +290,7 @@ def fit(observations: Array, use: NDArray[np.bool_], start: State, data: DataTer
     return state, data, cost, hessian
 
 
-@kernel
+@linked_kernel
 def stepped(observations: Array, use: NDArray[np.bool_], start: State, priors: Priors,
             sigma: float, steps: int) -> State:
     """The state after some Gauss-Newton steps from `start`, better or not."""
@@ -307,7 +307,7 @@ def stepped(observations: Array, use: NDArray[np.bool_], start: State, priors: P
     return state
 
 
-@kernel
+@linked_kernel
 def _scaled_factor(information: Array) -> tuple[Array, Array]:
     """Scales (n,) that make the diagonal 1, and the Cholesky factor of the matrix so scaled.
 
@@ -326,7 +326,7 @@ def _scaled_factor(information: Array) -> tuple[Array, Array]:
     return scale, factor
 
 
-@kernel
+@linked_kernel
 def inverse(information: Array) -> Array:
     """Covariance (n, n) of an information matrix: never indefinite."""
     scale, factor = _scaled_factor(information)

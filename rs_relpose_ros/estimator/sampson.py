@@ -27,7 +27,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.compiled import inlined_kernel, kernel
+from rs_relpose_ros.compiled import inlined_kernel, kernel, linked_kernel
 
 Array = NDArray[np.float64]
 
@@ -187,7 +187,7 @@ def _linearise(o, baselines, turns1, turns2, basis, rows):  # type: ignore[no-un
         rows[17, i] = r
 
 
-@kernel
+@linked_kernel
 def residuals(observations: Array, R: Array, t: Array, d1: Array, d2: Array, dw1: Array,
               dw2: Array) -> Array:
     """Signed Sampson errors (N,) [px] of observation rows (N, 20)."""
@@ -225,7 +225,7 @@ def jacobian(observations: Array, R: Array, t: Array, d1: Array, d2: Array, dw1:
     return out
 
 
-@kernel
+@linked_kernel
 def normal_equations(observations: Array, use: NDArray[np.bool_], R: Array, t: Array, d1: Array,
                      d2: Array, dw1: Array, dw2: Array) -> tuple[Array, Array, float]:
     """``J^T J`` (17, 17), ``J^T r`` (17,) and sum of squares over the matches in `use`."""

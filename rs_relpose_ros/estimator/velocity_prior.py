@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.compiled import kernel
+from rs_relpose_ros.compiled import kernel, linked_kernel
 from rs_relpose_ros.estimator.local_optimisation import count_behind, within
 from rs_relpose_ros.estimator.map_fit import (
     DataTerm,
@@ -130,7 +130,7 @@ def _reach(threshold: float, sigma: float) -> float:
     return min(max(threshold, REACH * sigma), WIDEST * threshold)
 
 
-@kernel
+@linked_kernel
 def _selected(observations: Array, valid: NDArray[np.bool_], state: State, threshold: float,
               angle_sigma: float, told_sigma: float) -> tuple[NDArray[np.bool_], float]:
     """Inliers of a state, and their noise [px]."""
@@ -143,7 +143,7 @@ def _selected(observations: Array, valid: NDArray[np.bool_], state: State, thres
     return inliers, noise_sigma(squares, inliers.sum(), told_sigma)
 
 
-@kernel
+@linked_kernel
 def _candidate(observations: Array, inliers: NDArray[np.bool_], start: State, data: DataTerm,
                priors: Priors, sigma: float, velocity_sigma: float, threshold: float,
                angle_sigma: float, iterations: int) -> tuple[State, DataTerm, Array, float]:
@@ -159,7 +159,7 @@ def _candidate(observations: Array, inliers: NDArray[np.bool_], start: State, da
     return state, data, hessian, evidence
 
 
-@kernel
+@linked_kernel
 def _average(observations: Array, inliers: NDArray[np.bool_], start: State, steps: Array,
              likely: NDArray[np.bool_], priors: Priors, sigma: float, grid: Array,
              threshold: float, angle_sigma: float) -> tuple[State, Array, int]:
