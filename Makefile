@@ -14,6 +14,11 @@ prefix := $(abspath $(VENV))
 stamp := $(VENV)/.installed
 pip := $(bin)/python -m pip --quiet --quiet --disable-pip-version-check
 
+# What a run imports is byte-compiled by the set-up, or else the first run would do it, and every run
+# where PYTHONDONTWRITEBYTECODE is set. pip would do it for all 6,000 modules of the environment.
+first_run := rs_relpose_ros.node.node, rs_relpose_ros.cli.replay, rs_relpose_lab.live.player, \
+    rs_relpose_lab.live.recorder, rs_relpose_lab.experiments.comparison
+
 # The environment brings its own ROS; one that a sourced setup.bash offers must not mix with it.
 unexport PYTHONPATH LD_LIBRARY_PATH
 export AMENT_PREFIX_PATH := $(prefix)
@@ -26,25 +31,30 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 demo: $(stamp)
 	$(bin)/python demo/run_demo.py
 
-# Message types are checked in tests; in Jazzy that is off unless asked for.
+# Message types are checked in tests; in Jazzy that is off unless asked for. Two processes: one runs
+# the live tests, which wait most of the time (test/conftest.py); PYTEST_ARGS='-n 0 ...' for one.
+pytest := ROS_PYTHON_CHECK_FIELDS=1 $(bin)/python -m pytest -n 2 --dist loadgroup \
+    --no-loadscope-reorder
+
 test: $(stamp)
-	ROS_PYTHON_CHECK_FIELDS=1 $(bin)/python -m pytest $(PYTEST_ARGS)
+	$(pytest) $(PYTEST_ARGS)
 
 test-all: $(stamp)
-	ROS_PYTHON_CHECK_FIELDS=1 $(bin)/python -m pytest -m 'long or not long' $(PYTEST_ARGS)
+	$(pytest) -m 'long or not long' $(PYTEST_ARGS)
 
 lint: $(stamp)
 	$(bin)/ruff check .
 	$(bin)/mypy
 
+$(stamp): export PYTHONDONTWRITEBYTECODE :=
 $(stamp): requirements/base.txt requirements/test.txt $(CONSTRAINTS) setup.py setup.cfg
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	    { echo '$(PYTHON) is no Python 3.11 or later; choose one: make PYTHON=python3.12 ...' >&2; exit 1; }
 	@echo 'Setting up $(VENV): two to three minutes and 1.1 GB.'
 	@$(bin)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)
 	$(pip) install --no-compile -r requirements/test.txt $(CONSTRAINTS:%=-c %)
+	$(bin)/python -c 'import $(first_run)'
 	$(pip) install --no-deps --no-build-isolation --editable .
-	$(bin)/python -m rs_relpose_ros.front_end.warm_up
 	touch $@
 
 # A PYTHON that was asked for must be the one that an existing environment was made with.

@@ -82,8 +82,8 @@ def measure(seed: int, scene: str, readout_time: float, folder: Path) -> Row:
                                stamps=read_stamps(live.stamps), pictures=False,
                                on_pair=pairs.append)
     answered = [pair for pair in pairs if pair.result.pose]
-    assert replayed.calibration is not None
-    opencv = min((best_opencv_score(method, answered, replayed.calibration, truth)
+    assert replayed.intrinsics is not None
+    opencv = min((best_opencv_score(method, answered, replayed.intrinsics, truth)
                   for method in METHODS), key=lambda s: s.rotation[0])
     node = score_of_table('', live.table, replayed.records, truth)
     still = [record for record in replayed.records if is_still(record)]

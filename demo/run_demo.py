@@ -64,10 +64,10 @@ def compare(live: LiveRun) -> list[str]:
                   score_of_records('the same, replayed', outcome.records)]
     say("replaying it offline: the paper's algorithms, OpenCV's 5-point ...")
     answered = [pair for pair in pairs if pair.result.pose]
-    assert outcome.calibration is not None
+    assert outcome.intrinsics is not None
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context('spawn')) as pool:
         paper = [pool.submit(score_of_method, name) for name in PAPER_METHODS]
-        opencv = [pool.submit(best_opencv_score, method, answered, outcome.calibration, truth)
+        opencv = [pool.submit(best_opencv_score, method, answered, outcome.intrinsics, truth)
                   for method in METHODS]
         scores += [future.result() for future in paper + opencv]
     return [*score_table(scores), '', *remarks(scores, outcome, live, same_frames)]

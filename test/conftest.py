@@ -27,7 +27,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     They wait more than they calculate, so the other process hardly slows them down. A module is
     never shared out, as its fixtures are set up once.
     """
-    if config.getoption('dist', 'no') != 'loadgroup':
+    if not getattr(config.option, 'loadgroup', False):   # not one of several processes
         return
     items.sort(key=lambda item: item.get_closest_marker('live') is None)
     for item in items:

@@ -17,6 +17,7 @@ from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 
 from rs_relpose_ros.bags.layout import CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMU_TOPIC, RAW_TOPIC
+from rs_relpose_ros.messages.incoming import stamp_ns
 
 SECOND = 10**9
 # Topics of the node -> those of the bag.
@@ -145,14 +146,14 @@ def pixels_of(image: Image) -> np.ndarray:
 
 
 def stamp_of(message: Any) -> int:
-    return message.header.stamp.sec * SECOND + message.header.stamp.nanosec
+    return stamp_ns(message.header)
 
 
-def with_stamp(message: Any, stamp_ns: int) -> Any:
+def with_stamp(message: Any, new_stamp_ns: int) -> Any:
     """A copy with another stamp; it shares the data."""
     out = copy.copy(message)
     out.header = copy.deepcopy(message.header)
-    out.header.stamp.sec, out.header.stamp.nanosec = divmod(stamp_ns, SECOND)
+    out.header.stamp.sec, out.header.stamp.nanosec = divmod(new_stamp_ns, SECOND)
     return out
 
 

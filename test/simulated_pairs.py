@@ -76,7 +76,9 @@ def simulated_flight(seed: int, points: int = 120,
             covariance=1e-6 * np.eye(6), velocity_covariance=1e-4 * np.eye(6), model='uniform')
         pairs.append(PairResult(
             reference_stamp_ns=START_NS + round(1e9 * TIMES[k]),
-            stamp_ns=START_NS + round(1e9 * TIMES[k + 1]), frame_id='camera',
+            stamp_ns=START_NS + round(1e9 * TIMES[k + 1]),
+            reference_ns1=START_NS + round(1e9 * TIMES[k]),
+            reference_ns2=START_NS + round(1e9 * TIMES[k + 1]), frame_id='camera',
             interval=TIMES[k + 1] - TIMES[k], pose=pose,
             matches=Matches(use.astype(np.uint32) + 7, a.pixels[use], b.pixels[use],
                             np.ones(len(use))),

@@ -17,6 +17,7 @@ from two_view_scene import (
     rotation_error,
 )
 
+from rs_relpose_lab.experiments.paper_reference import solve_by_determinants
 from rs_relpose_ros import (
     estimate_relative_pose,
     EstimatorConfig,
@@ -26,8 +27,7 @@ from rs_relpose_ros import (
     solvers,
     Status,
 )
-from rs_relpose_ros.config.estimator import REFINEMENTS, SOLVERS
-from rs_relpose_ros.solvers.paper_reference import solve_by_determinants
+from rs_relpose_ros.config.estimator import REFINEMENTS, SOLVER_CHOICES
 
 POINTS = {'linear_9pt': 9, 'uniform_9pt': 9, 'angular_3pt': 3, 'angular_5pt': 5, 'global_5pt': 5,
           'uniform_11pt': 11}
@@ -93,7 +93,7 @@ def random_points(seed, n):
 
 
 configs = st.fixed_dictionaries({
-    'solver': st.sampled_from(SOLVERS), 'refinement': st.sampled_from(REFINEMENTS)})
+    'solver': st.sampled_from(SOLVER_CHOICES), 'refinement': st.sampled_from(REFINEMENTS)})
 
 
 # --- the estimator

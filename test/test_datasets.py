@@ -14,8 +14,11 @@ import yaml
 
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.cli import convert, main
-from rs_relpose_ros.config.commented_file import parameter_text, write_parameters
-from rs_relpose_ros.config.parameter_file import read_parameters
+from rs_relpose_ros.config.parameter_file import (
+    parameter_text,
+    read_parameters,
+    write_parameters,
+)
 from rs_relpose_ros.convert import xiaomi
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.messages.incoming import (
@@ -287,9 +290,9 @@ def test_parameter_file_is_what_the_command_writes(tmp_path, dataset):
     parameters = read_parameters(file)
     assert parameters.sensor.missing() == []
     mapping = parameters.to_mapping()
-    for figure in source.parameters:
-        assert mapping[figure.name] == figure.value
-        assert len(figure.source) > 10
+    for item in source.parameters:
+        assert mapping[item.name] == item.value
+        assert len(item.source) > 10
     write_parameters(tmp_path / 'a.yaml', source.title, source.parameters)
     with pytest.raises(InputError, match='exists already'):
         write_parameters(tmp_path / 'a.yaml', source.title, source.parameters)

@@ -85,10 +85,10 @@ def pair_of(noise: float, outliers: int, seed: int = 0) -> ReplayedPair:
                         inliers=np.ones(count, dtype=bool), covariance=1e-6 * np.eye(6),
                         model='uniform')
     result = PairResult(
-        START_NS, START_NS + 10**9, 'camera', 1.0, pose,
+        START_NS, START_NS + 10**9, START_NS, START_NS + 10**9, 'camera', 1.0, pose,
         Matches(np.arange(count, dtype=np.uint32), points1, points2, np.ones(count)),
         np.zeros(count), np.zeros(count), np.zeros((count, 3)), np.zeros((count, 3)), 20.0)
-    return ReplayedPair(result, START_NS, START_NS + 10**9, 0)
+    return ReplayedPair(result, 0)
 
 
 @pytest.fixture
@@ -118,8 +118,7 @@ def test_best_threshold_is_the_best(truth):
 
 
 def test_scores_of_a_table_and_of_its_records_agree(truth, tmp_path):
-    records = [pair_record(pair.result, pair.reference_ns1, pair.reference_ns2, truth)
-               for pair in [pair_of(0.1, 10)]]
+    records = [pair_record(pair_of(0.1, 10).result, truth)]
     with TableWriter(tmp_path / 'a.csv', RELATIVE_POSE_COLUMNS) as table:
         table.write(relative_pose_cells(records[0]))
     told = score_of_table('live', tmp_path / 'a.csv', records, truth)

@@ -4,14 +4,15 @@ import numpy as np
 import pytest
 
 from rs_relpose_ros import FrameMotion, RollingShutterCamera
-from rs_relpose_ros.front_end.derotated_rays import DerotatedRays
+from rs_relpose_ros.front_end.derotated_rays import DerotatedRays, Sensor
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 
-CALIBRATION = Intrinsics(width=640, height=480, fx=450.0, fy=450.0, cx=320.0, cy=240.0,
-                          distortion_model='plumb_bob', distortion=(-0.2, 0.05, 0.0, 0.0),
-                          image_width=640, image_height=480)
+INTRINSICS = Intrinsics(width=640, height=480, fx=450.0, fy=450.0, cx=320.0, cy=240.0,
+                        distortion_model='plumb_bob', distortion=(-0.2, 0.05, 0.0, 0.0),
+                        image_width=640, image_height=480)
 CAMERA = RollingShutterCamera(width=640, height=480, fx=450.0, fy=450.0, cx=320.0, cy=240.0,
                               distortion=(-0.2, 0.05, 0.0, 0.0), readout_time=0.03)
+SENSOR = Sensor(CAMERA, INTRINSICS)
 MOTION = FrameMotion([0.4, -0.8, 0.3])
 
 
@@ -19,7 +20,7 @@ def rays_of(ids):
     """Of a set of points that depend on their ids alone."""
     ids = np.asarray(ids, dtype=np.uint32)
     points = np.random.default_rng(0).uniform([20.0, 20.0], [620.0, 460.0], (5000, 2))[ids % 5000]
-    return DerotatedRays.from_points(ids, points, CAMERA, CALIBRATION, MOTION)
+    return DerotatedRays.from_points(ids, points, SENSOR, MOTION)
 
 
 # Ids wrap around: what is newer may be smaller.
@@ -41,3 +42,11 @@ def test_all_are_the_same_and_none_is_legal():
 @pytest.mark.parametrize('wanted', [[3, 99], [99], [5, 3]])
 def test_a_track_that_is_missing_or_out_of_order_is_no_subset(wanted):
     assert rays_of(range(9)).of(np.array(wanted, dtype=np.uint32)) is None
+
+
+def test_a_derotated_ray_is_seen_where_it_came_from():
+    points = np.random.default_rng(1).uniform([60.0, 60.0], [580.0, 420.0], (50, 2))
+    rays, row_times = SENSOR.derotated(points, MOTION)
+    # First guess off by a millisecond: the row follows from where the ray is seen.
+    seen = SENSOR.seen(rays, row_times + 1e-3, MOTION)
+    np.testing.assert_allclose(seen, points, atol=2e-3)

@@ -15,6 +15,7 @@ from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.front_end.drift import DriftTracker, OFFSET_SIGMA, PairRotation
 from rs_relpose_ros.front_end.frame import Frame
+from rs_relpose_ros.front_end.front_end import FrameFailed, FrameProcessed, FrontEnd
 from rs_relpose_ros.front_end.sequencer import Refusal, Sequencer
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.imu.frame_imu import GyroSegment
@@ -23,7 +24,7 @@ from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.messages.intake import Intake
 from rs_relpose_ros.messages.sensor_feed import Role
 from rs_relpose_ros.node.diagnostics import Inputs, Statistics
-from rs_relpose_ros.node.worker import Worker
+from rs_relpose_ros.node.worker import Warm, Worker
 from rs_relpose_ros.replay.run import Replay
 
 MS = 1_000_000
@@ -252,38 +253,45 @@ def test_before_the_first_pair_diagnostics_tell_no_drift():
 def test_live_and_replay_agree_while_the_offset_is_applied(bundled_bag):
     """Frames are lost at random, as live; the replay of the processed ones has equal bits."""
     settings = sensor(bundled_bag, 'time_offset=0.01', 'track_time_offset=true')
-    sequencer = Sequencer(settings)
-    taken, results, problems = [], [], []
-    worker = Worker(settings, sequencer, lambda ready: taken.append(ready.frame.stamp_ns),
-                    lambda ready, result: results.append(result), lambda refused: None,
-                    lambda sentence, error: problems.append((sentence, error)))
+    front_end = FrontEnd(settings)
+    sequencer = front_end.sequencer
+    events = []
+    worker = Worker(front_end, events.append)
+
+    def processed():
+        return [event for event in events if isinstance(event, FrameProcessed)]
+
     worker.start()
-    while not worker.warm:
-        assert worker.is_alive(), problems
+    while not events:
+        assert worker.is_alive()
         time.sleep(0.01)
+    assert isinstance(events[0], Warm)
     intake, rng = Intake(sequencer), np.random.default_rng(5)
     images = 0
     with open_bag(bundled_bag) as bag:
-        topics = bag.find_topics()
-        for role, message in intake.feed.messages(bag, topics):
-            if role is not Role.IMAGE or rng.random() > 0.1:
+        for role, message in intake.feed.messages(bag, bag.find_topics()):
+            if role is not Role.IMAGE:
                 intake.receive(role, message.message)
-            if role is Role.IMAGE:
+            elif rng.random() > 0.1:
                 images += 1
+                intake.receive(role, message.message)
                 # Sometimes behind, sometimes ahead of the worker.
-                while len(taken) < images - rng.integers(1, 4) and images < 1000:
+                while len(processed()) < images - rng.integers(1, 4):
                     time.sleep(0.002)
                     if sequencer.counts().refused:
                         break
             if images == 90:
                 break
     threading.Event().wait(0.5)
-    while worker.is_alive() and len(taken) < images - sum(sequencer.counts().refused.values()) - 1:
+    while worker.is_alive() and len(processed()) < images - sum(
+            sequencer.counts().refused.values()) - 1:
         time.sleep(0.05)
-    assert worker.stop(30.0) and problems == []
-    live = [result for result in results if result is not None]
+    assert worker.stop(30.0)
+    assert not any(isinstance(event, FrameFailed) for event in events)
+    live = [frame.pair for frame in processed() if frame.pair is not None]
     assert live[-1].drift.applied < -0.005
-    again = replayed(bundled_bag, settings, frozenset(taken))[:len(live)]
+    again = replayed(bundled_bag, settings, frozenset(
+        frame.stamp_ns for frame in processed()))[:len(live)]
     assert len(again) == len(live)
     for a, b in zip(live, again, strict=True):
         assert (a.reference_stamp_ns, a.stamp_ns) == (b.reference_stamp_ns, b.stamp_ns)

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 import signal
-from typing import Any
 
 from conftest import BUNDLED_PARAMETERS, ROOT
 from nav_msgs.msg import Path as PathMessage
@@ -18,6 +17,7 @@ from rs_relpose_lab.live.graph import Graph
 from rs_relpose_lab.live.processes import Process, wait_until
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.config.parameter_file import read_parameters
+from rs_relpose_ros.messages.incoming import stamp_ns
 from rs_relpose_ros.messages.outgoing import pair_messages, PAIR_TOPICS, PairMessages
 from rs_relpose_ros.node.message_types import message_class
 from rs_relpose_ros.replay.run import read_truth, Replay
@@ -38,10 +38,6 @@ class Chained:
     truth: TrueTrajectory
     output: str
     exit_code: int
-
-
-def to_ns(time: Any) -> int:
-    return time.sec * 10**9 + time.nanosec
 
 
 @pytest.fixture(scope='module')
@@ -94,13 +90,13 @@ def test_it_says_where_it_cannot_go_on(run):
     paths = whole_paths(run)
     assert len(paths) == 2
     assert run.output.count('a pair is missing: the path starts anew, at another scale') == 1
-    assert to_ns(paths[1].poses[0].header.stamp) > to_ns(paths[0].poses[-1].header.stamp)
+    assert stamp_ns(paths[1].poses[0].header) > stamp_ns(paths[0].poses[-1].header)
 
 
 def test_shape_of_the_paths(run):
     """After one similarity each: scale is carried from pair to pair."""
     for path in whole_paths(run):
-        stamps = [to_ns(pose.header.stamp) for pose in path.poses]
+        stamps = [stamp_ns(pose.header) for pose in path.poses]
         found = np.array([[p.x, p.y, p.z] for p in (pose.pose.position for pose in path.poses)])
         true = true_positions(run.truth, stamps)
         aligned, scale = after_similarity(found, true)

@@ -92,15 +92,13 @@ def test_coverage():
         buffer.angular_velocity(START, end + 1)
 
 
-def test_duplicates_late_samples_and_jumps_are_told():
+def test_duplicates_and_late_samples_are_told():
     buffer = ImuBuffer(ImuConfig())
     first, second, third = samples(wobble, 3)
     assert buffer.add(first) is AddResult.ADDED
     assert buffer.add(third) is AddResult.ADDED
     assert buffer.add(second) is AddResult.LATE
     assert buffer.add(second) is AddResult.DUPLICATE
-    back = ImuSample(START - 2_000_000_000, (0.0, 0.0, 0.0), UP)
-    assert buffer.add(back) is AddResult.JUMPED_BACK
 
 
 @pytest.mark.parametrize('broken', [

@@ -322,6 +322,7 @@ def pair(count: int = 40, status: Status = Status.OK) -> PairResult:
     rays1, rays2 = rng.normal(size=(2, count, 3))
     return PairResult(
         reference_stamp_ns=1_700_000_000_100_000_000, stamp_ns=1_700_000_000_999_999_999,
+        reference_ns1=1_700_000_000_100_000_000, reference_ns2=1_700_000_000_999_999_999,
         frame_id='camera_optical_frame', interval=0.9, pose=pose, matches=matches,
         row_times1=rng.uniform(0, 0.03, count), row_times2=rng.uniform(0, 0.03, count),
         rays1=rays1, rays2=rays2, parallax=12.0)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 import signal
-from typing import Any
 
 from conftest import BUNDLED_PARAMETERS
 from diagnostic_msgs.msg import DiagnosticArray
@@ -21,6 +20,7 @@ from rs_relpose_lab.live.graph import diagnostic_values, Graph
 from rs_relpose_lab.live.processes import node_process, player_process, wait_until
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.config.parameter_file import read_parameters
+from rs_relpose_ros.messages.incoming import stamp_ns, time_ns
 from rs_relpose_ros.messages.outgoing import MATCH_DTYPE, quat_xyzw
 from rs_relpose_ros.replay.run import read_truth, Replay
 
@@ -41,10 +41,6 @@ class Published:
     output: str
     exit_code: int
     seconds_to_end: float
-
-
-def ros_stamp(stamp: Any) -> int:
-    return stamp.sec * 10**9 + stamp.nanosec
 
 
 @pytest.fixture(scope='module')
@@ -75,7 +71,7 @@ def run(module_ros_domain_id: int, bundled_bag: Path,
 
 def test_poses_arrive(run):
     assert len(run.poses) >= 10
-    stamps = [ros_stamp(message.header.stamp) for message in run.poses]
+    stamps = [stamp_ns(message.header) for message in run.poses]
     assert stamps == sorted(set(stamps))
     assert set(stamps) <= set(run.stamps)
     for message in run.poses:
@@ -90,12 +86,12 @@ def test_poses_arrive(run):
 
 
 def test_messages_of_a_pair_belong_together(run):
-    stamps = [ros_stamp(message.header.stamp) for message in run.poses]
+    stamps = [stamp_ns(message.header) for message in run.poses]
     for others in (run.references, run.velocities, run.matches):
-        assert [ros_stamp(message.header.stamp) for message in others] == stamps
+        assert [stamp_ns(message.header) for message in others] == stamps
     for reference, stamp in zip(run.references, stamps, strict=True):
-        assert ros_stamp(reference.time_ref) in run.stamps
-        assert ros_stamp(reference.time_ref) < stamp
+        assert time_ns(reference.time_ref) in run.stamps
+        assert time_ns(reference.time_ref) < stamp
     for cloud in run.matches:
         records = np.frombuffer(cloud.data, dtype=MATCH_DTYPE)
         assert len(records) == cloud.width >= 15
@@ -112,8 +108,8 @@ def test_poses_are_those_of_the_truth(run, bundled_bag):
         position, q = message.pose.pose.position, message.pose.pose.orientation
         errors = truth.errors(
             Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(),
-            np.array([position.x, position.y, position.z]), ros_stamp(reference.time_ref),
-            ros_stamp(message.header.stamp))
+            np.array([position.x, position.y, position.z]), time_ns(reference.time_ref),
+            stamp_ns(message.header))
         rotation_errors.append(errors.rotation_error)
         translation_errors.append(errors.translation_error)
     # The project's own aim on this bag.
@@ -127,7 +123,7 @@ def test_replay_of_the_same_frames_is_bit_equal(run, bundled_bag):
                         stamps=frozenset(run.stamps))
         replayed = {pair.result.stamp_ns: pair.result for pair in replay.pairs()
                     if pair.result.pose}
-    live = {ros_stamp(message.header.stamp): message for message in run.poses}
+    live = {stamp_ns(message.header): message for message in run.poses}
     assert list(live) == list(replayed)
     for stamp, message in live.items():
         pose = replayed[stamp].pose
@@ -158,7 +154,7 @@ def test_diagnostics_tell_what_happened(run):
               if key.endswith('_rate_hz')} for item in run.diagnostics]
     assert max(rate['image_rate_hz'] for rate in rates) == pytest.approx(30.0, abs=6.0)
     assert max(rate['imu_rate_hz'] for rate in rates) == pytest.approx(200.0, abs=40.0)
-    times = [ros_stamp(item.header.stamp) for item in run.diagnostics]
+    times = [stamp_ns(item.header) for item in run.diagnostics]
     assert np.median(np.diff(times)) == pytest.approx(1e9, rel=0.2)
 
 

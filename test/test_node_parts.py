@@ -88,7 +88,8 @@ def pair(status: Status = Status.OK, reason: str = '') -> PairResult:
     inliers[:15] = True
     zeros2, zeros3 = np.zeros((count, 2)), np.zeros((count, 3))
     return PairResult(
-        reference_stamp_ns=0, stamp_ns=1, frame_id='', interval=0.1,
+        reference_stamp_ns=0, stamp_ns=1, reference_ns1=0, reference_ns2=1, frame_id='',
+        interval=0.1,
         pose=RelativePose(status=status, reason=reason, inliers=inliers, model='uniform'),
         matches=Matches(np.arange(count, dtype=np.uint32), zeros2, zeros2, np.ones(count)),
         row_times1=np.zeros(count), row_times2=np.zeros(count), rays1=zeros3, rays2=zeros3,

@@ -18,12 +18,9 @@ from rs_relpose_lab.live.processes import wait_until
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.estimator.estimate import warm_up
 from rs_relpose_ros.front_end.frame import Frame
+from rs_relpose_ros.front_end.front_end import FrameFailed, FrameProcessed, FrontEnd
 from rs_relpose_ros.front_end.pipeline import Pipeline
-from rs_relpose_ros.front_end.sequencer import (
-    MAILBOX_FRAMES,
-    Refusal,
-    Sequencer,
-)
+from rs_relpose_ros.front_end.sequencer import FrameRefused, MAILBOX_FRAMES, Refusal
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.imu.frame_imu import FrameImu
 from rs_relpose_ros.imu.samples import ImuSample
@@ -57,18 +54,26 @@ class HeldPipeline(Pipeline):
     started: threading.Event
     let_go: threading.Event
 
-    def process(self, frame: Any, imu: Any) -> None:
+    def process(self, frame: Any, imu: Any, parameters: Any) -> None:
         type(self).frames.append((frame.stamp_ns, imu))
         type(self).started.set()
         assert type(self).let_go.wait(300.0)
+
+
+class HeldFrontEnd(FrontEnd):
+    """Its frames are processed by a `HeldPipeline`."""
+
+    def __init__(self, parameters: Parameters, **options: Any) -> None:
+        super().__init__(parameters, **options)
+        self._pipeline = HeldPipeline(parameters)
 
 
 @pytest.fixture
 def held(monkeypatch: pytest.MonkeyPatch) -> Iterator[type[HeldPipeline]]:
     HeldPipeline.frames = []
     HeldPipeline.started, HeldPipeline.let_go = threading.Event(), threading.Event()
-    monkeypatch.setattr('rs_relpose_ros.node.worker.Pipeline', HeldPipeline)
-    # The warm-up has a pipeline of its own, which nobody holds.
+    # The warm-up has a front end of its own, which nobody holds.
+    monkeypatch.setattr('rs_relpose_ros.node.node.FrontEnd', HeldFrontEnd)
     yield HeldPipeline
     HeldPipeline.let_go.set()
 
@@ -86,12 +91,14 @@ def noisy_rate(k: int) -> tuple[float, float, float]:
 def test_the_oldest_frame_goes_and_the_latest_wait(held):
     now_ns = [0]
     parameters = Parameters.from_mapping(VALUES)
-    sequencer = Sequencer(parameters, clock=lambda: now_ns[0])
-    done: list[tuple[int, int]] = []
-    refused: list[Any] = []
-    worker = Worker(parameters, sequencer, lambda ready: None,
-                    lambda ready, result: done.append((ready.frame.stamp_ns, ready.ready_ns)),
-                    refused.append, lambda sentence, error: pytest.fail(f'{sentence}: {error}'))
+    front_end = HeldFrontEnd(parameters, clock=lambda: now_ns[0])
+    sequencer = front_end.sequencer
+    events: list[Any] = []
+
+    def done() -> list[FrameProcessed]:
+        return [event for event in events if isinstance(event, FrameProcessed)]
+
+    worker = Worker(front_end, events.append)
     worker.start()
     try:
         samples = 0
@@ -118,15 +125,17 @@ def test_the_oldest_frame_goes_and_the_latest_wait(held):
         assert report.text.startswith(f'{lost} frames were not used')
         assert dict(report.values)['frames_refused_overload'] == str(lost)
         held.let_go.set()
-        wait_until(lambda: len(done) == 1 + MAILBOX_FRAMES, 'the frames that waited')
+        wait_until(lambda: len(done()) == 1 + MAILBOX_FRAMES, 'the frames that waited')
     finally:
         held.let_go.set()
         assert worker.stop(10.0)
     latest = [frame_stamp(k) for k in range(FRAMES - MAILBOX_FRAMES, FRAMES)]
-    assert [stamp for stamp, _ in done] == [frame_stamp(0), *latest]
-    assert [item.stamp_ns for item in refused] == [frame_stamp(k) for k in range(1, lost + 1)]
+    assert [frame.stamp_ns for frame in done()] == [frame_stamp(0), *latest]
+    assert [event.stamp_ns for event in events if isinstance(event, FrameRefused)] == [
+        frame_stamp(k) for k in range(1, lost + 1)]
+    assert not any(isinstance(event, FrameFailed) for event in events)
     # However long it was held, the oldest that waits came within as many frames as may wait.
-    assert now_ns[0] - done[1][1] <= (MAILBOX_FRAMES + 1) * FRAME_NS
+    assert now_ns[0] - done()[1].ready_ns <= (MAILBOX_FRAMES + 1) * FRAME_NS
     # The gyro from the frame before to the first after all those that went has no hole.
     _, imu = held.frames[1]
     stamps = imu.since_previous.stamps_ns
@@ -162,7 +171,7 @@ def test_a_busy_worker_costs_the_node_no_imu(held, module_ros_domain_id):
     try:
         spin_until(lambda: all(p.get_subscription_count() for p in publishers.values()),
                    'discovery')
-        sequencer = node._sequencer
+        sequencer = node._front_end.sequencer
         publishers[CameraInfo].publish(build.camera_info(
             build.rclpy_types, width=WIDTH, height=HEIGHT,
             k=(60.0, 0.0, 32.0, 0.0, 60.0, 24.0, 0.0, 0.0, 1.0)))

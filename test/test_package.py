@@ -110,7 +110,7 @@ BASE = {'geometry', 'config'}
 CORE = BASE | {'images', 'solvers', 'estimator', 'imu', 'tracking'}
 MAY_IMPORT = {
     'geometry': set(),
-    'config': {'geometry'},
+    'config': {'geometry', 'solvers'},
     'images': set(),
     'solvers': {'geometry'},
     'imu': BASE,

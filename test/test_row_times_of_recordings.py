@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.config.parameter_file import read_parameters
-from rs_relpose_ros.front_end.pipeline import sensor_camera
+from rs_relpose_ros.front_end.frame import sensor_camera
 from rs_relpose_ros.replay.run import Replay
 
 # Every second frame is a keyframe, and the gyro serves for the rows only.
@@ -80,12 +80,12 @@ def recording(request, recordings, tmp_path_factory):
     with open_bag(path) as bag:
         replay = Replay(bag, bag.find_topics(), parameters)
         pairs = list(replay.pairs())
-        camera = sensor_camera(replay.calibration, parameters)
+        camera = sensor_camera(replay.intrinsics, parameters)
         for pair in pairs:
             result = pair.result
             use = ((result.matches.points1[:, 1] < LAST_ROW.get(name, np.inf))
                    & (result.matches.points2[:, 1] < LAST_ROW.get(name, np.inf)))
-            measured = [camera.unproject(replay.calibration.to_sensor(points[use])) for points in
+            measured = [camera.unproject(replay.intrinsics.to_sensor(points[use])) for points in
                         (result.matches.points1, result.matches.points2)]
             derotated = [rays[use] for rays in (result.rays1, result.rays2)]
             # As far to the other side of the measured ray.

@@ -7,6 +7,7 @@ import scipy.linalg
 from scipy.spatial.transform import Rotation
 from two_view_scene import direction_error, make_minimal_problems
 
+from rs_relpose_lab.experiments.paper_reference import solve_by_determinants
 from rs_relpose_ros import InputError, solvers
 from rs_relpose_ros.solvers import (
     angular_3pt,
@@ -16,7 +17,6 @@ from rs_relpose_ros.solvers import (
     uniform_9pt,
     uniform_11pt,
 )
-from rs_relpose_ros.solvers.paper_reference import solve_by_determinants
 
 POINTS = {linear_9pt: 9, uniform_9pt: 9, angular_3pt: 3, angular_5pt: 5, global_5pt: 5,
           uniform_11pt: 11}

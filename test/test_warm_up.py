@@ -16,8 +16,7 @@ import json
 import sys
 from numba.core.dispatcher import Dispatcher
 from rs_relpose_ros.bags.reader import open_bag
-from rs_relpose_ros.front_end.pipeline import Pipeline
-from rs_relpose_ros.front_end.sequencer import ReadyFrame, Sequencer
+from rs_relpose_ros.front_end.front_end import FrameProcessed, FrontEnd
 from rs_relpose_ros.messages.intake import Intake
 from rs_relpose_ros.messages.sensor_feed import Role
 from rs_relpose_ros.front_end.warm_up import warm_up_pipeline
@@ -31,18 +30,16 @@ def kernels():
 parameters = read_parameters(sys.argv[2], sys.argv[3:])
 warm_up_pipeline(parameters)
 before = kernels()
-sequencer = Sequencer(parameters, offline=True)
-intake = Intake(sequencer)
-pipeline = Pipeline(parameters)
+front_end = FrontEnd(parameters, offline=True)
+intake = Intake(front_end.sequencer)
 statuses = set()
 with open_bag(sys.argv[1]) as bag:
     topics = bag.find_topics()
     for role, item in intake.feed.messages(bag, topics):
         intake.receive(role, item.message)
-        while isinstance(ready := sequencer.take(), ReadyFrame):
-            pair = pipeline.process(ready.frame, ready.imu)
-            if pair is not None:
-                statuses.add(pair.pose.status.value)
+        while isinstance(outcome := front_end.step(), FrameProcessed):
+            if outcome.pair is not None:
+                statuses.add(outcome.pair.pose.status.value)
 after = kernels()
 print(json.dumps([sorted(statuses), [k for k in after if after[k] != before[k]],
                   sum(before.values())]))

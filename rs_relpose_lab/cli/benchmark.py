@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 import sys
 
-from rs_relpose_ros.config.estimator import SOLVERS
+from rs_relpose_ros.config.estimator import SOLVER_CHOICES
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 
 HELP = ('Measure the estimator on simulated frame pairs, one thread each: "accuracy" against an '
@@ -87,7 +87,7 @@ def _add_accuracy_arguments(parser: argparse.ArgumentParser) -> None:
                              '(default: both)')
     parser.add_argument('--sigma-factor', nargs='+', type=float, default=[1.0], metavar='X',
                         help='tell the estimator so many times the true sigmas (default: 1)')
-    parser.add_argument('--solver', choices=SOLVERS, default='auto', help='(default: auto)')
+    parser.add_argument('--solver', choices=SOLVER_CHOICES, default='auto', help='(default: auto)')
     _add_common_arguments(
         parser, 'out/accuracy', seed_of='problem of a cell', jobs='processes; times are '
         'comparable only where each has a core of its own')

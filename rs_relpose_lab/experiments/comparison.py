@@ -114,7 +114,7 @@ def differing_poses(live: Path, replayed: Path) -> tuple[int, int]:
 def replay_records(bag: Bag, topics: SensorTopics, parameters: Parameters,
                    truth: TrueTrajectory) -> list[PairRecord]:
     """Records of a replay, nothing written."""
-    return [pair_record(pair.result, pair.reference_ns1, pair.reference_ns2, truth)
+    return [pair_record(pair.result, truth)
             for pair in Replay(bag, topics, parameters).pairs()]
 
 

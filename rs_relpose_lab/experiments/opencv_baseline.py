@@ -107,6 +107,6 @@ def best_opencv_score(method: str, pairs: Sequence[ReplayedPair], calibration: I
                 calibration.to_sensor(matches.points1), calibration.to_sensor(matches.points2),
                 camera, method, threshold)
             errors.append(None if pose is None else truth.errors(
-                pose.R, pose.t, pair.reference_ns1, pair.reference_ns2))
+                pose.R, pose.t, pair.result.reference_ns1, pair.result.reference_ns2))
         scores.append(score(f'OpenCV 5-point, {method}, {threshold:g} px', len(pairs), errors))
     return min(scores, key=lambda s: np.nan_to_num(s.rotation[0], nan=np.inf))

@@ -60,7 +60,7 @@ class Graph:
     def __init__(self) -> None:
         self._context = Context()
         rclpy.init(context=self._context)
-        self.node = rclpy.create_node('live_rig', context=self._context)
+        self.node = rclpy.create_node('live_rig', context=self._context, enable_rosout=False)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
         self._stopping = threading.Event()

@@ -10,8 +10,8 @@ from rs_relpose_ros.bags.reader import COMPRESSED_IMAGE, IMAGE
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 
-# In CDR a message that begins with a std_msgs/Header has its stamp after four bytes, the second of
-# which tells the byte order.
+# CDR: 4 bytes of encapsulation (the second one tells the byte order), then sec and nanosec of the
+# std_msgs/Header that the message begins with.
 _STAMP = slice(4, 12)
 _TAIL_NS = NANOSECONDS // 20
 
@@ -36,14 +36,14 @@ def in_turns(messages: Sequence[Outgoing], period_ns: int,
         In the order of `due_ns`; all begin with a header, and their stamps span one period.
     period_ns : int
     duration_ns : int
-        What would be due later is left out, and the last images a little earlier: the IMU samples
-        that cover their last rows are still to come.
+        Messages due later are left out. Images end 50 ms earlier, so that the IMU samples which
+        cover their last rows are still published.
     """
     stamps = [stamp_of(message.data) for message in messages]
     if messages and max(stamps) - min(stamps) >= period_ns:
         raise InputError(f'the recording is {(max(stamps) - min(stamps)) / NANOSECONDS:.3f} s '
                          f'long, and so has no period of {period_ns / NANOSECONDS:g} s')
-    # What is delivered after the period's end comes among the first messages of the next turn.
+    # A message due after the period's end is sent among the first messages of the next turn.
     order = sorted(range(len(messages)), key=lambda k: messages[k].due_ns % period_ns)
     turn = 0
     while messages:

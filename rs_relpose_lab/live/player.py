@@ -48,42 +48,19 @@ from rs_relpose_ros.node.message_types import message_class
 LOG_DTYPE = np.dtype([('is_image', '?'), ('stamp_ns', '<i8'), ('due_ns', '<i8'),
                       ('published_ns', '<i8')])
 
-# What the node subscribes to, and so what is worth waiting for.
+# Types that the node subscribes to: the player waits for these subscriptions.
 _SENSOR_TYPES = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, IMU)
 _DEPTH = 1000
-# A subscriber knows of the match a little later than the publisher, and misses what comes before.
+# From the match on the publisher's side to that on the subscriber's, which misses what is sent in
+# between [s].
 _SETTLE = 0.5
-# Best-effort samples are confirmed by nobody; the last ones need this long to be read.
+# Best-effort messages are not acknowledged: time for the subscriber to read the last ones [s].
 _LINGER = 0.2
 
 
 @dataclass(frozen=True, slots=True)
 class PlayerOptions:
-    """How a bag is played.
-
-    Parameters
-    ----------
-    bag : Path
-        Rosbag2 directory, MCAP file or ROS 1 bag.
-    rate : float
-        Speed against bag time.
-    best_effort : bool
-        QoS of the publishers; reliable otherwise.
-    decode : {'', 'mono8', 'bgr8'}
-        Publish compressed images raw, in this encoding, on the topic without ``/compressed``.
-    topics : tuple of str
-        Only these topics of the bag; empty for all.
-    wait_for_subscribers : float
-        Longest wait [s] for a subscription to each sensor topic; 0 starts at once.
-    loop : float
-        Repeat a recording without a seam, whose motion has this period [s]: stamps go on from
-        turn to turn. All messages are decoded and serialised ahead. 0 plays the bag as it is.
-    duration : float
-        With `loop`: end after so many seconds.
-    log : Path or None
-        With `loop`: file (NPY) that receives when each image and IMU message was published,
-        records of `LOG_DTYPE`.
-    """
+    """How a bag is played: the options of `parse`, which describes them."""
 
     bag: Path
     rate: float = 1.0
@@ -111,7 +88,7 @@ def play(node: Node, options: PlayerOptions) -> int:
         if options.loop > 0.0:
             messages = in_turns(list(messages), to_nanoseconds(options.loop),
                                 to_nanoseconds(options.duration))
-            # The sensors' clocks must not stop for a search of so many objects.
+            # Garbage collection over so many objects would delay publishing.
             gc.collect()
             gc.freeze()
         if options.wait_for_subscribers > 0.0:
@@ -220,18 +197,21 @@ def parse(arguments: Sequence[str]) -> PlayerOptions:
     parser.add_argument('--best-effort', action='store_true',
                         help='best-effort publishers instead of reliable ones')
     parser.add_argument('--decode', choices=('mono8', 'bgr8'), default='',
-                        help='publish compressed images raw in this encoding')
+                        help='publish compressed images raw in this encoding, on the topic '
+                             'without /compressed')
     parser.add_argument('--topics', nargs='+', default=(), metavar='TOPIC',
                         help='only these topics of the bag')
     parser.add_argument('--wait-for-subscribers', type=float, default=0.0, metavar='SECONDS',
-                        help='longest wait for a subscription to each sensor topic')
+                        help='longest wait for a subscription to each sensor topic; '
+                             '0 (default) starts at once')
     parser.add_argument('--loop', type=float, default=0.0, metavar='SECONDS',
-                        help='repeat a recording whose motion has this period, without a seam; '
-                             'everything is decoded ahead')
+                        help='repeat a recording whose motion has this period, without a seam: '
+                             'stamps go on from turn to turn; everything is decoded ahead')
     parser.add_argument('--duration', type=float, default=60.0, metavar='SECONDS',
                         help='with --loop: end after so many seconds (default: 60)')
     parser.add_argument('--log', type=Path, metavar='FILE',
-                        help='with --loop: write when each message was published (NPY)')
+                        help='with --loop: write when each image and IMU message was due and '
+                             'published (NPY, LOG_DTYPE)')
     given = parser.parse_args(arguments)
     if given.loop < 0.0 or given.duration <= 0.0:
         parser.error('--loop and --duration must be positive')

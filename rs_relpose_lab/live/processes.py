@@ -39,7 +39,7 @@ class Process:
     """
 
     def __init__(self, *arguments: str, log: Path | None = None) -> None:
-        self._name = arguments[arguments[0] == '-m'].rpartition('.')[2]
+        self._name = arguments[arguments[0] == '-m']
         # A file, as a pipe that nobody reads would block the process.
         self._log: BinaryIO = log.open('w+b') if log else tempfile.TemporaryFile()  # noqa: SIM115
         self._process = subprocess.Popen(

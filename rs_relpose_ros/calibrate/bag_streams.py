@@ -9,7 +9,6 @@ import logging
 from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics
 from rs_relpose_ros.calibrate.follow import PointFollower
 from rs_relpose_ros.calibrate.gyro_path import GyroSeries
-from rs_relpose_ros.calibrate.procedure import CalibrationConfig
 from rs_relpose_ros.calibrate.tracks import Tracks
 from rs_relpose_ros.config.tracking import TrackingConfig
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
@@ -21,11 +20,6 @@ from rs_relpose_ros.messages.sensor_feed import Role, SensorFeed
 
 # Guess of an unknown focal length, share of the longer side: 64 deg of view.
 _FOCAL_GUESS = 0.8
-
-# What KLT adds to the errors of a calibration, found on rendered bags: its errors are not
-# independent from frame to frame.
-TRACKED_IN_IMAGES = CalibrationConfig(
-    tracking_time_sigma=5e-5, tracking_rotation_sigma=1e-3, tracking_bias_sigma=2.5e-4)
 
 _logger = logging.getLogger(__name__)
 

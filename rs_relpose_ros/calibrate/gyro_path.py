@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry.so3 import exp_so3, rodrigues
+from rs_relpose_ros.geometry.gyro import integrated_rotations, step_turn
+from rs_relpose_ros.geometry.so3 import exp_so3, multiply
 
 Array = NDArray[np.float64]
 
@@ -79,26 +81,14 @@ def noise_density(times: Array, rates: Array) -> float:
     return float(np.median(third) / 0.6745 / np.sqrt(20.0) * np.sqrt(step))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class GyroPath:
-    """Integrated gyro: everything is linear or constant between neighbouring knots.
+class GyroPath(NamedTuple):
+    """Integrated gyro with K knots: rates are linear between neighbouring knots."""
 
-    Attributes
-    ----------
-    times : (K,) ndarray
-        [s].
-    rates : (K, 3) ndarray
-        Bias removed [rad/s].
-    rotations : (K, 3, 3) ndarray
-        ``R_start^T R_k`` in the IMU frame.
-    turned : (K, 3, 3) ndarray
-        Integral of the rotations over time [s]: a rate error db turns what comes out at knot k by
-        ``turned_k db``, in the frame of the start.
-    """
-
-    times: Array
-    rates: Array
-    rotations: Array
+    times: Array        # (K,) [s]
+    rates: Array        # (K, 3) without the bias [rad/s]
+    rotations: Array    # (K, 3, 3) R_start^T R_k, IMU frame
+    # (K, 3, 3) integral of the rotations over time [s]: a rate error db turns the rotation at knot
+    # k by ``turned_k db``, in the frame of the start.
     turned: Array
 
     @classmethod
@@ -106,56 +96,25 @@ class GyroPath:
         """Integrate rates (K, 3) at times (K,) after subtracting a bias (3,)."""
         times = np.ascontiguousarray(times, dtype=np.float64)
         rates = np.ascontiguousarray(np.asarray(measured) - np.asarray(bias), dtype=np.float64)
-        return cls(times, rates, *_integrated(times, rates))
+        rotations = integrated_rotations(times, rates)
+        turned = np.zeros_like(rotations)
+        np.cumsum(0.5 * np.diff(times)[:, None, None] * (rotations[:-1] + rotations[1:]), axis=0,
+                  out=turned[1:])
+        return cls(times, rates, rotations, turned)
 
     def at(self, times: ArrayLike) -> Array:
         """Rotations (N, 3, 3) at instants (N,); those outside of the knots extrapolate."""
-        return _evaluated(self.times, self.rates, self.rotations,
-                          np.ascontiguousarray(times, dtype=np.float64))
+        return _evaluated(self, np.ascontiguousarray(times, dtype=np.float64))
 
 
 @kernel
-def _integrated(times: Array, rates: Array) -> tuple[Array, Array]:
-    count = len(times)
-    rotations, turned = np.empty((count, 3, 3)), np.zeros((count, 3, 3))
-    rotations[0] = np.eye(3)
-    for k in range(count - 1):
-        dt = times[k + 1] - times[k]
-        step = exp_so3(0.5 * dt * (rates[k] + rates[k + 1]))
-        for i in range(3):
-            for j in range(3):
-                rotations[k + 1, i, j] = (
-                    rotations[k, i, 0] * step[0, j] + rotations[k, i, 1] * step[1, j]
-                    + rotations[k, i, 2] * step[2, j])
-        for i in range(3):
-            for j in range(3):
-                turned[k + 1, i, j] = turned[k, i, j] + 0.5 * dt * (
-                    rotations[k, i, j] + rotations[k + 1, i, j])
-    return rotations, turned
-
-
-@kernel
-def rotation_at(times: Array, rates: Array, rotations: Array, instant: float, k: int,
-                rotation: Array, rate: Array) -> None:
-    """Rotation (3, 3) and rate (3,) at an instant at or after knot `k`, written in place."""
-    dt = instant - times[k]
-    share = dt / (times[k + 1] - times[k])
+def rotation_at(path: GyroPath, instant: float, k: int, rotation: Array, rate: Array) -> None:
+    """Fill the rotation (3, 3) and the rate (3,) at an instant from knot `k` on."""
+    dt = instant - path.times[k]
+    share = dt / (path.times[k + 1] - path.times[k])
     for i in range(3):
-        rate[i] = rates[k, i] + share * (rates[k + 1, i] - rates[k, i])
-    x = 0.5 * dt * (rates[k, 0] + rate[0])
-    y = 0.5 * dt * (rates[k, 1] + rate[1])
-    z = 0.5 * dt * (rates[k, 2] + rate[2])
-    a, b = rodrigues(x * x + y * y + z * z)
-    e00, e11 = 1.0 - b * (y * y + z * z), 1.0 - b * (x * x + z * z)
-    e22 = 1.0 - b * (x * x + y * y)
-    e01, e10 = b * x * y - a * z, b * x * y + a * z
-    e02, e20 = b * x * z + a * y, b * x * z - a * y
-    e12, e21 = b * y * z - a * x, b * y * z + a * x
-    for i in range(3):
-        q0, q1, q2 = rotations[k, i, 0], rotations[k, i, 1], rotations[k, i, 2]
-        rotation[i, 0] = q0 * e00 + q1 * e10 + q2 * e20
-        rotation[i, 1] = q0 * e01 + q1 * e11 + q2 * e21
-        rotation[i, 2] = q0 * e02 + q1 * e12 + q2 * e22
+        rate[i] = path.rates[k, i] + share * (path.rates[k + 1, i] - path.rates[k, i])
+    multiply(path.rotations[k], exp_so3(step_turn(path.rates[k], rate, dt)), rotation)
 
 
 @kernel
@@ -170,10 +129,10 @@ def knot_before(times: Array, instant: float, near: int) -> int:
 
 
 @kernel
-def _evaluated(times: Array, rates: Array, rotations: Array, instants: Array) -> Array:
+def _evaluated(path: GyroPath, instants: Array) -> Array:
     out, rate = np.empty((len(instants), 3, 3)), np.empty(3)
     k = 0
     for n in range(len(instants)):
-        k = knot_before(times, instants[n], k)
-        rotation_at(times, rates, rotations, instants[n], k, out[n], rate)
+        k = knot_before(path.times, instants[n], k)
+        rotation_at(path, instants[n], k, out[n], rate)
     return out

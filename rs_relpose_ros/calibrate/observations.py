@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.calibrate.alignment import seen_rates
-from rs_relpose_ros.calibrate.fit import BEND_AT_START, Problem
+from rs_relpose_ros.calibrate.coplanarity import Problem, View
 from rs_relpose_ros.calibrate.gyro_path import GyroSeries, noise_density
 from rs_relpose_ros.calibrate.tracks import make_pairs, Pairs, Tracks
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
@@ -17,8 +18,21 @@ Array = NDArray[np.float64]
 
 # Frames further apart than so many intervals have lost some in between.
 _LOST = 1.5
+# Prior of `bend`, 1 sigma, before the parallax is known.
+_BEND_AT_START = 0.1
+# Rotation between two frames that even a gyro without noise misses between its samples [rad].
+_LEAST_TURN = 2e-5
 # Cosine of the angle to the optical axis beyond which a point has no normalised coordinates.
 _LEAST_COSINE = 0.05
+
+
+class PairSelection(NamedTuple):
+    """Which pairs of frames take part in a fit."""
+
+    spans: tuple[float, ...]    # time between the frames [s]
+    max_matches: int            # of a pair; more are drawn from
+    min_matches: int            # pairs with fewer are left out
+    most_pairs: int             # evenly over the recording
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,23 +91,26 @@ class Observations:
         """Steps (K - 1,) between samples of the gyro [s]."""
         return np.diff(self.gyro_times)
 
-    def frames_in(self, spans: tuple[float, ...]) -> tuple[int, ...]:
-        """Numbers of frames that make up these spans of time [s]."""
-        return tuple(sorted({max(1, round(span / self.interval)) for span in spans}))
-
     def pairs(self, gaps: tuple[int, ...], *, max_matches: int, min_matches: int,
               rng: np.random.Generator) -> Pairs:
         """Pairs of frames `gaps` frames apart that have lost none in between; see `make_pairs`."""
         return make_pairs(self.tracks, gaps, max_matches=max_matches, min_matches=min_matches,
                           max_interval=_LOST * self.interval, rng=rng)
 
-    def covered(self, pairs: Pairs, offset: float, max_gyro_gap: float) -> NDArray[np.bool_]:
-        """Mask (P,) of pairs all of whose rows lie within the gyro and touch no gap of it."""
+    def selected(self, selection: PairSelection, offset: float, max_gyro_gap: float,
+                 rng: np.random.Generator) -> Pairs:
+        """Selected pairs all of whose rows lie within the gyro and touch no gap of it."""
+        frames = sorted({max(1, round(span / self.interval)) for span in selection.spans})
+        pairs = self.pairs(tuple(frames), max_matches=selection.max_matches,
+                           min_matches=selection.min_matches, rng=rng)
         half = 0.5 * self.interval + 0.01
-        return np.asarray(
+        pairs = pairs.chosen(
             (self.times[pairs.first] + offset - half >= self.gyro_times[0])
             & (self.times[pairs.second] + offset + half <= self.gyro_times[-1])
             & self.clear_of_gaps(pairs, offset, half, max_gyro_gap))
+        if len(pairs) <= selection.most_pairs:
+            return pairs
+        return pairs.chosen(np.linspace(0, len(pairs) - 1, selection.most_pairs).astype(np.int64))
 
     def clear_of_gaps(self, pairs: Pairs, offset: float, margin: float,
                       max_gyro_gap: float) -> NDArray[np.bool_]:
@@ -113,26 +130,19 @@ class Observations:
 
     def problem(self, pairs: Pairs, offset: float) -> Problem:
         """Data of a fit to `pairs`, which the gyro covers at about this `offset` [s]."""
-        camera = self.camera
-        middle = 0.5 * (camera.height - 1)
-        points1, by_pixel1 = _normalised_by_pixel(camera, pairs.points1)
-        points2, by_pixel2 = _normalised_by_pixel(camera, pairs.points2)
         times1, times2 = self.times[pairs.first], self.times[pairs.second]
+        middles = np.searchsorted(self.gyro_times, 0.5 * (times1 + times2) + offset)
+        turn_sigma = np.sqrt(self.gyro_density**2 * (times2 - times1) + _LEAST_TURN**2)
         return Problem(
-            self.gyro_times, self.gyro_rates, pairs.begin,
-            np.searchsorted(self.gyro_times, 0.5 * (times1 + times2) + offset), pairs.first,
-            pairs.second, times1, times2, self.covariates[pairs.first],
-            self.covariates[pairs.second], points1, points2,
-            (pairs.points1[:, 1] - middle) / camera.height,
-            (pairs.points2[:, 1] - middle) / camera.height, by_pixel1, by_pixel2,
-            self.gyro_density, np.full(len(pairs), BEND_AT_START))
+            self.gyro_times, self.gyro_rates, pairs.begin, middles,
+            self._view(pairs.first, pairs.points1), self._view(pairs.second, pairs.points2),
+            np.full(len(pairs), _BEND_AT_START), turn_sigma)
 
-
-def evenly(pairs: Pairs, most: int) -> Pairs:
-    """At most so many of the pairs, evenly among all."""
-    if len(pairs) <= most:
-        return pairs
-    return pairs.chosen(np.linspace(0, len(pairs) - 1, most).astype(np.int64))
+    def _view(self, frames: NDArray[np.int64], pixels: Array) -> View:
+        camera = self.camera
+        rows = (pixels[:, 1] - 0.5 * (camera.height - 1)) / camera.height
+        points, by_pixel = _normalised_by_pixel(camera, pixels)
+        return View(self.times[frames], self.covariates[frames], points, rows, by_pixel)
 
 
 def _normalised(camera: RollingShutterCamera, points: Array) -> Array:

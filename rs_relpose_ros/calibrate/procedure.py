@@ -3,89 +3,53 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.calibrate.alignment import find_starts, Start
-from rs_relpose_ros.calibrate.axis_maps import nearest_axis_map
 from rs_relpose_ros.calibrate.coplanarity import (
-    BIAS,
     FOCAL,
     GLOBAL,
     OFFSET,
+    Problem,
     READOUT,
-    ROTATION,
     SLOPE,
+    Unknowns,
 )
 from rs_relpose_ros.calibrate.fit import (
     evaluate,
     Fit,
     fit,
-    Problem,
-    robust_weights,
-    State,
+    initial,
+    refit,
+    restarted,
+    stepped,
     with_bends,
 )
 from rs_relpose_ros.calibrate.gyro_path import GyroSeries
-from rs_relpose_ros.calibrate.observations import evenly, Observations
-from rs_relpose_ros.calibrate.result import AXES, CalibrationResult, CostCurve, Estimate
+from rs_relpose_ros.calibrate.judgement import judged
+from rs_relpose_ros.calibrate.observations import Observations, PairSelection
+from rs_relpose_ros.calibrate.result import CalibrationResult, CostCurve
 from rs_relpose_ros.calibrate.tracks import Tracks
-from rs_relpose_ros.config.declarations import check_settings, setting
+from rs_relpose_ros.config.calibration import CalibrationConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
 Array = NDArray[np.float64]
 Progress = Callable[[float], object]
 
-# Frame pairs this far apart [s]: far ones, whose rows the gyro has turned by different rates, and
-# near ones, over which a tracker's errors do not add up and the camera moves evenly. The noise of
-# each pair, as found, decides what counts.
-_SPANS = (0.033, 0.067, 0.133, 0.267)
-_SPAN_AT_START = (0.067,)
 _LEAST_MATCHES = 20
-_MATCHES_PER_PAIR, _MATCHES_PER_PAIR_AT_START = 80, 40
-_MOST_PAIRS, _PAIRS_AT_START = 800, 100
+# Spans [s]: over long ones the gyro's rates at the rows differ; over short ones the errors of the
+# tracker add up less and the velocity of the camera is constant. The noise that is found for each
+# pair decides on its weight.
+_ALL_PAIRS = PairSelection((0.033, 0.067, 0.133, 0.267), 80, _LEAST_MATCHES, 800)
+_SOME_PAIRS = _ALL_PAIRS._replace(max_matches=40, most_pairs=100)
+_PAIRS_AT_START = _SOME_PAIRS._replace(spans=(0.067,))
 # Intervals between frames that differ by more than this share may have exposures that differ.
 _VARYING = 0.02
 _FOCAL_FACTORS = np.geomspace(0.5, 2.0, 9)
 _CURVE_POINTS = 13
-
-
-@dataclass(frozen=True, slots=True)
-class CalibrationConfig:
-    """What a recording must have, and from where on a figure counts as observable."""
-
-    max_time_offset: float = setting(
-        0.25, 'largest clock offset that is searched for', 's', low=0.01, high=5.0)
-    min_frames: int = setting(40, 'frames that a recording must have', low=10, high=100_000)
-    min_rotation_rate: float = setting(
-        np.radians(2.0).item(), 'rms of the rotation below which a camera stands still', 'rad/s',
-        low=0.0, high=10.0)
-    max_gyro_gap: float = setting(
-        0.03, 'longest step between gyro samples that is interpolated', 's', low=1e-3, high=1.0)
-    max_readout_sigma: float = setting(
-        1.5e-3, 'sigma of an observable read-out time', 's', low=1e-5, high=1.0)
-    max_offset_sigma: float = setting(
-        3e-3, 'sigma of an observable offset', 's', low=1e-5, high=1.0)
-    max_rotation_sigma: float = setting(
-        np.radians(0.7).item(), 'sigma of an observable rotation, each axis', 'rad', low=1e-5,
-        high=1.0)
-    max_bias_sigma: float = setting(
-        0.01, 'sigma of an observable gyro bias', 'rad/s', low=1e-5, high=1.0)
-    max_focal_sigma: float = setting(
-        0.03, 'sigma of an observable focal length, relative', low=1e-4, high=1.0)
-
-    tracking_time_sigma: float = setting(
-        0.0, 'error of read-out and offset by the tracker, beyond scatter', 's', low=0.0, high=0.1)
-    tracking_rotation_sigma: float = setting(
-        0.0, 'error of the rotation by the tracker, beyond scatter', 'rad', low=0.0, high=1.0)
-    tracking_bias_sigma: float = setting(
-        0.0, 'error of the gyro bias by the tracker, beyond scatter', 'rad/s', low=0.0, high=1.0)
-
-    def __post_init__(self) -> None:
-        check_settings(self)
 
 
 def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
@@ -133,19 +97,15 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
     free[FOCAL] = not focal_known
     coarse = _coarse_fit(data, starts, free, config, rng)
     progress(0.4)
-    problem = _problem(data, _SPANS, coarse.state.parameters[OFFSET],
-                       _MATCHES_PER_PAIR, _MOST_PAIRS, config, rng)
-    begin = coarse.state.restarted(problem, 2.0)
-    problem = with_bends(problem, begin)
     free[SLOPE] = _intervals_vary(data)
-    final = fit(problem, begin, free)
+    offset = coarse.unknowns.parameters[OFFSET]
+    final = refit(_problem(data, _ALL_PAIRS, offset, config, rng), coarse.unknowns, free)
     progress(0.8)
-    some = with_bends(_problem(
-        data, _SPANS, final.state.parameters[OFFSET], _MATCHES_PER_PAIR_AT_START,
-        _PAIRS_AT_START, config, rng), final.state)
-    curve = _cost_curve(some, len(problem.points1), final, free, data.interval,
+    offset = final.unknowns.parameters[OFFSET]
+    some = with_bends(_problem(data, _SOME_PAIRS, offset, config, rng), final.unknowns)
+    curve = _cost_curve(some, final, free, data.interval,
                         lambda share: progress(0.8 + 0.2 * share))
-    return _judged(data, problem, final, free, curve, config)
+    return judged(data, final, free, curve, config)
 
 
 # -- what comes in -----------------------------------------------------------------------------
@@ -212,29 +172,21 @@ def _starts(data: Observations, focal_known: bool, config: CalibrationConfig,
 
 def _coarse_fit(data: Observations, starts: list[Start], free: NDArray[np.bool_],
                 config: CalibrationConfig, rng: np.random.Generator) -> Fit:
-    """The best of the starts after a fit to some of the pairs."""
-    best: Fit | None = None
-    best_cost = np.inf
+    """The best of the fits to a few pairs from each of the starts."""
+    fits = []
     for start in starts:
-        problem = _problem(data, _SPAN_AT_START, start.offset,
-                           _MATCHES_PER_PAIR_AT_START, _PAIRS_AT_START, config, rng)
-        state = State.start(problem, start.R_cam_imu.T, start.offset,
-                            log_focal=float(np.log(start.focal_factor)))
-        result = fit(problem, state, free, rounds=20, tolerance=0.3)
-        # Pairs differ between the starts; sigma of the matches does not depend on their number.
-        cost = float(np.median(result.state.noise))
-        if cost < best_cost:
-            best, best_cost = result, cost
-    assert best is not None
-    return best
+        problem = _problem(data, _PAIRS_AT_START, start.offset, config, rng)
+        unknowns = initial(problem, start.R_cam_imu.T, start.offset,
+                           log_focal=float(np.log(start.focal_factor)))
+        fits.append(fit(problem, unknowns, free, rounds=20, tolerance=0.3))
+    # By the noise of the matches: pairs and cost differ between the starts.
+    return min(fits, key=lambda found: float(np.median(found.unknowns.noise)))
 
 
-def _problem(data: Observations, spans: tuple[float, ...], offset: float, matches: int,
-             most_pairs: int, config: CalibrationConfig, rng: np.random.Generator) -> Problem:
-    """Pairs whose rows the gyro covers, as the fit takes them."""
-    pairs = data.pairs(data.frames_in(spans), max_matches=matches, min_matches=_LEAST_MATCHES,
-                       rng=rng)
-    pairs = evenly(pairs.chosen(data.covered(pairs, offset, config.max_gyro_gap)), most_pairs)
+def _problem(data: Observations, selection: PairSelection, offset: float,
+             config: CalibrationConfig, rng: np.random.Generator) -> Problem:
+    """Data of a fit to selected pairs whose rows the gyro covers at this `offset` [s]."""
+    pairs = data.selected(selection, offset, config.max_gyro_gap, rng)
     if len(pairs) < 10:
         raise InputError(
             f'only {len(pairs)} pairs of images have {_LEAST_MATCHES} points in common and a gyro '
@@ -242,131 +194,44 @@ def _problem(data: Observations, spans: tuple[float, ...], offset: float, matche
     return data.problem(pairs, offset)
 
 
-# -- outcome -----------------------------------------------------------------------------------
+# -- cost over the read-out time ---------------------------------------------------------------
 
 
-def _cost_curve(problem: Problem, matches: int, final: Fit, free: NDArray[np.bool_],
-                interval: float, progress: Progress) -> CostCurve:
+def _cost_curve(problem: Problem, final: Fit, free: NDArray[np.bool_], interval: float,
+                progress: Progress) -> CostCurve:
     """Cost with the read-out time held, from one frame interval upwards to one downwards."""
-    best = float(final.state.parameters[READOUT])
+    best = float(final.unknowns.parameters[READOUT])
     held = free.copy()
     held[READOUT] = False
     values = np.unique(np.concatenate([np.linspace(-interval, interval, _CURVE_POINTS), [best]]))
     costs = np.empty(len(values))
     order = np.argsort(np.abs(values - best))
-    begin = _refitted(problem, final.state.restarted(problem), held, 5)
+    begin = _refitted(problem, restarted(problem, final.unknowns), held, 5)
     for side in (order[values[order] <= best], order[values[order] > best]):
-        state = begin
+        unknowns = begin
         for k in side:
-            parameters = state.parameters.copy()
+            parameters = unknowns.parameters.copy()
             parameters[READOUT] = values[k]
-            state = _refitted(problem, replace(state, parameters=parameters), held, 2)
-            costs[k] = evaluate(problem, state, derivatives=False).cost
+            unknowns = _refitted(problem, unknowns._replace(parameters=parameters), held, 2)
+            costs[k] = evaluate(problem, unknowns, derivatives=False).cost
             progress(float(np.isfinite(costs).mean()))
-    # Matches of a frame serve in many pairs: scaled so that its bend at the minimum tells sigma.
-    information = final.information[np.ix_(free, free)] * len(problem.points1) / matches
+    # One match of a frame serves in many pairs: scaled so that the curvature at the minimum is
+    # 1 / sigma^2.
+    matches = problem.begin[-1] / final.problem.begin[-1]
+    information = final.information[np.ix_(free, free)] * matches
     naive = float(np.linalg.inv(information)[0, 0])
     variance = float(final.covariance[READOUT, READOUT])
     return CostCurve(values, (costs - costs.min()) * naive / variance)
 
 
-def _refitted(problem: Problem, state: State, free: NDArray[np.bool_], rounds: int) -> State:
-    """A few plain Gauss-Newton steps."""
+def _refitted(problem: Problem, unknowns: Unknowns, free: NDArray[np.bool_],
+              rounds: int) -> Unknowns:
+    """Unknowns after plain Gauss-Newton steps."""
     for _ in range(rounds):
-        evaluation = evaluate(problem, state)
+        evaluation = evaluate(problem, unknowns)
         H = evaluation.reduced.sum(axis=0)[np.ix_(free, free)]
         step = np.zeros(GLOBAL)
         step[free] = -np.linalg.solve(H + 1e-6 * np.diag(np.diag(H)),
                                       evaluation.score.sum(axis=0)[free])
-        local = -evaluation.back[:, :, GLOBAL] - evaluation.back[:, :, :GLOBAL] @ step
-        state = state.moved(step, local)
-    return state
-
-
-def _judged(data: Observations, problem: Problem, final: Fit, free: NDArray[np.bool_],
-            curve: CostCurve, config: CalibrationConfig) -> CalibrationResult:
-    """Figures with their sigmas and verdicts."""
-    covariance = _inflated(final.covariance, free, config)
-    parameters, R_cam_imu = final.state.parameters, final.state.R_imu_cam.T
-    interval = data.interval
-    rates, weak = _excitation(data, parameters[BIAS:BIAS + 3], R_cam_imu, config)
-    readout = float(parameters[READOUT])
-    readout_sigma = float(np.sqrt(covariance[READOUT, READOUT]))
-    if abs(readout) - 3.0 * readout_sigma > interval:
-        raise InputError(
-            f'the read-out time comes out as {1e3 * abs(readout):.1f} +- '
-            f'{1e3 * readout_sigma:.1f} ms, longer than the interval of {1e3 * interval:.1f} ms '
-            'between frames, which no camera can do: stamps or frames are not what they seem '
-            '(frames dropped and stamped anew, images cropped, scaled or rotated)')
-    # Row 0 is read this share of the read-out before the middle row.
-    to_first = np.zeros(GLOBAL)
-    to_first[OFFSET], to_first[READOUT] = 1.0, -0.5 * (data.camera.height - 1) / data.camera.height
-    offset_sigma = float(np.sqrt(to_first @ covariance @ to_first))
-    # About the camera's axes.
-    rotation = covariance[ROTATION:ROTATION + 3, ROTATION:ROTATION + 3]
-    rotation_sigma = np.sqrt(np.diag(R_cam_imu @ rotation @ R_cam_imu.T))
-    axis_map = nearest_axis_map(R_cam_imu)
-    angle = float(np.arccos(np.clip((np.trace(R_cam_imu @ axis_map.T) - 1.0) / 2.0, -1.0, 1.0)))
-    weights = robust_weights(problem, final.state, final.evaluation)
-    warnings = []
-    if not final.converged:
-        warnings.append('the fit had not settled when it was stopped')
-    if weak:
-        warnings.append(weak)
-
-    def told(value: float, sigma: float, limit: float, more: str = weak) -> Estimate:
-        good = sigma <= limit and not more
-        return Estimate(float(value), float(sigma), good, '' if good else (
-            more or 'too little rotation, too short, or too few points: record 10 s or more of '
-            'a textured scene while turning 20 to 60 deg/s about all three axes'))
-
-    bias_sigma = np.sqrt(np.diag(covariance))[BIAS:BIAS + 3]
-    biases = [told(parameters[BIAS + i], bias_sigma[i], config.max_bias_sigma, '')
-              for i in range(3)]
-    focal = slope = None
-    if free[FOCAL]:
-        factor = float(np.exp(parameters[FOCAL]))
-        sigma = float(np.sqrt(covariance[FOCAL, FOCAL]))
-        focal = told(factor, factor * sigma, factor * config.max_focal_sigma)
-    if free[SLOPE]:
-        sigma = float(np.sqrt(covariance[SLOPE, SLOPE]))
-        slope = told(parameters[SLOPE], sigma, 0.5, '')
-    return CalibrationResult(
-        readout_time=told(readout, readout_sigma, config.max_readout_sigma, ''),
-        time_offset=told(float(to_first @ parameters), offset_sigma, config.max_offset_sigma, ''),
-        R_cam_imu=R_cam_imu, rotation_sigma=rotation_sigma,
-        rotation=told(angle, float(rotation_sigma.max()), config.max_rotation_sigma),
-        axis_map=axis_map, gyro_bias=(biases[0], biases[1], biases[2]), focal_factor=focal,
-        offset_by_interval=slope, rotation_rates=rates, curve=curve,
-        pixel_sigma=float(np.median(final.state.noise)),
-        inlier_ratio=float((weights > 0.25).mean()), frames=len(data.tracks),
-        pairs=problem.pairs, matches=len(problem.points1), frame_interval=interval,
-        warnings=tuple(warnings))
-
-
-def _inflated(covariance: Array, free: NDArray[np.bool_], config: CalibrationConfig) -> Array:
-    """Covariance with what a tracker does to all of a recording alike."""
-    floors = np.zeros(GLOBAL)
-    floors[[READOUT, OFFSET]] = config.tracking_time_sigma
-    floors[ROTATION:ROTATION + 3] = config.tracking_rotation_sigma
-    floors[BIAS:BIAS + 3] = config.tracking_bias_sigma
-    floors[~free] = 0.0
-    return covariance + np.diag(floors**2)
-
-
-def _excitation(data: Observations, bias: Array, R_cam_imu: Array,
-                config: CalibrationConfig) -> tuple[Array, str]:
-    """Rms rates about the camera's axes [rad/s], and what is missing of them (empty: nothing)."""
-    inside = (data.gyro_times >= data.times[0]) & (data.gyro_times <= data.times[-1])
-    rates = (data.gyro_rates[inside] - bias) @ R_cam_imu.T
-    rates = rates - rates.mean(axis=0)
-    rms = np.sqrt((rates**2).mean(axis=0))
-    values, vectors = np.linalg.eigh(rates.T @ rates / len(rates))
-    # Two axes fix a rotation.
-    if np.sqrt(max(values[1], 0.0)) >= config.min_rotation_rate:
-        return rms, ''
-    main = vectors[:, 2]
-    lacking = [AXES[i] for i in np.argsort(np.abs(main))[:2]]
-    about = AXES[int(np.argmax(np.abs(main)))]
-    return rms, (f'the camera turns about one axis only, nearly {about}, so the rotation about it '
-                 f'cannot be told: turn about {lacking[0]} and {lacking[1]} too, 20 to 60 deg/s')
+        unknowns = stepped(unknowns, step, evaluation.local_step(step))
+    return unknowns

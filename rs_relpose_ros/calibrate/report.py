@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure as Picture
+from matplotlib.figure import Figure
 import numpy as np
 
 from rs_relpose_ros.calibrate.axis_maps import axes_text
 from rs_relpose_ros.calibrate.result import AXES, CalibrationResult, Estimate
-from rs_relpose_ros.config.commented_file import Figure, parameter_text
+from rs_relpose_ros.config.parameter_file import parameter_text, SourcedValue
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.picture_files import save_picture
 
@@ -82,44 +82,44 @@ def parameter_file(result: CalibrationResult, title: str, *, compressed: bool,
                    feature_rows: tuple[float, ...] = (0.0, 0.0)) -> str:
     """The node's parameter file; figures that are not observable are left out, and named."""
     readout, offset = result.readout_time, result.time_offset
-    figures = [Figure('image_transport', 'compressed' if compressed else 'raw',
-                      'As the bag has them.')]
+    values = [SourcedValue('image_transport', 'compressed' if compressed else 'raw',
+                           'As the bag has them.')]
     missing = []
     if readout.observable:
         global_shutter = result.shutter == 'global'
-        figures.append(Figure(
+        values.append(SourcedValue(
             'readout_time', 0.0 if global_shutter else round(abs(readout.value), 6),
             f'{_capital(shutter_text(result))}. Estimate {_MS * readout.value:.2f} +- '
             f'{_MS * readout.sigma:.2f} ms (1 sigma).'))
-        figures.append(Figure('readout_direction',
-                              'up' if _upwards(result) and not global_shutter else 'down',
-                              'By the sign of that estimate.'))
+        values.append(SourcedValue('readout_direction',
+                                   'up' if _upwards(result) and not global_shutter else 'down',
+                                   'By the sign of that estimate.'))
     else:
         missing.append(f'readout_time ({readout.remark})')
     if offset.observable:
-        figures.append(Figure('stamp_row', 'first', 'Convention of time_offset here.'))
-        figures.append(Figure('time_offset', round(offset.value, 6),
-                              f'1 sigma {_MS * offset.sigma:.2f} ms.'))
+        values.append(SourcedValue('stamp_row', 'first', 'Convention of time_offset here.'))
+        values.append(SourcedValue('time_offset', round(offset.value, 6),
+                                   f'1 sigma {_MS * offset.sigma:.2f} ms.'))
     else:
         missing.append(f'time_offset ({offset.remark})')
     if result.rotation.observable:
-        figures.append(Figure(
+        values.append(SourcedValue(
             'quat_cam_imu_xyzw', tuple(round(v, 7) for v in result.quat_cam_imu_xyzw),
             f'{axes_text(result.axis_map)}, {np.degrees(result.rotation.value):.2f} deg off; '
             f'1 sigma {np.degrees(result.rotation.sigma):.3f} deg at most.'))
     else:
         missing.append(f'quat_cam_imu_xyzw ({result.rotation.remark})')
     if all(bias.observable for bias in result.gyro_bias):
-        figures.append(Figure(
+        values.append(SourcedValue(
             'gyro_bias', tuple(round(bias.value, 5) for bias in result.gyro_bias), '1 sigma '
             + ', '.join(f'{bias.sigma:.5f}' for bias in result.gyro_bias) + ' rad/s.'))
     else:
         missing.append('gyro_bias')
     if feature_rows[1] > 0.0:
-        figures.append(Figure('feature_rows', tuple(feature_rows), 'As given to calibrate.'))
+        values.append(SourcedValue('feature_rows', tuple(feature_rows), 'As given to calibrate.'))
     if missing:
         title += ' Not observable in this recording, so left out: ' + '; '.join(missing) + '.'
-    return parameter_text(title, figures)
+    return parameter_text(title, values)
 
 
 def as_mapping(result: CalibrationResult, camera: RollingShutterCamera) -> dict[str, Any]:
@@ -152,8 +152,8 @@ def as_mapping(result: CalibrationResult, camera: RollingShutterCamera) -> dict[
 
 def draw_curve(result: CalibrationResult, path: Path) -> None:
     """Cost over the read-out time."""
-    picture = Picture(figsize=(7.5, 4.5), dpi=110, layout='constrained')
-    axes = picture.subplots()
+    figure = Figure(figsize=(7.5, 4.5), dpi=110, layout='constrained')
+    axes = figure.subplots()
     readout = result.readout_time
     # A parabola's root: straight on both sides of the best, so that a few points draw it.
     axes.plot(_MS * result.curve.readout_times, np.sqrt(2.0 * result.curve.costs), 'o-',
@@ -170,7 +170,7 @@ def draw_curve(result: CalibrationResult, path: Path) -> None:
     axes.set_title(f'{result.shutter} shutter; everything else fitted anew at each point')
     axes.legend()
     axes.grid(alpha=0.3)
-    save_picture(picture, path)
+    save_picture(figure, path)
 
 
 def _upwards(result: CalibrationResult) -> bool:

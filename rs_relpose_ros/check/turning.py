@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.calibrate.alignment import find_starts, Start
 from rs_relpose_ros.calibrate.coplanarity import BIAS, GLOBAL, OFFSET, READOUT, ROTATION
-from rs_relpose_ros.calibrate.fit import fit, State, with_bends
+from rs_relpose_ros.calibrate.fit import fit, initial, refit
 from rs_relpose_ros.calibrate.follow import PointFollower
 from rs_relpose_ros.calibrate.gyro_path import GyroSeries
-from rs_relpose_ros.calibrate.observations import evenly, Observations
+from rs_relpose_ros.calibrate.observations import Observations, PairSelection
 from rs_relpose_ros.config.tracking import TrackingConfig
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 
@@ -39,9 +39,7 @@ _OFFSET_STEP = 0.005
 _GYRO_GAP = 0.1
 _LEAST_PAIRS = 20
 _WORTH_REFINING = 0.5
-# Pairs for the refinement: how far apart [s], how many, and of how many points.
-_SPANS = (0.033, 0.067, 0.133)
-_MOST_PAIRS, _REFINED_POINTS = 160, 80
+_REFINED = PairSelection((0.033, 0.067, 0.133), 80, _LEAST_POINTS, 160)
 # What rows, blur and moving things leave open at least [s].
 _LEAST_SIGMA = 7e-4
 
@@ -186,18 +184,15 @@ class TurningImages:
 def _refined(data: Observations, start: Start, readout: float | None,
              rng: np.random.Generator) -> tuple[Array, float, float]:
     """Rotation IMU to camera, offset of the middle row and its sigma [s], by the fit."""
-    pairs = data.pairs(data.frames_in(_SPANS), max_matches=_REFINED_POINTS,
-                       min_matches=_LEAST_POINTS, rng=rng)
-    pairs = evenly(pairs.chosen(data.covered(pairs, start.offset, _GYRO_GAP)), _MOST_PAIRS)
+    pairs = data.selected(_REFINED, start.offset, _GYRO_GAP, rng)
     if len(pairs) < _LEAST_PAIRS:
         return start.R_cam_imu, start.offset, _OFFSET_STEP
     free = np.zeros(GLOBAL, dtype=bool)
     free[OFFSET] = free[ROTATION:ROTATION + 3] = free[BIAS:BIAS + 3] = True
     free[READOUT] = readout is None
     problem = data.problem(pairs, start.offset)
-    state = State.start(problem, start.R_cam_imu.T, start.offset,
-                        0.0 if readout is None else readout)
-    near = fit(problem, state, free, rounds=20, tolerance=0.3).state.restarted(problem, 2.0)
-    fitted = fit(with_bends(problem, near), near, free, rounds=20, tolerance=0.3)
-    return (fitted.state.R_imu_cam.T, float(fitted.state.parameters[OFFSET]),
+    begin = initial(problem, start.R_cam_imu.T, start.offset, 0.0 if readout is None else readout)
+    coarse = fit(problem, begin, free, rounds=20, tolerance=0.3)
+    fitted = refit(problem, coarse.unknowns, free, rounds=20, tolerance=0.3)
+    return (fitted.unknowns.R_imu_cam.T, float(fitted.unknowns.parameters[OFFSET]),
             math.hypot(_LEAST_SIGMA, math.sqrt(fitted.covariance[OFFSET, OFFSET])))

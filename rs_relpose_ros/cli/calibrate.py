@@ -9,8 +9,8 @@ import logging
 from pathlib import Path
 
 from rs_relpose_ros.bags.reader import COMPRESSED_IMAGE, open_bag
-from rs_relpose_ros.calibrate.bag_streams import read_recording, TRACKED_IN_IMAGES
-from rs_relpose_ros.calibrate.procedure import calibrate, CalibrationConfig
+from rs_relpose_ros.calibrate.bag_streams import read_recording
+from rs_relpose_ros.calibrate.procedure import calibrate
 from rs_relpose_ros.calibrate.report import as_mapping, draw_curve, parameter_file, report
 from rs_relpose_ros.cli.options import (
     add_bag_argument,
@@ -19,6 +19,7 @@ from rs_relpose_ros.cli.options import (
     progress_bar,
     topic_options,
 )
+from rs_relpose_ros.config.calibration import CalibrationConfig, TRACKED_IN_IMAGES
 from rs_relpose_ros.config.tracking import TrackingConfig
 from rs_relpose_ros.errors import InputError
 

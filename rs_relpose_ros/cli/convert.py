@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rs_relpose_ros.cli.options import progress_bar, refuse_existing
-from rs_relpose_ros.config.commented_file import Figure, write_parameters
+from rs_relpose_ros.config.parameter_file import SourcedValue, write_parameters
 from rs_relpose_ros.convert import realsense, xiaomi
 from rs_relpose_ros.convert.recording import Recording, write_bag
 from rs_relpose_ros.errors import MissingInputError
@@ -28,7 +28,7 @@ class Dataset:
 
     read: Callable[[Path], Recording]
     title: str
-    parameters: tuple[Figure, ...]
+    parameters: tuple[SourcedValue, ...]
 
 
 DATASETS: Mapping[str, Dataset] = {

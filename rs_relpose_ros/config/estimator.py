@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rs_relpose_ros.config.declarations import check_settings, setting
+from rs_relpose_ros.solvers.table import SOLVERS
 
-SOLVERS = ('auto', 'uniform_9pt', 'uniform_11pt', 'linear_9pt', 'angular_5pt', 'angular_3pt',
-           'global_5pt')
+SOLVER_CHOICES = ('auto', *SOLVERS)
 REFINEMENTS = ('map', 'alternating', 'none')
 
 
@@ -16,7 +16,8 @@ class EstimatorConfig:
     """How one frame pair is estimated."""
 
     solver: str = setting(
-        'auto', 'hypothesis generator; auto chooses from what the IMU offers', choices=SOLVERS)
+        'auto', 'hypothesis generator; auto chooses from what the IMU offers',
+        choices=SOLVER_CHOICES)
     refinement: str = setting(
         'map', 'joint fit with IMU priors (map), the scheme of the paper (alternating), or none',
         choices=REFINEMENTS)

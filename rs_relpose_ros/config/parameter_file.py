@@ -1,9 +1,14 @@
-"""Parameters of the node from a ROS parameter file and from the command line."""
+"""Parameter files of the node, in the format of ROS: read, and written with comments.
+
+A file has ``/**`` or the node's name, below it ``ros__parameters``, and below that the names.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+import textwrap
 from typing import Any
 
 import yaml
@@ -15,8 +20,19 @@ from rs_relpose_ros.errors import InputError, MissingInputError
 _NODE = 'relpose_node'
 # Parameters of every ROS node, which mean nothing offline.
 _ROS_OWN = ('use_sim_time', 'start_type_description_service')
-# No parameter file comes near this size.
+# Bytes of the largest file that is read; that of all parameters has 10,000.
 _MAX_BYTES = 1 << 20
+# Columns of a comment.
+_WIDTH = 95
+
+
+@dataclass(frozen=True, slots=True)
+class SourcedValue:
+    """Value of a parameter and where it comes from."""
+
+    name: str
+    value: float | str | tuple[float, ...]
+    source: str
 
 
 def read_parameters(path: Path | str | None, assignments: Sequence[str] = ()) -> Parameters:
@@ -25,8 +41,7 @@ def read_parameters(path: Path | str | None, assignments: Sequence[str] = ()) ->
     Parameters
     ----------
     path : path-like or None
-        As ``ros2 run --params-file`` takes it: ``/**`` or the node's name, then
-        ``ros__parameters``.
+        As ``ros2 run --params-file`` takes it.
     assignments : sequence of str
         Values in YAML, such as ``gyro_bias=[0.01, 0, 0]``.
 
@@ -53,6 +68,52 @@ def read_parameters(path: Path | str | None, assignments: Sequence[str] = ()) ->
         except (yaml.YAMLError, RecursionError):
             raise InputError(f'--set {name}: the value {text!r} is no YAML') from None
     return parameters.updated(_converted(given))
+
+
+def parameter_text(title: str, values: Sequence[SourcedValue]) -> str:
+    """Text of a parameter file: each value below its source, `title` at the head."""
+    lines = [*comment(title), '/**:', '  ros__parameters:']
+    for item in values:
+        lines += [*comment(item.source, '    '), f'    {item.name}: {yaml_text(item.value)}']
+    return '\n'.join(lines) + '\n'
+
+
+def write_parameters(path: Path, title: str, values: Sequence[SourcedValue]) -> None:
+    """Write `parameter_text` to a new file.
+
+    Raises
+    ------
+    InputError
+        The file exists already or cannot be written.
+    """
+    try:
+        with path.open('x', encoding='utf-8') as file:
+            file.write(parameter_text(title, values))
+    except FileExistsError:
+        raise InputError(
+            f'{path} exists already: remove it or choose another path') from None
+    except OSError as error:
+        raise InputError(f'cannot write {path}: {error.strerror}') from error
+
+
+def comment(text: str, indent: str = '') -> list[str]:
+    """Lines of a comment; none for an empty text."""
+    return textwrap.wrap(text, _WIDTH, initial_indent=f'{indent}# ',
+                         subsequent_indent=f'{indent}# ', break_long_words=False,
+                         break_on_hyphens=False)
+
+
+def yaml_text(value: Any) -> str:
+    """A bool, number, text without quotes in it, or a tuple of those, in YAML."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return f"'{value}'"
+    if isinstance(value, tuple):
+        return f'[{", ".join(map(yaml_text, value))}]'
+    text = repr(value)
+    # YAML 1.1 takes 1e-05 for a text: a float needs its point.
+    return text.replace('e', '.0e') if 'e' in text and '.' not in text else text
 
 
 def _values(path: Path) -> dict[str, Any]:

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 from pathlib import Path
 import sys
-import textwrap
-from typing import Any
 
 from rs_relpose_ros.config.declarations import Declared
+from rs_relpose_ros.config.parameter_file import comment, yaml_text
 from rs_relpose_ros.config.parameters import Parameters
 
 _HEAD = """\
@@ -28,35 +27,19 @@ def parameter_template() -> str:
     """Text of the commented parameter file."""
     lines = []
     for name, default, declared in Parameters.declarations():
-        lines += ['', *_comment(declared)]
+        lines += ['', *comment(_meaning(declared), '    ')]
         if default is None:
             lines.append(f'    # {name}:')
         else:
-            lines.append(f'    {name}: {_yaml(default)}')
+            lines.append(f'    {name}: {yaml_text(default)}')
     return _HEAD + '\n'.join(lines[1:]) + '\n'
 
 
-def _comment(declared: Declared) -> list[str]:
+def _meaning(declared: Declared) -> str:
     text = declared.description
     if declared.kind is not bool and declared.legal != 'finite':
         text += f': {declared.legal}'
-    if declared.live:
-        text += ' [live]'
-    return textwrap.wrap(text, 95, initial_indent='    # ', subsequent_indent='    # ')
-
-
-def _yaml(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        return f"'{value}'"
-    if isinstance(value, tuple):
-        return f'[{", ".join(_yaml(item) for item in value)}]'
-    if isinstance(value, float):
-        text = repr(value)
-        # YAML 1.1 takes 1e-05 for a string: a float needs its point.
-        return text if '.' in text or 'e' not in text else text.replace('e', '.0e')
-    return str(value)
+    return f'{text} [live]' if declared.live else text
 
 
 if __name__ == '__main__':

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rs_relpose_ros.config.commented_file import Figure
+from rs_relpose_ros.config.parameter_file import SourcedValue
 from rs_relpose_ros.convert.recording import ImageFile, ordered_samples, Recording
 from rs_relpose_ros.convert.tables import read_rows, Row
 from rs_relpose_ros.errors import InputError, MissingInputError
@@ -26,18 +26,20 @@ TITLE = ('Parameters of relpose_node for the recording realsense_rgb_rs (`rs_rel
          'realsense_rgb_rs`): rolling-shutter colour camera of a RealSense, 1280x720.')
 
 PARAMETERS = (
-    Figure('image_transport', 'compressed', 'The bag holds the recorded JPEG images.'),
-    Figure('readout_time', READOUT_TIME,
-           'Not documented by the maker. Estimated from the images and the gyro themselves: '
-           'minimum of the robust epipolar cost (29.0 at 28 ms, 38.8 at 0).'),
-    Figure('readout_direction', 'down', 'As that estimate.'),
-    Figure('stamp_row', 'first', 'Convention of readout_time and time_offset here.'),
-    Figure('time_offset', -0.057,
-           'Estimated with readout_time: -56 ms for frames of 33 ms, -58 ms for those of 40 ms '
-           '(auto exposure). Negative: the rows were exposed before the stamp.'),
-    Figure('quat_cam_imu_xyzw', (-0.01218755, -0.0025826, -0.00469531, 0.99991137),
-           'Rotation of T_cam_imu in camchain.yaml of the dataset (p_cam = T p_imu).'),
-    Figure('gyro_bias', (-0.0015, 0.0002, 0.0019), 'Mean of the gyro at rest, about.'),
+    SourcedValue('image_transport', 'compressed', 'The bag holds the recorded JPEG images.'),
+    SourcedValue(
+        'readout_time', READOUT_TIME,
+        'Not documented by the maker. Estimated from the images and the gyro themselves: '
+        'minimum of the robust epipolar cost (29.0 at 28 ms, 38.8 at 0).'),
+    SourcedValue('readout_direction', 'down', 'As that estimate.'),
+    SourcedValue('stamp_row', 'first', 'Convention of readout_time and time_offset here.'),
+    SourcedValue(
+        'time_offset', -0.057,
+        'Estimated with readout_time: -56 ms for frames of 33 ms, -58 ms for those of 40 ms '
+        '(auto exposure). Negative: the rows were exposed before the stamp.'),
+    SourcedValue('quat_cam_imu_xyzw', (-0.01218755, -0.0025826, -0.00469531, 0.99991137),
+        'Rotation of T_cam_imu in camchain.yaml of the dataset (p_cam = T p_imu).'),
+    SourcedValue('gyro_bias', (-0.0015, 0.0002, 0.0019), 'Mean of the gyro at rest, about.'),
 )
 
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 from pathlib import Path
 import re
 
-from rs_relpose_ros.config.commented_file import Figure
+from rs_relpose_ros.config.parameter_file import SourcedValue
 from rs_relpose_ros.convert.recording import ImageFile, ordered_samples, Recording
 from rs_relpose_ros.convert.tables import read_rows
 from rs_relpose_ros.errors import InputError, MissingInputError
@@ -34,22 +34,24 @@ TITLE = ('Parameters of relpose_node for the recording xiaomi_cc9_rs (`rs_relpos
          'xiaomi_cc9_rs`): phone of the Xiaomi CC9 class in a driving car, 800x600, gyro only.')
 
 PARAMETERS = (
-    Figure('image_transport', 'compressed', 'The bag holds the recorded JPEG images.'),
-    Figure('readout_time', READOUT_TIME,
-           'Estimated from the images and the gyro themselves: minimum of the robust epipolar '
-           'cost over 101 pairs (13.72 at 31.1 ms, 30.3 at 0). The repository itself takes the '
-           'whole frame interval, 33.3 ms.'),
-    Figure('readout_direction', 'down', 'As that estimate.'),
-    Figure('stamp_row', 'first', 'Stamps are the start of the frame.'),
-    Figure('time_offset', -0.0024,
-           'Estimated with readout_time; about minus half the exposure of 5.2 ms.'),
-    Figure('quat_cam_imu_xyzw', (0.71311442, -0.70096593, -0.00143244, 0.01060837),
-           'Rotation vector (2.22531, -2.18740, -0.00447) rad, refined with readout_time; 1.6 deg '
-           'from the axis map cam_x = -imu_y, cam_y = -imu_x, cam_z = -imu_z of the repository.'),
-    Figure('gyro_bias', (0.0, 0.0, 0.0),
-           'Not known: the phone is never at rest, and its mean rate is that of the car.'),
-    Figure('feature_rows', (0.0, 420.0),
-           'Below row 420 the image shows the dashboard, which moves with the camera.'),
+    SourcedValue('image_transport', 'compressed', 'The bag holds the recorded JPEG images.'),
+    SourcedValue(
+        'readout_time', READOUT_TIME,
+        'Estimated from the images and the gyro themselves: minimum of the robust epipolar '
+        'cost over 101 pairs (13.72 at 31.1 ms, 30.3 at 0). The repository itself takes the '
+        'whole frame interval, 33.3 ms.'),
+    SourcedValue('readout_direction', 'down', 'As that estimate.'),
+    SourcedValue('stamp_row', 'first', 'Stamps are the start of the frame.'),
+    SourcedValue(
+        'time_offset', -0.0024,
+        'Estimated with readout_time; about minus half the exposure of 5.2 ms.'),
+    SourcedValue('quat_cam_imu_xyzw', (0.71311442, -0.70096593, -0.00143244, 0.01060837),
+        'Rotation vector (2.22531, -2.18740, -0.00447) rad, refined with readout_time; 1.6 deg '
+        'from the axis map cam_x = -imu_y, cam_y = -imu_x, cam_z = -imu_z of the repository.'),
+    SourcedValue('gyro_bias', (0.0, 0.0, 0.0),
+        'Not known: the phone is never at rest, and its mean rate is that of the car.'),
+    SourcedValue('feature_rows', (0.0, 420.0),
+        'Below row 420 the image shows the dashboard, which moves with the camera.'),
 )
 
 _IMAGE_NAME = re.compile(r'RE_frame-([0-9]{1,6})\.jpg')

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 import time
 
 import numpy as np
@@ -13,15 +12,7 @@ from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator import sampson
 from rs_relpose_ros.estimator.alternating import refine_alternating
 from rs_relpose_ros.estimator.consensus import SCALES
-from rs_relpose_ros.estimator.hypotheses import (
-    ANGULAR_3PT,
-    ANGULAR_5PT,
-    GYRO_2PT,
-    Hypotheses,
-    Knowledge,
-    UNIFORM_9PT,
-    UNIFORM_11PT,
-)
+from rs_relpose_ros.estimator.hypotheses import draw_hypotheses, MODES, SolverMode
 from rs_relpose_ros.estimator.local_optimisation import (
     cheirality_sign,
     optimise,
@@ -45,7 +36,6 @@ from rs_relpose_ros.estimator.problem import (
 )
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.estimator.rotation_only import fit_rotation, transfer_errors
-from rs_relpose_ros.estimator.sampling import POOL, sample_hypotheses
 from rs_relpose_ros.estimator.spread import (
     correlation,
     distance_from_a_plane,
@@ -60,35 +50,14 @@ from rs_relpose_ros.estimator.velocity_prior import (
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import aligning_rotation, exp_so3, skew
-from rs_relpose_ros.solvers.gravity import gravity_alignment
+from rs_relpose_ros.solvers.solver import Solutions
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
-class SolverMode:
-    """What a solver assumes and which generators it samples."""
-
-    model: str
-    derotate: bool
-    velocities: bool
-    generators: tuple[int, ...]
-    needs_gravity: bool = False
-
-
-MODES = {
-    'auto': SolverMode('uniform', True, True, (GYRO_2PT, ANGULAR_3PT, ANGULAR_5PT)),
-    'uniform_9pt': SolverMode('uniform', True, True, (UNIFORM_9PT,), needs_gravity=True),
-    'uniform_11pt': SolverMode('uniform', True, True, (UNIFORM_11PT,)),
-    'linear_9pt': SolverMode('linear', False, True, (UNIFORM_9PT,), needs_gravity=True),
-    'angular_5pt': SolverMode('angular', True, False, (ANGULAR_5PT,)),
-    'angular_3pt': SolverMode('angular', True, False, (ANGULAR_3PT,), needs_gravity=True),
-    'global_5pt': SolverMode('global', False, False, (ANGULAR_5PT,)),
-}
-
 # Prior sigma of the velocities while hypotheses are compared [baselines per second].
 SAMPLING_VELOCITY_SIGMA = 3.0
-# Share of the matches that a generator must explain to spare those that know less.
+# Share of the matches that a solver must explain to spare those that know less.
 EXPLAINED = 0.5
 # Columns of an observation at which its rays f_1 and f_2 begin.
 RAYS = (0, 9)
@@ -170,7 +139,7 @@ def estimate_relative_pose(
         raise InputError(f'solver {config.solver!r} needs gravity in both frames; use auto, '
                          'uniform_11pt or angular_5pt without it')
     problem = build_problem(points1, points2, camera, motion1, motion2, rotation,
-                            rotation_covariance, mode.derotate)
+                            rotation_covariance, mode.model.derotated)
     seed = np.array([np.random.default_rng(rng).integers(2**63)], dtype=np.uint64)
     pose = _Estimation(problem, mode, config, order, seed, interval).run(middle_row_delay(camera))
     object.__setattr__(pose, 'duration', time.perf_counter() - started)
@@ -198,10 +167,10 @@ class _Estimation:
             return self._failure(Status.TOO_FEW_MATCHES,
                                  f'{len(self.order)} usable matches, fewer than min_inliers = '
                                  f'{config.min_inliers}')
-        # 1. Hypotheses from minimal samples, ranked by multi-scale MSAC.
+        # 1. Solutions from minimal samples, ranked by multi-scale MSAC.
         return self.refine(self.sample(), delay)
 
-    def refine(self, hypotheses: Hypotheses, delay: float) -> RelativePose:
+    def refine(self, hypotheses: Solutions, delay: float) -> RelativePose:
         """All steps after the first."""
         config = self.config
         # 2. Local optimisation of each; the best in the cost of the full model.
@@ -238,37 +207,15 @@ class _Estimation:
 
     # -- steps -------------------------------------------------------------------------------
 
-    def sample(self, enough: float = EXPLAINED) -> Hypotheses:
-        """The best hypotheses, of generators asked until one explains `enough` of the matches."""
-        problem, config = self.problem, self.config
-        eye = np.eye(3)
-        align1, align2 = eye, eye
-        g1, g2 = problem.motion1.gravity, problem.motion2.gravity
-        if g1 is not None and g2 is not None:
-            align1, align2 = gravity_alignment(g1), gravity_alignment(g2)
-        start = problem.rotation if problem.rotation is not None else eye
-        knowledge = Knowledge(align1, align2, np.ascontiguousarray(start),
-                              problem.rotation is not None)
-        threshold2 = (config.threshold * SCALES / problem.focal)**2
-        pool_R, pool_x = np.zeros((POOL, 3, 3)), np.zeros((POOL, 9))
-        pool_cost = np.full(POOL, np.inf)
-        best_inliers = 0
-        for generator in self.mode.generators:
-            if generator == GYRO_2PT and problem.rotation is None:
-                continue
-            if generator == ANGULAR_3PT and (g1 is None or g2 is None):
-                continue
-            self.unasked = best_inliers > enough * len(self.order)
-            if self.unasked:
-                break
-            drawn, best_inliers = sample_hypotheses(
-                generator, problem.points, knowledge, self.order, self.seed, threshold2,
-                config.confidence, config.max_iterations, best_inliers, pool_R, pool_x, pool_cost)
-            self.iterations += drawn
-        found = np.argsort(pool_cost)[:np.isfinite(pool_cost).sum()]
-        return Hypotheses(pool_R[found], pool_x[found])
+    def sample(self, enough: float = EXPLAINED) -> Solutions:
+        """The best hypotheses, of solvers asked until one explains `enough` of the matches."""
+        drawn = draw_hypotheses(self.problem, self.mode, self.config, self.order, self.seed,
+                                enough)
+        self.iterations += drawn.samples
+        self.unasked = drawn.some_unasked
+        return drawn.hypotheses
 
-    def _best(self, hypotheses: Hypotheses) -> State | None:
+    def _best(self, hypotheses: Solutions) -> State | None:
         config, problem = self.config, self.problem
         if not len(hypotheses.R):
             return None
@@ -277,7 +224,7 @@ class _Estimation:
             R, x, zero = hypotheses.R[0], hypotheses.x[0], np.zeros(3)
             return self._in_front(State(R, x[:3], x[3:6], x[6:], zero, zero))
         priors = with_velocity_sigma(self.priors, SAMPLING_VELOCITY_SIGMA) \
-            if self.mode.velocities or self.mode.derotate else self.priors
+            if self.mode.model.velocities or self.mode.model.derotated else self.priors
         state, found = optimise(problem.observations, problem.valid, hypotheses.R, hypotheses.x,
                                 priors, config.pixel_sigma, config.threshold, self.angle_sigma)
         return state if found else None
@@ -298,7 +245,8 @@ class _Estimation:
                 ) -> tuple[State, NDArray[np.bool_], float, float, Array | None]:
         """State, inliers, sigma of velocities and of matches [px], and covariance if known."""
         config, problem = self.config, self.problem
-        free = self.mode.velocities or (self.mode.derotate and config.refinement == 'map')
+        model = self.mode.model
+        free = model.velocities or (model.derotated and config.refinement == 'map')
         if config.refinement == 'map':
             grid = GRID if free else np.array([1.0 / np.sqrt(PINNED)])
             if free and self.interval is not None:
@@ -320,9 +268,7 @@ class _Estimation:
         """Inliers that the best of many fits reaches on random matches (about 5 sigma)."""
         size = self.problem.focal
         expected = len(self.order) * min(4.0 * self.config.threshold / size, 0.5)
-        # A sample agrees with itself: 9 or 11 points, and the fit of 11 unknowns with some more.
-        own = 14 if {UNIFORM_9PT, UNIFORM_11PT} & set(self.mode.generators) else 6
-        return int(expected + 5.0 * np.sqrt(expected)) + own
+        return int(expected + 5.0 * np.sqrt(expected)) + self.mode.fitted_points
 
     def _rotation_only(self, state: State, inliers: NDArray[np.bool_], sigma: float,
                        delay: float) -> RelativePose | None:
@@ -392,7 +338,7 @@ class _Estimation:
         problem = self.problem
         turn1 = problem.motion1.rotations([delay])[0]
         turn2 = problem.motion2.rotations([delay])[0]
-        if not self.mode.derotate:
+        if not self.mode.model.derotated:
             return np.eye(3), np.eye(3)
         return (exp_so3(delay * state.dw1) @ turn1,
                 exp_so3(delay * (state.R.T @ state.dw2)) @ turn2)
@@ -410,12 +356,12 @@ class _Estimation:
             R=pose.R, t=pose.t if carries_pose else np.full(3, np.nan),
             linear_velocity1=pose.v1, linear_velocity2=pose.v2, angular_velocity1=pose.w1,
             angular_velocity2=pose.w2, inliers=inliers, covariance=pose.covariance[:6, :6],
-            velocity_covariance=pose.covariance[np.ix_(v2w2, v2w2)], model=self.mode.model,
+            velocity_covariance=pose.covariance[np.ix_(v2w2, v2w2)], model=self.mode.model.name,
             velocity_sigma=velocity_sigma, iterations=self.iterations,
             residual_rms=float(np.sqrt(np.mean(r**2))))
 
     def _failure(self, status: Status, reason: str) -> RelativePose:
-        return RelativePose(status=status, reason=reason, model=self.mode.model,
+        return RelativePose(status=status, reason=reason, model=self.mode.model.name,
                             iterations=self.iterations,
                             inliers=np.zeros(len(self.problem.valid), dtype=bool))
 
@@ -435,7 +381,7 @@ def warm_up_sampling() -> None:
 
 def warm_up_refinement() -> None:
     """Compile the kernels of all steps but the first."""
-    _warm_estimation().refine(Hypotheses(np.eye(3)[None], np.eye(1, 9)), 0.0)
+    _warm_estimation().refine(Solutions(np.eye(3)[None], np.eye(1, 9)), 0.0)
 
 
 def _warm_estimation() -> _Estimation:
@@ -460,14 +406,14 @@ def _priors(problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig,
             interval: float | None) -> Priors:
     g1, g2 = problem.motion1.gravity, problem.motion2.gravity
     known = g1 is not None and g2 is not None
-    free = mode.velocities or mode.derotate
+    free = mode.model.velocities or mode.model.derotated
     unit1 = g1 / np.linalg.norm(g1) if g1 is not None else np.zeros(3)
     unit2 = g2 / np.linalg.norm(g2) if g2 is not None else np.zeros(3)
     rotation = problem.rotation if problem.rotation is not None else np.eye(3)
     information = problem.rotation_information
     return Priors(
         unit1, unit2, config.gravity_sigma**-2 if known else 0.0,
-        problem.reference_row_time, config.gyro_sigma**-2 if mode.derotate else PINNED,
+        problem.reference_row_time, config.gyro_sigma**-2 if mode.model.derotated else PINNED,
         SAMPLING_VELOCITY_SIGMA**-2 if free else PINNED,
         1.0 / interval if free and interval is not None else 0.0,
         np.ascontiguousarray(rotation),

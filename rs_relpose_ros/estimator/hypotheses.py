@@ -1,117 +1,112 @@
-"""Hypothesis generators: minimal samples to (R, t, d_1, d_2), by number, for compiled loops."""
+"""Hypotheses of a frame pair: which solvers a mode samples, and what they are given."""
 
 from __future__ import annotations
 
-import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.compiled import kernel
-from rs_relpose_ros.solvers.eleven_point import uniform_11pt_kernel
-from rs_relpose_ros.solvers.five_point import five_point_kernel
-from rs_relpose_ros.solvers.nine_point import uniform_9pt_kernel
-from rs_relpose_ros.solvers.three_point import angular_3pt_kernel
+from rs_relpose_ros.config.estimator import EstimatorConfig
+from rs_relpose_ros.estimator.consensus import SCALES
+from rs_relpose_ros.estimator.problem import TwoViewProblem
+from rs_relpose_ros.estimator.sampling import empty_pool, Matches, sample_hypotheses, Stop
+from rs_relpose_ros.solvers.gravity import gravity_alignment
+from rs_relpose_ros.solvers.solver import (
+    empty_solutions,
+    Knowledge,
+    Model,
+    no_knowledge,
+    Solutions,
+    Solver,
+)
+from rs_relpose_ros.solvers.table import GYRO_2PT, SOLVERS, UNIFORM
 
-Array = NDArray[np.float64]
-
-GYRO_2PT, ANGULAR_3PT, ANGULAR_5PT, UNIFORM_9PT, UNIFORM_11PT = range(5)
-SAMPLE_SIZES = np.array([2, 3, 5, 9, 11])
-MAX_SOLUTIONS = 12
+# Hypotheses that are optimised further.
+POOL_SIZE = 6
 
 
-class Hypotheses(NamedTuple):
-    """Rotations R (K, 3, 3), and x (K, 9): ``t`` (unit), ``d_1, d_2`` up to a common sign."""
+@dataclass(frozen=True, slots=True)
+class SolverMode:
+    """What is estimated, and the solvers that are sampled for it, those that know most first."""
 
-    R: Array
-    x: Array
+    model: Model
+    solvers: tuple[Solver, ...]
+
+    @property
+    def needs_gravity(self) -> bool:
+        """Whether no solver can be asked without gravity."""
+        return all(solver.needs_gravity for solver in self.solvers)
+
+    @property
+    def fitted_points(self) -> int:
+        """Matches that a hypothesis and its fit explain whatever they are: their unknowns.
+
+        A sample agrees with itself: 9 or 11 points, and the fit of 11 unknowns with some more.
+        """
+        return 14 if max(solver.sample_size for solver in self.solvers) >= 9 else 6
 
 
-class Knowledge(NamedTuple):
-    """What the IMU gives to the generators: gravity-aligning rotations, predicted rotation.
+MODES = {
+    'auto': SolverMode(UNIFORM, (GYRO_2PT, SOLVERS['angular_3pt'], SOLVERS['angular_5pt'])),
+    **{name: SolverMode(solver.model, (solver,)) for name, solver in SOLVERS.items()},
+}
 
-    `predicted`: whether `rotation` comes from the gyro; else the 11-point starts from 5 points.
+
+class DrawnHypotheses(NamedTuple):
+    """The best distinct hypotheses, best first.
+
+    `samples`: how many were drawn. `some_unasked`: solvers were spared, since one before them
+    explained enough.
     """
 
-    align1: Array
-    align2: Array
-    rotation: Array
-    predicted: bool
+    hypotheses: Solutions
+    samples: int
+    some_unasked: bool
 
 
-@kernel
-def _gyro_2pt(f1: Array, f2: Array, rotation: Array, R_out: Array, x_out: Array) -> int:
-    """The gyro's rotation, and t perpendicular to both normals ``n = f_1 x R f_2``."""
-    n = np.empty((2, 3))
-    for i in range(2):
-        hx = rotation[0, 0] * f2[i, 0] + rotation[0, 1] * f2[i, 1] + rotation[0, 2] * f2[i, 2]
-        hy = rotation[1, 0] * f2[i, 0] + rotation[1, 1] * f2[i, 1] + rotation[1, 2] * f2[i, 2]
-        hz = rotation[2, 0] * f2[i, 0] + rotation[2, 1] * f2[i, 1] + rotation[2, 2] * f2[i, 2]
-        n[i, 0] = f1[i, 1] * hz - f1[i, 2] * hy
-        n[i, 1] = f1[i, 2] * hx - f1[i, 0] * hz
-        n[i, 2] = f1[i, 0] * hy - f1[i, 1] * hx
-    tx = n[0, 1] * n[1, 2] - n[0, 2] * n[1, 1]
-    ty = n[0, 2] * n[1, 0] - n[0, 0] * n[1, 2]
-    tz = n[0, 0] * n[1, 1] - n[0, 1] * n[1, 0]
-    norm = math.sqrt(tx * tx + ty * ty + tz * tz)
-    if not norm > 1e-14:
-        return 0
-    R_out[0] = rotation
-    x_out[0] = 0.0
-    x_out[0, 0], x_out[0, 1], x_out[0, 2] = tx / norm, ty / norm, tz / norm
-    return 1
-
-
-@kernel
-def _uniform_11pt(f1: Array, f2: Array, tau1: Array, tau2: Array, knowledge: Knowledge,
-                  R_out: Array, x_out: Array) -> int:
-    """The 11-point's solutions from the gyro's rotation, or from those of its first 5 points."""
-    starts = 1
-    R_start = np.empty((MAX_SOLUTIONS, 3, 3))
-    R_start[0] = knowledge.rotation
-    if not knowledge.predicted:
-        starts = five_point_kernel(f1[:5], f2[:5], R_start, x_out[:, :3].copy())
-    count = 0
-    for k in range(starts):
-        if uniform_11pt_kernel(f1, f2, tau1, tau2, R_start[k], R_out[count], x_out[count]):
-            count += 1
-    return count
-
-
-@kernel
-def generate(generator: int, points: Array, sample: NDArray[np.int64], knowledge: Knowledge,
-             R_out: Array, x_out: Array) -> int:
-    """Hypotheses of one minimal sample; their number.
+def draw_hypotheses(problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig,
+                    order: NDArray[np.int64], seed: NDArray[np.uint64],
+                    enough: float) -> DrawnHypotheses:
+    """Ask the solvers of a mode until one explains a share `enough` of the matches.
 
     Parameters
     ----------
-    points : (6, N) ndarray
-        As in `consensus.multi_scale_cost`.
-    R_out, x_out : (MAX_SOLUTIONS, 3, 3), (MAX_SOLUTIONS, 9) ndarray
-        Receive R and ``(t, d_1, d_2)``, t of unit length, all in frame 1.
+    order : (M,) ndarray of int64
+        Usable matches, best first.
+    seed : (1,) ndarray of uint64
+        State of the random numbers, moved on.
     """
-    m = sample.shape[0]
-    f1, f2 = np.empty((m, 3)), np.empty((m, 3))
-    tau1, tau2 = np.empty(m), np.empty(m)
-    for k in range(m):
-        i = sample[k]
-        x1, y1, x2, y2 = points[0, i], points[1, i], points[2, i], points[3, i]
-        if math.isnan(x1):
-            return 0
-        s1 = 1.0 / math.sqrt(1.0 + x1 * x1 + y1 * y1)
-        s2 = 1.0 / math.sqrt(1.0 + x2 * x2 + y2 * y2)
-        f1[k, 0], f1[k, 1], f1[k, 2] = x1 * s1, y1 * s1, s1
-        f2[k, 0], f2[k, 1], f2[k, 2] = x2 * s2, y2 * s2, s2
-        tau1[k], tau2[k] = points[4, i], points[5, i]
-    if generator == GYRO_2PT:
-        return _gyro_2pt(f1, f2, knowledge.rotation, R_out, x_out)
-    x_out[:] = 0.0
-    if generator == ANGULAR_3PT:
-        return angular_3pt_kernel(f1, f2, knowledge.align1, knowledge.align2, R_out, x_out)
-    if generator == ANGULAR_5PT:
-        return five_point_kernel(f1, f2, R_out, x_out)
-    if generator == UNIFORM_9PT:
-        return uniform_9pt_kernel(f1, f2, tau1, tau2, knowledge.align1, knowledge.align2, R_out,
-                                  x_out)
-    return _uniform_11pt(f1, f2, tau1, tau2, knowledge, R_out, x_out)
+    known = _knowledge(problem)
+    matches = Matches(problem.points, order, (config.threshold * SCALES / problem.focal)**2)
+    stop = Stop(config.confidence, config.max_iterations)
+    has_gravity = problem.motion1.gravity is not None and problem.motion2.gravity is not None
+    # All addresses first: what a later pair asks is compiled with the first pair.
+    able = [(solver, solver.address) for solver in mode.solvers
+            if (known.predicted or not solver.needs_rotation)
+            and (has_gravity or not solver.needs_gravity)]
+    pool = empty_pool(POOL_SIZE)
+    samples = inliers = 0
+    some_unasked = False
+    for solver, address in able:
+        some_unasked = inliers > enough * len(order)
+        if some_unasked:
+            break
+        drawn, inliers = sample_hypotheses(
+            address, solver.sample_size, matches, known, stop, inliers,
+            empty_solutions(solver.most_solutions), pool, seed)
+        samples += drawn
+    found = np.argsort(pool.cost)[:np.isfinite(pool.cost).sum()]
+    return DrawnHypotheses(Solutions(pool.R[found], pool.x[found]), samples, some_unasked)
+
+
+def _knowledge(problem: TwoViewProblem) -> Knowledge:
+    known = no_knowledge()
+    gravity1, gravity2 = problem.motion1.gravity, problem.motion2.gravity
+    if gravity1 is not None and gravity2 is not None:
+        known = known._replace(align1=gravity_alignment(gravity1),
+                               align2=gravity_alignment(gravity2))
+    if problem.rotation is not None:
+        known = known._replace(rotation=np.ascontiguousarray(problem.rotation), predicted=True)
+    return known

@@ -7,24 +7,49 @@ PROSAC (Chum and Matas, CVPR 2005). The stopping rule is the usual one on the in
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.estimator.consensus import multi_scale_cost
-from rs_relpose_ros.estimator.hypotheses import generate, Knowledge, MAX_SOLUTIONS, SAMPLE_SIZES
+from rs_relpose_ros.geometry.vectors import dot
+from rs_relpose_ros.solvers.solver import Knowledge, Sample, Solutions, solve_at
 
 Array = NDArray[np.float64]
 
-POOL = 6
-# Samples over which the set grows to all matches.
-GROWTH = 100
-# Samples of noisy minimal sets: an outlier-free one is not yet an accurate one.
-MIN_SAMPLES = 40
-# Hypotheses closer than this are one: R [rad], direction of t [rad].
-SAME_ROTATION = 0.01
-SAME_DIRECTION = 0.1
+
+class Matches(NamedTuple):
+    """What is sampled, and how hypotheses are ranked.
+
+    `points` (6, N), `threshold2` (3,): as in `consensus.multi_scale_cost`. `order` (M,): usable
+    matches, best first.
+    """
+
+    points: Array
+    order: NDArray[np.int64]
+    threshold2: Array
+
+
+class Stop(NamedTuple):
+    """Probability of an outlier-free sample, or number of samples, at which sampling stops."""
+
+    confidence: float
+    max_samples: int
+
+
+class Pool(NamedTuple):
+    """The best distinct hypotheses so far: R (K, 3, 3), x (K, 9), cost (K,), infinite if none."""
+
+    R: Array
+    x: Array
+    cost: Array
+
+
+def empty_pool(size: int) -> Pool:
+    """Room for the `size` best hypotheses."""
+    return Pool(np.zeros((size, 3, 3)), np.zeros((size, 9)), np.full(size, np.inf))
 
 
 @kernel
@@ -54,91 +79,111 @@ def draw(order: NDArray[np.int64], head: int, sample: NDArray[np.int64],
 
 
 @kernel
+def _gather(points: Array, chosen: NDArray[np.int64], sample: Sample) -> bool:
+    """Write unit rays and row times of the chosen matches; False where one cannot be drawn."""
+    for k in range(chosen.shape[0]):
+        i = chosen[k]
+        x1, y1, x2, y2 = points[0, i], points[1, i], points[2, i], points[3, i]
+        if math.isnan(x1):
+            return False
+        s1 = 1.0 / math.sqrt(1.0 + x1 * x1 + y1 * y1)
+        s2 = 1.0 / math.sqrt(1.0 + x2 * x2 + y2 * y2)
+        sample.f1[k, 0], sample.f1[k, 1], sample.f1[k, 2] = x1 * s1, y1 * s1, s1
+        sample.f2[k, 0], sample.f2[k, 1], sample.f2[k, 2] = x2 * s2, y2 * s2, s2
+        sample.tau1[k], sample.tau2[k] = points[4, i], points[5, i]
+    return True
+
+
+@kernel
 def _same(Ra: Array, xa: Array, Rb: Array, xb: Array) -> bool:
+    """Whether two hypotheses are one: R within 0.01 rad, the direction of t within 0.1 rad."""
     trace = 0.0
     for i in range(3):
         for j in range(3):
             trace += Ra[i, j] * Rb[i, j]
-    if trace < 3.0 - SAME_ROTATION * SAME_ROTATION:
+    if trace < 3.0 - 0.01 * 0.01:
         return False
-    dot = xa[0] * xb[0] + xa[1] * xb[1] + xa[2] * xb[2]
-    return abs(dot) > 1.0 - 0.5 * SAME_DIRECTION * SAME_DIRECTION
+    return abs(dot(xa, xb)) > 1.0 - 0.5 * 0.1 * 0.1
 
 
 @kernel
-def _offer(R: Array, x: Array, cost: float, pool_R: Array, pool_x: Array,
-           pool_cost: Array) -> None:
+def _offer(R: Array, x: Array, cost: float, pool: Pool) -> None:
     """Put a hypothesis into the pool in place of its like or of the worst, if it is better."""
     place = -1
-    for k in range(pool_cost.shape[0]):
-        if pool_cost[k] < math.inf and _same(R, x, pool_R[k], pool_x[k]):
+    for k in range(pool.cost.shape[0]):
+        if pool.cost[k] < math.inf and _same(R, x, pool.R[k], pool.x[k]):
             place = k
             break
     if place < 0:
-        place = int(np.argmax(pool_cost))
-    if cost < pool_cost[place]:
-        pool_R[place] = R
-        pool_x[place] = x
-        pool_cost[place] = cost
+        place = int(np.argmax(pool.cost))
+    if cost < pool.cost[place]:
+        pool.R[place] = R
+        pool.x[place] = x
+        pool.cost[place] = cost
 
 
 @kernel
-def sample_hypotheses(generator: int, points: Array, knowledge: Knowledge,
-                      order: NDArray[np.int64], seed: NDArray[np.uint64], threshold2: Array,
-                      confidence: float, max_samples: int, best_inliers: int, pool_R: Array,
-                      pool_x: Array, pool_cost: Array) -> tuple[int, int]:
-    """Draw samples for one generator and fill the pool.
+def sample_hypotheses(solver: int, size: int, matches: Matches, known: Knowledge, stop: Stop,
+                      best_inliers: int, out: Solutions, pool: Pool,
+                      seed: NDArray[np.uint64]) -> tuple[int, int]:
+    """Draw samples for one solver and fill the pool.
 
     Parameters
     ----------
-    order : (M,) ndarray of int64
-        Usable matches, best first.
+    solver, size : int
+        Address of its kernel, and matches of a sample.
     best_inliers : int
-        Inliers that an earlier generator reached: the stopping rule starts from there.
-    pool_R, pool_x, pool_cost : (K, 3, 3), (K, 9), (K,) ndarray
-        Best distinct hypotheses so far, updated in place.
+        Inliers that an earlier solver reached: the stopping rule starts from there.
+    out : Solutions
+        Room for the solutions of one sample.
+    pool : Pool
+        Updated in place.
 
     Returns
     -------
     samples, inliers : int
         Samples drawn, and the inliers (middle scale) of the best hypothesis.
     """
-    size = SAMPLE_SIZES[generator]
-    usable = order.shape[0]
+    usable = matches.order.shape[0]
     if usable < size:
         return 0, best_inliers
-    sample = np.empty(size, dtype=np.int64)
-    R_out = np.empty((MAX_SOLUTIONS, 3, 3))
-    x_out = np.empty((MAX_SOLUTIONS, 9))
-    needed = float(max_samples)
+    chosen = np.empty(size, dtype=np.int64)
+    sample = Sample(np.empty((size, 3)), np.empty((size, 3)), np.empty(size), np.empty(size))
+    needed = float(stop.max_samples)
     drawn = 0
-    least = min(MIN_SAMPLES, max_samples)
-    best = pool_cost.min()
+    # Minimal sets are noisy: an outlier-free one is not yet an accurate one.
+    least = min(40, stop.max_samples)
+    best = pool.cost.min()
     if best < math.inf:
-        needed = samples_needed(best_inliers / usable, size, confidence, max_samples)
-    while drawn < max_samples and (drawn < least or drawn < needed):
-        head = min(usable, max(2 * size, (usable * (drawn + 1)) // GROWTH))
-        draw(order, head, sample, seed)
+        needed = samples_needed(best_inliers / usable, size, stop)
+    while drawn < stop.max_samples and (drawn < least or drawn < needed):
+        # The set grows to all matches over 100 samples.
+        head = min(usable, max(2 * size, (usable * (drawn + 1)) // 100))
+        draw(matches.order, head, chosen, seed)
         drawn += 1
-        count = generate(generator, points, sample, knowledge, R_out, x_out)
+        if not _gather(matches.points, chosen, sample):
+            continue
+        out.x[:] = 0.0
+        count = solve_at(solver, sample, known, out)
         for k in range(count):
-            limit = pool_cost.max()
-            cost, inliers = multi_scale_cost(points, R_out[k], x_out[k], threshold2, limit)
+            limit = pool.cost.max()
+            cost, inliers = multi_scale_cost(matches.points, out.R[k], out.x[k],
+                                             matches.threshold2, limit)
             if cost < limit:
-                _offer(R_out[k], x_out[k], cost, pool_R, pool_x, pool_cost)
+                _offer(out.R[k], out.x[k], cost, pool)
                 if cost < best:
                     best = cost
                     best_inliers = inliers
-                    needed = samples_needed(inliers / usable, size, confidence, max_samples)
+                    needed = samples_needed(inliers / usable, size, stop)
     return drawn, best_inliers
 
 
 @kernel
-def samples_needed(ratio: float, size: int, confidence: float, max_samples: int) -> float:
-    """Samples after which one is free of outliers with probability `confidence`."""
+def samples_needed(ratio: float, size: int, stop: Stop) -> float:
+    """Samples after which one is free of outliers with the probability that is asked for."""
     good = ratio**size
     if good >= 1.0 - 1e-12:
         return 1.0
     if good <= 1e-12:
-        return float(max_samples)
-    return min(math.log(1.0 - confidence) / math.log(1.0 - good), float(max_samples))
+        return float(stop.max_samples)
+    return min(math.log(1.0 - stop.confidence) / math.log(1.0 - good), float(stop.max_samples))

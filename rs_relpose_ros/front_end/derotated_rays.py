@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,34 @@ from rs_relpose_ros.geometry.motion import FrameMotion
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.uint32]
+
+
+class Sensor(NamedTuple):
+    """Camera model of the full sensor, and the place of the published image on it."""
+
+    camera: RollingShutterCamera
+    intrinsics: Intrinsics
+
+    def derotated(self, points: Array, motion: FrameMotion) -> tuple[Array, Array]:
+        """Rays (N, 3) of pixels (N, 2) of a published image, and their row times (N,) [s]."""
+        pixels = self.intrinsics.to_sensor(points)
+        row_times = self.camera.row_times(pixels[:, 1])
+        return motion.derotate(self.camera.unproject(pixels), row_times), row_times
+
+    def seen(self, rays: Array, row_times: Array, motion: FrameMotion) -> Array:
+        """Pixels (N, 2) of a published image at which rays (N, 3) are seen; NaN where nowhere.
+
+        The inverse of `derotated`. The row that sees a ray depends on where the ray is seen, so
+        `row_times` (N,) are a first guess that is improved twice.
+        """
+        camera = self.camera
+        first, last = camera.row_time_span
+        for _ in range(2):
+            turned = motion.rotations(np.clip(row_times, first, last))
+            pixels = camera.project(np.einsum('nji,nj->ni', turned, rays))
+            row_times = np.where(np.isfinite(pixels[:, 1]), camera.row_times(pixels[:, 1]),
+                                 row_times)
+        return self.intrinsics.to_image(pixels)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,13 +66,10 @@ class DerotatedRays:
     row_times: Array
 
     @classmethod
-    def from_points(cls, track_ids: Ids, points: Array, camera: RollingShutterCamera,
-                    calibration: Intrinsics, motion: FrameMotion) -> DerotatedRays:
+    def from_points(cls, track_ids: Ids, points: Array, sensor: Sensor,
+                    motion: FrameMotion) -> DerotatedRays:
         """Rays of points (N, 2) of a published image."""
-        pixels = calibration.to_sensor(points)
-        row_times = camera.row_times(pixels[:, 1])
-        return cls(track_ids, points, motion.derotate(camera.unproject(pixels), row_times),
-                   row_times)
+        return cls(track_ids, points, *sensor.derotated(points, motion))
 
     def of(self, track_ids: Ids) -> DerotatedRays | None:
         """Those of some of the tracks, in the same order; None where one is missing."""

@@ -1,13 +1,15 @@
-"""An image with its stamp and the intrinsics in force, before and after decoding."""
+"""An image with its stamp and the intrinsics in force, before and after decoding; its camera."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.config.parameters import Parameters
+from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.images.encoded import EncodedImage
 
@@ -64,3 +66,13 @@ class EncodedFrame:
     def decoded(self) -> Frame:
         """The frame with its image; raises InputError where it cannot be decoded."""
         return Frame(self.stamp_ns, self.image.decoded(), self.frame_id, self.intrinsics)
+
+
+def sensor_camera(intrinsics: Intrinsics, parameters: Parameters) -> RollingShutterCamera:
+    """Camera model of the full sensor; published pixels map to it by `Intrinsics.to_sensor`."""
+    sensor = parameters.sensor
+    if sensor.readout_time is None:
+        raise MissingInputError('parameter readout_time is not set: give image height times line '
+                                'delay in seconds (0 for a global shutter)')
+    return replace(intrinsics.global_shutter_camera(), readout_time=sensor.readout_time,
+                   readout_direction=sensor.readout_direction, reference_row=sensor.stamp_row)

@@ -2,43 +2,35 @@
 
 from __future__ import annotations
 
-from enum import Enum
+from typing import NamedTuple
 
 from rs_relpose_ros.config.keyframes import KeyframeConfig
 
 
-class KeyframeDecision(Enum):
-    """Whether the current frame closes a pair, and what for."""
+class SinceKeyframe(NamedTuple):
+    """What has happened since the reference keyframe.
 
-    WAIT = 'wait'
-    PARALLAX = 'parallax'
-    INTERVAL = 'interval'
-    FRAMES = 'frames'
-    TRACKS = 'tracks'
-
-
-def decide_keyframe(config: KeyframeConfig, parallax_px: float, interval_s: float, frames: int,
-                    tracked_fraction: float) -> KeyframeDecision:
-    """Decide on the current frame.
-
-    Parameters
+    Attributes
     ----------
-    config : KeyframeConfig
-    parallax_px : float
+    parallax : float
         Median parallax of the matches after derotation [px]; NaN where there are none.
-    interval_s : float
-        Time since the reference keyframe [s].
+    interval : float
+        Time [s].
     frames : int
-        Frames since the reference keyframe; 1 for the first after it.
+        Number of frames; 1 for the first after the keyframe.
     tracked_fraction : float
-        Share of the reference's features that are still tracked.
+        Share of the keyframe's features that are still tracked.
     """
-    if parallax_px >= config.min_keyframe_parallax:
-        return KeyframeDecision.PARALLAX
-    if tracked_fraction < config.min_tracked_fraction:
-        return KeyframeDecision.TRACKS
-    if interval_s >= config.max_keyframe_interval:
-        return KeyframeDecision.INTERVAL
-    if frames >= config.max_keyframe_frames:
-        return KeyframeDecision.FRAMES
-    return KeyframeDecision.WAIT
+
+    parallax: float
+    interval: float
+    frames: int
+    tracked_fraction: float
+
+
+def closes_pair(since: SinceKeyframe, config: KeyframeConfig) -> bool:
+    """Whether the current frame closes a pair: the camera moved far enough, or it is high time."""
+    return (since.parallax >= config.min_keyframe_parallax
+            or since.tracked_fraction < config.min_tracked_fraction
+            or since.interval >= config.max_keyframe_interval
+            or since.frames >= config.max_keyframe_frames)

@@ -22,6 +22,8 @@ class PairResult:
     ----------
     reference_stamp_ns, stamp_ns : int
         Header stamps of the reference keyframe and of the current image.
+    reference_ns1, reference_ns2 : int
+        Instants of the two stamped rows on the IMU clock.
     frame_id : str
         Of the current image.
     interval : float
@@ -46,6 +48,8 @@ class PairResult:
 
     reference_stamp_ns: int
     stamp_ns: int
+    reference_ns1: int
+    reference_ns2: int
     frame_id: str
     interval: float
     pose: RelativePose

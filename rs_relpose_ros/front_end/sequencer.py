@@ -9,40 +9,39 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from enum import Enum
 import threading
 import time
 
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.estimator.result import Status
-from rs_relpose_ros.front_end.frame import EncodedFrame, Frame
-from rs_relpose_ros.front_end.pipeline import sensor_camera
+from rs_relpose_ros.front_end.frame import EncodedFrame, Frame, sensor_camera
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.geometry.timing import ImageClock, NANOSECONDS, seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.buffer import AddResult, Coverage, ImuBuffer
 from rs_relpose_ros.imu.frame_imu import frame_imu, FrameImu
 from rs_relpose_ros.imu.samples import ImuSample
 
-# A stamp that lies further back than this is a bag that starts anew, not a late message.
+# Stamps that lie further back than this [ns] are a bag that starts anew, not late messages.
 CLOCK_JUMP_NS = NANOSECONDS
-# So many in a row that lie behind the newest, each newer than the one before, are a clock that
-# was set back by less; messages that overtake each other come alone.
+# Successive stamps behind the newest, each newer than the one before, that mean that the clock was
+# set back by less than that: messages that overtake each other come alone.
 _BACK_FRAMES = 3
 _BACK_SAMPLES = 20
-# Frames that wait for the worker; bounds the latency of an overloaded node.
+# Most frames that wait for the worker: bounds the latency of an overloaded node.
 MAILBOX_FRAMES = 5
-# Frames that wait for the IMU; bounds the memory.
+# Most frames that wait for the IMU: bounds the memory.
 WAITING_FRAMES = 16
-# How long a frame waits for the IMU.
+# Longest time [ns] that a frame waits for the IMU.
 MAX_IMU_WAIT_NS = NANOSECONDS
-# An accelerometer this far behind the gyro has stopped; frames no longer wait for it.
+# Delay [ns] behind the gyro from which on an accelerometer on its own topic counts as stopped:
+# frames no longer wait for it.
 _ACCELEROMETER_STALE_NS = NANOSECONDS // 10
+# Most refusals that are kept until they are taken; the counters lose none.
+_REFUSALS_KEPT = 256
 _IMU_GAP = ('the gyro does not cover the read-out of the frame: it has a gap there, or begins '
             'later')
-# Refusals that nobody has taken yet; the counters lose none.
-_REFUSALS_KEPT = 256
 
 
 class Refusal(str, Enum):
@@ -91,12 +90,6 @@ class FrameRefused:
     cause: Refusal
     reason: str
 
-    @property
-    def status(self) -> Status:
-        """The outcome as a pair's status."""
-        no_imu = self.cause in (Refusal.NO_IMU, Refusal.IMU_GAP)
-        return Status.NO_IMU if no_imu else Status.BAD_INPUT
-
 
 @dataclass(frozen=True, slots=True)
 class SequencerCounts:
@@ -118,7 +111,10 @@ class SequencerCounts:
 
 @dataclass(slots=True, eq=False)
 class _Waiting:
-    """A frame with its instants on the IMU clock and the monotonic clock [ns]."""
+    """A frame with its instants on the IMU clock and the monotonic clock [ns].
+
+    `ready_ns` is None until the IMU covers its last row.
+    """
 
     frame: Frame | EncodedFrame
     start_ns: int
@@ -149,8 +145,32 @@ class _StepsBack:
         return True
 
 
+@dataclass(slots=True)
+class _NewestImu:
+    """Newest stamps [ns] of the IMU: of any sample, of the gyro and of the accelerometer."""
+
+    any_ns: int | None = None
+    gyro_ns: int | None = None
+    accelerometer_ns: int | None = None
+
+    def add(self, sample: ImuSample) -> None:
+        self.any_ns = _later(self.any_ns, sample.stamp_ns)
+        if sample.angular_velocity is not None:
+            self.gyro_ns = _later(self.gyro_ns, sample.stamp_ns)
+        if sample.linear_acceleration is not None:
+            self.accelerometer_ns = _later(self.accelerometer_ns, sample.stamp_ns)
+
+    def covers(self, end_ns: int) -> bool:
+        """Whether the IMU has come as far as `end_ns`, an accelerometer on its own topic too."""
+        if self.gyro_ns is None or self.gyro_ns < end_ns:
+            return False
+        # Gravity must not depend on which of two topics came first.
+        return (self.accelerometer_ns is None or self.accelerometer_ns >= end_ns
+                or self.gyro_ns - self.accelerometer_ns > _ACCELEROMETER_STALE_NS)
+
+
 class Sequencer:
-    """Thread-safe meeting point of frames and IMU samples.
+    """Thread-safe meeting point of frames and IMU samples; its states: ``docs/architecture.md``.
 
     Parameters
     ----------
@@ -174,24 +194,22 @@ class Sequencer:
         # so that live and replay agree.
         self._longest_turn_ns = to_nanoseconds(0.5 * parameters.imu.imu_buffer_seconds)
         self._changed = threading.Condition()
+        self._closed = False
         self._buffer = ImuBuffer(parameters.imu)
+        self._newest = _NewestImu()
+        self._samples_back = _StepsBack(_BACK_SAMPLES)
         self._waiting: deque[_Waiting] = deque()
         self._refusals: deque[FrameRefused] = deque(maxlen=None if offline else _REFUSALS_KEPT)
-        self._calibration: Intrinsics | None = None
+        self._frames_back = _StepsBack(_BACK_FRAMES)
+        self._intrinsics: Intrinsics | None = None
         self._image_clock: ImageClock | None = None
         self._last_stamp_ns: int | None = None
         self._previous_reference_ns: int | None = None
-        self._frames_back = _StepsBack(_BACK_FRAMES)
-        self._samples_back = _StepsBack(_BACK_SAMPLES)
-        self._newest_imu_ns: int | None = None
-        self._newest_gyro_ns: int | None = None
-        self._newest_accelerometer_ns: int | None = None
+        # Tracked time offset, and how often time jumped: when frames came, and as they are taken.
         self._offset_ns = 0
         self._generation = 0
         self._taken_generation = 0
-        self._closed = False
-        self._frames = self._frames_taken = self._imu_samples = 0
-        self._imu_gaps = self._clock_jumps = self._imu_repeated = self._imu_late = 0
+        self._count: Counter[str] = Counter()
         self._refused: Counter[Refusal] = Counter()
 
     # -- input -------------------------------------------------------------------------------
@@ -204,65 +222,43 @@ class Sequencer:
         InputError
             It cannot be used; nothing is stored.
         """
+        has_gyro, stamp_ns = sample.angular_velocity is not None, sample.stamp_ns
         with self._changed:
-            newest = self._newest_imu_ns
-            set_back = sample.angular_velocity is not None and self._samples_back.add(
-                sample.stamp_ns, self._newest_gyro_ns)
-            if newest is not None and (set_back or sample.stamp_ns < newest - CLOCK_JUMP_NS):
-                self._jump(f'IMU stamps jumped back by '
-                           f'{seconds_between(sample.stamp_ns, newest):.3f} s')
+            set_back = has_gyro and self._samples_back.add(stamp_ns, self._newest.gyro_ns)
+            newest_ns = self._newest.any_ns
+            if newest_ns is not None and (set_back or stamp_ns < newest_ns - CLOCK_JUMP_NS):
+                self._jump('IMU stamps jumped back by '
+                           f'{seconds_between(stamp_ns, newest_ns):.3f} s')
                 self._clear_imu()
             added = self._buffer.add(sample)
-            self._imu_samples += 1
-            self._imu_repeated += added is AddResult.DUPLICATE
-            # Of two topics one is always behind; a gyro sample behind the gyro is late.
-            self._imu_late += (added is AddResult.LATE and sample.angular_velocity is not None
-                               and self._newest_gyro_ns is not None
-                               and sample.stamp_ns < self._newest_gyro_ns)
-            self._newest_imu_ns = _later(self._newest_imu_ns, sample.stamp_ns)
-            if sample.linear_acceleration is not None:
-                self._newest_accelerometer_ns = _later(
-                    self._newest_accelerometer_ns, sample.stamp_ns)
-            if sample.angular_velocity is not None:
-                if (self._newest_gyro_ns is not None
-                        and sample.stamp_ns - self._newest_gyro_ns > self._max_gap_ns):
-                    self._imu_gaps += 1
-                self._newest_gyro_ns = _later(self._newest_gyro_ns, sample.stamp_ns)
+            self._count['imu_samples'] += 1
+            self._count['imu_repeated'] += added is AddResult.DUPLICATE
+            before_ns = self._newest.gyro_ns
+            if has_gyro and before_ns is not None:
+                # Of two topics one is always behind; a gyro sample behind the gyro is late.
+                self._count['imu_late'] += added is AddResult.LATE and stamp_ns < before_ns
+                self._count['imu_gaps'] += stamp_ns - before_ns > self._max_gap_ns
+            self._newest.add(sample)
             self._sort_out()
 
     def add_frame(self, frame: Frame | EncodedFrame) -> None:
         """Take a frame into the mailbox, or refuse it for its stamp."""
         with self._changed:
-            self._frames += 1
-            image_clock = self._clock_of(frame.intrinsics)
-            start_ns, end_ns = image_clock.row_span_ns(frame.stamp_ns)
-            set_back = self._frames_back.add(frame.stamp_ns, self._last_stamp_ns)
-            if self._last_stamp_ns is not None and frame.stamp_ns <= self._last_stamp_ns:
-                back = seconds_between(frame.stamp_ns, self._last_stamp_ns)
-                if frame.stamp_ns == self._last_stamp_ns:
-                    self._refuse(frame.stamp_ns, Refusal.DUPLICATE,
-                                 'a frame of this stamp came before')
-                    return
-                if not set_back and self._last_stamp_ns - frame.stamp_ns <= CLOCK_JUMP_NS:
-                    self._refuse(frame.stamp_ns, Refusal.OUT_OF_ORDER,
-                                 f'the frame is {back:.3f} s older than the one before')
-                    return
-                self._jump(f'image stamps jumped back by {back:.3f} s')
-                # The IMU may have jumped already, and then holds what this frame needs; set back
-                # by little, it may hold two times at once.
-                if set_back or (self._newest_imu_ns is not None
-                                and self._newest_imu_ns > end_ns + CLOCK_JUMP_NS):
-                    self._clear_imu()
+            self._count['frames'] += 1
+            clock = self._clock_of(frame.intrinsics)
+            start_ns, end_ns = clock.row_span_ns(frame.stamp_ns)
+            if not self._goes_on(frame.stamp_ns, end_ns):
+                return
             self._last_stamp_ns = frame.stamp_ns
             self._waiting.append(_Waiting(
-                frame, start_ns, end_ns, image_clock.reference_ns(frame.stamp_ns),
+                frame, start_ns, end_ns, clock.reference_ns(frame.stamp_ns),
                 received_ns=self._now(), generation=self._generation))
             self._sort_out()
 
     def refuse(self, stamp_ns: int, cause: Refusal, reason: str) -> None:
         """Count a frame that could not even be added."""
         with self._changed:
-            self._frames += 1
+            self._count['frames'] += 1
             self._refuse(stamp_ns, cause, reason)
 
     def waits_for_imu(self) -> bool:
@@ -298,87 +294,78 @@ class Sequencer:
 
         The image is decoded outside of the lock.
         """
-        taken = self._take_waiting(timeout)
-        if not isinstance(taken, _Waiting):
-            return taken
+        head = self._await_head(timeout)
+        if not isinstance(head, _Waiting):
+            return head
         taken_ns = self._now()
         try:
-            frame = taken.frame.decoded()
+            frame = head.frame.decoded()
         except InputError as error:
             with self._changed:
-                return self._counted(taken.frame.stamp_ns, Refusal.BAD_IMAGE, str(error))
+                return self._counted(head.frame.stamp_ns, Refusal.BAD_IMAGE, str(error))
         with self._changed:
-            start_ns, end_ns = self._span(taken)
-            reference_ns = taken.reference_ns + self._offset_ns
             # While it was decoded time may have jumped, and the buffer belongs to another time.
-            if (taken.generation != self._generation
-                    or self._buffer.coverage(start_ns, end_ns) is not Coverage.AVAILABLE):
+            if (head.generation != self._generation
+                    or self._coverage(head) is not Coverage.AVAILABLE):
                 return self._counted(
                     frame.stamp_ns, Refusal.CLOCK_JUMP,
                     'the gyro samples of the frame went while it was decoded: stamps jumped')
-            previous_ns = self._previous_reference_ns
-            if (previous_ns is not None
-                    and reference_ns - previous_ns > self._longest_turn_ns):
-                previous_ns = None
-            imu = replace(frame_imu(self._buffer, (start_ns, end_ns), reference_ns,
-                                    self._R_cam_imu, previous_ns),
-                          applied_offset_ns=self._offset_ns)
-            self._previous_reference_ns = reference_ns
-            self._frames_taken += 1
+            imu = self._imu_of(head)
+            self._count['frames_taken'] += 1
             restart = self._taken_generation != self._generation
             self._taken_generation = self._generation
-            return ReadyFrame(frame, imu, restart, taken.ready_ns or 0, taken_ns)
+            return ReadyFrame(frame, imu, restart, head.ready_ns or 0, taken_ns)
 
     def counts(self) -> SequencerCounts:
         """A snapshot of the counters."""
         with self._changed:
-            return SequencerCounts(
-                frames=self._frames, frames_taken=self._frames_taken,
-                refused=dict(self._refused), imu_samples=self._imu_samples,
-                imu_gaps=self._imu_gaps, clock_jumps=self._clock_jumps,
-                imu_repeated=self._imu_repeated, imu_late=self._imu_late)
+            return SequencerCounts(refused=dict(self._refused), **{
+                field.name: self._count[field.name] for field in fields(SequencerCounts)
+                if field.name != 'refused'})
 
-    # -- under the lock ----------------------------------------------------------------------
+    # -- waiting (under the lock from here on, but for `_await_head`) --------------------------
 
-    def _take_waiting(self, timeout: float) -> _Waiting | FrameRefused | None:
+    def _await_head(self, timeout: float) -> _Waiting | FrameRefused | None:
+        """The oldest frame as soon as it is ready or refused; None after `timeout` seconds."""
         with self._changed:
             # Offline, what is not there yet does not come by waiting.
-            wait_ns = 0 if self._offline else round(timeout * NANOSECONDS)
-            deadline_ns = self._now() + wait_ns
+            deadline_ns = self._now() + (0 if self._offline else round(timeout * NANOSECONDS))
             while True:
-                if self._refusals:
-                    return self._refusals.popleft()
-                if self._waiting:
-                    head = self._waiting[0]
-                    # A tracked offset may have moved a frame that was ready.
-                    start_ns, end_ns = self._span(head)
-                    if head.ready_ns is not None and self._covers(end_ns):
-                        coverage = self._buffer.coverage(start_ns, end_ns)
-                        if coverage is Coverage.AVAILABLE:
-                            return self._waiting.popleft()
-                        if coverage is Coverage.NEVER:
-                            self._waiting.popleft()
-                            return self._counted(head.frame.stamp_ns, Refusal.IMU_GAP, _IMU_GAP)
-                    if self._closed:
-                        self._waiting.popleft()
-                        return self._counted(head.frame.stamp_ns, Refusal.NO_IMU,
-                                             'the gyro ends before the last row of the frame')
-                elif self._closed:
-                    return None
+                head = self._decided_head()
                 now_ns = self._now()
-                wait_until_ns = deadline_ns
-                if self._waiting and not self._offline:
-                    overdue_ns = self._waiting[0].received_ns + MAX_IMU_WAIT_NS
-                    if now_ns >= overdue_ns:
-                        stamp_ns = self._waiting.popleft().frame.stamp_ns
-                        return self._counted(
-                            stamp_ns, Refusal.NO_IMU,
-                            'no gyro sample that covers the last row of the frame came within '
-                            f'{MAX_IMU_WAIT_NS / NANOSECONDS:g} s')
-                    wait_until_ns = min(wait_until_ns, overdue_ns)
-                if now_ns >= deadline_ns:
-                    return None
-                self._changed.wait((wait_until_ns - now_ns) / NANOSECONDS)
+                if head is not None or self._closed or now_ns >= deadline_ns:
+                    return head
+                until_ns = min(deadline_ns, self._overdue_ns()) if self._waiting else deadline_ns
+                self._changed.wait(max(until_ns - now_ns, 0) / NANOSECONDS)
+
+    def _decided_head(self) -> _Waiting | FrameRefused | None:
+        """The oldest refusal, or the oldest frame if it is ready or must be refused."""
+        if self._refusals:
+            return self._refusals.popleft()
+        if not self._waiting:
+            return None
+        head = self._waiting[0]
+        # A tracked offset may have moved a frame that was ready.
+        covered = head.ready_ns is not None and self._newest.covers(self._span(head)[1])
+        coverage = self._coverage(head) if covered else Coverage.NOT_YET
+        if coverage is Coverage.AVAILABLE:
+            return self._waiting.popleft()
+        if coverage is Coverage.NEVER:
+            cause, reason = Refusal.IMU_GAP, _IMU_GAP
+        elif self._closed:
+            cause, reason = Refusal.NO_IMU, 'the gyro ends before the last row of the frame'
+        elif not self._offline and self._now() >= self._overdue_ns():
+            cause, reason = Refusal.NO_IMU, (
+                'no gyro sample that covers the last row of the frame came within '
+                f'{MAX_IMU_WAIT_NS / NANOSECONDS:g} s')
+        else:
+            return None
+        self._waiting.popleft()
+        return self._counted(head.frame.stamp_ns, cause, reason)
+
+    def _overdue_ns(self) -> int:
+        """When the oldest frame has waited for the IMU long enough, on the monotonic clock."""
+        return self._waiting[0].received_ns + MAX_IMU_WAIT_NS
 
     def _sort_out(self) -> None:
         """Mark the frames that the IMU covers by now, and keep the mailbox within its bounds."""
@@ -386,7 +373,7 @@ class Sequencer:
         ready = 0
         for waiting in tuple(self._waiting):
             if waiting.ready_ns is None:
-                if not self._covers(self._span(waiting)[1]):
+                if not self._newest.covers(self._span(waiting)[1]):
                     break
                 if self._buffer.coverage(waiting.start_ns, waiting.end_ns) is Coverage.NEVER:
                     # Here, not when its turn comes: it must not count as waiting for the worker.
@@ -405,27 +392,61 @@ class Sequencer:
         if ready:
             self._changed.notify()
 
+    # -- instants and IMU of a frame ---------------------------------------------------------
+
+    def _clock_of(self, intrinsics: Intrinsics) -> ImageClock:
+        if self._image_clock is None or intrinsics != self._intrinsics:
+            sensor = self._parameters.sensor
+            self._image_clock = ImageClock(
+                sensor_camera(intrinsics, self._parameters), sensor.time_offset,
+                sensor.stamp_exposure, sensor.exposure_time)
+            self._intrinsics = intrinsics
+        return self._image_clock
+
     def _span(self, waiting: _Waiting) -> tuple[int, int]:
         """Instants of its first and last row, with the offset tracked by now."""
         return waiting.start_ns + self._offset_ns, waiting.end_ns + self._offset_ns
 
-    def _covers(self, end_ns: int) -> bool:
-        """Whether the IMU has come as far as `end_ns`, an accelerometer on its own topic too."""
-        gyro_ns, accelerometer_ns = self._newest_gyro_ns, self._newest_accelerometer_ns
-        if gyro_ns is None or gyro_ns < end_ns:
-            return False
-        # Gravity must not depend on which of two topics came first.
-        return (accelerometer_ns is None or accelerometer_ns >= end_ns
-                or gyro_ns - accelerometer_ns > _ACCELEROMETER_STALE_NS)
+    def _coverage(self, waiting: _Waiting) -> Coverage:
+        return self._buffer.coverage(*self._span(waiting))
 
-    def _clock_of(self, calibration: Intrinsics) -> ImageClock:
-        if self._image_clock is None or calibration != self._calibration:
-            sensor = self._parameters.sensor
-            self._image_clock = ImageClock(
-                sensor_camera(calibration, self._parameters), sensor.time_offset,
-                sensor.stamp_exposure, sensor.exposure_time)
-            self._calibration = calibration
-        return self._image_clock
+    def _imu_of(self, taken: _Waiting) -> FrameImu:
+        """The IMU's share of a frame, with the turn since the frame that was taken before."""
+        reference_ns = taken.reference_ns + self._offset_ns
+        previous_ns = self._previous_reference_ns
+        if previous_ns is not None and reference_ns - previous_ns > self._longest_turn_ns:
+            previous_ns = None
+        imu = frame_imu(self._buffer, self._span(taken), reference_ns, self._R_cam_imu,
+                        previous_ns)
+        self._previous_reference_ns = reference_ns
+        return replace(imu, applied_offset_ns=self._offset_ns)
+
+    # -- refusals and jumps of a clock -------------------------------------------------------
+
+    def _goes_on(self, stamp_ns: int, end_ns: int) -> bool:
+        """Whether a frame of this stamp is taken; where it is not, it has been refused.
+
+        A stamp that only a clock set back can give is taken: time starts anew with it.
+        """
+        last_ns = self._last_stamp_ns
+        set_back = self._frames_back.add(stamp_ns, last_ns)
+        if last_ns is None or stamp_ns > last_ns:
+            return True
+        if stamp_ns == last_ns:
+            self._refuse(stamp_ns, Refusal.DUPLICATE, 'a frame of this stamp came before')
+            return False
+        back = seconds_between(stamp_ns, last_ns)
+        if not set_back and last_ns - stamp_ns <= CLOCK_JUMP_NS:
+            self._refuse(stamp_ns, Refusal.OUT_OF_ORDER,
+                         f'the frame is {back:.3f} s older than the one before')
+            return False
+        self._jump(f'image stamps jumped back by {back:.3f} s')
+        # The IMU may have jumped already, and then holds what this frame needs; set back by
+        # little, it may hold two times at once.
+        newest_ns = self._newest.any_ns
+        if set_back or (newest_ns is not None and newest_ns > end_ns + CLOCK_JUMP_NS):
+            self._clear_imu()
+        return True
 
     def _counted(self, stamp_ns: int, cause: Refusal, reason: str) -> FrameRefused:
         self._refused[cause] += 1
@@ -436,11 +457,11 @@ class Sequencer:
         self._changed.notify()
 
     def _jump(self, reason: str) -> None:
-        self._clock_jumps += 1
+        self._count['clock_jumps'] += 1
         self._start_anew(Refusal.CLOCK_JUMP, reason)
 
     def _start_anew(self, cause: Refusal, reason: str) -> None:
-        """What waits belongs to the time before."""
+        """Refuse all frames that wait: they belong to the time before."""
         self._generation += 1
         while self._waiting:
             self._refuse(self._waiting.popleft().frame.stamp_ns, cause, reason)
@@ -448,7 +469,7 @@ class Sequencer:
 
     def _clear_imu(self) -> None:
         self._buffer.clear()
-        self._newest_imu_ns = self._newest_gyro_ns = self._newest_accelerometer_ns = None
+        self._newest = _NewestImu()
 
 
 def _later(known_ns: int | None, stamp_ns: int) -> int:

@@ -23,17 +23,16 @@ from rs_relpose_ros.estimator.estimate import (
     warm_up_sampling,
 )
 from rs_relpose_ros.front_end.frame import Frame
-from rs_relpose_ros.front_end.pipeline import Pipeline
-from rs_relpose_ros.front_end.sequencer import ReadyFrame, Sequencer
+from rs_relpose_ros.front_end.front_end import FrameProcessed, FrontEnd
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.imu.samples import ImuSample
 
 _WIDTH, _HEIGHT = 320, 240
 # With a distortion: its kernels, too, must be there before the first frame.
-_CALIBRATION = Intrinsics(width=_WIDTH, height=_HEIGHT, fx=250.0, fy=250.0, cx=159.5, cy=119.5,
-                           image_width=_WIDTH, image_height=_HEIGHT,
-                           distortion_model='plumb_bob', distortion=(-0.02, 0.01, 0.0, 0.0))
+_INTRINSICS = Intrinsics(width=_WIDTH, height=_HEIGHT, fx=250.0, fy=250.0, cx=159.5, cy=119.5,
+                         image_width=_WIDTH, image_height=_HEIGHT,
+                         distortion_model='plumb_bob', distortion=(-0.02, 0.01, 0.0, 0.0))
 _FRAME_NS = NANOSECONDS // 30
 _IMU_NS = NANOSECONDS // 200
 
@@ -53,8 +52,8 @@ def warm_up_pipeline(parameters: Parameters) -> None:
         'readout_time': 0.02, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0], 'time_offset': 0.0,
         'stamp_exposure': 'middle', 'feature_rows': [0.0, 0.0], 'max_keyframe_frames': 1})
     for force in ((0.0, -9.81, 0.0), None):
-        sequencer = Sequencer(parameters, offline=True)
-        pipeline = Pipeline(parameters)
+        front_end = FrontEnd(parameters, offline=True)
+        sequencer = front_end.sequencer
         images = list(_images())
         for image in images:
             # A raw image is tracked in its message's memory; kernels for that are others.
@@ -62,10 +61,9 @@ def warm_up_pipeline(parameters: Parameters) -> None:
         for stamp_ns in range(NANOSECONDS, NANOSECONDS + (len(images) + 3) * _FRAME_NS, _IMU_NS):
             sequencer.add_imu(ImuSample(stamp_ns, (0.01, 0.02, 0.03), force))
         for k, image in enumerate(images):
-            sequencer.add_frame(Frame(NANOSECONDS + (k + 1) * _FRAME_NS, image, '', _CALIBRATION))
-            taken = sequencer.take()
-            assert isinstance(taken, ReadyFrame)
-            pipeline.process(taken.frame, taken.imu)
+            sequencer.add_frame(Frame(NANOSECONDS + (k + 1) * _FRAME_NS, image, '', _INTRINSICS))
+            outcome = front_end.step()
+            assert isinstance(outcome, FrameProcessed), outcome
 
 
 def _images() -> Iterator[NDArray[np.uint8]]:

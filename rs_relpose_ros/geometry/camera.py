@@ -12,12 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry.distortion import (
-    project_points,
-    RATIONAL_COEFFICIENTS,
-    rays_with_jacobian,
-    undistort_points,
-)
+from rs_relpose_ros.geometry.distortion.inverse import project_points, undistort_points
+from rs_relpose_ros.geometry.distortion.models import DISTORTION_MODELS, DistortionModel
+from rs_relpose_ros.geometry.rays import rays_with_jacobian
 
 REFERENCE_ROWS = ('first', 'middle', 'last')
 READOUT_DIRECTIONS = ('down', 'up')
@@ -25,13 +22,6 @@ READOUT_DIRECTIONS = ('down', 'up')
 # Far beyond any camera, and near enough that no square of a pixel or a ray overflows.
 _LARGEST_IMAGE = 1_000_000
 _FARTHEST_PIXEL = 1e9
-
-# Legal numbers of coefficients of each model, in the order of sensor_msgs/CameraInfo and OpenCV.
-DISTORTION_COEFFICIENTS = {
-    'plumb_bob': (0, 4, 5, 8),
-    'rational_polynomial': (8, 12),
-    'equidistant': (4,),
-}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,7 +35,8 @@ class RollingShutterCamera:
     fx, fy, cx, cy : float
         Pinhole intrinsics [px]; pixel centres at integer coordinates, as in OpenCV.
     distortion_model : {'plumb_bob', 'rational_polynomial', 'equidistant'}
-        As in sensor_msgs/CameraInfo (REP-104); ``'equidistant'`` is OpenCV's fisheye model.
+        A name of `DISTORTION_MODELS`, as in sensor_msgs/CameraInfo (REP-104); ``'equidistant'`` is
+        OpenCV's fisheye model.
     distortion : sequence of float
         Coefficients in OpenCV's order; empty for none.
     readout_time : float
@@ -96,14 +87,14 @@ class RollingShutterCamera:
         if self.reference_row not in REFERENCE_ROWS:
             raise InputError(
                 f'reference_row must be one of {REFERENCE_ROWS}, got {self.reference_row!r}')
-        if self.distortion_model not in DISTORTION_COEFFICIENTS:
+        if self.distortion_model not in DISTORTION_MODELS:
             raise InputError(
-                f'distortion_model must be one of {tuple(DISTORTION_COEFFICIENTS)}, '
+                f'distortion_model must be one of {tuple(DISTORTION_MODELS)}, '
                 f'got {self.distortion_model!r}')
         coefficients = tuple(float(c) for c in self.distortion)
         if not all(np.isfinite(coefficients)):
             raise InputError(f'distortion must be finite, got {coefficients}')
-        legal = DISTORTION_COEFFICIENTS[self.distortion_model]
+        legal = self._lens.coefficient_counts
         if coefficients and len(coefficients) not in legal:
             raise InputError(
                 f'distortion of model {self.distortion_model!r} must have one of {legal} '
@@ -145,7 +136,7 @@ class RollingShutterCamera:
     @property
     def is_undistorted(self) -> bool:
         """Whether the model is a plain pinhole (``'equidistant'`` never is)."""
-        return self.distortion_model != 'equidistant' and not any(self.distortion)
+        return self._lens.is_pinhole_at_zero and not any(self.distortion)
 
     def project(self, points: ArrayLike) -> NDArray[np.float64]:
         """Raw pixels (N, 2) of points (N, 3) in the camera frame; NaN behind the camera.
@@ -153,7 +144,8 @@ class RollingShutterCamera:
         A single exposure instant: a moving camera's rows are the caller's business.
         """
         points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
-        normalized = project_points(points, *self._distortion_arguments)
+        distort, _ = self._lens.addresses
+        normalized = project_points(points, distort, self._lens.padded(self.distortion))
         return normalized * (self.fx, self.fy) + (self.cx, self.cy)
 
     def unproject(self, points: ArrayLike) -> NDArray[np.float64]:
@@ -176,14 +168,11 @@ class RollingShutterCamera:
         if self.is_undistorted:
             by_pixel[:] = np.diag([1.0 / self.fx, 1.0 / self.fy])
         else:
-            normalized, inverse = undistort_points(normalized, *self._distortion_arguments)
+            normalized, inverse = undistort_points(normalized, *self._lens.addresses,
+                                                   self._lens.padded(self.distortion))
             np.divide(inverse, (self.fx, self.fy), out=by_pixel)
         return normalized, by_pixel
 
     @property
-    def _distortion_arguments(self) -> tuple[NDArray[np.float64], bool]:
-        """Coefficients as the compiled models take them, and whether it is the fisheye."""
-        fisheye = self.distortion_model == 'equidistant'
-        coefficients = np.zeros(4 if fisheye else RATIONAL_COEFFICIENTS)
-        coefficients[:len(self.distortion)] = self.distortion
-        return coefficients, fisheye
+    def _lens(self) -> DistortionModel:
+        return DISTORTION_MODELS[self.distortion_model]

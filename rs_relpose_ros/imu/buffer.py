@@ -21,11 +21,9 @@ from rs_relpose_ros.imu.gravity import (
 )
 from rs_relpose_ros.imu.integration import integrate_rotation
 from rs_relpose_ros.imu.samples import ImuSample
+from rs_relpose_ros.imu.series import Series
 
 Array = NDArray[np.float64]
-
-# Older than the newest sample by more than this: the clock was set back (a bag that loops).
-JUMP_BACK_NS = 1_000_000_000
 
 
 class Coverage(Enum):
@@ -42,56 +40,6 @@ class AddResult(Enum):
     ADDED = 'added'
     DUPLICATE = 'duplicate'
     LATE = 'late'
-    JUMPED_BACK = 'jumped back'
-
-
-class _Series:
-    """Stamped vectors (K, width) in the order of their stamps, in growing contiguous arrays."""
-
-    def __init__(self, width: int = 3) -> None:
-        self._stamps = np.empty(256, dtype=np.int64)
-        self._values = np.empty((256, width))
-        self._start = 0
-        self._end = 0
-
-    @property
-    def stamps(self) -> NDArray[np.int64]:
-        return self._stamps[self._start:self._end]
-
-    @property
-    def values(self) -> Array:
-        return self._values[self._start:self._end]
-
-    def insert(self, stamp_ns: int, value: tuple[float, ...]) -> bool:
-        """Insert in order; False for a stamp that is there already."""
-        stamps = self.stamps
-        position = len(stamps)
-        if position and stamp_ns <= stamps[-1]:
-            position = int(np.searchsorted(stamps, stamp_ns))
-            if stamps[position] == stamp_ns:
-                return False
-        if self._end == len(self._stamps):
-            self._make_room()
-        at = self._start + position
-        self._stamps[at + 1:self._end + 1] = self._stamps[at:self._end]
-        self._values[at + 1:self._end + 1] = self._values[at:self._end]
-        self._stamps[at], self._values[at] = stamp_ns, value
-        self._end += 1
-        return True
-
-    def prune(self, before_ns: int) -> None:
-        """Forget samples before `before_ns`, but for the last of them: borders interpolate."""
-        keep = int(np.searchsorted(self.stamps, before_ns, side='right')) - 1
-        if keep > 0:
-            self._start += keep
-
-    def _make_room(self) -> None:
-        count = self._end - self._start
-        size = max(256, 2 * count)
-        stamps = np.empty(size, dtype=np.int64)
-        values = np.empty((size, self._values.shape[1]))
-        stamps[:count], values[:count] = self.stamps, self.values
-        self._stamps, self._values, self._start, self._end = stamps, values, 0, count
 
 
 class ImuBuffer:
@@ -111,7 +59,7 @@ class ImuBuffer:
 
     def clear(self) -> None:
         """Forget everything."""
-        self._gyro, self._force, self._down = _Series(), _Series(), _Series(4)
+        self._gyro, self._force, self._down = Series(), Series(), Series(4)
         self._filter = GravityFilter(self._config)
         self._bias = BiasTracker(self._config)
         self._filtered_ns = self._pruned_ns = int(np.iinfo(np.int64).min)
@@ -137,11 +85,9 @@ class ImuBuffer:
                                  f'got {list(value)}')
         newest = max((int(s.stamps[-1]) for s in (self._gyro, self._force) if len(s.stamps)),
                      default=sample.stamp_ns)
-        if sample.stamp_ns < newest - JUMP_BACK_NS:
-            return AddResult.JUMPED_BACK
         added = False
         own = sample.orientation
-        values: tuple[tuple[_Series, tuple[float, ...] | None], ...] = (
+        values: tuple[tuple[Series, tuple[float, ...] | None], ...] = (
             (self._gyro, sample.angular_velocity), (self._force, sample.linear_acceleration),
             (self._down, None if own is None else (*own.down, own.sigma)))
         for series, numbers in values:
@@ -149,7 +95,7 @@ class ImuBuffer:
                 added |= series.insert(sample.stamp_ns, numbers)
         if not added:
             return AddResult.DUPLICATE
-        # A tenth late, so that not each sample costs a search.
+        # Pruned when a tenth is too old: a search per sample would cost more than the memory.
         if newest - self._pruned_ns > self._keep_ns * 11 // 10:
             self._pruned_ns = newest - self._keep_ns
             self.prune(self._pruned_ns)
@@ -157,7 +103,7 @@ class ImuBuffer:
 
     def prune(self, before_ns: int) -> None:
         """Forget what is older than `before_ns`."""
-        # The filters take in what is about to be forgotten.
+        # The filters must have seen a sample before it is forgotten.
         self._run_filters(before_ns)
         for series in (self._gyro, self._force, self._down):
             series.prune(before_ns)
@@ -193,15 +139,8 @@ class ImuBuffer:
         if self.coverage(start_ns, end_ns) is not Coverage.AVAILABLE:
             raise InputError(f'the gyro does not cover [{start_ns}, {end_ns}] ns: '
                              f'{self.coverage(start_ns, end_ns).value}')
-        stamps, values = self._gyro.stamps, self._gyro.values
-        inner = slice(int(np.searchsorted(stamps, start_ns, side='right')),
-                      int(np.searchsorted(stamps, end_ns, side='left')))
-        borders = [start_ns] if end_ns == start_ns else [start_ns, end_ns]
-        out_stamps = np.concatenate([borders[:1], stamps[inner], borders[1:]]).astype(np.int64)
-        out = np.concatenate([self._interpolated(start_ns)[None], values[inner],
-                              *([] if len(borders) == 1
-                                else [self._interpolated(end_ns)[None]])])
-        return out_stamps, out - self.bias(end_ns).value
+        stamps_ns, rates = self._gyro.between(start_ns, end_ns)
+        return stamps_ns, rates - self.bias(end_ns).value
 
     def bias(self, at_ns: int) -> GyroBias:
         """Bias of the gyro at an instant, from samples up to it; ask in the order of time."""
@@ -245,7 +184,7 @@ class ImuBuffer:
         return self._turned(estimate, stamp_ns, at_ns)
 
     def _own_gravity(self, at_ns: int) -> GravityEstimate | None:
-        """What the IMU's last orientation up to an instant says of gravity."""
+        """Gravity from the last orientation message up to an instant; None where it is old."""
         stamps = self._down.stamps
         last = int(np.searchsorted(stamps, at_ns, side='right')) - 1
         if last < 0 or at_ns - int(stamps[last]) > self._gap_ns:
@@ -263,15 +202,6 @@ class ImuBuffer:
         return GravityEstimate((turn.T if from_ns < to_ns else turn) @ estimate.direction,
                                estimate.sigma)
 
-    def _interpolated(self, at_ns: int) -> Array:
-        stamps, values = self._gyro.stamps, self._gyro.values
-        after = int(np.searchsorted(stamps, at_ns, side='left'))
-        if stamps[after] == at_ns:
-            return values[after]
-        before = after - 1
-        fraction = (at_ns - stamps[before]) / (stamps[after] - stamps[before])
-        return np.asarray(values[before] + fraction * (values[after] - values[before]))
-
     def _run_filters(self, until_ns: int) -> None:
         """Filter the samples up to an instant that were not filtered yet."""
         stamps = self._gyro.stamps
@@ -280,7 +210,7 @@ class ImuBuffer:
         if first < last:
             rates, forces = self._gyro.values[first:last], self._forces_at(stamps[first:last])
             self._bias.run(stamps[first:last], rates, forces)
-            # This one learns on its own what the told bias leaves of gravity's error.
+            # With the configured bias only: the gravity filter estimates the rest by itself.
             if self._config.gravity_filter == 'complementary':
                 self._filter.run(stamps[first:last], rates - self._told_bias, forces)
             self._filtered_ns = int(stamps[last - 1])

@@ -37,11 +37,11 @@ class Report:
 class Inputs:
     """What has come so far; of each topic the number of messages."""
 
-    images: int
-    camera_infos: int
-    imu: int
-    accelerometer: int
-    invalid: int
+    images: int = 0
+    camera_infos: int = 0
+    imu: int = 0
+    accelerometer: int = 0
+    invalid: int = 0
 
 
 class Statistics:
@@ -62,7 +62,7 @@ class Statistics:
         self._last_pose: PairResult | None = None
         self._last_no_pose = ''
         self._since_ns = clock()
-        self._counted = Inputs(0, 0, 0, 0, 0)
+        self._counted = Inputs()
         self._refused_before = self._overload_before = 0
         self._frame_times: deque[float] = deque(maxlen=_RECENT_FRAMES)
         self._busy_ns = 0

@@ -1,17 +1,31 @@
-"""When each frame was ready, taken and done: a line per frame, for measurements."""
+"""Files of a line per frame, for replays and measurements of a live run."""
 
 from __future__ import annotations
 
 from pathlib import Path
 import time
+from typing import TextIO
 
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.front_end.pair import PairResult
-from rs_relpose_ros.front_end.sequencer import ReadyFrame
+from rs_relpose_ros.front_end.front_end import FrameProcessed
 
 COLUMNS = ('stamp_ns', 'ready_ns', 'taken_ns', 'done_ns', 'cpu_ns', 'outcome')
 # The frame closed no pair.
 NO_PAIR = 'none'
+
+
+def opened(parameter: str, path: str) -> TextIO:
+    """File of the parameter of this name, written line by line.
+
+    Raises
+    ------
+    InputError
+        It cannot be written.
+    """
+    try:
+        return Path(path).open('w', buffering=1, encoding='ascii')
+    except OSError as error:
+        raise InputError(f'{parameter} {path} cannot be written: {error.strerror}') from error
 
 
 class FrameTimings:
@@ -29,10 +43,7 @@ class FrameTimings:
     """
 
     def __init__(self, path: str) -> None:
-        try:
-            self._file = Path(path).open('w', buffering=1, encoding='ascii')  # noqa: SIM115
-        except OSError as error:
-            raise InputError(f'timings_file {path} cannot be written: {error.strerror}') from error
+        self._file = opened('timings_file', path)
         self._file.write(','.join(COLUMNS) + '\n')
         self._spent_ns = 0
 
@@ -40,11 +51,11 @@ class FrameTimings:
         """What the thread did until now belongs to no frame."""
         self._spent_ns = time.thread_time_ns()
 
-    def add(self, ready: ReadyFrame, result: PairResult | None) -> None:
+    def add(self, frame: FrameProcessed) -> None:
         """Write a frame; call it right after its result was published."""
         done_ns, spent_ns = time.monotonic_ns(), time.thread_time_ns()
-        outcome = NO_PAIR if result is None else result.pose.status.value
-        self._file.write(f'{ready.frame.stamp_ns},{ready.ready_ns},{ready.taken_ns},{done_ns},'
+        outcome = NO_PAIR if frame.pair is None else frame.pair.pose.status.value
+        self._file.write(f'{frame.stamp_ns},{frame.ready_ns},{frame.taken_ns},{done_ns},'
                          f'{spent_ns - self._spent_ns},{outcome}\n')
         self._spent_ns = spent_ns
 

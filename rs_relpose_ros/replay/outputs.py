@@ -41,7 +41,7 @@ class ReplayOutcome:
     ----------
     records : list of PairRecord
     counts : ReplayCounts
-    calibration : Intrinsics or None
+    intrinsics : Intrinsics or None
         In force at the end.
     figures : dict
         As in summary.json, without provenance.
@@ -51,7 +51,7 @@ class ReplayOutcome:
 
     records: list[PairRecord]
     counts: ReplayCounts
-    calibration: Intrinsics | None
+    intrinsics: Intrinsics | None
     figures: dict[str, Any]
     files: list[Path]
 
@@ -100,7 +100,7 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
             files.append(folder / ERRORS_FILE)
         out_bag = stack.enter_context(BagWriter(folder / BAG_FOLDER)) if with_bag else None
         for pair in run.pairs():
-            record = pair_record(pair.result, pair.reference_ns1, pair.reference_ns2, truth)
+            record = pair_record(pair.result, truth)
             records.append(record)
             drift = pair.result.drift
             poses.write(relative_pose_cells(record))
@@ -116,7 +116,7 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
     if pictures and records and shown is not None:
         files += _draw(folder, records, shown, truth)
     counts = run.counts()
-    return ReplayOutcome(records, counts, run.calibration, summarize(records, counts, drift),
+    return ReplayOutcome(records, counts, run.intrinsics, summarize(records, counts, drift),
                          files)
 
 

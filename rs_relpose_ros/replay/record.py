@@ -50,8 +50,7 @@ class PairRecord:
     errors: PairErrors | None
 
 
-def pair_record(result: PairResult, reference_ns1: int, reference_ns2: int,
-                truth: TrueTrajectory | None = None) -> PairRecord:
+def pair_record(result: PairResult, truth: TrueTrajectory | None = None) -> PairRecord:
     """Figures of a pair, and its errors where there is a truth."""
     pose = result.pose
     difference = float('nan')
@@ -59,10 +58,11 @@ def pair_record(result: PairResult, reference_ns1: int, reference_ns2: int,
         difference = rotation_angle(pose.R.T @ result.gyro_rotation)
     errors = None
     if truth is not None:
-        errors = truth.errors(pose.R, pose.t, reference_ns1, reference_ns2)
+        errors = truth.errors(pose.R, pose.t, result.reference_ns1, result.reference_ns2)
     return PairRecord(
         reference_stamp_ns=result.reference_stamp_ns, stamp_ns=result.stamp_ns,
-        reference_ns1=reference_ns1, reference_ns2=reference_ns2, interval=result.interval,
+        reference_ns1=result.reference_ns1, reference_ns2=result.reference_ns2,
+        interval=result.interval,
         status=pose.status, reason=pose.reason, model=pose.model, R=pose.R, t=pose.t,
         covariance=pose.covariance, gyro_rotation=result.gyro_rotation,
         gyro_difference=difference, matches=len(result.matches.points1),

@@ -14,9 +14,9 @@ from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.estimator.estimate import warm_up
+from rs_relpose_ros.front_end.front_end import FrameFailed, FrontEnd
 from rs_relpose_ros.front_end.pair import PairResult
-from rs_relpose_ros.front_end.pipeline import Pipeline
-from rs_relpose_ros.front_end.sequencer import FrameRefused, ReadyFrame, Sequencer, SequencerCounts
+from rs_relpose_ros.front_end.sequencer import FrameRefused, SequencerCounts
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.messages.causes import CauseCounts
 from rs_relpose_ros.messages.incoming import stamp_ns, TruePose
@@ -29,11 +29,9 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReplayedPair:
-    """A pair, the instants of its stamped rows on the IMU clock, and when it closed [ns]."""
+    """A pair, and the bag time of the message that closed it [ns]."""
 
     result: PairResult
-    reference_ns1: int
-    reference_ns2: int
     bag_time_ns: int
 
 
@@ -95,10 +93,8 @@ class Replay:
                 f'{missing[0]}=...: see config/relpose.yaml')
         self._bag, self._topics, self._stamps = bag, topics, stamps
         self._on_image = on_image
-        self._sequencer = Sequencer(parameters, offline=True)
-        self._intake = Intake(self._sequencer, parameters.imu.stuck_gyro_time)
-        self._pipeline = Pipeline(parameters, keep_images=keep_images)
-        self._references_ns: dict[int, int] = {}
+        self._front_end = FrontEnd(parameters, offline=True, keep_images=keep_images)
+        self._intake = Intake(self._front_end.sequencer, parameters.imu.stuck_gyro_time)
         self._stamps_found: set[int] = set()
         self._images = self._skipped = self._invalid = self._failed = self._pairs = 0
         self._reasons = CauseCounts()
@@ -106,8 +102,8 @@ class Replay:
         self._first_ns = self._last_ns = 0
 
     @property
-    def calibration(self) -> Intrinsics | None:
-        """The calibration in force."""
+    def intrinsics(self) -> Intrinsics | None:
+        """The intrinsics in force."""
         return self._intake.intrinsics
 
     def pairs(self) -> Iterator[ReplayedPair]:
@@ -126,7 +122,7 @@ class Replay:
             self._hand_over(role, message)
             yield from self._drain()
         self._intake.refuse_held()
-        self._sequencer.close()
+        self._front_end.sequencer.close()
         yield from self._drain()
         self._seconds = time.perf_counter() - started
         self._check_outcome()
@@ -135,7 +131,7 @@ class Replay:
         """Counts so far."""
         return ReplayCounts(
             images=self._images, images_skipped=self._skipped,
-            sequencer=self._sequencer.counts(), invalid_messages=self._invalid,
+            sequencer=self._front_end.sequencer.counts(), invalid_messages=self._invalid,
             failed_frames=self._failed, reasons=self._reasons.most_common(),
             seconds=self._seconds, processing_seconds=self._processing_seconds,
             bag_seconds=(self._last_ns - self._first_ns) * 1e-9)
@@ -147,7 +143,7 @@ class Replay:
             if role is not Role.IMAGE or self._is_chosen(message.message):
                 self._intake.receive(role, message.message)
         except RsRelposeError as error:
-            if role is Role.CAMERA_INFO and not self._sequencer.counts().frames_taken:
+            if role is Role.CAMERA_INFO and not self._front_end.sequencer.counts().frames_taken:
                 # Nothing was estimated and nothing can be: say so now.
                 raise type(error)(f'{message.topic}: {error}') from error
             self._invalid += 1
@@ -167,42 +163,24 @@ class Replay:
         return True
 
     def _drain(self) -> Iterator[ReplayedPair]:
-        while (taken := self._sequencer.take()) is not None:
-            if isinstance(taken, FrameRefused):
-                self._not_used(f'{taken.cause.value}: {taken.reason}')
-                continue
-            result = self._process(taken)
-            if result is not None:
-                self._pairs += 1
-                reference_ns1 = self._references_ns[result.reference_stamp_ns]
-                # Later pairs begin at this frame.
-                self._references_ns = {result.stamp_ns: taken.imu.reference_ns}
-                yield ReplayedPair(result, reference_ns1, taken.imu.reference_ns, self._last_ns)
-
-    def _process(self, ready: ReadyFrame) -> PairResult | None:
-        started = time.perf_counter()
-        self._references_ns[ready.frame.stamp_ns] = ready.imu.reference_ns
-        try:
-            if ready.restart:
-                self._pipeline.reset()
-            result = self._pipeline.process(ready.frame, ready.imu)
-            self._sequencer.apply_time_offset(self._pipeline.applied_offset_ns)
-            return result
-        except RsRelposeError as error:
-            # As the live node does it: one frame does not end the run.
-            self._pipeline.reset()
-            self._failed += 1
-            self._not_used(str(error))
-            return None
-        finally:
-            self._processing_seconds += time.perf_counter() - started
+        while (outcome := self._front_end.step()) is not None:
+            if isinstance(outcome, FrameRefused):
+                self._not_used(f'{outcome.cause.value}: {outcome.reason}')
+            elif isinstance(outcome, FrameFailed):
+                self._failed += 1
+                self._not_used(str(outcome.error))
+            else:
+                self._processing_seconds += outcome.seconds
+                if outcome.pair is not None:
+                    self._pairs += 1
+                    yield ReplayedPair(outcome.pair, self._last_ns)
 
     def _not_used(self, reason: str) -> None:
         if self._reasons.add(reason):
             _logger.info('not used: %s', reason)
 
     def _check_outcome(self) -> None:
-        counts = self._sequencer.counts()
+        counts = self._front_end.sequencer.counts()
         if self._stamps is not None:
             absent = len(self._stamps - self._stamps_found)
             if absent == len(self._stamps):

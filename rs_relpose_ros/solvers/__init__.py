@@ -1,21 +1,15 @@
-"""Minimal solvers: the paper's five algorithms and the global-shutter 5-point."""
+"""Minimal solvers: a function for every row of the table, such as `uniform_9pt`."""
 
-from rs_relpose_ros.solvers.minimal import (
-    angular_3pt,
-    angular_5pt,
-    global_5pt,
-    linear_9pt,
-    uniform_9pt,
-    uniform_11pt,
-)
-from rs_relpose_ros.solvers.solution import MinimalSolution
+from __future__ import annotations
 
-__all__ = [
-    'MinimalSolution',
-    'angular_3pt',
-    'angular_5pt',
-    'global_5pt',
-    'linear_9pt',
-    'uniform_9pt',
-    'uniform_11pt',
-]
+from typing import TYPE_CHECKING
+
+from rs_relpose_ros.solvers.public import as_function, MinimalSolution, MinimalSolver
+from rs_relpose_ros.solvers.table import SOLVERS
+
+if TYPE_CHECKING:
+    def __getattr__(name: str) -> MinimalSolver: ...
+
+globals().update({name: as_function(row) for name, row in SOLVERS.items()})
+
+__all__ = ['MinimalSolution', *SOLVERS]

@@ -6,42 +6,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel
+from rs_relpose_ros.geometry.vectors import dot, rotated
+from rs_relpose_ros.solvers.solver import Sample
 
 Array = NDArray[np.float64]
 
 
 @kernel
-def cheirality_votes(f1: Array, f2: Array, tau1: Array, tau2: Array, R: Array,
-                     x: Array) -> tuple[int, int]:
-    """Points in front of both cameras for ``x = (t, d_1, d_2)``, and for ``-x``.
+def cheirality_votes(sample: Sample, R: Array, x: Array) -> tuple[int, int]:
+    """Points in front of both cameras for ``x = (t, d_1, d_2)`` (9,), and for ``-x``.
 
     Each point is triangulated from the two positions that the cameras had at its own rows:
-    ``lambda_1 f_1 - lambda_2 R f_2 = t - tau_1 d_1 + tau_2 d_2`` in the least-squares sense.
-
-    Parameters
-    ----------
-    f1, f2 : (n, 3) ndarray
-        Unit rays in their own camera's frame.
-    tau1, tau2 : (n,) ndarray
-        Row times [s]; not read when `x` has only the three elements of t.
-    x : (3,) or (9,) ndarray
-        In frame 1.
+    ``lambda_1 f_1 - lambda_2 R f_2 = b = t - tau_1 d_1 + tau_2 d_2`` in the least-squares sense.
     """
     front = 0
     behind = 0
-    moving = x.shape[0] == 9
-    for k in range(f1.shape[0]):
-        along1 = 0.0  # f_1 . b
-        along2 = 0.0  # R f_2 . b
-        cosine = 0.0
-        for i in range(3):
-            h = R[i, 0] * f2[k, 0] + R[i, 1] * f2[k, 1] + R[i, 2] * f2[k, 2]
-            b = x[i]
-            if moving:
-                b += tau2[k] * x[6 + i] - tau1[k] * x[3 + i]
-            along1 += f1[k, i] * b
-            along2 += h * b
-            cosine += f1[k, i] * h
+    for k in range(sample.f1.shape[0]):
+        f1, h = sample.f1[k], rotated(R, sample.f2[k])
+        tau1, tau2 = sample.tau1[k], sample.tau2[k]
+        b = (x[0] + (tau2 * x[6] - tau1 * x[3]), x[1] + (tau2 * x[7] - tau1 * x[4]),
+             x[2] + (tau2 * x[8] - tau1 * x[5]))
+        along1, along2, cosine = dot(f1, b), dot(h, b), dot(f1, h)
         # Both depths times sin^2 of the angle between the rays.
         depth1 = along1 - cosine * along2
         depth2 = cosine * along1 - along2
@@ -50,3 +35,12 @@ def cheirality_votes(f1: Array, f2: Array, tau1: Array, tau2: Array, R: Array,
         elif depth1 < 0.0 and depth2 < 0.0:
             behind += 1
     return front, behind
+
+
+@kernel
+def point_forward(sample: Sample, R: Array, x: Array) -> None:
+    """Give `x` (9,) the sign that puts most points in front of both cameras."""
+    front, behind = cheirality_votes(sample, R, x)
+    if behind > front:
+        for i in range(9):
+            x[i] = 0.0 - x[i]  # not -x: a velocity of zero stays +0

@@ -11,46 +11,58 @@ derivative of ``A(R) y`` (variable projection, Golub and Pereyra 1973, in Kaufma
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.geometry.so3 import exp_so3
-from rs_relpose_ros.solvers.cheirality import cheirality_votes
+from rs_relpose_ros.geometry.vectors import cross, rotated
+from rs_relpose_ros.solvers.cheirality import point_forward
+from rs_relpose_ros.solvers.five_point import MAX_SOLUTIONS as MAX_STARTS
+from rs_relpose_ros.solvers.five_point import solve_5pt
 from rs_relpose_ros.solvers.linear_algebra import normalise, reflect, triangularise
-from rs_relpose_ros.solvers.uniform_columns import row_time_factors, translation_and_velocities
+from rs_relpose_ros.solvers.solver import Knowledge, Sample, Solutions
+from rs_relpose_ros.solvers.uniform_columns import (
+    row_time_factors,
+    RowTimeFactors,
+    translation_and_velocities,
+)
 
 Array = NDArray[np.float64]
 
-
-_ITERATIONS = 30
-# Damping relative to the squared size of the Jacobian.
-_DAMPING = 1e-8
-_LEAST_DAMPING = 1e-20
-_LARGEST_DAMPING = 1e4
-_LONGEST_STEP = 0.2
+# One from each start.
+MAX_SOLUTIONS = MAX_STARTS
 # Smallest singular value, relative to the size of A, at which the rank is 8.
-_CONVERGED = 1e-13
-# The step before the last: the iteration squares it.
-_LAST_STEP = 1e-6
+_SINGULAR = 1e-13
+
+
+class _Equations(NamedTuple):
+    """``A(R) y = 0`` with the rows ``[n, p n, q n]``, and room for what belongs to one R.
+
+    `columns` (9, 11): of A. `bordered` (12, 11): ``[A Y, dA y / dtheta, A y]``, triangularised;
+    its last rows hold in ``[8:11, 8:]`` the transposed derivative J of the three conditions and
+    in ``[11, 8:]`` the conditions r. `work` (11, 11), `diagonal`, `scales` (9,): overwritten.
+    """
+
+    sample: Sample
+    factors: RowTimeFactors
+    columns: Array
+    bordered: Array
+    work: Array
+    diagonal: Array
+    scales: Array
 
 
 @kernel
-def _rotated(R: Array, f2: Array, k: int) -> tuple[float, float, float]:
-    return (R[0, 0] * f2[k, 0] + R[0, 1] * f2[k, 1] + R[0, 2] * f2[k, 2],
-            R[1, 0] * f2[k, 0] + R[1, 1] * f2[k, 1] + R[1, 2] * f2[k, 2],
-            R[2, 0] * f2[k, 0] + R[2, 1] * f2[k, 1] + R[2, 2] * f2[k, 2])
-
-
-@kernel
-def _columns(f1: Array, f2: Array, p: Array, q: Array, R: Array, columns: Array) -> float:
-    """Write the nine columns of A(R) into `columns` (9, 11); the Frobenius norm of A."""
+def _fill_columns(equations: _Equations, R: Array) -> float:
+    """Write the nine columns of A(R); the Frobenius norm of A."""
+    sample, columns = equations.sample, equations.columns
+    p, q = equations.factors.p, equations.factors.q
     total = 0.0
-    for k in range(f1.shape[0]):
-        hx, hy, hz = _rotated(R, f2, k)
-        n = (f1[k, 1] * hz - f1[k, 2] * hy, f1[k, 2] * hx - f1[k, 0] * hz,
-             f1[k, 0] * hy - f1[k, 1] * hx)
+    for k in range(sample.f1.shape[0]):
+        n = cross(sample.f1[k], rotated(R, sample.f2[k]))
         for i in range(3):
             columns[i, k] = n[i]
             columns[3 + i, k] = p[k] * n[i]
@@ -60,26 +72,16 @@ def _columns(f1: Array, f2: Array, p: Array, q: Array, R: Array, columns: Array)
 
 
 @kernel
-def _null_vector(columns: Array, y: Array, work: Array) -> float:
+def _null_vector(equations: _Equations, y: Array) -> float:
     """Right singular vector of the smallest singular value; the singular value.
 
-    Inverse iteration with the factor of a QR decomposition: the square of A is never formed.
-
-    Parameters
-    ----------
-    columns : (9, 11) ndarray
-        Of A; not changed.
-    y : (9,) ndarray
-        Start, and result.
-    work : (>= 11, 11) ndarray
-        Overwritten.
+    Inverse iteration from `y` (9,) with the factor of a QR decomposition: the square of A is
+    never formed. The columns stay as they are.
     """
-    n = columns.shape[0]
-    factor, diagonal, scales = work[:n], work[n], work[n + 1]
-    for k in range(n):
-        for i in range(columns.shape[1]):
-            factor[k, i] = columns[k, i]
-    triangularise(factor, n, diagonal, scales)
+    n = equations.columns.shape[0]
+    factor, diagonal = equations.work[:n], equations.diagonal
+    factor[:] = equations.columns
+    triangularise(factor, n, diagonal, equations.scales)
     tiny = 0.0
     for k in range(n):
         tiny = max(tiny, 1e-18 * abs(diagonal[k]))
@@ -103,45 +105,40 @@ def _null_vector(columns: Array, y: Array, work: Array) -> float:
 
 
 @kernel
-def _conditions(f1: Array, f2: Array, p: Array, q: Array, R: Array, columns: Array, y: Array,
-                bordered: Array, diagonal: Array, scales: Array) -> None:
-    """The three rank conditions and their derivative by theta, R moving as ``Exp(theta) R``.
-
-    Parameters
-    ----------
-    bordered : (12, 11) ndarray
-        Receives in ``[8:11, 8:]`` the transposed derivative and in ``[11, 8:]`` the conditions.
-    """
-    # A reflection exchanges y and +-e_9, so that its other columns are perpendicular to y.
+def _linearise(equations: _Equations, R: Array, y: Array) -> float:
+    """Write the rank conditions r and J, R moving as ``Exp(theta) R``; ``|J|^2``."""
+    sample, columns, bordered = equations.sample, equations.columns, equations.bordered
+    p, q = equations.factors.p, equations.factors.q
+    # A reflection exchanges y and +-e_9, so that its other columns Y are perpendicular to y.
     sign = 1.0 if y[8] >= 0.0 else -1.0
     scale = 1.0 / (1.0 + abs(y[8]))
-    for k in range(f1.shape[0]):
+    for k in range(sample.f1.shape[0]):
         Ay = 0.0
         for j in range(9):
             Ay += columns[j, k] * y[j]
         Aw = (Ay + sign * columns[8, k]) * scale
         for j in range(8):
             bordered[j, k] = columns[j, k] - Aw * y[j]
-        hx, hy, hz = _rotated(R, f2, k)
-        bx = y[0] + p[k] * y[3] + q[k] * y[6]
-        by = y[1] + p[k] * y[4] + q[k] * y[7]
-        bz = y[2] + p[k] * y[5] + q[k] * y[8]
-        # d((f_1 x h) . b) / d theta = h x (b x f_1)
-        mx = by * f1[k, 2] - bz * f1[k, 1]
-        my = bz * f1[k, 0] - bx * f1[k, 2]
-        mz = bx * f1[k, 1] - by * f1[k, 0]
-        bordered[8, k] = hy * mz - hz * my
-        bordered[9, k] = hz * mx - hx * mz
-        bordered[10, k] = hx * my - hy * mx
+        # b = y_1 + p y_2 + q y_3, and d((f_1 x h) . b) / dtheta = h x (b x f_1) with h = R f_2
+        b = (y[0] + p[k] * y[3] + q[k] * y[6], y[1] + p[k] * y[4] + q[k] * y[7],
+             y[2] + p[k] * y[5] + q[k] * y[8])
+        by_theta = cross(rotated(R, sample.f2[k]), cross(b, sample.f1[k]))
+        for i in range(3):
+            bordered[8 + i, k] = by_theta[i]
         bordered[11, k] = Ay
-    triangularise(bordered, 8, diagonal, scales)
+    triangularise(bordered, 8, equations.diagonal, equations.scales)
+    jacobian2 = 0.0
+    for j in range(3):
+        for i in range(3):
+            jacobian2 += bordered[8 + j, 8 + i] ** 2
+    return jacobian2
 
 
 @kernel
-def _damped_step(bordered: Array, damping: float, step: Array, work: Array, diagonal: Array,
-                 scales: Array) -> None:
+def _damped_step(equations: _Equations, damping: float, step: Array) -> None:
     """Least-squares solution of ``J step = -r`` and ``sqrt(damping) step = 0``: `step` (3,)."""
-    system = work[:4, :6]
+    bordered, diagonal, scales = equations.bordered, equations.diagonal, equations.scales
+    system = np.empty((4, 6))
     for j in range(4):
         for i in range(3):
             system[j, i] = bordered[8 + j, 8 + i]
@@ -157,76 +154,73 @@ def _damped_step(bordered: Array, damping: float, step: Array, work: Array, diag
 
 
 @kernel
-def _reach_rank_8(f1: Array, f2: Array, p: Array, q: Array, R: Array, y: Array) -> bool:
-    """Move `R` (3, 3) in place to a rotation where A(R) has rank 8, with null vector `y` (9,)."""
-    points = f1.shape[0]
-    columns, bordered = np.empty((9, points)), np.empty((12, points))
-    work, diagonal, scales = np.empty((11, points)), np.empty(9), np.empty(9)
+def _reach_rank_8(equations: _Equations, R: Array, y: Array) -> bool:
+    """Move `R` (3, 3) in place to a rotation where A(R) has rank 8, with null vector `y` (9,).
+
+    Levenberg-Marquardt; the damping is relative to the squared size of the Jacobian.
+    """
     trial, step = np.empty(9), np.empty(3)
     y[:] = 1.0
-    _columns(f1, f2, p, q, R, columns)
-    sigma = _null_vector(columns, y, work)
-    damping = _DAMPING
+    _fill_columns(equations, R)
+    sigma = _null_vector(equations, y)
+    damping = 1e-8
     jacobian2 = 0.0
     accepted = True
-    for _ in range(_ITERATIONS):
+    for _ in range(30):
         if accepted:
-            _conditions(f1, f2, p, q, R, columns, y, bordered, diagonal, scales)
-            jacobian2 = 0.0
-            for j in range(3):
-                for i in range(3):
-                    jacobian2 += bordered[8 + j, 8 + i] ** 2
-        _damped_step(bordered, damping * jacobian2, step, work, diagonal, scales)
+            jacobian2 = _linearise(equations, R, y)
+        _damped_step(equations, damping * jacobian2, step)
         length = normalise(step)
         if not length < math.inf:
             return False
-        step *= min(length, _LONGEST_STEP)
+        step *= min(length, 0.2)
         R_trial = exp_so3(step) @ R
-        limit = _CONVERGED * _columns(f1, f2, p, q, R_trial, columns)
+        limit = _SINGULAR * _fill_columns(equations, R_trial)
         trial[:] = y
-        sigma_trial = _null_vector(columns, trial, work)
+        sigma_trial = _null_vector(equations, trial)
         accepted = sigma_trial < sigma or sigma_trial < limit
         if accepted:
             R[:], y[:], sigma = R_trial, trial, sigma_trial
-            damping = max(0.01 * damping, _LEAST_DAMPING)
-            if sigma < limit and length < _LAST_STEP:
+            damping = max(0.01 * damping, 1e-20)
+            # The step before the last is this long: the iteration squares it.
+            if sigma < limit and length < 1e-6:
                 return math.isfinite(y[0])
         else:
             damping *= 100.0
-            if damping > _LARGEST_DAMPING:
+            if damping > 1e4:
                 return False
     return False
 
 
 @kernel
-def uniform_11pt_kernel(f1: Array, f2: Array, tau1: Array, tau2: Array, R_start: Array,
-                        R_out: Array, x_out: Array) -> bool:
-    """The solution of `uniform_11pt` that a start rotation reaches; whether it reaches one.
+def solve_uniform_11pt(sample: Sample, known: Knowledge, out: Solutions) -> int:
+    """A rotation at which the 11x9 matrix A(R) has rank 8; its null vector is (t, d_1, d_2).
 
-    Parameters
-    ----------
-    f1, f2 : (11, 3) ndarray
-        Derotated unit rays.
-    tau1, tau2 : (11,) ndarray
-        Row times [s].
-    R_start : (3, 3) ndarray
-        Rotation to start from.
-    R_out, x_out : (3, 3), (9,) ndarray
-        Receive R and ``(t, d_1, d_2)`` in frame 1, t of unit length, the sign by the majority of
-        the points; without meaning when no solution is reached.
+    The solution that the known rotation reaches, or those that the rotations reach of the angular
+    5-point solver on the first five matches (section 'Uniform 11-point algorithm'). These are not
+    all that there are: at low velocities solutions lie within 0.1 to 0.3 degrees of each other,
+    and a start is attracted by any of them.
+
+    On a flight of constant velocity A has a null space of dimension 3, as for `linear_9pt`.
     """
-    points = f1.shape[0]
-    p, q = np.empty(points), np.empty(points)
-    m, s_p, s_q = row_time_factors(tau1, tau2, p, q)
-    if s_p == 0.0:
-        return False
+    factors = row_time_factors(sample)
+    if not factors.observable:
+        return 0
+    starts = 1
+    start = Solutions(np.empty((MAX_STARTS, 3, 3)), np.zeros((MAX_STARTS, 9)))
+    start.R[0] = known.rotation
+    if not known.predicted:
+        starts = solve_5pt(Sample(sample.f1[:5], sample.f2[:5], sample.tau1[:5], sample.tau2[:5]),
+                           known, start)
+    points = sample.f1.shape[0]
+    equations = _Equations(sample, factors, np.empty((9, points)), np.empty((12, points)),
+                           np.empty((11, points)), np.empty(9), np.empty(9))
     y = np.empty(9)
-    R_out[:] = R_start
-    if not (_reach_rank_8(f1, f2, p, q, R_out, y)
-            and translation_and_velocities(y, m, s_p, s_q, x_out)):
-        return False
-    front, behind = cheirality_votes(f1, f2, tau1, tau2, R_out, x_out)
-    if behind > front:
-        for i in range(9):
-            x_out[i] = -x_out[i]
-    return True
+    count = 0
+    for k in range(starts):
+        R, x = out.R[count], out.x[count]
+        R[:] = start.R[k]
+        if _reach_rank_8(equations, R, y) and translation_and_velocities(y, factors, x):
+            point_forward(sample, R, x)
+            count += 1
+    return count

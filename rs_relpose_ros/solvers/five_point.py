@@ -16,25 +16,15 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.geometry.so3 import exp_so3
+from rs_relpose_ros.geometry.vectors import cross, dot, norm, rotated
 from rs_relpose_ros.solvers.cheirality import cheirality_votes
-from rs_relpose_ros.solvers.linear_algebra import reflect, triangularise
+from rs_relpose_ros.solvers.linear_algebra import null_direction, reflect, triangularise
 from rs_relpose_ros.solvers.polynomial import real_roots
+from rs_relpose_ros.solvers.solver import Knowledge, Sample, Solutions
 
 Array = NDArray[np.float64]
 
-
 MAX_SOLUTIONS = 10
-# A double root that rounding has made a conjugate pair; Newton's method decides on it.
-_PAIR_TOLERANCE = 1e-4
-_POLISH_STEPS = 4
-# Largest coefficient after the elimination above which it is tried in another basis: rounding is
-# that much larger (1 to 2 % of random problems; seldom twice).
-_LARGEST_COEFFICIENT = 1e4
-_BASES = 3
-# Constraint residual (unit rays, unit t) above which a candidate is no solution.
-_ACCEPTED_RESIDUAL = 1e-10
-_CONVERGED = 1e-15
-_NO_TIMES = np.zeros(5)
 
 # Monomials, in Nister's order of the cubic ones: the first ten are eliminated.
 _CUBIC = ['xxx', 'yyy', 'xxy', 'xyy', 'xxz', 'xx1', 'yyz', 'yy1', 'xyz', 'xy1',
@@ -171,14 +161,18 @@ def _eliminate(M: Array) -> float:
 
 @kernel
 def _reduced_constraints(basis: Array, M: Array) -> bool:
-    """Constraints in `M` (10, 20) after elimination, `basis` (4, 9) turned if it must be."""
+    """Constraints in `M` (10, 20) after elimination, `basis` (4, 9) turned if it must be.
+
+    Rounding is as large as the largest coefficient: beyond 1e4 (1 to 2 % of random problems, in a
+    second basis seldom) another basis is tried.
+    """
     coefficient = math.inf
-    for attempt in range(_BASES):
+    for attempt in range(3):
         if attempt > 0:
             _turn_basis(basis)
         _cubic_constraints(basis, M)
         coefficient = _eliminate(M)
-        if coefficient < _LARGEST_COEFFICIENT:
+        if coefficient < 1e4:
             break
     return coefficient < math.inf
 
@@ -224,17 +218,7 @@ def _essential_matrix(B: Array, z: float, basis: Array, E: Array) -> bool:
         for j in range(3):
             for k in range(4, -1, -1):
                 V[i, j] = V[i, j] * z + B[i, j, k]
-    longest = 0.0
-    x, y, w = 0.0, 0.0, 0.0
-    for i in range(3):
-        p, q = V[i], V[(i + 1) % 3]
-        cx = p[1] * q[2] - p[2] * q[1]
-        cy = p[2] * q[0] - p[0] * q[2]
-        cw = p[0] * q[1] - p[1] * q[0]
-        length2 = cx * cx + cy * cy + cw * cw
-        if length2 > longest:
-            longest = length2
-            x, y, w = cx, cy, cw
+    (x, y, w), _ = null_direction(V)
     norm2 = 0.0
     for i in range(3):
         for j in range(3):
@@ -264,33 +248,26 @@ def _orthonormalise(R: Array) -> bool:
         if not worst < 0.1:
             return False
         for i in range(3):
-            x, y, z = R[i, 0], R[i, 1], R[i, 2]
+            row = (R[i, 0], R[i, 1], R[i, 2])
             for j in range(3):
-                R[i, j] = x * G[0, j] + y * G[1, j] + z * G[2, j]
+                R[i, j] = row[0] * G[0, j] + row[1] * G[1, j] + row[2] * G[2, j]
         if worst < 1e-8:
             return True
     return True
 
 
 @kernel
-def _decompose(E: Array, f1: Array, f2: Array, R: Array, t: Array) -> bool:
-    """R and t of ``E = [t]x R`` that put most points in front of both cameras.
+def _decompose(E: Array, sample: Sample, R: Array, x: Array) -> bool:
+    """R and t (in `x`) of ``E = [t]x R`` that put most points in front of both cameras.
 
     Horn: ``(t.t) R = cofactors(E) -+ [t]x E``, for t and -t.
     """
-    longest = 0.0
-    for i in range(3):
-        j = (i + 1) % 3
-        x = E[1, i] * E[2, j] - E[2, i] * E[1, j]
-        y = E[2, i] * E[0, j] - E[0, i] * E[2, j]
-        z = E[0, i] * E[1, j] - E[1, i] * E[0, j]
-        length2 = x * x + y * y + z * z
-        if length2 > longest:
-            longest = length2
-            t[0], t[1], t[2] = x, y, z
-    if not longest > 1e-20:
+    t, length2 = null_direction(np.ascontiguousarray(E.T))
+    if not length2 > 1e-20:
         return False
-    t *= 1.0 / math.sqrt(longest)
+    scale = 1.0 / math.sqrt(length2)
+    for i in range(3):
+        x[i] = t[i] * scale
     candidate = np.empty((3, 3))
     best = -1
     sign = 1.0
@@ -300,17 +277,17 @@ def _decompose(E: Array, f1: Array, f2: Array, R: Array, t: Array) -> bool:
             for j in range(3):
                 j1, j2 = (j + 1) % 3, (j + 2) % 3
                 cofactor = E[i1, j1] * E[i2, j2] - E[i1, j2] * E[i2, j1]
-                cross = t[i1] * E[i2, j] - t[i2] * E[i1, j]
-                candidate[i, j] = cofactor - twist * cross
+                t_cross_E = x[i1] * E[i2, j] - x[i2] * E[i1, j]
+                candidate[i, j] = cofactor - twist * t_cross_E
         if not _orthonormalise(candidate):
             continue
-        front, behind = cheirality_votes(f1, f2, _NO_TIMES, _NO_TIMES, candidate, t)
+        front, behind = cheirality_votes(sample, candidate, x)
         votes = max(front, behind)
         if votes > best:
             best = votes
             sign = 1.0 if front >= behind else -1.0
             R[:] = candidate
-    t *= sign
+    x *= sign
     return best >= 0
 
 
@@ -341,43 +318,51 @@ def _solve5(J: Array, r: Array) -> bool:
 
 
 @kernel
-def _polish(f1: Array, f2: Array, R: Array, t: Array) -> bool:
-    """Newton's method on ``e = (f_1 x R f_2) . t``, R by ``Exp(theta) R``, t on the sphere."""
+def _perpendicular(t: Array, u: Array, v: Array) -> None:
+    """Write to `u`, `v` (3,) two unit vectors perpendicular to the unit vector t."""
+    smallest = 0
+    for i in range(1, 3):
+        if abs(t[i]) < abs(t[smallest]):
+            smallest = i
+    i, j = (smallest + 1) % 3, (smallest + 2) % 3
+    length = math.sqrt(t[i] * t[i] + t[j] * t[j])
+    u[smallest], u[i], u[j] = 0.0, -t[j] / length, t[i] / length
+    v[0], v[1], v[2] = cross(t, u)
+
+
+@kernel
+def _linearise(sample: Sample, R: Array, t: Array, u: Array, v: Array, J: Array,
+               right: Array) -> float:
+    """``e = (f_1 x R f_2) . t``, by (theta, t along u, t along v) in `J`, ``-e`` in `right`.
+
+    Returns the largest ``|e|``.
+    """
+    worst = 0.0
+    for k in range(5):
+        f1, h = sample.f1[k], rotated(R, sample.f2[k])
+        n = cross(f1, h)
+        by_theta = cross(h, cross(t, f1))
+        for i in range(3):
+            J[k, i] = by_theta[i]
+        J[k, 3], J[k, 4] = dot(n, u), dot(n, v)
+        right[k] = -dot(n, t)
+        worst = max(worst, abs(right[k]))
+    return worst
+
+
+@kernel
+def _polish(sample: Sample, R: Array, t: Array) -> bool:
+    """Newton's method on the constraints e, R by ``Exp(theta) R``, t on the sphere."""
+    # Of e, with unit rays and unit t: rounding, and the most that a solution leaves.
+    converged, accepted = 1e-15, 1e-10
+    steps = 4
     J, step = np.empty((5, 5)), np.empty(5)
-    # Two unit vectors perpendicular to t.
     u, v = np.empty(3), np.empty(3)
-    for attempt in range(_POLISH_STEPS + 1):
-        smallest = 0
-        for i in range(1, 3):
-            if abs(t[i]) < abs(t[smallest]):
-                smallest = i
-        i, j = (smallest + 1) % 3, (smallest + 2) % 3
-        norm = math.sqrt(t[i] * t[i] + t[j] * t[j])
-        u[smallest], u[i], u[j] = 0.0, -t[j] / norm, t[i] / norm
-        v[0] = t[1] * u[2] - t[2] * u[1]
-        v[1] = t[2] * u[0] - t[0] * u[2]
-        v[2] = t[0] * u[1] - t[1] * u[0]
-        worst = 0.0
-        for k in range(5):
-            f = f1[k]
-            hx = R[0, 0] * f2[k, 0] + R[0, 1] * f2[k, 1] + R[0, 2] * f2[k, 2]
-            hy = R[1, 0] * f2[k, 0] + R[1, 1] * f2[k, 1] + R[1, 2] * f2[k, 2]
-            hz = R[2, 0] * f2[k, 0] + R[2, 1] * f2[k, 1] + R[2, 2] * f2[k, 2]
-            nx, ny, nz = f[1] * hz - f[2] * hy, f[2] * hx - f[0] * hz, f[0] * hy - f[1] * hx
-            # de / d theta = h x (t x f_1)
-            mx, my, mz = t[1] * f[2] - t[2] * f[1], t[2] * f[0] - t[0] * f[2], (
-                t[0] * f[1] - t[1] * f[0])
-            J[k, 0] = hy * mz - hz * my
-            J[k, 1] = hz * mx - hx * mz
-            J[k, 2] = hx * my - hy * mx
-            J[k, 3] = nx * u[0] + ny * u[1] + nz * u[2]
-            J[k, 4] = nx * v[0] + ny * v[1] + nz * v[2]
-            step[k] = -(nx * t[0] + ny * t[1] + nz * t[2])
-            worst = max(worst, abs(step[k]))
-        if worst < _CONVERGED or attempt == _POLISH_STEPS:
-            return worst < _ACCEPTED_RESIDUAL
-        if not _solve5(J, step):
-            return worst < _ACCEPTED_RESIDUAL
+    for attempt in range(steps + 1):
+        _perpendicular(t, u, v)
+        worst = _linearise(sample, R, t, u, v, J, step)
+        if worst < converged or attempt == steps or not _solve5(J, step):
+            return worst < accepted
         length2 = 0.0
         for k in range(5):
             length2 += step[k] * step[k]
@@ -385,29 +370,39 @@ def _polish(f1: Array, f2: Array, R: Array, t: Array) -> bool:
         if not length2 < 0.01:
             return False
         R[:] = exp_so3(step[:3]) @ R
-        norm = math.sqrt(1.0 + step[3] * step[3] + step[4] * step[4])
+        length = norm((1.0, step[3], step[4]))
         for i in range(3):
-            t[i] = (t[i] + step[3] * u[i] + step[4] * v[i]) / norm
+            t[i] = (t[i] + step[3] * u[i] + step[4] * v[i]) / length
     return False
 
 
 @kernel
-def five_point_kernel(f1: Array, f2: Array, R_out: Array, t_out: Array) -> int:
-    """All real solutions of the calibrated 5-point problem; their number.
+def _is_known(out: Solutions, count: int) -> bool:
+    """Whether solution `count` repeats one before it."""
+    R, x = out.R[count], out.x[count]
+    for j in range(count):
+        gap = 0.0
+        for i in range(3):
+            gap += abs(out.R[j, i, 0] - R[i, 0]) + abs(out.R[j, i, 1] - R[i, 1])
+            gap += abs(out.x[j, i] - x[i])
+        if gap < 1e-9:
+            return True
+    return False
 
-    Parameters
-    ----------
-    f1, f2 : (5, 3) ndarray
-        Unit rays, measured (`global_5pt`) or derotated (`angular_5pt`).
-    R_out, t_out : (>= 10, 3, 3), (>= 10, 3) ndarray
-        Receive R and the unit t: of the four decompositions of each essential matrix the one
-        that puts most of the five points in front of both cameras.
+
+@kernel
+def solve_5pt(sample: Sample, _known: Knowledge, out: Solutions) -> int:
+    """The calibrated 5-point problem: of every real essential matrix one decomposition.
+
+    Of its four decompositions it is the one that puts most points in front of both cameras. On
+    derotated rays (section 'Angular 5-point algorithm') there is no other unknown; see
+    `rs_relpose_ros.solvers.five_point` for the method.
     """
     rows = np.empty((5, 9))
     for k in range(5):
         for i in range(3):
             for j in range(3):
-                rows[k, 3 * i + j] = f1[k, i] * f2[k, j]  # f_1^T E f_2 = 0
+                rows[k, 3 * i + j] = sample.f1[k, i] * sample.f2[k, j]  # f_1^T E f_2 = 0
     basis, M = np.empty((4, 9)), np.empty((10, 20))
     _null_space(rows, basis)
     if not _reduced_constraints(basis, M):
@@ -420,22 +415,13 @@ def five_point_kernel(f1: Array, f2: Array, R_out: Array, t_out: Array) -> int:
     if not 0.0 < largest < math.inf:
         return 0
     p *= 1.0 / largest
-    found = real_roots(p, _PAIR_TOLERANCE, roots)
+    # A double root that rounding has made a pair counts; Newton's method decides on it.
+    found = real_roots(p, 1e-4, roots)
     E = np.empty((3, 3))
     count = 0
     for k in range(found):
-        R, t = R_out[count], t_out[count]
-        if not (_essential_matrix(B, roots[k], basis, E) and _decompose(E, f1, f2, R, t)
-                and _polish(f1, f2, R, t)):
-            continue
-        repeated = False
-        for j in range(count):
-            gap = 0.0
-            for i in range(3):
-                gap += abs(R_out[j, i, 0] - R[i, 0]) + abs(R_out[j, i, 1] - R[i, 1])
-                gap += abs(t_out[j, i] - t[i])
-            if gap < 1e-9:
-                repeated = True
-        if not repeated:
+        R, x = out.R[count], out.x[count]
+        if _essential_matrix(B, roots[k], basis, E) and _decompose(E, sample, R, x) \
+                and _polish(sample, R, x) and not _is_known(out, count):
             count += 1
     return count

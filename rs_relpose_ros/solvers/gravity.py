@@ -12,13 +12,29 @@ on z instead of y.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel
+from rs_relpose_ros.geometry.vectors import cross, rotated, rotated_back
+from rs_relpose_ros.solvers.solver import Knowledge, Sample
 
 Array = NDArray[np.float64]
+
+
+class AlignedRays(NamedTuple):
+    """Rays in frames with gravity on z, the second turned so that solutions crowd about yaw 0.
+
+    `a`, `b` (n, 3): ``A_1 f_1`` and ``Rz(centre) A_2 f_2``. `centre` [rad]: to be added to a yaw
+    that is found with them. `zoom`: rms distance of a and b, about the width of the crowd.
+    """
+
+    a: Array
+    b: Array
+    centre: float
+    zoom: float
 
 
 @kernel
@@ -41,79 +57,61 @@ def gravity_alignment(gravity: Array) -> Array:
 
 
 @kernel
-def rotation_from_yaw(psi: float, A1: Array, A2: Array, R: Array) -> None:
+def rotation_from_yaw(psi: float, known: Knowledge, R: Array) -> None:
     """Write ``A_1^T Rz(psi) A_2`` into `R` (3, 3)."""
     c, s = math.cos(psi), math.sin(psi)
+    A2 = known.align2
     for j in range(3):
-        x = c * A2[0, j] - s * A2[1, j]
-        y = s * A2[0, j] + c * A2[1, j]
-        z = A2[2, j]
+        turned = (c * A2[0, j] - s * A2[1, j], s * A2[0, j] + c * A2[1, j], A2[2, j])
+        column = rotated_back(known.align1, turned)
         for i in range(3):
-            R[i, j] = A1[0, i] * x + A1[1, i] * y + A1[2, i] * z
+            R[i, j] = column[i]
 
 
 @kernel
-def rotate_rows(A: Array, rays: Array, out: Array) -> None:
-    """Write ``A f`` for every row f of `rays` (n, 3) into `out` (n, 3)."""
-    for k in range(rays.shape[0]):
-        for i in range(3):
-            out[k, i] = A[i, 0] * rays[k, 0] + A[i, 1] * rays[k, 1] + A[i, 2] * rays[k, 2]
-
-
-@kernel
-def normals_at_yaw(a: Array, b: Array, c: float, s: float, normals: Array,
+def normals_at_yaw(rays: AlignedRays, c: float, s: float, normals: Array,
                    derivatives: Array) -> None:
-    """Epipolar normals ``a x Rz(psi) b`` of gravity-aligned rays, and d/d psi of them.
+    """Epipolar normals ``n = a x h`` with ``h = Rz(psi) b``, and ``dn / dpsi``.
 
     Parameters
     ----------
-    a, b : (n, 3) ndarray
-        ``A_1 f_1`` and ``A_2 f_2``.
     c, s : float
         Cosine and sine of psi.
     normals, derivatives : (n, 3) ndarray
         Overwritten; normals are in the aligned frame, ``A_1 (f_1 x R f_2)``.
     """
-    for k in range(a.shape[0]):
-        hx = c * b[k, 0] - s * b[k, 1]
-        hy = s * b[k, 0] + c * b[k, 1]
-        hz = b[k, 2]
-        normals[k, 0] = a[k, 1] * hz - a[k, 2] * hy
-        normals[k, 1] = a[k, 2] * hx - a[k, 0] * hz
-        normals[k, 2] = a[k, 0] * hy - a[k, 1] * hx
-        # dh / d psi = (-hy, hx, 0)
-        derivatives[k, 0] = -a[k, 2] * hx
-        derivatives[k, 1] = -a[k, 2] * hy
-        derivatives[k, 2] = a[k, 0] * hx + a[k, 1] * hy
+    for k in range(rays.a.shape[0]):
+        a, b = rays.a[k], rays.b[k]
+        h = (c * b[0] - s * b[1], s * b[0] + c * b[1], b[2])
+        n = cross(a, h)
+        # dh / dpsi = (-h_y, h_x, 0)
+        dn = (-a[2] * h[0], -a[2] * h[1], a[0] * h[0] + a[1] * h[1])
+        for i in range(3):
+            normals[k, i], derivatives[k, i] = n[i], dn[i]
 
 
 @kernel
-def centre_yaw(a: Array, b: Array) -> tuple[float, float]:
-    """Turn `b` so that the solutions crowd about yaw 0.
+def align_rays(sample: Sample, known: Knowledge) -> AlignedRays:
+    """Turn gravity onto z, and the rays of the second camera onto those of the first.
 
     The normals ``a x Rz(psi) b`` of distant points all nearly vanish at the true yaw, so that the
-    zeros of a determinant of them crowd there, within about the parallax.
-
-    Parameters
-    ----------
-    a, b : (n, 3) ndarray
-        Gravity-aligned unit rays; `b` is turned in place by the yaw that best aligns them.
-
-    Returns
-    -------
-    centre, width : float
-        ``argmax sum a . Rz(psi) b`` [rad], and the rms distance of the aligned rays, in
-        [1e-3, 1].
+    zeros of a determinant of them crowd there, within about the parallax. The centre of the crowd
+    is about ``argmax sum a . Rz(psi) b``. The zoom lies in [1e-3, 1].
     """
-    n = a.shape[0]
+    count = sample.f1.shape[0]
+    a, b = np.empty((count, 3)), np.empty((count, 3))
     along, across = 0.0, 0.0
-    for k in range(n):
-        along += a[k, 0] * b[k, 0] + a[k, 1] * b[k, 1]
-        across += a[k, 1] * b[k, 0] - a[k, 0] * b[k, 1]
+    for k in range(count):
+        a_k, b_k = rotated(known.align1, sample.f1[k]), rotated(known.align2, sample.f2[k])
+        for i in range(3):
+            a[k, i], b[k, i] = a_k[i], b_k[i]
+        along += a_k[0] * b_k[0] + a_k[1] * b_k[1]
+        across += a_k[1] * b_k[0] - a_k[0] * b_k[1]
     length = math.sqrt(along * along + across * across)
     c, s = (along / length, across / length) if length > 0.0 else (1.0, 0.0)
     total = 0.0
-    for k in range(n):
+    for k in range(count):
         b[k, 0], b[k, 1] = c * b[k, 0] - s * b[k, 1], s * b[k, 0] + c * b[k, 1]
         total += (a[k, 0] - b[k, 0]) ** 2 + (a[k, 1] - b[k, 1]) ** 2 + (a[k, 2] - b[k, 2]) ** 2
-    return math.atan2(s, c), min(max(math.sqrt(total / n), 1e-3), 1.0)
+    zoom = min(max(math.sqrt(total / count), 1e-3), 1.0)
+    return AlignedRays(a, b, math.atan2(s, c), zoom)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel
+from rs_relpose_ros.geometry.vectors import cross, dot, Vector
 
 Array = NDArray[np.float64]
 
@@ -149,3 +150,52 @@ def normalise(v: Array) -> float:
     for k in range(v.shape[0]):
         v[k] /= total
     return largest * total
+
+
+@kernel
+def null_direction(rows: Array) -> tuple[Vector, float]:
+    """Vector perpendicular to the rows of a matrix (3, 3) of rank 2, and its squared length.
+
+    The longest of the cross products of two rows; zero where all are parallel.
+    """
+    best, longest = (0.0, 0.0, 0.0), 0.0
+    for i in range(3):
+        direction = cross(rows[i], rows[(i + 1) % 3])
+        length2 = dot(direction, direction)
+        if length2 > longest:
+            best, longest = direction, length2
+    return best, longest
+
+
+@kernel
+def cholesky(matrix: Array, factor: Array) -> bool:
+    """Lower Cholesky factor of a symmetric matrix; False unless it is positive definite."""
+    n = matrix.shape[0]
+    for i in range(n):
+        for j in range(i + 1):
+            value = matrix[i, j]
+            for k in range(j):
+                value -= factor[i, k] * factor[j, k]
+            if i == j:
+                if not value > 0.0:
+                    return False
+                factor[i, i] = math.sqrt(value)
+            else:
+                factor[i, j] = value / factor[j, j]
+    return True
+
+
+@kernel
+def cholesky_solve(factor: Array, right: Array) -> Array:
+    """Solution of ``L L^T x = right``."""
+    n = right.shape[0]
+    x = right.copy()
+    for i in range(n):
+        for k in range(i):
+            x[i] -= factor[i, k] * x[k]
+        x[i] /= factor[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            x[i] -= factor[k, i] * x[k]
+        x[i] /= factor[i, i]
+    return x

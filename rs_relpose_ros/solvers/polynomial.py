@@ -1,4 +1,4 @@
-"""Real roots of polynomials and of trigonometric polynomials, for compiled code.
+"""Real roots of polynomials, for compiled code.
 
 The roots of a polynomial's derivative cut the line into pieces on which it is monotonic, so that
 each piece holds at most one root; applied from the linear derivative upwards this isolates **all**
@@ -10,6 +10,7 @@ real roots without a start value and without division by a leading coefficient (
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +20,15 @@ from rs_relpose_ros.compiled import kernel
 Array = NDArray[np.float64]
 
 
-# A step below this is the last one: Newton's iteration squares the error.
-_LAST_STEP = 1e-8
-_LAST_STEP_OF_DERIVATIVES = 1e-5
-_MAX_STEPS = 80
+class PairRule(NamedTuple):
+    """Which conjugate pairs ``c +- ih`` count as the real root c.
+
+    Those whose angle ``2 atan(zoom x)`` has an imaginary part below `tolerance` [rad] there:
+    ``2 zoom h / (1 + zoom^2 c^2)``.
+    """
+
+    tolerance: float
+    zoom: float
 
 
 @kernel
@@ -39,7 +45,7 @@ def _root_between(p: Array, degree: int, low: float, high: float, at_low: float,
                   last_step: float) -> float:
     """Root in a bracket on which the polynomial is monotonic: Newton, kept inside by bisection."""
     x = 0.5 * (low + high)
-    for _ in range(_MAX_STEPS):
+    for _ in range(80):  # bisection alone would need 52
         y = p[degree]
         slope = 0.0
         for k in range(degree - 1, -1, -1):
@@ -62,212 +68,105 @@ def _root_between(p: Array, degree: int, low: float, high: float, at_low: float,
 
 
 @kernel
-def roots_in_unit_interval(p: Array, pair_tolerance: float, zoom: float, roots: Array,
-                           half_gaps: Array, work: Array) -> int:
-    """All real roots in [-1, 1], ascending.
+def _write_derivatives(p: Array, derivatives: Array) -> None:
+    """Row m: the derivative of degree m, by (n - m)! smaller, so that coefficients stay moderate.
+
+    Row n is `p` itself, ascending; `derivatives` (n + 1, n + 1) is overwritten.
+    """
+    n = p.shape[0] - 1
+    derivatives[:] = 0.0
+    derivatives[n] = p
+    for m in range(n - 1, 0, -1):
+        scale = 1.0 / (n - m)
+        for k in range(m + 1):
+            derivatives[m, k] = derivatives[m + 1, k + 1] * ((k + 1) * scale)
+
+
+@kernel
+def _half_gap2(derivatives: Array, extremum: float, at_extremum: float, rule: PairRule) -> float:
+    """``h^2`` of the pair ``extremum +- ih`` of the polynomial in the last row, if it counts.
+
+    Else -1. Near its extremum c, ``p(x) = p(c) + p''(c) (x - c)^2 / 2``, of which the row of the
+    second derivative holds the half.
+    """
+    n = derivatives.shape[0] - 1
+    h2 = at_extremum / value(derivatives[n - 2], n - 2, extremum)
+    limit = 0.5 * rule.tolerance * (1.0 / rule.zoom + rule.zoom * extremum * extremum)
+    return h2 if 0.0 <= h2 < limit * limit else -1.0
+
+
+@kernel
+def _roots_between_cuts(derivatives: Array, m: int, cuts: Array, rule: PairRule, roots: Array,
+                        half_gaps: Array) -> int:
+    """Roots in [-1, 1] of row m of the derivatives, ascending; -1 where a value is not finite.
+
+    `cuts` are the roots of the row before: row m is monotonic between them. Pairs count only in
+    the last row, the polynomial itself.
+    """
+    p = derivatives[m]
+    is_last = m == derivatives.shape[0] - 1
+    # A step below this is the last one: Newton's iteration squares the error.
+    last_step = 1e-8 if is_last else 1e-5
+    count, left = 0, -1.0
+    at_left = value(p, m, left)
+    for k in range(cuts.shape[0] + 1):
+        right = cuts[k] if k < cuts.shape[0] else 1.0
+        at_right = value(p, m, right)
+        if not (math.isfinite(at_left) and math.isfinite(at_right)):
+            return -1
+        if (at_left > 0.0) != (at_right > 0.0):
+            # Exactly 0 counts as negative: a root at a cut is then found once.
+            roots[count] = _root_between(p, m, left, right, at_left, last_step)
+            half_gaps[count] = 0.0
+            count += 1
+        elif is_last and k < cuts.shape[0]:
+            # An extremum, if no root follows: it may nearly touch zero.
+            following = value(p, m, cuts[k + 1] if k + 1 < cuts.shape[0] else 1.0)
+            h2 = _half_gap2(derivatives, right, at_right, rule)
+            if (following > 0.0) == (at_right > 0.0) and h2 >= 0.0:
+                roots[count], half_gaps[count] = right, math.sqrt(h2)
+                count += 1
+        left, at_left = right, at_right
+    return count
+
+
+@kernel
+def roots_in_unit_interval(p: Array, rule: PairRule, roots: Array, half_gaps: Array) -> int:
+    """All real roots in [-1, 1], ascending; their number, 0 when a coefficient is not finite.
 
     Parameters
     ----------
     p : (n + 1,) ndarray
         Ascending coefficients, n >= 1.
-    pair_tolerance, zoom : float
-        A conjugate pair ``c +- ih`` counts as the root c if the *angle* ``2 atan(zoom x)`` has an
-        imaginary part below the tolerance there: ``2 zoom h / (1 + zoom^2 c^2)``.
     roots, half_gaps : (n,) ndarray
-        Receive the roots, and h of those that stand for a pair (else 0).
-    work : (>= n + 3, n + 1) ndarray
-        Overwritten.
-
-    Returns
-    -------
-    int
-        Number of roots; 0 when a coefficient is not finite.
+        Receive the roots, and h of those that stand for a conjugate pair (else 0).
     """
     n = p.shape[0] - 1
-    # Row m: the derivative of degree m, divided by (n - m)!, so that coefficients stay moderate.
-    for m in range(n + 1):
-        for k in range(m + 1):
-            work[m, k] = p[k] if m == n else 0.0
-    for m in range(n - 1, 0, -1):
-        scale = 1.0 / (n - m)
-        for k in range(m + 1):
-            work[m, k] = work[m + 1, k + 1] * ((k + 1) * scale)
-    cuts = work[n + 1]
-    found = work[n + 2]
-    cut_count = 0
+    derivatives, cuts = np.empty((n + 1, n + 1)), np.empty(n)
+    _write_derivatives(p, derivatives)
+    count = 0
     for m in range(1, n + 1):
-        last_step = _LAST_STEP if m == n else _LAST_STEP_OF_DERIVATIVES
-        count = 0
-        left = -1.0
-        at_left = value(work[m], m, left)
-        for k in range(cut_count + 1):
-            right = cuts[k] if k < cut_count else 1.0
-            at_right = value(work[m], m, right)
-            if not (math.isfinite(at_left) and math.isfinite(at_right)):
-                return 0
-            if (at_left > 0.0) != (at_right > 0.0):
-                # Exactly 0 counts as negative: a root at a cut is then found once.
-                found[count] = _root_between(work[m], m, left, right, at_left, last_step)
-                if m == n:
-                    half_gaps[count] = 0.0
-                count += 1
-            elif m == n and k < cut_count:
-                # An extremum that nearly touches zero: p'' = 2 work[n - 2].
-                following = value(work[m], m, cuts[k + 1] if k + 1 < cut_count else 1.0)
-                bend = value(work[n - 2], n - 2, right) if n >= 2 else 0.0
-                h2 = at_right / bend
-                limit = 0.5 * pair_tolerance * (1.0 / zoom + zoom * right * right)
-                if (following > 0.0) == (at_right > 0.0) and 0.0 <= h2 < limit * limit:
-                    found[count] = right
-                    half_gaps[count] = math.sqrt(h2)
-                    count += 1
-            left, at_left = right, at_right
-        if m == n:
-            for k in range(count):
-                roots[k] = found[k]
-        else:
-            for k in range(count):
-                cuts[k] = found[k]
-            cut_count = count
+        cuts[:count] = roots[:count]
+        count = _roots_between_cuts(derivatives, m, cuts[:count], rule, roots, half_gaps)
+        if count < 0:
+            return 0
     return count
-
-
-def half_angle_matrix(degree: int) -> Array:
-    """Samples of a trigonometric polynomial to its half-angle polynomial.
-
-    A trigonometric polynomial D of degree n is fixed by 2n + 1 samples at ``2 pi k / (2n + 1)``.
-    With ``x = tan(psi / 2)``, ``exp(i psi) = (1 + ix)^2 / (1 + x^2)``, hence
-    ``(1 + x^2)^n D(psi)`` is a polynomial of degree 2n in x.
-
-    Returns
-    -------
-    (2n + 1, 2n + 1) ndarray
-        Its product with the samples gives the ascending coefficients.
-    """
-    n = degree
-    size = 2 * n + 1
-    angles = 2.0 * np.pi * np.arange(size) / size
-    matrix = np.zeros((size, size))
-    one_plus_x2 = np.polynomial.Polynomial([1.0, 0.0, 1.0])
-    turn = np.polynomial.Polynomial([1.0, 1.0j])
-    for k in range(n + 1):
-        basis = (one_plus_x2 ** (n - k) * turn ** (2 * k)).coef
-        basis = np.concatenate([basis, np.zeros(size - len(basis))])
-        weight = (1.0 if k == 0 else 2.0) / size
-        matrix += weight * (np.outer(basis.real, np.cos(k * angles))
-                            + np.outer(basis.imag, np.sin(k * angles)))
-    return matrix
-
-
-def half_angle_nodes(degree: int) -> Array:
-    """Cosine and sine (2n + 1, 2) of the half angles at which `angles_of_zeros` wants samples."""
-    half = np.pi * np.arange(2 * degree + 1) / (2 * degree + 1)
-    return np.stack([np.cos(half), np.sin(half)], axis=1)
-
-
-@kernel
-def sample_angle(node: Array, zoom: float) -> tuple[float, float, float]:
-    """Cosine and sine of the angle of a sample, and the weight that it gets.
-
-    With ``x = tan(angle / 2) / zoom = sin / cos`` of `node` (2,), a row of `half_angle_nodes`, the
-    weight ``((1 + zoom^2 x^2) / (1 + x^2))^n`` makes a trigonometric polynomial of degree n in the
-    angle one of the same degree in ``2 atan(x)``; it is returned for n = 1.
-    """
-    c, s = node[0], zoom * node[1]
-    weight = c * c + s * s
-    return (c * c - s * s) / weight, 2.0 * c * s / weight, weight
-
-
-@kernel
-def _append_angles(p: Array, outside: bool, pair_tolerance: float, zoom: float, work: Array,
-                   angles: Array, half_gaps: Array, count: int) -> int:
-    """Add the zeros with ``|x| <= 1`` of `p`, or `outside` those with ``x = -1 / y``."""
-    size = p.shape[0]
-    roots, gaps = work[size + 2], work[size + 3]
-    # 2 atan(zoom x) = 2 atan(y / zoom) - pi: outside, a step of y turns by 1 / zoom.
-    scale = 1.0 / zoom if outside else zoom
-    found = roots_in_unit_interval(p, pair_tolerance, scale, roots, gaps, work)
-    for k in range(found):
-        angle = 2.0 * math.atan(scale * roots[k])
-        if outside:
-            angle += math.pi
-        # A root on the border of both halves is found twice.
-        repeated = False
-        for j in range(count):
-            gap = abs(angle - angles[j])
-            if gap < 1e-12 or abs(gap - 2.0 * math.pi) < 1e-12:
-                repeated = True
-        if not repeated and count < angles.shape[0]:
-            angles[count] = angle
-            half_gaps[count] = 2.0 * gaps[k] / (1.0 / scale + scale * roots[k] * roots[k])
-            count += 1
-    return count
-
-
-@kernel
-def angles_of_zeros(samples: Array, matrix: Array, zoom: float, pair_tolerance: float,
-                    angles: Array, half_gaps: Array) -> int:
-    """All zeros of a real trigonometric polynomial D of degree n.
-
-    With ``x = tan(psi / 2) / zoom``, ``(1 + zoom^2 x^2)^n D`` is a polynomial of degree 2n in x,
-    sampled at the tangents of equally spaced half angles. A zoom below 1 crowds the samples around
-    angle 0: zeros that are clustered there within about `zoom`, where D is smaller by many orders
-    of magnitude than on the rest of the circle, are then resolved as well as any others.
-
-    Parameters
-    ----------
-    samples : (2n + 1,) ndarray
-        D at the angles of `sample_angle`, times its weight to the power n.
-    matrix : (2n + 1, 2n + 1) ndarray
-        Of `half_angle_matrix`.
-    pair_tolerance : float
-        A pair of roots in ``exp(i psi)`` that near to the unit circle counts as its angle.
-    angles, half_gaps : (2n,) ndarray
-        Receive the zeros [rad], and for those that stand for such a pair its distance.
-
-    Returns
-    -------
-    int
-        Number of zeros.
-    """
-    size = samples.shape[0]
-    largest = 0.0
-    for k in range(size):
-        largest = max(largest, abs(samples[k]))
-    if not 0.0 < largest < math.inf:
-        return 0
-    work = np.empty((size + 5, size))
-    p = work[size + 4]
-    for i in range(size):
-        total = 0.0
-        for k in range(size):
-            total += matrix[i, k] * samples[k]
-        p[i] = total / largest
-    count = _append_angles(p, False, pair_tolerance, zoom, work, angles, half_gaps, 0)
-    # p(-1 / y) y^2n
-    for i in range(size // 2):
-        p[i], p[size - 1 - i] = p[size - 1 - i], p[i]
-    for i in range(1, size, 2):
-        p[i] = -p[i]
-    return _append_angles(p, True, pair_tolerance, zoom, work, angles, half_gaps, count)
 
 
 @kernel
 def real_roots(p: Array, pair_tolerance: float, roots: Array) -> int:
     """All real roots of a polynomial with ascending coefficients `p` (n + 1,) into `roots` (n,).
 
-    Conjugate pairs within `pair_tolerance` (see `roots_in_unit_interval`) count as one root.
+    Conjugate pairs within `pair_tolerance` (see `PairRule`, zoom 1) count as one root.
     """
-    size = p.shape[0]
-    found, gaps = np.empty(size - 1), np.empty(size - 1)
-    work = np.empty((size + 2, size))
-    count = roots_in_unit_interval(p, pair_tolerance, 1.0, found, gaps, work)
-    for k in range(count):
-        roots[k] = found[k]
-    outside = roots_in_unit_interval(p[::-1].copy(), pair_tolerance, 1.0, found, gaps, work)
+    degree = p.shape[0] - 1
+    rule = PairRule(pair_tolerance, 1.0)
+    found, half_gaps = np.empty(degree), np.empty(degree)
+    count = roots_in_unit_interval(p, rule, roots, half_gaps)
+    outside = roots_in_unit_interval(p[::-1].copy(), rule, found, half_gaps)
     for k in range(outside):
         # +-1 belongs to the inner part; 0 is a root at infinity.
-        if 0.0 < abs(found[k]) < 1.0 and count < size - 1:
+        if 0.0 < abs(found[k]) < 1.0 and count < degree:
             roots[count] = 1.0 / found[k]
             count += 1
     return count

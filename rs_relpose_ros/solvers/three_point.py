@@ -1,4 +1,4 @@
-"""Angular 3-point solver: derotated rays and gravity, yaw and translation unknown."""
+"""Angular 3-point solver: derotated rays and gravity; yaw and translation unknown."""
 
 from __future__ import annotations
 
@@ -8,14 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel
-from rs_relpose_ros.solvers.cheirality import cheirality_votes
-from rs_relpose_ros.solvers.gravity import (
-    centre_yaw,
-    normals_at_yaw,
-    rotate_rows,
-    rotation_from_yaw,
-)
-from rs_relpose_ros.solvers.polynomial import (
+from rs_relpose_ros.geometry.vectors import rotated_back
+from rs_relpose_ros.solvers.cheirality import point_forward
+from rs_relpose_ros.solvers.gravity import align_rays, normals_at_yaw, rotation_from_yaw
+from rs_relpose_ros.solvers.linear_algebra import null_direction
+from rs_relpose_ros.solvers.solver import Knowledge, Sample, Solutions
+from rs_relpose_ros.solvers.trigonometric import (
     angles_of_zeros,
     half_angle_matrix,
     half_angle_nodes,
@@ -24,81 +22,63 @@ from rs_relpose_ros.solvers.polynomial import (
 
 Array = NDArray[np.float64]
 
-
 MAX_SOLUTIONS = 4
-# A pair of roots of the polynomial in exp(i psi) that near to the unit circle is one real angle.
-PAIR_TOLERANCE = 1e-3
-
-_DEGREE = 2
-_HALF_ANGLE = half_angle_matrix(_DEGREE)
-_NODES = half_angle_nodes(_DEGREE)
-_NO_TIMES = np.zeros(3)
+DEGREE = 2
+HALF_ANGLE, NODES = half_angle_matrix(DEGREE), half_angle_nodes(DEGREE)
 
 
 @kernel
 def _triple(a: Array, b: Array, c: Array) -> float:
+    """``a . (b x c)``."""
     return (a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2])
             + a[2] * (b[0] * c[1] - b[1] * c[0]))
 
 
 @kernel
-def angular_3pt_kernel(f1: Array, f2: Array, A1: Array, A2: Array, R_out: Array,
-                       t_out: Array) -> int:
-    """All solutions of `angular_3pt` for unit rays `f1`, `f2` (3, 3); their number.
+def _newton_step(n: Array, dn: Array) -> float:
+    """``det / (d det / d psi)`` of the three normals."""
+    slope = (_triple(dn[0], n[1], n[2]) + _triple(n[0], dn[1], n[2])
+             + _triple(n[0], n[1], dn[2]))
+    return _triple(n[0], n[1], n[2]) / slope
 
-    Parameters
-    ----------
-    A1, A2 : (3, 3) ndarray
-        `gravity_alignment` of the two cameras' gravity.
-    R_out, t_out : (>= 4, 3, 3), (>= 4, 3) ndarray
-        Receive R and the unit t in frame 1, its sign by the majority of the three points.
+
+@kernel
+def solve_angular_3pt(sample: Sample, known: Knowledge, out: Solutions) -> int:
+    """The normals ``n = f_1 x R f_2`` of three matches lie in one plane, perpendicular to t.
+
+    With gravity on z in both frames ``R = A_1^T Rz(psi) A_2``, and the determinant of the 3x3
+    matrix of normals (section 'Angular 3-point algorithm') is a trigonometric polynomial of degree
+    2 in psi: five samples give a polynomial of degree 4 in the tangent of the half angle. For the
+    global shutter this is the upright 3-point problem of Fraundorfer et al. (ECCV 2010).
+
+    The model is exact for a global shutter and on a flight of constant velocity.
     """
-    a, b = np.empty((3, 3)), np.empty((3, 3))
-    rotate_rows(A1, f1, a)
-    rotate_rows(A2, f2, b)
-    centre, zoom = centre_yaw(a, b)
+    rays = align_rays(sample, known)
     n, dn = np.empty((3, 3)), np.empty((3, 3))
-    samples = np.empty(_NODES.shape[0])
-    for k in range(_NODES.shape[0]):
-        c, s, weight = sample_angle(_NODES[k], zoom)
-        normals_at_yaw(a, b, c, s, n, dn)
-        samples[k] = _triple(n[0], n[1], n[2]) * weight**_DEGREE
+    samples = np.empty(NODES.shape[0])
+    for k in range(NODES.shape[0]):
+        c, s, weight = sample_angle(NODES[k], rays.zoom)
+        normals_at_yaw(rays, c, s, n, dn)
+        samples[k] = _triple(n[0], n[1], n[2]) * weight**DEGREE
     angles, half_gaps = np.empty(MAX_SOLUTIONS), np.empty(MAX_SOLUTIONS)
-    found = angles_of_zeros(samples, _HALF_ANGLE, zoom, PAIR_TOLERANCE, angles, half_gaps)
-    t = np.empty(3)
+    found = angles_of_zeros(samples, HALF_ANGLE, rays.zoom, angles, half_gaps)
     count = 0
     for k in range(found):
         psi = angles[k]
-        normals_at_yaw(a, b, math.cos(psi), math.sin(psi), n, dn)
+        normals_at_yaw(rays, math.cos(psi), math.sin(psi), n, dn)
         if half_gaps[k] == 0.0:
-            # One Newton step on the determinant itself, free of the polynomial's rounding.
-            slope = (_triple(dn[0], n[1], n[2]) + _triple(n[0], dn[1], n[2])
-                     + _triple(n[0], n[1], dn[2]))
-            step = _triple(n[0], n[1], n[2]) / slope
+            # The step is taken on the determinant itself: free of the polynomial's rounding.
+            step = _newton_step(n, dn)
             if abs(step) < 1e-4:
                 psi -= step
-                normals_at_yaw(a, b, math.cos(psi), math.sin(psi), n, dn)
-        # t is perpendicular to all three normals: the longest of their cross products.
-        longest = 0.0
-        for i in range(3):
-            p, q = n[i], n[(i + 1) % 3]
-            x = p[1] * q[2] - p[2] * q[1]
-            y = p[2] * q[0] - p[0] * q[2]
-            z = p[0] * q[1] - p[1] * q[0]
-            length2 = x * x + y * y + z * z
-            if length2 > longest:
-                longest = length2
-                t[0], t[1], t[2] = x, y, z
-        if not longest > 1e-28:
+                normals_at_yaw(rays, math.cos(psi), math.sin(psi), n, dn)
+        direction, length2 = null_direction(n)
+        if not length2 > 1e-28:
             continue
-        rotation_from_yaw(centre + psi, A1, A2, R_out[count])
-        scale = 1.0 / math.sqrt(longest)
+        t, scale = rotated_back(known.align1, direction), 1.0 / math.sqrt(length2)
         for i in range(3):
-            t_out[count, i] = scale * (A1[0, i] * t[0] + A1[1, i] * t[1] + A1[2, i] * t[2])
-        front, behind = cheirality_votes(f1, f2, _NO_TIMES, _NO_TIMES, R_out[count],
-                                         t_out[count])
-        if behind > front:
-            for i in range(3):
-                t_out[count, i] = -t_out[count, i]
+            out.x[count, i] = scale * t[i]
+        rotation_from_yaw(rays.centre + psi, known, out.R[count])
+        point_forward(sample, out.R[count], out.x[count])
         count += 1
     return count

@@ -15,60 +15,65 @@ rotation, so that determinants differ by a constant factor and solutions by the 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel
+from rs_relpose_ros.solvers.solver import Sample
 
 Array = NDArray[np.float64]
 
 
-# Row times closer than this cannot tell a velocity from a translation.
-_LEAST_SPREAD = 1e-12
+class RowTimeFactors(NamedTuple):
+    """p, q (n,), the mean row time m [s] and the scales s_p, s_q [s].
+
+    `observable` is False where the row times do not differ: velocities are then not seen.
+    """
+
+    p: Array
+    q: Array
+    m: float
+    s_p: float
+    s_q: float
+    observable: bool
 
 
 @kernel
-def row_time_factors(tau1: Array, tau2: Array, p: Array, q: Array) -> tuple[float, float, float]:
-    """Write p and q (n,); ``m, s_p, s_q``, the scales 0 where the row times do not differ."""
+def row_time_factors(sample: Sample) -> RowTimeFactors:
+    """Factors of a sample; p and q are not scaled where velocities are not observable."""
+    tau1, tau2 = sample.tau1, sample.tau2
     n = tau1.shape[0]
     m = 0.0
     for k in range(n):
         m += tau1[k] / n
-    s_p = 0.0
-    s_q = 0.0
+    p, q = np.empty(n), np.empty(n)
+    s_p, s_q = 0.0, 0.0
     for k in range(n):
         p[k] = tau1[k] - m
         q[k] = tau2[k] - tau1[k]
         s_p = max(s_p, abs(p[k]))
         s_q = max(s_q, abs(q[k]))
-    if not (_LEAST_SPREAD < s_p < math.inf and _LEAST_SPREAD < s_q < math.inf):
-        return m, 0.0, 0.0
-    for k in range(n):
-        p[k] /= s_p
-        q[k] /= s_q
-    return m, s_p, s_q
+    # Row times closer than this [s] cannot tell a velocity from a translation.
+    least = 1e-12
+    observable = least < s_p < math.inf and least < s_q < math.inf
+    if observable:
+        for k in range(n):
+            p[k] /= s_p
+            q[k] /= s_q
+    return RowTimeFactors(p, q, m, s_p, s_q, observable)
 
 
 @kernel
-def fill_columns(normals: Array, p: Array, q: Array, A: Array) -> None:
-    """Write the rows ``[n, p n, q n]`` into `A` (n, 9)."""
-    for k in range(normals.shape[0]):
-        for i in range(3):
-            A[k, i] = normals[k, i]
-            A[k, 3 + i] = p[k] * normals[k, i]
-            A[k, 6 + i] = q[k] * normals[k, i]
-
-
-@kernel
-def translation_and_velocities(y: Array, m: float, s_p: float, s_q: float, x: Array) -> bool:
+def translation_and_velocities(y: Array, factors: RowTimeFactors, x: Array) -> bool:
     """``x = (t, d_1, d_2)`` with ``|t| = 1`` from `y` (9,); False where t vanishes."""
     norm2 = 0.0
     for i in range(3):
-        difference = y[3 + i] / s_p  # d_2 - d_1
-        x[6 + i] = y[6 + i] / s_q
+        difference = y[3 + i] / factors.s_p  # d_2 - d_1
+        x[6 + i] = y[6 + i] / factors.s_q
         x[3 + i] = x[6 + i] - difference
-        x[i] = y[i] - m * difference
+        x[i] = y[i] - factors.m * difference
         norm2 += x[i] * x[i]
     # |y| = 1: a translation of this size is rounding.
     if not norm2 > 1e-20:

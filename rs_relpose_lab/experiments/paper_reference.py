@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.solvers import inputs
-from rs_relpose_ros.solvers.solution import MinimalSolution
+from rs_relpose_ros.solvers.public import MinimalSolution
 
 Array = NDArray[np.float64]
 

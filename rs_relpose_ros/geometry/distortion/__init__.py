@@ -1,0 +1,1 @@
+"""Lens distortion: a module for each model, and the registry of all (`models`)."""
