@@ -33,7 +33,8 @@ _KERNELS: dict[str, Any] = {}
 @ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_char_p)
 def _address(key: bytes) -> int:
     """Machine address of the kernel and argument types in `key`; compiled or loaded if need be."""
-    name, arguments = pickle.loads(base64.b64decode(key))
+    # Of no other origin than this module: a constant of compiled code.
+    name, arguments = pickle.loads(base64.b64decode(key))  # noqa: S301
     compiled = _compiled(_KERNELS[name], arguments)
     address: int = compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name)
     return address

@@ -136,7 +136,8 @@ def test_differing_poses_are_found(tmp_path):
     row = '1,2,0.6,0.8,0,0,0,0,1,0.1,0.1,0.1,0.1,0.1,50,{},{},OK'
     live = write('live.csv', row.format('', ''), row.format('', '').replace('1,2,', '2,3,'))
     same = write('same.csv', row.format(60, 'uniform'),
-                 row.format(60, 'uniform').replace('1,2,', '2,3,'), '3,4' + ',' * 14 + '9,,NO_IMU')
+                 row.format(60, 'uniform').replace('1,2,', '2,3,'),
+                 '3,4' + ',' * 14 + '9,,BAD_INPUT')
     assert differing_poses(live, same) == (0, 2)
     off = row.format(60, 'uniform').replace('0.6,', '0.6000000000000001,')
     one_digit = write('digit.csv', off, row.format(60, 'uniform').replace('1,2,', '2,3,'))

@@ -22,7 +22,6 @@ class Status(str, Enum):
     LOW_PARALLAX = 'LOW_PARALLAX'
     PURE_ROTATION = 'PURE_ROTATION'
     BAD_INPUT = 'BAD_INPUT'
-    NO_IMU = 'NO_IMU'
 
 
 def _nan(*shape: int) -> Array:
