@@ -14,7 +14,7 @@ from rs_relpose_ros.bags.reader import Bag, BagMessage
 from rs_relpose_ros.bags.topics import SensorTopics
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
-from rs_relpose_ros.estimator.estimate import warm_up
+from rs_relpose_ros.estimator.warm_up import warm_up
 from rs_relpose_ros.front_end.front_end import FrameFailed, FrontEnd
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.front_end.sequencer import FrameRefused, SequencerCounts
