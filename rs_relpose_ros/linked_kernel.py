@@ -18,8 +18,7 @@ from typing import Any, ParamSpec, TypeVar
 from llvmlite import binding, ir
 from numba.core import cgutils, types
 from numba.core.serialize import dumps
-from numba.core.typing import signature
-from numba.core.typing.templates import AbstractTemplate, infer_global
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import lower_builtin
 
 P = ParamSpec('P')
