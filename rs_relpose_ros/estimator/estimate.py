@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 
 import numpy as np
@@ -164,6 +165,8 @@ class Estimation:
         self.priors = _priors(problem, mode, config, interval)
         self.interval = interval
         self.iterations = 0
+        self.deadline = (time.perf_counter() + config.time_limit if config.time_limit > 0.0
+                         else math.inf)
         # Whether solvers were spared, since one before them explained enough.
         self.some_unasked = False
 
@@ -203,7 +206,7 @@ class Estimation:
     def sample(self, enough: float = EXPLAINED) -> Solutions:
         """The best hypotheses, of solvers asked until one explains `enough` of the matches."""
         drawn = draw_hypotheses(self.problem, self.mode, self.config, self.order, self.seed,
-                                enough)
+                                enough, self.deadline)
         self.iterations += drawn.samples
         self.some_unasked = drawn.some_unasked
         return drawn.hypotheses

@@ -16,12 +16,11 @@ from rs_relpose_ros.solvers.solver import Solutions
 Array = NDArray[np.float64]
 
 
-def warm_up() -> None:
-    """Compile (or load from the cache) every kernel of every solver."""
+def warm_up(config: EstimatorConfig | None = None) -> None:
+    """Compile (or load from the cache) every kernel of an estimate with `config`."""
     points1, points2, camera, motion = _sideways()
-    for solver in MODES:
-        estimate_relative_pose(points1, points2, camera, motion, motion, np.eye(3),
-                               1e-4 * np.eye(3), config=EstimatorConfig(solver=solver))
+    estimate_relative_pose(points1, points2, camera, motion, motion, np.eye(3), 1e-4 * np.eye(3),
+                           config=config)
 
 
 def warm_up_sampling() -> None:

@@ -115,7 +115,7 @@ class Replay:
         InputError, MissingInputError
             The bag is damaged, its camera is not calibrated, or no frame of it could be used.
         """
-        warm_up()
+        warm_up(self._front_end.parameters.estimator)
         started = time.perf_counter()
         for role, message in self._intake.feed.messages(self._bag, self._topics):
             self._first_ns = self._first_ns or message.bag_time_ns
