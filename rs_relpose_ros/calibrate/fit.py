@@ -145,12 +145,13 @@ def evaluate(problem: Problem, unknowns: Unknowns, derivatives: bool = True) -> 
     weights = np.repeat([np.ones(pairs), problem.bend_sigma**-2, problem.turn_sigma**-2],
                         [2, 3, 3], axis=0).T
     losses = sums.losses + 0.5 * (weights * own**2).sum(axis=1)
-    own, weights = own[:size], weights[:size]
+    if not derivatives:
+        return Evaluation(losses, sums.residuals, *3 * (np.empty(0),))
     H = sums.hessian + np.tril(sums.hessian, -1).swapaxes(1, 2)
     g_g, H_gg = sums.gradient[:, :GLOBAL], H[:, :GLOBAL, :GLOBAL]
     g_l, H_lg = sums.gradient[:, GLOBAL:] + weights * own, H[:, GLOBAL:, :GLOBAL]
     H_ll = H[:, GLOBAL:, GLOBAL:] + weights[:, :, None] * np.eye(LOCAL)
-    H_ll *= 1.0 + unknowns.damping[:size, None, None] * np.eye(LOCAL)
+    H_ll *= 1.0 + unknowns.damping[:, None, None] * np.eye(LOCAL)
     # Schur complement: score = g_g - H_gl H_ll^-1 g_l, reduced = H_gg - H_gl H_ll^-1 H_lg.
     back = np.linalg.solve(H_ll, np.concatenate([H_lg, g_l[:, :, None]], axis=2))
     eliminated = H_lg.swapaxes(1, 2) @ back
