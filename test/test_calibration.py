@@ -115,7 +115,7 @@ def test_camera_read_upwards_with_unknown_focal_length():
     result = calibrate(recorded.tracks, recorded.gyro, camera_of(truth, guess), focal_known=False)
     assert_right(result, truth)
     assert result.focal_factor.value * guess == pytest.approx(900.0, rel=0.02)
-    assert 'readout_direction: "up"' in parameter_file(result, 'A test.', compressed=False)
+    assert "readout_direction: 'up'" in parameter_file(result, 'A test.', compressed=False)
 
 
 @pytest.mark.long

@@ -19,18 +19,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GyroSeries:
-    """Samples of a gyro, IMU frame.
+    """Samples of a gyro; taken as array_likes."""
 
-    Parameters
-    ----------
-    stamps_ns : (K,) array_like of int
-        On the IMU clock, strictly increasing.
-    rates : (K, 3) array_like
-        Angular velocity as measured [rad/s].
-    """
-
-    stamps_ns: NDArray[np.int64]
-    rates: Array
+    stamps_ns: NDArray[np.int64]    # (K,) IMU clock, strictly increasing
+    rates: Array                    # (K, 3) as measured, IMU frame [rad/s]
 
     def __post_init__(self) -> None:
         stamps = np.ascontiguousarray(self.stamps_ns, dtype=np.int64)
@@ -61,14 +53,9 @@ class GyroSeries:
 
 
 def noise_density(times: Array, rates: Array) -> float:
-    """White noise of a gyro [rad/s/sqrt(Hz)], from third differences of its samples.
+    """White noise [rad/s/sqrt(Hz)] of rates (K, 3) at times (K,), from third differences.
 
     A movement that is smooth from sample to sample drops out of them; vibration counts as noise.
-
-    Parameters
-    ----------
-    times, rates : (K,), (K, 3) ndarray
-        [s], [rad/s].
     """
     steps = np.diff(times)
     step = float(np.median(steps))
