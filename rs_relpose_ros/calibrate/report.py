@@ -81,41 +81,34 @@ def _shutter_text(result: CalibrationResult) -> str:
 def parameter_file(result: CalibrationResult, title: str, *, compressed: bool,
                    feature_rows: tuple[float, ...] = (0.0, 0.0)) -> str:
     """The node's parameter file; figures that are not observable are left out, and named."""
-    readout, offset = result.readout_time, result.time_offset
+    readout, offset, rotation = result.readout_time, result.time_offset, result.rotation
+    shutter, biases = _shutter_text(result), result.gyro_bias
+    rolling = result.shutter != 'global'
+    # What a file has of each figure that is observable.
+    told = [
+        (readout.observable, f'readout_time ({readout.remark})', [
+            SourcedValue(
+                'readout_time', round(abs(readout.value), 6) if rolling else 0.0,
+                f'{shutter[:1].upper()}{shutter[1:]}. Estimate {_ms(readout)} (1 sigma).'),
+            SourcedValue('readout_direction', 'up' if rolling and readout.value < 0.0 else 'down',
+                         'By the sign of that estimate.')]),
+        (offset.observable, f'time_offset ({offset.remark})', [
+            SourcedValue('stamp_row', 'first', 'Convention of time_offset here.'),
+            SourcedValue('time_offset', round(offset.value, 6),
+                         f'1 sigma {_MS * offset.sigma:.2f} ms.')]),
+        (rotation.observable, f'quat_cam_imu_xyzw ({rotation.remark})', [SourcedValue(
+            'quat_cam_imu_xyzw', tuple(round(v, 7) for v in result.quat_cam_imu_xyzw),
+            f'{axes_text(result.axis_map)}, {np.degrees(rotation.value):.2f} deg off; '
+            f'1 sigma {np.degrees(rotation.sigma):.3f} deg at most.')]),
+        (all(bias.observable for bias in biases), 'gyro_bias', [SourcedValue(
+            'gyro_bias', tuple(round(bias.value, 5) for bias in biases), '1 sigma '
+            + ', '.join(f'{bias.sigma:.5f}' for bias in biases) + ' rad/s.')])]
     values = [SourcedValue('image_transport', 'compressed' if compressed else 'raw',
                            'As the bag has them.')]
-    missing = []
-    if readout.observable:
-        global_shutter, shutter = result.shutter == 'global', _shutter_text(result)
-        values.append(SourcedValue(
-            'readout_time', 0.0 if global_shutter else round(abs(readout.value), 6),
-            f'{shutter[:1].upper()}{shutter[1:]}. Estimate {_ms(readout)} (1 sigma).'))
-        upwards = readout.value < 0.0 and not global_shutter
-        values.append(SourcedValue('readout_direction', 'up' if upwards else 'down',
-                                   'By the sign of that estimate.'))
-    else:
-        missing.append(f'readout_time ({readout.remark})')
-    if offset.observable:
-        values.append(SourcedValue('stamp_row', 'first', 'Convention of time_offset here.'))
-        values.append(SourcedValue('time_offset', round(offset.value, 6),
-                                   f'1 sigma {_MS * offset.sigma:.2f} ms.'))
-    else:
-        missing.append(f'time_offset ({offset.remark})')
-    if result.rotation.observable:
-        values.append(SourcedValue(
-            'quat_cam_imu_xyzw', tuple(round(v, 7) for v in result.quat_cam_imu_xyzw),
-            f'{axes_text(result.axis_map)}, {np.degrees(result.rotation.value):.2f} deg off; '
-            f'1 sigma {np.degrees(result.rotation.sigma):.3f} deg at most.'))
-    else:
-        missing.append(f'quat_cam_imu_xyzw ({result.rotation.remark})')
-    if all(bias.observable for bias in result.gyro_bias):
-        values.append(SourcedValue(
-            'gyro_bias', tuple(round(bias.value, 5) for bias in result.gyro_bias), '1 sigma '
-            + ', '.join(f'{bias.sigma:.5f}' for bias in result.gyro_bias) + ' rad/s.'))
-    else:
-        missing.append('gyro_bias')
+    values += [value for observable, _, group in told if observable for value in group]
     if feature_rows[1] > 0.0:
         values.append(SourcedValue('feature_rows', tuple(feature_rows), 'As given to calibrate.'))
+    missing = [name for observable, name, _ in told if not observable]
     if missing:
         title += ' Not observable in this recording, so left out: ' + '; '.join(missing) + '.'
     return parameter_text(title, values)
