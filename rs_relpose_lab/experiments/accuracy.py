@@ -26,17 +26,9 @@ from rs_relpose_ros import RelativePose, warm_up
 class Trial:
     """One problem, estimated.
 
-    Attributes
-    ----------
-    cell, noise : str
-    sigma_factor : float
-        Told sigmas are so many times the true ones.
-    seed : int
-    status : str
-    error, oracle : PoseError
-        Of the estimator and of the oracle.
-    duration : float
-        Of the whole estimate [s].
+    `sigma_factor`: told sigmas are so many times the true ones.
+    `error`, `oracle`: of the estimator and of the oracle.
+    `duration`: of the whole estimate [s].
     """
 
     cell: str
@@ -79,14 +71,8 @@ def run_accuracy(run: AccuracyRun, cache: OracleCache, jobs: int = 1,
                  on_trials: Callable[[int], object] = lambda count: None) -> list[Trial]:
     """Run all trials.
 
-    Parameters
-    ----------
-    run : AccuracyRun
-    cache : OracleCache
-    jobs : int
-        Processes; durations are comparable only where each has a core of its own.
-    on_trials : callable
-        Called with the number of estimates that have been added.
+    `jobs`: processes; durations are comparable only where each has a core of its own.
+    `on_trials`: called with the number of estimates that have been added.
     """
     seeds, chunk = range(run.first_seed, run.first_seed + run.trials), 10
     tasks = [_Task(run, cell, noise, tuple(seeds[first:first + chunk]),

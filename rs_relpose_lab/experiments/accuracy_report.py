@@ -27,12 +27,9 @@ GROSS_ERROR = 2.0
 class Consistency:
     """How the errors compare with the covariance.
 
-    Attributes
-    ----------
-    mean : float
-        Of the inner 98 % of NEES, by its degrees of freedom: 1 is right, more is overconfident.
-    above : float
-        Share above the 95 % quantile of chi-square: 0.05 is right.
+    `mean`: of the inner 98 % of NEES, by its degrees of freedom: 1 is right, more is
+        overconfident.
+    `above`: share above the 95 % quantile of chi-square: 0.05 is right.
     """
 
     mean: float
@@ -43,19 +40,13 @@ class Consistency:
 class CellStatistics:
     """Of one cell with one kind of noise and one factor of the told sigmas.
 
-    Attributes
-    ----------
-    noise, sigma_factor, cell, trials
-        What was run.
-    lost, gross : int
-        Trials without a pose, and with a rotation more than `GROSS_ERROR` wrong.
-    rotation, translation, oracle_rotation, oracle_translation : Quantiles
-        Of the estimator and of the oracle on the same problems; a lost pose counts as infinite.
-    rotation_ratio, translation_ratio : Quantiles
-        Estimator by oracle: of the medians and of the 90th percentiles.
-    nees, oracle_nees : Consistency
-    duration : float
-        Median [ms].
+    `noise`, `sigma_factor`, `cell`, `trials`: what was run.
+    `lost`, `gross`: trials without a pose, and with a rotation more than `GROSS_ERROR` wrong.
+    `rotation`, `translation`, `oracle_rotation`, `oracle_translation`: of the estimator and of the
+        oracle on the same problems; a lost pose counts as infinite.
+    `rotation_ratio`, `translation_ratio`: estimator by oracle: of the medians and of the 90th
+        percentiles.
+    `duration`: median [ms].
     """
 
     noise: str
@@ -144,17 +135,8 @@ def _median(values: Array) -> float:
 def write_report(folder: Path, run: AccuracyRun, trials: Sequence[Trial]) -> str:
     """Write every trial, the statistics of every cell, the report and the plot.
 
-    Parameters
-    ----------
-    folder : pathlib.Path
-        Made where it is missing.
-    run : AccuracyRun
-    trials : sequence of Trial
-
-    Returns
-    -------
-    str
-        The report (Markdown).
+    `folder`: made where it is missing.
+    Returns the report (Markdown).
     """
     folder.mkdir(parents=True, exist_ok=True)
     cells = [cell_statistics(group) for group in by_setting(trials).values()]

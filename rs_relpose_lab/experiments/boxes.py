@@ -31,12 +31,8 @@ SIDES = {'rotation': 'rotation error [deg]', 'translation': 'translation directi
 class Box:
     """What one box of a plot stands for, but for the method.
 
-    Attributes
-    ----------
-    experiment, case : str
-        Such as 'pixel_noise' and 'sideways'.
-    level : str
-        Along the axis of the plot.
+    `experiment`, `case`: such as 'pixel_noise' and 'sideways'.
+    `level`: along the axis of the plot.
     """
 
     experiment: str
@@ -59,11 +55,7 @@ class Record:
 class BoxErrors:
     """Errors of a method in a box, of the trials with a pose.
 
-    Attributes
-    ----------
-    trials : int
-    rotation, translation : (K,) ndarray
-        [deg].
+    `rotation`, `translation` (K,): [deg].
     """
 
     trials: int
@@ -152,13 +144,8 @@ def write_boxes(boxes: Boxes, path: Path) -> None:
 def tables(boxes: Boxes, titles: Mapping[tuple[str, str], str], axis: str) -> str:
     """Tables to read: medians and 90th percentiles of each experiment and case.
 
-    Parameters
-    ----------
-    boxes : mapping
-    titles : mapping
-        Headings, by experiment and case.
-    axis : str
-        Heading of the column of levels.
+    `titles`: headings, by experiment and case.
+    `axis`: heading of the column of levels.
     """
     parts = []
     for case, levels in by_case(boxes).items():
@@ -205,14 +192,9 @@ def draw_boxes(boxes: Boxes, title: str, axis: str, path: Path) -> Figure:
     Boxes hold the quartiles, whiskers reach to the 5th and 95th percentiles, dots are beyond. Red
     figures above the boxes say how many estimates are in none, for want of a pose.
 
-    Parameters
-    ----------
-    boxes : mapping
-        Of this experiment.
-    title, axis : str
-        Of the figure; of the levels.
-    path : Path
-        PNG file.
+    `boxes`: of this experiment.
+    `title`, `axis`: of the figure; of the levels.
+    `path`: PNG file.
     """
     cases = by_case(boxes)
     figure = Figure(figsize=(13.0, 1.1 + 3.5 * len(cases)), dpi=110, layout='constrained')

@@ -11,10 +11,7 @@ from rs_relpose_ros.errors import InputError
 def matching_cells(patterns: Iterable[str], names: Mapping[str, object]) -> tuple[str, ...]:
     """Those of the names that match any of the patterns ('all', or with ``*`` as in file names).
 
-    Raises
-    ------
-    InputError
-        A pattern matches none.
+    Raises InputError: a pattern matches none.
     """
     chosen: set[str] = set()
     for pattern in patterns:

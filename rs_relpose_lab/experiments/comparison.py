@@ -36,12 +36,8 @@ PAPER_ALGORITHMS: Mapping[str, Mapping[str, str | bool]] = {
 class Score:
     """Errors of a method over pairs, in degrees.
 
-    Attributes
-    ----------
-    name : str
-    pairs, answered : int
-    rotation, translation : (float, float)
-        Median and 90th percentile over the answered pairs; NaN without any.
+    `rotation`, `translation` (float, float): median and 90th percentile over the answered pairs;
+        NaN without any.
     """
 
     name: str
@@ -73,18 +69,10 @@ def is_still(record: PairRecord) -> bool:
 class LiveComparison:
     """What a live node published, beside the replay of the frames that it processed.
 
-    Attributes
-    ----------
-    node : Score
-    records, pairs : list
-        Of the replay.
-    truth : TrueTrajectory
-    intrinsics : Intrinsics
-        In force at the end.
-    frames, processed : int
-        In the bag, and by the node.
-    poses, unequal : int
-        Poses of both, and those that are not bit by bit the same in the two.
+    `records`, `pairs`: of the replay.
+    `intrinsics`: in force at the end.
+    `frames`, `processed`: in the bag, and by the node.
+    `poses`, `unequal`: poses of both, and those that are not bit by bit the same in the two.
     """
 
     node: Score
@@ -108,17 +96,10 @@ def compare_live(table: Path, stamps_file: Path, bag_path: Path, parameter_file:
                  folder: Path, *, pictures: bool = False) -> LiveComparison:
     """Replay into `folder` the frames that a live node processed.
 
-    Parameters
-    ----------
-    table : Path
-        Relative poses that the node published, as its recorder wrote them.
-    stamps_file : Path
-        Stamps of the frames that it processed.
-    bag_path, parameter_file : Path
-        What it was given.
-    folder : Path
-    pictures : bool
-        Whether to draw those of the replay.
+    `table`: relative poses that the node published, as its recorder wrote them.
+    `stamps_file`: stamps of the frames that it processed.
+    `bag_path`, `parameter_file`: what it was given.
+    `pictures`: whether to draw those of the replay.
     """
     stamps = read_stamps(stamps_file)
     pairs: list[ReplayedPair] = []
@@ -154,13 +135,8 @@ def score_of_table(name: str, path: Path, pairs: Sequence[PairRecord],
                    truth: TrueTrajectory) -> Score:
     """Score of a table of relative poses, which a live node's recorder wrote.
 
-    Parameters
-    ----------
-    name : str
-    path : Path
-    pairs : sequence of PairRecord
-        Of a replay of the same frames: they tell how many pairs there were, and their instants.
-    truth : TrueTrajectory
+    `pairs`: of a replay of the same frames: they tell how many pairs there were, and their
+        instants.
     """
     instants = {(r.reference_stamp_ns, r.stamp_ns): (r.reference_ns1, r.reference_ns2)
                 for r in pairs}
@@ -199,13 +175,8 @@ def best_opencv_score(estimator: str, pairs: Sequence[ReplayedPair], intrinsics:
     Best in the median rotation error against the truth: a choice that no user could make, in the
     baseline's favour.
 
-    Parameters
-    ----------
-    estimator : {'RANSAC', 'USAC_MAGSAC'}
-    pairs : sequence of ReplayedPair
-        Those that the pipeline answered: the same matches, and none of a camera that stands.
-    intrinsics : Intrinsics
-    truth : TrueTrajectory
+    `estimator` {'RANSAC', 'USAC_MAGSAC'}.
+    `pairs`: those that the pipeline answered: the same matches, and none of a camera that stands.
     """
     camera = intrinsics.global_shutter_camera()
     matches = [tuple(undistorted(intrinsics.to_sensor(points), camera) for points in

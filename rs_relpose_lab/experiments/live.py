@@ -43,13 +43,8 @@ FORMATS = ('mono8', 'bgr8', 'jpeg')
 class LiveCell:
     """One camera and IMU.
 
-    Attributes
-    ----------
-    width, height : int
-    image_format : {'mono8', 'bgr8', 'jpeg'}
-        Raw gray, raw colour, or JPEG in colour.
-    imu_rate : int
-        Samples per second.
+    `image_format` {'mono8', 'bgr8', 'jpeg'}: raw gray, raw colour, or JPEG in colour.
+    `imu_rate`: samples per second.
     """
 
     width: int
@@ -95,40 +90,26 @@ class Percentiles:
 class LiveStatistics:
     """Figures of one cell; times in ms, memory in MB, errors in degrees.
 
-    Attributes
-    ----------
-    cell : str
-    duration : float
-        Seconds that were played.
-    frames_sent, frames_received, frames_used : int
-        By the player, by the node's callback, and through the whole pipeline.
-    dropped_overload, dropped_other : int
-        Refused by the node because newer frames waited, or for any other cause.
-    imu_sent, imu_received : int
-    pairs, poses : int
-    latency : Percentiles
-        Of a published pair: from the later of image and first IMU sample that covers its last
-        row, as the node's callbacks got them, to publication.
-    end_to_end : Percentiles
-        The same from outside: from the later publication of the two by the player to the receipt
-        of the pose by a third process. No delay inside the node can hide from it.
-    frame_time, frame_cpu : Percentiles
-        Of every frame, pair or not: from its turn to its end, and processor time of the worker.
-    cpu, cpu_callbacks, cpu_player : float
-        Percent of one core: the node, its first thread alone (callbacks), and the player.
-    memory_start, memory_end : float
-        Resident memory of the node after the first pose and at the end.
-    private_start, private_end : float
-        Without what is shared with other processes.
-    seconds_to_ready, seconds_to_pose : float
-        From the start of the node's process to its subscriptions; from the first frame to the
-        first pose.
-    rotation_error, translation_error : Percentiles
-        Against the truth.
-    wrong : int
-        Poses that are off by more than 1 deg, or 15 deg in the direction of translation.
-    player_late : Percentiles
-        How late the player published, on this machine.
+    `duration`: seconds that were played.
+    `frames_sent`, `frames_received`, `frames_used`: by the player, by the node's callback, and
+        through the whole pipeline.
+    `dropped_overload`, `dropped_other`: refused by the node because newer frames waited, or for
+        any other cause.
+    `latency`: of a published pair: from the later of image and first IMU sample that covers its
+        last row, as the node's callbacks got them, to publication.
+    `end_to_end`: the same from outside: from the later publication of the two by the player to the
+        receipt of the pose by a third process. No delay inside the node can hide from it.
+    `frame_time`, `frame_cpu`: of every frame, pair or not: from its turn to its end, and processor
+        time of the worker.
+    `cpu`, `cpu_callbacks`, `cpu_player`: percent of one core: the node, its first thread alone
+        (callbacks), and the player.
+    `memory_start`, `memory_end`: resident memory of the node after the first pose and at the end.
+    `private_start`, `private_end`: without what is shared with other processes.
+    `seconds_to_ready`, `seconds_to_pose`: from the start of the node's process to its
+        subscriptions; from the first frame to the first pose.
+    `rotation_error`, `translation_error`: against the truth.
+    `wrong`: poses that are off by more than 1 deg, or 15 deg in the direction of translation.
+    `player_late`: how late the player published, on this machine.
     """
 
     cell: str
@@ -165,12 +146,8 @@ class LiveStatistics:
 class Course:
     """How latency and memory went over time.
 
-    Attributes
-    ----------
-    latency_seconds, latencies : (N,) ndarray
-        Seconds since the first pair, and ms.
-    memory_seconds, resident, private : (M,) ndarray
-        Seconds likewise, and MB.
+    `latency_seconds`, `latencies` (N,): seconds since the first pair, and ms.
+    `memory_seconds`, `resident`, `private` (M,): seconds likewise, and MB.
     """
 
     latency_seconds: Array
@@ -189,19 +166,11 @@ def run_cell(cell: LiveCell, clip: Clip, duration: float, folder: Path, profile:
              on_second: Callable[[], object] = lambda: None) -> tuple[LiveStatistics, Course]:
     """Play a clip to a node of its own.
 
-    Parameters
-    ----------
-    cell : LiveCell
-    clip : Clip
-        Of the cell's size.
-    duration : float
-        Seconds to play.
-    folder : Path
-        Directory of logs and tables; made where it is missing.
-    profile : Path
-        Fast DDS profile for big images.
-    on_second : callable
-        Called once a second.
+    `clip`: of the cell's size.
+    `duration`: seconds to play.
+    `folder`: directory of logs and tables; made where it is missing.
+    `profile`: Fast DDS profile for big images.
+    `on_second`: called once a second.
     """
     # Here, so that the names of cells are known without ROS.
     from rs_relpose_lab.live.measured_run import measure, Play

@@ -35,12 +35,8 @@ IMU_RATES = (200, 400)
 class Clip:
     """Files of a clip.
 
-    Attributes
-    ----------
-    bag : Path
-        JPEG in colour, CameraInfo, and the IMU at each of `IMU_RATES` on a topic of its own.
-    parameters : Path
-        Parameter file of the node.
+    `bag`: JPEG in colour, CameraInfo, and the IMU at each of `IMU_RATES` on a topic of its own.
+    `parameters`: parameter file of the node.
     """
 
     bag: Path
@@ -63,14 +59,9 @@ def prepare_clip(folder: Path, width: int, height: int,
                  on_frame: Callable[[], object] = lambda: None) -> Clip:
     """Render a clip into a folder, unless it is there.
 
-    Parameters
-    ----------
-    folder : Path
-        Made where it is missing.
-    width, height : int
-        Size of the images [px].
-    on_frame : callable
-        Called after each of the images.
+    `folder`: made where it is missing.
+    `width`, `height`: size of the images [px].
+    `on_frame`: called after each of the images.
     """
     def render(path: Path, parameters: Path) -> None:
         trajectory = closed_loop(PERIOD)

@@ -44,20 +44,14 @@ CAMERA = RollingShutterCamera(width=WIDTH, height=HEIGHT, fx=FOCAL, fy=FOCAL, cx
 class Method:
     """How a pair is estimated.
 
-    Attributes
-    ----------
-    label : str
-        For tables and legends.
-    solver, refinement : str
-        Of this library, as in `EstimatorConfig`; without a solver another library is meant.
-    library : {'', 'opencv', 'poselib'}
-    derotated : bool
-        Whether another library gets the points as if all rows had been read with the middle one,
-        as far as the gyro knows.
-    continuous_gyro : bool
-        Whether the gyro over the rows and between the frames is used, too.
-    threshold : float
-        Of another library [px].
+    `label`: for tables and legends.
+    `solver`, `refinement`: of this library, as in `EstimatorConfig`; without a solver another
+        library is meant.
+    `library` {'', 'opencv', 'poselib'}.
+    `derotated`: whether another library gets the points as if all rows had been read with the
+        middle one, as far as the gyro knows.
+    `continuous_gyro`: whether the gyro over the rows and between the frames is used, too.
+    `threshold`: of another library [px].
     """
 
     label: str
@@ -95,18 +89,12 @@ METHODS: Mapping[str, Method] = {
 class ContinuousGyro:
     """What a gyro that runs on knows of a pair, beyond one mean rate a frame.
 
-    Attributes
-    ----------
-    motion1, motion2 : FrameMotion
-        From the gyro over the rows.
-    rotation, covariance : (3, 3) ndarray
-        ``R_1^T R_2`` between the reference rows, and the covariance of its error [rad^2].
-    interval : float
-        Between the reference rows [s].
-    rate_sigma : float
-        Of the motions' rates, per axis [rad/s].
-    gravity_sigma : float or None
-        Of the motions' gravity, per axis [rad].
+    `motion1`, `motion2`: from the gyro over the rows.
+    `rotation`, `covariance` (3, 3): ``R_1^T R_2`` between the reference rows, and the covariance
+        of its error [rad^2].
+    `interval`: between the reference rows [s].
+    `rate_sigma`: of the motions' rates, per axis [rad/s].
+    `gravity_sigma`: of the motions' gravity, per axis [rad].
     """
 
     motion1: FrameMotion
@@ -122,21 +110,13 @@ class ContinuousGyro:
 class PairProblem:
     """A pair of frames as every method gets it, and its truth.
 
-    Attributes
-    ----------
-    points1, points2 : (N, 2) ndarray
-        Matches [px].
-    camera : RollingShutterCamera
-    motion1, motion2 : FrameMotion
-        One angular velocity and one direction of gravity each.
-    R, t : (3, 3), (3,) ndarray
-        True pose between the reference rows, ``X1 = R X2 + t``; t of any length.
-    told : EstimatorConfig
-        Noise figures that the estimator is told, and its other settings.
-    quality : (N,) ndarray or None
-        Of the matches.
-    gyro : ContinuousGyro or None
-        For the methods that use it.
+    `points1`, `points2` (N, 2): matches [px].
+    `motion1`, `motion2`: one angular velocity and one direction of gravity each.
+    `R`, `t` (3, 3), (3,): true pose between the reference rows, ``X1 = R X2 + t``; t of any
+        length.
+    `told`: noise figures that the estimator is told, and its other settings.
+    `quality` (N,): of the matches.
+    `gyro`: for the methods that use it.
     """
 
     points1: Array
@@ -272,21 +252,11 @@ def opencv_five_point(pixels1: Array, pixels2: Array, camera: RollingShutterCame
                       seed: int = 0) -> Pose | None:
     """Pose by OpenCV's essential matrix, as if both images had a global shutter.
 
-    Parameters
-    ----------
-    pixels1, pixels2 : (N, 2) ndarray
-        Undistorted.
-    camera : RollingShutterCamera
-        Of which the camera matrix is used.
-    threshold : float
-        [px].
-    estimator : {'RANSAC', 'USAC_MAGSAC'}
-    seed : int
-
-    Returns
-    -------
-    Pose or None
-        None where OpenCV finds nothing.
+    `pixels1`, `pixels2` (N, 2): undistorted.
+    `camera`: of which the camera matrix is used.
+    `threshold`: [px].
+    `estimator` {'RANSAC', 'USAC_MAGSAC'}.
+    Returns None where OpenCV finds nothing.
     """
     if len(pixels1) < 5:
         return None

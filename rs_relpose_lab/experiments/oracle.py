@@ -45,11 +45,9 @@ _STEP = 1e-30
 class OracleEstimate:
     """Pose ``X1 = R X2 + t`` and its covariance.
 
-    Attributes
-    ----------
-    R, t : (3, 3) and (3,) ndarray
-    covariance : (6, 6) ndarray
-        Of ``(dt, dtheta)``, ``t_true = t + dt``, ``R_true = Exp(dtheta) R``, both in camera 1.
+    `R`, `t` (3, 3) and (3,).
+    `covariance` (6, 6): of ``(dt, dtheta)``, ``t_true = t + dt``, ``R_true = Exp(dtheta) R``, both
+        in camera 1.
     """
 
     R: Array
@@ -77,12 +75,7 @@ def start_at(R: Array, t: Array, gravity: Array) -> Start:
 class Objective:
     """Residuals, of which the oracle minimises the sum of squares, over a step x from `start`.
 
-    Attributes
-    ----------
-    problem : TwoViewProblem
-    pixel_sigma, gravity_sigma, gyro_sigma : float
-        As in `oracle_estimate`.
-    start : Start
+    `pixel_sigma`, `gravity_sigma`, `gyro_sigma`: as in `oracle_estimate`.
     """
 
     problem: TwoViewProblem
@@ -137,17 +130,10 @@ def oracle_estimate(problem: TwoViewProblem, pixel_sigma: float, gravity_sigma: 
                     gyro_sigma: float, start: tuple[Array, Array] | None = None) -> OracleEstimate:
     """The oracle's estimate of a problem.
 
-    Parameters
-    ----------
-    problem : TwoViewProblem
-    pixel_sigma : float
-        [px] per coordinate.
-    gravity_sigma : float
-        [rad] per axis of one frame's direction.
-    gyro_sigma : float
-        [rad/s] per axis of one frame.
-    start : tuple of (3, 3) and (3,) ndarray, optional
-        Pose to start from instead of the truth.
+    `pixel_sigma`: [px] per coordinate.
+    `gravity_sigma`: [rad] per axis of one frame's direction.
+    `gyro_sigma`: [rad/s] per axis of one frame.
+    `start`: pose to start from instead of the truth.
     """
     R, t = (problem.R, problem.t) if start is None else start
     objective = Objective(problem, pixel_sigma, gravity_sigma, gyro_sigma,

@@ -21,18 +21,10 @@ METHODS_OF_THE_PAPER = ('global_5pt', 'uniform_9pt', 'uniform_11pt', 'auto')
 class Sweep:
     """One figure of the paper.
 
-    Attributes
-    ----------
-    name, title : str
-    axis, unit : str
-        What is varied, with its unit; the unit.
-    varied : str
-        The field of `Cell`.
-    levels : tuple of float
-        Its values.
-    fixed : tuple of (str, float)
-        Fields of `Cell` that are not at their defaults.
-    in_paper : bool
+    `axis`, `unit`: what is varied, with its unit; the unit.
+    `varied`: the field of `Cell`.
+    `levels`: its values.
+    `fixed`: fields of `Cell` that are not at their defaults.
     """
 
     name: str
@@ -79,15 +71,10 @@ SWEEPS = {sweep.name: sweep for sweep in (
 class PaperRun:
     """Which experiments are run, and how.
 
-    Attributes
-    ----------
-    sweeps, directions, methods : sequence of str
-        Names of `SWEEPS`, `problems.BASELINES` and `methods.METHODS`.
-    trials : int
-        Of each level of each direction.
-    seed : int
-    base : Cell
-        Noises and outliers where an experiment does not vary them.
+    `sweeps`, `directions`, `methods`: names of `SWEEPS`, `problems.BASELINES` and
+        `methods.METHODS`.
+    `trials`: of each level of each direction.
+    `base`: noises and outliers where an experiment does not vary them.
     """
 
     sweeps: tuple[str, ...]
@@ -129,13 +116,8 @@ def run_paper(run: PaperRun, jobs: int = 1,
               on_problem: Callable[[], object] = lambda: None) -> list[Record]:
     """Run the experiments; the result does not depend on `jobs`.
 
-    Parameters
-    ----------
-    run : PaperRun
-    jobs : int
-        Processes.
-    on_problem : callable
-        Called after each of `run.tasks()`.
+    `jobs`: processes.
+    `on_problem`: called after each of `run.tasks()`.
     """
     if jobs < 1:
         raise InputError(f'jobs must be at least 1, got {jobs}')

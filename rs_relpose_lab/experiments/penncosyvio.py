@@ -70,23 +70,13 @@ class Pair:
 class PennCosyvioRun:
     """What is run, and on what.
 
-    Attributes
-    ----------
-    sequences, methods : sequence of str
-        Names of `STRETCHES` and `methods.METHODS`.
-    camera, imu : str
-        Names of `penncosyvio_files.CAMERAS` and `IMUS`.
-    readout_time : float
-        Of the camera [s].
-    stamp_row : {'first', 'middle', 'last'}
-        Row that a frame's stamp marks.
-    time_offset : float
-        IMU clock minus camera clock [s].
-    gyro_bias : (3,) sequence of float
-        Subtracted from the gyro, IMU frame [rad/s].
-    every, distance : int
-        Frames from one pair to the next, and between the two of a pair.
-    seed : int
+    `sequences`, `methods`: names of `STRETCHES` and `methods.METHODS`.
+    `camera`, `imu`: names of `penncosyvio_files.CAMERAS` and `IMUS`.
+    `readout_time`: of the camera [s].
+    `stamp_row` {'first', 'middle', 'last'}: row that a frame's stamp marks.
+    `time_offset`: IMU clock minus camera clock [s].
+    `gyro_bias` (3,): subtracted from the gyro, IMU frame [rad/s].
+    `every`, `distance`: frames from one pair to the next, and between the two of a pair.
     """
 
     sequences: tuple[str, ...]
@@ -127,13 +117,8 @@ def run_penncosyvio(run: PennCosyvioRun, open_sequence: Callable[[str], PairSour
                     on_pair: Callable[[], object] = lambda: None) -> list[Record]:
     """Estimate every pair by every method.
 
-    Parameters
-    ----------
-    run : PennCosyvioRun
-    open_sequence : callable
-        Gives the source of a sequence.
-    on_pair : callable
-        Called after each pair.
+    `open_sequence`: gives the source of a sequence.
+    `on_pair`: called after each pair.
     """
     records = []
     sequences = {name: open_sequence(name) for name in run.sequences}

@@ -48,16 +48,10 @@ _IMU, _POINTS, _NOISE, _SCENE, _IMAGE = range(5)
 class Simulated:
     """What is put in place of the recorded images.
 
-    Attributes
-    ----------
-    rendered : bool
-        Images, of which SIFT features are matched, instead of points.
-    scene : str
-        Name of `simulation.scene.SCENES`, for images.
-    pixel_noise : float
-        Of points, 1 sigma of each coordinate [px].
-    outliers : float
-        Share of the points' matches that are random.
+    `rendered`: images, of which SIFT features are matched, instead of points.
+    `scene`: name of `simulation.scene.SCENES`, for images.
+    `pixel_noise`: of points, 1 sigma of each coordinate [px].
+    `outliers`: share of the points' matches that are random.
     """
 
     rendered: bool = False

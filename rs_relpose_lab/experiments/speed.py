@@ -32,14 +32,8 @@ COMPARED = {LIBRARY: METHODS['auto']} | {
 class Timing:
     """One method on one problem.
 
-    Attributes
-    ----------
-    cell, method : str
-    matches, seed : int
-    duration : float
-        The shortest of the repeats [ms].
-    rotation, translation : float
-        Errors [deg]; infinite without a pose.
+    `duration`: the shortest of the repeats [ms].
+    `rotation`, `translation`: errors [deg]; infinite without a pose.
     """
 
     cell: str
@@ -55,11 +49,7 @@ class Timing:
 class Soak:
     """Resident memory [MB] while estimates of twenty problems go on.
 
-    Attributes
-    ----------
-    estimates : int
-        Between the two.
-    before, after : float
+    `estimates`: between the two.
     """
 
     estimates: int

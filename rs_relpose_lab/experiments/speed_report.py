@@ -70,10 +70,7 @@ def write_report(folder: Path, comparison: Sequence[Timing], scaling: Sequence[T
                  first: Sequence[tuple[float, float]], soak: Soak | None) -> str:
     """Write runs, tables, report and plot into a folder, which is made where it is missing.
 
-    Returns
-    -------
-    str
-        The report (Markdown).
+    Returns the report (Markdown).
     """
     folder.mkdir(parents=True, exist_ok=True)
     compared, scaled = method_statistics(comparison), method_statistics(scaling)

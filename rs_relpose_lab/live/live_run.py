@@ -28,12 +28,8 @@ _QUIET = 1.0
 class LiveRun:
     """Files of a live run.
 
-    Attributes
-    ----------
-    table : Path
-        The relative poses that the node published.
-    stamps : Path
-        Stamps of the frames that it processed, for `rs_relpose replay --stamps`.
+    `table`: the relative poses that the node published.
+    `stamps`: stamps of the frames that it processed, for `rs_relpose replay --stamps`.
     """
 
     table: Path
@@ -43,19 +39,10 @@ class LiveRun:
 def run_live(bag: Path, parameters: Path, folder: Path) -> LiveRun:
     """Play `bag` to a relpose_node of its own.
 
-    Parameters
-    ----------
-    bag : Path
-    parameters : Path
-        Parameter file of the node.
-    folder : Path
-        Directory for tables and logs; must exist.
-
-    Raises
-    ------
-    LiveRunError
-    InputError, MissingInputError
-        The bag cannot be read or lacks a topic.
+    `parameters`: parameter file of the node.
+    `folder`: directory for tables and logs; must exist.
+    Raises LiveRunError.
+    Raises InputError, MissingInputError: the bag cannot be read or lacks a topic.
     """
     with open_bag(bag) as opened:
         topics, duration = opened.find_topics(), opened.duration

@@ -38,19 +38,11 @@ _QUIET = 2.5
 class Play:
     """What is played to the node, and how.
 
-    Attributes
-    ----------
-    bag : Path
-    parameters : Path
-        Parameter file of the node.
-    remap : dict
-        The node's topics `image`, `camera_info` and `imu` by their names in the bag.
-    transport : {'raw', 'compressed'}
-        What the node subscribes to.
-    player : tuple of str
-        Options of the player.
-    profile : Path or None
-        Fast DDS profile of all processes.
+    `parameters`: parameter file of the node.
+    `remap`: the node's topics `image`, `camera_info` and `imu` by their names in the bag.
+    `transport` {'raw', 'compressed'}: what the node subscribes to.
+    `player`: options of the player.
+    `profile`: Fast DDS profile of all processes.
     """
 
     bag: Path
@@ -76,19 +68,11 @@ class ReceivedPose:
 class MeasuredRun:
     """What was seen.
 
-    Attributes
-    ----------
-    poses : list of ReceivedPose
-    diagnostics : list of (int, dict)
-        Time on the monotonic clock, and the figures of a report.
-    figures, player_figures : list of ProcessFigures
-        Of node and player, once a second while messages are played.
-    started_ns, ready_ns : int
-        When the node was started, and when it subscribed.
-    timings : Path
-        Table of the node's parameter `timings_file`.
-    log : Path
-        The player's log.
+    `diagnostics`: time on the monotonic clock, and the figures of a report.
+    `figures`, `player_figures`: of node and player, once a second while messages are played.
+    `started_ns`, `ready_ns`: when the node was started, and when it subscribed.
+    `timings`: table of the node's parameter `timings_file`.
+    `log`: the player's log.
     """
 
     poses: list[ReceivedPose]
@@ -134,18 +118,9 @@ def measure(play: Play, folder: Path,
             on_second: Callable[[], object] = lambda: None) -> MeasuredRun:
     """Play a bag to a node of its own and watch.
 
-    Parameters
-    ----------
-    play : Play
-    folder : Path
-        Directory of logs and tables; must exist.
-    on_second : callable
-        Called once a second while messages are played.
-
-    Raises
-    ------
-    LiveRunError
-        A process failed.
+    `folder`: directory of logs and tables; must exist.
+    `on_second`: called once a second while messages are played.
+    Raises LiveRunError: a process failed.
     """
     timings, log = folder / 'frames.csv', folder / 'player.npy'
     log.unlink(missing_ok=True)

@@ -14,15 +14,10 @@ _TICK = 1.0 / os.sysconf('SC_CLK_TCK')
 class ProcessFigures:
     """A process at an instant.
 
-    Attributes
-    ----------
-    time_ns : int
-        On the monotonic clock.
-    cpu, cpu_main : float
-        Processor time since its start [s]: of all threads, and of the first one.
-    resident, private : float
-        Memory [MB]: all that is resident, and without what is shared with others (the transport's
-        segments).
+    `time_ns`: on the monotonic clock.
+    `cpu`, `cpu_main`: processor time since its start [s]: of all threads, and of the first one.
+    `resident`, `private`: memory [MB]: all that is resident, and without what is shared with
+        others (the transport's segments).
     """
 
     time_ns: int

@@ -30,12 +30,8 @@ class LiveRunError(RsRelposeError):
 class Process:
     """A Python process with a log. Leaving the ``with`` block kills it if it still runs.
 
-    Parameters
-    ----------
-    *arguments : str
-        Of the interpreter: a file, or ``-m`` and a module, and what that is given.
-    log : Path, optional
-        File of standard output and error; a temporary one by default.
+    `*arguments`: of the interpreter: a file, or ``-m`` and a module, and what that is given.
+    `log`: file of standard output and error; a temporary one by default.
     """
 
     def __init__(self, *arguments: str, log: Path | None = None) -> None:
@@ -134,24 +130,12 @@ def wait_until(condition: Callable[[], Value], what: str, *processes: Process,
                timeout: float = PATIENCE) -> Value:
     """Wait for a condition while processes run.
 
-    Parameters
-    ----------
-    condition : callable
-        Asked until its answer is true.
-    what : str
-        For the error message.
-    *processes : Process
-        Must not fail meanwhile.
-    timeout : float
-        Longest wait [s].
-
-    Returns
-    -------
-    The true answer.
-
-    Raises
-    ------
-    LiveRunError
+    `condition`: asked until its answer is true.
+    `what`: for the error message.
+    `*processes`: must not fail meanwhile.
+    `timeout`: longest wait [s].
+    Returns the true answer.
+    Raises LiveRunError.
     """
     deadline = time.monotonic() + timeout
     while not (value := condition()):

@@ -20,11 +20,7 @@ from rs_relpose_ros.replay.tables import number, RELATIVE_POSE_COLUMNS, TableWri
 class Recorder:
     """Collects the topics of the pairs that a node publishes.
 
-    Parameters
-    ----------
-    graph : Graph
-    node : Process
-        Must not end before it publishes.
+    `node`: must not end before it publishes.
     """
 
     def __init__(self, graph: Graph, node: Process) -> None:

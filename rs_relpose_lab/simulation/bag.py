@@ -41,22 +41,11 @@ def write_bag(simulation: Simulation, path: Path | str, *, jpeg_quality: int = 8
               raw: bool = False, on_frame: Callable[[], object] = lambda: None) -> None:
     """Render `simulation` into a bag, in the order in which drivers would deliver.
 
-    Parameters
-    ----------
-    simulation : Simulation
-    path : path-like
-        Directory to create.
-    jpeg_quality : int
-        1 to 100.
-    raw : bool
-        sensor_msgs/Image instead of JPEG.
-    on_frame : callable
-        Called after each image.
-
-    Raises
-    ------
-    InputError
-        The path exists already or cannot be created.
+    `path`: directory to create.
+    `jpeg_quality`: 1 to 100.
+    `raw`: sensor_msgs/Image instead of JPEG.
+    `on_frame`: called after each image.
+    Raises InputError: the path exists already or cannot be created.
     """
     if not 1 <= jpeg_quality <= 100:
         raise InputError(f'jpeg_quality must lie in [1, 100], got {jpeg_quality}')

@@ -23,12 +23,8 @@ def closed_loop(period: float, *, speed: float = 1.5) -> Trajectory:
     Around an ellipse, half as deep as wide, with the bob of the steps and a hand's turns about
     all axes (30 deg/s rms), looking along x.
 
-    Parameters
-    ----------
-    period : float
-        Time of one turn [s].
-    speed : float
-        Mean speed along the ellipse [m/s].
+    `period`: time of one turn [s].
+    `speed`: mean speed along the ellipse [m/s].
     """
     # 25 control points a second: quintic splines through them follow steps of 2 Hz.
     count = round(25 * period)

@@ -41,13 +41,7 @@ class Renderer:
     Pixel centres are at integer coordinates; row v is seen at the time of the reference row plus
     ``camera.row_times(v)``.
 
-    Parameters
-    ----------
-    scene : Scene
-    camera : RollingShutterCamera
-    trajectory : Trajectory
-    edge_samples : int
-        Pixels on the outline of a surface are the mean of this many samples squared.
+    `edge_samples`: pixels on the outline of a surface are the mean of this many samples squared.
     """
 
     scene: Scene
@@ -70,10 +64,7 @@ class Renderer:
     def render(self, reference_time: float) -> NDArray[np.float32]:
         """Noise-free image (H, W) of gray values 0 to 255.
 
-        Parameters
-        ----------
-        reference_time : float
-            Time of the reference row on the trajectory [s].
+        `reference_time`: time of the reference row on the trajectory [s].
         """
         rows = np.arange(self.camera.height)
         positions, rotations = self.trajectory.poses(reference_time + self.camera.row_times(rows))

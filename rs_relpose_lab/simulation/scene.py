@@ -32,16 +32,12 @@ _ROOT = np.array([0.0, 0.0, 1.6])
 class Surface:
     """A textured rectangle, seen from the side of its normal ``across x down`` reversed.
 
-    Parameters
-    ----------
-    corner : (3,) ndarray
-        World position [m] of the texture's upper left corner, as its viewer sees it.
-    across, down : (3,) ndarray
-        Unit vectors along the texture's rows and columns, perpendicular to each other.
-    width, height : float
-        Size [m].
-    texture : (H, W) ndarray of uint8
-        Gray values; texel (i, j) is centred at ``((j + 0.5) width / W, (i + 0.5) height / H)``.
+    `corner` (3,): world position [m] of the texture's upper left corner, as its viewer sees it.
+    `across`, `down` (3,): unit vectors along the texture's rows and columns, perpendicular to each
+        other.
+    `width`, `height`: size [m].
+    `texture` (H, W): gray values; texel (i, j) is centred at ``((j + 0.5) width / W, (i + 0.5)
+        height / H)``.
     """
 
     corner: Array
@@ -116,15 +112,10 @@ class Scene:
 def make_scene(kind: str, rng: np.random.Generator, focal_length: float) -> Scene:
     """A scene around the origin, where the camera walks at eye height and looks along x.
 
-    Parameters
-    ----------
-    kind : {'hall', 'yard', 'gallery'}
-        Closed hall with crates and banners; yard with house fronts, crates and sky; narrow
-        gallery with pictures and pillars.
-    rng : numpy.random.Generator
-        Draws places, sizes and textures.
-    focal_length : float
-        Of the camera [px]: textures are as fine as it can see.
+    `kind` {'hall', 'yard', 'gallery'}: closed hall with crates and banners; yard with house
+        fronts, crates and sky; narrow gallery with pictures and pillars.
+    `rng`: draws places, sizes and textures.
+    `focal_length`: of the camera [px]: textures are as fine as it can see.
     """
     if kind not in SCENES:
         raise InputError(f'scene must be one of {SCENES}, got {kind!r}')

@@ -32,14 +32,9 @@ _MOTION, _SCENE, _IMU, _BIAS, _IMAGE = range(5)
 class ImuSeries:
     """IMU samples, IMU frame.
 
-    Attributes
-    ----------
-    stamps_ns : (N,) ndarray of int64
-        On the IMU clock.
-    angular_velocities : (N, 3) ndarray
-        [rad/s].
-    linear_accelerations : (N, 3) ndarray
-        Specific force [m/s^2].
+    `stamps_ns` (N,): on the IMU clock.
+    `angular_velocities` (N, 3): [rad/s].
+    `linear_accelerations` (N, 3): specific force [m/s^2].
     """
 
     stamps_ns: NDArray[np.int64]
@@ -51,14 +46,9 @@ class ImuSeries:
 class SimulatedFrame:
     """An image and its instants.
 
-    Attributes
-    ----------
-    index : int
-    stamp_ns : int
-        Header stamp, camera clock.
-    reference_ns : int
-        Instant of the stamped row on the IMU clock.
-    image : (H, W) ndarray of uint8
+    `stamp_ns`: header stamp, camera clock.
+    `reference_ns`: instant of the stamped row on the IMU clock.
+    `image` (H, W).
     """
 
     index: int
@@ -129,12 +119,8 @@ def simulate(config: SimulationConfig | None = None, *, scene: Scene | None = No
              trajectory: Trajectory | None = None) -> Simulation:
     """Set up a recording; nothing is rendered yet.
 
-    Parameters
-    ----------
-    config : SimulationConfig, optional
-        Defaults where omitted.
-    scene, trajectory : optional
-        Instead of those that the configuration describes.
+    `config`: defaults where omitted.
+    `scene`, `trajectory`: instead of those that the configuration describes.
     """
     config = SimulationConfig() if config is None else config
     camera = config.camera
