@@ -7,10 +7,10 @@ from operator import attrgetter
 import numpy as np
 import pytest
 
+from rs_relpose_lab.cli.benchmark import matching_cells
 from rs_relpose_lab.experiments import accuracy, accuracy_report, speed_report
 from rs_relpose_lab.experiments.accuracy import AccuracyRun, OracleCache, run_accuracy, Trial
 from rs_relpose_lab.experiments.accuracy_report import cell_statistics, consistency, summary
-from rs_relpose_lab.experiments.cell_names import matching_cells
 from rs_relpose_lab.experiments.methods import as_pair, METHODS, prepared, run_method
 from rs_relpose_lab.experiments.problems import Cell, CELLS, make_problem
 from rs_relpose_lab.experiments.scoring import NO_POSE, PoseError

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 import csv
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_lab.experiments.cell_names import matching_cells
 from rs_relpose_lab.experiments.live_clip import (
     Clip,
+    closed_loop,
     configuration,
     IMU_RATES,
     imu_topic,
@@ -23,15 +23,13 @@ from rs_relpose_lab.experiments.live_clip import (
 )
 from rs_relpose_lab.experiments.scoring import pose_error
 from rs_relpose_lab.experiments.tables import write_csv
-from rs_relpose_lab.live.process_figures import ProcessFigures
-from rs_relpose_lab.simulation.closed_loop import closed_loop
 from rs_relpose_ros.bags.layout import CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, RAW_TOPIC
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.front_end.sequencer import Refusal
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 
 if TYPE_CHECKING:   # the rest of this module needs no ROS
-    from rs_relpose_lab.live.measured_run import MeasuredRun, ReceivedPose
+    from rs_relpose_lab.live.measured_run import MeasuredRun, ProcessFigures, ReceivedPose
 
 Array = NDArray[np.float64]
 
@@ -157,11 +155,6 @@ class Course:
     private: Array
 
 
-def select_cells(patterns: Iterable[str]) -> tuple[LiveCell, ...]:
-    """The cells that match any of the patterns, as `matching_cells` has them."""
-    return tuple(CELLS[name] for name in matching_cells(patterns, CELLS))
-
-
 def run_cell(cell: LiveCell, clip: Clip, duration: float, folder: Path, profile: Path,
              on_second: Callable[[], object] = lambda: None) -> tuple[LiveStatistics, Course]:
     """Play a clip to a node of its own.
@@ -197,15 +190,14 @@ def statistics_of(cell: LiveCell, duration: float, run: MeasuredRun) -> LiveStat
     latency = (frames['done_ns'] - frames['ready_ns']) / 1e6
     log = np.load(run.log)
     images, imu = log[log['is_image']], log[~log['is_image']]
-    last = run.diagnostics[-1][1]
-    refused = {cause: int(last[f'frames_refused_{cause.value}']) for cause in Refusal}
+    refused = {cause: int(run.counters[f'frames_refused_{cause.value}']) for cause in Refusal}
     rotation, translation = errors(run.poses)
     first, end = run.figures[0], run.figures[-1]
     return LiveStatistics(
         cell=cell.name, duration=duration, frames_sent=len(images),
-        frames_received=int(last['frames_received']), frames_used=len(frames),
+        frames_received=int(run.counters['frames_received']), frames_used=len(frames),
         dropped_overload=refused.pop(Refusal.OVERLOAD), dropped_other=sum(refused.values()),
-        imu_sent=len(imu), imu_received=int(last['imu_samples']),
+        imu_sent=len(imu), imu_received=int(run.counters['imu_samples']),
         pairs=int(np.count_nonzero(paired)), poses=len(run.poses),
         latency=Percentiles.of(latency[posed]),
         end_to_end=Percentiles.of(_end_to_end(run.poses, images, imu)),

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import TimeReference
 
 from rs_relpose_lab.live.graph import diagnostic_values, Graph, private_domain
-from rs_relpose_lab.live.process_figures import process_figures, ProcessFigures
 from rs_relpose_lab.live.processes import (
     LiveRunError,
     node_process,
@@ -64,11 +63,47 @@ class ReceivedPose:
     quat_xyzw: NDArray[np.float64]
 
 
+@dataclass(frozen=True, slots=True)
+class ProcessFigures:
+    """Processor time and memory of a process at an instant, as Linux tells them.
+
+    `time_ns`: on the monotonic clock.
+    `cpu`, `cpu_main`: processor time since its start [s]: of all threads, and of the first one.
+    `resident`, `private`: memory [MB]: all that is resident, and without what is shared with
+        others (the transport's segments).
+    """
+
+    time_ns: int
+    cpu: float
+    cpu_main: float
+    resident: float
+    private: float
+
+
+def process_figures(pid: int) -> ProcessFigures:
+    """Figures of a running process."""
+    folder = Path('/proc') / str(pid)
+    memory = dict(line.split(':', 1) for line in (folder / 'status').read_text().splitlines())
+
+    def megabytes(name: str) -> float:
+        return int(memory[name].split()[0]) / 1024.0
+
+    return ProcessFigures(time.monotonic_ns(), _cpu(folder / 'stat'),
+                          _cpu(folder / 'task' / str(pid) / 'stat'), megabytes('VmRSS'),
+                          megabytes('RssAnon'))
+
+
+def _cpu(path: Path) -> float:
+    # The name, in parentheses, may hold anything.
+    fields = path.read_text().rpartition(')')[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuredRun:
     """What was seen.
 
-    `diagnostics`: time on the monotonic clock, and the figures of a report.
+    `counters`: last figures of the node's diagnostics.
     `figures`, `player_figures`: of node and player, once a second while messages are played.
     `started_ns`, `ready_ns`: when the node was started, and when it subscribed.
     `timings`: table of the node's parameter `timings_file`.
@@ -76,7 +111,7 @@ class MeasuredRun:
     """
 
     poses: list[ReceivedPose]
-    diagnostics: list[tuple[int, dict[str, str]]]
+    counters: dict[str, str]
     figures: list[ProcessFigures]
     player_figures: list[ProcessFigures]
     started_ns: int
@@ -91,27 +126,23 @@ class _Listener:
     def __init__(self, graph: Graph) -> None:
         self.poses: dict[int, tuple[int, PoseWithCovarianceStamped]] = {}
         self.references = graph.listen(TimeReference, '/relpose_node/reference')
-        self.diagnostics: list[tuple[int, dict[str, str]]] = []
         graph.subscribe(PoseWithCovarianceStamped, '/relpose_node/relative_pose', self._on_pose)
-        graph.subscribe(DiagnosticArray, '/diagnostics', self._on_diagnostics)
+        self.diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
 
     def _on_pose(self, msg: Any) -> None:
         self.poses[stamp_ns(msg.header)] = time.monotonic_ns(), msg
 
-    def _on_diagnostics(self, msg: Any) -> None:
-        self.diagnostics.append((time.monotonic_ns(), diagnostic_values(msg)))
-
     def received(self) -> list[ReceivedPose]:
         """Poses whose reference came as well, in the order of their stamps."""
         references = {stamp_ns(msg.header): time_ns(msg.time_ref) for msg in self.references}
-        return [_received(references[stamp], stamp, *self.poses[stamp])
-                for stamp in sorted(self.poses.keys() & references.keys())]
-
-
-def _received(reference: int, stamp: int, received_ns: int, msg: Any) -> ReceivedPose:
-    t, q = msg.pose.pose.position, msg.pose.pose.orientation
-    return ReceivedPose(reference, stamp, received_ns, np.array([t.x, t.y, t.z]),
-                        np.array([q.x, q.y, q.z, q.w]))
+        received = []
+        for stamp in sorted(self.poses.keys() & references.keys()):
+            received_ns, msg = self.poses[stamp]
+            t, q = msg.pose.pose.position, msg.pose.pose.orientation
+            received.append(ReceivedPose(references[stamp], stamp, received_ns,
+                                         np.array([t.x, t.y, t.z]),
+                                         np.array([q.x, q.y, q.z, q.w])))
+        return received
 
 
 def measure(play: Play, folder: Path,
@@ -143,8 +174,8 @@ def measure(play: Play, folder: Path,
                     figures = _watch(node, player, listener, on_second)
                 wait_until_quiet(lambda: len(listener.poses), _QUIET, node)
                 node.stop()
-        return MeasuredRun(listener.received(), listener.diagnostics, *figures, started_ns,
-                           ready_ns, timings, log)
+        return MeasuredRun(listener.received(), diagnostic_values(listener.diagnostics[-1]),
+                           *figures, started_ns, ready_ns, timings, log)
 
 
 def _watch(node: Process, player: Process, listener: _Listener,
