@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_lab.experiments.boxes import Box, by_box, draw_boxes, Record, tables
+from rs_relpose_lab.experiments.boxes import by_case, draw_boxes, Record, tables
 from rs_relpose_lab.experiments.methods import run_method
 from rs_relpose_lab.experiments.paper import EXACT, paper_problem, PaperRun, run_paper, SWEEPS
 from rs_relpose_lab.experiments.problems import (
@@ -248,11 +248,11 @@ def test_a_run_with_illegal_numbers_is_refused_by_name(change):
 
 def boxes_of(errors):
     """Boxes of one method; None is an estimate without a pose."""
-    return by_box([
-        Record(Box('pixel_noise', 'forward', '0.2'), 'auto', trial, Status.NO_CONSENSUS, NO_POSE)
-        if error is None else
-        Record(Box('pixel_noise', 'forward', '0.2'), 'auto', trial, Status.OK,
-               PoseError(error, 10.0 * error)) for trial, error in enumerate(errors)])
+    return by_case([
+        Record('pixel_noise', 'forward', '0.2', 'auto', trial,
+               Status.NO_CONSENSUS if error is None else Status.OK,
+               NO_POSE if error is None else PoseError(error, 10.0 * error))
+        for trial, error in enumerate(errors)])
 
 
 def test_table_counts_what_has_no_pose_and_leaves_it_out():

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from rs_relpose_lab.experiments.boxes import Box, Record
+from rs_relpose_lab.experiments.boxes import Record
 from rs_relpose_lab.experiments.methods import as_pair, PairProblem, run_method
 from rs_relpose_lab.experiments.problems import BASELINES, Cell, make_problem
 from rs_relpose_lab.experiments.workers import in_processes
@@ -132,9 +132,8 @@ def run_task(task: Task) -> list[Record]:
     """Draw a problem and estimate it by every method."""
     problem = paper_problem(task.sweep.cell(task.level, task.run.base), task.direction,
                             task.run.seed, task.trial)
-    box = Box(task.sweep.name, task.direction, f'{task.level:g}')
-    return [Record(box, name, task.trial, *run_method(name, problem, task.trial))
-            for name in task.run.methods]
+    return [Record(task.sweep.name, task.direction, f'{task.level:g}', name, task.trial,
+                   *run_method(name, problem, task.trial)) for name in task.run.methods]
 
 
 def paper_problem(cell: Cell, direction: str, seed: int, trial: int) -> PairProblem:

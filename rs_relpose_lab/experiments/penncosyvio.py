@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_lab.experiments.boxes import Box, Record
+from rs_relpose_lab.experiments.boxes import Record
 from rs_relpose_lab.experiments.methods import METHODS, PairProblem, run_method
 from rs_relpose_lab.experiments.pair_imu import PairImu
 from rs_relpose_lab.experiments.penncosyvio_files import (
@@ -124,9 +124,8 @@ def run_penncosyvio(run: PennCosyvioRun, open_sequence: Callable[[str], PairSour
     sequences = {name: open_sequence(name) for name in run.sequences}
     for pair in run.pairs():
         problem = sequences[pair.sequence].problem(pair)
-        box = Box(EXPERIMENT, pair.sequence, str(pair.stretch))
-        records += [Record(box, name, pair.first, *run_method(name, problem, pair.first))
-                    for name in run.methods]
+        records += [Record(EXPERIMENT, pair.sequence, str(pair.stretch), name, pair.first,
+                           *run_method(name, problem, pair.first)) for name in run.methods]
         on_pair()
     return records
 
