@@ -145,4 +145,3 @@ def test_kept_errors_come_back_for_their_own_cell_only(tmp_path):
                                            3: PoseError(0.1, 0.2, 4.0)}
     assert cache.load(Cell(), 'gaussian') == {}
     assert cache.load(Cell(speed=2.0), 'paper') == {}
-    assert OracleCache(None).load(Cell(), 'paper') == {}

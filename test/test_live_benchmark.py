@@ -17,7 +17,8 @@ from rs_relpose_lab.cli.benchmark import matching_cells
 from rs_relpose_lab.experiments import live, live_clip, live_report
 from rs_relpose_lab.experiments.live import Course, LiveCell, Percentiles
 from rs_relpose_lab.live.loop import in_turns, Outgoing, stamp_of
-from rs_relpose_lab.live.measured_run import process_figures, ReceivedPose
+from rs_relpose_lab.live.measured_run import ReceivedPose
+from rs_relpose_lab.live.processes import process_figures
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.node.frame_timings import COLUMNS, FrameTimings

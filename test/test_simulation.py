@@ -45,7 +45,7 @@ def blob_wall():
     i, j = np.meshgrid(np.arange(1, 25), np.arange(1, 15))
     centres = np.stack([np.full(i.size, 7.0), 10.0 - spacing * i.ravel(),
                         7.6 - spacing * j.ravel()], axis=1)
-    return Scene.of((wall,)), centres
+    return Scene.of(wall), centres
 
 
 def project_by_rows(point, trajectory, reference_time, config, sign=1.0):
@@ -100,14 +100,14 @@ def test_rendered_rows_are_seen_at_their_instants(direction, stamp_row):
     simulation = simulate(config, scene=scene)
     errors, wrong_sign = [], []
     for index in (3, 17):
-        frame = simulation.frame(index)
-        time = (frame.reference_ns - config.start_ns) * 1e-9
+        image = simulation.image(index)
+        time = (simulation.reference_ns(index) - config.start_ns) * 1e-9
         for centre in centres:
             expected = project_by_rows(centre, simulation.trajectory, time, config)
             if expected is None or not ((expected > 30).all() and expected[0] < 610
                                         and expected[1] < 450):
                 continue
-            found = blob_centre(frame.image, expected)
+            found = blob_centre(image, expected)
             errors.append(np.linalg.norm(found - expected))
             mirrored = project_by_rows(centre, simulation.trajectory, time, config, sign=-1.0)
             wrong_sign.append(np.linalg.norm(found - mirrored))
@@ -122,7 +122,7 @@ def test_global_shutter_has_no_skew_and_rolling_shutter_has():
     scene, _ = blob_wall()
     pictures = [
         simulate(SimulationConfig(plan='constant:2', seed=1, readout_time=readout, **NOISE_FREE),
-                 scene=scene).frame(10).image.astype(float) for readout in (0.0, 0.03)]
+                 scene=scene).image(10).astype(float) for readout in (0.0, 0.03)]
     difference = np.abs(pictures[0] - pictures[1]).mean(axis=1)
     # The first row is the reference of both; the skew grows downwards.
     assert difference[0] < 1e-6
@@ -297,7 +297,7 @@ def hall(bundled):
 
 
 def test_features_can_be_tracked_to_where_they_truly_went(hall):
-    images = [hall.frame(index).image for index in (5, 7)]
+    images = [hall.image(index) for index in (5, 7)]
     corners = cv2.goodFeaturesToTrack(images[0], 600, 0.005, 9)
     truth = hall.true_matches(5, 7, corners[:, 0])
     tracked, found, _ = cv2.calcOpticalFlowPyrLK(images[0], images[1], corners, None)
@@ -312,7 +312,7 @@ def test_features_can_be_tracked_to_where_they_truly_went(hall):
 def test_sift_finds_the_same_points_across_a_wide_baseline(hall):
     sift = cv2.SIFT_create(800)
     (points1, words1), (points2, words2) = (
-        sift.detectAndCompute(hall.frame(index).image, None) for index in (105, 125))
+        sift.detectAndCompute(hall.image(index), None) for index in (105, 125))
     pairs = cv2.BFMatcher().knnMatch(words1, words2, 2)
     good = [a for a, b in pairs if a.distance < 0.75 * b.distance]
     found1 = np.array([points1[m.queryIdx].pt for m in good])
@@ -362,7 +362,7 @@ def test_renderer_reads_texels_where_they_are():
     wall = Surface(np.array([7.0, 10.0, 7.6]), np.array([0.0, -1.0, 0.0]),
                    np.array([0.0, 0.0, -1.0]), 20.0, 12.0, ramp)
     config = SimulationConfig(seed=1, **NOISE_FREE)
-    simulation = simulate(config, scene=Scene.of((wall,)))
+    simulation = simulate(config, scene=Scene.of(wall))
     image = simulation.renderer.render(1.0)
     points = np.array([[100.0, 50.0], [320.0, 240.0], [500.0, 400.0]])
     world, _ = simulation.renderer.locate(1.0, points)
@@ -441,7 +441,7 @@ def test_command_writes_a_bag_and_its_parameters(tmp_path, capsys):
         time_offset=0.004))
     decoded = cv2.imdecode(images[2][1].data, cv2.IMREAD_UNCHANGED)
     assert decoded.shape == (120, 160)
-    difference = decoded.astype(float) - simulation.frame(2).image
+    difference = decoded.astype(float) - simulation.image(2)
     assert np.abs(difference).mean() < 4.0
     assert stamp_ns(images[2][1]) == simulation.stamp_ns(2)
     pose = truth[30][1].pose
@@ -523,7 +523,7 @@ def test_bundled_bag_is_what_its_command_makes(bundled, tmp_path):
     for index in (0, 100):
         _, message = found['/camera/image_raw/compressed'][index]
         assert stamp_ns(message) == simulation.stamp_ns(index)
-        image = simulation.frame(index).image
+        image = simulation.image(index)
         jpeg = cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, args.jpeg_quality])[1]
         again, bundled_image = (cv2.imdecode(data, cv2.IMREAD_UNCHANGED).astype(float)
                                 for data in (jpeg, message.data))

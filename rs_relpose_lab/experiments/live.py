@@ -23,13 +23,14 @@ from rs_relpose_lab.experiments.live_clip import (
 )
 from rs_relpose_lab.experiments.scoring import pose_error
 from rs_relpose_lab.experiments.tables import write_csv
+from rs_relpose_lab.live.processes import ProcessFigures
 from rs_relpose_ros.bags.layout import CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, RAW_TOPIC
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.front_end.sequencer import Refusal
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 
 if TYPE_CHECKING:   # the rest of this module needs no ROS
-    from rs_relpose_lab.live.measured_run import MeasuredRun, ProcessFigures, ReceivedPose
+    from rs_relpose_lab.live.measured_run import MeasuredRun, ReceivedPose
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 import gc
 from multiprocessing import get_context
-from pathlib import Path
+import os
 import time
 
 import cv2
@@ -15,6 +15,7 @@ import numpy as np
 
 from rs_relpose_lab.experiments.methods import as_pair, Estimate, METHODS, prepared
 from rs_relpose_lab.experiments.problems import Cell, CELLS, make_problem
+from rs_relpose_lab.live.processes import process_figures
 from rs_relpose_ros import warm_up
 
 THRESHOLD = 1.5  # [px], of OpenCV and PoseLib
@@ -131,17 +132,9 @@ def soak(estimates: int, on_estimate: Callable[[], object] = lambda: None) -> So
             on_estimate()
 
     work(estimates // 10)
-    before = _resident()
+    before = process_figures(os.getpid())
     work(estimates)
-    return Soak(estimates, before, _resident())
-
-
-def _resident() -> float:
-    """Resident memory of this process [MB], as Linux tells."""
-    for line in Path('/proc/self/status').read_text().splitlines():
-        if line.startswith('VmRSS:'):
-            return float(line.split()[1]) / 1024.0
-    raise OSError('/proc/self/status has no VmRSS')
+    return Soak(estimates, before.resident, process_figures(os.getpid()).resident)
 
 
 def medians(timings: Sequence[Timing], method: str) -> dict[int, float]:

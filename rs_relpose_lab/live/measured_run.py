@@ -24,6 +24,8 @@ from rs_relpose_lab.live.processes import (
     node_process,
     player_process,
     Process,
+    process_figures,
+    ProcessFigures,
     wait_until,
     wait_until_quiet,
 )
@@ -61,42 +63,6 @@ class ReceivedPose:
     received_ns: int
     t: NDArray[np.float64]
     quat_xyzw: NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class ProcessFigures:
-    """Processor time and memory of a process at an instant, as Linux tells them.
-
-    `time_ns`: on the monotonic clock.
-    `cpu`, `cpu_main`: processor time since its start [s]: of all threads, and of the first one.
-    `resident`, `private`: memory [MB]: all that is resident, and without what is shared with
-        others (the transport's segments).
-    """
-
-    time_ns: int
-    cpu: float
-    cpu_main: float
-    resident: float
-    private: float
-
-
-def process_figures(pid: int) -> ProcessFigures:
-    """Figures of a running process."""
-    folder = Path('/proc') / str(pid)
-    memory = dict(line.split(':', 1) for line in (folder / 'status').read_text().splitlines())
-
-    def megabytes(name: str) -> float:
-        return int(memory[name].split()[0]) / 1024.0
-
-    return ProcessFigures(time.monotonic_ns(), _cpu(folder / 'stat'),
-                          _cpu(folder / 'task' / str(pid) / 'stat'), megabytes('VmRSS'),
-                          megabytes('RssAnon'))
-
-
-def _cpu(path: Path) -> float:
-    # The name, in parentheses, may hold anything.
-    fields = path.read_text().rpartition(')')[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -122,12 +122,11 @@ def image_entries(simulation: Simulation, bag: BagWriter,
                   on_frame: Callable[[], object]) -> Iterator[Entry]:
     """Images and their CameraInfo; `encode`: topic, type and message of a stamp and pixels."""
     delay_ns = to_nanoseconds(simulation.config.readout_time + IMAGE_DELAY)
-    for frame in simulation.frames():
-        stamp_ns = frame.stamp_ns
-        topic, msgtype, message = encode(stamp_ns, frame.image)
+    for index in range(simulation.config.frame_count):
+        stamp_ns = simulation.stamp_ns(index)
+        topic, msgtype, message = encode(stamp_ns, simulation.image(index))
         info = bag.camera_info(stamp_ns, CAMERA_FRAME, simulation.camera)
-        yield (stamp_ns + delay_ns, CAMERA_INFO_TOPIC, 'sensor_msgs/msg/CameraInfo',
-               info)
+        yield stamp_ns + delay_ns, CAMERA_INFO_TOPIC, 'sensor_msgs/msg/CameraInfo', info
         yield stamp_ns + delay_ns, topic, msgtype, message
         on_frame()
 

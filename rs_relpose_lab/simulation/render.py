@@ -73,9 +73,9 @@ class Renderer:
         shape = (self.camera.height, self.camera.width)
         image = np.empty(shape, dtype=np.float32)
         hits = np.empty(shape, dtype=np.int32)
-        _render(exposure, self.scene.arrays, image, hits)
+        _render(exposure, self.scene, image, hits)
         if self.edge_samples > 1:
-            _smooth_edges(exposure, self.scene.arrays, self.edge_samples, image, hits)
+            _smooth_edges(exposure, self.scene, self.edge_samples, image, hits)
         return image
 
     def locate(self, reference_time: float,
@@ -90,7 +90,7 @@ class Renderer:
         rays = np.einsum('nij,nj->ni', rotations, self.camera.unproject(points))
         distances = np.empty(len(points))
         hits = np.empty(len(points), dtype=np.int64)
-        _trace_all(positions, rays, self.scene.arrays, distances, hits)
+        _trace_all(positions, rays, self.scene, distances, hits)
         return positions + distances[:, None] * rays, hits
 
     def project(self, reference_time: float, world_points: ArrayLike) -> Array:
