@@ -26,8 +26,7 @@ from rs_relpose_ros import RelativePose, warm_up
 class Trial:
     """One problem, estimated.
 
-    `sigma_factor`: told sigmas are so many times the true ones.
-    `error`, `oracle`: of the estimator and of the oracle.
+    `sigma_factor`: told sigmas by the true ones; `error`, `oracle`: of estimator and oracle;
     `duration`: of the whole estimate [s].
     """
 

@@ -34,11 +34,7 @@ PAPER_ALGORITHMS: Mapping[str, Mapping[str, str | bool]] = {
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Errors of a method over pairs, in degrees.
-
-    `rotation`, `translation` (float, float): median and 90th percentile over the answered pairs;
-        NaN without any.
-    """
+    """Errors of a method over pairs: median and 90th percentile of those answered [deg]."""
 
     name: str
     pairs: int
@@ -96,10 +92,8 @@ def compare_live(table: Path, stamps_file: Path, bag_path: Path, parameter_file:
                  folder: Path, *, pictures: bool = False) -> LiveComparison:
     """Replay into `folder` the frames that a live node processed.
 
-    `table`: relative poses that the node published, as its recorder wrote them.
-    `stamps_file`: stamps of the frames that it processed.
-    `bag_path`, `parameter_file`: what it was given.
-    `pictures`: whether to draw those of the replay.
+    `table`: poses that the node published; `stamps_file`: of the frames that it processed.
+    `bag_path`, `parameter_file`: what it was given; `pictures`: whether to draw the replay's.
     """
     stamps = read_stamps(stamps_file)
     pairs: list[ReplayedPair] = []
@@ -133,11 +127,7 @@ def score_of_replay(name: str, bag_path: Path, parameters: Parameters) -> Score:
 
 def score_of_table(name: str, path: Path, pairs: Sequence[PairRecord],
                    truth: TrueTrajectory) -> Score:
-    """Score of a table of relative poses, which a live node's recorder wrote.
-
-    `pairs`: of a replay of the same frames: they tell how many pairs there were, and their
-        instants.
-    """
+    """Score of a live node's table; `pairs` of a replay of its frames tell number and instants."""
     instants = {(r.reference_stamp_ns, r.stamp_ns): (r.reference_ns1, r.reference_ns2)
                 for r in pairs}
     errors = []
@@ -173,10 +163,7 @@ def best_opencv_score(estimator: str, pairs: Sequence[ReplayedPair], intrinsics:
     """Score of an OpenCV estimator at that of three thresholds which suits it best.
 
     Best in the median rotation error against the truth: a choice that no user could make, in the
-    baseline's favour.
-
-    `estimator` {'RANSAC', 'USAC_MAGSAC'}.
-    `pairs`: those that the pipeline answered: the same matches, and none of a camera that stands.
+    baseline's favour. `pairs`: those that the pipeline answered, none of a camera that stands.
     """
     camera = intrinsics.global_shutter_camera()
     matches = [tuple(undistorted(intrinsics.to_sensor(points), camera) for points in

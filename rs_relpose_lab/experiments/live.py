@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -40,11 +39,7 @@ FORMATS = ('mono8', 'bgr8', 'jpeg')
 
 @dataclass(frozen=True, slots=True)
 class LiveCell:
-    """One camera and IMU.
-
-    `image_format` {'mono8', 'bgr8', 'jpeg'}: raw gray, raw colour, or JPEG in colour.
-    `imu_rate`: samples per second.
-    """
+    """One camera, with one of `FORMATS` (JPEG is in colour), and the rate of an IMU [Hz]."""
 
     width: int
     height: int
@@ -89,24 +84,20 @@ class Percentiles:
 class LiveStatistics:
     """Figures of one cell; times in ms, memory in MB, errors in degrees.
 
-    `duration`: seconds that were played.
     `frames_sent`, `frames_received`, `frames_used`: by the player, by the node's callback, and
         through the whole pipeline.
-    `dropped_overload`, `dropped_other`: refused by the node because newer frames waited, or for
-        any other cause.
+    `dropped_overload`: refused by the node because newer frames waited.
     `latency`: of a published pair: from the later of image and first IMU sample that covers its
         last row, as the node's callbacks got them, to publication.
     `end_to_end`: the same from outside: from the later publication of the two by the player to the
         receipt of the pose by a third process. No delay inside the node can hide from it.
     `frame_time`, `frame_cpu`: of every frame, pair or not: from its turn to its end, and processor
         time of the worker.
-    `cpu`, `cpu_callbacks`, `cpu_player`: percent of one core: the node, its first thread alone
-        (callbacks), and the player.
-    `memory_start`, `memory_end`: resident memory of the node after the first pose and at the end.
-    `private_start`, `private_end`: without what is shared with other processes.
+    `cpu`, `cpu_callbacks`, `cpu_player`: percent of one core: the node, its first thread, player.
+    `memory_*`, `private_*`: of the node after the first pose and at the end: resident, and without
+        what is shared with other processes.
     `seconds_to_ready`, `seconds_to_pose`: from the start of the node's process to its
         subscriptions; from the first frame to the first pose.
-    `rotation_error`, `translation_error`: against the truth.
     `wrong`: poses that are off by more than 1 deg, or 15 deg in the direction of translation.
     `player_late`: how late the player published, on this machine.
     """
@@ -158,13 +149,9 @@ class Course:
 
 def run_cell(cell: LiveCell, clip: Clip, duration: float, folder: Path, profile: Path,
              on_second: Callable[[], object] = lambda: None) -> tuple[LiveStatistics, Course]:
-    """Play a clip to a node of its own.
+    """Play a clip of the cell's size to a node of its own; logs and tables into `folder`.
 
-    `clip`: of the cell's size.
-    `duration`: seconds to play.
-    `folder`: directory of logs and tables; made where it is missing.
-    `profile`: Fast DDS profile for big images.
-    `on_second`: called once a second.
+    `duration` [s]; `profile`: of Fast DDS, for big images; `on_second`: called once a second.
     """
     # Here, so that the names of cells are known without ROS.
     from rs_relpose_lab.live.measured_run import measure, Play
@@ -253,14 +240,8 @@ def _end_to_end(poses: Sequence[ReceivedPose], images: NDArray[np.void],
 
 
 def _read_frames(path: Path) -> NDArray[np.void]:
-    with path.open(newline='') as file:
-        rows = list(csv.DictReader(file))
-    numbers = ('stamp_ns', 'ready_ns', 'taken_ns', 'done_ns', 'cpu_ns')
-    frames = np.empty(len(rows), dtype=[(name, '<i8') for name in numbers] + [('outcome', 'U24')])
-    for name in numbers:
-        frames[name] = [int(row[name]) for row in rows]
-    frames['outcome'] = [row['outcome'] for row in rows]
-    return frames
+    return np.atleast_1d(np.genfromtxt(path, delimiter=',', names=True, dtype=None,
+                                       encoding='ascii'))
 
 
 def _percent(first: ProcessFigures, last: ProcessFigures, name: str) -> float:

@@ -37,11 +37,7 @@ IMU_RATES = (200, 400)
 
 @dataclass(frozen=True, slots=True)
 class Clip:
-    """Files of a clip.
-
-    `bag`: JPEG in colour, CameraInfo, and the IMU at each of `IMU_RATES` on a topic of its own.
-    `parameters`: parameter file of the node.
-    """
+    """Parameter file of the node, and bag: JPEG in colour, CameraInfo, IMU at all `IMU_RATES`."""
 
     bag: Path
     parameters: Path
@@ -61,12 +57,7 @@ def configuration(width: int, height: int, imu_rate: int = IMU_RATES[0]) -> Simu
 
 def prepare_clip(folder: Path, width: int, height: int,
                  on_frame: Callable[[], object] = lambda: None) -> Clip:
-    """Render a clip into a folder, unless it is there.
-
-    `folder`: made where it is missing.
-    `width`, `height`: size of the images [px].
-    `on_frame`: called after each of the images.
-    """
+    """Render a clip into a folder, unless it is there; `on_frame` is called after each image."""
     def render(path: Path, parameters: Path) -> None:
         trajectory = closed_loop(PERIOD)
         first = simulate(configuration(width, height), trajectory=trajectory)

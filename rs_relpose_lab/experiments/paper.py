@@ -22,9 +22,7 @@ class Sweep:
     """One figure of the paper.
 
     `axis`, `unit`: what is varied, with its unit; the unit.
-    `varied`: the field of `Cell`.
-    `levels`: its values.
-    `fixed`: fields of `Cell` that are not at their defaults.
+    `varied`, `levels`: the field of `Cell` and its values; `fixed`: others not at their defaults.
     """
 
     name: str
@@ -71,10 +69,8 @@ SWEEPS = {sweep.name: sweep for sweep in (
 class PaperRun:
     """Which experiments are run, and how.
 
-    `sweeps`, `directions`, `methods`: names of `SWEEPS`, `problems.BASELINES` and
-        `methods.METHODS`.
-    `trials`: of each level of each direction.
-    `base`: noises and outliers where an experiment does not vary them.
+    `sweeps`, `directions`, `methods`: names of `SWEEPS`, `BASELINES` and `METHODS`.
+    `trials`: of each level of each direction; `base`: what an experiment does not vary.
     """
 
     sweeps: tuple[str, ...]
@@ -114,11 +110,7 @@ class Task:
 
 def run_paper(run: PaperRun, jobs: int = 1,
               on_problem: Callable[[], object] = lambda: None) -> list[Record]:
-    """Run the experiments; the result does not depend on `jobs`.
-
-    `jobs`: processes.
-    `on_problem`: called after each of `run.tasks()`.
-    """
+    """Run the experiments in `jobs` processes; `on_problem` is called after each task."""
     if jobs < 1:
         raise InputError(f'jobs must be at least 1, got {jobs}')
     records = []

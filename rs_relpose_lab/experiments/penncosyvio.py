@@ -70,12 +70,9 @@ class Pair:
 class PennCosyvioRun:
     """What is run, and on what.
 
-    `sequences`, `methods`: names of `STRETCHES` and `methods.METHODS`.
-    `camera`, `imu`: names of `penncosyvio_files.CAMERAS` and `IMUS`.
-    `readout_time`: of the camera [s].
-    `stamp_row` {'first', 'middle', 'last'}: row that a frame's stamp marks.
-    `time_offset`: IMU clock minus camera clock [s].
-    `gyro_bias` (3,): subtracted from the gyro, IMU frame [rad/s].
+    `sequences`, `methods`, `camera`, `imu`: names of `STRETCHES`, `METHODS`, `CAMERAS`, `IMUS`.
+    `readout_time` [s]; `stamp_row`: that a frame's stamp marks.
+    `time_offset`: IMU clock minus camera clock [s]; `gyro_bias`: subtracted, IMU frame [rad/s].
     `every`, `distance`: frames from one pair to the next, and between the two of a pair.
     """
 
@@ -115,11 +112,7 @@ class PairSource(Protocol):
 
 def run_penncosyvio(run: PennCosyvioRun, open_sequence: Callable[[str], PairSource],
                     on_pair: Callable[[], object] = lambda: None) -> list[Record]:
-    """Estimate every pair by every method.
-
-    `open_sequence`: gives the source of a sequence.
-    `on_pair`: called after each pair.
-    """
+    """Estimate every pair by every method; `on_pair` is called after each pair."""
     records = []
     sequences = {name: open_sequence(name) for name in run.sequences}
     for pair in run.pairs():

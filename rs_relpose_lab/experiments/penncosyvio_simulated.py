@@ -48,10 +48,8 @@ _IMU, _POINTS, _NOISE, _SCENE, _IMAGE = range(5)
 class Simulated:
     """What is put in place of the recorded images.
 
-    `rendered`: images, of which SIFT features are matched, instead of points.
-    `scene`: name of `simulation.scene.SCENES`, for images.
-    `pixel_noise`: of points, 1 sigma of each coordinate [px].
-    `outliers`: share of the points' matches that are random.
+    `rendered`: images of a `scene`, of which SIFT features are matched, instead of points.
+    `pixel_noise`, `outliers`: of points, 1 sigma [px]; share of their matches that are random.
     """
 
     rendered: bool = False

@@ -45,12 +45,9 @@ _DEPTHS = 6.0, 34.0  # [m]
 class Cell:
     """One setting of an experiment; the defaults are the base cell of the benchmark.
 
-    `direction` {'forward', 'sideways'}.
-    `speed`, `rate`: linear [m/s] and angular [rad/s] velocity per axis, opposite in the two
-        frames.
-    `pixel_noise`: 1 sigma per coordinate [px].
-    `gravity_noise`: per axis of one frame's direction [deg].
-    `gyro_noise`: 1 sigma per axis [deg/s].
+    `direction` of `BASELINES`; `speed` [m/s], `rate` [rad/s]: per axis, opposite in the frames.
+    `pixel_noise` [px], `gyro_noise` [deg/s]: 1 sigma per axis; `gravity_noise` [deg]: per axis of
+        one frame's direction.
     `outliers`: share of matches whose second point is anywhere in the image.
     `constant_velocity`: both frames move along the baseline at ``sqrt(3) speed``.
     `placing` {'box', 'image'}: points are drawn evenly in a box of the world, or over the image
@@ -95,14 +92,9 @@ CELLS = {f'{direction}-{name}': Cell(direction=direction, **changes)  # type: ig
 class TwoViewProblem:
     """Matches, what the IMU measures, and the truth; pose and motion refer to row 0.
 
-    `points1`, `points2` (N, 2): matches [px].
-    `measured_rate1`, `measured_rate2` (3,): gyro [rad/s], each in its own camera's frame.
-    `measured_gravity1`, `measured_gravity2` (3,): unit, down, each in its own camera's frame.
-    `R`, `t` (3, 3) and (3,): truth: ``X1 = R X2 + t``, ``|t| = 1``.
-    `v1`, `v2` (3,): true linear velocities, each in its own camera's frame [baselines per second].
-    `w1`, `w2` (3,): true angular velocities, each in its own camera's frame [rad/s].
-    `gravity1` (3,): true direction of gravity in camera 1.
-    `is_outlier` (N,).
+    `measured_rate*` [rad/s], `measured_gravity*` (unit, down): each in its own camera's frame.
+    `R`, `t`: truth: ``X1 = R X2 + t``, ``|t| = 1``; `gravity1`: true direction in camera 1.
+    `v1`, `v2` [baselines per second], `w1`, `w2` [rad/s]: true velocities in the cameras' frames.
     """
 
     points1: Array

@@ -32,24 +32,14 @@ from rs_relpose_ros.replay.tables import number, RELATIVE_POSE_COLUMNS, TableWri
 
 @dataclass(frozen=True, slots=True)
 class LiveRun:
-    """Files of a live run.
-
-    `table`: the relative poses that the node published.
-    `stamps`: stamps of the frames that it processed, for `rs_relpose replay --stamps`.
-    """
+    """Files of a live run: poses that the node published, stamps of the frames it processed."""
 
     table: Path
     stamps: Path
 
 
 def run_live(bag: Path, parameters: Path, folder: Path) -> LiveRun:
-    """Play `bag` to a relpose_node of its own.
-
-    `parameters`: parameter file of the node.
-    `folder`: directory for tables and logs; must exist.
-    Raises LiveRunError.
-    Raises InputError, MissingInputError: the bag cannot be read or lacks a topic.
-    """
+    """Play `bag` to a relpose_node of its own; tables and logs into `folder`, which exists."""
     with open_bag(bag) as opened:
         topics, duration = opened.find_topics(), opened.duration
     run = LiveRun(folder / 'live.csv', folder / 'live_stamps.txt')

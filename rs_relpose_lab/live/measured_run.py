@@ -39,11 +39,9 @@ _QUIET = 2.5
 class Play:
     """What is played to the node, and how.
 
-    `parameters`: parameter file of the node.
+    `parameters`: file of the node; `transport`: its `image_transport`.
     `remap`: the node's topics `image`, `camera_info` and `imu` by their names in the bag.
-    `transport` {'raw', 'compressed'}: what the node subscribes to.
-    `player`: options of the player.
-    `profile`: Fast DDS profile of all processes.
+    `player`: options of the player; `profile`: of Fast DDS, for all processes.
     """
 
     bag: Path
@@ -113,11 +111,9 @@ class _Listener:
 
 def measure(play: Play, folder: Path,
             on_second: Callable[[], object] = lambda: None) -> MeasuredRun:
-    """Play a bag to a node of its own and watch.
+    """Play a bag to a node of its own and watch; logs and tables into `folder`, which exists.
 
-    `folder`: directory of logs and tables; must exist.
     `on_second`: called once a second while messages are played.
-    Raises LiveRunError: a process failed.
     """
     timings, log = folder / 'frames.csv', folder / 'player.npy'
     log.unlink(missing_ok=True)

@@ -129,14 +129,9 @@ def player_process(bag: Path, *options: str, log: Path | None = None) -> Process
 
 def wait_until(condition: Callable[[], Value], what: str, *processes: Process,
                timeout: float = PATIENCE) -> Value:
-    """Wait for a condition while processes run.
+    """Ask until the answer is true, and return it; LiveRunError where a process fails meanwhile.
 
-    `condition`: asked until its answer is true.
     `what`: for the error message.
-    `*processes`: must not fail meanwhile.
-    `timeout`: longest wait [s].
-    Returns the true answer.
-    Raises LiveRunError.
     """
     deadline = time.monotonic() + timeout
     while not (value := condition()):

@@ -42,11 +42,8 @@ def write_bag(simulation: Simulation, path: Path | str, *, jpeg_quality: int = 8
               raw: bool = False, on_frame: Callable[[], object] = lambda: None) -> None:
     """Render `simulation` into a bag, in the order in which drivers would deliver.
 
-    `path`: directory to create.
-    `jpeg_quality`: 1 to 100.
-    `raw`: sensor_msgs/Image instead of JPEG.
+    `path`: directory to create; `jpeg_quality`: 1 to 100; `raw`: sensor_msgs/Image instead.
     `on_frame`: called after each image.
-    Raises InputError: the path exists already or cannot be created.
     """
     if not 1 <= jpeg_quality <= 100:
         raise InputError(f'jpeg_quality must lie in [1, 100], got {jpeg_quality}')

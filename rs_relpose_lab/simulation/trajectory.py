@@ -46,7 +46,6 @@ class CameraStates:
     """Poses of the camera optical frame in the world at N instants, and their derivatives.
 
     `position`, `velocity`, `acceleration` (N, 3): world frame [m], [m/s], [m/s^2].
-    `R_world_cam` (N, 3, 3): orientation.
     `angular_velocity`, `angular_acceleration` (N, 3): camera frame [rad/s], [rad/s^2].
     """
 
@@ -62,10 +61,8 @@ class CameraStates:
 class Trajectory:
     """Motion of the camera over an interval.
 
-    `positions` (K, 3): control points of the position [m], one every `spacing`.
-    `angles` (K, 3): control points of yaw, pitch and roll [rad].
-    `first_control`: time of the first control point [s].
-    `spacing`: time between control points [s].
+    `positions` (K, 3) [m], `angles` (K, 3) of yaw, pitch and roll [rad]: control points, one every
+        `spacing` [s] from `first_control` [s] on.
     `segments`: labels of the stretches; between them one kind passes into the next.
     """
 
