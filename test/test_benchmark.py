@@ -209,3 +209,10 @@ def test_times_are_compared_problem_by_problem(tmp_path):
     assert [(list(line.get_xdata()), list(line.get_ydata())) for line in right.lines] == [
         (list(times), list(times.values()))
         for times in (medians(timings, REFERENCE), medians(timings, LIBRARY))]
+
+
+def test_without_the_laboratory_its_commands_say_so(monkeypatch, capsys):
+    monkeypatch.setattr('importlib.util.find_spec', lambda name: None)
+    assert main(['benchmark', 'speed']) == 2
+    said = capsys.readouterr().err
+    assert 'benchmark needs the package rs_relpose_lab' in said and said.count('\n') == 1

@@ -327,19 +327,7 @@ def test_bad_numbers_are_one_line_and_exit_code_2(arguments, said, tmp_path, cap
     assert said in error and error.count('\n') == 1
 
 
-@pytest.mark.parametrize('arguments', [['--solvers', 'magic'], ['--figures', 'none'],
-                                       ['--solvers', 'auto_gyro']])
-def test_bad_names_are_refused(arguments, tmp_path, capsys):
-    assert paper(tmp_path, *arguments) == 2
-    assert 'invalid choice' in capsys.readouterr().err
-
-
 def test_output_that_is_a_file_is_refused(tmp_path, capsys):
     (tmp_path / 'file').write_text('')
     assert paper(tmp_path / 'file', '--trials', '1') == 2
     assert str(tmp_path / 'file') in capsys.readouterr().err
-
-
-def test_experiment_must_be_named(capsys):
-    assert main.main(['evaluate']) == 2
-    assert 'EXPERIMENT' in capsys.readouterr().err

@@ -33,10 +33,10 @@ from rs_relpose_lab.experiments.penncosyvio_files import (
 )
 from rs_relpose_lab.experiments.penncosyvio_simulated import (
     PlacedMotion,
+    RecordedMotion,
     Simulated,
     SimulatedSequence,
 )
-from rs_relpose_lab.experiments.recorded_motion import RecordedMotion
 from rs_relpose_lab.experiments.scoring import NO_POSE, PoseError
 from rs_relpose_lab.simulation.inertial import ImuModel
 from rs_relpose_lab.simulation.render import Renderer

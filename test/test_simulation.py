@@ -118,17 +118,6 @@ def test_rendered_rows_are_seen_at_their_instants(direction, stamp_row):
     assert np.median(wrong_sign) > 3.0
 
 
-def test_global_shutter_has_no_skew_and_rolling_shutter_has():
-    scene, _ = blob_wall()
-    pictures = [
-        simulate(SimulationConfig(plan='constant:2', seed=1, readout_time=readout, **NOISE_FREE),
-                 scene=scene).image(10).astype(float) for readout in (0.0, 0.03)]
-    difference = np.abs(pictures[0] - pictures[1]).mean(axis=1)
-    # The first row is the reference of both; the skew grows downwards.
-    assert difference[0] < 1e-6
-    assert difference[400:].mean() > 5 * difference[5:40].mean()
-
-
 def test_trajectory_derivatives_are_exact():
     trajectory = hand_held(np.random.default_rng(3), -0.2, 6.2,
                            Plan.drawn(np.random.default_rng(1), 6.0), speed=1.5,
