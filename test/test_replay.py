@@ -152,7 +152,9 @@ def test_pictures_are_drawn(replayed):
     for name in ('matches.png', 'errors.png', 'residuals.png', 'rotation.png'):
         picture = cv2.imread(str(replayed / name))
         assert picture is not None and min(picture.shape[:2]) > 400, name
-        assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50, f'{name} is empty'
+        # Colours as one integer each: rows are dear to compare.
+        colours = picture.astype(np.uint32) @ np.array([1, 1 << 8, 1 << 16], dtype=np.uint32)
+        assert len(np.unique(colours)) > 50, f'{name} is empty'
 
 
 def test_the_bag_of_the_poses_equals_the_table(replayed):
@@ -300,7 +302,7 @@ def test_parameter_file_and_assignments(tmp_path):
     ('other:\n  ros__parameters:\n    a: 1\n', 'has no parameters for relpose_node'),
     ('just text', 'no ROS parameter file'),
     ('a: [1', 'no YAML'),
-    ('a: ' + '[' * 5000, 'no YAML'),
+    ('a: ' + '[' * 1500, 'no YAML'),
     ('a: &a [1]\n/**: {ros__parameters: {gyro_bias: *a}}', 'YAML aliases'),
 ])
 def test_bad_parameter_files(tmp_path, text, said):

@@ -57,15 +57,7 @@ def find_sensor_topics(bag: Path, topics: Sequence[Topic], options: TopicOptions
     """The sensors' topics: as chosen, or by type where only one can be meant.
 
     Of several CameraInfo topics the one beside the image is taken, and of two Imu topics one with
-    'gyro' and one with 'accel' in its name make a pair (RealSense).
-
-    Parameters
-    ----------
-    bag : Path
-        Named in errors.
-    topics : sequence of Topic
-        All that the bag has.
-    options : TopicOptions
+    'gyro' and one with 'accel' in its name make a pair (RealSense). `bag` is named in errors.
 
     Raises
     ------

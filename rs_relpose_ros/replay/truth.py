@@ -22,24 +22,12 @@ _MIN_POSES = 4
 
 @dataclass(frozen=True, slots=True)
 class PairErrors:
-    """True motion of a pair and the errors of its estimate, NaN where there is no such figure.
+    """True motion of a pair and the errors of its estimate, NaN where there is no such figure."""
 
-    Attributes
-    ----------
-    baseline : float
-        True distance of the two reference instants' positions [m].
-    rotation : float
-        True angle of rotation [deg].
-    rotation_error : float
-        Angle of ``R_estimated^T R_true`` [deg].
-    translation_error : float
-        Angle between the directions of translation [deg], 0 to 180.
-    """
-
-    baseline: float
-    rotation: float
-    rotation_error: float
-    translation_error: float
+    baseline: float   # true distance of the two reference instants' positions [m]
+    rotation: float   # true angle [deg]
+    rotation_error: float   # angle of R_estimated^T R_true [deg]
+    translation_error: float   # angle between the directions of translation [deg], 0 to 180
 
 
 class TrueTrajectory:
