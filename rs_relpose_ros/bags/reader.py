@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, ExitStack
-from dataclasses import dataclass
 import functools
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, QosReliability
 from rosbags.rosbag1 import Reader as Reader1
@@ -17,7 +16,7 @@ from rosbags.typesys.store import Typestore
 
 from rs_relpose_ros.bags.limits import bound_decompression, check_metadata, MAX_MESSAGE_BYTES
 from rs_relpose_ros.bags.mcap_check import check_mcap
-from rs_relpose_ros.bags.topics import find_sensor_topics, SensorTopics, Topic, TopicOptions
+from rs_relpose_ros.bags.topics import SensorTopics, Topic, TopicFinder, TopicOptions
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 
@@ -26,8 +25,7 @@ _STORAGE_SUFFIXES = ('.mcap', '.db3')
 bound_decompression()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BagMessage:
+class BagMessage(NamedTuple):
     """A message with its topic and the time at which it was recorded [ns]."""
 
     topic: str
@@ -35,8 +33,7 @@ class BagMessage:
     message: Any
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RawMessage:
+class RawMessage(NamedTuple):
     """A message as CDR bytes, with its topic and the time at which it was recorded [ns]."""
 
     topic: str
@@ -99,8 +96,8 @@ class Bag:
         return 'reliable' if QosReliability.RELIABLE in offered else ''
 
     def find_topics(self, options: TopicOptions | None = None) -> SensorTopics:
-        """The sensors' topics; see `find_sensor_topics`."""
-        return find_sensor_topics(self.path, self.topics, options or TopicOptions())
+        """The sensors' topics; see `TopicFinder.find`."""
+        return TopicFinder(self.path, self.topics).find(options or TopicOptions())
 
     def messages(self, topics: Sequence[Topic]) -> Iterator[BagMessage]:
         """Messages of `topics` in the order of bag time; their arrays are read-only.
@@ -173,12 +170,8 @@ class Bag:
 def open_bag(path: Path | str) -> Iterator[Bag]:
     """Open a rosbag2 directory, or a single ``.mcap``, ``.db3`` or ROS 1 ``.bag`` file.
 
-    Raises
-    ------
-    MissingInputError
-        There is nothing at `path`.
-    InputError
-        It is no bag, or it is truncated or damaged; one sentence says which.
+    MissingInputError where there is nothing at `path`; InputError where it is no bag, or truncated
+    or damaged: one sentence says which.
     """
     path = Path(path)
     _check_path(path)
