@@ -82,15 +82,7 @@ def pose_from_message(msg: Any) -> TruePose:
 
 
 def intrinsics_from_info(msg: Any) -> Intrinsics:
-    """Intrinsics of a sensor_msgs/CameraInfo, region of interest and binning honoured.
-
-    Raises
-    ------
-    MissingInputError
-        The camera is not calibrated (``k[0] == 0``).
-    InputError
-        Unknown distortion model or number of coefficients, or figures that contradict each other.
-    """
+    """Intrinsics of a sensor_msgs/CameraInfo, region of interest and binning honoured."""
     k = [float(value) for value in _field(msg, 'k')]
     if len(k) != 9:
         raise InputError(f'k of CameraInfo must have 9 elements, got {len(k)}')

@@ -56,19 +56,8 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
     """Run `bag` through the pipeline and write tables, pictures and a bag into `folder`.
 
     Files of an earlier run in `folder` are replaced; it is created as needed. `stamps` and
-    `on_image` are as of `Replay`.
-
-    Parameters
-    ----------
-    pictures, with_bag : bool
-        Whether to draw, and whether to write the node's topics as a bag.
-    on_pair : callable
-        Called with each pair; its result carries images where `pictures` are drawn.
-
-    Raises
-    ------
-    InputError, MissingInputError
-        As `Replay.pairs`; or `folder` cannot be written.
+    `on_image` are as of `Replay`; `with_bag`: whether to write the node's topics as a bag.
+    `on_pair` is called with each pair, which carries images where `pictures` are drawn.
     """
     run = Replay(bag, topics, parameters, stamps=stamps, keep_images=pictures, on_image=on_image)
     truth = read_truth(bag, topics)

@@ -53,18 +53,11 @@ class ReplayCounts:
 
 
 class Replay:
-    """One run over a bag; iterate over `pairs`, then read `counts` and `reasons`.
+    """One run over an open bag; iterate over `pairs`, then read `counts` and `reasons`.
 
-    Parameters
-    ----------
-    bag : Bag
-        Open.
-    stamps : set of int, optional
-        Only these frames are handed over, as those that a live node processed.
-    keep_images : bool
-        Whether pairs carry their images.
-    on_image : callable
-        Called after each image of the bag, for a progress bar.
+    With `stamps` only these frames are handed over, as those that a live node processed.
+    `keep_images`: whether pairs carry their images. `on_image` is called after each image of the
+    bag, for a progress bar.
     """
 
     def __init__(self, bag: Bag, topics: SensorTopics, parameters: Parameters, *,
@@ -93,10 +86,7 @@ class Replay:
     def pairs(self) -> Iterator[ReplayedPair]:
         """Run over the bag; every pair as it closes.
 
-        Raises
-        ------
-        InputError, MissingInputError
-            The bag is damaged, its camera is not calibrated, or no frame of it could be used.
+        Raises where the bag is damaged, its camera is not calibrated, or no frame could be used.
         """
         warm_up()
         started = time.perf_counter()
@@ -184,13 +174,7 @@ def read_truth(bag: Bag, topics: SensorTopics) -> TrueTrajectory | None:
 
 
 def read_stamps(path: Path | str) -> frozenset[int]:
-    """Stamps of frames, one integer [ns] per line, as the node's `stamps_file` writes them.
-
-    Raises
-    ------
-    InputError, MissingInputError
-        No such file, a line that is no integer, or no stamp at all; empty lines do not count.
-    """
+    """Stamps of frames, one integer [ns] per line, as the node's `stamps_file` writes them."""
     path = Path(path)
     if not path.is_file():
         raise MissingInputError(f'there is no file of stamps {path}')

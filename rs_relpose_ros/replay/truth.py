@@ -33,14 +33,8 @@ class PairErrors:
 class TrueTrajectory:
     """Camera poses in the world, interpolated: SLERP and a cubic spline of the position.
 
-    Parameters
-    ----------
-    stamps_ns : (K,) array_like of int
-        On the IMU clock.
-    positions : (K, 3) array_like
-        [m].
-    quats_xyzw : (K, 4) array_like
-        Rotation of the camera's optical frame in the world.
+    Stamps (K,) on the IMU clock, positions (K, 3) [m], and rotations of the camera's optical
+    frame in the world as quaternions (K, 4).
     """
 
     def __init__(self, stamps_ns: ArrayLike, positions: ArrayLike, quats_xyzw: ArrayLike) -> None:
