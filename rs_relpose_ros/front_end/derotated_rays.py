@@ -47,23 +47,12 @@ class Sensor(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DerotatedRays:
-    """Points of one image and what follows from them.
+    """Points of one image with their rays."""
 
-    Attributes
-    ----------
-    track_ids : (N,) ndarray of uint32
-    points : (N, 2) ndarray
-        Pixels of the published image.
-    rays : (N, 3) ndarray
-        Unit rays in the camera frame of the stamped row.
-    row_times : (N,) ndarray
-        From the stamped row [s].
-    """
-
-    track_ids: Ids
-    points: Array
-    rays: Array
-    row_times: Array
+    track_ids: Ids   # (N,)
+    points: Array   # (N, 2) pixels of the published image
+    rays: Array   # (N, 3) unit, in the camera frame of the stamped row
+    row_times: Array   # (N,) [s] from the stamped row
 
     @classmethod
     def from_points(cls, track_ids: Ids, points: Array, sensor: Sensor,

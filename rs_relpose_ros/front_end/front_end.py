@@ -19,38 +19,21 @@ from rs_relpose_ros.front_end.sequencer import FrameRefused, ReadyFrame, Sequenc
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameProcessed:
-    """A frame that was tracked, and the pair that it closed, if it did.
-
-    Attributes
-    ----------
-    ready_ns, taken_ns : int
-        As in `ReadyFrame`.
-    seconds : float
-        Wall time of tracking and estimation.
-    pair : PairResult or None
-    """
+    """A frame that was tracked, and the pair that it closed, if it did."""
 
     stamp_ns: int
-    ready_ns: int
+    ready_ns: int   # both as in `ReadyFrame`
     taken_ns: int
-    seconds: float
+    seconds: float   # wall time of tracking and estimation
     pair: PairResult | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameFailed:
-    """A frame in which an error came up: tracking starts anew with the next one.
+    """A frame in which an error came up: tracking starts anew with the next one."""
 
-    Attributes
-    ----------
-    stamp_ns : int or None
-        None where no frame had been taken yet.
-    error : Exception
-        Of the package (`RsRelposeError`), or, live, a programming error.
-    """
-
-    stamp_ns: int | None
-    error: Exception
+    stamp_ns: int | None   # None where no frame had been taken yet
+    error: Exception   # of the package (`RsRelposeError`), or, live, a programming error
 
 
 Outcome = FrameRefused | FrameFailed | FrameProcessed

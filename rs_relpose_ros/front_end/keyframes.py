@@ -8,24 +8,12 @@ from rs_relpose_ros.config.keyframes import KeyframeConfig
 
 
 class SinceKeyframe(NamedTuple):
-    """What has happened since the reference keyframe.
+    """What has happened since the reference keyframe."""
 
-    Attributes
-    ----------
-    parallax : float
-        Median parallax of the matches after derotation [px]; NaN where there are none.
-    interval : float
-        Time [s].
-    frames : int
-        Number of frames; 1 for the first after the keyframe.
-    tracked_fraction : float
-        Share of the keyframe's features that are still tracked.
-    """
-
-    parallax: float
-    interval: float
-    frames: int
-    tracked_fraction: float
+    parallax: float   # [px] median of the matches after derotation
+    interval: float   # [s]
+    frames: int   # 1 for the first frame after the keyframe
+    tracked_fraction: float   # share of the keyframe's features that are still tracked
 
 
 def closes_pair(since: SinceKeyframe, config: KeyframeConfig) -> bool:

@@ -60,26 +60,13 @@ class Refusal(str, Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReadyFrame:
-    """A decoded frame with its IMU.
-
-    Attributes
-    ----------
-    frame : Frame
-    imu : FrameImu
-    restart : bool
-        Time jumped since the frame before: what was tracked belongs to another time.
-    ready_ns : int
-        When the later of the image and the IMU sample that covers its last row came, on the
-        monotonic clock; 0 offline.
-    taken_ns : int
-        When its turn came, on the same clock: it was decoded after that.
-    """
+    """A decoded frame with its IMU; both instants are on the monotonic clock, 0 offline."""
 
     frame: Frame
     imu: FrameImu
-    restart: bool
-    ready_ns: int
-    taken_ns: int
+    restart: bool   # time jumped since the frame before: tracks belong to another time
+    ready_ns: int   # arrival of the image or of the IMU sample behind its last row: the later
+    taken_ns: int   # when its turn came; it was decoded after that
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,11 +80,7 @@ class FrameRefused:
 
 @dataclass(frozen=True, slots=True)
 class SequencerCounts:
-    """What came and what became of it, since the start.
-
-    `imu_repeated` counts samples of a stamp that had come before and were dropped, `imu_late`
-    those that came after a younger one and were sorted in.
-    """
+    """What came and what became of it, since the start."""
 
     frames: int
     frames_taken: int
@@ -105,24 +88,21 @@ class SequencerCounts:
     imu_samples: int
     imu_gaps: int
     clock_jumps: int
-    imu_repeated: int = 0
-    imu_late: int = 0
+    imu_repeated: int = 0   # samples of a stamp that had come before, dropped
+    imu_late: int = 0   # samples that came after a younger one, sorted in
 
 
 @dataclass(slots=True, eq=False)
 class _Waiting:
-    """A frame with its instants on the IMU clock and the monotonic clock [ns].
-
-    `ready_ns` is None until the IMU covers its last row.
-    """
+    """A frame that waits for the IMU or for the worker."""
 
     frame: Frame | EncodedFrame
-    start_ns: int
+    start_ns: int   # first, last and stamped row on the IMU clock, without a tracked offset
     end_ns: int
     reference_ns: int
-    received_ns: int
+    received_ns: int   # on the monotonic clock
     generation: int
-    ready_ns: int | None = None
+    ready_ns: int | None = None   # None until the IMU covers its last row
 
 
 class _StepsBack:

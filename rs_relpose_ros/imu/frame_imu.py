@@ -16,24 +16,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GyroSegment:
-    """Gyro samples between two instants, borders interpolated, bias removed, camera frame.
+    """Gyro samples between two instants, borders interpolated, bias removed, camera frame."""
 
-    Attributes
-    ----------
-    stamps_ns : (K,) ndarray of int64
-        The first and the last are the two instants themselves.
-    angular_velocities : (K, 3) ndarray
-        Rates [rad/s] in the camera frame.
-    bias : (3,) ndarray
-        What was removed [rad/s], in the camera frame; the mean where it changed meanwhile.
-    bias_sigma : float
-        Its uncertainty per axis [rad/s].
-    """
-
-    stamps_ns: NDArray[np.int64]
-    angular_velocities: Array
-    bias: Array
-    bias_sigma: float
+    stamps_ns: NDArray[np.int64]   # (K,) the first and the last are the two instants
+    angular_velocities: Array   # (K, 3) [rad/s]
+    bias: Array   # (3,) [rad/s] that was removed; the mean where it changed meanwhile
+    bias_sigma: float   # [rad/s] per axis
 
     @property
     def duration(self) -> float:
@@ -51,28 +39,14 @@ class GyroSegment:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameImu:
-    """The IMU's share of a frame, all in the camera frame.
+    """The IMU's share of a frame, all in the camera frame."""
 
-    Attributes
-    ----------
-    motion : FrameMotion
-        Reference: the stamped row.
-    gravity_sigma : float or None
-        1 sigma per axis of the gravity direction [rad]; None where there is no gravity.
-    reference_ns : int
-        Instant of the stamped row on the IMU clock.
-    since_previous : GyroSegment or None
-        From the previous frame's reference instant to this one's; None for the first frame or
-        where the gyro has a gap.
-    applied_offset_ns : int
-        Tracked time offset that these instants hold beyond the parameter's.
-    """
-
-    motion: FrameMotion
-    gravity_sigma: float | None
-    reference_ns: int
+    motion: FrameMotion   # relative to the stamped row
+    gravity_sigma: float | None   # [rad] per axis of the direction; None where there is none
+    reference_ns: int   # instant of the stamped row on the IMU clock
+    # Since the previous frame's reference instant; None for the first frame or after a gap.
     since_previous: GyroSegment | None
-    applied_offset_ns: int = 0
+    applied_offset_ns: int = 0   # tracked time offset in these instants, beyond the parameter's
 
 
 def frame_imu(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_cam_imu: Array,

@@ -50,38 +50,20 @@ class GravityEstimate:
 
 
 class _Noise(NamedTuple):
-    """Noise of the filter.
+    """Noise of the filter, per axis."""
 
-    Attributes
-    ----------
-    acceleration : float
-        Variance of the camera's own acceleration per axis [m^2/s^4].
-    turning, bias : float
-        Growth of the variance of direction [rad^2/s] and gyro bias [rad^2/s^3] per axis.
-    """
-
-    acceleration: float
-    turning: float
-    bias: float
+    acceleration: float   # [m^2/s^4] variance of the camera's own acceleration
+    turning: float   # [rad^2/s] growth of the variance of the direction
+    bias: float   # [rad^2/s^3] growth of the variance of the gyro bias
 
 
 class _State(NamedTuple):
-    """State of the filter, which the kernels update in place; all in the IMU frame.
+    """State of the filter, which the kernels update in place; all in the IMU frame."""
 
-    Attributes
-    ----------
-    up, bias : (3,) ndarray
-        Direction ``u`` and bias ``b`` [rad/s].
-    covariance : (6, 6) ndarray
-        P, of ``(d, e)``.
-    residual : (3,) ndarray
-        Mean of ``f / |f| - u`` over about the last second.
-    """
-
-    up: Array
-    bias: Array
-    covariance: Array
-    residual: Array
+    up: Array   # (3,) u
+    bias: Array   # (3,) b [rad/s]
+    covariance: Array   # (6, 6) P, of (d, e)
+    residual: Array   # (3,) mean of f / |f| - u over about the last second
 
 
 class GravityFilter:

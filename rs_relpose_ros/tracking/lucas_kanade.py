@@ -28,20 +28,11 @@ _WORTH = 2.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Flow:
-    """Where points were found again.
+    """Where points were found again."""
 
-    Attributes
-    ----------
-    points : (N, 2) ndarray
-        In the second image.
-    found : (N,) ndarray of bool
-    strength : (N,) ndarray
-        Least eigenvalue of each window's structure tensor [gray^2/px^2].
-    """
-
-    points: Array
-    found: NDArray[np.bool_]
-    strength: Array
+    points: Array   # (N, 2) in the second image
+    found: NDArray[np.bool_]   # (N,)
+    strength: Array   # (N,) [gray^2/px^2] least eigenvalue of each window's structure tensor
 
 
 def follow(image1: Image, image2: Image, points1: Array, guess: Array, side: int, levels: int,

@@ -25,18 +25,10 @@ _FARTHEST = 1e6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patches:
-    """Square patches of one image.
+    """Square patches of one image."""
 
-    Attributes
-    ----------
-    image : (H, W) ndarray of uint8
-        Patch by patch, in rows.
-    shifts : (N, 2) ndarray
-        Added to a point near the centre of patch k [px of the whole image] they give its place in
-        `image`.
-    """
-
-    image: Image
+    image: Image   # patch by patch, in rows
+    # (N, 2), row k added to a point [px] near the centre of patch k gives its place in `image`
     shifts: Array
 
 
