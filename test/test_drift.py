@@ -24,7 +24,7 @@ from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.messages.intake import Intake
 from rs_relpose_ros.messages.sensor_feed import Role
 from rs_relpose_ros.node.diagnostics import Inputs, Statistics
-from rs_relpose_ros.node.worker import Warm, Worker
+from rs_relpose_ros.node.worker import WarmedUp, Worker
 from rs_relpose_ros.replay.run import Replay
 
 MS = 1_000_000
@@ -265,7 +265,7 @@ def test_live_and_replay_agree_while_the_offset_is_applied(bundled_bag):
     while not events:
         assert worker.is_alive()
         time.sleep(0.01)
-    assert isinstance(events[0], Warm)
+    assert isinstance(events[0], WarmedUp)
     intake, rng = Intake(sequencer), np.random.default_rng(5)
     images = 0
     with open_bag(bundled_bag) as bag:

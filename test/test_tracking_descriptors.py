@@ -6,7 +6,7 @@ import pytest
 from tracking_images import errors, WarpedScene
 
 from rs_relpose_ros.config.tracking import TrackingConfig
-from rs_relpose_ros.tracking.registry import make_tracker
+from rs_relpose_ros.tracking.tracker import make_tracker
 
 
 @pytest.fixture(scope='module')

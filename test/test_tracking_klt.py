@@ -10,7 +10,7 @@ from rs_relpose_ros.config.tracking import TRACKERS, TrackingConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.tracking.alignment import window_homography
 from rs_relpose_ros.tracking.correlation import correlations
-from rs_relpose_ros.tracking.registry import make_tracker
+from rs_relpose_ros.tracking.tracker import make_tracker
 
 
 @pytest.fixture(scope='module')

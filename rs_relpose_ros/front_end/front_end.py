@@ -42,27 +42,19 @@ Outcome = FrameRefused | FrameFailed | FrameProcessed
 class FrontEnd:
     """Takes frames from its sequencer and processes them.
 
-    `sequencer` is filled from any thread, `parameters` may be replaced from any thread; `step` is
-    called by one.
+    `sequencer` is filled from any thread; `step` is called by one. `parameters` may be replaced
+    from any thread and are in force from the next step on: nothing behind `step` keeps a value
+    that may change while running, all of it gets these with each frame.
 
     Parameters
     ----------
     parameters : Parameters
         Sensor settings that have no default must be given.
-    offline : bool
-        As in `Sequencer`. Programming errors leave `step`; live they are an outcome, since the
-        node goes on.
+    offline, clock
+        As in `Sequencer`. Offline programming errors leave `step`; live they are an outcome,
+        since the node goes on.
     keep_images : bool
         Whether pairs carry their two images.
-    clock : callable
-        Monotonic time [ns]; for tests.
-
-    Attributes
-    ----------
-    sequencer : Sequencer
-    parameters : Parameters
-        In force from the next step on. Nothing behind `step` keeps a value that may change while
-        running: all of it gets these with each frame.
     """
 
     def __init__(self, parameters: Parameters, *, offline: bool = False,
@@ -74,13 +66,7 @@ class FrontEnd:
         self._offline = offline
 
     def step(self, timeout: float = 0.0) -> Outcome | None:
-        """What became of the next frame; None where none is ready within `timeout` seconds.
-
-        Raises
-        ------
-        Exception
-            Offline, a programming error.
-        """
+        """What became of the next frame; None where none is ready within `timeout` seconds."""
         stamp_ns: int | None = None
         try:
             if not self._offline:

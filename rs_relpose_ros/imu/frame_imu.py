@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,20 +51,11 @@ class FrameImu:
 
 def frame_imu(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_cam_imu: Array,
               previous_reference_ns: int | None = None) -> FrameImu:
-    """Collect from `buffer` what a frame needs.
+    """Collect from `buffer` what a frame needs; all instants are on the IMU clock.
 
-    Parameters
-    ----------
-    buffer : ImuBuffer
-        Must answer AVAILABLE for `span_ns`.
-    span_ns : (int, int)
-        Instants of the frame's earliest and latest row on the IMU clock.
-    reference_ns : int
-        Instant of its stamped row, within `span_ns`.
-    R_cam_imu : (3, 3) ndarray
-        ``v_cam = R_cam_imu v_imu``.
-    previous_reference_ns : int, optional
-        Reference instant of the frame processed before.
+    `span_ns` are those of the frame's earliest and latest row, which the buffer must cover,
+    `reference_ns` and `previous_reference_ns` those of the stamped rows of this frame and of the
+    one processed before. ``v_cam = R_cam_imu v_imu``.
     """
     start_ns, end_ns = span_ns
     stamps_ns, rates = buffer.angular_velocity(start_ns, end_ns)
@@ -78,9 +69,7 @@ def frame_imu(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_
     estimate = buffer.gravity(end_ns)
     if estimate is not None:
         turn = motion.rotations([(end_ns - reference_ns) * 1e-9])[0]
-        gravity = turn @ (R_cam_imu @ estimate.direction)
-        motion = FrameMotion(motion.angular_velocity, gravity, motion.knot_times,
-                             motion.knot_rotations)
+        motion = replace(motion, gravity=turn @ (R_cam_imu @ estimate.direction))
         gravity_sigma = estimate.sigma
     since_previous = None
     if (previous_reference_ns is not None and previous_reference_ns < reference_ns

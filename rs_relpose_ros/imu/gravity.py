@@ -90,17 +90,7 @@ class GravityFilter:
         return self._stamp_ns
 
     def run(self, stamps_ns: NDArray[np.int64], rates: Array, forces: Array) -> None:
-        """Take in samples that follow those before.
-
-        Parameters
-        ----------
-        stamps_ns : (K,) ndarray of int64
-            Strictly increasing.
-        rates : (K, 3) ndarray
-            Gyro [rad/s], known bias removed.
-        forces : (K, 3) ndarray
-            Specific force [m/s^2] at these stamps; NaN where there is none.
-        """
+        """Take in samples, as `BiasTracker.run` does, but with the known bias removed."""
         k = 0
         while k < len(stamps_ns):
             if self._stamp_ns is None:

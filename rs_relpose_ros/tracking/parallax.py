@@ -15,14 +15,9 @@ Array = NDArray[np.float64]
 
 @kernel
 def median_parallax(rays1: Array, rays2: Array, rotation: Array) -> float:
-    """Median of ``|f_1 x R f_2|`` [about rad]; rays of NaN do not count, 0 where none does.
+    """Median of ``|f_1 x R f_2|`` [about rad] of unit rays (N, 3), ``R = R_1^T R_2`` (3, 3).
 
-    Parameters
-    ----------
-    rays1, rays2 : (N, 3) ndarray
-        Unit rays, derotated to their frames' reference rows.
-    rotation : (3, 3) ndarray
-        ``R_1^T R_2``.
+    Rays of NaN do not count; 0 where none does.
     """
     values = np.empty(len(rays1))
     count = 0
