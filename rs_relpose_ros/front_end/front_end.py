@@ -46,15 +46,8 @@ class FrontEnd:
     from any thread and are in force from the next step on: nothing behind `step` keeps a value
     that may change while running, all of it gets these with each frame.
 
-    Parameters
-    ----------
-    parameters : Parameters
-        Sensor settings that have no default must be given.
-    offline, clock
-        As in `Sequencer`. Offline programming errors leave `step`; live they are an outcome,
-        since the node goes on.
-    keep_images : bool
-        Whether pairs carry their two images.
+    `offline` and `clock` are those of `Sequencer`. Offline, programming errors leave `step`; live
+    they are an outcome, since the node goes on. With `keep_images` pairs carry their two images.
     """
 
     def __init__(self, parameters: Parameters, *, offline: bool = False,

@@ -1,4 +1,4 @@
-"""A keyframe pair, what came of it, and the table of figures that are published of it."""
+"""Keyframe pairs: which frames close one, what came of it, and the figures that are published."""
 
 from __future__ import annotations
 
@@ -10,12 +10,30 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.config.keyframes import KeyframeConfig
 from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.front_end.drift import Drift
 from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.tracking.matches import Matches
 
 Array = NDArray[np.float64]
+
+
+class SinceKeyframe(NamedTuple):
+    """What has happened since the reference keyframe."""
+
+    parallax: float   # [px] median of the matches after derotation
+    interval: float   # [s]
+    frames: int   # 1 for the first frame after the keyframe
+    tracked_fraction: float   # share of the keyframe's features that are still tracked
+
+
+def closes_pair(since: SinceKeyframe, config: KeyframeConfig) -> bool:
+    """Whether the current frame closes a pair: the camera moved far enough, or it is high time."""
+    return (since.parallax >= config.min_keyframe_parallax
+            or since.tracked_fraction < config.min_tracked_fraction
+            or since.interval >= config.max_keyframe_interval
+            or since.frames >= config.max_keyframe_frames)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -80,34 +80,29 @@ class GravityFilter:
                              config.gyro_bias_sigma**2 / BIAS_MEMORY)
         self._state = _State(np.zeros(3), np.zeros(3), np.zeros((6, 6)), np.zeros(3))
         self._state.covariance[3:, 3:] = config.gyro_bias_sigma**2 * np.eye(3)
-        # Of the last sample: None while the direction is unknown.
-        self._stamp_ns: int | None = None
+        # Of the last sample taken in: None while the direction is unknown.
+        self.stamp_ns: int | None = None
         self._rate = np.zeros(3)
-
-    @property
-    def stamp_ns(self) -> int | None:
-        """Stamp of the last sample taken in; None while there is no direction."""
-        return self._stamp_ns
 
     def run(self, stamps_ns: NDArray[np.int64], rates: Array, forces: Array) -> None:
         """Take in samples, as `BiasTracker.run` does, but with the known bias removed."""
         k = 0
         while k < len(stamps_ns):
-            if self._stamp_ns is None:
+            if self.stamp_ns is None:
                 k = self._begin(k, stamps_ns, rates, forces)
                 continue
-            done = _advance(self._state, self._noise, self._stamp_ns, self._rate, stamps_ns[k:],
+            done = _advance(self._state, self._noise, self.stamp_ns, self._rate, stamps_ns[k:],
                             rates[k:], forces[k:], self._gap_ns)
             if done:
                 k += done
-                self._stamp_ns, self._rate = int(stamps_ns[k - 1]), rates[k - 1].copy()
+                self.stamp_ns, self._rate = int(stamps_ns[k - 1]), rates[k - 1].copy()
             if k < len(stamps_ns):
                 # The turn of the IMU during a gap is unknown: the direction is lost.
-                self._stamp_ns = None
+                self.stamp_ns = None
 
     def estimate(self) -> GravityEstimate | None:
         """Gravity at the stamp of the last sample; None without accelerometer."""
-        if self._stamp_ns is None:
+        if self.stamp_ns is None:
             return None
         up = self._state.up
         # An error along the direction itself turns nothing.
@@ -131,7 +126,7 @@ class GravityFilter:
         up[:], residual[:] = forces[first] / length, 0.0
         covariance[:3, 3:] = covariance[3:, :3] = 0.0
         covariance[:3, :3] = _direction_variance(length, self._noise.acceleration) * np.eye(3)
-        self._stamp_ns, self._rate = int(stamps_ns[first]), rates[first].copy()
+        self.stamp_ns, self._rate = int(stamps_ns[first]), rates[first].copy()
         return first + 1
 
 

@@ -42,17 +42,8 @@ def integrate_rotation(stamps_ns: NDArray[np.int64], rates: ArrayLike, config: I
     """Rotation ``R_start^T R_end`` (3, 3) between the first and the last sample, its covariance.
 
     The covariance (3, 3) [rad^2] is that of dtheta in the start frame, ``R_true = Exp(dtheta) R``.
-
-    Parameters
-    ----------
-    stamps_ns : (K,) ndarray of int64
-        Strictly increasing.
-    rates : (K, 3) array_like
-        Angular velocity [rad/s], bias removed, linear between samples.
-    config : ImuConfig
-        Noise density and bias uncertainty.
-    bias_sigma : float, optional
-        Uncertainty per axis [rad/s] of the removed bias, where it is less than `config` says.
+    The stamps (K,) strictly increase; the rates (K, 3) [rad/s], their bias removed, are linear
+    between samples. `bias_sigma` [rad/s] per axis is told where it is not that of `config`.
     """
     rates = np.ascontiguousarray(rates, dtype=np.float64)
     if len(stamps_ns) < 1 or rates.shape != (len(stamps_ns), 3):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 import threading
@@ -57,7 +57,7 @@ class Statistics:
         self._last_no_pose = ''
         self._since_ns = clock()
         self._counted = Inputs()
-        self._refused_before = self._overload_before = 0
+        self._refused: Counter[Refusal] = Counter()
         self._frame_times: deque[float] = deque(maxlen=_RECENT_FRAMES)
         self._busy_ns = 0
         self._last_input_ns: dict[str, int] = {}
@@ -102,13 +102,10 @@ class Statistics:
                      for name, field in (('image', 'images'), ('camera_info', 'camera_infos'),
                                          ('imu', 'imu'), ('accel', 'accelerometer'))}
             self._since_ns, self._counted = now_ns, inputs
-            refused = {} if counts is None else dict(counts.refused)
-            dropped = sum(refused.values()) - self._refused_before
-            self._refused_before = sum(refused.values())
-            overload = refused.get(Refusal.OVERLOAD, 0) - self._overload_before
-            self._overload_before = refused.get(Refusal.OVERLOAD, 0)
+            refused = Counter({} if counts is None else counts.refused)
+            dropped, self._refused = refused - self._refused, refused
             busy, self._busy_ns = self._busy_ns / NANOSECONDS / elapsed, 0
-            level, text = self._judge(problem, dropped, overload)
+            level, text = self._judge(problem, dropped.total(), dropped[Refusal.OVERLOAD])
             last, pose = self._last_pair, self._last_pose
             latency, frame_time = _milliseconds(self._latencies), _milliseconds(self._frame_times)
             values = [
@@ -117,8 +114,7 @@ class Statistics:
                 *((f'{name}_rate_hz', f'{rate:.1f}') for name, rate in rates.items()),
                 ('frames_received', str(counts.frames if counts else inputs.images)),
                 ('frames_processed', str(counts.frames_taken if counts else 0)),
-                *((f'frames_refused_{cause.value}', str(refused.get(cause, 0)))
-                  for cause in Refusal),
+                *((f'frames_refused_{cause.value}', str(refused[cause])) for cause in Refusal),
                 ('frames_failed', str(self._failures)),
                 ('messages_invalid', str(inputs.invalid)),
                 *((name, str(getattr(counts, name, 0))) for name in (

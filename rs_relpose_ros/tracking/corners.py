@@ -11,9 +11,9 @@ from scipy.spatial import KDTree
 
 from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.config.tracking import TrackingConfig
+from rs_relpose_ros.tracking.images import Image
 
 Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 # Side of the window over which the structure tensor of the half-size image is summed.
 _BLOCK = 5
