@@ -22,7 +22,7 @@ from rs_relpose_ros.calibrate import follow
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.errors import MissingInputError
-from rs_relpose_ros.tracking.registry import make_tracker
+from rs_relpose_ros.tracking.tracker import make_tracker
 
 IMAGE, IMU = '/camera/image_raw/compressed', '/imu/data_raw'
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.calibrate.tracks import Tracks
 from rs_relpose_ros.config.tracking import TrackingConfig
-from rs_relpose_ros.tracking.registry import make_tracker
+from rs_relpose_ros.tracking.tracker import make_tracker
 
 Array = NDArray[np.float64]
 
