@@ -43,22 +43,11 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
     Two views of every pair of frames obey the coplanarity of the rows' own instants; see
     `rs_relpose_ros.calibrate.coplanarity` and docs/calibration.md.
 
-    Parameters
-    ----------
-    tracks : Tracks
-        Of the whole recording.
-    gyro : GyroSeries
-        On a clock that differs from the camera's by at most ``config.max_time_offset``.
-    camera : RollingShutterCamera
-        Intrinsics; its read-out time is not looked at.
-    focal_known : bool
-        Whether fx and fy are those of the camera; where not, they are a guess within a factor of
-        2, whose ratio holds, and the camera has no distortion.
-    config : CalibrationConfig, optional
-    rng : numpy.random.Generator or int
-        Chooses among matches where there are more than needed.
-    progress : callable
-        Called with the share of the work that is done.
+    `tracks` are of the whole recording, `gyro` is on a clock that differs from the camera's by at
+    most ``config.max_time_offset``; the read-out time of `camera` is not looked at. Unless
+    `focal_known`, fx and fy are a guess within a factor of 2, whose ratio holds, and the camera
+    has no distortion. `rng` chooses among matches where there are more than needed; `progress` is
+    called with the share of the work that is done.
 
     Raises
     ------
