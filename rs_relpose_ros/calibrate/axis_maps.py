@@ -14,16 +14,12 @@ Array = NDArray[np.float64]
 @cache
 def axis_maps() -> Array:
     """All 24 rotations (24, 3, 3) that map axes to axes."""
-    maps = []
-    for columns in itertools.permutations(range(3)):
-        for signs in itertools.product((1.0, -1.0), repeat=3):
-            matrix = np.zeros((3, 3))
-            matrix[range(3), columns] = signs
-            if np.linalg.det(matrix) > 0.0:
-                maps.append(matrix)
-    all_maps = np.array(maps)
-    all_maps.setflags(write=False)      # one copy serves everybody
-    return all_maps
+    maps = np.array([np.diag(signs) @ np.eye(3)[list(columns)] + 0.0    # no zero is negative
+                     for columns in itertools.permutations(range(3))
+                     for signs in itertools.product((1.0, -1.0), repeat=3)])
+    maps = maps[np.linalg.det(maps) > 0.0]
+    maps.setflags(write=False)      # one copy serves everybody
+    return maps
 
 
 def nearest_axis_map(R: Array) -> Array:

@@ -265,8 +265,7 @@ def accumulate(problem: Problem, path: GyroPath, unknowns: Unknowns, tangent: Ar
             f1 = _off_axis(sight1.M, view1.points[n], stretch)
             f2 = _off_axis(sight2.M, view2.points[n], stretch)
             rows = row1 + row2
-            b = (straight[0] + rows * bend[0], straight[1] + rows * bend[1],
-                 straight[2] + rows * bend[2])
+            b = _less(straight, -rows, bend, 1.0)   # straight + rows bend
             m1, m2 = _ray(sight1.M, f1), _ray(sight2.M, f2)
             found = _residual(sight1.M, sight2.M, m1, m2, b, view1.by_pixel[n],
                               view2.by_pixel[n], stretch)
@@ -289,18 +288,12 @@ def accumulate(problem: Problem, path: GyroPath, unknowns: Unknowns, tangent: Ar
             J[DIRECTION + 1] = dot(tangent[p, 1], by_b)
             for i in range(3):
                 J[BEND + i] = rows * by_b[i]
-            _add_weighted(J, found.r, level * level * per_noise2, sums.gradient[p],
-                          sums.hessian[p])
+            weight = level * level * per_noise2
+            for i in range(ALL):
+                sums.gradient[p, i] += weight * found.r * J[i]
+                for j in range(i + 1):
+                    sums.hessian[p, i, j] += weight * J[i] * J[j]
         sums.losses[p] = loss
-
-
-@inlined_kernel
-def _add_weighted(J: Array, residual: float, weight: float, gradient: Array,
-                  hessian: Array) -> None:
-    for i in range(ALL):
-        gradient[i] += weight * residual * J[i]
-        for j in range(i + 1):
-            hessian[i, j] += weight * J[i] * J[j]
 
 
 @kernel

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 import itertools
 import math
@@ -28,6 +29,7 @@ from rs_relpose_ros.calibrate.coplanarity import (
 )
 from rs_relpose_ros.calibrate.covariance import jackknife, stretches
 from rs_relpose_ros.calibrate.gyro_path import GyroPath
+from rs_relpose_ros.calibrate.result import CostCurve
 
 Array = NDArray[np.float64]
 
@@ -229,6 +231,45 @@ def refit(problem: Problem, coarse: Unknowns, free: NDArray[np.bool_], *, rounds
     """Fit from the calibration of a coarser one, with priors of `bend` by what it shows."""
     begin = restarted(problem, coarse, 2.0)
     return fit(with_bends(problem, begin), begin, free, rounds=rounds, tolerance=tolerance)
+
+
+def cost_curve(problem: Problem, final: Fit, free: NDArray[np.bool_], interval: float,
+               progress: Callable[[float], object]) -> CostCurve:
+    """Cost of `problem` with the read-out time held, from an interval upwards to one downwards."""
+    best = float(final.unknowns.parameters[READOUT])
+    held = free.copy()
+    held[READOUT] = False
+    values = np.unique(np.concatenate([np.linspace(-interval, interval, 13), [best]]))
+    costs = np.empty(len(values))
+    order = np.argsort(np.abs(values - best))
+    begin = _refitted(problem, restarted(problem, final.unknowns), held, 5)
+    for side in (order[values[order] <= best], order[values[order] > best]):
+        unknowns = begin
+        for k in side:
+            parameters = unknowns.parameters.copy()
+            parameters[READOUT] = values[k]
+            unknowns = _refitted(problem, unknowns._replace(parameters=parameters), held, 2)
+            costs[k] = evaluate(problem, unknowns, derivatives=False).cost
+            progress(float(np.isfinite(costs).mean()))
+    # One match of a frame serves in many pairs: scaled so that the curvature at the minimum is
+    # 1 / sigma^2.
+    information = final.information[np.ix_(free, free)] * (
+        problem.begin[-1] / final.problem.begin[-1])
+    naive = float(np.linalg.inv(information)[0, 0])
+    return CostCurve(values, (costs - costs.min()) * naive / final.covariance[READOUT, READOUT])
+
+
+def _refitted(problem: Problem, unknowns: Unknowns, free: NDArray[np.bool_],
+              rounds: int) -> Unknowns:
+    """Unknowns after plain Gauss-Newton steps."""
+    for _ in range(rounds):
+        evaluation = evaluate(problem, unknowns)
+        H = evaluation.reduced.sum(axis=0)[np.ix_(free, free)]
+        step = np.zeros(GLOBAL)
+        step[free] = -np.linalg.solve(H + 1e-6 * np.diag(np.diag(H)),
+                                      evaluation.score.sum(axis=0)[free])
+        unknowns = stepped(unknowns, step, evaluation.local_step(step))
+    return unknowns
 
 
 def _better_directions(problem: Problem, unknowns: Unknowns) -> Unknowns:

@@ -23,8 +23,7 @@ class PointFollower:
 
     def __init__(self, tracking: TrackingConfig) -> None:
         self._tracker = make_tracker(tracking)
-        self._started = False
-        self._since_renewed = 0
+        self._since_renewed: int | None = None    # images; None: nothing is followed yet
         self._stamps: list[int] = []
         self._ids: list[NDArray[np.uint32]] = []
         self._points: list[Array] = []
@@ -40,13 +39,12 @@ class PointFollower:
 
     def restart(self) -> None:
         """Follow nothing into the next image: images in between were left out."""
-        self._started = False
+        self._since_renewed = None
 
     def add(self, stamp_ns: int, image: NDArray[np.uint8]) -> int:
         """Follow all points into an image (H, W), and return how many were."""
-        if not self._started:
+        if self._since_renewed is None:
             self._tracker.start(image)
-            self._started = True
             self._since_renewed = 0
         # Matches with the reference, so that errors do not add up from frame to frame.
         self._tracker.track(image)

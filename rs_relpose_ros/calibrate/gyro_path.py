@@ -47,10 +47,6 @@ class GyroSeries:
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
-    def seconds(self, origin_ns: int) -> Array:
-        """Instants (K,) [s] since `origin_ns`."""
-        return np.asarray((self.stamps_ns - origin_ns) * 1e-9, dtype=np.float64)
-
 
 def noise_density(times: Array, rates: Array) -> float:
     """White noise [rad/s/sqrt(Hz)] of rates (K, 3) at times (K,), from third differences.

@@ -40,11 +40,23 @@ def judged(data: Observations, final: Fit, free: NDArray[np.bool_], curve: CostC
     InputError
         The read-out time is longer than the interval between frames.
     """
-    covariance = _with_tracker(final.covariance, free, config)
+    # Errors of the tracker that are alike over all of a recording.
+    tracker = np.zeros(GLOBAL)
+    tracker[[READOUT, OFFSET]] = config.tracking_time_sigma
+    tracker[ROTATION:ROTATION + 3] = config.tracking_rotation_sigma
+    tracker[BIAS:BIAS + 3] = config.tracking_bias_sigma
+    covariance = final.covariance + np.diag(np.where(free, tracker, 0.0)**2)
     parameters, R_cam_imu = final.unknowns.parameters, final.unknowns.R_imu_cam.T
     rates, one_axis = _excitation(data, parameters[BIAS:BIAS + 3], R_cam_imu, config)
     sigmas = np.sqrt(np.diag(covariance))
-    _check_readout(parameters[READOUT], sigmas[READOUT], data.interval)
+    readout, readout_sigma = parameters[READOUT], sigmas[READOUT]
+    if abs(readout) - 3.0 * readout_sigma > data.interval:
+        raise InputError(
+            f'the read-out time comes out as {1e3 * abs(readout):.1f} +- '
+            f'{1e3 * readout_sigma:.1f} ms, longer than the interval of '
+            f'{1e3 * data.interval:.1f} ms between frames, which no camera can do: stamps or '
+            'frames are not what they seem (frames dropped and stamped anew, images cropped, '
+            'scaled or rotated)')
     # Row 0 is read this share of the read-out before the middle row.
     to_first = np.zeros(GLOBAL)
     to_first[OFFSET], to_first[READOUT] = 1.0, -0.5 * (data.camera.height - 1) / data.camera.height
@@ -64,7 +76,7 @@ def judged(data: Observations, final: Fit, free: NDArray[np.bool_], curve: CostC
         slope = _estimate(parameters[SLOPE], sigmas[SLOPE], _MOST_SLOPE_SIGMA)
     unsettled = '' if final.converged else 'the fit had not settled when it was stopped'
     return CalibrationResult(
-        readout_time=_estimate(parameters[READOUT], sigmas[READOUT], config.max_readout_sigma),
+        readout_time=_estimate(readout, readout_sigma, config.max_readout_sigma),
         time_offset=_estimate(float(to_first @ parameters),
                               math.sqrt(to_first @ covariance @ to_first),
                               config.max_offset_sigma),
@@ -83,25 +95,6 @@ def _estimate(value: float, sigma: float, limit: float, obstacle: str = '') -> E
     """Estimate that is observable where its sigma is within `limit` and there is no obstacle."""
     good = bool(sigma <= limit and not obstacle)
     return Estimate(float(value), float(sigma), good, '' if good else obstacle or _RECORD_MORE)
-
-
-def _check_readout(readout: float, sigma: float, interval: float) -> None:
-    if abs(readout) - 3.0 * sigma > interval:
-        raise InputError(
-            f'the read-out time comes out as {1e3 * abs(readout):.1f} +- {1e3 * sigma:.1f} ms, '
-            f'longer than the interval of {1e3 * interval:.1f} ms between frames, which no camera '
-            'can do: stamps or frames are not what they seem (frames dropped and stamped anew, '
-            'images cropped, scaled or rotated)')
-
-
-def _with_tracker(covariance: Array, free: NDArray[np.bool_], config: CalibrationConfig) -> Array:
-    """Covariance with the errors of the tracker that are alike over all of a recording."""
-    sigmas = np.zeros(GLOBAL)
-    sigmas[[READOUT, OFFSET]] = config.tracking_time_sigma
-    sigmas[ROTATION:ROTATION + 3] = config.tracking_rotation_sigma
-    sigmas[BIAS:BIAS + 3] = config.tracking_bias_sigma
-    sigmas[~free] = 0.0
-    return covariance + np.diag(sigmas**2)
 
 
 def _excitation(data: Observations, bias: Array, R_cam_imu: Array,

@@ -55,8 +55,8 @@ class Observations:
         ahead = np.isfinite(rays).all(axis=1) & (rays[:, 2] > _LEAST_COSINE)
         tracks = replace(tracks, frames=tracks.frames[ahead], ids=tracks.ids[ahead],
                          points=tracks.points[ahead])
-        origin_ns = int(tracks.stamps_ns[0])
-        times, gyro_times = tracks.seconds(origin_ns), gyro.seconds(origin_ns)
+        times, gyro_times = (np.asarray((stamps_ns - tracks.stamps_ns[0]) * 1e-9)
+                             for stamps_ns in (tracks.stamps_ns, gyro.stamps_ns))
         intervals = np.diff(times)
         to_next = np.append(intervals, intervals[-1])
         longer = to_next - np.median(intervals)

@@ -8,29 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.calibrate.alignment import find_starts, Start
-from rs_relpose_ros.calibrate.coplanarity import (
-    FOCAL,
-    GLOBAL,
-    OFFSET,
-    Problem,
-    READOUT,
-    SLOPE,
-    Unknowns,
-)
-from rs_relpose_ros.calibrate.fit import (
-    evaluate,
-    Fit,
-    fit,
-    initial,
-    refit,
-    restarted,
-    stepped,
-    with_bends,
-)
+from rs_relpose_ros.calibrate.coplanarity import FOCAL, GLOBAL, OFFSET, Problem, SLOPE, Unknowns
+from rs_relpose_ros.calibrate.fit import cost_curve, fit, initial, refit, with_bends
 from rs_relpose_ros.calibrate.gyro_path import GyroSeries
 from rs_relpose_ros.calibrate.judgement import judged
 from rs_relpose_ros.calibrate.observations import Observations, PairSelection
-from rs_relpose_ros.calibrate.result import CalibrationResult, CostCurve
+from rs_relpose_ros.calibrate.result import CalibrationResult
 from rs_relpose_ros.calibrate.tracks import Tracks
 from rs_relpose_ros.config.calibration import CalibrationConfig
 from rs_relpose_ros.errors import InputError
@@ -49,7 +32,6 @@ _PAIRS_AT_START = _SOME_PAIRS._replace(spans=(0.067,))
 # Intervals between frames that differ by more than this share may have exposures that differ.
 _VARYING = 0.02
 _FOCAL_FACTORS = np.geomspace(0.5, 2.0, 9)
-_CURVE_POINTS = 13
 
 
 def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
@@ -61,22 +43,11 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
     Two views of every pair of frames obey the coplanarity of the rows' own instants; see
     `rs_relpose_ros.calibrate.coplanarity` and docs/calibration.md.
 
-    Parameters
-    ----------
-    tracks : Tracks
-        Of the whole recording.
-    gyro : GyroSeries
-        On a clock that differs from the camera's by at most ``config.max_time_offset``.
-    camera : RollingShutterCamera
-        Intrinsics; its read-out time is not looked at.
-    focal_known : bool
-        Whether fx and fy are those of the camera; where not, they are a guess within a factor of
-        2, whose ratio holds, and the camera has no distortion.
-    config : CalibrationConfig, optional
-    rng : numpy.random.Generator or int
-        Chooses among matches where there are more than needed.
-    progress : callable
-        Called with the share of the work that is done.
+    `tracks` are of the whole recording, `gyro` is on a clock that differs from the camera's by at
+    most ``config.max_time_offset``; the read-out time of `camera` is not looked at. Unless
+    `focal_known`, fx and fy are a guess within a factor of 2, whose ratio holds, and the camera
+    has no distortion. `rng` chooses among matches where there are more than needed; `progress` is
+    called with the share of the work that is done.
 
     Raises
     ------
@@ -97,14 +68,15 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
     free[FOCAL] = not focal_known
     coarse = _coarse_fit(data, starts, free, config, rng)
     progress(0.4)
-    free[SLOPE] = _intervals_vary(data)
-    offset = coarse.unknowns.parameters[OFFSET]
-    final = refit(_problem(data, _ALL_PAIRS, offset, config, rng), coarse.unknowns, free)
+    low, high = np.quantile(data.covariates, (0.1, 0.9))
+    free[SLOPE] = high - low > _VARYING * data.interval
+    offset = coarse.parameters[OFFSET]
+    final = refit(_problem(data, _ALL_PAIRS, offset, config, rng), coarse, free)
     progress(0.8)
     offset = final.unknowns.parameters[OFFSET]
     some = with_bends(_problem(data, _SOME_PAIRS, offset, config, rng), final.unknowns)
-    curve = _cost_curve(some, final, free, data.interval,
-                        lambda share: progress(0.8 + 0.2 * share))
+    curve = cost_curve(some, final, free, data.interval,
+                       lambda share: progress(0.8 + 0.2 * share))
     return judged(data, final, free, curve, config)
 
 
@@ -145,11 +117,6 @@ def _check_recording(data: Observations, config: CalibrationConfig) -> None:
             'three axes, 20 to 60 deg/s')
 
 
-def _intervals_vary(data: Observations) -> bool:
-    low, high = np.quantile(data.covariates, (0.1, 0.9))
-    return bool(high - low > _VARYING * data.interval)
-
-
 # -- start -------------------------------------------------------------------------------------
 
 
@@ -171,16 +138,16 @@ def _starts(data: Observations, focal_known: bool, config: CalibrationConfig,
 
 
 def _coarse_fit(data: Observations, starts: list[Start], free: NDArray[np.bool_],
-                config: CalibrationConfig, rng: np.random.Generator) -> Fit:
+                config: CalibrationConfig, rng: np.random.Generator) -> Unknowns:
     """The best of the fits to a few pairs from each of the starts."""
     fits = []
     for start in starts:
         problem = _problem(data, _PAIRS_AT_START, start.offset, config, rng)
         unknowns = initial(problem, start.R_cam_imu.T, start.offset,
                            log_focal=float(np.log(start.focal_factor)))
-        fits.append(fit(problem, unknowns, free, rounds=20, tolerance=0.3))
+        fits.append(fit(problem, unknowns, free, rounds=20, tolerance=0.3).unknowns)
     # By the noise of the matches: pairs and cost differ between the starts.
-    return min(fits, key=lambda found: float(np.median(found.unknowns.noise)))
+    return min(fits, key=lambda found: float(np.median(found.noise)))
 
 
 def _problem(data: Observations, selection: PairSelection, offset: float,
@@ -192,46 +159,3 @@ def _problem(data: Observations, selection: PairSelection, offset: float,
             f'only {len(pairs)} pairs of images have {_LEAST_MATCHES} points in common and a gyro '
             'without gaps: record a textured scene with a short exposure, and all of the gyro')
     return data.problem(pairs, offset)
-
-
-# -- cost over the read-out time ---------------------------------------------------------------
-
-
-def _cost_curve(problem: Problem, final: Fit, free: NDArray[np.bool_], interval: float,
-                progress: Progress) -> CostCurve:
-    """Cost with the read-out time held, from one frame interval upwards to one downwards."""
-    best = float(final.unknowns.parameters[READOUT])
-    held = free.copy()
-    held[READOUT] = False
-    values = np.unique(np.concatenate([np.linspace(-interval, interval, _CURVE_POINTS), [best]]))
-    costs = np.empty(len(values))
-    order = np.argsort(np.abs(values - best))
-    begin = _refitted(problem, restarted(problem, final.unknowns), held, 5)
-    for side in (order[values[order] <= best], order[values[order] > best]):
-        unknowns = begin
-        for k in side:
-            parameters = unknowns.parameters.copy()
-            parameters[READOUT] = values[k]
-            unknowns = _refitted(problem, unknowns._replace(parameters=parameters), held, 2)
-            costs[k] = evaluate(problem, unknowns, derivatives=False).cost
-            progress(float(np.isfinite(costs).mean()))
-    # One match of a frame serves in many pairs: scaled so that the curvature at the minimum is
-    # 1 / sigma^2.
-    matches = problem.begin[-1] / final.problem.begin[-1]
-    information = final.information[np.ix_(free, free)] * matches
-    naive = float(np.linalg.inv(information)[0, 0])
-    variance = float(final.covariance[READOUT, READOUT])
-    return CostCurve(values, (costs - costs.min()) * naive / variance)
-
-
-def _refitted(problem: Problem, unknowns: Unknowns, free: NDArray[np.bool_],
-              rounds: int) -> Unknowns:
-    """Unknowns after plain Gauss-Newton steps."""
-    for _ in range(rounds):
-        evaluation = evaluate(problem, unknowns)
-        H = evaluation.reduced.sum(axis=0)[np.ix_(free, free)]
-        step = np.zeros(GLOBAL)
-        step[free] = -np.linalg.solve(H + 1e-6 * np.diag(np.diag(H)),
-                                      evaluation.score.sum(axis=0)[free])
-        unknowns = stepped(unknowns, step, evaluation.local_step(step))
-    return unknowns

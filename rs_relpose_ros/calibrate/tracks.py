@@ -43,10 +43,6 @@ class Tracks:
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
-    def seconds(self, origin_ns: int) -> Array:
-        """Stamps (F,) [s] since `origin_ns`."""
-        return np.asarray((self.stamps_ns - origin_ns) * 1e-9, dtype=np.float64)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:

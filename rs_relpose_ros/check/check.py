@@ -5,19 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from rs_relpose_ros.bags.reader import Bag
-from rs_relpose_ros.bags.topics import (
-    CAMERA_INFO,
-    COMPRESSED_IMAGE,
-    IMAGE,
-    IMU,
-    Topic,
-    TopicOptions,
-)
+from rs_relpose_ros.bags.topics import Topic, TopicOptions
 from rs_relpose_ros.check import judge_images, judge_imu, judge_turning
 from rs_relpose_ros.check.findings import CheckReport, FAILURE, Finding, Verdict, WARNING
 from rs_relpose_ros.check.scan import Chosen, scan
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.messages.sensor_feed import PARTS, Role
 
 
 def choose_topics(bag: Bag, options: TopicOptions) -> Chosen:
@@ -35,9 +29,9 @@ def choose_topics(bag: Bag, options: TopicOptions) -> Chosen:
         asked = [name for name in (options.image, options.camera_info, options.imu, options.accel)
                  if name]
         there = {topic.name.lstrip('/') for topic in bag.topics if topic.count}
-        chosen = Chosen(_first(bag, options.image, IMAGE, COMPRESSED_IMAGE),
-                        _first(bag, options.camera_info, CAMERA_INFO),
-                        _first(bag, options.imu, IMU), None)
+        chosen = Chosen(_first(bag, options.image, Role.IMAGE),
+                        _first(bag, options.camera_info, Role.CAMERA_INFO),
+                        _first(bag, options.imu, Role.IMU), None)
         absent = isinstance(error, MissingInputError) and all(
             name.lstrip('/') in there for name in asked)
         if not absent and 'image_rect' not in (chosen.image.name if chosen.image else ''):
@@ -69,12 +63,10 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters,
     return CheckReport(str(bag.path), tuple(findings))
 
 
-def _first(bag: Bag, name: str, *msgtypes: str) -> Topic | None:
-    for topic in bag.topics:
-        if topic.msgtype in msgtypes and topic.count and (
-                not name or topic.name.lstrip('/') == name.lstrip('/')):
-            return topic
-    return None
+def _first(bag: Bag, name: str, role: Role) -> Topic | None:
+    return next((topic for topic in bag.topics
+                 if topic.msgtype in PARTS[role].msgtypes and topic.count
+                 and (not name or topic.name.lstrip('/') == name.lstrip('/'))), None)
 
 
 def _topics(bag: Bag, chosen: Chosen) -> Finding:

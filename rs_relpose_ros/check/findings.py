@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from enum import Enum
 import textwrap
 from typing import Any, NamedTuple
@@ -62,10 +62,6 @@ class CheckReport:
         """Whether something would make the estimation fail."""
         return any(finding.verdict is Verdict.FAILURE for finding in self.findings)
 
-    def count(self, verdict: Verdict) -> int:
-        """Number of findings with this verdict."""
-        return sum(finding.verdict is verdict for finding in self.findings)
-
     def lines(self, width: int = 100) -> list[str]:
         """The report as text of at most `width` columns."""
         names = max(len(finding.name) for finding in self.findings)
@@ -75,16 +71,12 @@ class CheckReport:
             text = finding.text + (f' -> {finding.remedy}' if finding.remedy else '')
             lines += textwrap.wrap(text, width, initial_indent=head,
                                    subsequent_indent=' ' * len(head), break_on_hyphens=False)
-        counts = [f'{self.count(verdict)} {verdict.value}' for verdict in Verdict]
+        verdicts = [finding.verdict for finding in self.findings]
+        counts = [f'{verdicts.count(verdict)} {verdict.value}' for verdict in Verdict]
         lines.append(f'{self.bag}: {", ".join(counts)}')
         return lines
 
     def to_mapping(self) -> dict[str, Any]:
         """The report as data for JSON."""
-        return {
-            'bag': self.bag,
-            'failed': self.failed,
-            'findings': [{'name': f.name, 'verdict': f.verdict.value, 'text': f.text,
-                          'remedy': f.remedy, 'figures': dict(f.figures)}
-                         for f in self.findings],
-        }
+        return {'bag': self.bag, 'failed': self.failed,
+                'findings': [asdict(finding) for finding in self.findings]}

@@ -26,7 +26,7 @@ class Inertial:
         self.forces = 0          # number of samples of the accelerometer
         self.orientations = 0    # number of orientations that say how good they are
         self._rest = BiasTracker(ImuConfig(gyro_bias_sigma=_BIAS_SIGMA))
-        self._rates = Thinned(3)
+        self.rates = Thinned(3)  # of the gyro [rad/s]
         self._sum, self._length = np.zeros(3), 0.0
         self._newest_ns: int | None = None
         self._force: Vector = (float('nan'),) * 3
@@ -42,18 +42,13 @@ class Inertial:
             self.forces += 1
         if sample.angular_velocity is None:
             return
-        self._rates.add(*sample.angular_velocity)
+        self.rates.add(*sample.angular_velocity)
         # The search for rest takes samples in the order of their stamps.
         if self._newest_ns is None or sample.stamp_ns > self._newest_ns:
             self._newest_ns = sample.stamp_ns
             self._portion.append((sample.stamp_ns, sample.angular_velocity, self._force))
             if len(self._portion) == _PORTION:
                 self._search()
-
-    @property
-    def rates(self) -> Array:
-        """Some of the gyro's rates (K, 3) [rad/s], evenly over the recording."""
-        return self._rates.values
 
     @property
     def force(self) -> Array:

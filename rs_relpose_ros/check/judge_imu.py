@@ -23,7 +23,7 @@ _FASTEST_MEDIAN = 8.0
 
 def findings(seen: Scan, reliability: str, parameters: Parameters) -> list[Finding]:
     """What is said of the IMU by itself."""
-    if not len(seen.inertial.rates):
+    if not len(seen.inertial.rates.values):
         problem = seen.problems.get(Role.IMU, 'all messages mark the gyro as absent')
         return [Finding('gyro', FAILURE, f'no gyro: {problem}',
                         'choose the topic that has angular_velocity with --imu-topic')]
@@ -59,10 +59,10 @@ def _rate(seen: Scan, reliability: str, parameters: Parameters) -> Finding:
 
 
 def _gyro(inertial: Inertial) -> Finding:
-    name, rates = 'gyro', np.linalg.norm(inertial.rates, axis=1)
+    name, rates = 'gyro', np.linalg.norm(inertial.rates.values, axis=1)
     median, high = float(np.median(rates)), float(np.percentile(rates, 95))
     figures = {'median_rad_s': median, 'p95_rad_s': high}
-    if float(np.ptp(inertial.rates, axis=0).max()) == 0.0:
+    if float(np.ptp(inertial.rates.values, axis=0).max()) == 0.0:
         return Finding(name, FAILURE, 'all samples are equal',
                        'the sensor hangs or is not read: see its driver', figures)
     if median > _FASTEST_MEDIAN:

@@ -179,12 +179,12 @@ def _words(down: np.ndarray) -> str:
 def _effect(seen: Scan, parameters: Parameters) -> Finding | None:
     """Displacement of the last against the first row by rotation alone [px]."""
     intrinsics, inertial = seen.intrinsics, seen.inertial
-    if intrinsics is None or not len(inertial.rates):
+    if intrinsics is None or not len(inertial.rates.values):
         return None
     given, rest = parameters.sensor.readout_time, inertial.rest()
     readout = _EXAMPLE_READOUT if given is None else given
     bias = np.array(parameters.imu.gyro_bias) if rest is None else rest.value
-    rates = np.linalg.norm(inertial.rates - bias, axis=1)
+    rates = np.linalg.norm(inertial.rates.values - bias, axis=1)
     median, high = (readout * intrinsics.fx * float(np.percentile(rates, p)) for p in (50, 95))
     figures = {'readout_s': readout, 'given': given is not None, 'median_px': median,
                'p95_px': high}
