@@ -25,9 +25,13 @@ from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
-from rs_relpose_ros.replay.record import pair_record
 from rs_relpose_ros.replay.run import ReplayedPair
-from rs_relpose_ros.replay.tables import relative_pose_cells, RELATIVE_POSE_COLUMNS, TableWriter
+from rs_relpose_ros.replay.tables import (
+    pair_record,
+    relative_pose_cells,
+    RELATIVE_POSE_COLUMNS,
+    TableWriter,
+)
 from rs_relpose_ros.replay.truth import PairErrors, TrueTrajectory
 from rs_relpose_ros.tracking.matches import Matches
 

@@ -20,9 +20,8 @@ from rs_relpose_ros.errors import MissingInputError
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.replay.outputs import POSES_FILE, replay_into
-from rs_relpose_ros.replay.record import pair_record, PairRecord
-from rs_relpose_ros.replay.run import read_truth, Replay, ReplayedPair
-from rs_relpose_ros.replay.stamps import read_stamps
+from rs_relpose_ros.replay.run import read_stamps, read_truth, Replay, ReplayedPair
+from rs_relpose_ros.replay.tables import pair_record, PairRecord
 from rs_relpose_ros.replay.truth import median_and_p90, PairErrors, TrueTrajectory
 
 # The algorithms of the paper, by solver: its refinement, and the gyro only derotates rows.

@@ -26,8 +26,13 @@ from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.messages.incoming import stamp_ns, time_ns
 from rs_relpose_ros.messages.outgoing import PAIR_TOPICS
 from rs_relpose_ros.node.message_types import message_class
-from rs_relpose_ros.replay.record import rotation_sigmas, translation_sigmas
-from rs_relpose_ros.replay.tables import number, RELATIVE_POSE_COLUMNS, TableWriter
+from rs_relpose_ros.replay.tables import (
+    number,
+    RELATIVE_POSE_COLUMNS,
+    rotation_sigmas,
+    TableWriter,
+    translation_sigmas,
+)
 
 
 @dataclass(frozen=True, slots=True)
