@@ -39,10 +39,10 @@ STARTED = time.monotonic()
 
 
 def compare(live: LiveRun) -> list[str]:
-    """Replay the bag with all methods, on two cores; the lines to print."""
+    """Replay the bag with all methods, side by side; the lines to print."""
     say("replaying it offline: the pipeline of the node, the paper's algorithms, OpenCV's 5-point "
         '...')
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context('spawn')) as pool:
+    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context('spawn')) as pool:
         paper = [pool.submit(score_of_paper, name) for name in PAPER_ALGORITHMS]
         replayed = compare_live(live.table, live.stamps, BAG, PARAMETERS, OUT, pictures=True)
         opencv = replayed.opencv_scores()

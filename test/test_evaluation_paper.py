@@ -28,7 +28,6 @@ from rs_relpose_lab.experiments.problems import (
 from rs_relpose_lab.experiments.scoring import NO_POSE, PoseError
 from rs_relpose_lab.simulation.rows import see, uniform_motion
 from rs_relpose_ros.cli import main
-from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.result import Status
 
 CENTRE = np.array([CENTRE_U, CENTRE_V])
@@ -124,15 +123,6 @@ def test_problem_follows_the_paper_and_its_truth_fits_the_points(direction):
     assert np.argmax(np.abs(problem.t)) == {'forward': 2, 'sideways': 0}[direction]
     # Gravity in both frames is one direction of the world.
     assert problem.R @ problem.measured_gravity2 == pytest.approx(problem.measured_gravity1)
-
-
-def test_constant_velocity_is_along_the_baseline_and_leaves_the_pose_exact():
-    """Derotated rays then meet the pose without any velocity, though the camera moves."""
-    cell = replace(EXACT, speed=5.0, constant_velocity=True)
-    moving, still = make_problem(cell, 3), make_problem(replace(cell, speed=0.0), 3)
-    assert np.abs(moving.points1 - still.points1).max() > 1.0
-    rays = derotated(moving)
-    assert np.abs(np.cross(rays[0], rays[1] @ moving.R.T) @ moving.t).max() < 1e-9
 
 
 def test_auto_is_as_good_as_five_points_on_derotated_rays_at_constant_velocity():
@@ -237,12 +227,6 @@ def test_processes_do_not_change_the_result():
     assert len(seen) == len(run.tasks()) == 6
 
 
-@pytest.mark.parametrize('change', [{'trials': 0}, {'seed': -1}])
-def test_a_run_with_illegal_numbers_is_refused_by_name(change):
-    with pytest.raises(InputError, match=f'^{next(iter(change))} must be'):
-        small_run(**change)
-
-
 # --- tables and pictures
 
 
@@ -316,6 +300,7 @@ def test_command_writes_tables_pictures_and_how_they_were_made(tmp_path, capsys)
 
 @pytest.mark.parametrize(('arguments', 'said'), [
     (['--trials', '0'], 'trials must be at least 1, got 0'),
+    (['--seed', '-1'], 'seed must be at least 0, got -1'),
     (['--jobs', '0'], 'jobs must be at least 1, got 0'),
     (['--outliers', '2'], 'outliers must be in [0, 0.95], got 2'),
     (['--pixel-noise', 'nan'], 'pixel_noise must be in'),

@@ -181,15 +181,13 @@ def _run_penncosyvio(args: argparse.Namespace) -> int:
         gyro_bias=tuple(args.gyro_bias), every=args.every, distance=args.distance, seed=args.seed)
     simulated = Simulated(args.rendered, args.scene, args.pixel_noise, args.outliers)
 
-    def open_sequence(name: str) -> PairSource:
-        if args.trajectory_only:
-            return SimulatedSequence(args.folder, name, run, simulated)
-        return RecordedSequence(args.folder, name, run)
-
     if not args.folder.is_dir():
         raise MissingInputError(f'there is no folder {args.folder}')
+    sequences: dict[str, PairSource] = {
+        name: SimulatedSequence(args.folder, name, run, simulated) if args.trajectory_only
+        else RecordedSequence(args.folder, name, run) for name in run.sequences}
     with progress_bar(len(run.pairs()), 'pair') as bar:
-        records = run_penncosyvio(run, open_sequence, on_pair=bar.update)
+        records = run_penncosyvio(run, sequences, on_pair=bar.update)
     source = 'recorded images' if not args.trajectory_only else \
         f'images rendered of a {args.scene}' if args.rendered else 'simulated points'
     title = f'PennCOSYVIO, camera {run.camera}, {source}'

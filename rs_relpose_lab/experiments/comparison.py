@@ -64,9 +64,7 @@ def is_still(record: PairRecord) -> bool:
 class LiveComparison:
     """What a live node published, beside the replay of the frames that it processed.
 
-    `records`, `pairs`: of the replay.
-    `intrinsics`: in force at the end.
-    `frames`, `processed`: in the bag, and by the node.
+    `records`, `pairs`: of the replay; `frames`, `processed`: in the bag, and by the node.
     `poses`, `unequal`: poses of both, and those that are not bit by bit the same in the two.
     """
 

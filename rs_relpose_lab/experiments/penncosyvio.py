@@ -110,11 +110,10 @@ class PairSource(Protocol):
         """The pair as the methods get it."""
 
 
-def run_penncosyvio(run: PennCosyvioRun, open_sequence: Callable[[str], PairSource],
+def run_penncosyvio(run: PennCosyvioRun, sequences: Mapping[str, PairSource],
                     on_pair: Callable[[], object] = lambda: None) -> list[Record]:
     """Estimate every pair by every method; `on_pair` is called after each pair."""
     records = []
-    sequences = {name: open_sequence(name) for name in run.sequences}
     for pair in run.pairs():
         problem = sequences[pair.sequence].problem(pair)
         records += [Record(EXPERIMENT, pair.sequence, str(pair.stretch), name, pair.first,

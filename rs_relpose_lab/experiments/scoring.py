@@ -18,9 +18,8 @@ POSE_FREEDOM = 5
 
 @dataclass(frozen=True, slots=True)
 class PoseError:
-    """Of one estimate.
+    """Of one estimate: angles [deg], infinite where there is no pose.
 
-    `rotation`, `translation`: angles [deg]; infinite where there is no pose.
     `nees`: normalised estimation error squared over rotation (3) and direction of translation (2);
         NaN where there is no covariance.
     """
@@ -37,9 +36,7 @@ def pose_error(R: Array, t: Array, true_R: Array, true_t: Array, covariance: Arr
                ) -> PoseError:
     """Error of a pose ``X1 = R X2 + t``.
 
-    `R`, `true_R` (3, 3).
-    `t` (3,): unit vector.
-    `true_t` (3,): of any length but zero.
+    `t` is a unit vector, `true_t` of any length but zero.
     `covariance` (6, 6): of ``(dt, dtheta)`` with ``t_true = t + dt`` (dt perpendicular to t) and
         ``R_true = Exp(dtheta) R``, both in camera 1.
     """

@@ -31,11 +31,7 @@ COMPARED = {LIBRARY: METHODS['auto']} | {
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """One method on one problem.
-
-    `duration`: the shortest of the repeats [ms].
-    `rotation`, `translation`: errors [deg]; infinite without a pose.
-    """
+    """One method on one problem: shortest time [ms], errors [deg], infinite without a pose."""
 
     cell: str
     matches: int
@@ -48,10 +44,7 @@ class Timing:
 
 @dataclass(frozen=True, slots=True)
 class Soak:
-    """Resident memory [MB] while estimates of twenty problems go on.
-
-    `estimates`: between the two.
-    """
+    """Resident memory [MB] before and after so many estimates of twenty problems."""
 
     estimates: int
     before: float

@@ -12,10 +12,6 @@ _Task = TypeVar('_Task')
 _Result = TypeVar('_Result')
 
 
-def do_nothing() -> None:
-    """Prepare nothing; a lambda could not be sent to another process."""
-
-
 def use_one_thread() -> None:
     """Give numerical libraries one thread, here and in child processes.
 
@@ -26,13 +22,14 @@ def use_one_thread() -> None:
 
 
 def in_processes(work: Callable[[_Task], _Result], tasks: Sequence[_Task], jobs: int,
-                 prepare: Callable[[], object] = do_nothing) -> Iterator[_Result]:
+                 prepare: Callable[[], object] | None = None) -> Iterator[_Result]:
     """Results of `work`, in the order of the tasks, which does not depend on `jobs`.
 
     `prepare` is called once in each process.
     """
     if jobs == 1:
-        prepare()
+        if prepare is not None:
+            prepare()
         yield from map(work, tasks)
         return
     # Not forked: OpenCV's and Numba's threads do not survive that.

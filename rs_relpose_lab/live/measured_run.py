@@ -70,8 +70,7 @@ class MeasuredRun:
     `counters`: last figures of the node's diagnostics.
     `figures`, `player_figures`: of node and player, once a second while messages are played.
     `started_ns`, `ready_ns`: when the node was started, and when it subscribed.
-    `timings`: table of the node's parameter `timings_file`.
-    `log`: the player's log.
+    `timings`: table of the node's parameter `timings_file`; `log`: the player's.
     """
 
     poses: list[ReceivedPose]

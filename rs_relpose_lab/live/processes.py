@@ -157,10 +157,8 @@ def wait_until_quiet(count: Callable[[], int], seconds: float, process: Process)
 class ProcessFigures:
     """Processor time and memory of a process at an instant, as Linux tells them.
 
-    `time_ns`: on the monotonic clock.
     `cpu`, `cpu_main`: processor time since its start [s]: of all threads, and of the first one.
-    `resident`, `private`: memory [MB]: all that is resident, and without what is shared with
-        others (the transport's segments).
+    `resident`, `private` [MB]: without what is shared (the transport's segments) in the latter.
     """
 
     time_ns: int

@@ -87,11 +87,8 @@ def hand_held(rng: np.random.Generator, start: float, end: float, plan: Plan, *,
               rotation_rate: float) -> Trajectory:
     """Trajectory of `plan` from time 0, defined at least from `start` to `end` [s].
 
-    `rng`: draws directions, phases and tremor.
-    `start`, `end`: what lies before time 0 continues the plan's first part, what lies after its
-        end the last one.
-    `speed`: walking speed [m/s].
-    `rotation_rate`: root mean square of the angular velocity while walking [rad/s].
+    What lies before time 0 continues the plan's first part, what lies after its end the last one.
+    `speed` [m/s], `rotation_rate` [rad/s, root mean square]: while walking.
     """
     margin = 6 * CONTROL_SPACING
     count = math.ceil((end - start + 2 * margin) / CONTROL_SPACING) + 1

@@ -18,11 +18,9 @@ GRAVITY = np.array([0.0, 0.0, -9.80665])
 class ImuModel:
     """Mounting, biases and noise.
 
-    `R_cam_imu` (3, 3): ``v_cam = R_cam_imu v_imu``.
-    `lever_arm` (3,): position of the IMU in the camera frame [m].
-    `gyro_bias`, `accel_bias` (3,): added to the truth, IMU frame [rad/s], [m/s^2].
-    `gyro_sigma`, `accel_sigma`: white noise of a sample, per axis [rad/s], [m/s^2]: the density
-        times the square root of the rate.
+    ``v_cam = R_cam_imu v_imu``; `lever_arm`: position of the IMU in the camera frame [m].
+    `gyro_bias` [rad/s], `accel_bias` [m/s^2]: added to the truth, IMU frame; sigmas of a sample's
+    white noise, per axis: the density times the square root of the rate.
     """
 
     R_cam_imu: Array

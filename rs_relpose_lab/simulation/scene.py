@@ -32,12 +32,9 @@ _ROOT = np.array([0.0, 0.0, 1.6])
 class Surface:
     """A textured rectangle, seen from the side of its normal ``across x down`` reversed.
 
-    `corner` (3,): world position [m] of the texture's upper left corner, as its viewer sees it.
-    `across`, `down` (3,): unit vectors along the texture's rows and columns, perpendicular to each
-        other.
-    `width`, `height`: size [m].
-    `texture` (H, W): gray values; texel (i, j) is centred at ``((j + 0.5) width / W, (i + 0.5)
-        height / H)``.
+    `corner`: world position [m] of the texture's upper left corner, as its viewer sees it.
+    `across`, `down`: unit vectors along the texture's rows and columns; `width`, `height` [m].
+    Texel (i, j) of `texture` (H, W) is centred at ``((j + 0.5) width / W, (i + 0.5) height / H)``.
     """
 
     corner: Array

@@ -89,11 +89,7 @@ class Simulation:
 
 def simulate(config: SimulationConfig | None = None, *, scene: Scene | None = None,
              trajectory: Trajectory | None = None) -> Simulation:
-    """Set up a recording; nothing is rendered yet.
-
-    `config`: defaults where omitted.
-    `scene`, `trajectory`: instead of those that the configuration describes.
-    """
+    """Set up a recording; `scene`, `trajectory`: instead of those of the configuration."""
     config = SimulationConfig() if config is None else config
     camera = config.camera
     before = -camera.row_time_span[0] + _MARGIN
