@@ -15,6 +15,7 @@ import pytest
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, storage_mcap, StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
+from rosbags.typesys.store import Typestore
 
 from rs_relpose_ros.bags import limits, reader
 from rs_relpose_ros.bags.reader import Bag, open_bag
@@ -69,13 +70,7 @@ def write_rosbag2(path: Path, messages: list[tuple[str, str, object, int]],
     writer = Writer(path, version=9, storage_plugin=storage)
     if mode is not CompressionMode.NONE:
         writer.set_compression(mode, CompressionFormat.ZSTD)
-    with writer:
-        connections = {}
-        for topic, msgtype, message, time in messages:
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, msgtype, typestore=JAZZY)
-            writer.write(connections[topic], STAMP_NS + time, serialize(message, msgtype))
-    return path
+    return write_all(writer, JAZZY, messages, serialize)
 
 
 def write_ros1(path: Path, messages: list[tuple[str, str, object, int]],
@@ -83,14 +78,20 @@ def write_ros1(path: Path, messages: list[tuple[str, str, object, int]],
     writer = Ros1Writer(path)
     if compression is not None:
         writer.set_compression(compression)
+    return write_all(writer, NOETIC, messages, lambda message, msgtype: NOETIC.serialize_ros1(
+        as_ros1(message), msgtype))
+
+
+def write_all(writer: Writer | Ros1Writer, typestore: Typestore,
+              messages: list[tuple[str, str, object, int]],
+              serialize: Callable[..., bytes]) -> Path:
     with writer:
         connections = {}
         for topic, msgtype, message, time in messages:
             if topic not in connections:
-                connections[topic] = writer.add_connection(topic, msgtype, typestore=NOETIC)
-            writer.write(connections[topic], STAMP_NS + time,
-                         NOETIC.serialize_ros1(as_ros1(message), msgtype))
-    return path
+                connections[topic] = writer.add_connection(topic, msgtype, typestore=typestore)
+            writer.write(connections[topic], STAMP_NS + time, serialize(message, msgtype))
+    return writer.path
 
 
 def as_ros1(message: object) -> object:
