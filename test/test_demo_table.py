@@ -74,7 +74,6 @@ def test_opencv_pose_in_our_convention(estimator):
     # OpenCV's RANSAC refines nothing; the inverse would be off by 10 deg.
     assert np.degrees(Rotation.from_matrix(pose.R.T @ R_TRUE).magnitude()) < 0.5
     assert degrees_between(pose.t, T_TRUE) < 3.0   # and not the opposite, or that of camera 2
-    assert not pose.inliers[:60].sum() > 6 and pose.inliers[60:].mean() > 0.9
 
 
 @pytest.mark.parametrize('estimator', OPENCV_ESTIMATORS)

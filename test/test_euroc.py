@@ -25,7 +25,7 @@ from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.imu.buffer import Coverage, ImuBuffer
 from rs_relpose_ros.imu.frame_imu import frame_imu
 from rs_relpose_ros.imu.samples import ImuSample
-from rs_relpose_ros.tracking.registry import make_tracker
+from rs_relpose_ros.tracking.tracker import make_tracker
 
 pytestmark = pytest.mark.recordings
 

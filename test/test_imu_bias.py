@@ -134,10 +134,11 @@ def test_a_gap_is_no_rest():
 def test_buffer_and_frame_use_it(gravity_filter):
     rng = np.random.default_rng(7)
     stamps, rates, forces = joined(rest(5.0, rng), hand(2.0, rng))
-    config = ImuConfig(gravity_filter=gravity_filter)
-    buffer = ImuBuffer(config)
+    buffer, told = (ImuBuffer(ImuConfig(gravity_filter=gravity_filter, track_gyro_bias=tracked))
+                    for tracked in (True, False))
     for stamp, rate, force in zip(stamps.tolist(), rates.tolist(), forces.tolist(), strict=True):
-        buffer.add(ImuSample(stamp, tuple(rate), tuple(force)))
+        for either in (buffer, told):
+            either.add(ImuSample(stamp, tuple(rate), tuple(force)))
     R_cam_imu = Rotation.from_euler('xyz', [90, 0, 30], degrees=True).as_matrix()
     at = START + 6 * SECOND
     answer = frame_imu(buffer, (at, at + 30_000_000), at, R_cam_imu, at - 500_000_000)
@@ -148,9 +149,6 @@ def test_buffer_and_frame_use_it(gravity_filter):
     _, removed = buffer.angular_velocity(at - 500_000_000, at)
     np.testing.assert_allclose(segment.angular_velocities, removed @ R_cam_imu.T, atol=1e-12)
     _, known = buffer.rotation(at - 500_000_000, at)
-    told = ImuBuffer(ImuConfig(gravity_filter=gravity_filter, track_gyro_bias=False))
-    for stamp, rate, force in zip(stamps.tolist(), rates.tolist(), forces.tolist(), strict=True):
-        told.add(ImuSample(stamp, tuple(rate), tuple(force)))
     _, unknown = told.rotation(at - 500_000_000, at)
     assert np.trace(known) < 0.2 * np.trace(unknown)
     joint = segment.joined(segment.__class__(

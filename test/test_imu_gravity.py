@@ -65,12 +65,6 @@ def test_gravity_points_down_when_the_specific_force_points_up(mode):
     assert angle(buffer.gravity(end).direction, np.array([0.0, 0.0, -1.0])) < 0.2
 
 
-def test_gravity_follows_a_turning_imu():
-    buffer, end = run(ImuConfig(), swinging, at_rest, 8.0, np.random.default_rng(1))
-    estimate = buffer.gravity(end)
-    assert angle(estimate.direction, down(end)) < 0.3
-
-
 def test_hand_held_acceleration_hurts_the_mean_and_not_the_filter():
     def shaking(t):
         return np.stack([1.5 * np.sin(7.0 * t), 1.2 * np.cos(9.0 * t), 0.8 * np.sin(11.0 * t)],

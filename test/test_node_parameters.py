@@ -100,14 +100,6 @@ def test_a_live_parameter_is_handed_on(node, parameters, changes, name):
     assert parameters.current == Parameters()
 
 
-def test_what_can_change_live():
-    """Thresholds, noise of matches, keyframe policy and debug images, as documented."""
-    assert {'threshold', 'pixel_sigma', 'gravity_sigma', 'gyro_sigma', 'confidence',
-            'max_iterations', 'time_limit', 'min_inliers', 'min_parallax',
-            'min_keyframe_parallax', 'max_keyframe_interval', 'max_keyframe_frames',
-            'min_tracked_fraction', 'publish_debug_image', 'track_time_offset'} == set(LIVE)
-
-
 def test_several_at_once_are_all_set_or_none(node, parameters):
     result = node.set_parameters_atomically([
         Parameter('threshold', value=1.5), Parameter('min_inliers', value=1)])

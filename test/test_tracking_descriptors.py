@@ -6,7 +6,7 @@ import pytest
 from tracking_images import errors, WarpedScene
 
 from rs_relpose_ros.config.tracking import TrackingConfig
-from rs_relpose_ros.tracking.registry import make_tracker
+from rs_relpose_ros.tracking.tracker import make_tracker
 
 
 @pytest.fixture(scope='module')
@@ -99,42 +99,3 @@ def test_images_that_share_nothing_have_few_matches(scene, detector):
     tracker = tracker_of(detector)
     tracker.start(scene.view(np.eye(3)))
     assert len(tracker.track(other.view(np.eye(3)))) < 0.05 * 600
-
-
-@pytest.mark.parametrize('detector', ['sift', 'orb'])
-def test_a_blank_frame_has_no_matches(scene, detector):
-    tracker = tracker_of(detector)
-    tracker.start(scene.view(np.eye(3)))
-    assert len(tracker.track(np.zeros((360, 480), dtype=np.uint8))) == 0
-    tracker.promote()
-    assert len(tracker.track(scene.view(np.eye(3)))) == 0
-    assert tracker.tracked_fraction == 0.0
-    assert len(tracker.refined_matches()) == 0
-
-
-def test_feature_rows_bound_both_points(scene):
-    tracker = tracker_of('orb', feature_rows=(50, 250))
-    tracker.start(scene.view(np.eye(3)))
-    matches = tracker.track(scene.view(scene.similarity(0.0, 1.0, (0.0, 15.0))))
-    rows = np.concatenate([matches.points1[:, 1], matches.points2[:, 1]])
-    assert len(matches) > 50
-    assert rows.min() >= 50 and rows.max() <= 250
-
-
-@pytest.mark.parametrize('detector', ['sift', 'orb'])
-def test_threads_do_not_change_a_bit(scene, detector):
-    images = [scene.view(scene.similarity(10.0 * k), noise=2.0) for k in range(2)]
-    found = []
-    threads = cv2.getNumThreads()
-    try:
-        for count in (1, 2, 2):
-            cv2.setNumThreads(count)
-            tracker = tracker_of(detector)
-            tracker.start(images[0])
-            found.append(tracker.track(images[1]))
-    finally:
-        cv2.setNumThreads(threads)
-    for other in found[1:]:
-        np.testing.assert_array_equal(other.track_ids, found[0].track_ids)
-        np.testing.assert_array_equal(other.points2, found[0].points2)
-        np.testing.assert_array_equal(other.quality, found[0].quality)

@@ -5,7 +5,7 @@ import pytest
 
 from rs_relpose_ros.config.keyframes import KeyframeConfig
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.front_end.keyframes import closes_pair, SinceKeyframe
+from rs_relpose_ros.front_end.pair import closes_pair, SinceKeyframe
 
 CONFIG = KeyframeConfig(min_keyframe_parallax=10.0, max_keyframe_interval=0.5,
                         max_keyframe_frames=12, min_tracked_fraction=0.3)

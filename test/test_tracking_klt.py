@@ -10,7 +10,7 @@ from rs_relpose_ros.config.tracking import TRACKERS, TrackingConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.tracking.alignment import window_homography
 from rs_relpose_ros.tracking.correlation import correlations
-from rs_relpose_ros.tracking.registry import make_tracker
+from rs_relpose_ros.tracking.tracker import make_tracker
 
 
 @pytest.fixture(scope='module')
@@ -24,8 +24,8 @@ def hand_held(scene, k):
     return H @ np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [2e-6 * k, -3e-6 * k, 1.0]])
 
 
-def track_sequence(scene, images, config=None):
-    tracker = make_tracker(config or TrackingConfig())
+def track_sequence(images, **settings):
+    tracker = make_tracker(TrackingConfig(**settings))
     tracker.start(images[0])
     for image in images[1:]:
         tracker.track(image)
@@ -34,7 +34,7 @@ def track_sequence(scene, images, config=None):
 
 def test_matches_of_a_pure_warp_are_exact(scene):
     H1, H2 = np.eye(3), scene.similarity(4.0, 1.03, (6.3, -4.8))
-    tracker = track_sequence(scene, [scene.view(H1), scene.view(H2)])
+    tracker = track_sequence([scene.view(H1), scene.view(H2)])
     matches = tracker.refined_matches()
     assert len(matches) > 250
     error = errors(matches, H1, H2)
@@ -45,7 +45,7 @@ def test_matches_of_a_pure_warp_are_exact(scene):
 def test_noise_gain_and_offset_do_not_bias(scene):
     H1, H2 = np.eye(3), scene.similarity(1.0, 1.0, (3.4, 1.7))
     tracker = track_sequence(
-        scene, [scene.view(H1, noise=3.0), scene.view(H2, noise=3.0, gain=0.7, offset=25.0)])
+        [scene.view(H1, noise=3.0), scene.view(H2, noise=3.0, gain=0.7, offset=25.0)])
     error = errors(tracker.refined_matches(), H1, H2)
     assert len(error) > 230
     assert np.median(error) < 0.1
@@ -53,10 +53,8 @@ def test_noise_gain_and_offset_do_not_bias(scene):
 
 def test_the_reference_corrects_the_drift(scene):
     images = [scene.view(hand_held(scene, k), noise=2.0) for k in range(9)]
-    tracker = make_tracker(TrackingConfig())
-    tracker.start(images[0])
-    for image in images[1:]:
-        followed = tracker.track(image)
+    tracker = track_sequence(images[:8])
+    followed = tracker.track(images[8])
     refined = tracker.refined_matches()
     H1, H2 = hand_held(scene, 0), hand_held(scene, 8)
     assert len(refined) > 0.85 * 300
@@ -82,8 +80,7 @@ def test_prediction_carries_over_60_px(scene, levels):
 def test_without_prediction_one_level_cannot_follow_60_px(scene):
     """What the test above shows is owed to the prediction."""
     H1, H2 = np.eye(3), scene.similarity(2.0, 1.0, (60.0, -20.0))
-    tracker = track_sequence(scene, [scene.view(H1), scene.view(H2)],
-                             TrackingConfig(klt_levels=1))
+    tracker = track_sequence([scene.view(H1), scene.view(H2)], klt_levels=1)
     assert np.sum(errors(tracker.refined_matches(), H1, H2) < 1.0) < 20
 
 
@@ -175,8 +172,9 @@ def test_corners_are_spread_and_keep_their_distance(scene):
     assert cells.min() >= 3
 
 
-def test_feature_rows_bound_both_points(scene):
-    tracker = make_tracker(TrackingConfig(feature_rows=(100, 300)))
+@pytest.mark.parametrize('detector', ['klt', 'orb'])
+def test_feature_rows_bound_both_points(scene, detector):
+    tracker = make_tracker(TrackingConfig(detector=detector, feature_rows=(100, 300)))
     H2 = scene.similarity(0.0, 1.0, (0.0, 20.0))
     tracker.start(scene.view(np.eye(3)))
     matches = tracker.track(scene.view(H2))
@@ -189,17 +187,18 @@ def test_noise_gives_few_matches(scene):
     """Images that share nothing, and images of next to no texture."""
     rng = np.random.default_rng(5)
     other = WarpedScene(seed=7)
-    tracker = track_sequence(scene, [scene.view(np.eye(3)), other.view(np.eye(3))])
+    tracker = track_sequence([scene.view(np.eye(3)), other.view(np.eye(3))])
     assert len(tracker.refined_matches()) < 15
     grey = [np.clip(np.round(120 + 2.0 * rng.normal(size=(480, 640))), 0, 255).astype(np.uint8)
             for _ in range(2)]
-    assert len(track_sequence(scene, grey).refined_matches()) < 10
+    assert len(track_sequence(grey).refined_matches()) < 10
 
 
-@pytest.mark.parametrize('value', [0, 255])
-def test_blank_frames_lose_all_tracks_and_good_ones_bring_new(scene, value):
+@pytest.mark.parametrize(('detector', 'value'), [
+    ('klt', 0), ('klt', 255), ('sift', 0), ('orb', 0)])
+def test_blank_frames_lose_all_tracks_and_good_ones_bring_new(scene, detector, value):
     good, blank = scene.view(np.eye(3)), np.full((480, 640), value, dtype=np.uint8)
-    tracker = make_tracker(TrackingConfig())
+    tracker = make_tracker(TrackingConfig(detector=detector))
     tracker.start(good)
     assert len(tracker.track(blank)) == 0
     assert tracker.tracked_fraction == 0.0
@@ -212,7 +211,7 @@ def test_blank_frames_lose_all_tracks_and_good_ones_bring_new(scene, value):
 
 def test_a_frozen_image_stands_still(scene):
     image = scene.view(np.eye(3))
-    tracker = track_sequence(scene, [image] * 4)
+    tracker = track_sequence([image] * 4)
     matches = tracker.refined_matches()
     assert len(matches) > 290
     np.testing.assert_allclose(matches.points2, matches.points1, atol=1e-3)
@@ -256,8 +255,8 @@ def test_quality_tells_good_matches_from_bad_ones(scene):
     halves = []
     for k in range(4):
         H1, H2 = np.eye(3), scene.similarity(1.0, 1.0, (3.4, 1.7 + 0.1 * k))
-        tracker = track_sequence(scene, [scene.view(H1, noise=12.0), scene.view(H2, noise=12.0)],
-                                 TrackingConfig(min_correlation=0.3))
+        tracker = track_sequence([scene.view(H1, noise=12.0), scene.view(H2, noise=12.0)],
+                                 min_correlation=0.3)
         matches = tracker.refined_matches()
         assert (matches.quality >= 0.0).all() and (matches.quality <= 1.0).all()
         error = errors(matches, H1, H2)[np.argsort(-matches.quality)]
@@ -268,14 +267,15 @@ def test_quality_tells_good_matches_from_bad_ones(scene):
     assert 0.5 * (better + worse) < 0.22
 
 
-def test_threads_and_repetition_do_not_change_a_bit(scene):
+@pytest.mark.parametrize('detector', TRACKERS)
+def test_threads_and_repetition_do_not_change_a_bit(scene, detector):
     images = [scene.view(hand_held(scene, k), noise=2.0) for k in range(4)]
     found = []
     threads = cv2.getNumThreads()
     try:
         for count in (1, 2, 2):
             cv2.setNumThreads(count)
-            tracker = track_sequence(scene, images)
+            tracker = track_sequence(images, detector=detector)
             tracker.promote()
             tracker.track(images[1])
             found.append(tracker.refined_matches())
@@ -300,7 +300,7 @@ def test_matches_given_out_do_not_change_later(scene):
 def test_windows_turned_by_25_degrees_are_compared_upright(scene):
     H1, H2 = np.eye(3), scene.similarity(25.0, 1.15)
     images = [scene.view(scene.similarity(5.0 * k, 1.0 + 0.03 * k)) for k in range(6)]
-    tracker = track_sequence(scene, images)
+    tracker = track_sequence(images)
     matches = tracker.refined_matches()
     assert len(matches) > 150
     assert np.median(errors(matches, H1, H2)) < 0.1
@@ -338,13 +338,8 @@ def test_correlation_equals_that_of_numpy(scene, side):
 
 def test_a_jerk_after_steady_motion_does_not_lose_the_tracks(scene):
     """Where guesses were good less of the pyramid is asked, until they are not."""
-    tracker = make_tracker(TrackingConfig())
-    shifts = [0.0, 1.0, 2.0, 3.0, 4.0, 22.0, 23.0]
-    H = [scene.similarity(0.0, 1.0, (shift, 0.0)) for shift in shifts]
-    tracker.start(scene.view(H[0]))
-    for warp in H[1:]:
-        tracker.track(scene.view(warp))
-    matches = tracker.refined_matches()
+    H = [scene.similarity(0.0, 1.0, (x, 0.0)) for x in (0.0, 1.0, 2.0, 3.0, 4.0, 22.0, 23.0)]
+    matches = track_sequence([scene.view(warp) for warp in H]).refined_matches()
     assert len(matches) > 240
     assert np.median(errors(matches, H[0], H[-1])) < 0.1
 
@@ -380,15 +375,11 @@ def test_five_frames_of_a_recording_keep_most_corners(recordings, name, rows, le
     # Names end in the frame's number or stamp.
     files = sorted((recordings / name / 'images').iterdir(),
                    key=lambda file: int(''.join(c for c in file.stem if c.isdigit())))
-    tracker = make_tracker(TrackingConfig(feature_rows=rows))
     kept, consistent = [], []
     for start in range(0, 40, 10):
-        tracker.reset()
-        images = [cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files[start:start + 6]]
-        tracker.start(images[0])
-        for image in images[1:]:
-            tracker.track(image)
-        matches = tracker.refined_matches()
+        matches = track_sequence(
+            [cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files[start:start + 6]],
+            feature_rows=rows).refined_matches()
         _, inliers = cv2.findFundamentalMat(matches.points1, matches.points2, cv2.USAC_MAGSAC,
                                             2.0, 0.999, 2000)
         kept.append(len(matches))

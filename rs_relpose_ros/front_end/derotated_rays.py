@@ -1,8 +1,9 @@
-"""Rays of tracked points, turned to the stamped row of their image."""
+"""Rays of tracked points, turned to the stamped row of their image, and their parallax."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.geometry.motion import FrameMotion
+from rs_relpose_ros.geometry.vectors import cross, norm, rotated
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.uint32]
@@ -47,23 +49,12 @@ class Sensor(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DerotatedRays:
-    """Points of one image and what follows from them.
+    """Points of one image with their rays."""
 
-    Attributes
-    ----------
-    track_ids : (N,) ndarray of uint32
-    points : (N, 2) ndarray
-        Pixels of the published image.
-    rays : (N, 3) ndarray
-        Unit rays in the camera frame of the stamped row.
-    row_times : (N,) ndarray
-        From the stamped row [s].
-    """
-
-    track_ids: Ids
-    points: Array
-    rays: Array
-    row_times: Array
+    track_ids: Ids   # (N,)
+    points: Array   # (N, 2) pixels of the published image
+    rays: Array   # (N, 3) unit, in the camera frame of the stamped row
+    row_times: Array   # (N,) [s] from the stamped row
 
     @classmethod
     def from_points(cls, track_ids: Ids, points: Array, sensor: Sensor,
@@ -95,3 +86,19 @@ def _positions(ids: Ids, wanted: Ids) -> NDArray[np.int64]:
         found[i] = k
         k += 1
     return found
+
+
+@kernel
+def median_parallax(rays1: Array, rays2: Array, rotation: Array) -> float:
+    """Median of ``|f_1 x R f_2|`` [about rad] of unit rays (N, 3), ``R = R_1^T R_2`` (3, 3).
+
+    Rays of NaN do not count; 0 where none does.
+    """
+    values = np.empty(len(rays1))
+    count = 0
+    for i in range(len(rays1)):
+        value = norm(cross(rays1[i], rotated(rotation, rays2[i])))
+        if not math.isnan(value):
+            values[count] = value
+            count += 1
+    return float(np.median(values[:count])) if count else 0.0

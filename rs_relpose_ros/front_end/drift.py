@@ -46,55 +46,27 @@ _LARGEST_STEP = 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drift:
-    """What the pairs so far say of gyro and clock.
+    """Gyro bias and time offset after the pairs so far."""
 
-    Attributes
-    ----------
-    gyro_bias, gyro_bias_sigma : (3,) ndarray
-        IMU frame [rad/s]; the bias as a whole, not what is left of it.
-    time_offset, time_offset_sigma : float
-        IMU clock minus camera clock [s], to be compared with the parameter of this name.
-    applied : float
-        Share of it [s] beyond the parameter that frames get from now on.
-    pairs : int
-        Number of pairs that told something.
-    """
-
-    gyro_bias: Array
+    gyro_bias: Array   # (3,) [rad/s], IMU frame; the bias as a whole, not what is left of it
     gyro_bias_sigma: Array
-    time_offset: float
+    time_offset: float   # [s] IMU clock minus camera clock, as the parameter of this name
     time_offset_sigma: float
-    applied: float
-    pairs: int
+    applied: float   # [s] share of it, beyond the parameter, that the next frames get
+    pairs: int   # that held information on the gyro
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairRotation:
-    """A pair's rotation by images and gyro.
+    """A pair's rotation by images and gyro."""
 
-    Attributes
-    ----------
-    stamp_ns : int
-        Instant of the second frame.
-    R, covariance : (3, 3) ndarray
-        As estimated, ``R_true = Exp(dtheta) R``.
-    gyro_rotation : (3, 3) ndarray
-        As integrated.
-    gyro_covariance : (3, 3) ndarray or None
-        As handed to the estimator; None where the estimate did without.
-    gyro : GyroSegment
-        What was integrated.
-    applied1, applied2 : float
-        Offset applied to each frame [s].
-    """
-
-    stamp_ns: int
-    R: Array
-    covariance: Array
-    gyro_rotation: Array
-    gyro_covariance: Array | None
+    stamp_ns: int   # of the second frame
+    R: Array   # (3, 3) as estimated, R_true = Exp(dtheta) R
+    covariance: Array   # (3, 3) of dtheta
+    gyro_rotation: Array   # (3, 3) as integrated from `gyro`
+    gyro_covariance: Array | None   # None where the estimator did not get the gyro's rotation
     gyro: GyroSegment
-    applied1: float
+    applied1: float   # [s] time offset applied to each frame
     applied2: float
 
 
@@ -152,12 +124,9 @@ class DriftTracker:
     def apply(self, wanted: bool) -> None:
         """Move the applied offset towards the known one, or back to none."""
         known = self._covariance[3, 3] < _APPLIED_SIGMA**2
-        target = float(self._state[3]) if known else self._applied
-        if not wanted:
-            target = 0.0
+        target = (float(self._state[3]) if known else self._applied) if wanted else 0.0
         target = min(max(target, -_LARGEST_APPLIED), _LARGEST_APPLIED)
-        step = min(max(target - self._applied, -_LARGEST_STEP), _LARGEST_STEP)
-        self._applied += step
+        self._applied += min(max(target - self._applied, -_LARGEST_STEP), _LARGEST_STEP)
 
     def _pass_time(self, stamp_ns: int) -> None:
         if self._last_ns is not None:

@@ -16,25 +16,10 @@ from rs_relpose_ros.images.encoded import EncodedImage
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """A gray image.
+    """A gray image; raises InputError where it is not of the size that the intrinsics tell."""
 
-    Parameters
-    ----------
-    stamp_ns : int
-        Header stamp.
-    image : (H, W) ndarray of uint8
-        As published: not rectified, not resized.
-    frame_id : str
-    intrinsics : Intrinsics
-
-    Raises
-    ------
-    InputError
-        The image is not of the size that the intrinsics tell.
-    """
-
-    stamp_ns: int
-    image: NDArray[np.uint8]
+    stamp_ns: int   # of the header
+    image: NDArray[np.uint8]   # (H, W) as published: not rectified, not resized
     frame_id: str
     intrinsics: Intrinsics
 

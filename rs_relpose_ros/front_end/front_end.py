@@ -19,38 +19,21 @@ from rs_relpose_ros.front_end.sequencer import FrameRefused, ReadyFrame, Sequenc
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameProcessed:
-    """A frame that was tracked, and the pair that it closed, if it did.
-
-    Attributes
-    ----------
-    ready_ns, taken_ns : int
-        As in `ReadyFrame`.
-    seconds : float
-        Wall time of tracking and estimation.
-    pair : PairResult or None
-    """
+    """A frame that was tracked, and the pair that it closed, if it did."""
 
     stamp_ns: int
-    ready_ns: int
+    ready_ns: int   # both as in `ReadyFrame`
     taken_ns: int
-    seconds: float
+    seconds: float   # wall time of tracking and estimation
     pair: PairResult | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameFailed:
-    """A frame in which an error came up: tracking starts anew with the next one.
+    """A frame in which an error came up: tracking starts anew with the next one."""
 
-    Attributes
-    ----------
-    stamp_ns : int or None
-        None where no frame had been taken yet.
-    error : Exception
-        Of the package (`RsRelposeError`), or, live, a programming error.
-    """
-
-    stamp_ns: int | None
-    error: Exception
+    stamp_ns: int | None   # None where no frame had been taken yet
+    error: Exception   # of the package (`RsRelposeError`), or, live, a programming error
 
 
 Outcome = FrameRefused | FrameFailed | FrameProcessed
@@ -59,27 +42,12 @@ Outcome = FrameRefused | FrameFailed | FrameProcessed
 class FrontEnd:
     """Takes frames from its sequencer and processes them.
 
-    `sequencer` is filled from any thread, `parameters` may be replaced from any thread; `step` is
-    called by one.
+    `sequencer` is filled from any thread; `step` is called by one. `parameters` may be replaced
+    from any thread and are in force from the next step on: nothing behind `step` keeps a value
+    that may change while running, all of it gets these with each frame.
 
-    Parameters
-    ----------
-    parameters : Parameters
-        Sensor settings that have no default must be given.
-    offline : bool
-        As in `Sequencer`. Programming errors leave `step`; live they are an outcome, since the
-        node goes on.
-    keep_images : bool
-        Whether pairs carry their two images.
-    clock : callable
-        Monotonic time [ns]; for tests.
-
-    Attributes
-    ----------
-    sequencer : Sequencer
-    parameters : Parameters
-        In force from the next step on. Nothing behind `step` keeps a value that may change while
-        running: all of it gets these with each frame.
+    `offline` and `clock` are those of `Sequencer`. Offline, programming errors leave `step`; live
+    they are an outcome, since the node goes on. With `keep_images` pairs carry their two images.
     """
 
     def __init__(self, parameters: Parameters, *, offline: bool = False,
@@ -91,13 +59,7 @@ class FrontEnd:
         self._offline = offline
 
     def step(self, timeout: float = 0.0) -> Outcome | None:
-        """What became of the next frame; None where none is ready within `timeout` seconds.
-
-        Raises
-        ------
-        Exception
-            Offline, a programming error.
-        """
+        """What became of the next frame; None where none is ready within `timeout` seconds."""
         stamp_ns: int | None = None
         try:
             if not self._offline:

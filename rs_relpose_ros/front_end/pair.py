@@ -1,4 +1,4 @@
-"""A keyframe pair, what came of it, and the table of figures that are published of it."""
+"""Keyframe pairs: which frames close one, what came of it, and the figures that are published."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.config.keyframes import KeyframeConfig
 from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.front_end.drift import Drift
 from rs_relpose_ros.geometry.so3 import log_so3
@@ -18,54 +19,43 @@ from rs_relpose_ros.tracking.matches import Matches
 Array = NDArray[np.float64]
 
 
+class SinceKeyframe(NamedTuple):
+    """What has happened since the reference keyframe."""
+
+    parallax: float   # [px] median of the matches after derotation
+    interval: float   # [s]
+    frames: int   # 1 for the first frame after the keyframe
+    tracked_fraction: float   # share of the keyframe's features that are still tracked
+
+
+def closes_pair(since: SinceKeyframe, config: KeyframeConfig) -> bool:
+    """Whether the current frame closes a pair: the camera moved far enough, or it is high time."""
+    return (since.parallax >= config.min_keyframe_parallax
+            or since.tracked_fraction < config.min_tracked_fraction
+            or since.interval >= config.max_keyframe_interval
+            or since.frames >= config.max_keyframe_frames)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PairResult:
-    """Estimate of one keyframe pair with the matches that it was made from.
+    """Estimate of one keyframe pair with the matches that it was made from."""
 
-    Attributes
-    ----------
-    reference_stamp_ns, stamp_ns : int
-        Header stamps of the reference keyframe and of the current image.
-    reference_ns1, reference_ns2 : int
-        Instants of the two stamped rows on the IMU clock.
-    frame_id : str
-        Of the current image.
-    interval : float
-        Seconds between the two reference instants.
-    pose : RelativePose
-        ``pose.inliers`` is a mask over `matches`.
-    matches : Matches
-        Pixels of the published images.
-    row_times1, row_times2 : (N,) ndarray
-        Row times [s] of the matches against the stamped row.
-    rays1, rays2 : (N, 3) ndarray
-        Unit rays, turned by the gyro to the stamped row.
-    parallax : float
-        Median parallax after derotation [px].
-    gyro_rotation : (3, 3) ndarray or None
-        ``R_1^T R_2`` integrated from the gyro.
-    drift : Drift or None
-        Gyro bias and time offset as tracked up to this pair.
-    image1, image2 : (H, W) ndarray of uint8 or None
-        Kept where the front end was asked to.
-    """
-
-    reference_stamp_ns: int
+    reference_stamp_ns: int   # header stamps of the reference keyframe and of the current image
     stamp_ns: int
-    reference_ns1: int
+    reference_ns1: int   # instants of the two stamped rows on the IMU clock
     reference_ns2: int
-    frame_id: str
-    interval: float
-    pose: RelativePose
-    matches: Matches
-    row_times1: Array
+    frame_id: str   # of the current image
+    interval: float   # [s] between the two reference instants
+    pose: RelativePose   # its inliers are a mask over `matches`
+    matches: Matches   # pixels of the published images
+    row_times1: Array   # (N,) [s] from the stamped row
     row_times2: Array
-    rays1: Array
+    rays1: Array   # (N, 3) unit, turned by the gyro to the stamped row
     rays2: Array
-    parallax: float
-    gyro_rotation: Array | None = None
-    drift: Drift | None = None
-    image1: NDArray[np.uint8] | None = None
+    parallax: float   # [px] median after derotation
+    gyro_rotation: Array | None = None   # (3, 3) R_1^T R_2 integrated from the gyro
+    drift: Drift | None = None   # as tracked up to this pair
+    image1: NDArray[np.uint8] | None = None   # both only where the front end keeps images
     image2: NDArray[np.uint8] | None = None
 
     @property
@@ -84,15 +74,11 @@ class PairResult:
 
 
 class PairFigure(NamedTuple):
-    """A figure that is published of every pair.
+    """A figure that is published of every pair; NaN is shown as an empty text."""
 
-    `name` ends with the unit: the key on /diagnostics, where it has `digits` after the point, and
-    among the medians of summary.json. NaN is told as nothing.
-    """
-
-    name: str
+    name: str   # with the unit; the key on /diagnostics and among the medians of summary.json
     of: Callable[[PairResult], float]
-    digits: int
+    digits: int   # after the point, on /diagnostics
 
     def text(self, pair: PairResult | None) -> str:
         """As /diagnostics shows it."""

@@ -12,19 +12,17 @@ from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import MissingInputError
 from rs_relpose_ros.estimator.estimate import estimate_relative_pose
 from rs_relpose_ros.estimator.result import RelativePose
-from rs_relpose_ros.front_end.derotated_rays import DerotatedRays, Sensor
+from rs_relpose_ros.front_end.derotated_rays import DerotatedRays, median_parallax, Sensor
 from rs_relpose_ros.front_end.drift import DriftTracker, PairRotation
 from rs_relpose_ros.front_end.frame import Frame, sensor_camera
-from rs_relpose_ros.front_end.keyframes import closes_pair, SinceKeyframe
-from rs_relpose_ros.front_end.pair import PairResult
+from rs_relpose_ros.front_end.pair import closes_pair, PairResult, SinceKeyframe
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import aligning_rotation
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between
 from rs_relpose_ros.imu.frame_imu import FrameImu, GyroSegment
 from rs_relpose_ros.imu.integration import integrate_rotation
 from rs_relpose_ros.tracking.matches import Matches
-from rs_relpose_ros.tracking.parallax import median_parallax
-from rs_relpose_ros.tracking.registry import make_tracker
+from rs_relpose_ros.tracking.tracker import make_tracker
 
 Array = NDArray[np.float64]
 
@@ -34,11 +32,10 @@ _LARGEST_GRAVITY_SIGMA = 1.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _View:
-    """A processed frame: what a later frame or pair needs of it."""
+    """A processed frame."""
 
-    stamp_ns: int
+    frame: Frame
     imu: FrameImu
-    image: NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,13 +58,8 @@ class _GravityPrior(NamedTuple):
 class Pipeline:
     """Tracks frames against a reference keyframe and estimates a pose whenever a pair closes.
 
-    Parameters
-    ----------
-    parameters : Parameters
-        Those that may change while running (declared `live`) are not kept: `process` gets the
-        current ones with each frame.
-    keep_images : bool
-        Whether results carry the two images (for pictures).
+    Parameters that may change while running (declared `live`) are not kept: `process` gets the
+    current ones with each frame. With `keep_images` results carry the two images.
     """
 
     def __init__(self, parameters: Parameters, keep_images: bool = False) -> None:
@@ -107,7 +99,7 @@ class Pipeline:
         """
         self.prepare()
         sensor = self._sensor_of(frame, parameters)
-        view = _View(frame.stamp_ns, imu, frame.image)
+        view = _View(frame, imu)
         # Without the gyro tracks are not predicted, and wrong ones that agree by chance pass.
         if self._reference is None or self._previous is None or imu.since_previous is None:
             self._tracker.start(frame.image)
@@ -116,15 +108,17 @@ class Pipeline:
         self._frames += 1
         predicted = self._predicted(self._previous.imu.motion, imu, sensor, parameters)
         matches = self._tracker.track(
-            frame.image, predicted, seconds_between(self._previous.stamp_ns, frame.stamp_ns))
+            frame.image, predicted,
+            seconds_between(self._previous.frame.stamp_ns, frame.stamp_ns))
         self._previous = view
         self._gyro = self._turn_with(imu.since_previous, parameters)
-        self._derotate(matches, self._reference.imu.motion, imu.motion, sensor)
-        since = SinceKeyframe(self._parallax(sensor), _interval(self._reference, view),
-                              self._frames, self._tracker.tracked_fraction)
+        rays1, rays2 = self._derotate(matches, self._reference.imu.motion, imu.motion, sensor)
+        since = SinceKeyframe(self._parallax(rays1, rays2, sensor),
+                              _interval(self._reference, view), self._frames,
+                              self._tracker.tracked_fraction)
         if not closes_pair(since, parameters.keyframes):
             return None
-        result = self._close_pair(frame, self._reference, view, sensor, parameters)
+        result = self._close_pair(self._reference, view, sensor, parameters)
         self._restart_from(view)
         self._promotion_due = True
         return result
@@ -181,29 +175,28 @@ class Pipeline:
                                              parameters.imu, segment.bias_sigma), segment)
 
     def _derotate(self, matches: Matches, motion1: FrameMotion, motion2: FrameMotion,
-                  sensor: Sensor) -> None:
-        """Keep the rays of matches in the reference and in the current image."""
+                  sensor: Sensor) -> tuple[DerotatedRays, DerotatedRays]:
+        """Rays of matches in the reference and in the current image, which are kept."""
         # In the reference image points do not move: their rays are kept for the tracks that go on.
         known = self._reference_rays
         first = None if known is None else known.of(matches.track_ids)
         if first is None:
             first = DerotatedRays.from_points(matches.track_ids, matches.points1, sensor, motion1)
-        self._reference_rays = first
-        self._current_rays = DerotatedRays.from_points(matches.track_ids, matches.points2, sensor,
-                                                       motion2)
+        second = DerotatedRays.from_points(matches.track_ids, matches.points2, sensor, motion2)
+        self._reference_rays, self._current_rays = first, second
+        return first, second
 
-    def _parallax(self, sensor: Sensor) -> float:
-        """Median parallax [px] of the rays that are kept, beyond what the rotation explains."""
-        assert self._reference_rays is not None and self._current_rays is not None
-        rays1, rays2 = self._reference_rays.rays, self._current_rays.rays
-        rotation = aligning_rotation(rays1.T @ rays2) if self._gyro is None else (
+    def _parallax(self, first: DerotatedRays, second: DerotatedRays, sensor: Sensor) -> float:
+        """Median parallax [px] of matched rays, beyond what the rotation explains."""
+        rotation = aligning_rotation(first.rays.T @ second.rays) if self._gyro is None else (
             self._gyro.rotation)
-        return sensor.camera.fx * median_parallax(rays1, rays2, rotation)
+        return sensor.camera.fx * median_parallax(first.rays, second.rays, rotation)
 
     # -- one pair ----------------------------------------------------------------------------
 
-    def _close_pair(self, frame: Frame, reference: _View, view: _View, sensor: Sensor,
+    def _close_pair(self, reference: _View, view: _View, sensor: Sensor,
                     parameters: Parameters) -> PairResult:
+        stamp1_ns, stamp2_ns = reference.frame.stamp_ns, view.frame.stamp_ns
         matches, gyro = self._tracker.refined_matches(), self._gyro
         told = gyro if parameters.pair.use_gyro_rotation else None
         gravity = _gravity_prior(reference.imu, view.imu, parameters)
@@ -216,20 +209,18 @@ class Pipeline:
             interval=_interval(reference, view),
             config=replace(parameters.estimator, gravity_sigma=gravity.sigma),
             quality=matches.quality,
-            rng=np.random.default_rng([parameters.pair.seed, reference.stamp_ns, view.stamp_ns]))
+            rng=np.random.default_rng([parameters.pair.seed, stamp1_ns, stamp2_ns]))
         self._follow_drift(pose, reference.imu, view.imu, parameters)
-        self._derotate(matches, reference.imu.motion, view.imu.motion, sensor)
-        rays1, rays2 = self._reference_rays, self._current_rays
-        assert rays1 is not None and rays2 is not None
+        rays1, rays2 = self._derotate(matches, reference.imu.motion, view.imu.motion, sensor)
         return PairResult(
-            reference_stamp_ns=reference.stamp_ns, stamp_ns=view.stamp_ns,
+            reference_stamp_ns=stamp1_ns, stamp_ns=stamp2_ns,
             reference_ns1=reference.imu.reference_ns, reference_ns2=view.imu.reference_ns,
-            frame_id=frame.frame_id, interval=_interval(reference, view), pose=pose,
+            frame_id=view.frame.frame_id, interval=_interval(reference, view), pose=pose,
             matches=matches, row_times1=rays1.row_times, row_times2=rays2.row_times,
-            rays1=rays1.rays, rays2=rays2.rays, parallax=self._parallax(sensor),
+            rays1=rays1.rays, rays2=rays2.rays, parallax=self._parallax(rays1, rays2, sensor),
             gyro_rotation=None if gyro is None else gyro.rotation, drift=self._drift.estimate(),
-            image1=reference.image if self._keep_images else None,
-            image2=frame.image if self._keep_images else None)
+            image1=reference.frame.image if self._keep_images else None,
+            image2=view.frame.image if self._keep_images else None)
 
     def _follow_drift(self, pose: RelativePose, imu1: FrameImu, imu2: FrameImu,
                       parameters: Parameters) -> None:

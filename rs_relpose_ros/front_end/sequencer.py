@@ -60,26 +60,13 @@ class Refusal(str, Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReadyFrame:
-    """A decoded frame with its IMU.
-
-    Attributes
-    ----------
-    frame : Frame
-    imu : FrameImu
-    restart : bool
-        Time jumped since the frame before: what was tracked belongs to another time.
-    ready_ns : int
-        When the later of the image and the IMU sample that covers its last row came, on the
-        monotonic clock; 0 offline.
-    taken_ns : int
-        When its turn came, on the same clock: it was decoded after that.
-    """
+    """A decoded frame with its IMU; both instants are on the monotonic clock, 0 offline."""
 
     frame: Frame
     imu: FrameImu
-    restart: bool
-    ready_ns: int
-    taken_ns: int
+    restart: bool   # time jumped since the frame before: tracks belong to another time
+    ready_ns: int   # arrival of the image or of the IMU sample behind its last row: the later
+    taken_ns: int   # when its turn came; it was decoded after that
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,11 +80,7 @@ class FrameRefused:
 
 @dataclass(frozen=True, slots=True)
 class SequencerCounts:
-    """What came and what became of it, since the start.
-
-    `imu_repeated` counts samples of a stamp that had come before and were dropped, `imu_late`
-    those that came after a younger one and were sorted in.
-    """
+    """What came and what became of it, since the start."""
 
     frames: int
     frames_taken: int
@@ -105,24 +88,21 @@ class SequencerCounts:
     imu_samples: int
     imu_gaps: int
     clock_jumps: int
-    imu_repeated: int = 0
-    imu_late: int = 0
+    imu_repeated: int = 0   # samples of a stamp that had come before, dropped
+    imu_late: int = 0   # samples that came after a younger one, sorted in
 
 
 @dataclass(slots=True, eq=False)
 class _Waiting:
-    """A frame with its instants on the IMU clock and the monotonic clock [ns].
-
-    `ready_ns` is None until the IMU covers its last row.
-    """
+    """A frame that waits for the IMU or for the worker."""
 
     frame: Frame | EncodedFrame
-    start_ns: int
+    start_ns: int   # first, last and stamped row on the IMU clock, without a tracked offset
     end_ns: int
     reference_ns: int
-    received_ns: int
+    received_ns: int   # on the monotonic clock
     generation: int
-    ready_ns: int | None = None
+    ready_ns: int | None = None   # None until the IMU covers its last row
 
 
 class _StepsBack:
@@ -145,42 +125,12 @@ class _StepsBack:
         return True
 
 
-@dataclass(slots=True)
-class _NewestImu:
-    """Newest stamps [ns] of the IMU: of any sample, of the gyro and of the accelerometer."""
-
-    any_ns: int | None = None
-    gyro_ns: int | None = None
-    accelerometer_ns: int | None = None
-
-    def add(self, sample: ImuSample) -> None:
-        self.any_ns = _later(self.any_ns, sample.stamp_ns)
-        if sample.angular_velocity is not None:
-            self.gyro_ns = _later(self.gyro_ns, sample.stamp_ns)
-        if sample.linear_acceleration is not None:
-            self.accelerometer_ns = _later(self.accelerometer_ns, sample.stamp_ns)
-
-    def covers(self, end_ns: int) -> bool:
-        """Whether the IMU has come as far as `end_ns`, an accelerometer on its own topic too."""
-        if self.gyro_ns is None or self.gyro_ns < end_ns:
-            return False
-        # Gravity must not depend on which of two topics came first.
-        return (self.accelerometer_ns is None or self.accelerometer_ns >= end_ns
-                or self.gyro_ns - self.accelerometer_ns > _ACCELEROMETER_STALE_NS)
-
-
 class Sequencer:
     """Thread-safe meeting point of frames and IMU samples; its states: ``docs/architecture.md``.
 
-    Parameters
-    ----------
-    parameters : Parameters
-        Sensor and IMU settings; those that have no default must be given.
-    offline : bool
-        Every frame is kept until the IMU covers it or the input is closed. Take what is ready
-        after each message: the IMU history is only `imu_buffer_seconds` long.
-    clock : callable
-        Monotonic time [ns]; for tests.
+    Offline every frame is kept until the IMU covers it or the input is closed. Take what is ready
+    after each message: the IMU history is only `imu_buffer_seconds` long. Tests give a `clock` of
+    their own, monotonic [ns].
     """
 
     def __init__(self, parameters: Parameters, *, offline: bool = False,
@@ -196,7 +146,6 @@ class Sequencer:
         self._changed = threading.Condition()
         self._closed = False
         self._buffer = ImuBuffer(parameters.imu)
-        self._newest = _NewestImu()
         self._samples_back = _StepsBack(_BACK_SAMPLES)
         self._waiting: deque[_Waiting] = deque()
         self._refusals: deque[FrameRefused] = deque(maxlen=None if offline else _REFUSALS_KEPT)
@@ -215,30 +164,24 @@ class Sequencer:
     # -- input -------------------------------------------------------------------------------
 
     def add_imu(self, sample: ImuSample) -> None:
-        """Store an IMU sample.
-
-        Raises
-        ------
-        InputError
-            It cannot be used; nothing is stored.
-        """
+        """Store an IMU sample; InputError where it cannot be used, and nothing is stored."""
         has_gyro, stamp_ns = sample.angular_velocity is not None, sample.stamp_ns
         with self._changed:
-            set_back = has_gyro and self._samples_back.add(stamp_ns, self._newest.gyro_ns)
-            newest_ns = self._newest.any_ns
+            buffer = self._buffer
+            set_back = has_gyro and self._samples_back.add(stamp_ns, buffer.newest_gyro_ns)
+            newest_ns = buffer.newest_ns
             if newest_ns is not None and (set_back or stamp_ns < newest_ns - CLOCK_JUMP_NS):
                 self._jump('IMU stamps jumped back by '
                            f'{seconds_between(stamp_ns, newest_ns):.3f} s')
-                self._clear_imu()
-            added = self._buffer.add(sample)
+                buffer.clear()
+            before_ns = buffer.newest_gyro_ns
+            added = buffer.add(sample)
             self._count['imu_samples'] += 1
             self._count['imu_repeated'] += added is AddResult.DUPLICATE
-            before_ns = self._newest.gyro_ns
             if has_gyro and before_ns is not None:
                 # Of two topics one is always behind; late is a gyro sample behind another one.
                 self._count['imu_late'] += added is AddResult.LATE and stamp_ns < before_ns
                 self._count['imu_gaps'] += stamp_ns - before_ns > self._max_gap_ns
-            self._newest.add(sample)
             self._sort_out()
 
     def add_frame(self, frame: Frame | EncodedFrame) -> None:
@@ -270,7 +213,7 @@ class Sequencer:
         """Forget all frames and the IMU; the next frame starts anew."""
         with self._changed:
             self._start_anew(Refusal.RESET, 'a reset was asked for')
-            self._clear_imu()
+            self._buffer.clear()
 
     def close(self) -> None:
         """End of the input: `take` gives what is there, then None."""
@@ -346,7 +289,7 @@ class Sequencer:
             return None
         head = self._waiting[0]
         # A tracked offset may have moved a frame that was ready.
-        covered = head.ready_ns is not None and self._newest.covers(self._span(head)[1])
+        covered = head.ready_ns is not None and self._imu_reaches(self._span(head)[1])
         coverage = self._coverage(head) if covered else Coverage.NOT_YET
         if coverage is Coverage.AVAILABLE:
             return self._waiting.popleft()
@@ -373,7 +316,7 @@ class Sequencer:
         ready = 0
         for waiting in tuple(self._waiting):
             if waiting.ready_ns is None:
-                if not self._newest.covers(self._span(waiting)[1]):
+                if not self._imu_reaches(self._span(waiting)[1]):
                     break
                 if self._buffer.coverage(waiting.start_ns, waiting.end_ns) is Coverage.NEVER:
                     # Refused at once: it must not count as a frame that waits for the worker.
@@ -406,6 +349,15 @@ class Sequencer:
     def _span(self, waiting: _Waiting) -> tuple[int, int]:
         """Instants of its first and last row, with the offset tracked by now."""
         return waiting.start_ns + self._offset_ns, waiting.end_ns + self._offset_ns
+
+    def _imu_reaches(self, end_ns: int) -> bool:
+        """Whether gyro and accelerometer, which may have a topic each, have come to an instant."""
+        gyro_ns, force_ns = self._buffer.newest_gyro_ns, self._buffer.newest_force_ns
+        if gyro_ns is None or gyro_ns < end_ns:
+            return False
+        # Gravity must not depend on which of two topics came first.
+        return (force_ns is None or force_ns >= end_ns
+                or gyro_ns - force_ns > _ACCELEROMETER_STALE_NS)
 
     def _coverage(self, waiting: _Waiting) -> Coverage:
         return self._buffer.coverage(*self._span(waiting))
@@ -443,9 +395,9 @@ class Sequencer:
         self._jump(f'image stamps jumped back by {back:.3f} s')
         # The IMU may have jumped already, and then holds what this frame needs; set back by
         # little, it may hold two times at once.
-        newest_ns = self._newest.any_ns
+        newest_ns = self._buffer.newest_ns
         if set_back or (newest_ns is not None and newest_ns > end_ns + CLOCK_JUMP_NS):
-            self._clear_imu()
+            self._buffer.clear()
         return True
 
     def _counted(self, stamp_ns: int, cause: Refusal, reason: str) -> FrameRefused:
@@ -466,11 +418,3 @@ class Sequencer:
         while self._waiting:
             self._refuse(self._waiting.popleft().frame.stamp_ns, cause, reason)
         self._last_stamp_ns = self._previous_reference_ns = None
-
-    def _clear_imu(self) -> None:
-        self._buffer.clear()
-        self._newest = _NewestImu()
-
-
-def _later(known_ns: int | None, stamp_ns: int) -> int:
-    return stamp_ns if known_ns is None else max(known_ns, stamp_ns)

@@ -16,10 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.config.parameters import Parameters
-from rs_relpose_ros.estimator.estimate import (
-    warm_up_refinement,
-    warm_up_sampling,
-)
+from rs_relpose_ros.estimator.warm_up import warm_up_refinement, warm_up_sampling
 from rs_relpose_ros.front_end.frame import Frame
 from rs_relpose_ros.front_end.front_end import FrameProcessed, FrontEnd
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
@@ -38,13 +35,8 @@ _IMU_NS = NANOSECONDS // 200
 def warm_up_pipeline(parameters: Parameters) -> None:
     """Run the pipeline over a few made-up frames, once with all of the IMU, once with its gyro.
 
-    Images are read-only the first time and writable the second.
-
-    Parameters
-    ----------
-    parameters : Parameters
-        Detector, solver and filters are those that will be used; what would keep the made-up
-        frames from being processed is replaced.
+    Detector, solver and filters are those of `parameters`; what would keep the made-up frames from
+    being processed is replaced.
     """
     parameters = parameters.updated({
         'readout_time': 0.02, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0], 'time_offset': 0.0,

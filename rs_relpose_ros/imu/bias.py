@@ -70,16 +70,10 @@ class BiasTracker:
             np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty((0, 3)))
 
     def run(self, stamps_ns: NDArray[np.int64], rates: Array, forces: Array) -> None:
-        """Take in samples that follow those before.
+        """Take in samples (K,) that follow those before, their stamps strictly increasing.
 
-        Parameters
-        ----------
-        stamps_ns : (K,) ndarray of int64
-            Strictly increasing.
-        rates : (K, 3) ndarray
-            Gyro as it reads [rad/s].
-        forces : (K, 3) ndarray
-            Specific force [m/s^2] at these stamps; NaN where there is none.
+        `rates` (K, 3) [rad/s] are those that the gyro reads, `forces` (K, 3) [m/s^2] the specific
+        force at these stamps, NaN where there is none.
         """
         if not self._follow:
             return

@@ -65,34 +65,34 @@ class ImuBuffer:
         self._filtered_ns = self._pruned_ns = int(np.iinfo(np.int64).min)
 
     @property
-    def newest_ns(self) -> int | None:
+    def newest_gyro_ns(self) -> int | None:
         """Stamp of the newest gyro sample."""
-        stamps = self._gyro.stamps
-        return int(stamps[-1]) if len(stamps) else None
+        return self._gyro.newest_ns
+
+    @property
+    def newest_force_ns(self) -> int | None:
+        """Stamp of the newest accelerometer sample."""
+        return self._force.newest_ns
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Newest stamp of any kind."""
+        return max((series.newest_ns for series in (self._gyro, self._force, self._down)
+                    if series.newest_ns is not None), default=None)
 
     def add(self, sample: ImuSample) -> AddResult:
-        """Store a sample.
-
-        Raises
-        ------
-        InputError
-            A value is not finite; nothing is stored then.
-        """
+        """Store a sample; InputError where a value is not finite, and nothing is stored."""
         for name, value in (('angular_velocity', sample.angular_velocity),
                             ('linear_acceleration', sample.linear_acceleration)):
             if value is not None and not all(map(math.isfinite, value)):
                 raise InputError(f'IMU sample at {sample.stamp_ns} ns: {name} must be finite, '
                                  f'got {list(value)}')
-        newest = max((int(s.stamps[-1]) for s in (self._gyro, self._force) if len(s.stamps)),
-                     default=sample.stamp_ns)
-        added = False
-        own = sample.orientation
-        values: tuple[tuple[Series, tuple[float, ...] | None], ...] = (
-            (self._gyro, sample.angular_velocity), (self._force, sample.linear_acceleration),
-            (self._down, None if own is None else (*own.down, own.sigma)))
-        for series, numbers in values:
-            if numbers is not None:
-                added |= series.insert(sample.stamp_ns, numbers)
+        newest_ns, own = self.newest_ns, sample.orientation
+        newest = sample.stamp_ns if newest_ns is None else newest_ns
+        added = self._gyro.insert(sample.stamp_ns, sample.angular_velocity)
+        added |= self._force.insert(sample.stamp_ns, sample.linear_acceleration)
+        if own is not None:
+            added |= self._down.insert(sample.stamp_ns, (*own.down, own.sigma))
         if not added:
             return AddResult.DUPLICATE
         # Pruned when a tenth is too old: a search per sample would cost more than the memory.
@@ -125,14 +125,9 @@ class ImuBuffer:
         return Coverage.AVAILABLE
 
     def angular_velocity(self, start_ns: int, end_ns: int) -> tuple[NDArray[np.int64], Array]:
-        """Gyro over an interval, its borders interpolated.
+        """Gyro over an interval, its borders interpolated; one entry where they are equal.
 
-        Returns
-        -------
-        stamps_ns : (K,) ndarray of int64
-            From `start_ns` to `end_ns`; one entry where they are equal.
-        rates : (K, 3) ndarray
-            IMU frame [rad/s], `bias` of `end_ns` subtracted.
+        Stamps (K,) and rates (K, 3) [rad/s] in the IMU frame, `bias` of `end_ns` subtracted.
         """
         if end_ns < start_ns:
             raise InputError(f'the interval must not end ({end_ns}) before it starts ({start_ns})')

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,24 +16,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GyroSegment:
-    """Gyro samples between two instants, borders interpolated, bias removed, camera frame.
+    """Gyro samples between two instants, borders interpolated, bias removed, camera frame."""
 
-    Attributes
-    ----------
-    stamps_ns : (K,) ndarray of int64
-        The first and the last are the two instants themselves.
-    angular_velocities : (K, 3) ndarray
-        Rates [rad/s] in the camera frame.
-    bias : (3,) ndarray
-        What was removed [rad/s], in the camera frame; the mean where it changed meanwhile.
-    bias_sigma : float
-        Its uncertainty per axis [rad/s].
-    """
-
-    stamps_ns: NDArray[np.int64]
-    angular_velocities: Array
-    bias: Array
-    bias_sigma: float
+    stamps_ns: NDArray[np.int64]   # (K,) the first and the last are the two instants
+    angular_velocities: Array   # (K, 3) [rad/s]
+    bias: Array   # (3,) [rad/s] that was removed; the mean where it changed meanwhile
+    bias_sigma: float   # [rad/s] per axis
 
     @property
     def duration(self) -> float:
@@ -51,46 +39,23 @@ class GyroSegment:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameImu:
-    """The IMU's share of a frame, all in the camera frame.
+    """The IMU's share of a frame, all in the camera frame."""
 
-    Attributes
-    ----------
-    motion : FrameMotion
-        Reference: the stamped row.
-    gravity_sigma : float or None
-        1 sigma per axis of the gravity direction [rad]; None where there is no gravity.
-    reference_ns : int
-        Instant of the stamped row on the IMU clock.
-    since_previous : GyroSegment or None
-        From the previous frame's reference instant to this one's; None for the first frame or
-        where the gyro has a gap.
-    applied_offset_ns : int
-        Tracked time offset that these instants hold beyond the parameter's.
-    """
-
-    motion: FrameMotion
-    gravity_sigma: float | None
-    reference_ns: int
+    motion: FrameMotion   # relative to the stamped row
+    gravity_sigma: float | None   # [rad] per axis of the direction; None where there is none
+    reference_ns: int   # instant of the stamped row on the IMU clock
+    # Since the previous frame's reference instant; None for the first frame or after a gap.
     since_previous: GyroSegment | None
-    applied_offset_ns: int = 0
+    applied_offset_ns: int = 0   # tracked time offset in these instants, beyond the parameter's
 
 
 def frame_imu(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_cam_imu: Array,
               previous_reference_ns: int | None = None) -> FrameImu:
-    """Collect from `buffer` what a frame needs.
+    """Collect from `buffer` what a frame needs; all instants are on the IMU clock.
 
-    Parameters
-    ----------
-    buffer : ImuBuffer
-        Must answer AVAILABLE for `span_ns`.
-    span_ns : (int, int)
-        Instants of the frame's earliest and latest row on the IMU clock.
-    reference_ns : int
-        Instant of its stamped row, within `span_ns`.
-    R_cam_imu : (3, 3) ndarray
-        ``v_cam = R_cam_imu v_imu``.
-    previous_reference_ns : int, optional
-        Reference instant of the frame processed before.
+    `span_ns` are those of the frame's earliest and latest row, which the buffer must cover,
+    `reference_ns` and `previous_reference_ns` those of the stamped rows of this frame and of the
+    one processed before. ``v_cam = R_cam_imu v_imu``.
     """
     start_ns, end_ns = span_ns
     stamps_ns, rates = buffer.angular_velocity(start_ns, end_ns)
@@ -104,9 +69,7 @@ def frame_imu(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_
     estimate = buffer.gravity(end_ns)
     if estimate is not None:
         turn = motion.rotations([(end_ns - reference_ns) * 1e-9])[0]
-        gravity = turn @ (R_cam_imu @ estimate.direction)
-        motion = FrameMotion(motion.angular_velocity, gravity, motion.knot_times,
-                             motion.knot_rotations)
+        motion = replace(motion, gravity=turn @ (R_cam_imu @ estimate.direction))
         gravity_sigma = estimate.sigma
     since_previous = None
     if (previous_reference_ns is not None and previous_reference_ns < reference_ns

@@ -50,38 +50,20 @@ class GravityEstimate:
 
 
 class _Noise(NamedTuple):
-    """Noise of the filter.
+    """Noise of the filter, per axis."""
 
-    Attributes
-    ----------
-    acceleration : float
-        Variance of the camera's own acceleration per axis [m^2/s^4].
-    turning, bias : float
-        Growth of the variance of direction [rad^2/s] and gyro bias [rad^2/s^3] per axis.
-    """
-
-    acceleration: float
-    turning: float
-    bias: float
+    acceleration: float   # [m^2/s^4] variance of the camera's own acceleration
+    turning: float   # [rad^2/s] growth of the variance of the direction
+    bias: float   # [rad^2/s^3] growth of the variance of the gyro bias
 
 
 class _State(NamedTuple):
-    """State of the filter, which the kernels update in place; all in the IMU frame.
+    """State of the filter, which the kernels update in place; all in the IMU frame."""
 
-    Attributes
-    ----------
-    up, bias : (3,) ndarray
-        Direction ``u`` and bias ``b`` [rad/s].
-    covariance : (6, 6) ndarray
-        P, of ``(d, e)``.
-    residual : (3,) ndarray
-        Mean of ``f / |f| - u`` over about the last second.
-    """
-
-    up: Array
-    bias: Array
-    covariance: Array
-    residual: Array
+    up: Array   # (3,) u
+    bias: Array   # (3,) b [rad/s]
+    covariance: Array   # (6, 6) P, of (d, e)
+    residual: Array   # (3,) mean of f / |f| - u over about the last second
 
 
 class GravityFilter:
@@ -98,44 +80,29 @@ class GravityFilter:
                              config.gyro_bias_sigma**2 / BIAS_MEMORY)
         self._state = _State(np.zeros(3), np.zeros(3), np.zeros((6, 6)), np.zeros(3))
         self._state.covariance[3:, 3:] = config.gyro_bias_sigma**2 * np.eye(3)
-        # Of the last sample: None while the direction is unknown.
-        self._stamp_ns: int | None = None
+        # Of the last sample taken in: None while the direction is unknown.
+        self.stamp_ns: int | None = None
         self._rate = np.zeros(3)
 
-    @property
-    def stamp_ns(self) -> int | None:
-        """Stamp of the last sample taken in; None while there is no direction."""
-        return self._stamp_ns
-
     def run(self, stamps_ns: NDArray[np.int64], rates: Array, forces: Array) -> None:
-        """Take in samples that follow those before.
-
-        Parameters
-        ----------
-        stamps_ns : (K,) ndarray of int64
-            Strictly increasing.
-        rates : (K, 3) ndarray
-            Gyro [rad/s], known bias removed.
-        forces : (K, 3) ndarray
-            Specific force [m/s^2] at these stamps; NaN where there is none.
-        """
+        """Take in samples, as `BiasTracker.run` does, but with the known bias removed."""
         k = 0
         while k < len(stamps_ns):
-            if self._stamp_ns is None:
+            if self.stamp_ns is None:
                 k = self._begin(k, stamps_ns, rates, forces)
                 continue
-            done = _advance(self._state, self._noise, self._stamp_ns, self._rate, stamps_ns[k:],
+            done = _advance(self._state, self._noise, self.stamp_ns, self._rate, stamps_ns[k:],
                             rates[k:], forces[k:], self._gap_ns)
             if done:
                 k += done
-                self._stamp_ns, self._rate = int(stamps_ns[k - 1]), rates[k - 1].copy()
+                self.stamp_ns, self._rate = int(stamps_ns[k - 1]), rates[k - 1].copy()
             if k < len(stamps_ns):
                 # The turn of the IMU during a gap is unknown: the direction is lost.
-                self._stamp_ns = None
+                self.stamp_ns = None
 
     def estimate(self) -> GravityEstimate | None:
         """Gravity at the stamp of the last sample; None without accelerometer."""
-        if self._stamp_ns is None:
+        if self.stamp_ns is None:
             return None
         up = self._state.up
         # An error along the direction itself turns nothing.
@@ -159,7 +126,7 @@ class GravityFilter:
         up[:], residual[:] = forces[first] / length, 0.0
         covariance[:3, 3:] = covariance[3:, :3] = 0.0
         covariance[:3, :3] = _direction_variance(length, self._noise.acceleration) * np.eye(3)
-        self._stamp_ns, self._rate = int(stamps_ns[first]), rates[first].copy()
+        self.stamp_ns, self._rate = int(stamps_ns[first]), rates[first].copy()
         return first + 1
 
 

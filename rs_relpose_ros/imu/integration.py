@@ -39,26 +39,11 @@ def _integrate(seconds: Array, rates: Array) -> tuple[Array, Array, Array]:
 
 def integrate_rotation(stamps_ns: NDArray[np.int64], rates: ArrayLike, config: ImuConfig,
                        bias_sigma: float | None = None) -> tuple[Array, Array]:
-    """Rotation between the first and the last sample.
+    """Rotation ``R_start^T R_end`` (3, 3) between the first and the last sample, its covariance.
 
-    Parameters
-    ----------
-    stamps_ns : (K,) ndarray of int64
-        Strictly increasing.
-    rates : (K, 3) array_like
-        Angular velocity [rad/s], bias removed, linear between samples.
-    config : ImuConfig
-        Noise density and bias uncertainty.
-    bias_sigma : float, optional
-        1 sigma per axis of the bias that was removed [rad/s], where it is known better than
-        `config` says.
-
-    Returns
-    -------
-    rotation : (3, 3) ndarray
-        ``R_start^T R_end``.
-    covariance : (3, 3) ndarray
-        Of dtheta in the start frame, ``R_true = Exp(dtheta) rotation`` [rad^2].
+    The covariance (3, 3) [rad^2] is that of dtheta in the start frame, ``R_true = Exp(dtheta) R``.
+    The stamps (K,) strictly increase; the rates (K, 3) [rad/s], their bias removed, are linear
+    between samples. `bias_sigma` [rad/s] per axis is told where it is not that of `config`.
     """
     rates = np.ascontiguousarray(rates, dtype=np.float64)
     if len(stamps_ns) < 1 or rates.shape != (len(stamps_ns), 3):
@@ -74,9 +59,5 @@ def integrate_rotation(stamps_ns: NDArray[np.int64], rates: ArrayLike, config: I
 
 
 def bias_jacobian(stamps_ns: NDArray[np.int64], rates: Array) -> Array:
-    """Derivative (3, 3) of the integrated rotation by a constant added to all rates.
-
-    ``Exp(J dw) R`` is the rotation integrated from ``rates + dw``, to first order in dw; arguments
-    as in `integrate_rotation`.
-    """
+    """J (3, 3): ``Exp(J dw) R`` is the rotation integrated from ``rates + dw``, for small dw."""
     return _integrate((stamps_ns - stamps_ns[0]) * 1e-9, np.ascontiguousarray(rates))[1]

@@ -27,8 +27,15 @@ class Series:
         """Values (K, width); such a view, too."""
         return self._values[self._start:self._end]
 
-    def insert(self, stamp_ns: int, value: tuple[float, ...]) -> bool:
-        """Insert in order; False for a stamp that is there already."""
+    @property
+    def newest_ns(self) -> int | None:
+        """The last stamp; None without any."""
+        return int(self._stamps[self._end - 1]) if self._end > self._start else None
+
+    def insert(self, stamp_ns: int, value: tuple[float, ...] | None) -> bool:
+        """Insert in order; False for no value, and for a stamp that is there already."""
+        if value is None:
+            return False
         stamps = self.stamps
         position = len(stamps)
         if position and stamp_ns <= stamps[-1]:

@@ -10,16 +10,9 @@ from rs_relpose_ros.messages.causes import cause_of, MOST_CAUSES
 
 
 class CauseLog:
-    """Passes a text on unless its like was passed on shortly before; thread-safe.
+    """Hands a text to `write` unless one of its cause came in the last `period` [s]; thread-safe.
 
-    Parameters
-    ----------
-    write : callable
-        Receives the text, e.g. a logger's ``warning``.
-    period : float
-        Shortest time [s] between two texts of one cause.
-    clock : callable
-        Monotonic seconds; for tests.
+    Tests give a `clock` of their own, of monotonic seconds.
     """
 
     def __init__(self, write: Callable[[str], object], period: float = 30.0,

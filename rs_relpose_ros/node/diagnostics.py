@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 import threading
@@ -45,13 +45,7 @@ class Inputs:
 
 
 class Statistics:
-    """Figures of the node; thread-safe.
-
-    Parameters
-    ----------
-    clock : callable
-        Monotonic time [ns]; for tests.
-    """
+    """Figures of the node; thread-safe. Tests give a `clock` of their own, monotonic [ns]."""
 
     def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
         self._clock = clock
@@ -63,33 +57,20 @@ class Statistics:
         self._last_no_pose = ''
         self._since_ns = clock()
         self._counted = Inputs()
-        self._refused_before = self._overload_before = 0
+        self._refused: Counter[Refusal] = Counter()
         self._frame_times: deque[float] = deque(maxlen=_RECENT_FRAMES)
         self._busy_ns = 0
         self._last_input_ns: dict[str, int] = {}
 
     def add_frame(self, taken_ns: int) -> None:
-        """Count a frame; call it when all is done for it.
-
-        Parameters
-        ----------
-        taken_ns : int
-            When the worker took it, on the monotonic clock.
-        """
+        """Count a frame that was `taken_ns` (monotonic clock); call it when all is done for it."""
         spent_ns = self._clock() - taken_ns
         with self._lock:
             self._frame_times.append(spent_ns / NANOSECONDS)
             self._busy_ns += spent_ns
 
     def add_pair(self, result: PairResult, ready_ns: int) -> None:
-        """Count a pair; call it right after its publication.
-
-        Parameters
-        ----------
-        result : PairResult
-        ready_ns : int
-            When everything that the pair needs had come, on the monotonic clock.
-        """
+        """Count a pair right after its publication; all for it had come by `ready_ns`."""
         now_ns = self._clock()
         with self._lock:
             self._pairs += 1
@@ -111,49 +92,33 @@ class Statistics:
                missing: tuple[str, ...]) -> Report:
         """The state since the last report.
 
-        Parameters
-        ----------
-        inputs : Inputs
-        counts : SequencerCounts or None
-            None while nothing is estimated.
-        problem : str
-            Why nothing can be estimated, told by the node; empty for none.
-        missing : tuple of str
-            Names of parameters and inputs that are missing.
+        `counts` is None while nothing is estimated; `problem` says why nothing can be, or is
+        empty; `missing` names parameters and inputs that are missing.
         """
         now_ns = self._clock()
         with self._lock:
             elapsed = max((now_ns - self._since_ns) / NANOSECONDS, 1e-3)
-            rates = {name: (getattr(inputs, name) - getattr(self._counted, name)) / elapsed
-                     for name in ('images', 'camera_infos', 'imu', 'accelerometer')}
+            rates = {name: (getattr(inputs, field) - getattr(self._counted, field)) / elapsed
+                     for name, field in (('image', 'images'), ('camera_info', 'camera_infos'),
+                                         ('imu', 'imu'), ('accel', 'accelerometer'))}
             self._since_ns, self._counted = now_ns, inputs
-            refused = {} if counts is None else dict(counts.refused)
-            dropped = sum(refused.values()) - self._refused_before
-            self._refused_before = sum(refused.values())
-            overload = refused.get(Refusal.OVERLOAD, 0) - self._overload_before
-            self._overload_before = refused.get(Refusal.OVERLOAD, 0)
+            refused = Counter({} if counts is None else counts.refused)
+            dropped, self._refused = refused - self._refused, refused
             busy, self._busy_ns = self._busy_ns / NANOSECONDS / elapsed, 0
-            level, text = self._judge(problem, dropped, overload)
+            level, text = self._judge(problem, dropped.total(), dropped[Refusal.OVERLOAD])
             last, pose = self._last_pair, self._last_pose
             latency, frame_time = _milliseconds(self._latencies), _milliseconds(self._frame_times)
             values = [
                 ('state', {OK: 'ok', WARN: 'degraded', ERROR: 'not estimating'}[level]),
                 ('missing', ', '.join(missing)),
-                ('image_rate_hz', f'{rates["images"]:.1f}'),
-                ('camera_info_rate_hz', f'{rates["camera_infos"]:.1f}'),
-                ('imu_rate_hz', f'{rates["imu"]:.1f}'),
-                ('accel_rate_hz', f'{rates["accelerometer"]:.1f}'),
+                *((f'{name}_rate_hz', f'{rate:.1f}') for name, rate in rates.items()),
                 ('frames_received', str(counts.frames if counts else inputs.images)),
                 ('frames_processed', str(counts.frames_taken if counts else 0)),
-                *((f'frames_refused_{cause.value}', str(refused.get(cause, 0)))
-                  for cause in Refusal),
+                *((f'frames_refused_{cause.value}', str(refused[cause])) for cause in Refusal),
                 ('frames_failed', str(self._failures)),
                 ('messages_invalid', str(inputs.invalid)),
-                ('imu_samples', str(counts.imu_samples if counts else 0)),
-                ('imu_gaps', str(counts.imu_gaps if counts else 0)),
-                ('imu_repeated', str(counts.imu_repeated if counts else 0)),
-                ('imu_late', str(counts.imu_late if counts else 0)),
-                ('clock_jumps', str(counts.clock_jumps if counts else 0)),
+                *((name, str(getattr(counts, name, 0))) for name in (
+                    'imu_samples', 'imu_gaps', 'imu_repeated', 'imu_late', 'clock_jumps')),
                 ('pairs', str(self._pairs)),
                 ('poses', str(self._poses)),
                 *((figure.name, figure.text(last)) for figure in PAIR_FIGURES),

@@ -1,4 +1,4 @@
-"""Files of a line per frame, for replays and measurements of a live run."""
+"""Files of a line per frame: which ones were processed, and how long each of them took."""
 
 from __future__ import annotations
 
@@ -10,18 +10,10 @@ from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.front_end.front_end import FrameProcessed
 
 COLUMNS = ('stamp_ns', 'ready_ns', 'taken_ns', 'done_ns', 'cpu_ns', 'outcome')
-# Outcome of a frame that closed no pair.
-NO_PAIR = 'none'
 
 
 def opened(parameter: str, path: str) -> TextIO:
-    """File of the parameter of this name, written line by line.
-
-    Raises
-    ------
-    InputError
-        It cannot be written.
-    """
+    """File of the parameter of this name, written line by line; InputError where that fails."""
     try:
         return Path(path).open('w', buffering=1, encoding='ascii')
     except OSError as error:
@@ -31,15 +23,9 @@ def opened(parameter: str, path: str) -> TextIO:
 class FrameTimings:
     """Writes the file of the parameter `timings_file`; to be used by the worker thread.
 
-    Of each frame: its stamp; on the monotonic clock when it was `ready` (the later of image and
-    the IMU sample that covers its last row had come), `taken` from the mailbox and `done` (after
-    publication); processor time that the thread spent since the frame before; the status of the
-    pair that it closed, or ``none``.
-
-    Raises
-    ------
-    InputError
-        The file cannot be written.
+    Of each frame: its stamp; on the monotonic clock when it was `ready` and `taken` (as in
+    `ReadyFrame`) and `done` (after publication); processor time that the thread spent since the
+    frame before; the status of the pair that it closed, or ``none``.
     """
 
     def __init__(self, path: str) -> None:
@@ -54,7 +40,7 @@ class FrameTimings:
     def add(self, frame: FrameProcessed) -> None:
         """Write a frame; call it right after its result was published."""
         done_ns, spent_ns = time.monotonic_ns(), time.thread_time_ns()
-        outcome = NO_PAIR if frame.pair is None else frame.pair.pose.status.value
+        outcome = 'none' if frame.pair is None else frame.pair.pose.status.value
         self._file.write(f'{frame.stamp_ns},{frame.ready_ns},{frame.taken_ns},{done_ns},'
                          f'{spent_ns - self._spent_ns},{outcome}\n')
         self._spent_ns = spent_ns

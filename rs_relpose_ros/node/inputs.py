@@ -32,22 +32,9 @@ _DRAIN_PERIOD = 0.1
 class SensorInputs:
     """Subscriptions to the topics of the camera and the IMU; hands messages to the intake.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    intake : Intake
-    waits_for_imu : callable
-        Whether a frame needs IMU samples that have not been read yet.
-    image_transport : {'raw', 'compressed'}
-    on_invalid : callable
-        Gets the sentence about a message that cannot be used.
-    clock : rclpy.clock.Clock
-        Steady: silence goes by the wall's pace also where /clock stands still.
-
-    Attributes
-    ----------
-    topics : dict
-        Resolved name of the topic of each role.
+    `topics` are the resolved names by role. `waits_for_imu` tells whether a frame needs samples
+    that have not been read yet, `on_invalid` gets the sentence about a message that cannot be
+    used. The `clock` is steady: silence goes by the wall's pace also where /clock stands still.
     """
 
     def __init__(self, node: Node, intake: Intake, waits_for_imu: Callable[[], bool],

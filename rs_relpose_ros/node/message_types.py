@@ -11,13 +11,7 @@ from rs_relpose_ros.errors import MissingInputError
 
 @functools.cache
 def message_class(msgtype: str) -> Any:
-    """Class of a message type name such as ``'sensor_msgs/msg/Imu'``.
-
-    Raises
-    ------
-    MissingInputError
-        The package of the type is not installed.
-    """
+    """Class of a message type name such as ``'sensor_msgs/msg/Imu'``."""
     package, _, name = msgtype.split('/')
     try:
         return getattr(importlib.import_module(f'{package}.msg'), name)

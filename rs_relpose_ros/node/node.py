@@ -38,12 +38,10 @@ from rs_relpose_ros.node.inputs import SensorInputs
 from rs_relpose_ros.node.message_types import message_class
 from rs_relpose_ros.node.outputs import PairPublishers, SHUT_DOWN
 from rs_relpose_ros.node.params import NodeParameters, unknown_overrides, unknown_qos_overrides
-from rs_relpose_ros.node.worker import CannotStart, Event, Warm, Worker
+from rs_relpose_ros.node.worker import Event, WarmedUp, Worker
 
 # Time [s] that the worker gets to end: a frame takes less, compiling takes longer.
 _JOIN_TIMEOUT = 0.4
-# Gap between IMU messages [s] above which the sensor has stopped.
-_SUSPICIOUS_SILENCE = 0.3
 # Time [s] of a start above which kernels are being compiled, not loaded from the cache.
 _TELL_COMPILING = 4.0
 
@@ -51,12 +49,8 @@ _TELL_COMPILING = 4.0
 class RelposeNode(Node):
     """Relative poses of a rolling-shutter camera with an IMU; its states: docs/architecture.md.
 
-    Callbacks convert little and hand over; one worker thread does the rest.
-
-    Raises
-    ------
-    InputError
-        A parameter is not legal.
+    Callbacks convert little and hand over; one worker thread does the rest. An illegal parameter
+    raises InputError.
     """
 
     def __init__(self) -> None:
@@ -119,8 +113,9 @@ class RelposeNode(Node):
     def _subscribe_when_warm(self) -> None:
         if not self._warm.is_set():
             if self._now_ns() - self._started_ns > _TELL_COMPILING * NANOSECONDS:
-                self._info('compiling kernels: the first start takes a minute or two, the later '
-                           'ones some seconds')
+                # Only where the build left none that can be used: see kernel_cache.py.
+                self._info("compiling kernels into the user's cache: this start takes a minute "
+                           'or two, the later ones some seconds')
             return
         self.destroy_timer(self._warm_timer)
         assert self._front_end is not None
@@ -152,11 +147,10 @@ class RelposeNode(Node):
     def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Start anew, as after a restart, but for the intrinsics and the counters."""
         response.success = self._front_end is not None
+        response.message = self._cannot_start
         if self._front_end is not None:
             self._front_end.sequencer.reset()
             response.message = 'starting anew with the next frame'
-        else:
-            response.message = self._cannot_start
         return response
 
     def _on_parameters(self, parameters: Parameters) -> None:
@@ -169,9 +163,10 @@ class RelposeNode(Node):
         """The one outlet of the worker."""
         if isinstance(event, FrameRefused):
             self._tell_refused(event)
-        elif isinstance(event, CannotStart):
-            self._tell_failed('the kernels cannot be compiled', event.error)
-        elif isinstance(event, Warm):
+        elif isinstance(event, WarmedUp):
+            if event.error is not None:
+                self._tell_failed('the kernels cannot be compiled', event.error)
+                return
             if self._timings is not None:
                 self._timings.start()
             self._warm.set()
@@ -201,7 +196,8 @@ class RelposeNode(Node):
         if refused.cause is Refusal.NO_CALIBRATION:
             return   # `_missing_input` tells it
         if refused.cause is Refusal.NO_IMU:
-            if self._inputs is not None and self._inputs.silent(Role.IMU, _SUSPICIOUS_SILENCE):
+            # A gap of 0.3 s between IMU messages: the sensor has stopped.
+            if self._inputs is not None and self._inputs.silent(Role.IMU, 0.3):
                 return   # `_missing_input` tells it after `SILENCE`
             self._warn(f'a frame was not used: {refused.reason}; is '
                        f'{self.resolve_topic_name("imu")} published, with a gyro, and are its '
@@ -314,6 +310,7 @@ def main(arguments: Sequence[str] | None = None,
 
 
 def _finish(node: RelposeNode | None) -> None:
+    """End the node; signals are ignored from here on, as Ctrl-C comes twice under ros2 launch."""
     _ignore_signals()
     if node is not None:
         if not node.stop():
@@ -338,7 +335,6 @@ def leave(code: int) -> NoReturn:
 
 
 def _ignore_signals() -> None:
-    """From here on the node ends anyway; Ctrl-C comes twice under ros2 launch."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
 

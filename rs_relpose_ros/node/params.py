@@ -28,20 +28,11 @@ _QOS = 'qos_overrides.'
 class NodeParameters:
     """The node's parameters; keeps them valid while it runs.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    on_change : callable, optional
-        Called with the new `Parameters` after a live one was set.
-
-    Raises
-    ------
-    InputError
-        A value of the parameter file or the command line is not legal.
+    `on_change` gets the new `Parameters` after a live one was set. Raises InputError where a value
+    of the parameter file or the command line is not legal.
     """
 
-    def __init__(self, node: Node,
-                 on_change: Callable[[Parameters], None] | None = None) -> None:
+    def __init__(self, node: Node, on_change: Callable[[Parameters], None]) -> None:
         self._on_change = on_change
         values = {}
         for name, default, declared in Parameters.declarations():
@@ -64,8 +55,7 @@ class NodeParameters:
         changed = self._known(parameters)
         if changed:
             self.current = self.current.updated(changed)
-            if self._on_change is not None:
-                self._on_change(self.current)
+            self._on_change(self.current)
 
     def _known(self, parameters: list[Parameter]) -> dict[str, Any]:
         """Those of ours: use_sim_time and QoS overrides are rclpy's business."""

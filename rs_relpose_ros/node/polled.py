@@ -25,19 +25,8 @@ _STAMPED = 12
 class PolledSubscription:
     """A subscription that is read by `drain`, and wakes the executor only while it is urgent.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    msgtype : type
-    topic : str
-    qos : QoSProfile
-        Its depth must hold what comes between two calls of `drain`.
-    receive : callable
-        Called with each message (its bytes where `raw`).
-    urgent : callable
-        Whether the next message should wake the executor; asked before it waits.
-    raw : bool
-        Do not deserialise.
+    `receive` gets each message, its bytes where `raw`; `urgent` is asked before the executor
+    waits. The depth of `qos` must hold what comes between two calls of `drain`.
     """
 
     def __init__(self, node: Node, msgtype: type, topic: str, qos: QoSProfile,
@@ -83,14 +72,8 @@ class _WhileUrgent(CallbackGroup):
 class WhenChanged:
     """Hands on a serialised message only if it differs from the last one by more than its stamp.
 
-    A CameraInfo comes with each image and hardly ever changes.
-
-    Parameters
-    ----------
-    msgtype : type
-        Of messages that begin with a std_msgs/Header.
-    receive : callable
-        Called with the message.
+    For messages that begin with a std_msgs/Header: a CameraInfo comes with each image and hardly
+    ever changes.
     """
 
     def __init__(self, msgtype: type, receive: Callable[[Any], None]) -> None:

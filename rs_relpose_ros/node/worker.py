@@ -14,28 +14,19 @@ _STEP_TIMEOUT = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Warm:
-    """The kernels are compiled or loaded: frames are taken from now on."""
+class WarmedUp:
+    """The kernels are compiled or loaded, and frames are taken from now on; or the thread ends."""
+
+    error: Exception | None = None   # why they could not be compiled
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CannotStart:
-    """The kernels could not be compiled: the thread ends."""
-
-    error: Exception
-
-
-Event = Warm | CannotStart | Outcome
+Event = WarmedUp | Outcome
 
 
 class Worker(threading.Thread):
     """Steps the front end until it is stopped; an error in one frame never ends it.
 
-    Parameters
-    ----------
-    front_end : FrontEnd
-    consume : callable
-        Takes each event, in this thread: one `Warm` or `CannotStart`, then outcomes of frames.
+    `consume` gets each event, in this thread: one `WarmedUp`, then outcomes of frames.
     """
 
     def __init__(self, front_end: FrontEnd, consume: Callable[[Event], object]) -> None:
@@ -57,9 +48,9 @@ class Worker(threading.Thread):
         try:
             warm_up_pipeline(self._front_end.parameters)
         except Exception as error:  # noqa: BLE001 - the node shows it; a silent thread is worse
-            self._consume(CannotStart(error))
+            self._consume(WarmedUp(error))
             return
-        self._consume(Warm())
+        self._consume(WarmedUp())
         while not self._stopping.is_set():
             outcome = self._front_end.step(_STEP_TIMEOUT)
             if outcome is None:

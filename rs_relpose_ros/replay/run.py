@@ -15,7 +15,7 @@ from rs_relpose_ros.bags.reader import Bag, BagMessage
 from rs_relpose_ros.bags.topics import SensorTopics
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
-from rs_relpose_ros.estimator.estimate import warm_up
+from rs_relpose_ros.estimator.warm_up import warm_up
 from rs_relpose_ros.front_end.front_end import FrameFailed, FrontEnd
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.front_end.sequencer import FrameRefused
@@ -88,7 +88,7 @@ class Replay:
 
         Raises where the bag is damaged, its camera is not calibrated, or no frame could be used.
         """
-        warm_up()
+        warm_up(self._front_end.parameters.estimator)
         started = time.perf_counter()
         for role, message in self._intake.feed.messages(self._bag, self._topics):
             self.counts.first_ns = self.counts.first_ns or message.bag_time_ns

@@ -23,21 +23,10 @@ _LEAST_GAIN, _LEAST_OFFSET = 0.1, 10.0
 
 def brightness_table(image1: Image, image2: Image, points1: Array, points2: Array,
                      side: int) -> Image | None:
-    """What makes the second image as bright and as rich in contrast as the first.
+    """The first image's brightness for each of the second's (256,); None where they are alike.
 
-    Parameters
-    ----------
-    image1, image2 : (H, W) ndarray of uint8
-        As the camera took them: interpolation smooths the noise, and contrast with it.
-    points1, points2 : (N, 2) ndarray
-        Matches, whose windows are compared.
-    side : int
-        Of the windows [px].
-
-    Returns
-    -------
-    (256,) ndarray of uint8 or None
-        The first image's brightness for each of the second's; None where they are alike.
+    Windows of `side` pixels around matches (N, 2) are compared, in images as the camera took
+    them: interpolation smooths the noise, and contrast with it.
     """
     if not len(points1):
         return None

@@ -11,9 +11,9 @@ from scipy.spatial import KDTree
 
 from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.config.tracking import TrackingConfig
+from rs_relpose_ros.tracking.images import Image
 
 Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 # Side of the window over which the structure tensor of the half-size image is summed.
 _BLOCK = 5
@@ -24,23 +24,10 @@ _ALL = 1e-9
 
 
 def find_corners(image: Image, taken: Array, count: int, config: TrackingConfig) -> Array:
-    """New corners that keep their distance from the points that are there.
+    """At most `count` new corners (K, 2) [px], at a distance from those `taken` (M, 2) already.
 
-    Parameters
-    ----------
-    image : (H, W) ndarray of uint8
-    taken : (M, 2) ndarray
-        Points that are tracked already [px].
-    count : int
-        At most so many new ones.
-    config : TrackingConfig
-
-    Returns
-    -------
-    (K, 2) ndarray
-        Whole pixels of the full image: the best of each cell of a grid first, then the second
-        best, and so on. Not refined to sub-pixels: the accuracy of a match is that of the second
-        point relative to the first one.
+    The best of each cell of a grid first, then the second best, and so on. Whole pixels, not
+    refined: the accuracy of a match is that of the second point relative to the first one.
     """
     height, width = image.shape
     # Half size: less noise, and the search costs a quarter.

@@ -56,14 +56,9 @@ def correlations(image1: Image, image2: Image, points1: Array, points2: Array,
 
 @kernel
 def _window(image: Image, x: float, y: float, window: Window, by_column: Window) -> float:
-    """Sample the `window` centred at a point, the border repeated; the sum of its pixels.
+    """Fill the `window` (side, padded) centred at a point, the border repeated.
 
-    Parameters
-    ----------
-    window : (side, padded) ndarray
-        Overwritten.
-    by_column : (padded,) ndarray
-        Overwritten with the sums of the columns.
+    The sum of its pixels is returned, that of its columns written to `by_column` (padded,).
     """
     height, width = image.shape
     side, padded = window.shape

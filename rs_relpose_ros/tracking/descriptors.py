@@ -106,11 +106,12 @@ class DescriptorTracker:
     # -- inside ------------------------------------------------------------------------------
 
     def _detect(self, image: Image) -> _Keypoints:
+        nothing = _Keypoints(self._ids.take(0), np.empty((0, 2)), np.empty((0, 0), dtype=np.uint8))
         if min(image.shape) < _SMALLEST_SIDE:
-            return _no_keypoints()
+            return nothing
         keypoints, descriptors = self._detector.detectAndCompute(image, None)
         if not keypoints:
-            return _no_keypoints()
+            return nothing
         points = np.array([k.pt for k in keypoints], dtype=np.float64)
         first, last = feature_rows(self._config, image.shape[0])
         # One keypoint per place: SIFT gives a place with several orientations several times.
@@ -143,8 +144,3 @@ class DescriptorTracker:
         distances, indices = cv2.batchDistance(first, second, self._depth, normType=self._norm,
                                                K=count)
         return distances.astype(np.float64), indices.astype(np.int64)
-
-
-def _no_keypoints() -> _Keypoints:
-    return _Keypoints(np.empty(0, dtype=np.uint32), np.empty((0, 2)),
-                      np.empty((0, 0), dtype=np.uint8))

@@ -11,12 +11,9 @@ Image = NDArray[np.uint8]
 
 
 def checked(image: Image, shape: tuple[int, ...] | None) -> Image:
-    """`image` as a contiguous (H, W) array of uint8 of the expected shape.
+    """`image` as a contiguous (H, W) array of uint8; InputError where it cannot be.
 
-    Raises
-    ------
-    InputError
-        It is of another type, or of another size than the images before.
+    `shape` is that of the images before: a stream has one size.
     """
     image = np.ascontiguousarray(image)
     if image.ndim != 2 or image.dtype != np.uint8 or image.size == 0:

@@ -14,7 +14,7 @@ from rs_relpose_ros.tracking.alignment import aligned
 from rs_relpose_ros.tracking.brightness import brightness_table, with_brightness
 from rs_relpose_ros.tracking.corners import feature_rows, find_corners, keep_apart
 from rs_relpose_ros.tracking.images import checked, Image
-from rs_relpose_ros.tracking.lucas_kanade import Flow, follow
+from rs_relpose_ros.tracking.lucas_kanade import follow
 from rs_relpose_ros.tracking.matches import Matches, TrackIds
 
 Array = NDArray[np.float64]
@@ -71,10 +71,7 @@ class KltTracker:
 
     def track(self, image: Image, predicted: Array | None = None,
               interval: float = 1.0) -> Matches:
-        """Follow the corners from the current image into `image`, which then is the current one.
-
-        Parameters are those of `rs_relpose_ros.tracking.tracker.Tracker.track`.
-        """
+        """Follow the corners into `image`, which then is the current one; see `Tracker.track`."""
         if self._current is None:
             raise InputError('the tracker has no reference keyframe: call start() first')
         previous, points = self._current, self.points
@@ -86,7 +83,8 @@ class KltTracker:
         seen = with_brightness(current, brightness_table(
             previous, current, points, guess, self._config.klt_window))
         all_levels = self._config.klt_levels
-        levels = min(self._levels_needed, all_levels) if expected else all_levels
+        needed = _NEAR_LEVELS if self._guesses_near else _EXPECTED_LEVELS
+        levels = min(needed, all_levels) if expected else all_levels
         found, good = self._follow_and_return(previous, seen, points, guess, levels)
         lost = ~good
         if levels < all_levels and np.count_nonzero(lost) > _MOST_LOST * len(good):
@@ -134,17 +132,13 @@ class KltTracker:
 
     # -- inside ------------------------------------------------------------------------------
 
-    @property
-    def _levels_needed(self) -> int:
-        return _NEAR_LEVELS if self._guesses_near else _EXPECTED_LEVELS
-
     def _set(self, matches: Matches, unexplained: Array, good: NDArray[np.bool_]) -> None:
         self._matches, self._unexplained = matches.kept(good), unexplained[good]
 
     def _follow_and_return(self, image1: Image, image2: Image, points1: Array, guess: Array,
                            levels: int) -> tuple[Array, NDArray[np.bool_]]:
         """Points of `image2` that look like `points1` (N, 2), and which of them lead back."""
-        there = self._follow(image1, image2, points1, guess, levels)
+        there = follow(image1, image2, points1, guess, self._config.klt_window, levels, _CRITERIA)
         # The way back starts as far off as the way forth did: the guess must not be the answer.
         offset = there.points - guess
         good = there.found.copy()
@@ -160,10 +154,7 @@ class KltTracker:
     def _return(self, image2: Image, image1: Image, found: Array, points1: Array, offset: Array,
                 levels: int) -> NDArray[np.bool_]:
         """Which of the `found` points lead back to `points1`, from a guess that is off as told."""
-        back = self._follow(image2, image1, found, points1 + offset, levels)
+        back = follow(image2, image1, found, points1 + offset, self._config.klt_window, levels,
+                      _CRITERIA)
         error = np.linalg.norm(back.points - points1, axis=1)
         return back.found & (error <= self._config.forward_backward_threshold)
-
-    def _follow(self, image1: Image, image2: Image, points1: Array, guess: Array,
-                levels: int) -> Flow:
-        return follow(image1, image2, points1, guess, self._config.klt_window, levels, _CRITERIA)

@@ -28,37 +28,18 @@ _WORTH = 2.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Flow:
-    """Where points were found again.
+    """Where points were found again."""
 
-    Attributes
-    ----------
-    points : (N, 2) ndarray
-        In the second image.
-    found : (N,) ndarray of bool
-    strength : (N,) ndarray
-        Least eigenvalue of each window's structure tensor [gray^2/px^2].
-    """
-
-    points: Array
-    found: NDArray[np.bool_]
-    strength: Array
+    points: Array   # (N, 2) in the second image
+    found: NDArray[np.bool_]   # (N,)
+    strength: Array   # (N,) [gray^2/px^2] least eigenvalue of each window's structure tensor
 
 
 def follow(image1: Image, image2: Image, points1: Array, guess: Array, side: int, levels: int,
            criteria: Criteria) -> Flow:
-    """Points of `image2` that look like `points1` (N, 2) of `image1`.
+    """Points of `image2` near the `guess` (N, 2) that look like `points1` (N, 2) of `image1`.
 
-    Parameters
-    ----------
-    image1, image2 : (H, W) ndarray of uint8
-    points1, guess : (N, 2) ndarray
-        In the first image; where to look in the second.
-    side : int
-        Of the windows [px].
-    levels : int
-        Of the pyramid; 1 for the images themselves.
-    criteria : tuple
-        OpenCV's, when to stop.
+    Windows of `side` pixels are compared; `levels` of the pyramid: 1 for the images themselves.
     """
     if not len(points1):
         return Flow(points1, np.empty(0, dtype=bool), np.empty(0))

@@ -12,22 +12,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matches:
-    """Points of two images that show the same thing; the arrays are not written to.
+    """Points of two images that show the same thing; the arrays are not written to."""
 
-    Attributes
-    ----------
-    track_ids : (N,) ndarray of uint32
-        Unique within a pair; the same for the same track in all pairs.
-    points1, points2 : (N, 2) ndarray
-        Raw pixels in the reference keyframe and in the current frame.
-    quality : (N,) ndarray
-        In [0, 1]; higher is more trustworthy.
-    """
-
-    track_ids: NDArray[np.uint32]
-    points1: Array
-    points2: Array
-    quality: Array
+    track_ids: NDArray[np.uint32]   # (N,) the same for the same track in all pairs
+    points1: Array   # (N, 2) raw pixels in the reference keyframe
+    points2: Array   # (N, 2) and in the current frame
+    quality: Array   # (N,) in [0, 1]; higher is more trustworthy
 
     @classmethod
     def none(cls) -> Matches:

@@ -25,18 +25,10 @@ _FARTHEST = 1e6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patches:
-    """Square patches of one image.
+    """Square patches of one image."""
 
-    Attributes
-    ----------
-    image : (H, W) ndarray of uint8
-        Patch by patch, in rows.
-    shifts : (N, 2) ndarray
-        Added to a point near the centre of patch k [px of the whole image] they give its place in
-        `image`.
-    """
-
-    image: Image
+    image: Image   # patch by patch, in rows
+    # (N, 2), row k added to a point [px] near the centre of patch k gives its place in `image`
     shifts: Array
 
 
@@ -55,21 +47,8 @@ def cut_warped(image: Image, points: Array, jacobians: Array, radius: int,
                points1: Array) -> Patches:
     """Patches of another image's geometry, filled with what this one shows.
 
-    Parameters
-    ----------
-    image : (H, W) ndarray of uint8
-    points : (N, 2) ndarray
-        In this image.
-    jacobians : (N, 2, 2) ndarray
-        How far one moves in this image with a pixel of the other.
-    radius : int
-    points1 : (N, 2) ndarray
-        The same points in the other image.
-
-    Returns
-    -------
-    Patches
-        With shifts from the other image's pixels; patch k shows ``points + J (x - points1)`` at x.
+    At pixel x of the other image patch k shows ``points + J (x - points1)`` of this one, for
+    `points` (N, 2) in this image, `points1` (N, 2) in the other and `jacobians` (N, 2, 2).
     """
     centres = _whole(points1)
     side = 2 * radius + 1

@@ -1,16 +1,18 @@
-"""What a tracker does."""
+"""What a tracker does, and the choice of one."""
 
 from __future__ import annotations
 
+import pkgutil
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.config.tracking import TRACKERS, TrackingConfig
+from rs_relpose_ros.tracking.images import Image
 from rs_relpose_ros.tracking.matches import Matches
 
 Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 
 class Tracker(Protocol):
@@ -35,16 +37,11 @@ class Tracker(Protocol):
 
     def track(self, image: Image, predicted: Array | None = None,
               interval: float = 1.0) -> Matches:
-        """Make `image` the current one; its matches with the reference.
+        """Make `image` (H, W) the current one; its matches with the reference.
 
-        Parameters
-        ----------
-        image : (H, W) ndarray of uint8
-        predicted : (N, 2) ndarray, optional
-            Where each of `points` is expected in `image` [px]; NaN where that is unknown.
-        interval : float
-            Time since the image before, in any unit: the part of a track's motion that was not
-            predicted is extrapolated in proportion to it.
+        `predicted` (N, 2) [px] is where each of `points` is expected in `image`, NaN where that is
+        unknown. The part of a track's motion that was not predicted is extrapolated in proportion
+        to `interval`, the time since the image before in any unit.
         """
 
     def refined_matches(self) -> Matches:
@@ -55,3 +52,9 @@ class Tracker(Protocol):
 
     def reset(self) -> None:
         """Forget all images; ids are not used again."""
+
+
+def make_tracker(config: TrackingConfig) -> Tracker:
+    """Tracker that `config.detector` names; its module is imported now."""
+    tracker: Tracker = pkgutil.resolve_name(TRACKERS[config.detector])(config)
+    return tracker
