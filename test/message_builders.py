@@ -80,9 +80,7 @@ def imu(types: Types, stamp_ns: int, gyro: tuple[float, float, float] = (0.1, 0.
         return types('geometry_msgs/msg/Vector3')(x=values[0], y=values[1], z=values[2])
 
     def block(first: float) -> np.ndarray:
-        covariance = np.zeros(9)
-        covariance[0] = first
-        return covariance
+        return np.diag([first, 0.0, 0.0]).ravel()
 
     return types('sensor_msgs/msg/Imu')(
         header=header(types, stamp_ns, 'imu'),

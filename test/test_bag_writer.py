@@ -63,24 +63,6 @@ def test_messages_come_back_as_written(tmp_path):
     assert (pose.pose.position.y, pose.pose.orientation.w) == (2.0, -0.5)
 
 
-def test_absent_sensors_are_marked(tmp_path):
-    with BagWriter(tmp_path / 'bag') as bag:
-        for stamp, rate, force in ((1, (1.0, 2.0, 3.0), None), (2, None, (0.0, 0.0, 9.8))):
-            bag.write('/imu', 'sensor_msgs/msg/Imu', bag.imu(stamp, 'imu', rate, force), stamp)
-    (_, _, gyro), (_, _, accel) = read(tmp_path / 'bag')
-    assert gyro.linear_acceleration_covariance[0] == -1.0
-    assert gyro.angular_velocity_covariance[0] == 0.0
-    assert accel.angular_velocity_covariance[0] == -1.0
-    assert accel.linear_acceleration_covariance[0] == 0.0
-
-
-def test_plain_pinhole_gets_five_zeros(tmp_path):
-    camera = RollingShutterCamera(
-        width=4, height=3, fx=5.0, fy=5.0, cx=1.5, cy=1.0, readout_time=0.0)
-    bag = BagWriter(tmp_path / 'bag')
-    np.testing.assert_array_equal(bag.camera_info(0, 'cam', camera).d, np.zeros(5))
-
-
 @pytest.mark.parametrize('pixels', [np.zeros((3, 4)), np.zeros((3, 4, 3), dtype=np.uint8)])
 def test_image_of_wrong_kind_is_refused(tmp_path, pixels):
     with pytest.raises(InputError, match='encoding'):

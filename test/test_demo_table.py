@@ -30,7 +30,7 @@ from rs_relpose_ros.replay.tables import (
     pair_record,
     relative_pose_cells,
     RELATIVE_POSE_COLUMNS,
-    TableWriter,
+    table_writer,
 )
 from rs_relpose_ros.replay.truth import PairErrors, TrueTrajectory
 from rs_relpose_ros.tracking.matches import Matches
@@ -123,8 +123,8 @@ def test_best_threshold_is_the_best(truth):
 
 def test_scores_of_a_table_and_of_its_records_agree(truth, tmp_path):
     records = [pair_record(pair_of(0.1, 10).result, truth)]
-    with TableWriter(tmp_path / 'a.csv', RELATIVE_POSE_COLUMNS) as table:
-        table.write(relative_pose_cells(records[0]))
+    with table_writer(tmp_path / 'a.csv', RELATIVE_POSE_COLUMNS) as write:
+        write(relative_pose_cells(records[0]))
     told = score_of_table('live', tmp_path / 'a.csv', records, truth)
     assert (told.pairs, told.answered) == (1, 1)
     assert told.rotation == pytest.approx(score_of_records('', records).rotation, abs=1e-5)

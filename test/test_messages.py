@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import struct
 from types import SimpleNamespace
 import zlib
@@ -11,10 +12,11 @@ import message_builders as build
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from simulated_pairs import simulated_flight
 
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
-from rs_relpose_ros.estimator.result import RelativePose, Status
+from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.front_end.sequencer import FrameRefused, ReadyFrame, Refusal, Sequencer
 from rs_relpose_ros.imu.samples import ImuSample
@@ -22,7 +24,6 @@ from rs_relpose_ros.messages import incoming, outgoing
 from rs_relpose_ros.messages.hanging import HangingCamera, HangingGyro
 from rs_relpose_ros.messages.intake import Intake
 from rs_relpose_ros.messages.sensor_feed import Role
-from rs_relpose_ros.tracking.matches import Matches
 
 # Luma of ITU-R BT.601.
 WEIGHTS = np.array([0.299, 0.587, 0.114])
@@ -62,16 +63,11 @@ def test_color_becomes_luma(types, rgb, encoding, order, padding):
     np.testing.assert_allclose(gray, rgb @ WEIGHTS, atol=0.51)
 
 
-@pytest.mark.parametrize('padding', [0, 5])
-def test_mono8_is_passed_on(types, rgb, padding):
+@pytest.mark.parametrize(('padding', 'end'), [(0, None), (5, None), (5, -5)])
+def test_mono8_is_passed_on(types, rgb, padding, end):
+    """The last row needs no padding."""
     data, step = padded(rgb[:, :, 0], padding)
-    gray = decoded(build.image(types, 10, 7, 'mono8', data, step=step))
-    np.testing.assert_array_equal(gray, rgb[:, :, 0])
-
-
-def test_last_row_needs_no_padding(types, rgb):
-    data, step = padded(rgb[:, :, 0], 5)
-    gray = decoded(build.image(types, 10, 7, 'mono8', data[:-5], step=step))
+    gray = decoded(build.image(types, 10, 7, 'mono8', data[:end], step=step))
     np.testing.assert_array_equal(gray, rgb[:, :, 0])
 
 
@@ -90,8 +86,7 @@ def test_packed_yuv_gives_its_luma(types, rgb, encoding, luma_first):
     luma = rgb[:, :, 0]
     packed = np.full((7, 10, 2), 128, np.uint8)
     packed[:, :, 0 if luma_first else 1] = luma
-    gray = decoded(
-        build.image(types, 10, 7, encoding, packed.tobytes(), step=20))
+    gray = decoded(build.image(types, 10, 7, encoding, packed.tobytes(), step=20))
     np.testing.assert_array_equal(gray, luma)
 
 
@@ -260,27 +255,19 @@ def test_imu_sample(types):
     assert sample.linear_acceleration == (0.0, 0.0, 9.8)
 
 
-def test_absent_sensors_are_none(types):
-    no_accelerometer = incoming.imu_sample_from_message(
-        build.imu(types, 0, accelerometer_covariance=-1.0))
-    assert no_accelerometer.linear_acceleration is None
-    assert no_accelerometer.angular_velocity == (0.1, 0.2, 0.3)
-    all_zero = incoming.imu_sample_from_message(build.imu(types, 0, accelerometer=(0.0,) * 3))
-    assert all_zero.linear_acceleration is None
-    no_gyro = incoming.imu_sample_from_message(build.imu(types, 0, gyro_covariance=-1.0))
-    assert no_gyro.angular_velocity is None
-    assert no_gyro.linear_acceleration == (0.0, 0.0, 9.8)
-
-
-def test_a_gyro_at_rest_is_a_sensor(types):
-    sample = incoming.imu_sample_from_message(build.imu(types, 0, gyro=(0.0, 0.0, 0.0)))
-    assert sample.angular_velocity == (0.0, 0.0, 0.0)
+@pytest.mark.parametrize(('change', 'gyro', 'force'), [
+    ({'accelerometer_covariance': -1.0}, (0.1, 0.2, 0.3), None),
+    ({'accelerometer': (0.0,) * 3}, (0.1, 0.2, 0.3), None),
+    ({'gyro_covariance': -1.0}, None, (0.0, 0.0, 9.8)),
+    ({'gyro': (0.0,) * 3}, (0.0,) * 3, (0.0, 0.0, 9.8))])   # a gyro at rest is a sensor
+def test_absent_sensors_are_none(types, change, gyro, force):
+    sample = incoming.imu_sample_from_message(build.imu(types, 0, **change))
+    assert (sample.angular_velocity, sample.linear_acceleration) == (gyro, force)
 
 
 def test_accelerometer_topic_has_no_gyro(types):
-    sample = incoming.accelerometer_sample_from_message(build.imu(types, 5, gyro=(0.0,) * 3))
-    assert sample.angular_velocity is None
-    assert sample.linear_acceleration == (0.0, 0.0, 9.8)
+    sample = incoming.imu_sample_from_message(build.imu(types, 5), with_gyro=False)
+    assert (sample.angular_velocity, sample.linear_acceleration) == (None, (0.0, 0.0, 9.8))
 
 
 @pytest.mark.parametrize(('change', 'sentence'), [
@@ -305,27 +292,17 @@ def test_impossible_stamp_is_refused():
 # -- outgoing --------------------------------------------------------------------------------
 
 
-def pair(count: int = 40, status: Status = Status.OK) -> PairResult:
+def pair(status: Status = Status.OK) -> PairResult:
+    """A pair with covariances, outliers, and a turn that is told by a quaternion with w < 0."""
     rng = np.random.default_rng(3)
-    half = rng.normal(size=(6, 6))
-    velocity_half = rng.normal(size=(6, 6))
-    # A turn by more than 180 degrees about z, for which a quaternion routine may give w < 0.
+    result = simulated_flight(0, 40).pairs[0]
+    halves = rng.normal(size=(2, 6, 6))
+    covariance, velocity_covariance = halves @ np.swapaxes(halves, 1, 2)
+    # By more than 180 degrees about z.
     R = Rotation.from_euler('xyz', [0.1, -0.2, 3.3]).as_matrix()
-    pose = RelativePose(
-        status=status, R=R, t=np.array([0.6, 0.0, -0.8]), linear_velocity2=np.array([1.0, 2, 3]),
-        angular_velocity2=np.array([0.1, 0.2, 0.3]), inliers=rng.random(count) < 0.7,
-        covariance=half @ half.T, velocity_covariance=velocity_half @ velocity_half.T,
-        model='uniform')
-    matches = Matches(rng.permutation(count).astype(np.uint32) + 7,
-                      rng.uniform(0, 640, (count, 2)), rng.uniform(0, 640, (count, 2)),
-                      np.ones(count))
-    rays1, rays2 = rng.normal(size=(2, count, 3))
-    return PairResult(
-        reference_stamp_ns=1_700_000_000_100_000_000, stamp_ns=1_700_000_000_999_999_999,
-        reference_ns1=1_700_000_000_100_000_000, reference_ns2=1_700_000_000_999_999_999,
-        frame_id='camera_optical_frame', interval=0.9, pose=pose, matches=matches,
-        row_times1=rng.uniform(0, 0.03, count), row_times2=rng.uniform(0, 0.03, count),
-        rays1=rays1, rays2=rays2, parallax=12.0)
+    return replace(result, pose=replace(
+        result.pose, status=status, R=R, inliers=rng.random(40) < 0.7, covariance=covariance,
+        velocity_covariance=velocity_covariance))
 
 
 def test_pair_messages(types):
@@ -335,7 +312,7 @@ def test_pair_messages(types):
                     messages.matches):
         assert incoming.stamp_ns(message.header) == result.stamp_ns
     pose = messages.relative_pose
-    assert pose.header.frame_id == 'camera_optical_frame_reference'
+    assert pose.header.frame_id == 'camera_reference'
     position, orientation = pose.pose.pose.position, pose.pose.pose.orientation
     assert [position.x, position.y, position.z] == result.pose.t.tolist()
     assert orientation.w >= 0.0
@@ -348,10 +325,10 @@ def test_pair_messages(types):
     time_ref = messages.reference.time_ref
     assert time_ref.sec * 10**9 + time_ref.nanosec == result.reference_stamp_ns
     velocity = messages.velocity
-    assert velocity.header.frame_id == 'camera_optical_frame'
+    assert velocity.header.frame_id == 'camera'
     linear, angular = velocity.twist.twist.linear, velocity.twist.twist.angular
-    assert [linear.x, linear.y, linear.z] == [1.0, 2.0, 3.0]
-    assert [angular.x, angular.y, angular.z] == [0.1, 0.2, 0.3]
+    assert [linear.x, linear.y, linear.z] == result.pose.linear_velocity2.tolist()
+    assert [angular.x, angular.y, angular.z] == result.pose.angular_velocity2.tolist()
     np.testing.assert_array_equal(
         np.reshape(velocity.twist.covariance, (6, 6)), result.pose.velocity_covariance)
 
@@ -401,15 +378,16 @@ def test_no_message_without_a_pose():
 # -- intake ----------------------------------------------------------------------------------
 
 
-def intake() -> tuple[Intake, Sequencer]:
+def intake(*, calibrated: bool = False) -> tuple[Intake, Sequencer]:
+    """An intake that has received the IMU of the first second."""
     sequencer = Sequencer(Parameters.from_mapping({
         'readout_time': 0.02, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0]}), offline=True)
-    return Intake(sequencer), sequencer
-
-
-def feed_imu(target: Intake, start_ns: int, end_ns: int) -> None:
-    for stamp_ns in range(start_ns, end_ns, 5_000_000):
+    target = Intake(sequencer)
+    for stamp_ns in range(0, 10**9, 5_000_000):
         target.receive(Role.IMU, build.imu(build.rosbags_types, stamp_ns))
+    if calibrated:
+        target.receive(Role.CAMERA_INFO, build.camera_info(build.rosbags_types))
+    return target, sequencer
 
 
 def taken(sequencer: Sequencer) -> list[ReadyFrame | FrameRefused]:
@@ -424,7 +402,6 @@ PIXELS = np.random.default_rng(5).integers(0, 256, (480, 640), dtype=np.uint8)
 
 def test_image_before_its_camera_info_is_kept():
     target, sequencer = intake()
-    feed_imu(target, 0, 10**9)
     image = build.gray_image(build.rosbags_types, PIXELS, stamp_ns=500_000_000)
     target.receive(Role.IMAGE, image)
     assert taken(sequencer) == []
@@ -436,7 +413,6 @@ def test_image_before_its_camera_info_is_kept():
 
 def test_images_without_camera_info_are_counted():
     target, sequencer = intake()
-    feed_imu(target, 0, 10**9)
     for k in range(6):
         image = build.gray_image(build.rosbags_types, PIXELS, stamp_ns=k * 10**8)
         target.receive(Role.IMAGE, image)
@@ -448,9 +424,7 @@ def test_images_without_camera_info_are_counted():
 
 
 def test_no_outdated_calibration_is_used():
-    target, sequencer = intake()
-    feed_imu(target, 0, 10**9)
-    target.receive(Role.CAMERA_INFO, build.camera_info(build.rosbags_types))
+    target, sequencer = intake(calibrated=True)
     with pytest.raises(MissingInputError):
         target.receive(Role.CAMERA_INFO, build.camera_info(build.rosbags_types, k=(0.0,) * 9))
     assert 'uncalibrated' in target.camera_info_problem
@@ -461,9 +435,7 @@ def test_no_outdated_calibration_is_used():
 
 
 def test_image_of_another_size_is_refused():
-    target, sequencer = intake()
-    feed_imu(target, 0, 10**9)
-    target.receive(Role.CAMERA_INFO, build.camera_info(build.rosbags_types))
+    target, sequencer = intake(calibrated=True)
     image = build.gray_image(build.rosbags_types, PIXELS[:240], stamp_ns=10**8)
     target.receive(Role.IMAGE, image)
     target.receive(

@@ -30,7 +30,7 @@ from rs_relpose_ros.replay.tables import (
     number,
     RELATIVE_POSE_COLUMNS,
     rotation_sigmas,
-    TableWriter,
+    table_writer,
     translation_sigmas,
 )
 
@@ -88,11 +88,11 @@ class Recorder:
         poses, references, matches = (
             {stamp_ns(msg.header): msg for msg in self._received[name]}
             for name in ('relative_pose', 'reference', 'matches'))
-        with TableWriter(path, RELATIVE_POSE_COLUMNS) as table:
+        with table_writer(path, RELATIVE_POSE_COLUMNS) as write:
             for stamp, pose in sorted(poses.items()):
                 reference = references.get(stamp)
                 cloud = matches.get(stamp)
-                table.write([
+                write([
                     '' if reference is None else str(time_ns(reference.time_ref)), str(stamp),
                     *map(number, _pose_figures(pose)), '' if cloud is None else str(cloud.width),
                     '', '', Status.OK.value])

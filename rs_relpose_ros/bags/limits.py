@@ -7,11 +7,12 @@ length.
 from __future__ import annotations
 
 import bz2
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 import os
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, BinaryIO, Self
+from typing import Any, BinaryIO
 
 from lz4.frame import LZ4FrameDecompressor
 from rosbags.rosbag1 import reader as rosbag1
@@ -42,17 +43,12 @@ def check_metadata(path: Path) -> None:
         raise InputError(f'{path} is no metadata of a bag: it has more than '
                          f'{_MAX_METADATA_BYTES} bytes')
     content = path.read_bytes()
-    # Looked for in the bytes first: parsing takes time, and recorders write no aliases.
-    if b'*' in content and has_aliases(content):
-        raise InputError(f'{path} has YAML aliases, which no recorder writes: it is damaged')
-
-
-def has_aliases(content: bytes | str) -> bool:
-    """Whether YAML refers to parts of itself; False for what is no YAML."""
-    try:
-        return any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(content))
-    except (yaml.YAMLError, RecursionError):
-        return False
+    # Looked for in the bytes first: parsing takes time, and recorders write no aliases. What is no
+    # YAML is told by who reads it.
+    with suppress(yaml.YAMLError, RecursionError):
+        if b'*' in content and any(
+                isinstance(event, yaml.AliasEvent) for event in yaml.parse(content)):
+            raise InputError(f'{path} has YAML aliases, which no recorder writes: it is damaged')
 
 
 def bound_decompression() -> None:
@@ -65,7 +61,7 @@ def bound_decompression() -> None:
         # MCAP tells the size of a chunk, ROS 1 does not.
         return lambda data, *size: _bounded(decompressor, data, min([*size, MAX_CHUNK_BYTES]))
 
-    whole_file = SimpleNamespace(open=_BoundedFile, decompress=lambda data: _bounded(
+    whole_file = SimpleNamespace(open=_bounded_file, decompress=lambda data: _bounded(
         _zstd.ZstdDecompressor, data, MAX_MESSAGE_BYTES))
     tables: Any = ((mcap.DECOMPRESSORS, 'zstd', of_chunk(_zstd.ZstdDecompressor)),
                    (mcap.DECOMPRESSORS, 'lz4', of_chunk(LZ4FrameDecompressor)),
@@ -78,27 +74,22 @@ def bound_decompression() -> None:
         table[name] = bounded
 
 
-class _BoundedFile:
+@contextmanager
+def _bounded_file(file: BinaryIO, mode: str) -> Iterator[SimpleNamespace]:
     """A zstd file that is read up to a size only; where rosbags opens one for reading."""
+    size = os.fstat(file.fileno()).st_size
+    limit = MAX_FILE_BYTES + _MAX_FILE_GROWTH * size
+    count = 0
+    with _zstd.open(file, mode) as stream:
+        def read(most: int) -> bytes:
+            nonlocal count
+            data: bytes = stream.read(most)
+            count += len(data)
+            if count > limit:
+                raise InputError(f'{size} bytes decompress to more than {limit}')
+            return data
 
-    def __init__(self, file: BinaryIO, mode: str) -> None:
-        self._size = os.fstat(file.fileno()).st_size
-        self._limit = MAX_FILE_BYTES + _MAX_FILE_GROWTH * self._size
-        self._stream: Any = _zstd.open(file, mode)
-        self._count = 0
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stream.close()
-
-    def read(self, size: int) -> bytes:
-        data: bytes = self._stream.read(size)
-        self._count += len(data)
-        if self._count > self._limit:
-            raise InputError(f'{self._size} bytes decompress to more than {self._limit}')
-        return data
+        yield SimpleNamespace(read=read)
 
 
 def _bounded(decompressor: Callable[[], Any], data: bytes, limit: int) -> bytes:

@@ -84,14 +84,10 @@ class BagWriter:
 
     # -- messages from plain data ------------------------------------------------------------
 
-    def time(self, stamp_ns: int) -> Any:
-        """builtin_interfaces/Time of an instant [ns]."""
-        seconds, nanoseconds = divmod(int(stamp_ns), NANOSECONDS)
-        return self.type('builtin_interfaces/msg/Time')(sec=seconds, nanosec=nanoseconds)
-
     def header(self, stamp_ns: int, frame_id: str) -> Any:
-        """std_msgs/Header."""
-        return self.type('std_msgs/msg/Header')(stamp=self.time(stamp_ns), frame_id=frame_id)
+        """std_msgs/Header of an instant [ns]."""
+        stamp = self.type('builtin_interfaces/msg/Time')(*divmod(int(stamp_ns), NANOSECONDS))
+        return self.type('std_msgs/msg/Header')(stamp=stamp, frame_id=frame_id)
 
     def camera_info(self, stamp_ns: int, frame_id: str, camera: RollingShutterCamera) -> Any:
         """sensor_msgs/CameraInfo of a camera whose whole sensor is published.

@@ -22,7 +22,7 @@ from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.errors import MissingInputError
 from rs_relpose_ros.replay.outputs import replay_into, ReplayOutcome, SUMMARY_FILE
 from rs_relpose_ros.replay.run import read_stamps
-from rs_relpose_ros.replay.summary import with_provenance, write_summary
+from rs_relpose_ros.replay.summary import write_summary
 
 HELP = (
     'Estimate relative poses from a bag (rosbag2 with SQLite3 or MCAP, compressed or not, or ROS '
@@ -70,15 +70,13 @@ def run(args: argparse.Namespace) -> int:
             outcome = replay_into(folder, bag, topics, parameters, stamps=stamps,
                                   pictures=not args.no_pictures, with_bag=args.with_bag,
                                   on_image=bar.update)
-        summary = with_provenance(
-            outcome.figures, bag=args.bag, topics=topics, parameters=parameters, command=sys.argv,
-            package_version=package_version())
-    write_summary(folder / SUMMARY_FILE, summary)
-    for reason, count in summary['not_used'].items():
+    write_summary(folder / SUMMARY_FILE, outcome.figures, bag=args.bag, topics=topics,
+                  parameters=parameters, command=sys.argv, package_version=package_version())
+    for reason, count in outcome.figures['not_used'].items():
         _logger.warning('not used, %d times: %s', count, reason)
     for line in report(outcome, folder):
         print(line)
-    return 0 if summary['pairs']['answered'] else _NO_POSE
+    return 0 if outcome.figures['pairs']['answered'] else _NO_POSE
 
 
 def report(outcome: ReplayOutcome, folder: Path) -> list[str]:

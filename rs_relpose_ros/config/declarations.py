@@ -53,16 +53,15 @@ class Declared:
             raise InputError(f'{name} must be {self.legal}, got {value!r}')
 
 
-def setting(default: Any, description: str, unit: str = '', *, low: float = -math.inf,
-            high: float = math.inf, choices: tuple[str, ...] = (), length: int | None = None,
-            live: bool = False, kind: type | None = None) -> Any:
+def setting(default: Any, description: str, unit: str = '', *, kind: type | None = None,
+            **legal: Any) -> Any:
     """Field of a configuration dataclass, with its declaration as metadata.
 
-    `live`: whether a running node may change it. A tuple setting declares its `length`.
-    `kind`: the type of a setting that has no default (None), which the user must give.
+    `legal`: other fields of `Declared`. `live`: whether a running node may change it. A tuple
+    setting declares its `length`, and one without a default (None), which the user must give, its
+    `kind`.
     """
-    declared = Declared(description, unit, low, high, choices, length, live,
-                        type(default) if kind is None else kind)
+    declared = Declared(description, unit, kind=type(default) if kind is None else kind, **legal)
     return dataclasses.field(default=default, metadata={'declared': declared})
 
 

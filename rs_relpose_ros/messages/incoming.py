@@ -117,26 +117,17 @@ def _field(msg: Any, name: str) -> Any:
     return getattr(msg, name) if hasattr(msg, name) else getattr(msg, name.upper())
 
 
-def imu_sample_from_message(msg: Any) -> ImuSample:
+def imu_sample_from_message(msg: Any, *, with_gyro: bool = True) -> ImuSample:
     """Gyro and accelerometer of a sensor_msgs/Imu, each None where the message has no such sensor.
 
     By REP-145 a covariance whose first element is -1 means that the sensor does not exist; drivers
     that publish the two sensors apart leave the other vector zero, and an accelerometer that reads
-    exactly zero in all axes is taken for such.
+    exactly zero in all axes is taken for such. Not `with_gyro`: the topic is the accelerometer's.
     """
-    return _imu_sample(msg, gyro=_has_sensor(msg.angular_velocity_covariance))
-
-
-def accelerometer_sample_from_message(msg: Any) -> ImuSample:
-    """The accelerometer alone of a sensor_msgs/Imu (drivers with a topic of its own for it)."""
-    return _imu_sample(msg, gyro=False)
-
-
-def _imu_sample(msg: Any, gyro: bool) -> ImuSample:
-    angular_velocity = (_vector('angular_velocity', msg.angular_velocity, MAX_ANGULAR_VELOCITY)
-                        if gyro else None)
-    linear_acceleration = None
-    if _has_sensor(msg.linear_acceleration_covariance):
+    angular_velocity = linear_acceleration = None
+    if with_gyro and msg.angular_velocity_covariance[0] != -1.0:
+        angular_velocity = _vector('angular_velocity', msg.angular_velocity, MAX_ANGULAR_VELOCITY)
+    if msg.linear_acceleration_covariance[0] != -1.0:
         linear_acceleration = _vector('linear_acceleration', msg.linear_acceleration,
                                       MAX_LINEAR_ACCELERATION)
         if linear_acceleration == (0.0, 0.0, 0.0):
@@ -145,7 +136,7 @@ def _imu_sample(msg: Any, gyro: bool) -> ImuSample:
         raise InputError('an IMU message has neither gyro nor accelerometer: both are marked as '
                          'absent (covariance -1) or zero')
     return ImuSample(stamp_ns(msg.header), angular_velocity, linear_acceleration,
-                     _orientation(msg) if gyro else None)
+                     None if angular_velocity is None else _orientation(msg))
 
 
 def _orientation(msg: Any) -> Orientation | None:
@@ -164,10 +155,6 @@ def _orientation(msg: Any) -> Orientation | None:
     down = (-2.0 * (x * z - w * y) / norm2, -2.0 * (y * z + w * x) / norm2,
             -(w * w - x * x - y * y + z * z) / norm2)
     return Orientation(down, math.sqrt(variance))
-
-
-def _has_sensor(covariance: Any) -> bool:
-    return bool(covariance[0] != -1.0)
 
 
 def _vector(name: str, vector: Any, largest: float) -> tuple[float, float, float]:

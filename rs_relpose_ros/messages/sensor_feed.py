@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 from typing import Any
 
 from rs_relpose_ros.messages.incoming import (
-    accelerometer_sample_from_message,
     image_from_message,
     imu_sample_from_message,
     intrinsics_from_info,
@@ -40,7 +40,7 @@ class Part:
 
 PARTS: Mapping[Role, Part] = {
     Role.IMU: Part(('sensor_msgs/msg/Imu',), imu_sample_from_message),
-    Role.ACCEL: Part(('sensor_msgs/msg/Imu',), accelerometer_sample_from_message),
+    Role.ACCEL: Part(('sensor_msgs/msg/Imu',), partial(imu_sample_from_message, with_gyro=False)),
     Role.CAMERA_INFO: Part(('sensor_msgs/msg/CameraInfo',), intrinsics_from_info),
     Role.IMAGE: Part(('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'),
                      image_from_message),

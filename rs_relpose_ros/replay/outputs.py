@@ -26,7 +26,7 @@ from rs_relpose_ros.replay.tables import (
     PairRecord,
     relative_pose_cells,
     RELATIVE_POSE_COLUMNS,
-    TableWriter,
+    table_writer,
 )
 from rs_relpose_ros.replay.truth import TrueTrajectory
 
@@ -67,19 +67,20 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
     drift: Drift | None = None
     files = [folder / POSES_FILE]
     with ExitStack() as stack:
-        poses = stack.enter_context(TableWriter(folder / POSES_FILE, RELATIVE_POSE_COLUMNS))
-        errors = None
+        write_pose = stack.enter_context(
+            table_writer(folder / POSES_FILE, RELATIVE_POSE_COLUMNS))
+        write_error = None
         if truth is not None:
-            errors = stack.enter_context(TableWriter(folder / ERRORS_FILE, ERROR_COLUMNS))
+            write_error = stack.enter_context(table_writer(folder / ERRORS_FILE, ERROR_COLUMNS))
             files.append(folder / ERRORS_FILE)
         out_bag = stack.enter_context(BagWriter(folder / BAG_FOLDER)) if with_bag else None
         for pair in run.pairs():
             record = pair_record(pair.result, truth)
             records.append(record)
             drift = pair.result.drift
-            poses.write(relative_pose_cells(record))
-            if errors is not None:
-                errors.write(error_cells(record))
+            write_pose(relative_pose_cells(record))
+            if write_error is not None:
+                write_error(error_cells(record))
             if out_bag is not None and pair.result.pose:
                 _write_messages(out_bag, pair, parameters.pair.reference_frame)
             on_pair(pair)

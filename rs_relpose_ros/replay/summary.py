@@ -79,12 +79,11 @@ def summarize(records: Sequence[PairRecord], run: Replay,
     }
 
 
-def with_provenance(figures: dict[str, Any], *, bag: Path, topics: SensorTopics,
-                    parameters: Parameters, command: Sequence[str],
-                    package_version: str) -> dict[str, Any]:
-    """The figures, and what they were made from."""
+def write_summary(path: Path, figures: dict[str, Any], *, bag: Path, topics: SensorTopics,
+                  parameters: Parameters, command: Sequence[str], package_version: str) -> None:
+    """Write the figures, and what they were made from, as JSON, which has no NaN."""
     by_role = {field.name: getattr(topics, field.name) for field in fields(topics)}
-    return {
+    summary = {
         'bag': str(bag),
         'topics': {role: topic and topic.name for role, topic in by_role.items()},
         **figures,
@@ -94,10 +93,6 @@ def with_provenance(figures: dict[str, Any], *, bag: Path, topics: SensorTopics,
                      'numpy': np.__version__, 'scipy': scipy.__version__,
                      'opencv': cv2.__version__, 'numba': numba.__version__},
     }
-
-
-def write_summary(path: Path, summary: dict[str, Any]) -> None:
-    """Write a summary as JSON; NaN, which JSON has not, must not be in it."""
     path.write_text(json.dumps(summary, indent=2, allow_nan=False) + '\n', encoding='utf-8')
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 import csv
 from dataclasses import dataclass
 import math
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,26 +72,19 @@ def rotation_sigmas(covariance: Array) -> tuple[float, float, float]:
     return float(x), float(y), float(z)
 
 
-class TableWriter:
-    """Writes a CSV file row by row; use it as a context manager."""
+@contextmanager
+def table_writer(path: Path, columns: tuple[str, ...]) -> Iterator[Callable[[list[str]], None]]:
+    """A CSV file; gives what appends a row, there and whole even if the process ends after it."""
+    with path.open('w', newline='', encoding='ascii') as file:
+        writer = csv.writer(file, lineterminator='\n')
 
-    def __init__(self, path: Path, columns: tuple[str, ...]) -> None:
-        self._columns = columns
-        self._file = path.open('w', newline='', encoding='ascii')
-        self._writer = csv.writer(self._file, lineterminator='\n')
-        self._writer.writerow(columns)
+        def write(cells: list[str]) -> None:
+            assert len(cells) == len(columns)
+            writer.writerow(cells)
+            file.flush()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
-
-    def write(self, cells: list[str]) -> None:
-        """Append a row; there and whole even if the process ends after it."""
-        assert len(cells) == len(self._columns)
-        self._writer.writerow(cells)
-        self._file.flush()
+        write(list(columns))
+        yield write
 
 
 def relative_pose_cells(record: PairRecord) -> list[str]:
