@@ -1,4 +1,4 @@
-"""The drive loop: what becomes of errors, what closes a pair, and parameters that change in mid-run."""
+"""The drive loop: errors, what closes a pair, and parameters that change in mid-run."""
 
 from __future__ import annotations
 
