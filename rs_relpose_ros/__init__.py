@@ -14,8 +14,9 @@ from typing import Any, TYPE_CHECKING
 if TYPE_CHECKING:
     from rs_relpose_ros.config.estimator import EstimatorConfig
     from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
-    from rs_relpose_ros.estimator.estimate import estimate_relative_pose, warm_up
+    from rs_relpose_ros.estimator.estimate import estimate_relative_pose
     from rs_relpose_ros.estimator.result import RelativePose, Status
+    from rs_relpose_ros.estimator.warm_up import warm_up
     from rs_relpose_ros.geometry.camera import RollingShutterCamera
     from rs_relpose_ros.geometry.motion import FrameMotion
     from rs_relpose_ros.messages.pose_chain import PoseChain
@@ -32,7 +33,7 @@ _HOMES = {
     'RelativePose': 'estimator.result',
     'RollingShutterCamera': 'geometry.camera', 'RsRelposeError': 'errors',
     'Status': 'estimator.result', 'estimate_relative_pose': 'estimator.estimate',
-    'warm_up': 'estimator.estimate',
+    'warm_up': 'estimator.warm_up',
 }
 
 logging.getLogger(__name__).addHandler(logging.NullHandler())

@@ -7,9 +7,16 @@ that a process's results would depend on which caller it ran first.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
 import numba
 
 from rs_relpose_ros import kernel_cache
+from rs_relpose_ros.linked_kernel import link
+
+P = ParamSpec('P')
+T = TypeVar('T')
 
 kernel_cache.install()
 kernel = numba.njit(cache=True, nogil=True, error_model='numpy')
@@ -18,3 +25,8 @@ inlined_kernel = numba.njit(cache=True, nogil=True, error_model='numpy', forcein
 # Copied into its callers before types are inferred, so that it costs them no compilation of its
 # own: for functions of a few lines, such as a cross product.
 small_kernel = numba.njit(cache=True, nogil=True, error_model='numpy', inline='always')
+
+
+def linked_kernel(function: Callable[P, T]) -> Callable[P, T]:
+    """Compile a function whose code other kernels call by address, never as a copy of it."""
+    return link(kernel(function), function)

@@ -28,8 +28,8 @@ from numba.core import caching
 
 _PACKAGE = __name__.partition('.')[0]
 _BESIDE = Path(__file__).with_name('__pycache__') / 'kernels'
-# "from PACKAGE.module import name": the name may be a module, too.
-_IMPORT = re.compile(rf'^from ({_PACKAGE}[\w.]*) import \(?\s*(\w+)', re.MULTILINE)
+# "from PACKAGE.module import name, ...": a name may be a module, too.
+_IMPORT = re.compile(rf'^from ({_PACKAGE}[\w.]*) import (\([^)]*\)|.*)', re.MULTILINE)
 
 
 class KernelLocator:
@@ -79,9 +79,10 @@ def source_digest(module: str) -> str:
     """Hash of an imported module's source and of what it imports from this package."""
     source = Path(str(sys.modules[module].__file__)).read_bytes()
     digest = hashlib.sha256(source)
-    for package, name in _IMPORT.findall(source.decode()):
-        inner = f'{package}.{name}'
-        digest.update(source_digest(inner if inner in sys.modules else package).encode())
+    for package, names in _IMPORT.findall(source.decode()):
+        for name in re.findall(r'\w+', names):
+            inner = f'{package}.{name}'
+            digest.update(source_digest(inner if inner in sys.modules else package).encode())
     return digest.hexdigest()
 
 

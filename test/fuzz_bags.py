@@ -10,7 +10,6 @@ from collections import Counter
 import faulthandler
 import json
 from pathlib import Path
-import resource
 import shutil
 import signal
 import sys
@@ -18,7 +17,7 @@ import tempfile
 import time
 from typing import Any
 
-from fuzz_messages import mutated_bytes
+from fuzz_messages import memory_mb, mutated_bytes
 import numpy as np
 import test_bag_reader as bags
 
@@ -58,15 +57,6 @@ def sensor_messages(folder: Path) -> list[tuple[str, str, object, int]]:
     return messages
 
 
-def write(kind: str, folder: Path) -> Path:
-    """An undamaged bag of this kind."""
-    folder.mkdir()
-    messages = sensor_messages(folder)
-    if kind in bags.ROS1_KINDS:
-        return bags.write_ros1(folder / 'bag.bag', messages, bags.ROS1_KINDS[kind])
-    return bags.write_rosbag2(folder / 'bag', messages, *bags.ROSBAG2_KINDS[kind])
-
-
 def files_of(bag: Path) -> dict[Path, bytes]:
     """The bag's files with their content."""
     files = [bag] if bag.is_file() else sorted(bag.iterdir())
@@ -103,16 +93,16 @@ def read(bag: Path) -> str:
 def fuzz(count: int, seed: int, folder: Path) -> dict[str, Any]:
     """Figures of a run."""
     rng = np.random.default_rng(seed)
-    bases = {kind: write(kind, folder / kind) for kind in KINDS}
+    bases = {kind: bags.write_kind(kind, folder, sensor_messages(folder)) for kind in KINDS}
     contents = {kind: files_of(bag) for kind, bag in bases.items()}
     for kind, bag in bases.items():
         assert read(bag) == 'read', kind
     outcomes: Counter[str] = Counter()
-    slowest, before = 0.0, 0
+    slowest, before = 0.0, 0.0
     started = time.perf_counter()
     for number in range(count):
         if number == min(count // 2, 200):
-            before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+            before = memory_mb()
         kind = KINDS[number % len(KINDS)]
         damage(contents[kind], rng)
         # What is at hand if the process dies.
@@ -124,9 +114,7 @@ def fuzz(count: int, seed: int, folder: Path) -> dict[str, Any]:
         slowest = max(slowest, time.perf_counter() - begun)
     return {'bags': count, 'seed': seed, 'seconds': round(time.perf_counter() - started, 1),
             'slowest_ms': round(1e3 * slowest, 1),
-            'memory_growth_mb': round((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-                                       - before) / 1024, 1),
-            'outcomes': dict(outcomes)}
+            'memory_growth_mb': round(memory_mb() - before, 1), 'outcomes': dict(outcomes)}
 
 
 def main() -> None:

@@ -17,7 +17,6 @@ from typing import Any
 import cv2
 import message_builders as build
 import numpy as np
-from rosbags.typesys import get_typestore, Stores
 
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import RsRelposeError
@@ -26,7 +25,6 @@ from rs_relpose_ros.images.encoded import ENCODINGS
 from rs_relpose_ros.messages.intake import Intake
 from rs_relpose_ros.messages.sensor_feed import Role
 
-TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
 START_NS = 1_700_000_000 * 10**9
 WIDTH, HEIGHT = 32, 24
 # One after the other as a camera with an IMU sends them.
@@ -125,9 +123,9 @@ class Fuzzer:
     def with_other_bytes(self, message: Any) -> Any:
         """As it comes from a wire or file; None where it cannot be deserialised."""
         name = message.__msgtype__
-        data = mutated_bytes(bytes(TYPESTORE.serialize_cdr(message, name)), self.rng)
+        data = mutated_bytes(bytes(build.TYPESTORE.serialize_cdr(message, name)), self.rng)
         try:
-            return TYPESTORE.deserialize_cdr(data, name)
+            return build.TYPESTORE.deserialize_cdr(data, name)
         except Exception:  # noqa: BLE001 - the bag reader's part, which `fuzz_bags` looks at
             return None
 
@@ -194,18 +192,22 @@ def mutated_bytes(data: bytes, rng: np.random.Generator) -> bytes:
     return bytes(out)
 
 
+def memory_mb() -> float:
+    """Most memory that the process has had."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
 def fuzz(count: int, seed: int) -> dict[str, Any]:
     """Figures of a run."""
     fuzzer = Fuzzer(seed)
     fuzzer.run(min(count, 1000))
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    before = memory_mb()
     started = time.perf_counter()
     fuzzer.run(count - min(count, 1000))
     return {
         'messages': count, 'seed': seed, 'seconds': round(time.perf_counter() - started, 1),
         'slowest_ms': round(1e3 * fuzzer.slowest, 1),
-        'memory_growth_mb': round((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
-                                  / 1024, 1),
+        'memory_growth_mb': round(memory_mb() - before, 1),
         'outcomes': dict(fuzzer.outcomes.most_common())}
 
 

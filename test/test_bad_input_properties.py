@@ -17,7 +17,6 @@ from two_view_scene import (
     rotation_error,
 )
 
-from rs_relpose_lab.experiments.paper_reference import solve_by_determinants
 from rs_relpose_ros import (
     estimate_relative_pose,
     EstimatorConfig,
@@ -379,14 +378,3 @@ def test_solvers_on_degenerate_rays(problem, gravity):
     for name, n in POINTS.items():
         if n == len(f1):
             assert solve(name, f1, f2, *tau, gravity, DOWN, np.eye(3)[None]) is not None
-
-
-@examples(40)
-@given(degenerate_rays())
-def test_the_papers_search_on_degenerate_rays(problem):
-    f1, f2, tau = problem
-    for name in set(POINTS) - {'global_5pt'}:
-        if POINTS[name] == len(f1):
-            found = solve_by_determinants(name, f1, f2, *tau, np.eye(3), gravity1=DOWN,
-                                          gravity2=-DOWN)
-            check_solutions([] if found is None else [found], 1)

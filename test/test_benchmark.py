@@ -7,10 +7,10 @@ from operator import attrgetter
 import numpy as np
 import pytest
 
+from rs_relpose_lab.cli.benchmark import matching_cells
 from rs_relpose_lab.experiments import accuracy, accuracy_report, speed_report
 from rs_relpose_lab.experiments.accuracy import AccuracyRun, OracleCache, run_accuracy, Trial
 from rs_relpose_lab.experiments.accuracy_report import cell_statistics, consistency, summary
-from rs_relpose_lab.experiments.cell_names import matching_cells
 from rs_relpose_lab.experiments.methods import as_pair, METHODS, prepared, run_method
 from rs_relpose_lab.experiments.problems import Cell, CELLS, make_problem
 from rs_relpose_lab.experiments.scoring import NO_POSE, PoseError
@@ -209,3 +209,10 @@ def test_times_are_compared_problem_by_problem(tmp_path):
     assert [(list(line.get_xdata()), list(line.get_ydata())) for line in right.lines] == [
         (list(times), list(times.values()))
         for times in (medians(timings, REFERENCE), medians(timings, LIBRARY))]
+
+
+def test_without_the_laboratory_its_commands_say_so(monkeypatch, capsys):
+    monkeypatch.setattr('importlib.util.find_spec', lambda name: None)
+    assert main(['benchmark', 'speed']) == 2
+    said = capsys.readouterr().err
+    assert 'benchmark needs the package rs_relpose_lab' in said and said.count('\n') == 1

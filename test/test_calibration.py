@@ -115,7 +115,7 @@ def test_camera_read_upwards_with_unknown_focal_length():
     result = calibrate(recorded.tracks, recorded.gyro, camera_of(truth, guess), focal_known=False)
     assert_right(result, truth)
     assert result.focal_factor.value * guess == pytest.approx(900.0, rel=0.02)
-    assert 'readout_direction: "up"' in parameter_file(result, 'A test.', compressed=False)
+    assert "readout_direction: 'up'" in parameter_file(result, 'A test.', compressed=False)
 
 
 @pytest.mark.long
@@ -186,41 +186,30 @@ def few_frames(recorded: Recorded, count: int) -> Tracks:
                   tracks.points[kept])
 
 
-def test_too_short_a_recording_is_refused():
+def with_tracks(recorded: Recorded, kept: np.ndarray | slice, ids: np.ndarray) -> Tracks:
+    tracks = recorded.tracks
+    return Tracks(tracks.stamps_ns, tracks.frames[kept], ids[kept], tracks.points[kept])
+
+
+UNUSABLE = {
+    r'too short: 10 frames.*Record 10 s or more': lambda r: (few_frames(r, 10), r.gyro),
+    r'hardly turns.*all three axes': lambda r: (r.tracks, GyroSeries(
+        r.gyro.stamps_ns, 0.05 + 1e-3 * np.random.default_rng(0).standard_normal(
+            r.gyro.rates.shape))),
+    r'too little to follow.*texture': lambda r: (
+        with_tracks(r, r.tracks.ids % 30 == 0, r.tracks.ids), r.gyro),
+    r'blurred.*short exposure': lambda r: (
+        with_tracks(r, slice(None), np.arange(len(r.tracks.ids))), r.gyro),
+    r'the gyro covers 0.0 s': lambda r: (r.tracks, GyroSeries(
+        r.gyro.stamps_ns + 3_600_000_000_000, r.gyro.rates)),
+}
+
+
+@pytest.mark.parametrize('message', UNUSABLE)
+def test_unusable_recordings_are_refused_with_what_to_record(message):
     recorded, _ = usual()
-    with pytest.raises(InputError, match=r'too short: 10 frames.*Record 10 s or more'):
-        calibrate(few_frames(recorded, 10), recorded.gyro, camera_of(recorded.truth))
-
-
-def test_camera_at_rest_is_refused():
-    recorded, _ = usual()
-    rng = np.random.default_rng(0)
-    still = GyroSeries(recorded.gyro.stamps_ns, 1e-3 * rng.standard_normal(
-        recorded.gyro.rates.shape) + 0.05)
-    with pytest.raises(InputError, match=r'hardly turns.*all three axes'):
-        calibrate(recorded.tracks, still, camera_of(recorded.truth))
-
-
-def test_scene_without_texture_is_refused():
-    tracks = usual()[0].tracks
-    kept = tracks.ids % 30 == 0
-    bare = Tracks(tracks.stamps_ns, tracks.frames[kept], tracks.ids[kept], tracks.points[kept])
-    with pytest.raises(InputError, match=r'too little to follow.*texture'):
-        calibrate(bare, usual()[0].gyro, camera_of(usual()[0].truth))
-
-
-def test_points_that_cannot_be_followed_are_refused():
-    tracks = usual()[0].tracks
-    torn = Tracks(tracks.stamps_ns, tracks.frames, np.arange(len(tracks.ids)), tracks.points)
-    with pytest.raises(InputError, match=r'blurred.*short exposure'):
-        calibrate(torn, usual()[0].gyro, camera_of(usual()[0].truth))
-
-
-def test_gyro_of_another_time_is_refused():
-    recorded, _ = usual()
-    later = GyroSeries(recorded.gyro.stamps_ns + 3_600_000_000_000, recorded.gyro.rates)
-    with pytest.raises(InputError, match=r'the gyro covers 0.0 s'):
-        calibrate(recorded.tracks, later, camera_of(recorded.truth))
+    with pytest.raises(InputError, match=message):
+        calibrate(*UNUSABLE[message](recorded), camera_of(recorded.truth))
 
 
 def test_readout_longer_than_the_interval_is_refused():

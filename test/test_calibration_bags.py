@@ -96,18 +96,13 @@ def test_bag_of_a_global_shutter_and_of_one_axis(tmp_path, capsys):
 # -- refused ----------------------------------------------------------------------------------
 
 
-def changed(bag: Path, path: Path, change: Callable[[str, Any], Any],
-            last: int | None = None) -> Path:
+def changed(bag: Path, path: Path, change: Callable[[str, Any], Any]) -> Path:
     """A copy of a bag with `change` applied to its messages; those it makes None are left out."""
     with open_bag(bag) as source, BagWriter(path) as copy:
-        topics = source.find_topics()
-        images = 0
-        for item in source.messages([topics.image, topics.camera_info, topics.imu]):
-            images += item.topic == IMAGE
+        for item in source.messages(source.topics):
             message = change(item.topic, item.message)
-            if message is None or (last is not None and images > last):
-                continue
-            copy.write(item.topic, message.__msgtype__, message, item.bag_time_ns)
+            if message is not None:
+                copy.write(item.topic, message.__msgtype__, message, item.bag_time_ns)
     return path
 
 
@@ -126,11 +121,6 @@ def refused(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> st
     return capsys.readouterr().err
 
 
-def test_too_short_a_bag(bag, tmp_path, capsys):
-    short = changed(bag, tmp_path / 'short', lambda topic, message: message, last=20)
-    assert 'too short: 20 frames' in refused(short, tmp_path, capsys)
-
-
 def test_bag_without_texture(bag, tmp_path, capsys):
     bare = changed(bag, tmp_path / 'bare', repainted(lambda image: np.full_like(image, 120)))
     assert 'Record a scene with texture' in refused(bare, tmp_path, capsys)
@@ -140,16 +130,6 @@ def test_blurred_bag(bag, tmp_path, capsys):
     blurred = changed(bag, tmp_path / 'blurred', repainted(
         lambda image: cv2.blur(image, (161, 161))))
     assert 'Record' in refused(blurred, tmp_path, capsys)
-
-
-def test_bag_of_a_camera_at_rest(bag, tmp_path, capsys):
-    def at_rest(topic: str, message: Any) -> Any:
-        if topic == IMU:
-            rate = message.angular_velocity
-            rate.x, rate.y, rate.z = 0.01, -0.02, 0.005
-        return message
-    still = changed(bag, tmp_path / 'still', at_rest)
-    assert 'the camera hardly turns' in refused(still, tmp_path, capsys)
 
 
 def test_bag_without_a_gyro(bag, tmp_path, capsys):

@@ -7,7 +7,6 @@ import json
 from pathlib import Path
 import tarfile
 
-import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -17,10 +16,7 @@ from rs_relpose_ros.calibrate.gyro_path import GyroSeries
 from rs_relpose_ros.calibrate.procedure import calibrate
 from rs_relpose_ros.calibrate.tracks import Tracks
 from rs_relpose_ros.cli.main import main
-from rs_relpose_ros.config.tracking import TrackingConfig
-from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
-from rs_relpose_ros.tracking.klt import KltTracker
 
 pytestmark = pytest.mark.recordings
 
@@ -68,24 +64,6 @@ def test_corners_of_a_global_shutter(recordings):
     biases = [bias.value for bias in result.gyro_bias]
     # A plane and the folder's intrinsics, which the corners contradict, leave up to 0.012 rad/s.
     np.testing.assert_allclose(biases, (-0.0016, 0.0250, 0.0777), atol=0.02)
-
-
-def test_ten_frames_are_too_short(recordings):
-    folder = recordings / 'euroc_v101_10frames'
-    tracker, stamps, frames, ids, points = KltTracker(TrackingConfig()), [], [], [], []
-    for index, path in enumerate(sorted((folder / 'cam0').glob('*.jpg'))):
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        if index == 0:
-            tracker.start(image)
-        matches = tracker.track(image)
-        stamps.append(int(path.stem))
-        frames.append(np.full(len(matches.track_ids), index))
-        ids.append(matches.track_ids.astype(np.int64))
-        points.append(matches.points2)
-    tracks = Tracks(np.array(stamps), np.concatenate(frames), np.concatenate(ids),
-                    np.concatenate(points))
-    with pytest.raises(InputError, match=r'too short: 10 frames.*Record 10 s or more'):
-        calibrate(tracks, gyro_of(folder / 'imu0.csv'), EUROC)
 
 
 def calibrated(recordings: Path, name: str, tmp_path: Path, *options: str) -> dict[str, object]:

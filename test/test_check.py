@@ -7,7 +7,6 @@ import json
 import re
 
 import cv2
-from message_builders import imu as imu_message
 import numpy as np
 import pytest
 from rosbags.interfaces import (
@@ -18,15 +17,13 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
-from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import get_typestore, Stores
 from scipy.spatial.transform import Rotation
+from test_bag_reader import JAZZY, STAMP_NS, write_ros1
 
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.bags.topics import TopicOptions
 from rs_relpose_ros.bags.writer import BagWriter
-from rs_relpose_ros.calibrate.axis_maps import axes_text, nearest_axis_map
 from rs_relpose_ros.check import judge_turning
 from rs_relpose_ros.check.check import check_bag, choose_topics
 from rs_relpose_ros.check.findings import CheckReport, Finding, Verdict
@@ -266,25 +263,18 @@ def test_parameters_that_are_missing_are_a_warning(tmp_path):
 
 
 def rewritten(bundled_bag, path, change, seconds=3.0):
-    """The first seconds of the bundled bag, its IMU messages changed."""
+    """The first seconds of the bundled bag, its rates (3,) changed."""
     with open_bag(bundled_bag) as bag, BagWriter(path) as out:
         topics = bag.find_topics()
-        first = None
-        for message in bag.messages([topics.image, topics.camera_info, topics.imu]):
-            first = first or message.bag_time_ns
-            if message.bag_time_ns > first + seconds * 1e9:
+        first_ns = None
+        for item in bag.messages([topics.image, topics.camera_info, topics.imu]):
+            first_ns = first_ns or item.bag_time_ns
+            if item.bag_time_ns > first_ns + seconds * 1e9:
                 break
-            msg = message.message
-            kinds = {t.name: t.msgtype for t in (topics.image, topics.camera_info, topics.imu)}
-            if message.topic == topics.imu.name:
-                w = change(np.array([msg.angular_velocity.x, msg.angular_velocity.y,
-                                     msg.angular_velocity.z]))
-                stamp = msg.header.stamp
-                msg = imu_message(out.type, stamp.sec * 10**9 + stamp.nanosec,
-                                  tuple(map(float, w)),
-                                  (msg.linear_acceleration.x, msg.linear_acceleration.y,
-                                   msg.linear_acceleration.z))
-            out.write(message.topic, kinds[message.topic], msg, message.bag_time_ns)
+            if item.topic == topics.imu.name:
+                rate = item.message.angular_velocity
+                rate.x, rate.y, rate.z = map(float, change(np.array([rate.x, rate.y, rate.z])))
+            out.write(item.topic, item.message.__msgtype__, item.message, item.bag_time_ns)
     return path
 
 
@@ -375,43 +365,7 @@ def test_recordings_of_real_cameras(recordings, tmp_path, name, offset):
     assert [f.name for f in report.findings if f.verdict is Verdict.WARNING] == [expected]
 
 
-def test_axes_in_words():
-    R = Rotation.from_euler('xyz', [88.0, 1.0, -2.0], degrees=True).as_matrix()
-    assert axes_text(nearest_axis_map(R)) == 'cam x = +imu x, cam y = -imu z, cam z = +imu y'
-
-
 # -- containers, options, output -------------------------------------------------------------
-
-
-def copied(source, writer, typestore, path_qos=()):
-    """Copy the messages of a bag into another container."""
-    store = get_typestore(typestore)
-    with open_bag(source) as bag:
-        connections = {}
-        for message in bag.messages(bag.topics):
-            topic = next(t for t in bag.topics if t.name == message.topic)
-            if topic.name not in connections:
-                extra = {'offered_qos_profiles': path_qos} if path_qos else {}
-                connections[topic.name] = writer.add_connection(
-                    topic.name, topic.msgtype, typestore=store, **extra)
-            serialize = store.serialize_ros1 if typestore is Stores.ROS1_NOETIC \
-                else store.serialize_cdr
-            msg = message.message
-            if typestore is Stores.ROS1_NOETIC:
-                msg = as_ros1(store, msg, topic.msgtype)
-            writer.write(connections[topic.name], message.bag_time_ns,
-                         serialize(msg, topic.msgtype))
-
-
-def as_ros1(store, msg, msgtype):
-    """With the header's sequence number and the capital names of ROS 1."""
-    kinds = store.types
-    header = kinds['std_msgs/msg/Header'](seq=0, stamp=msg.header.stamp,
-                                          frame_id=msg.header.frame_id)
-    values = {name: getattr(msg, name if hasattr(msg, name) else name.lower())
-              for name in kinds[msgtype].__dataclass_fields__
-              if name not in ('header', '__msgtype__')}
-    return kinds[msgtype](header=header, **values)
 
 
 BEST_EFFORT = Qos(QosHistory.KEEP_LAST, 5, QosReliability.BEST_EFFORT, QosDurability.VOLATILE,
@@ -420,16 +374,20 @@ BEST_EFFORT = Qos(QosHistory.KEEP_LAST, 5, QosReliability.BEST_EFFORT, QosDurabi
 
 @pytest.mark.parametrize('kind', ['sqlite3', 'mcap', 'ros1'])
 def test_every_container(kind, tmp_path):
-    source = broken(seconds=1.0).write(tmp_path / 'source')
+    with open_bag(broken(seconds=1.0).write(tmp_path / 'source')) as source:
+        topics, messages = source.topics, list(source.messages(source.topics))
+    path = tmp_path / 'copy.bag'
     if kind == 'ros1':
-        path = tmp_path / 'copy.bag'
-        with Writer1(path) as writer:
-            copied(source, writer, Stores.ROS1_NOETIC)
+        write_ros1(path, [(item.topic, item.message.__msgtype__, item.message,
+                           item.bag_time_ns - STAMP_NS) for item in messages])
     else:
-        path = tmp_path / 'copy'
-        plugin = StoragePlugin.SQLITE3 if kind == 'sqlite3' else StoragePlugin.MCAP
-        with Writer(path, version=9, storage_plugin=plugin) as writer:
-            copied(source, writer, Stores.ROS2_JAZZY, [BEST_EFFORT])
+        with Writer(path, version=9, storage_plugin=StoragePlugin[kind.upper()]) as writer:
+            connections = {topic.name: writer.add_connection(
+                topic.name, topic.msgtype, typestore=JAZZY, offered_qos_profiles=[BEST_EFFORT])
+                for topic in topics}
+            for item in messages:
+                writer.write(connections[item.topic], item.bag_time_ns,
+                             JAZZY.serialize_cdr(item.message, item.message.__msgtype__))
     findings, _ = checked(path)
     assert findings['image rate'].figures['count'] == 10
     assert findings['imu rate'].figures['rate_hz'] == pytest.approx(200.0)
@@ -475,11 +433,11 @@ def test_a_damaged_bag_is_exit_code_2(tmp_path, capsys):
 def test_several_topics_want_a_choice(tmp_path):
     bag_path = Small().write(tmp_path / 'bag')
     with open_bag(bag_path) as bag, BagWriter(tmp_path / 'two') as out:
-        for message in bag.messages(bag.topics):
-            kind = next(t.msgtype for t in bag.topics if t.name == message.topic)
-            out.write(message.topic, kind, message.message, message.bag_time_ns)
+        for item in bag.messages(bag.topics):
+            kind = item.message.__msgtype__
+            out.write(item.topic, kind, item.message, item.bag_time_ns)
             if kind.endswith('Imu'):
-                out.write('/other_imu', kind, message.message, message.bag_time_ns)
+                out.write('/other_imu', kind, item.message, item.bag_time_ns)
     with pytest.raises(InputError, match='choose one with --imu-topic'):
         checked(tmp_path / 'two')
     assert checked(tmp_path / 'two', imu='/other_imu')[0]['topics'].figures['imu'] == '/other_imu'
@@ -496,8 +454,7 @@ def test_memory_does_not_grow_with_the_stream():
     # Still evenly over all of it.
     assert np.abs(np.median(thinned.values) - 100_000) < 200
     assert np.diff(thinned.values[:, 0]).max() < 2 * np.diff(thinned.values[:, 0]).min()
-    summary = stamps.summary()
-    assert summary.interval == pytest.approx(0.005) and summary.count == 200_000
+    assert stamps.interval == pytest.approx(0.005) and stamps.count == 200_000
     assert stamps.longer_than(0.05) == (1, pytest.approx(0.105))
 
 

@@ -286,18 +286,18 @@ def test_paths_that_cannot_be_used(tmp_path, capsys):
 def test_parameter_file_is_what_the_command_writes(tmp_path, dataset):
     source = convert.DATASETS[dataset]
     file = ROOT / 'config' / f'{dataset}.yaml'
-    assert file.read_text() == parameter_text(source.title, source.parameters)
+    assert file.read_text() == parameter_text(source.TITLE, source.PARAMETERS)
     parameters = read_parameters(file)
     assert parameters.sensor.missing() == []
     mapping = parameters.to_mapping()
-    for item in source.parameters:
+    for item in source.PARAMETERS:
         assert mapping[item.name] == item.value
         assert len(item.source) > 10
-    write_parameters(tmp_path / 'a.yaml', source.title, source.parameters)
+    write_parameters(tmp_path / 'a.yaml', source.TITLE, source.PARAMETERS)
     with pytest.raises(InputError, match='exists already'):
-        write_parameters(tmp_path / 'a.yaml', source.title, source.parameters)
+        write_parameters(tmp_path / 'a.yaml', source.TITLE, source.PARAMETERS)
     with pytest.raises(InputError, match='cannot write'):
-        write_parameters(tmp_path / 'no' / 'a.yaml', source.title, source.parameters)
+        write_parameters(tmp_path / 'no' / 'a.yaml', source.TITLE, source.PARAMETERS)
 
 
 def test_axes_of_the_parameter_files():

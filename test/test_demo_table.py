@@ -25,9 +25,13 @@ from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
-from rs_relpose_ros.replay.record import pair_record
 from rs_relpose_ros.replay.run import ReplayedPair
-from rs_relpose_ros.replay.tables import relative_pose_cells, RELATIVE_POSE_COLUMNS, TableWriter
+from rs_relpose_ros.replay.tables import (
+    pair_record,
+    relative_pose_cells,
+    RELATIVE_POSE_COLUMNS,
+    TableWriter,
+)
 from rs_relpose_ros.replay.truth import PairErrors, TrueTrajectory
 from rs_relpose_ros.tracking.matches import Matches
 
@@ -70,7 +74,6 @@ def test_opencv_pose_in_our_convention(estimator):
     # OpenCV's RANSAC refines nothing; the inverse would be off by 10 deg.
     assert np.degrees(Rotation.from_matrix(pose.R.T @ R_TRUE).magnitude()) < 0.5
     assert degrees_between(pose.t, T_TRUE) < 3.0   # and not the opposite, or that of camera 2
-    assert not pose.inliers[:60].sum() > 6 and pose.inliers[60:].mean() > 0.9
 
 
 @pytest.mark.parametrize('estimator', OPENCV_ESTIMATORS)

@@ -12,7 +12,7 @@ import pytest
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_lab.experiments.boxes import Box, by_box, Record, tables, with_totals
+from rs_relpose_lab.experiments.boxes import by_case, Record, tables
 from rs_relpose_lab.experiments.methods import run_method
 from rs_relpose_lab.experiments.omnidirectional import OmnidirectionalCamera
 from rs_relpose_lab.experiments.pair_imu import PairImu
@@ -33,10 +33,10 @@ from rs_relpose_lab.experiments.penncosyvio_files import (
 )
 from rs_relpose_lab.experiments.penncosyvio_simulated import (
     PlacedMotion,
+    RecordedMotion,
     Simulated,
     SimulatedSequence,
 )
-from rs_relpose_lab.experiments.recorded_motion import RecordedMotion
 from rs_relpose_lab.experiments.scoring import NO_POSE, PoseError
 from rs_relpose_lab.simulation.inertial import ImuModel
 from rs_relpose_lab.simulation.render import Renderer
@@ -428,14 +428,14 @@ def test_bad_input_is_one_line_and_exit_code_2(made, tmp_path, arguments, said, 
 
 
 def test_totals_are_of_all_levels_of_a_case():
-    records = [Record(Box('x', 'as', str(level)), 'auto', 0, Status.OK,
-                      PoseError(1.0 * level, 2.0)) for level in (1, 2, 3)]
-    records.append(Record(Box('x', 'af', '1'), 'auto', 0, Status.NO_CONSENSUS, NO_POSE))
-    boxes = with_totals(by_box(records))
-    assert [(box.case, box.level) for box in boxes] == [
-        ('as', '1'), ('as', '2'), ('as', '3'), ('as', 'all'), ('af', '1'), ('af', 'all')]
-    assert list(boxes[Box('x', 'as', 'all')]['auto'].rotation) == [1.0, 2.0, 3.0]
-    shown = tables(boxes, {('x', 'as'): '', ('x', 'af'): ''}, 'part')
+    records = [Record('x', 'as', str(level), 'auto', 0, Status.OK, PoseError(1.0 * level, 2.0))
+               for level in (1, 2, 3)]
+    records.append(Record('x', 'af', '1', 'auto', 0, Status.NO_CONSENSUS, NO_POSE))
+    cases = by_case(records, totals=True)
+    assert {case: list(levels) for case, levels in cases.items()} == {
+        ('x', 'as'): ['1', '2', '3', 'all'], ('x', 'af'): ['1', 'all']}
+    assert list(cases['x', 'as']['all']['auto'].rotation) == [1.0, 2.0, 3.0]
+    shown = tables(cases, {('x', 'as'): '', ('x', 'af'): ''}, 'part')
     assert 'no pose: auto, 1 of 1\n' in shown
 
 

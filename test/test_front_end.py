@@ -178,10 +178,7 @@ def test_every_live_parameter_is_tried():
     assert set(LIVE) == CHANGED.keys() | OF_THE_NODE
 
 
-@pytest.mark.parametrize('name', [
-    pytest.param(name, marks=pytest.mark.xfail(
-        name == 'time_limit', reason='no part of the estimator reads it', strict=True))
-    for name in CHANGED])
+@pytest.mark.parametrize('name', CHANGED)
 def test_a_live_parameter_has_its_effect_from_the_next_frame_on(recorded, parameters, name):
     if name == 'confidence':
         # Many samples are needed: the hypotheses of a solver without priors, few of which fit.

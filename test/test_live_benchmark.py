@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_lab.cli.benchmark import matching_cells
 from rs_relpose_lab.experiments import live, live_clip, live_report
 from rs_relpose_lab.experiments.live import Course, LiveCell, Percentiles
 from rs_relpose_lab.live.loop import in_turns, Outgoing, stamp_of
 from rs_relpose_lab.live.measured_run import ReceivedPose
-from rs_relpose_lab.live.process_figures import process_figures
-from rs_relpose_lab.simulation.closed_loop import closed_loop
+from rs_relpose_lab.live.processes import process_figures
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.node.frame_timings import COLUMNS, FrameTimings
@@ -34,7 +34,7 @@ SECOND = 10**9
 
 @pytest.mark.parametrize('period', [2.0, 4.0, 6.5])
 def test_the_walk_ends_as_it_began(period):
-    motion = closed_loop(period)
+    motion = live_clip.closed_loop(period)
     times = np.array([-0.4, 0.0, 0.3, 1.1])
     before, after = motion.states(times), motion.states(times + period)
     for name in ('position', 'velocity', 'acceleration', 'R_world_cam', 'angular_velocity',
@@ -87,7 +87,8 @@ def pose(first: int, second: int, turn: np.ndarray | None = None) -> ReceivedPos
     """The true pose between two stamps of the clip's tenth turn, and an error."""
     start = live_clip.configuration(640, 480).start_ns
     stamps = [start + 40 * SECOND + k for k in (first, second)]
-    (p1, p2), (R1, R2) = closed_loop(live_clip.PERIOD).poses([first / SECOND, second / SECOND])
+    (p1, p2), (R1, R2) = live_clip.closed_loop(live_clip.PERIOD).poses(
+        [first / SECOND, second / SECOND])
     R, t = R1.T @ R2, R1.T @ (p2 - p1)
     if turn is not None:
         R, t = Rotation.from_rotvec(turn).as_matrix() @ R, Rotation.from_rotvec(turn).apply(t)
@@ -141,8 +142,8 @@ def test_latency_over_time_is_by_minutes():
 
 def test_cells_are_selected_by_pattern(capsys):
     assert len(live.CELLS) == 18
-    assert [cell.name for cell in live.select_cells(['1920x1080-b*'])] == [
-        '1920x1080-bgr8-imu200', '1920x1080-bgr8-imu400']
+    assert matching_cells(['1920x1080-b*'], live.CELLS) == (
+        '1920x1080-bgr8-imu200', '1920x1080-bgr8-imu400')
     assert live.CELLS['1280x720-mono8-imu200'].is_big
     assert not live.CELLS['640x480-mono8-imu200'].is_big
     assert live.CELLS['1920x1080-jpeg-imu200'].is_big

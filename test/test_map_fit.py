@@ -10,13 +10,15 @@ from rs_relpose_ros import (
     FrameMotion,
     RollingShutterCamera,
 )
-from rs_relpose_ros.estimator import map_fit, sampson
+from rs_relpose_ros.estimator import map_fit
+from rs_relpose_ros.estimator.priors import prior_cost, Priors
+from rs_relpose_ros.estimator.state import moved, PARAMETERS, TwoViewState
 
 
 def some_state(rng, rate):
     R = Rotation.from_rotvec(rng.normal(size=3)).as_matrix()
     t, d1, d2, dw1, dw2 = rng.normal(size=(5, 3))
-    return map_fit.State(R, t / np.linalg.norm(t), d1, d2, rate * dw1, rate * dw2)
+    return TwoViewState(R, t / np.linalg.norm(t), d1, d2, rate * dw1, rate * dw2)
 
 
 def some_priors(rng, state, **weights):
@@ -25,10 +27,9 @@ def some_priors(rng, state, **weights):
     near = Rotation.from_rotvec([0.01, -0.02, 0.015]).as_matrix()
     values = {'gravity_weight': 0.0, 'gravity_row_time': 0.03, 'rate_weight': 0.0,
               'velocity_weight': 0.0, 'velocity_rate': 2.0, **weights}
-    return map_fit.Priors(np.array([0.59, 0.02, 0.81]), down, rotation=near @ state.R,
-                          rotation_information=np.diag([3.0, 4.0, 5.0])
-                          * weights.get('rotation', 0.0),
-                          **{k: v for k, v in values.items() if k != 'rotation'})
+    return Priors(np.array([0.59, 0.02, 0.81]), down, rotation=near @ state.R,
+                  rotation_information=np.diag([3.0, 4.0, 5.0]) * weights.get('rotation', 0.0),
+                  **{k: v for k, v in values.items() if k != 'rotation'})
 
 
 @pytest.mark.parametrize('weights', [{'gravity_weight': 7.0}, {'rate_weight': 3.0},
@@ -38,15 +39,15 @@ def test_gradient_of_each_prior(weights):
     # The rates' part of gravity neglects what corrections do to each other: exact about zero.
     state = some_state(rng, 0.0 if 'gravity_weight' in weights else 0.1)
     priors = some_priors(rng, state, **weights)
-    n = sampson.PARAMETERS
+    n = PARAMETERS
     nothing = map_fit.DataTerm(np.zeros((n, n)), np.zeros(n), 0.0)
     _, gradient, cost = map_fit.normal_equations(nothing, state, priors)
-    assert cost == pytest.approx(map_fit.prior_cost(state, priors))
+    assert cost == pytest.approx(prior_cost(state, priors))
     assert cost > 0.0
     step = 1e-5
     for k in range(n):
-        ahead, behind = (map_fit.prior_cost(map_fit.moved(state, sign * step * np.eye(n)[k]),
-                                            priors) for sign in (1.0, -1.0))
+        ahead, behind = (prior_cost(moved(state, sign * step * np.eye(n)[k]), priors)
+                         for sign in (1.0, -1.0))
         # Half the gradient of a sum of squares. Log has a Jacobian that the fit takes for one.
         tolerance = 0.03 if 'rotation' in weights else 1e-6
         assert (ahead - behind) / (4 * step) == pytest.approx(

@@ -16,7 +16,7 @@ from sensor_msgs.msg import CameraInfo, Image, Imu
 
 from rs_relpose_lab.live.processes import wait_until
 from rs_relpose_ros.config.parameters import Parameters
-from rs_relpose_ros.estimator.estimate import warm_up
+from rs_relpose_ros.estimator.warm_up import warm_up
 from rs_relpose_ros.front_end.frame import Frame
 from rs_relpose_ros.front_end.front_end import FrameFailed, FrameProcessed, FrontEnd
 from rs_relpose_ros.front_end.pipeline import Pipeline

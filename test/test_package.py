@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+import doctest
 import fcntl
 import graphlib
+import importlib
 from importlib.metadata import distribution
 import os
 from pathlib import Path
@@ -99,6 +101,17 @@ def test_every_folder_of_modules_is_a_package():
     missing = {path.parent for path in MODULES.values()} - {
         path.parent for path in MODULES.values() if path.name == '__init__.py'}
     assert missing == set()
+
+
+# --- examples
+
+
+@pytest.mark.parametrize('name', [
+    name for name, path in MODULES.items() if '>>> ' in path.read_text()])
+def test_examples_in_docstrings_are_true(name):
+    failed, attempted = doctest.testmod(importlib.import_module(name))
+    assert attempted
+    assert failed == 0
 
 
 # --- layers

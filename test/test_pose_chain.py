@@ -11,6 +11,7 @@ from simulated_pairs import simulated_flight
 
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator import sampson
+from rs_relpose_ros.estimator.state import TwoViewState
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.messages.outgoing import pair_messages
 from rs_relpose_ros.messages.pose_chain import PathPose, PoseChain, track_distances
@@ -74,8 +75,9 @@ def test_distances_are_those_of_the_estimator():
                          (18, 'tau1'), (19, 'tau2')):
         rows[:, column] = noisy[name]
     velocity = pair.R @ pair.linear_velocity
+    state = TwoViewState(pair.R, pair.t, velocity, velocity, np.zeros(3), np.zeros(3))
     for i, track in enumerate(noisy['id'].tolist()):
-        l1, l2, _, _ = sampson.triangulated(rows, i, pair.R, pair.t, velocity, velocity)
+        l1, l2, _, _ = sampson.triangulated(rows, i, state)
         assert (track in distances1) == (l1 > 0.0 and l2 > 0.0)
         if track in distances1:
             assert distances1[track] == pytest.approx(l1, rel=1e-6)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from fnmatch import fnmatchcase
 from importlib import import_module
 from pathlib import Path
 import sys
@@ -13,19 +14,12 @@ from rs_relpose_ros.cli.options import progress_bar
 from rs_relpose_ros.config.estimator import SOLVER_CHOICES
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 
-HELP = ('Measure the estimator on simulated frame pairs, one thread each: "accuracy" against an '
-        'oracle that knows the true matches and starts at the truth, "speed" beside OpenCV and '
-        'PoseLib, "all" both as the project reports them. "live" measures the node: latency, '
-        'dropped frames, processor time and memory at camera rate; "unseen" its poses on other '
-        'bags. "calibration" compares that of simulated tracks with the truth, "calibration-bags" '
-        'that of rendered bags. Writes tables (CSV, Markdown) and plots into a folder.')
+HELP = ('Measure what the package reaches: the estimator on simulated frame pairs, the live node, '
+        'the calibration. Writes tables (CSV, Markdown) and plots into a folder.')
 
 
 class Benchmark(NamedTuple):
-    """A benchmark: one line of help, its description, its arguments, its run.
-
-    `seed_of`, `jobs`: what its options of these names are for, where it has them.
-    """
+    """A benchmark; `seed_of`, `jobs`: what its options of these names are for, or ''."""
 
     help: str
     description: str
@@ -71,6 +65,17 @@ def _check_at_least(low: int, args: argparse.Namespace, *names: str) -> None:
             raise InputError(f'--{name} must be at least {low}, got {value}')
 
 
+def matching_cells(patterns: Iterable[str], names: Iterable[str]) -> tuple[str, ...]:
+    """Names that match any of the patterns: 'all', or with ``*`` as in file names."""
+    names, chosen = tuple(names), set[str]()
+    for pattern in patterns:
+        matching = {name for name in names if pattern == 'all' or fnmatchcase(name, pattern)}
+        if not matching:
+            raise InputError(f'no cell is named {pattern!r}; there are {", ".join(names)}')
+        chosen |= matching
+    return tuple(name for name in names if name in chosen)
+
+
 def _tell(report: str, folder: Path) -> int:
     print(report)
     print(f'written to {folder}')
@@ -82,11 +87,14 @@ def _number(parser: argparse.ArgumentParser, option: str, default: int, text: st
                         help=f'{text} (default: %(default)s)')
 
 
+def _cells(parser: argparse.ArgumentParser, default: list[str], text: str) -> None:
+    parser.add_argument('--cells', nargs='+', default=default, metavar='NAME',
+                        help=f'cells by name, with * as in file names; {text}')
+
+
 def _accuracy_arguments(parser: argparse.ArgumentParser) -> None:
     _number(parser, '--trials', 200, 'problems a cell')
-    parser.add_argument('--cells', nargs='+', default=['all'], metavar='NAME',
-                        help='cells by name, with * as in file names, e.g. "forward-*" '
-                             '(default: all)')
+    _cells(parser, ['all'], 'e.g. "forward-*" (default: all)')
     parser.add_argument('--noise', nargs='+', choices=('paper', 'gaussian'),
                         default=['paper', 'gaussian'],
                         help='error of gravity: of fixed size and opposite in the frames, as in '
@@ -102,7 +110,6 @@ def _accuracy_arguments(parser: argparse.ArgumentParser) -> None:
 def _run_accuracy(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments.accuracy import AccuracyRun, OracleCache, run_accuracy
     from rs_relpose_lab.experiments.accuracy_report import write_report
-    from rs_relpose_lab.experiments.cell_names import matching_cells
     from rs_relpose_lab.experiments.problems import CELLS
 
     _check_at_least(1, args, 'trials')
@@ -119,10 +126,8 @@ def _run_accuracy(args: argparse.Namespace) -> int:
 
 def _speed_arguments(parser: argparse.ArgumentParser) -> None:
     _number(parser, '--trials', 50, 'problems a cell')
-    parser.add_argument('--cells', nargs='+', metavar='NAME',
-                        default=['*-base', '*-v0-w0', '*-outliers-60'],
-                        help='cells by name, with * as in file names (default: the base cells, '
-                             'cameras at rest, 60 %% outliers)')
+    _cells(parser, ['*-base', '*-v0-w0', '*-outliers-60'],
+           'default: the base cells, cameras at rest, 60 %% outliers')
     parser.add_argument('--matches', nargs='+', type=int, default=[300, 1000, 3000, 10000],
                         metavar='N', help='numbers of matches over which time is shown (default: '
                         '300 1000 3000 10000)')
@@ -132,7 +137,6 @@ def _speed_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_speed(args: argparse.Namespace) -> int:
-    from rs_relpose_lab.experiments.cell_names import matching_cells
     from rs_relpose_lab.experiments.problems import Cell, CELLS
     from rs_relpose_lab.experiments.speed import compare, first_estimates, soak
     from rs_relpose_lab.experiments.speed_report import write_report
@@ -158,9 +162,7 @@ def _run_speed(args: argparse.Namespace) -> int:
 
 
 def _live_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('--cells', nargs='+', default=['all'], metavar='NAME',
-                        help='cells by name, with * as in file names, e.g. "640x480-*" or '
-                             '1280x720-mono8-imu400 (default: all)')
+    _cells(parser, ['all'], 'e.g. "640x480-*" or 1280x720-mono8-imu400 (default: all)')
     parser.add_argument('--duration', type=float, default=60.0, metavar='SECONDS',
                         help='how long each cell is played (default: 60)')
     parser.add_argument('--soak', type=float, nargs='?', const=10.0, default=0.0,
@@ -182,14 +184,14 @@ def _need_ros(module: str) -> None:
 
 
 def _run_live(args: argparse.Namespace) -> int:
-    from rs_relpose_lab.experiments.live import run_cell, select_cells
+    from rs_relpose_lab.experiments.live import CELLS, run_cell
     from rs_relpose_lab.experiments.live_clip import FPS, PERIOD, prepare_clip
     from rs_relpose_lab.experiments.live_report import write_report, write_soak_report
 
     # Shorter than a turn of the motion, hardly anything is measured.
     _check_at_least(5, args, 'duration')
     _check_at_least(0, args, 'soak')
-    cells = select_cells(args.cells)
+    cells = [CELLS[name] for name in matching_cells(args.cells, CELLS)]
     _need_ros('measured_run')
     duration = 60.0 * args.soak or args.duration
     profile = args.profile or _shipped('fastdds.xml')

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 import dataclasses
 import json
 from pathlib import Path
@@ -11,15 +11,7 @@ import platform
 import sys
 from typing import Any
 
-from rs_relpose_lab.experiments.boxes import (
-    by_box,
-    draw_boxes,
-    Record,
-    tables,
-    with_totals,
-    write_boxes,
-    write_trials,
-)
+from rs_relpose_lab.experiments import boxes
 from rs_relpose_lab.experiments.methods import METHODS
 from rs_relpose_lab.experiments.paper import (
     EXACT,
@@ -45,6 +37,7 @@ from rs_relpose_lab.experiments.problems import BASELINES
 from rs_relpose_lab.simulation.scene import SCENES
 from rs_relpose_ros.cli.options import package_version, progress_bar
 from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.geometry.camera import REFERENCE_ROWS
 
 HELP = 'Run an experiment of the paper again: tables (printed and CSV), box plots (PNG).'
@@ -155,9 +148,7 @@ def _add_common(parser: argparse.ArgumentParser, default: tuple[str, ...],
 
 def run(args: argparse.Namespace) -> int:
     """Run the experiment that was asked for; 1 when nothing got a pose."""
-    runs: Mapping[str, Callable[[argparse.Namespace], int]] = {
-        'paper': _run_paper, 'penncosyvio': _run_penncosyvio}
-    return runs[args.experiment](args)
+    return _run_paper(args) if args.experiment == 'paper' else _run_penncosyvio(args)
 
 
 def _run_paper(args: argparse.Namespace) -> int:
@@ -210,27 +201,26 @@ def _run_penncosyvio(args: argparse.Namespace) -> int:
                     'simulated': dataclasses.asdict(simulated)}, totals=True)
 
 
-def _report(folder: Path, records: list[Record], titles: Mapping[tuple[str, str], str],
+def _report(folder: Path, records: list[boxes.Record], titles: Mapping[tuple[str, str], str],
             sweeps: Sequence[Sweep], arguments: Mapping[str, Any], *,
             totals: bool = False) -> int:
     """Print the tables (`titles`: by experiment and case), write tables and pictures.
 
     `totals`: a box of all levels together, too.
     """
-    boxes = with_totals(by_box(records)) if totals else by_box(records)
+    cases = boxes.by_case(records, totals=totals)
     files = ['trials.csv', 'cells.csv', *(f'{sweep.name}.png' for sweep in sweeps), 'run.json']
-    write_trials(records, folder / files[0])
-    write_boxes(boxes, folder / files[1])
+    boxes.write_trials(records, folder / files[0])
+    boxes.write_boxes(cases, folder / files[1])
     for sweep in sweeps:
-        part = {box: methods for box, methods in boxes.items() if box.experiment == sweep.name}
-        draw_boxes(part, sweep.title, sweep.axis, folder / f'{sweep.name}.png')
-        print(tables(part, titles, sweep.unit))
+        part = {case: levels for case, levels in cases.items() if case[0] == sweep.name}
+        boxes.draw_boxes(part, sweep.title, sweep.axis, folder / f'{sweep.name}.png')
+        print(boxes.tables(part, titles, sweep.unit))
     (folder / files[-1]).write_text(json.dumps(
         {**arguments, 'command': sys.argv, 'rs_relpose_ros': package_version(),
          'python': platform.python_version()}, indent=2) + '\n', encoding='utf-8')
     print(f'in {folder}: {", ".join(files)}')
-    posed = any(len(errors.rotation) for methods in boxes.values() for errors in methods.values())
-    return 0 if posed else 1
+    return 0 if any(record.status is Status.OK for record in records) else 1
 
 
 def _once(names: list[str]) -> tuple[str, ...]:

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.bag import write_bag, write_parameters
-from rs_relpose_ros.cli.options import progress_bar, refuse_existing
+from rs_relpose_ros.bags.writer import refuse_existing
+from rs_relpose_ros.cli.options import progress_bar
 from rs_relpose_ros.config.declarations import Declared, declared
 
 HELP = ('Render true rolling-shutter images (every row at its own instant) of a textured scene '

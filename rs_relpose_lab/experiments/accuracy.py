@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 import functools
 import hashlib
@@ -26,17 +26,8 @@ from rs_relpose_ros import RelativePose, warm_up
 class Trial:
     """One problem, estimated.
 
-    Attributes
-    ----------
-    cell, noise : str
-    sigma_factor : float
-        Told sigmas are so many times the true ones.
-    seed : int
-    status : str
-    error, oracle : PoseError
-        Of the estimator and of the oracle.
-    duration : float
-        Of the whole estimate [s].
+    `sigma_factor`: told sigmas by the true ones; `error`, `oracle`: of estimator and oracle;
+    `duration`: of the whole estimate [s].
     """
 
     cell: str
@@ -79,14 +70,8 @@ def run_accuracy(run: AccuracyRun, cache: OracleCache, jobs: int = 1,
                  on_trials: Callable[[int], object] = lambda count: None) -> list[Trial]:
     """Run all trials.
 
-    Parameters
-    ----------
-    run : AccuracyRun
-    cache : OracleCache
-    jobs : int
-        Processes; durations are comparable only where each has a core of its own.
-    on_trials : callable
-        Called with the number of estimates that have been added.
+    `jobs`: processes; durations are comparable only where each has a core of its own.
+    `on_trials`: called with the number of estimates that have been added.
     """
     seeds, chunk = range(run.first_seed, run.first_seed + run.trials), 10
     tasks = [_Task(run, cell, noise, tuple(seeds[first:first + chunk]),
@@ -127,28 +112,20 @@ def _oracle_error(cell: Cell, problem: TwoViewProblem) -> PoseError:
     return pose_error(best.R, best.t, problem.R, problem.t, best.covariance)
 
 
-def by_setting(trials: Iterable[Trial]) -> dict[tuple[Noise, float, str], list[Trial]]:
-    """Trials of each (noise, sigma factor, cell), in the order in which these first occur."""
-    groups: dict[tuple[Noise, float, str], list[Trial]] = {}
-    for trial in trials:
-        groups.setdefault((trial.noise, trial.sigma_factor, trial.cell), []).append(trial)
-    return groups
-
-
 @dataclass(frozen=True, slots=True)
 class OracleCache:
     """The oracle's errors on disk: it need not run again while the estimator is worked on.
 
-    A folder with one file per cell and kind of noise, or none. A file's name holds the digest of
+    A folder with one file per cell and kind of noise. A file's name holds the digest of
     all that decides its content: the cell, the noise, and the source of generator and oracle.
     """
 
-    folder: Path | None
+    folder: Path
 
     def load(self, cell: Cell, noise: Noise) -> dict[int, PoseError]:
         """Errors of the oracle by seed."""
         path = self._path(cell, noise)
-        if path is None or not path.is_file():
+        if not path.is_file():
             return {}
         stored = json.loads(path.read_text())
         return {int(seed): PoseError(*error) for seed, error in stored.items()}
@@ -156,7 +133,7 @@ class OracleCache:
     def add(self, cell: Cell, noise: Noise, errors: dict[int, PoseError]) -> None:
         """Keep errors by seed, beside those that are kept already."""
         path = self._path(cell, noise)
-        if path is None or not errors:
+        if not errors:
             return
         path.parent.mkdir(parents=True, exist_ok=True)
         merged = {**self.load(cell, noise), **errors}
@@ -167,9 +144,7 @@ class OracleCache:
             for seed, error in sorted(merged.items())}))
         new.replace(path)
 
-    def _path(self, cell: Cell, noise: Noise) -> Path | None:
-        if self.folder is None:
-            return None
+    def _path(self, cell: Cell, noise: Noise) -> Path:
         digest = hashlib.sha256(json.dumps([asdict(cell), noise]).encode() + _source())
         return self.folder / f'{digest.hexdigest()[:24]}.json'
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2, trim_mean
 
-from rs_relpose_lab.experiments.accuracy import AccuracyRun, by_setting, Trial
+from rs_relpose_lab.experiments.accuracy import AccuracyRun, Trial
 from rs_relpose_lab.experiments.scoring import POSE_FREEDOM, Quantiles
-from rs_relpose_lab.experiments.tables import markdown_table, write_csv
+from rs_relpose_lab.experiments.tables import grouped, markdown_table, write_csv
 from rs_relpose_ros.picture_files import save_picture
 
 Array = NDArray[np.float64]
@@ -27,12 +27,8 @@ GROSS_ERROR = 2.0
 class Consistency:
     """How the errors compare with the covariance.
 
-    Attributes
-    ----------
-    mean : float
-        Of the inner 98 % of NEES, by its degrees of freedom: 1 is right, more is overconfident.
-    above : float
-        Share above the 95 % quantile of chi-square: 0.05 is right.
+    `mean`: of the inner 98 % of NEES / 5: 1 is right, more is overconfident.
+    `above`: share above the 95 % quantile of chi-square: 0.05 is right.
     """
 
     mean: float
@@ -43,19 +39,10 @@ class Consistency:
 class CellStatistics:
     """Of one cell with one kind of noise and one factor of the told sigmas.
 
-    Attributes
-    ----------
-    noise, sigma_factor, cell, trials
-        What was run.
-    lost, gross : int
-        Trials without a pose, and with a rotation more than `GROSS_ERROR` wrong.
-    rotation, translation, oracle_rotation, oracle_translation : Quantiles
-        Of the estimator and of the oracle on the same problems; a lost pose counts as infinite.
-    rotation_ratio, translation_ratio : Quantiles
-        Estimator by oracle: of the medians and of the 90th percentiles.
-    nees, oracle_nees : Consistency
-    duration : float
-        Median [ms].
+    `lost`, `gross`: trials without a pose, and with a rotation more than `GROSS_ERROR` wrong.
+    `rotation` ... `oracle_translation`: errors [deg]; a lost pose counts as infinite.
+    `rotation_ratio`, `translation_ratio`: estimator by oracle.
+    `duration`: median [ms].
     """
 
     noise: str
@@ -109,31 +96,27 @@ def _ratio(error: Quantiles, reference: Quantiles) -> Quantiles:
 
 def summary(cells: Sequence[CellStatistics]) -> list[tuple[str, float, str]]:
     """What the project asks for, over cells of one noise and factor: name, figure, limit."""
-    def column(value: Callable[[CellStatistics], float]) -> Array:
-        return np.array([value(cell) for cell in cells])
+    def column(name: str) -> Array:
+        return np.array([attrgetter(name)(cell) for cell in cells])
 
-    rotation = column(lambda cell: cell.rotation_ratio.median)
-    translation = column(lambda cell: cell.translation_ratio.median)
-    mean = column(lambda cell: cell.nees.mean)
-    above = 100.0 * column(lambda cell: cell.nees.above)
+    rotation, translation = column('rotation_ratio.median'), column('translation_ratio.median')
+    mean, above = column('nees.mean'), 100.0 * column('nees.above')
     return [
         ('ratio of median rotation errors, median over cells', _median(rotation), '<= 1.10'),
         ('ratio of median translation errors, median over cells', _median(translation), '<= 1.20'),
         ('ratio of median errors, largest of a cell',
          float(np.maximum(rotation, translation).max()), '<= 1.6'),
         ('ratio of 90th percentiles of rotation, median over cells',
-         _median(column(lambda cell: cell.rotation_ratio.p90)), '<= 1.5'),
+         _median(column('rotation_ratio.p90')), '<= 1.5'),
         ('ratio of 90th percentiles of translation, median over cells',
-         _median(column(lambda cell: cell.translation_ratio.p90)), '<= 1.5'),
-        ('lost poses', float(sum(cell.lost for cell in cells)), '0'),
-        (f'rotations wrong by more than {GROSS_ERROR:g} deg',
-         float(sum(cell.gross for cell in cells)), '0'),
+         _median(column('translation_ratio.p90')), '<= 1.5'),
+        ('lost poses', float(column('lost').sum()), '0'),
+        (f'rotations wrong by more than {GROSS_ERROR:g} deg', float(column('gross').sum()), '0'),
         ('NEES / 5, smallest of a cell', float(mean.min()), '>= 0.8'),
         ('NEES / 5, largest of a cell', float(mean.max()), '<= 1.25'),
         ('above the 95 % quantile, smallest of a cell [%]', float(above.min()), '>= 2'),
         ('above the 95 % quantile, largest of a cell [%]', float(above.max()), '<= 10'),
-        ('median time of an estimate, median over cells [ms]',
-         _median(column(lambda cell: cell.duration)), ''),
+        ('median time of an estimate, median over cells [ms]', _median(column('duration')), ''),
     ]
 
 
@@ -142,22 +125,10 @@ def _median(values: Array) -> float:
 
 
 def write_report(folder: Path, run: AccuracyRun, trials: Sequence[Trial]) -> str:
-    """Write every trial, the statistics of every cell, the report and the plot.
-
-    Parameters
-    ----------
-    folder : pathlib.Path
-        Made where it is missing.
-    run : AccuracyRun
-    trials : sequence of Trial
-
-    Returns
-    -------
-    str
-        The report (Markdown).
-    """
+    """Write every trial, the statistics of every cell, the plot and the report; the report."""
     folder.mkdir(parents=True, exist_ok=True)
-    cells = [cell_statistics(group) for group in by_setting(trials).values()]
+    cells = [cell_statistics(group) for group in grouped(
+        trials, attrgetter('noise', 'sigma_factor', 'cell')).values()]
     write_csv(folder / 'trials.csv', trials)
     write_csv(folder / 'cells.csv', cells)
     report = _report(run, cells)
@@ -166,20 +137,13 @@ def write_report(folder: Path, run: AccuracyRun, trials: Sequence[Trial]) -> str
     return report
 
 
-def _settings(cells: Sequence[CellStatistics]) -> dict[tuple[str, float], list[CellStatistics]]:
-    groups: dict[tuple[str, float], list[CellStatistics]] = {}
-    for cell in cells:
-        groups.setdefault((cell.noise, cell.sigma_factor), []).append(cell)
-    return groups
-
-
 def _report(run: AccuracyRun, cells: Sequence[CellStatistics]) -> str:
     parts = [
         '# Accuracy against the oracle\n',
         (f'{run.trials} trials a cell, solver `{run.solver}`, errors in degrees '
          '(median / 90th percentile); a ratio is estimator by oracle. NEES / 5 is the mean of the '
          'inner 98 %; "above" is the share above the 95 % quantile of chi-square(5).\n')]
-    settings = _settings(cells)
+    settings = grouped(cells, attrgetter('noise', 'sigma_factor'))
     for (noise, factor), group in settings.items():
         parts.append(f'## Noise of gravity: {noise}; told sigmas {factor:g} times the true ones\n')
         parts.append(markdown_table(
@@ -226,7 +190,7 @@ def draw(path: Path, cells: Sequence[CellStatistics]) -> Figure:
     figure = Figure(figsize=(12.0, 1.6 + 0.22 * len(names)), dpi=110, layout='constrained')
     axes = figure.subplots(1, len(panels), sharey=True)
     for axis, (field, label, limit) in zip(axes, panels, strict=True):
-        for (noise, factor), group in _settings(cells).items():
+        for (noise, factor), group in grouped(cells, attrgetter('noise', 'sigma_factor')).items():
             axis.plot(list(map(attrgetter(field), group)),
                       [names.index(cell.cell) for cell in group], 'o', markersize=4, alpha=0.8,
                       label=f'{noise}, told sigmas x {factor:g}')

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from pathlib import Path
 
@@ -28,27 +28,12 @@ SIDES = {'rotation': 'rotation error [deg]', 'translation': 'translation directi
 
 
 @dataclass(frozen=True, slots=True)
-class Box:
-    """What one box of a plot stands for, but for the method.
-
-    Attributes
-    ----------
-    experiment, case : str
-        Such as 'pixel_noise' and 'sideways'.
-    level : str
-        Along the axis of the plot.
-    """
+class Record:
+    """One estimate, in the box of a plot: `level` along the axis of an `experiment` and `case`."""
 
     experiment: str
     case: str
     level: str
-
-
-@dataclass(frozen=True, slots=True)
-class Record:
-    """One estimate."""
-
-    box: Box
     method: str
     trial: int
     status: Status
@@ -57,14 +42,7 @@ class Record:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoxErrors:
-    """Errors of a method in a box, of the trials with a pose.
-
-    Attributes
-    ----------
-    trials : int
-    rotation, translation : (K,) ndarray
-        [deg].
-    """
+    """Errors of a method in a box: `rotation`, `translation` (K,) [deg] of the K poses."""
 
     trials: int
     rotation: Array
@@ -75,24 +53,23 @@ class BoxErrors:
         """Trials without a pose."""
         return self.trials - len(self.rotation)
 
-    @classmethod
-    def together(cls, parts: Sequence[BoxErrors]) -> BoxErrors:
-        """All trials of several boxes."""
-        return cls(sum(part.trials for part in parts),
-                   np.concatenate([part.rotation for part in parts]),
-                   np.concatenate([part.translation for part in parts]))
+
+Levels = Mapping[str, Mapping[str, BoxErrors]]
+# By experiment and case, then by level, then by method.
+Cases = Mapping[tuple[str, str], Levels]
 
 
-Boxes = Mapping[Box, Mapping[str, BoxErrors]]
-
-
-def by_box(records: Iterable[Record]) -> dict[Box, dict[str, BoxErrors]]:
-    """Errors of each box by method, in the order of the records."""
-    grouped: dict[Box, dict[str, list[Record]]] = {}
+def by_case(records: Sequence[Record], *, totals: bool = False) -> Cases:
+    """Errors in every box, in the order of the records; `totals`: a box of all levels, too."""
+    if totals:
+        records = [*records, *(replace(record, level=ALL_LEVELS) for record in records)]
+    grouped: dict[tuple[str, str], dict[str, dict[str, list[Record]]]] = {}
     for record in records:
-        grouped.setdefault(record.box, {}).setdefault(record.method, []).append(record)
-    return {box: {method: _errors(found) for method, found in methods.items()}
-            for box, methods in grouped.items()}
+        levels = grouped.setdefault((record.experiment, record.case), {})
+        levels.setdefault(record.level, {}).setdefault(record.method, []).append(record)
+    return {case: {level: {method: _errors(found) for method, found in methods.items()}
+                   for level, methods in levels.items()}
+            for case, levels in grouped.items()}
 
 
 def _errors(records: Sequence[Record]) -> BoxErrors:
@@ -101,67 +78,38 @@ def _errors(records: Sequence[Record]) -> BoxErrors:
                      np.array([error.translation for error in posed]))
 
 
-def by_case(boxes: Boxes) -> dict[tuple[str, str], dict[str, Mapping[str, BoxErrors]]]:
-    """The boxes of each experiment and case, by level."""
-    cases: dict[tuple[str, str], dict[str, Mapping[str, BoxErrors]]] = {}
-    for box, methods in boxes.items():
-        cases.setdefault((box.experiment, box.case), {})[box.level] = methods
-    return cases
-
-
-def with_totals(boxes: Boxes) -> dict[Box, Mapping[str, BoxErrors]]:
-    """The boxes, and after those of each case one of all its levels together."""
-    found: dict[Box, Mapping[str, BoxErrors]] = {}
-    for case, levels in by_case(boxes).items():
-        found |= {Box(*case, level): methods for level, methods in levels.items()}
-        found[Box(*case, ALL_LEVELS)] = {
-            method: BoxErrors.together([methods[method] for methods in levels.values()])
-            for method in next(iter(levels.values()))}
-    return found
-
-
 def write_trials(records: Iterable[Record], path: Path) -> None:
     """Write every estimate (CSV)."""
     write_csv(path, (
-        {'experiment': r.box.experiment, 'case': r.box.case, 'level': r.box.level,
-         'method': r.method, 'trial': r.trial, 'status': r.status.value}
+        {'experiment': r.experiment, 'case': r.case, 'level': r.level, 'method': r.method,
+         'trial': r.trial, 'status': r.status.value}
         | {f'{side}_error_deg': getattr(r.error, side) if r.status is Status.OK else math.nan
            for side in SIDES} for r in records))
 
 
-def write_boxes(boxes: Boxes, path: Path) -> None:
+def write_boxes(cases: Cases, path: Path) -> None:
     """Write the figures of every box (CSV)."""
     percentiles = {'median': 50, 'p25': 25, 'p75': 75, 'p90': 90, 'max': 100}
 
     def figures(errors: BoxErrors) -> dict[str, float]:
-        found: dict[str, float] = {}
-        for side in SIDES:
-            values = getattr(errors, side)
-            at = np.percentile(values, list(percentiles.values())).tolist() if len(values) \
-                else [math.nan] * len(percentiles)
-            found |= {f'{side}_{name}_deg': value
-                      for name, value in zip(percentiles, at, strict=True)}
-        return found
+        return {f'{side}_{name}_deg': float(np.percentile(values, at)) if len(values) else math.nan
+                for side in SIDES for values in [getattr(errors, side)]
+                for name, at in percentiles.items()}
 
     write_csv(path, (
-        {'experiment': box.experiment, 'case': box.case, 'level': box.level, 'method': method,
+        {'experiment': experiment, 'case': case, 'level': level, 'method': method,
          'trials': errors.trials, 'poses': len(errors.rotation)} | figures(errors)
-        for box, methods in boxes.items() for method, errors in methods.items()))
+        for (experiment, case), levels in cases.items() for level, methods in levels.items()
+        for method, errors in methods.items()))
 
 
-def tables(boxes: Boxes, titles: Mapping[tuple[str, str], str], axis: str) -> str:
-    """Tables to read: medians and 90th percentiles of each experiment and case.
+def tables(cases: Cases, titles: Mapping[tuple[str, str], str], axis: str) -> str:
+    """Tables to read: medians and 90th percentiles of each case, each below its title.
 
-    Parameters
-    ----------
-    boxes : mapping
-    titles : mapping
-        Headings, by experiment and case.
-    axis : str
-        Heading of the column of levels.
+    `axis`: heading of the column of levels.
     """
     parts = []
-    for case, levels in by_case(boxes).items():
+    for case, levels in cases.items():
         parts.append(f'## {titles[case]}\n')
         methods = list(next(iter(levels.values())))
         for side, heading in SIDES.items():
@@ -171,11 +119,10 @@ def tables(boxes: Boxes, titles: Mapping[tuple[str, str], str], axis: str) -> st
                 [[level, *(_summary(getattr(row[method], side)) for method in methods)]
                  for level, row in levels.items()]))
         for method in methods:
-            errors = BoxErrors.together([row[method] for level, row in levels.items()
-                                         if level != ALL_LEVELS])
-            if errors.lost:
-                parts.append(f'no pose: {METHODS[method].label}, {errors.lost} of '
-                             f'{errors.trials}\n')
+            found = [row[method] for level, row in levels.items() if level != ALL_LEVELS]
+            if lost := sum(errors.lost for errors in found):
+                parts.append(f'no pose: {METHODS[method].label}, {lost} of '
+                             f'{sum(errors.trials for errors in found)}\n')
     return '\n'.join(parts)
 
 
@@ -199,35 +146,26 @@ _LOST_COLOR = '#B00000'
 FLOOR = 1e-5
 
 
-def draw_boxes(boxes: Boxes, title: str, axis: str, path: Path) -> Figure:
+def draw_boxes(cases: Cases, title: str, axis: str, path: Path) -> Figure:
     """Draw one experiment: a row of plots for each case, rotation left and translation right.
 
     Boxes hold the quartiles, whiskers reach to the 5th and 95th percentiles, dots are beyond. Red
     figures above the boxes say how many estimates are in none, for want of a pose.
-
-    Parameters
-    ----------
-    boxes : mapping
-        Of this experiment.
-    title, axis : str
-        Of the figure; of the levels.
-    path : Path
-        PNG file.
     """
-    cases = by_case(boxes)
     figure = Figure(figsize=(13.0, 1.1 + 3.5 * len(cases)), dpi=110, layout='constrained')
     axes = figure.subplots(len(cases), 2, squeeze=False)
     for column, (side, label) in enumerate(SIDES.items()):
-        limits = _limits([getattr(errors, side) for methods in boxes.values()
-                          for errors in methods.values()])
+        limits = _limits([getattr(errors, side) for levels in cases.values()
+                          for methods in levels.values() for errors in methods.values()])
         for row, ((_, case), levels) in zip(axes, cases.items(), strict=True):
             _draw_levels(row[column], levels, side, limits)
             row[column].set_title(case, fontsize=11)
             row[column].set_ylabel(label)
             row[column].set_xlabel(axis)
+    methods = next(iter(next(iter(cases.values())).values()))
     axes[0, 1].legend(handles=[
         Patch(facecolor=color, edgecolor='black', linewidth=0.6, label=METHODS[method].label)
-        for method, color in zip(next(iter(boxes.values())), _COLORS, strict=False)],
+        for method, color in zip(methods, _COLORS, strict=False)],
         loc='upper left', bbox_to_anchor=(1.0, 1.0), fontsize=9)
     figure.suptitle(title, fontsize=13)
     save_picture(figure, path)
@@ -244,7 +182,7 @@ def _limits(errors: Sequence[Array]) -> tuple[float, float]:
     return low, max(min(10.0**np.ceil(most), 180.0), 10.0 * low)
 
 
-def _draw_levels(plot: Axes, levels: Mapping[str, Mapping[str, BoxErrors]], side: str,
+def _draw_levels(plot: Axes, levels: Levels, side: str,
                  limits: tuple[float, float]) -> None:
     methods = list(next(iter(levels.values())))
     step = 0.86 / len(methods)

@@ -20,9 +20,8 @@ from rs_relpose_ros.errors import MissingInputError
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.replay.outputs import POSES_FILE, replay_into
-from rs_relpose_ros.replay.record import pair_record, PairRecord
-from rs_relpose_ros.replay.run import read_truth, Replay, ReplayedPair
-from rs_relpose_ros.replay.stamps import read_stamps
+from rs_relpose_ros.replay.run import read_stamps, read_truth, Replay, ReplayedPair
+from rs_relpose_ros.replay.tables import pair_record, PairRecord
 from rs_relpose_ros.replay.truth import median_and_p90, PairErrors, TrueTrajectory
 
 # The algorithms of the paper, by solver: its refinement, and the gyro only derotates rows.
@@ -34,15 +33,7 @@ PAPER_ALGORITHMS: Mapping[str, Mapping[str, str | bool]] = {
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Errors of a method over pairs, in degrees.
-
-    Attributes
-    ----------
-    name : str
-    pairs, answered : int
-    rotation, translation : (float, float)
-        Median and 90th percentile over the answered pairs; NaN without any.
-    """
+    """Errors of a method over pairs: median and 90th percentile of those answered [deg]."""
 
     name: str
     pairs: int
@@ -73,18 +64,10 @@ def is_still(record: PairRecord) -> bool:
 class LiveComparison:
     """What a live node published, beside the replay of the frames that it processed.
 
-    Attributes
-    ----------
-    node : Score
-    records, pairs : list
-        Of the replay.
-    truth : TrueTrajectory
-    intrinsics : Intrinsics
-        In force at the end.
-    frames, processed : int
-        In the bag, and by the node.
-    poses, unequal : int
-        Poses of both, and those that are not bit by bit the same in the two.
+    `records`, `pairs`: of the replay.
+    `intrinsics`: in force at the end.
+    `frames`, `processed`: in the bag, and by the node.
+    `poses`, `unequal`: poses of both, and those that are not bit by bit the same in the two.
     """
 
     node: Score
@@ -108,17 +91,8 @@ def compare_live(table: Path, stamps_file: Path, bag_path: Path, parameter_file:
                  folder: Path, *, pictures: bool = False) -> LiveComparison:
     """Replay into `folder` the frames that a live node processed.
 
-    Parameters
-    ----------
-    table : Path
-        Relative poses that the node published, as its recorder wrote them.
-    stamps_file : Path
-        Stamps of the frames that it processed.
-    bag_path, parameter_file : Path
-        What it was given.
-    folder : Path
-    pictures : bool
-        Whether to draw those of the replay.
+    `table`: poses that the node published; `stamps_file`: of the frames that it processed.
+    `bag_path`, `parameter_file`: what it was given; `pictures`: whether to draw the replay's.
     """
     stamps = read_stamps(stamps_file)
     pairs: list[ReplayedPair] = []
@@ -152,16 +126,7 @@ def score_of_replay(name: str, bag_path: Path, parameters: Parameters) -> Score:
 
 def score_of_table(name: str, path: Path, pairs: Sequence[PairRecord],
                    truth: TrueTrajectory) -> Score:
-    """Score of a table of relative poses, which a live node's recorder wrote.
-
-    Parameters
-    ----------
-    name : str
-    path : Path
-    pairs : sequence of PairRecord
-        Of a replay of the same frames: they tell how many pairs there were, and their instants.
-    truth : TrueTrajectory
-    """
+    """Score of a live node's table; `pairs` of a replay of its frames tell number and instants."""
     instants = {(r.reference_stamp_ns, r.stamp_ns): (r.reference_ns1, r.reference_ns2)
                 for r in pairs}
     errors = []
@@ -197,15 +162,7 @@ def best_opencv_score(estimator: str, pairs: Sequence[ReplayedPair], intrinsics:
     """Score of an OpenCV estimator at that of three thresholds which suits it best.
 
     Best in the median rotation error against the truth: a choice that no user could make, in the
-    baseline's favour.
-
-    Parameters
-    ----------
-    estimator : {'RANSAC', 'USAC_MAGSAC'}
-    pairs : sequence of ReplayedPair
-        Those that the pipeline answered: the same matches, and none of a camera that stands.
-    intrinsics : Intrinsics
-    truth : TrueTrajectory
+    baseline's favour. `pairs`: those that the pipeline answered, none of a camera that stands.
     """
     camera = intrinsics.global_shutter_camera()
     matches = [tuple(undistorted(intrinsics.to_sensor(points), camera) for points in

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-import csv
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_lab.experiments.cell_names import matching_cells
 from rs_relpose_lab.experiments.live_clip import (
     Clip,
+    closed_loop,
     configuration,
     IMU_RATES,
     imu_topic,
@@ -23,8 +22,7 @@ from rs_relpose_lab.experiments.live_clip import (
 )
 from rs_relpose_lab.experiments.scoring import pose_error
 from rs_relpose_lab.experiments.tables import write_csv
-from rs_relpose_lab.live.process_figures import ProcessFigures
-from rs_relpose_lab.simulation.closed_loop import closed_loop
+from rs_relpose_lab.live.processes import ProcessFigures
 from rs_relpose_ros.bags.layout import CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, RAW_TOPIC
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.front_end.sequencer import Refusal
@@ -41,16 +39,7 @@ FORMATS = ('mono8', 'bgr8', 'jpeg')
 
 @dataclass(frozen=True, slots=True)
 class LiveCell:
-    """One camera and IMU.
-
-    Attributes
-    ----------
-    width, height : int
-    image_format : {'mono8', 'bgr8', 'jpeg'}
-        Raw gray, raw colour, or JPEG in colour.
-    imu_rate : int
-        Samples per second.
-    """
+    """One camera, with one of `FORMATS` (JPEG is in colour), and the rate of an IMU [Hz]."""
 
     width: int
     height: int
@@ -95,40 +84,22 @@ class Percentiles:
 class LiveStatistics:
     """Figures of one cell; times in ms, memory in MB, errors in degrees.
 
-    Attributes
-    ----------
-    cell : str
-    duration : float
-        Seconds that were played.
-    frames_sent, frames_received, frames_used : int
-        By the player, by the node's callback, and through the whole pipeline.
-    dropped_overload, dropped_other : int
-        Refused by the node because newer frames waited, or for any other cause.
-    imu_sent, imu_received : int
-    pairs, poses : int
-    latency : Percentiles
-        Of a published pair: from the later of image and first IMU sample that covers its last
-        row, as the node's callbacks got them, to publication.
-    end_to_end : Percentiles
-        The same from outside: from the later publication of the two by the player to the receipt
-        of the pose by a third process. No delay inside the node can hide from it.
-    frame_time, frame_cpu : Percentiles
-        Of every frame, pair or not: from its turn to its end, and processor time of the worker.
-    cpu, cpu_callbacks, cpu_player : float
-        Percent of one core: the node, its first thread alone (callbacks), and the player.
-    memory_start, memory_end : float
-        Resident memory of the node after the first pose and at the end.
-    private_start, private_end : float
-        Without what is shared with other processes.
-    seconds_to_ready, seconds_to_pose : float
-        From the start of the node's process to its subscriptions; from the first frame to the
-        first pose.
-    rotation_error, translation_error : Percentiles
-        Against the truth.
-    wrong : int
-        Poses that are off by more than 1 deg, or 15 deg in the direction of translation.
-    player_late : Percentiles
-        How late the player published, on this machine.
+    `frames_sent`, `frames_received`, `frames_used`: by the player, by the node's callback, and
+        through the whole pipeline.
+    `dropped_overload`: refused by the node because newer frames waited.
+    `latency`: of a published pair: from the later of image and first IMU sample that covers its
+        last row, as the node's callbacks got them, to publication.
+    `end_to_end`: the same from outside: from the later publication of the two by the player to the
+        receipt of the pose by a third process. No delay inside the node can hide from it.
+    `frame_time`, `frame_cpu`: of every frame, pair or not: from its turn to its end, and processor
+        time of the worker.
+    `cpu`, `cpu_callbacks`, `cpu_player`: percent of one core: the node, its first thread, player.
+    `memory_*`, `private_*`: of the node after the first pose and at the end: resident, and without
+        what is shared with other processes.
+    `seconds_to_ready`, `seconds_to_pose`: from the start of the node's process to its
+        subscriptions; from the first frame to the first pose.
+    `wrong`: poses that are off by more than 1 deg, or 15 deg in the direction of translation.
+    `player_late`: how late the player published, on this machine.
     """
 
     cell: str
@@ -165,12 +136,8 @@ class LiveStatistics:
 class Course:
     """How latency and memory went over time.
 
-    Attributes
-    ----------
-    latency_seconds, latencies : (N,) ndarray
-        Seconds since the first pair, and ms.
-    memory_seconds, resident, private : (M,) ndarray
-        Seconds likewise, and MB.
+    `latency_seconds`, `latencies` (N,): seconds since the first pair, and ms.
+    `memory_seconds`, `resident`, `private` (M,): seconds likewise, and MB.
     """
 
     latency_seconds: Array
@@ -180,28 +147,11 @@ class Course:
     private: Array
 
 
-def select_cells(patterns: Iterable[str]) -> tuple[LiveCell, ...]:
-    """The cells that match any of the patterns, as `matching_cells` has them."""
-    return tuple(CELLS[name] for name in matching_cells(patterns, CELLS))
-
-
 def run_cell(cell: LiveCell, clip: Clip, duration: float, folder: Path, profile: Path,
              on_second: Callable[[], object] = lambda: None) -> tuple[LiveStatistics, Course]:
-    """Play a clip to a node of its own.
+    """Play a clip of the cell's size to a node of its own; logs and tables into `folder`.
 
-    Parameters
-    ----------
-    cell : LiveCell
-    clip : Clip
-        Of the cell's size.
-    duration : float
-        Seconds to play.
-    folder : Path
-        Directory of logs and tables; made where it is missing.
-    profile : Path
-        Fast DDS profile for big images.
-    on_second : callable
-        Called once a second.
+    `duration` [s]; `profile`: of Fast DDS, for big images; `on_second`: called once a second.
     """
     # Here, so that the names of cells are known without ROS.
     from rs_relpose_lab.live.measured_run import measure, Play
@@ -228,15 +178,14 @@ def statistics_of(cell: LiveCell, duration: float, run: MeasuredRun) -> LiveStat
     latency = (frames['done_ns'] - frames['ready_ns']) / 1e6
     log = np.load(run.log)
     images, imu = log[log['is_image']], log[~log['is_image']]
-    last = run.diagnostics[-1][1]
-    refused = {cause: int(last[f'frames_refused_{cause.value}']) for cause in Refusal}
+    refused = {cause: int(run.counters[f'frames_refused_{cause.value}']) for cause in Refusal}
     rotation, translation = errors(run.poses)
     first, end = run.figures[0], run.figures[-1]
     return LiveStatistics(
         cell=cell.name, duration=duration, frames_sent=len(images),
-        frames_received=int(last['frames_received']), frames_used=len(frames),
+        frames_received=int(run.counters['frames_received']), frames_used=len(frames),
         dropped_overload=refused.pop(Refusal.OVERLOAD), dropped_other=sum(refused.values()),
-        imu_sent=len(imu), imu_received=int(last['imu_samples']),
+        imu_sent=len(imu), imu_received=int(run.counters['imu_samples']),
         pairs=int(np.count_nonzero(paired)), poses=len(run.poses),
         latency=Percentiles.of(latency[posed]),
         end_to_end=Percentiles.of(_end_to_end(run.poses, images, imu)),
@@ -291,14 +240,8 @@ def _end_to_end(poses: Sequence[ReceivedPose], images: NDArray[np.void],
 
 
 def _read_frames(path: Path) -> NDArray[np.void]:
-    with path.open(newline='') as file:
-        rows = list(csv.DictReader(file))
-    numbers = ('stamp_ns', 'ready_ns', 'taken_ns', 'done_ns', 'cpu_ns')
-    frames = np.empty(len(rows), dtype=[(name, '<i8') for name in numbers] + [('outcome', 'U24')])
-    for name in numbers:
-        frames[name] = [int(row[name]) for row in rows]
-    frames['outcome'] = [row['outcome'] for row in rows]
-    return frames
+    return np.atleast_1d(np.genfromtxt(path, delimiter=',', names=True, dtype=None,
+                                       encoding='ascii'))
 
 
 def _percent(first: ProcessFigures, last: ProcessFigures, name: str) -> float:

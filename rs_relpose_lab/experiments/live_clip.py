@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+import math
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,13 @@ from rs_relpose_lab.simulation.bag import (
     write_in_order,
     write_parameters,
 )
-from rs_relpose_lab.simulation.closed_loop import closed_loop
+from rs_relpose_lab.simulation.hand_held import EYE_HEIGHT
+from rs_relpose_lab.simulation.trajectory import DEGREE, Trajectory
 from rs_relpose_ros.bags.layout import CAMERA_FRAME, COMPRESSED_TOPIC, IMU_DELAY
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
+
+Array = NDArray[np.float64]
 
 # Duration of the motion before it repeats itself [s].
 PERIOD = 4.0
@@ -33,15 +37,7 @@ IMU_RATES = (200, 400)
 
 @dataclass(frozen=True, slots=True)
 class Clip:
-    """Files of a clip.
-
-    Attributes
-    ----------
-    bag : Path
-        JPEG in colour, CameraInfo, and the IMU at each of `IMU_RATES` on a topic of its own.
-    parameters : Path
-        Parameter file of the node.
-    """
+    """Parameter file of the node, and bag: JPEG in colour, CameraInfo, IMU at all `IMU_RATES`."""
 
     bag: Path
     parameters: Path
@@ -61,17 +57,7 @@ def configuration(width: int, height: int, imu_rate: int = IMU_RATES[0]) -> Simu
 
 def prepare_clip(folder: Path, width: int, height: int,
                  on_frame: Callable[[], object] = lambda: None) -> Clip:
-    """Render a clip into a folder, unless it is there.
-
-    Parameters
-    ----------
-    folder : Path
-        Made where it is missing.
-    width, height : int
-        Size of the images [px].
-    on_frame : callable
-        Called after each of the images.
-    """
+    """Render a clip into a folder, unless it is there; `on_frame` is called after each image."""
     def render(path: Path, parameters: Path) -> None:
         trajectory = closed_loop(PERIOD)
         first = simulate(configuration(width, height), trajectory=trajectory)
@@ -112,3 +98,38 @@ def seconds_into_loop(stamp_ns: int) -> float:
     """Time on the closed trajectory of an instant of the endlessly played clip [s]."""
     start_ns = SimulationConfig().start_ns
     return (stamp_ns - start_ns) % to_nanoseconds(PERIOD) / NANOSECONDS
+
+
+def closed_loop(period: float) -> Trajectory:
+    """Trajectory from -2 to `period` + 2 seconds that repeats itself after `period` [s].
+
+    Around an ellipse, half as deep as wide, at a mean speed of 1.5 m/s, with the bob of the steps
+    and a hand's turns about all axes (30 deg/s rms), looking along x. A recording that is played
+    backwards will not do: its rows would still be those of the motion forwards.
+    """
+    # 25 control points a second: quintic splines through them follow steps of 2 Hz.
+    count = round(25 * period)
+    phase = 2.0 * math.pi * np.arange(count) / count
+    steps = max(round(1.8 * period), 2)
+    # Ramanujan's perimeter of an ellipse with half axes 1 and 1/2.
+    half_width = 1.5 * period / 4.844
+    positions = np.stack([
+        0.5 * half_width * np.cos(phase), half_width * np.sin(phase),
+        EYE_HEIGHT + 0.03 * np.cos(steps * phase)], axis=1)
+    angles = _waves(phase, period, ((1, 0.2), (2, 1.3), (5, 2.1)), 0.45)
+    angles = np.stack([angles, _waves(phase, period, ((1, 2.5), (3, 0.4), (6, 5.0)), 0.3),
+                       _waves(phase, period, ((2, 4.1), (4, 1.0), (7, 3.0)), 0.2)], axis=1)
+    spacing = period / count
+    before = math.ceil(2.0 / spacing) + DEGREE
+    turns = np.arange(-before, count + before) % count
+    return Trajectory(positions[turns], angles[turns], -before * spacing, spacing)
+
+
+def _waves(phase: Array, period: float, waves: tuple[tuple[int, float], ...],
+           rate: float) -> Array:
+    """Sum of harmonics (number, phase), each with its share of a rms `rate` [rad/s]."""
+    total = np.zeros_like(phase)
+    for harmonic, shift in waves:
+        amplitude = rate * math.sqrt(2.0 / len(waves)) * period / (2.0 * math.pi * harmonic)
+        total += amplitude * np.sin(harmonic * phase + shift)
+    return total

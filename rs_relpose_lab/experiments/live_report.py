@@ -17,13 +17,7 @@ from rs_relpose_ros.picture_files import save_picture
 
 
 def write_report(folder: Path, cells: Sequence[LiveStatistics]) -> str:
-    """Write table, report and plot into a folder.
-
-    Returns
-    -------
-    str
-        The report (Markdown).
-    """
+    """Write table, plot and report into a folder; the report."""
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / 'live.csv', cells)
     report = '\n'.join([

@@ -44,20 +44,10 @@ CAMERA = RollingShutterCamera(width=WIDTH, height=HEIGHT, fx=FOCAL, fy=FOCAL, cx
 class Method:
     """How a pair is estimated.
 
-    Attributes
-    ----------
-    label : str
-        For tables and legends.
-    solver, refinement : str
-        Of this library, as in `EstimatorConfig`; without a solver another library is meant.
-    library : {'', 'opencv', 'poselib'}
-    derotated : bool
-        Whether another library gets the points as if all rows had been read with the middle one,
-        as far as the gyro knows.
-    continuous_gyro : bool
-        Whether the gyro over the rows and between the frames is used, too.
-    threshold : float
-        Of another library [px].
+    `solver`, `refinement`: of this library, as in `EstimatorConfig`.
+    `library`, `threshold` [px]: of another one; `derotated`: it gets the points as if all rows had
+        been read with the middle one, as far as the gyro knows.
+    `continuous_gyro`: the gyro over the rows and between the frames is used, too.
     """
 
     label: str
@@ -95,18 +85,9 @@ METHODS: Mapping[str, Method] = {
 class ContinuousGyro:
     """What a gyro that runs on knows of a pair, beyond one mean rate a frame.
 
-    Attributes
-    ----------
-    motion1, motion2 : FrameMotion
-        From the gyro over the rows.
-    rotation, covariance : (3, 3) ndarray
-        ``R_1^T R_2`` between the reference rows, and the covariance of its error [rad^2].
-    interval : float
-        Between the reference rows [s].
-    rate_sigma : float
-        Of the motions' rates, per axis [rad/s].
-    gravity_sigma : float or None
-        Of the motions' gravity, per axis [rad].
+    `rotation`, `covariance` (3, 3): ``R_1^T R_2`` between the reference rows, and the covariance
+        of its error [rad^2]; `interval` [s] between them.
+    `rate_sigma` [rad/s], `gravity_sigma` [rad]: of the motions, per axis.
     """
 
     motion1: FrameMotion
@@ -122,21 +103,10 @@ class ContinuousGyro:
 class PairProblem:
     """A pair of frames as every method gets it, and its truth.
 
-    Attributes
-    ----------
-    points1, points2 : (N, 2) ndarray
-        Matches [px].
-    camera : RollingShutterCamera
-    motion1, motion2 : FrameMotion
-        One angular velocity and one direction of gravity each.
-    R, t : (3, 3), (3,) ndarray
-        True pose between the reference rows, ``X1 = R X2 + t``; t of any length.
-    told : EstimatorConfig
-        Noise figures that the estimator is told, and its other settings.
-    quality : (N,) ndarray or None
-        Of the matches.
-    gyro : ContinuousGyro or None
-        For the methods that use it.
+    `points1`, `points2` (N, 2): matches [px], with their `quality` (N,).
+    `motion1`, `motion2`: one angular velocity and one direction of gravity each.
+    `R`, `t`: true pose between the reference rows, ``X1 = R X2 + t``; t of any length.
+    `told`: noise figures that the estimator is told, and its other settings.
     """
 
     points1: Array
@@ -172,20 +142,16 @@ def as_pair(problem: TwoViewProblem, cell: Cell, sigma_factor: float = 1.0) -> P
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:
-    """Pose ``X1 = R X2 + t``, t of unit length, of a library that tells no covariance.
-
-    `inliers` (N,): which of the matches agree with it.
-    """
+    """Pose ``X1 = R X2 + t``, t of unit length, of a library that tells no covariance."""
 
     R: Array
     t: Array
-    inliers: NDArray[np.bool_]
     covariance: None = None
 
     @classmethod
-    def of_inverse(cls, R: Array, t: Array, inliers: NDArray[np.bool_]) -> Pose:
+    def of_inverse(cls, R: Array, t: Array) -> Pose:
         """From ``X2 = R X1 + t``, as OpenCV and PoseLib have it."""
-        return cls(np.asarray(R.T), np.asarray(-R.T @ t), inliers)
+        return cls(np.asarray(R.T), np.asarray(-R.T @ t))
 
 
 # The call that is timed where time counts.
@@ -270,23 +236,9 @@ OPENCV_ESTIMATORS = {'RANSAC': cv2.RANSAC, 'USAC_MAGSAC': cv2.USAC_MAGSAC}
 def opencv_five_point(pixels1: Array, pixels2: Array, camera: RollingShutterCamera,
                       threshold: float, *, estimator: str = 'USAC_MAGSAC',
                       seed: int = 0) -> Pose | None:
-    """Pose by OpenCV's essential matrix, as if both images had a global shutter.
+    """Pose by OpenCV's essential matrix, as if both images had a global shutter, or None.
 
-    Parameters
-    ----------
-    pixels1, pixels2 : (N, 2) ndarray
-        Undistorted.
-    camera : RollingShutterCamera
-        Of which the camera matrix is used.
-    threshold : float
-        [px].
-    estimator : {'RANSAC', 'USAC_MAGSAC'}
-    seed : int
-
-    Returns
-    -------
-    Pose or None
-        None where OpenCV finds nothing.
+    `pixels1`, `pixels2` (N, 2): undistorted; `threshold` [px]; `estimator` of `OPENCV_ESTIMATORS`.
     """
     if len(pixels1) < 5:
         return None
@@ -299,14 +251,13 @@ def opencv_five_point(pixels1: Array, pixels2: Array, camera: RollingShutterCame
         # Several solutions come stacked; none comes as None.
         if np.shape(essential) != (3, 3):
             return None
-        inliers = np.asarray(mask).ravel().astype(bool)
         count, R, t, _ = cv2.recoverPose(essential, pixels1, pixels2, K, mask=mask)
     except cv2.error:   # too few, or degenerate
         return None
     if not count:
         return None
     return Pose.of_inverse(np.asarray(R, dtype=np.float64),
-                           np.asarray(t, dtype=np.float64).ravel(), inliers)
+                           np.asarray(t, dtype=np.float64).ravel())
 
 
 def poselib_five_point(pixels1: Array, pixels2: Array, camera: RollingShutterCamera,
@@ -315,9 +266,9 @@ def poselib_five_point(pixels1: Array, pixels2: Array, camera: RollingShutterCam
     library: Any = importlib.import_module('poselib')
     pinhole = {'model': 'PINHOLE', 'width': camera.width, 'height': camera.height,
                'params': [camera.fx, camera.fy, camera.cx, camera.cy]}
-    pose, told = library.estimate_relative_pose(
+    pose, _ = library.estimate_relative_pose(
         pixels1, pixels2, pinhole, pinhole, {'max_epipolar_error': threshold, 'seed': seed}, {})
     length = np.linalg.norm(pose.t)
     if not length > 0.0:
         return None
-    return Pose.of_inverse(pose.R, pose.t / length, np.asarray(told['inliers'], dtype=bool))
+    return Pose.of_inverse(pose.R, pose.t / length)

@@ -26,12 +26,8 @@ _SETTLED = 1e-10
 class OmnidirectionalCamera(RollingShutterCamera):
     """A wide-angle rolling-shutter camera that sees less than 180 degrees.
 
-    Parameters
-    ----------
-    polynomial : sequence of float
-        a0, a1, a2, ... as OCamCalib prints ``ss``; a1 is 0, as its model demands.
-    affine : (c, d, e)
-        As OCamCalib names them.
+    `polynomial`: a0, a1, a2, ... as OCamCalib prints ``ss``; a1 is 0, as its model demands.
+    `affine` (c, d, e): as OCamCalib names them.
 
     Notes
     -----

@@ -43,13 +43,9 @@ _STEP = 1e-30
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OracleEstimate:
-    """Pose ``X1 = R X2 + t`` and its covariance.
+    """Pose ``X1 = R X2 + t`` and the covariance (6, 6) of ``(dt, dtheta)``, both in camera 1.
 
-    Attributes
-    ----------
-    R, t : (3, 3) and (3,) ndarray
-    covariance : (6, 6) ndarray
-        Of ``(dt, dtheta)``, ``t_true = t + dt``, ``R_true = Exp(dtheta) R``, both in camera 1.
+    ``t_true = t + dt``, ``R_true = Exp(dtheta) R``
     """
 
     R: Array
@@ -77,12 +73,8 @@ def start_at(R: Array, t: Array, gravity: Array) -> Start:
 class Objective:
     """Residuals, of which the oracle minimises the sum of squares, over a step x from `start`.
 
-    Attributes
-    ----------
-    problem : TwoViewProblem
-    pixel_sigma, gravity_sigma, gyro_sigma : float
-        As in `oracle_estimate`.
-    start : Start
+    `pixel_sigma` [px] per coordinate, `gravity_sigma` [rad] per axis of one frame's direction,
+    `gyro_sigma` [rad/s] per axis of one frame.
     """
 
     problem: TwoViewProblem
@@ -135,20 +127,7 @@ class Objective:
 
 def oracle_estimate(problem: TwoViewProblem, pixel_sigma: float, gravity_sigma: float,
                     gyro_sigma: float, start: tuple[Array, Array] | None = None) -> OracleEstimate:
-    """The oracle's estimate of a problem.
-
-    Parameters
-    ----------
-    problem : TwoViewProblem
-    pixel_sigma : float
-        [px] per coordinate.
-    gravity_sigma : float
-        [rad] per axis of one frame's direction.
-    gyro_sigma : float
-        [rad/s] per axis of one frame.
-    start : tuple of (3, 3) and (3,) ndarray, optional
-        Pose to start from instead of the truth.
-    """
+    """The oracle's estimate of a problem; `start`: pose to start from instead of the truth."""
     R, t = (problem.R, problem.t) if start is None else start
     objective = Objective(problem, pixel_sigma, gravity_sigma, gyro_sigma,
                           start_at(R, t, problem.gravity1))

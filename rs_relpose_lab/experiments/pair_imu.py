@@ -25,16 +25,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeanMotion:
-    """Motion of a frame by the paper's means, at its reference row.
-
-    Attributes
-    ----------
-    motion : FrameMotion
-    gravity_sigma : float
-        Per axis [rad].
-    rate_sigma : float
-        Standard deviation of the averaged rates, per axis [rad/s].
-    """
+    """Motion of a frame by the paper's means, at its reference row; sigmas [rad], [rad/s]."""
 
     motion: FrameMotion
     gravity_sigma: float
@@ -44,16 +35,8 @@ class MeanMotion:
 class PairImu:
     """Samples of an IMU, asked about frames of a camera.
 
-    Parameters
-    ----------
-    samples : sequence of ImuSample
-        By stamp, IMU frame.
-    R_cam_imu : (3, 3) ndarray
-        ``v_cam = R_cam_imu v_imu``.
-    clock : ImageClock
-        Of the camera.
-    config : ImuConfig
-        Holds the bias that is subtracted.
+    `samples`: by stamp, IMU frame; `R_cam_imu`: ``v_cam = R_cam_imu v_imu``.
+    `clock`: of the camera; `config`: holds the bias that is subtracted.
     """
 
     def __init__(self, samples: Sequence[ImuSample], R_cam_imu: Array, clock: ImageClock,

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from rs_relpose_lab.experiments.boxes import Box, Record
+from rs_relpose_lab.experiments.boxes import Record
 from rs_relpose_lab.experiments.methods import as_pair, PairProblem, run_method
 from rs_relpose_lab.experiments.problems import BASELINES, Cell, make_problem
 from rs_relpose_lab.experiments.workers import in_processes
@@ -21,18 +21,8 @@ METHODS_OF_THE_PAPER = ('global_5pt', 'uniform_9pt', 'uniform_11pt', 'auto')
 class Sweep:
     """One figure of the paper.
 
-    Attributes
-    ----------
-    name, title : str
-    axis, unit : str
-        What is varied, with its unit; the unit.
-    varied : str
-        The field of `Cell`.
-    levels : tuple of float
-        Its values.
-    fixed : tuple of (str, float)
-        Fields of `Cell` that are not at their defaults.
-    in_paper : bool
+    `axis`, `unit`: what is varied, with its unit; the unit.
+    `varied`, `levels`: the field of `Cell` and its values; `fixed`: others not at their defaults.
     """
 
     name: str
@@ -79,15 +69,8 @@ SWEEPS = {sweep.name: sweep for sweep in (
 class PaperRun:
     """Which experiments are run, and how.
 
-    Attributes
-    ----------
-    sweeps, directions, methods : sequence of str
-        Names of `SWEEPS`, `problems.BASELINES` and `methods.METHODS`.
-    trials : int
-        Of each level of each direction.
-    seed : int
-    base : Cell
-        Noises and outliers where an experiment does not vary them.
+    `sweeps`, `directions`, `methods`: names of `SWEEPS`, `BASELINES` and `METHODS`.
+    `trials`: of each level of each direction; `base`: what an experiment does not vary.
     """
 
     sweeps: tuple[str, ...]
@@ -127,16 +110,7 @@ class Task:
 
 def run_paper(run: PaperRun, jobs: int = 1,
               on_problem: Callable[[], object] = lambda: None) -> list[Record]:
-    """Run the experiments; the result does not depend on `jobs`.
-
-    Parameters
-    ----------
-    run : PaperRun
-    jobs : int
-        Processes.
-    on_problem : callable
-        Called after each of `run.tasks()`.
-    """
+    """Run the experiments in `jobs` processes; `on_problem` is called after each task."""
     if jobs < 1:
         raise InputError(f'jobs must be at least 1, got {jobs}')
     records = []
@@ -150,9 +124,8 @@ def run_task(task: Task) -> list[Record]:
     """Draw a problem and estimate it by every method."""
     problem = paper_problem(task.sweep.cell(task.level, task.run.base), task.direction,
                             task.run.seed, task.trial)
-    box = Box(task.sweep.name, task.direction, f'{task.level:g}')
-    return [Record(box, name, task.trial, *run_method(name, problem, task.trial))
-            for name in task.run.methods]
+    return [Record(task.sweep.name, task.direction, f'{task.level:g}', name, task.trial,
+                   *run_method(name, problem, task.trial)) for name in task.run.methods]
 
 
 def paper_problem(cell: Cell, direction: str, seed: int, trial: int) -> PairProblem:

@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_lab.experiments.boxes import Box, Record
+from rs_relpose_lab.experiments.boxes import Record
 from rs_relpose_lab.experiments.methods import METHODS, PairProblem, run_method
 from rs_relpose_lab.experiments.pair_imu import PairImu
 from rs_relpose_lab.experiments.penncosyvio_files import (
@@ -70,23 +70,10 @@ class Pair:
 class PennCosyvioRun:
     """What is run, and on what.
 
-    Attributes
-    ----------
-    sequences, methods : sequence of str
-        Names of `STRETCHES` and `methods.METHODS`.
-    camera, imu : str
-        Names of `penncosyvio_files.CAMERAS` and `IMUS`.
-    readout_time : float
-        Of the camera [s].
-    stamp_row : {'first', 'middle', 'last'}
-        Row that a frame's stamp marks.
-    time_offset : float
-        IMU clock minus camera clock [s].
-    gyro_bias : (3,) sequence of float
-        Subtracted from the gyro, IMU frame [rad/s].
-    every, distance : int
-        Frames from one pair to the next, and between the two of a pair.
-    seed : int
+    `sequences`, `methods`, `camera`, `imu`: names of `STRETCHES`, `METHODS`, `CAMERAS`, `IMUS`.
+    `readout_time` [s]; `stamp_row`: that a frame's stamp marks.
+    `time_offset`: IMU clock minus camera clock [s]; `gyro_bias`: subtracted, IMU frame [rad/s].
+    `every`, `distance`: frames from one pair to the next, and between the two of a pair.
     """
 
     sequences: tuple[str, ...]
@@ -125,23 +112,13 @@ class PairSource(Protocol):
 
 def run_penncosyvio(run: PennCosyvioRun, open_sequence: Callable[[str], PairSource],
                     on_pair: Callable[[], object] = lambda: None) -> list[Record]:
-    """Estimate every pair by every method.
-
-    Parameters
-    ----------
-    run : PennCosyvioRun
-    open_sequence : callable
-        Gives the source of a sequence.
-    on_pair : callable
-        Called after each pair.
-    """
+    """Estimate every pair by every method; `on_pair` is called after each pair."""
     records = []
     sequences = {name: open_sequence(name) for name in run.sequences}
     for pair in run.pairs():
         problem = sequences[pair.sequence].problem(pair)
-        box = Box(EXPERIMENT, pair.sequence, str(pair.stretch))
-        records += [Record(box, name, pair.first, *run_method(name, problem, pair.first))
-                    for name in run.methods]
+        records += [Record(EXPERIMENT, pair.sequence, str(pair.stretch), name, pair.first,
+                           *run_method(name, problem, pair.first)) for name in run.methods]
         on_pair()
     return records
 

@@ -54,14 +54,9 @@ _MILLIMETRE = 1e-3
 class Poses:
     """Poses of a sensor in the world.
 
-    Attributes
-    ----------
-    stamps_ns : (K,) ndarray of int64
-        Increasing.
-    positions : (K, 3) ndarray
-        [m].
-    rotations : Rotation
-        K of them, from the sensor's axes to the world's, z up.
+    `stamps_ns` (K,): increasing.
+    `positions` (K, 3): [m].
+    `rotations` (K,): from the sensor's axes to the world's, z up.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -147,11 +142,7 @@ def read_imu(folder: Path, name: str, sequence: str) -> tuple[ImuSample, ...]:
 class Frames:
     """Extracted frames of a camera.
 
-    Attributes
-    ----------
-    folder : Path
-    stamps_ns : (K,) ndarray of int64
-        Of frames 1 to K.
+    `stamps_ns` (K,): of frames 1 to K.
     """
 
     folder: Path

@@ -9,7 +9,8 @@ from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
 
 from rs_relpose_lab.experiments.methods import PairProblem
 from rs_relpose_lab.experiments.pair_imu import PairImu
@@ -22,19 +23,18 @@ from rs_relpose_lab.experiments.penncosyvio import (
     STRETCHES,
     with_gyro,
 )
-from rs_relpose_lab.experiments.penncosyvio_files import read_camera
-from rs_relpose_lab.experiments.recorded_motion import RecordedMotion
+from rs_relpose_lab.experiments.penncosyvio_files import Poses, read_camera
 from rs_relpose_lab.simulation.config import SimulationConfig
 from rs_relpose_lab.simulation.hand_held import EYE_HEIGHT
 from rs_relpose_lab.simulation.inertial import ImuModel
 from rs_relpose_lab.simulation.render import Renderer, view_of
 from rs_relpose_lab.simulation.rows import in_front, measured, Motion, seen_by_both
 from rs_relpose_lab.simulation.scene import make_scene, Scene, SCENES
-from rs_relpose_lab.simulation.trajectory import Trajectory
+from rs_relpose_lab.simulation.trajectory import CameraStates, Trajectory
 from rs_relpose_ros.config.estimator import EstimatorConfig
 from rs_relpose_ros.config.imu import ImuConfig
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry.timing import ImageClock, to_nanoseconds
+from rs_relpose_ros.geometry.timing import ImageClock, NANOSECONDS, to_nanoseconds
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.tracking.matches import Matches
 
@@ -48,16 +48,8 @@ _IMU, _POINTS, _NOISE, _SCENE, _IMAGE = range(5)
 class Simulated:
     """What is put in place of the recorded images.
 
-    Attributes
-    ----------
-    rendered : bool
-        Images, of which SIFT features are matched, instead of points.
-    scene : str
-        Name of `simulation.scene.SCENES`, for images.
-    pixel_noise : float
-        Of points, 1 sigma of each coordinate [px].
-    outliers : float
-        Share of the points' matches that are random.
+    `rendered`: images of a `scene`, of which SIFT features are matched, instead of points.
+    `pixel_noise`, `outliers`: of points, 1 sigma [px]; share of their matches that are random.
     """
 
     rendered: bool = False
@@ -157,6 +149,46 @@ class SimulatedSequence:
 
     def _stream(self, *key: int) -> np.random.Generator:
         return np.random.default_rng((self._run.seed, list(STRETCHES).index(self._name), *key))
+
+
+class RecordedMotion:
+    """Cubic splines of position and orientation through all poses.
+
+    Instants are seconds since the first pose. It offers what the renderer and the IMU model ask of
+    `rs_relpose_lab.simulation.trajectory.Trajectory`.
+    """
+
+    def __init__(self, poses: Poses) -> None:
+        self._start_ns = int(poses.stamps_ns[0])
+        seconds = (poses.stamps_ns - self._start_ns) / NANOSECONDS
+        self.span = 0.0, float(seconds[-1])
+        self._position = CubicSpline(seconds, poses.positions)
+        self._rotation = RotationSpline(seconds, poses.rotations)
+
+    def seconds(self, instant_ns: int) -> float:
+        """Time on this motion of an instant of the poses' clock."""
+        return (instant_ns - self._start_ns) / NANOSECONDS
+
+    def at(self, times: ArrayLike) -> tuple[Rotation, Array]:
+        """Orientations in the world and positions (N, 3) [m] at times (N,) [s]."""
+        times = np.asarray(times, dtype=np.float64)
+        if len(times) and not (self.span[0] <= times.min() and times.max() <= self.span[1]):
+            raise InputError(f'the poses last {self.span[1]:.3f} s, asked for '
+                             f'{times.min():.3f} to {times.max():.3f} s')
+        return self._rotation(times), self._position(times)
+
+    def poses(self, times: ArrayLike) -> tuple[Array, Array]:
+        """Positions (N, 3) [m] and orientations (N, 3, 3) at times (N,) [s]."""
+        rotations, positions = self.at(times)
+        return positions, rotations.as_matrix()
+
+    def states(self, times: ArrayLike) -> CameraStates:
+        """Poses and derivatives at times (N,) [s]."""
+        positions, rotations = self.poses(times)
+        return CameraStates(
+            position=positions, R_world_cam=rotations, velocity=self._position(times, 1),
+            acceleration=self._position(times, 2), angular_velocity=self._rotation(times, 1),
+            angular_acceleration=self._rotation(times, 2))
 
 
 class PlacedMotion:

@@ -45,24 +45,13 @@ _DEPTHS = 6.0, 34.0  # [m]
 class Cell:
     """One setting of an experiment; the defaults are the base cell of the benchmark.
 
-    Parameters
-    ----------
-    direction : {'forward', 'sideways'}
-    speed, rate : float
-        Linear [m/s] and angular [rad/s] velocity per axis, opposite in the two frames.
-    pixel_noise : float
-        1 sigma per coordinate [px].
-    gravity_noise : float
-        Per axis of one frame's direction [deg].
-    gyro_noise : float
-        1 sigma per axis [deg/s].
-    outliers : float
-        Share of matches whose second point is anywhere in the image.
-    constant_velocity : bool
-        Both frames move along the baseline at ``sqrt(3) speed``.
-    matches : int
-    placing : {'box', 'image'}
-        Points are drawn evenly in a box of the world, or over the image and depths of camera 1.
+    `direction` of `BASELINES`; `speed` [m/s], `rate` [rad/s]: per axis, opposite in the frames.
+    `pixel_noise` [px], `gyro_noise` [deg/s]: 1 sigma per axis; `gravity_noise` [deg]: per axis of
+        one frame's direction.
+    `outliers`: share of matches whose second point is anywhere in the image.
+    `constant_velocity`: both frames move along the baseline at ``sqrt(3) speed``.
+    `placing` {'box', 'image'}: points are drawn evenly in a box of the world, or over the image
+        and depths of camera 1.
     """
 
     direction: str = 'forward'
@@ -103,23 +92,9 @@ CELLS = {f'{direction}-{name}': Cell(direction=direction, **changes)  # type: ig
 class TwoViewProblem:
     """Matches, what the IMU measures, and the truth; pose and motion refer to row 0.
 
-    Attributes
-    ----------
-    points1, points2 : (N, 2) ndarray
-        Matches [px].
-    measured_rate1, measured_rate2 : (3,) ndarray
-        Gyro [rad/s], each in its own camera's frame.
-    measured_gravity1, measured_gravity2 : (3,) ndarray
-        Unit, down, each in its own camera's frame.
-    R, t : (3, 3) and (3,) ndarray
-        Truth: ``X1 = R X2 + t``, ``|t| = 1``.
-    v1, v2 : (3,) ndarray
-        True linear velocities, each in its own camera's frame [baselines per second].
-    w1, w2 : (3,) ndarray
-        True angular velocities, each in its own camera's frame [rad/s].
-    gravity1 : (3,) ndarray
-        True direction of gravity in camera 1.
-    is_outlier : (N,) ndarray of bool
+    `measured_rate*` [rad/s], `measured_gravity*` (unit, down): each in its own camera's frame.
+    `R`, `t`: truth: ``X1 = R X2 + t``, ``|t| = 1``; `gravity1`: true direction in camera 1.
+    `v1`, `v2` [baselines per second], `w1`, `w2` [rad/s]: true velocities in the cameras' frames.
     """
 
     points1: Array
@@ -142,16 +117,12 @@ def make_problem(cell: Cell, seed: int | Sequence[int], noise: Noise = 'paper',
                  ) -> TwoViewProblem:
     """Draw one problem of a cell.
 
-    Parameters
-    ----------
-    cell : Cell
-    seed : int or sequence of int
-        Equal seeds give the same cameras in all cells, and the same points in cells that differ
-        in noise only.
-    noise : {'paper', 'gaussian'}
-        Error of gravity. 'paper': of exactly `gravity_noise` about each axis, with random signs,
-        opposite in the two frames. 'gaussian': of that standard deviation about each axis,
-        independent in each frame, as a covariance can describe it. The gyro's is Gaussian in both.
+    `seed`: equal seeds give the same cameras in all cells, and the same points in cells that
+        differ in noise only.
+    `noise` {'paper', 'gaussian'}: error of gravity. 'paper': of exactly `gravity_noise` about each
+        axis, with random signs, opposite in the two frames. 'gaussian': of that standard deviation
+        about each axis, independent in each frame, as a covariance can describe it. The gyro's is
+        Gaussian in both.
     """
     rng = np.random.default_rng(seed)
     baseline = np.array(BASELINES[cell.direction]) + 0.2 * rng.normal(size=3)

@@ -20,12 +20,8 @@ POSE_FREEDOM = 5
 class PoseError:
     """Of one estimate.
 
-    Attributes
-    ----------
-    rotation, translation : float
-        Angles [deg]; infinite where there is no pose.
-    nees : float
-        Normalised estimation error squared over rotation (3) and direction of translation (2);
+    `rotation`, `translation`: angles [deg]; infinite where there is no pose.
+    `nees`: normalised estimation error squared over rotation (3) and direction of translation (2);
         NaN where there is no covariance.
     """
 
@@ -41,15 +37,10 @@ def pose_error(R: Array, t: Array, true_R: Array, true_t: Array, covariance: Arr
                ) -> PoseError:
     """Error of a pose ``X1 = R X2 + t``.
 
-    Parameters
-    ----------
-    R, true_R : (3, 3) ndarray
-    t : (3,) ndarray
-        Unit vector.
-    true_t : (3,) ndarray
-        Of any length but zero.
-    covariance : (6, 6) ndarray, optional
-        Of ``(dt, dtheta)`` with ``t_true = t + dt`` (dt perpendicular to t) and
+    `R`, `true_R` (3, 3).
+    `t` (3,): unit vector.
+    `true_t` (3,): of any length but zero.
+    `covariance` (6, 6): of ``(dt, dtheta)`` with ``t_true = t + dt`` (dt perpendicular to t) and
         ``R_true = Exp(dtheta) R``, both in camera 1.
     """
     true_t = true_t / np.linalg.norm(true_t)

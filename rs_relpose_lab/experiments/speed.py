@@ -7,7 +7,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 import gc
 from multiprocessing import get_context
-from pathlib import Path
+import os
 import time
 
 import cv2
@@ -15,6 +15,7 @@ import numpy as np
 
 from rs_relpose_lab.experiments.methods import as_pair, Estimate, METHODS, prepared
 from rs_relpose_lab.experiments.problems import Cell, CELLS, make_problem
+from rs_relpose_lab.live.processes import process_figures
 from rs_relpose_ros import warm_up
 
 THRESHOLD = 1.5  # [px], of OpenCV and PoseLib
@@ -32,14 +33,8 @@ COMPARED = {LIBRARY: METHODS['auto']} | {
 class Timing:
     """One method on one problem.
 
-    Attributes
-    ----------
-    cell, method : str
-    matches, seed : int
-    duration : float
-        The shortest of the repeats [ms].
-    rotation, translation : float
-        Errors [deg]; infinite without a pose.
+    `duration`: the shortest of the repeats [ms].
+    `rotation`, `translation`: errors [deg]; infinite without a pose.
     """
 
     cell: str
@@ -55,11 +50,7 @@ class Timing:
 class Soak:
     """Resident memory [MB] while estimates of twenty problems go on.
 
-    Attributes
-    ----------
-    estimates : int
-        Between the two.
-    before, after : float
+    `estimates`: between the two.
     """
 
     estimates: int
@@ -141,17 +132,9 @@ def soak(estimates: int, on_estimate: Callable[[], object] = lambda: None) -> So
             on_estimate()
 
     work(estimates // 10)
-    before = _resident()
+    before = process_figures(os.getpid())
     work(estimates)
-    return Soak(estimates, before, _resident())
-
-
-def _resident() -> float:
-    """Resident memory of this process [MB], as Linux tells."""
-    for line in Path('/proc/self/status').read_text().splitlines():
-        if line.startswith('VmRSS:'):
-            return float(line.split()[1]) / 1024.0
-    raise OSError('/proc/self/status has no VmRSS')
+    return Soak(estimates, before.resident, process_figures(os.getpid()).resident)
 
 
 def medians(timings: Sequence[Timing], method: str) -> dict[int, float]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 import math
+from operator import attrgetter
 from pathlib import Path
 import platform
 
@@ -23,7 +24,7 @@ from rs_relpose_lab.experiments.speed import (
     THRESHOLD,
     Timing,
 )
-from rs_relpose_lab.experiments.tables import markdown_table, write_csv
+from rs_relpose_lab.experiments.tables import grouped, markdown_table, write_csv
 from rs_relpose_ros.picture_files import save_picture
 
 
@@ -48,9 +49,7 @@ class MethodStatistics:
 
 def method_statistics(timings: Sequence[Timing]) -> list[MethodStatistics]:
     """Statistics of each method in each cell and number of matches."""
-    groups: dict[tuple[str, int, str], list[Timing]] = {}
-    for timing in timings:
-        groups.setdefault((timing.cell, timing.matches, timing.method), []).append(timing)
+    groups = grouped(timings, attrgetter('cell', 'matches', 'method'))
     result = []
     for (cell, matches, method), group in groups.items():
         reference = {timing.seed: timing.duration
@@ -68,13 +67,7 @@ def method_statistics(timings: Sequence[Timing]) -> list[MethodStatistics]:
 
 def write_report(folder: Path, comparison: Sequence[Timing], scaling: Sequence[Timing],
                  first: Sequence[tuple[float, float]], soak: Soak | None) -> str:
-    """Write runs, tables, report and plot into a folder, which is made where it is missing.
-
-    Returns
-    -------
-    str
-        The report (Markdown).
-    """
+    """Write runs, tables, plot and report into a folder; the report."""
     folder.mkdir(parents=True, exist_ok=True)
     compared, scaled = method_statistics(comparison), method_statistics(scaling)
     write_csv(folder / 'runs.csv', [*comparison, *scaling])

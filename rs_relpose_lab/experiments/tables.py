@@ -1,12 +1,22 @@
-"""Tables in Markdown and CSV."""
+"""Tables in Markdown and CSV, and the groups of records that become their lines."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import csv
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+_Record = TypeVar('_Record')
+
+
+def grouped(records: Iterable[_Record], key: Callable[[_Record], Any]) -> dict[Any, list[_Record]]:
+    """Records by their key, in the order in which the keys first occur."""
+    groups: dict[Any, list[_Record]] = {}
+    for record in records:
+        groups.setdefault(key(record), []).append(record)
+    return groups
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

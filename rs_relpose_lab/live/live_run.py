@@ -7,6 +7,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from rs_relpose_lab.live.graph import Graph, private_domain
 from rs_relpose_lab.live.processes import (
@@ -14,49 +17,34 @@ from rs_relpose_lab.live.processes import (
     node_process,
     PATIENCE,
     player_process,
+    Process,
     wait_until,
     wait_until_quiet,
 )
-from rs_relpose_lab.live.recorder import Recorder
 from rs_relpose_ros.bags.reader import open_bag
-
-# The node is done when it has taken no frame for so long [s].
-_QUIET = 1.0
+from rs_relpose_ros.estimator.result import Status
+from rs_relpose_ros.messages.incoming import stamp_ns, time_ns
+from rs_relpose_ros.messages.outgoing import PAIR_TOPICS
+from rs_relpose_ros.node.message_types import message_class
+from rs_relpose_ros.replay.tables import (
+    number,
+    RELATIVE_POSE_COLUMNS,
+    rotation_sigmas,
+    TableWriter,
+    translation_sigmas,
+)
 
 
 @dataclass(frozen=True, slots=True)
 class LiveRun:
-    """Files of a live run.
-
-    Attributes
-    ----------
-    table : Path
-        The relative poses that the node published.
-    stamps : Path
-        Stamps of the frames that it processed, for `rs_relpose replay --stamps`.
-    """
+    """Files of a live run: poses that the node published, stamps of the frames it processed."""
 
     table: Path
     stamps: Path
 
 
 def run_live(bag: Path, parameters: Path, folder: Path) -> LiveRun:
-    """Play `bag` to a relpose_node of its own.
-
-    Parameters
-    ----------
-    bag : Path
-    parameters : Path
-        Parameter file of the node.
-    folder : Path
-        Directory for tables and logs; must exist.
-
-    Raises
-    ------
-    LiveRunError
-    InputError, MissingInputError
-        The bag cannot be read or lacks a topic.
-    """
+    """Play `bag` to a relpose_node of its own; tables and logs into `folder`, which exists."""
     with open_bag(bag) as opened:
         topics, duration = opened.find_topics(), opened.duration
     run = LiveRun(folder / 'live.csv', folder / 'live_stamps.txt')
@@ -71,8 +59,48 @@ def run_live(bag: Path, parameters: Path, folder: Path) -> LiveRun:
         with player_process(bag, log=folder / 'player.log') as player:
             wait_until(player.ended, 'the end of the player', node,
                        timeout=2.0 * PATIENCE + duration)
-        wait_until_quiet(lambda: run.stamps.stat().st_size, _QUIET, node)
+        # It is done when it has taken no frame for a second.
+        wait_until_quiet(lambda: run.stamps.stat().st_size, 1.0, node)
         node.stop()
         if not recorder.write(run.table):
             raise LiveRunError(f'the node published no pose:\n{node.output}')
     return run
+
+
+class Recorder:
+    """Collects the topics of the pairs that a node publishes.
+
+    `node`: must not end before it publishes.
+    """
+
+    def __init__(self, graph: Graph, node: Process) -> None:
+        self._received = {name: graph.listen(message_class(msgtype), f'/relpose_node/{name}')
+                          for name, msgtype in PAIR_TOPICS.items()}
+        for name in PAIR_TOPICS:
+            graph.wait_for_publisher(f'/relpose_node/{name}', node)
+
+    def write(self, path: Path) -> int:
+        """Write the pairs that came, and return their number.
+
+        The live topics carry neither pairs without a pose nor the number of matches and the model:
+        these cells stay empty.
+        """
+        poses, references, matches = (
+            {stamp_ns(msg.header): msg for msg in self._received[name]}
+            for name in ('relative_pose', 'reference', 'matches'))
+        with TableWriter(path, RELATIVE_POSE_COLUMNS) as table:
+            for stamp, pose in sorted(poses.items()):
+                reference = references.get(stamp)
+                cloud = matches.get(stamp)
+                table.write([
+                    '' if reference is None else str(time_ns(reference.time_ref)), str(stamp),
+                    *map(number, _pose_figures(pose)), '' if cloud is None else str(cloud.width),
+                    '', '', Status.OK.value])
+        return len(poses)
+
+
+def _pose_figures(msg: Any) -> list[float]:
+    t, q = msg.pose.pose.position, msg.pose.pose.orientation
+    covariance = np.array(msg.pose.covariance).reshape(6, 6)
+    return [t.x, t.y, t.z, q.x, q.y, q.z, q.w, *translation_sigmas(covariance),
+            *rotation_sigmas(covariance)]

@@ -30,14 +30,10 @@ def in_turns(messages: Sequence[Outgoing], period_ns: int,
              duration_ns: int) -> Iterator[Outgoing]:
     """Messages of one period again and again, each turn's stamps and dues a period later.
 
-    Parameters
-    ----------
-    messages : sequence of Outgoing
-        In the order of `due_ns`; all begin with a header, and their stamps span one period.
-    period_ns : int
-    duration_ns : int
-        Messages due later are left out. Images end 50 ms earlier, so that the IMU samples which
-        cover their last rows are still published.
+    `messages`: in the order of `due_ns`; all begin with a header, and their stamps span one
+        period.
+    `duration_ns`: messages due later are left out. Images end 50 ms earlier, so that the IMU
+        samples which cover their last rows are still published.
     """
     stamps = [stamp_of(message.data) for message in messages]
     if messages and max(stamps) - min(stamps) >= period_ns:

@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import TimeReference
 
 from rs_relpose_lab.live.graph import diagnostic_values, Graph, private_domain
-from rs_relpose_lab.live.process_figures import process_figures, ProcessFigures
 from rs_relpose_lab.live.processes import (
     LiveRunError,
     node_process,
     player_process,
     Process,
+    process_figures,
+    ProcessFigures,
     wait_until,
     wait_until_quiet,
 )
@@ -38,19 +39,9 @@ _QUIET = 2.5
 class Play:
     """What is played to the node, and how.
 
-    Attributes
-    ----------
-    bag : Path
-    parameters : Path
-        Parameter file of the node.
-    remap : dict
-        The node's topics `image`, `camera_info` and `imu` by their names in the bag.
-    transport : {'raw', 'compressed'}
-        What the node subscribes to.
-    player : tuple of str
-        Options of the player.
-    profile : Path or None
-        Fast DDS profile of all processes.
+    `parameters`: file of the node; `transport`: its `image_transport`.
+    `remap`: the node's topics `image`, `camera_info` and `imu` by their names in the bag.
+    `player`: options of the player; `profile`: of Fast DDS, for all processes.
     """
 
     bag: Path
@@ -76,23 +67,15 @@ class ReceivedPose:
 class MeasuredRun:
     """What was seen.
 
-    Attributes
-    ----------
-    poses : list of ReceivedPose
-    diagnostics : list of (int, dict)
-        Time on the monotonic clock, and the figures of a report.
-    figures, player_figures : list of ProcessFigures
-        Of node and player, once a second while messages are played.
-    started_ns, ready_ns : int
-        When the node was started, and when it subscribed.
-    timings : Path
-        Table of the node's parameter `timings_file`.
-    log : Path
-        The player's log.
+    `counters`: last figures of the node's diagnostics.
+    `figures`, `player_figures`: of node and player, once a second while messages are played.
+    `started_ns`, `ready_ns`: when the node was started, and when it subscribed.
+    `timings`: table of the node's parameter `timings_file`.
+    `log`: the player's log.
     """
 
     poses: list[ReceivedPose]
-    diagnostics: list[tuple[int, dict[str, str]]]
+    counters: dict[str, str]
     figures: list[ProcessFigures]
     player_figures: list[ProcessFigures]
     started_ns: int
@@ -107,45 +90,30 @@ class _Listener:
     def __init__(self, graph: Graph) -> None:
         self.poses: dict[int, tuple[int, PoseWithCovarianceStamped]] = {}
         self.references = graph.listen(TimeReference, '/relpose_node/reference')
-        self.diagnostics: list[tuple[int, dict[str, str]]] = []
         graph.subscribe(PoseWithCovarianceStamped, '/relpose_node/relative_pose', self._on_pose)
-        graph.subscribe(DiagnosticArray, '/diagnostics', self._on_diagnostics)
+        self.diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
 
     def _on_pose(self, msg: Any) -> None:
         self.poses[stamp_ns(msg.header)] = time.monotonic_ns(), msg
 
-    def _on_diagnostics(self, msg: Any) -> None:
-        self.diagnostics.append((time.monotonic_ns(), diagnostic_values(msg)))
-
     def received(self) -> list[ReceivedPose]:
         """Poses whose reference came as well, in the order of their stamps."""
         references = {stamp_ns(msg.header): time_ns(msg.time_ref) for msg in self.references}
-        return [_received(references[stamp], stamp, *self.poses[stamp])
-                for stamp in sorted(self.poses.keys() & references.keys())]
-
-
-def _received(reference: int, stamp: int, received_ns: int, msg: Any) -> ReceivedPose:
-    t, q = msg.pose.pose.position, msg.pose.pose.orientation
-    return ReceivedPose(reference, stamp, received_ns, np.array([t.x, t.y, t.z]),
-                        np.array([q.x, q.y, q.z, q.w]))
+        received = []
+        for stamp in sorted(self.poses.keys() & references.keys()):
+            received_ns, msg = self.poses[stamp]
+            t, q = msg.pose.pose.position, msg.pose.pose.orientation
+            received.append(ReceivedPose(references[stamp], stamp, received_ns,
+                                         np.array([t.x, t.y, t.z]),
+                                         np.array([q.x, q.y, q.z, q.w])))
+        return received
 
 
 def measure(play: Play, folder: Path,
             on_second: Callable[[], object] = lambda: None) -> MeasuredRun:
-    """Play a bag to a node of its own and watch.
+    """Play a bag to a node of its own and watch; logs and tables into `folder`, which exists.
 
-    Parameters
-    ----------
-    play : Play
-    folder : Path
-        Directory of logs and tables; must exist.
-    on_second : callable
-        Called once a second while messages are played.
-
-    Raises
-    ------
-    LiveRunError
-        A process failed.
+    `on_second`: called once a second while messages are played.
     """
     timings, log = folder / 'frames.csv', folder / 'player.npy'
     log.unlink(missing_ok=True)
@@ -168,8 +136,8 @@ def measure(play: Play, folder: Path,
                     figures = _watch(node, player, listener, on_second)
                 wait_until_quiet(lambda: len(listener.poses), _QUIET, node)
                 node.stop()
-        return MeasuredRun(listener.received(), listener.diagnostics, *figures, started_ns,
-                           ready_ns, timings, log)
+        return MeasuredRun(listener.received(), diagnostic_values(listener.diagnostics[-1]),
+                           *figures, started_ns, ready_ns, timings, log)
 
 
 def _watch(node: Process, player: Process, listener: _Listener,

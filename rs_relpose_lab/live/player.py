@@ -67,10 +67,7 @@ class PlayerOptions:
 def play(node: Node, options: PlayerOptions) -> int:
     """Publish the bag; the number of messages published.
 
-    Raises
-    ------
-    InputError, MissingInputError
-        No bag, no such topic, or no subscriber in time.
+    Raises InputError, MissingInputError: no bag, no such topic, or no subscriber in time.
     """
     with open_bag(options.bag) as bag:
         topics = _chosen(bag, options)

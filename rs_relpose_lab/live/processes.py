@@ -1,8 +1,9 @@
-"""Processes of a live run, the node and a player: start, log, wait, signals, end."""
+"""Processes of a live run, the node and a player: start, log, wait, signals, end, cost."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 import os
 from pathlib import Path
 import signal
@@ -30,12 +31,8 @@ class LiveRunError(RsRelposeError):
 class Process:
     """A Python process with a log. Leaving the ``with`` block kills it if it still runs.
 
-    Parameters
-    ----------
-    *arguments : str
-        Of the interpreter: a file, or ``-m`` and a module, and what that is given.
-    log : Path, optional
-        File of standard output and error; a temporary one by default.
+    `*arguments`: of the interpreter: a file, or ``-m`` and a module, and what that is given.
+    `log`: file of standard output and error; a temporary one by default.
     """
 
     def __init__(self, *arguments: str, log: Path | None = None) -> None:
@@ -132,26 +129,9 @@ def player_process(bag: Path, *options: str, log: Path | None = None) -> Process
 
 def wait_until(condition: Callable[[], Value], what: str, *processes: Process,
                timeout: float = PATIENCE) -> Value:
-    """Wait for a condition while processes run.
+    """Ask until the answer is true, and return it; LiveRunError where a process fails meanwhile.
 
-    Parameters
-    ----------
-    condition : callable
-        Asked until its answer is true.
-    what : str
-        For the error message.
-    *processes : Process
-        Must not fail meanwhile.
-    timeout : float
-        Longest wait [s].
-
-    Returns
-    -------
-    The true answer.
-
-    Raises
-    ------
-    LiveRunError
+    `what`: for the error message.
     """
     deadline = time.monotonic() + timeout
     while not (value := condition()):
@@ -171,3 +151,39 @@ def wait_until_quiet(count: Callable[[], int], seconds: float, process: Process)
         if count() != known:
             known, since = count(), time.monotonic()
         time.sleep(0.05)
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessFigures:
+    """Processor time and memory of a process at an instant, as Linux tells them.
+
+    `time_ns`: on the monotonic clock.
+    `cpu`, `cpu_main`: processor time since its start [s]: of all threads, and of the first one.
+    `resident`, `private`: memory [MB]: all that is resident, and without what is shared with
+        others (the transport's segments).
+    """
+
+    time_ns: int
+    cpu: float
+    cpu_main: float
+    resident: float
+    private: float
+
+
+def process_figures(pid: int) -> ProcessFigures:
+    """Figures of a running process."""
+    folder = Path('/proc') / str(pid)
+    memory = dict(line.split(':', 1) for line in (folder / 'status').read_text().splitlines())
+
+    def megabytes(name: str) -> float:
+        return int(memory[name].split()[0]) / 1024.0
+
+    return ProcessFigures(time.monotonic_ns(), _cpu(folder / 'stat'),
+                          _cpu(folder / 'task' / str(pid) / 'stat'), megabytes('VmRSS'),
+                          megabytes('RssAnon'))
+
+
+def _cpu(path: Path) -> float:
+    # The name, in parentheses, may hold anything.
+    fields = path.read_text().rpartition(')')[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')

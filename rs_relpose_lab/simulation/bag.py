@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-import yaml
 
 from rs_relpose_lab.simulation.config import SimulationConfig
 from rs_relpose_lab.simulation.simulation import simulate, Simulation
@@ -30,6 +29,8 @@ from rs_relpose_ros.bags.layout import (
     WORLD_FRAME,
 )
 from rs_relpose_ros.bags.writer import BagWriter
+from rs_relpose_ros.config import parameter_file
+from rs_relpose_ros.config.parameter_file import SourcedValue
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.timing import to_nanoseconds
 
@@ -41,22 +42,8 @@ def write_bag(simulation: Simulation, path: Path | str, *, jpeg_quality: int = 8
               raw: bool = False, on_frame: Callable[[], object] = lambda: None) -> None:
     """Render `simulation` into a bag, in the order in which drivers would deliver.
 
-    Parameters
-    ----------
-    simulation : Simulation
-    path : path-like
-        Directory to create.
-    jpeg_quality : int
-        1 to 100.
-    raw : bool
-        sensor_msgs/Image instead of JPEG.
-    on_frame : callable
-        Called after each image.
-
-    Raises
-    ------
-    InputError
-        The path exists already or cannot be created.
+    `path`: directory to create; `jpeg_quality`: 1 to 100; `raw`: sensor_msgs/Image instead.
+    `on_frame`: called after each image.
     """
     if not 1 <= jpeg_quality <= 100:
         raise InputError(f'jpeg_quality must lie in [1, 100], got {jpeg_quality}')
@@ -101,33 +88,22 @@ def made_once(folder: Path, name: str,
     return bag, parameters
 
 
-def node_parameters(simulation: Simulation, *, raw: bool = False) -> dict[str, Any]:
-    """Parameters of the node that the recording needs, by name."""
+def write_parameters(simulation: Simulation, path: Path, *, raw: bool = False) -> None:
+    """Write the parameters of the node that the recording needs; `raw` as in `write_bag`."""
     config = simulation.config
-    return {
+    values = {
         'image_transport': 'raw' if raw else 'compressed',
         'readout_time': config.readout_time,
         'readout_direction': config.readout_direction,
         'stamp_row': config.stamp_row,
         'stamp_exposure': 'middle',
         'time_offset': config.time_offset,
-        'quat_cam_imu_xyzw': list(config.quat_cam_imu_xyzw),
-        'gyro_bias': [round(float(value), 6) for value in simulation.calibrated_gyro_bias],
+        'quat_cam_imu_xyzw': config.quat_cam_imu_xyzw,
+        'gyro_bias': tuple(round(float(value), 6) for value in simulation.calibrated_gyro_bias),
     }
-
-
-def write_parameters(simulation: Simulation, path: Path | str, *, raw: bool = False) -> None:
-    """Write `node_parameters` as a ROS parameter file."""
-    path = Path(path)
-    if path.exists():
-        raise InputError(f'{path} exists already: remove it or choose another path')
-    document = {'/**': {'ros__parameters': node_parameters(simulation, raw=raw)}}
-    try:
-        path.write_text(
-            '# Parameters of relpose_node for the simulated bag of the same name.\n'
-            + yaml.safe_dump(document, sort_keys=False, default_flow_style=None))
-    except OSError as error:
-        raise InputError(f'cannot write {path}: {error.strerror}') from error
+    parameter_file.write_parameters(
+        path, 'Parameters of relpose_node for the simulated bag of the same name.',
+        [SourcedValue(name, value, '') for name, value in values.items()])
 
 
 def jpeg(pixels: NDArray[np.uint8], quality: int) -> bytes:
@@ -143,12 +119,11 @@ def image_entries(simulation: Simulation, bag: BagWriter,
                   on_frame: Callable[[], object]) -> Iterator[Entry]:
     """Images and their CameraInfo; `encode`: topic, type and message of a stamp and pixels."""
     delay_ns = to_nanoseconds(simulation.config.readout_time + IMAGE_DELAY)
-    for frame in simulation.frames():
-        stamp_ns = frame.stamp_ns
-        topic, msgtype, message = encode(stamp_ns, frame.image)
+    for index in range(simulation.config.frame_count):
+        stamp_ns = simulation.stamp_ns(index)
+        topic, msgtype, message = encode(stamp_ns, simulation.image(index))
         info = bag.camera_info(stamp_ns, CAMERA_FRAME, simulation.camera)
-        yield (stamp_ns + delay_ns, CAMERA_INFO_TOPIC, 'sensor_msgs/msg/CameraInfo',
-               info)
+        yield stamp_ns + delay_ns, CAMERA_INFO_TOPIC, 'sensor_msgs/msg/CameraInfo', info
         yield stamp_ns + delay_ns, topic, msgtype, message
         on_frame()
 

@@ -87,17 +87,11 @@ def hand_held(rng: np.random.Generator, start: float, end: float, plan: Plan, *,
               rotation_rate: float) -> Trajectory:
     """Trajectory of `plan` from time 0, defined at least from `start` to `end` [s].
 
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Draws directions, phases and tremor.
-    start, end : float
-        What lies before time 0 continues the plan's first part, what lies after its end the
-        last one.
-    speed : float
-        Walking speed [m/s].
-    rotation_rate : float
-        Root mean square of the angular velocity while walking [rad/s].
+    `rng`: draws directions, phases and tremor.
+    `start`, `end`: what lies before time 0 continues the plan's first part, what lies after its
+        end the last one.
+    `speed`: walking speed [m/s].
+    `rotation_rate`: root mean square of the angular velocity while walking [rad/s].
     """
     margin = 6 * CONTROL_SPACING
     count = math.ceil((end - start + 2 * margin) / CONTROL_SPACING) + 1

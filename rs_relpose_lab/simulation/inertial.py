@@ -18,17 +18,11 @@ GRAVITY = np.array([0.0, 0.0, -9.80665])
 class ImuModel:
     """Mounting, biases and noise.
 
-    Parameters
-    ----------
-    R_cam_imu : (3, 3) ndarray
-        ``v_cam = R_cam_imu v_imu``.
-    lever_arm : (3,) array_like
-        Position of the IMU in the camera frame [m].
-    gyro_bias, accel_bias : (3,) array_like
-        Added to the truth, IMU frame [rad/s], [m/s^2].
-    gyro_sigma, accel_sigma : float
-        White noise of a sample, per axis [rad/s], [m/s^2]: the density times the square root of
-        the rate.
+    `R_cam_imu` (3, 3): ``v_cam = R_cam_imu v_imu``.
+    `lever_arm` (3,): position of the IMU in the camera frame [m].
+    `gyro_bias`, `accel_bias` (3,): added to the truth, IMU frame [rad/s], [m/s^2].
+    `gyro_sigma`, `accel_sigma`: white noise of a sample, per axis [rad/s], [m/s^2]: the density
+        times the square root of the rate.
     """
 
     R_cam_imu: Array

@@ -41,13 +41,7 @@ class Renderer:
     Pixel centres are at integer coordinates; row v is seen at the time of the reference row plus
     ``camera.row_times(v)``.
 
-    Parameters
-    ----------
-    scene : Scene
-    camera : RollingShutterCamera
-    trajectory : Trajectory
-    edge_samples : int
-        Pixels on the outline of a surface are the mean of this many samples squared.
+    `edge_samples`: pixels on the outline of a surface are the mean of this many samples squared.
     """
 
     scene: Scene
@@ -70,10 +64,7 @@ class Renderer:
     def render(self, reference_time: float) -> NDArray[np.float32]:
         """Noise-free image (H, W) of gray values 0 to 255.
 
-        Parameters
-        ----------
-        reference_time : float
-            Time of the reference row on the trajectory [s].
+        `reference_time`: time of the reference row on the trajectory [s].
         """
         rows = np.arange(self.camera.height)
         positions, rotations = self.trajectory.poses(reference_time + self.camera.row_times(rows))
@@ -82,9 +73,9 @@ class Renderer:
         shape = (self.camera.height, self.camera.width)
         image = np.empty(shape, dtype=np.float32)
         hits = np.empty(shape, dtype=np.int32)
-        _render(exposure, self.scene.arrays, image, hits)
+        _render(exposure, self.scene, image, hits)
         if self.edge_samples > 1:
-            _smooth_edges(exposure, self.scene.arrays, self.edge_samples, image, hits)
+            _smooth_edges(exposure, self.scene, self.edge_samples, image, hits)
         return image
 
     def locate(self, reference_time: float,
@@ -99,7 +90,7 @@ class Renderer:
         rays = np.einsum('nij,nj->ni', rotations, self.camera.unproject(points))
         distances = np.empty(len(points))
         hits = np.empty(len(points), dtype=np.int64)
-        _trace_all(positions, rays, self.scene.arrays, distances, hits)
+        _trace_all(positions, rays, self.scene, distances, hits)
         return positions + distances[:, None] * rays, hits
 
     def project(self, reference_time: float, world_points: ArrayLike) -> Array:

@@ -28,18 +28,11 @@ _LEAST_DEPTH = 0.1  # [m]
 class View:
     """What a camera sees while it stands still, and when it reads its rows.
 
-    Attributes
-    ----------
-    project : callable
-        Points (N, 3) in the camera frame to pixels (N, 2); NaN where the lens cannot see.
-    unproject : callable
-        Pixels (N, 2) to directions (N, 3) in the camera frame, of any length.
-    width, height : int
-        Size of the image [px].
-    line_delay : float
-        Time from one row to the row below [s].
-    reference_row : float
-        Row that is read at time 0.
+    `project`: points (N, 3) in the camera frame to pixels (N, 2); NaN where the lens cannot see.
+    `unproject`: pixels (N, 2) to directions (N, 3) in the camera frame, of any length.
+    `width`, `height`: size of the image [px].
+    `line_delay`: time from one row to the row below [s].
+    `reference_row`: row that is read at time 0.
     """
 
     project: Callable[[Array], Array]
@@ -67,19 +60,9 @@ def see(world: Array, motion: Motion, view: View, margin: float = 0.0) -> Array:
     A point is seen in row v if it is projected into row v from where the camera is when that row
     is read: a root of ``projected_row(v) - v``, found by secants.
 
-    Parameters
-    ----------
-    world : (N, 3) ndarray
-        Points [m].
-    motion : callable
-    view : View
-    margin : float
-        How far beyond the centres of the outermost pixels a point still counts as seen [px].
-
-    Returns
-    -------
-    (N, 2) ndarray
-        Pixels; NaN for a point outside of the image or nearer than 0.1 m, and for one that
+    `world` (N, 3): points [m].
+    `margin`: how far beyond the centres of the outermost pixels a point still counts as seen [px].
+    Returns pixels; NaN for a point outside of the image or nearer than 0.1 m, and for one that
         crosses the rows as fast as they are read, whose row is not unique.
     """
     def project(which: NDArray[np.intp], rows: Array) -> Array:

@@ -32,16 +32,12 @@ _ROOT = np.array([0.0, 0.0, 1.6])
 class Surface:
     """A textured rectangle, seen from the side of its normal ``across x down`` reversed.
 
-    Parameters
-    ----------
-    corner : (3,) ndarray
-        World position [m] of the texture's upper left corner, as its viewer sees it.
-    across, down : (3,) ndarray
-        Unit vectors along the texture's rows and columns, perpendicular to each other.
-    width, height : float
-        Size [m].
-    texture : (H, W) ndarray of uint8
-        Gray values; texel (i, j) is centred at ``((j + 0.5) width / W, (i + 0.5) height / H)``.
+    `corner` (3,): world position [m] of the texture's upper left corner, as its viewer sees it.
+    `across`, `down` (3,): unit vectors along the texture's rows and columns, perpendicular to each
+        other.
+    `width`, `height`: size [m].
+    `texture` (H, W): gray values; texel (i, j) is centred at ``((j + 0.5) width / W, (i + 0.5)
+        height / H)``.
     """
 
     corner: Array
@@ -51,19 +47,8 @@ class Surface:
     height: float
     texture: NDArray[np.uint8]
 
-    def __post_init__(self) -> None:
-        frame = np.stack([self.across, self.down])
-        if not np.allclose(frame @ frame.T, np.eye(2), atol=1e-9):
-            raise InputError('across and down of a surface must be perpendicular unit vectors, '
-                             f'got {self.across} and {self.down}')
 
-    @property
-    def normal(self) -> Array:
-        """Unit normal, towards the viewer."""
-        return np.cross(self.down, self.across)
-
-
-class SceneArrays(NamedTuple):
+class Scene(NamedTuple):
     """S surfaces packed for the renderer, textures with their L mip levels.
 
     `corners`, `across`, `down` (S, 3) and `sizes` (S, 2) [m] are those of `Surface`, `texels`
@@ -82,19 +67,9 @@ class SceneArrays(NamedTuple):
     shapes: NDArray[np.int64]
     levels: NDArray[np.int64]
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Scene:
-    """Surfaces, and the same packed for the renderer."""
-
-    surfaces: tuple[Surface, ...]
-    arrays: SceneArrays
-
     @classmethod
-    def of(cls, surfaces: tuple[Surface, ...]) -> Scene:
+    def of(cls, *surfaces: Surface) -> Scene:
         """Pack `surfaces`."""
-        if not surfaces:
-            raise InputError('a scene needs at least one surface')
         pyramids = [list(_pyramid(surface.texture)) for surface in surfaces]
         levels = np.array([len(pyramid) for pyramid in pyramids], dtype=np.int64)
         offsets = np.zeros((len(surfaces), levels.max()), dtype=np.int64)
@@ -107,30 +82,24 @@ class Scene:
         sizes = np.array([[s.width, s.height] for s in surfaces])
         corners, across, down = (np.array([getattr(s, name) for s in surfaces], dtype=np.float64)
                                  for name in ('corner', 'across', 'down'))
-        return cls(surfaces, SceneArrays(
-            corners, across, down, sizes, sizes / shapes[:, 0, ::-1],
-            np.concatenate([texture.ravel() for pyramid in pyramids for texture in pyramid]),
-            offsets, shapes, levels))
+        pixels = np.concatenate([texture.ravel() for pyramid in pyramids for texture in pyramid])
+        return cls(corners, across, down, sizes, sizes / shapes[:, 0, ::-1], pixels, offsets,
+                   shapes, levels)
 
 
 def make_scene(kind: str, rng: np.random.Generator, focal_length: float) -> Scene:
     """A scene around the origin, where the camera walks at eye height and looks along x.
 
-    Parameters
-    ----------
-    kind : {'hall', 'yard', 'gallery'}
-        Closed hall with crates and banners; yard with house fronts, crates and sky; narrow
-        gallery with pictures and pillars.
-    rng : numpy.random.Generator
-        Draws places, sizes and textures.
-    focal_length : float
-        Of the camera [px]: textures are as fine as it can see.
+    `kind`: closed 'hall' with crates and banners; 'yard' with house fronts, crates and sky; narrow
+        'gallery' with pictures and pillars.
+    `rng`: draws places, sizes and textures.
+    `focal_length`: of the camera [px]: textures are as fine as it can see.
     """
     if kind not in SCENES:
         raise InputError(f'scene must be one of {SCENES}, got {kind!r}')
     builder = _Builder(rng, focal_length)
     build = {'hall': _hall, 'yard': _yard, 'gallery': _gallery}[kind]
-    return Scene.of(tuple(surface for surface in build(builder, rng) if surface is not None))
+    return Scene.of(*(surface for surface in build(builder, rng) if surface is not None))
 
 
 def _hall(builder: _Builder, rng: np.random.Generator) -> Iterator[Surface | None]:

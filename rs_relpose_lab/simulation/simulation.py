@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 import math
 
@@ -30,41 +29,11 @@ _MOTION, _SCENE, _IMU, _BIAS, _IMAGE = range(5)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuSeries:
-    """IMU samples, IMU frame.
-
-    Attributes
-    ----------
-    stamps_ns : (N,) ndarray of int64
-        On the IMU clock.
-    angular_velocities : (N, 3) ndarray
-        [rad/s].
-    linear_accelerations : (N, 3) ndarray
-        Specific force [m/s^2].
-    """
+    """Samples of the IMU on its clock: rates [rad/s], specific forces [m/s^2] (N, 3), its axes."""
 
     stamps_ns: NDArray[np.int64]
     angular_velocities: Array
     linear_accelerations: Array
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SimulatedFrame:
-    """An image and its instants.
-
-    Attributes
-    ----------
-    index : int
-    stamp_ns : int
-        Header stamp, camera clock.
-    reference_ns : int
-        Instant of the stamped row on the IMU clock.
-    image : (H, W) ndarray of uint8
-    """
-
-    index: int
-    stamp_ns: int
-    reference_ns: int
-    image: NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,20 +55,13 @@ class Simulation:
         """Header stamp of frame `index`, camera clock [ns]."""
         return self.reference_ns(index) - to_nanoseconds(self.config.time_offset)
 
-    def frame(self, index: int) -> SimulatedFrame:
-        """Render frame `index`."""
-        reference_ns = self.reference_ns(index)
-        gray = self.renderer.render(self.seconds(reference_ns))
+    def image(self, index: int) -> NDArray[np.uint8]:
+        """Render frame `index`: gray values (H, W)."""
+        gray = self.renderer.render(self.seconds(self.reference_ns(index)))
         rng = _stream(self.config.seed, _IMAGE, index)
         gray = gray + np.float32(self.config.pixel_noise) * rng.standard_normal(
             gray.shape, dtype=np.float32)
-        image = np.clip(np.rint(gray), 0, 255).astype(np.uint8)
-        return SimulatedFrame(index, self.stamp_ns(index), reference_ns, image)
-
-    def frames(self) -> Iterator[SimulatedFrame]:
-        """Render every frame in turn."""
-        for index in range(self.config.frame_count):
-            yield self.frame(index)
+        return np.clip(np.rint(gray), 0, 255).astype(np.uint8)
 
     def seconds(self, instant_ns: int) -> float:
         """Time on the trajectory of an instant on the IMU clock [s]."""
@@ -129,12 +91,8 @@ def simulate(config: SimulationConfig | None = None, *, scene: Scene | None = No
              trajectory: Trajectory | None = None) -> Simulation:
     """Set up a recording; nothing is rendered yet.
 
-    Parameters
-    ----------
-    config : SimulationConfig, optional
-        Defaults where omitted.
-    scene, trajectory : optional
-        Instead of those that the configuration describes.
+    `config`: defaults where omitted.
+    `scene`, `trajectory`: instead of those that the configuration describes.
     """
     config = SimulationConfig() if config is None else config
     camera = config.camera

@@ -45,14 +45,8 @@ class Segment:
 class CameraStates:
     """Poses of the camera optical frame in the world at N instants, and their derivatives.
 
-    Attributes
-    ----------
-    position, velocity, acceleration : (N, 3) ndarray
-        World frame [m], [m/s], [m/s^2].
-    R_world_cam : (N, 3, 3) ndarray
-        Orientation.
-    angular_velocity, angular_acceleration : (N, 3) ndarray
-        Camera frame [rad/s], [rad/s^2].
+    `position`, `velocity`, `acceleration` (N, 3): world frame [m], [m/s], [m/s^2].
+    `angular_velocity`, `angular_acceleration` (N, 3): camera frame [rad/s], [rad/s^2].
     """
 
     position: Array
@@ -67,18 +61,9 @@ class CameraStates:
 class Trajectory:
     """Motion of the camera over an interval.
 
-    Parameters
-    ----------
-    positions : (K, 3) ndarray
-        Control points of the position [m], one every `spacing`.
-    angles : (K, 3) ndarray
-        Control points of yaw, pitch and roll [rad].
-    first_control : float
-        Time of the first control point [s].
-    spacing : float
-        Time between control points [s].
-    segments : tuple of Segment
-        Labels of the stretches; between them one kind passes into the next.
+    `positions` (K, 3) [m], `angles` (K, 3) of yaw, pitch and roll [rad]: control points, one every
+        `spacing` [s] from `first_control` [s] on.
+    `segments`: labels of the stretches; between them one kind passes into the next.
     """
 
     positions: Array

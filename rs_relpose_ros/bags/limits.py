@@ -37,12 +37,7 @@ _zstd: Any = vars(mcap)['zstd']
 
 
 def check_metadata(path: Path) -> None:
-    """Check the size of a metadata.yaml, and that it has no aliases.
-
-    Raises
-    ------
-    InputError
-    """
+    """Raise InputError unless the size of a metadata.yaml is sane and it has no aliases."""
     if path.stat().st_size > _MAX_METADATA_BYTES:
         raise InputError(f'{path} is no metadata of a bag: it has more than '
                          f'{_MAX_METADATA_BYTES} bytes')
@@ -63,12 +58,8 @@ def has_aliases(content: bytes | str) -> bool:
 def bound_decompression() -> None:
     """Let rosbags decompress to bounded sizes only, in all bags that this process reads.
 
-    rosbags has no setting for it, so the entries of its tables of decompressors are replaced.
-
-    Raises
-    ------
-    ImportError
-        This version of rosbags has no such entry: nothing would be bounded.
+    rosbags has no setting for it, so the entries of its tables of decompressors are replaced; a
+    version without such an entry raises ImportError, since nothing would be bounded.
     """
     def of_chunk(decompressor: Callable[[], Any]) -> Callable[..., bytes]:
         # MCAP tells the size of a chunk, ROS 1 does not.

@@ -18,10 +18,7 @@ _CHUNK_HEAD = struct.Struct('<QQQI')
 def check_mcap(path: Path) -> None:
     """Walk over the records of an MCAP file (https://mcap.dev/spec), contents unread.
 
-    Raises
-    ------
-    InputError
-        No MCAP file, truncated, or with a record that cannot be right.
+    Raises InputError: no MCAP file, truncated, or with a record that cannot be right.
     """
     size = path.stat().st_size
     with path.open('rb') as file:

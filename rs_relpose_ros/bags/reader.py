@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import contextmanager, ExitStack
 import functools
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, QosReliability
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.typesys import get_typestore, Stores
+from rosbags.typesys.store import Typestore
 
 from rs_relpose_ros.bags.limits import bound_decompression, check_metadata, MAX_MESSAGE_BYTES
 from rs_relpose_ros.bags.mcap_check import check_mcap
-from rs_relpose_ros.bags.topics import find_sensor_topics, SensorTopics, Topic, TopicOptions
+from rs_relpose_ros.bags.topics import SensorTopics, Topic, TopicFinder, TopicOptions
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 
@@ -25,8 +25,7 @@ _STORAGE_SUFFIXES = ('.mcap', '.db3')
 bound_decompression()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BagMessage:
+class BagMessage(NamedTuple):
     """A message with its topic and the time at which it was recorded [ns]."""
 
     topic: str
@@ -34,8 +33,7 @@ class BagMessage:
     message: Any
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RawMessage:
+class RawMessage(NamedTuple):
     """A message as CDR bytes, with its topic and the time at which it was recorded [ns]."""
 
     topic: str
@@ -44,37 +42,22 @@ class RawMessage:
     data: bytes
 
 
-class _Types:
+@functools.cache
+def _types(of_ros2: bool) -> Typestore:
     """Message types of one ROS, by their names alone.
 
     rosbags would parse the definitions in a bag, also of topics that nobody asks for, and make
     code of them: an expression in IDL takes any time and memory to parse, an array of empty
     messages to read.
     """
-
-    def __init__(self, store: Stores, name: str) -> None:
-        self.store = get_typestore(store)
-        self.name = name
-        self._hashes: dict[str, str] = {}
-
-    def hash(self, msgtype: str, of_ros2: bool) -> str:
-        """Hash of its fields as recorders write it; empty for a type that is not known."""
-        if msgtype not in self.store.fielddefs:
-            return ''
-        if msgtype not in self._hashes:
-            self._hashes[msgtype] = (self.store.hash_rihs01(msgtype) if of_ros2
-                                     else self.store.generate_msgdef(msgtype)[1])
-        return self._hashes[msgtype]
+    return get_typestore(Stores.ROS2_JAZZY if of_ros2 else Stores.ROS1_NOETIC)
 
 
 @functools.cache
-def _ros1_types() -> _Types:
-    return _Types(Stores.ROS1_NOETIC, 'ROS 1 Noetic')
-
-
-@functools.cache
-def _ros2_types() -> _Types:
-    return _Types(Stores.ROS2_JAZZY, 'ROS 2 Jazzy')
+def _type_hash(msgtype: str, of_ros2: bool) -> str:
+    """Hash of the fields of a known type as recorders write it."""
+    store = _types(of_ros2)
+    return store.hash_rihs01(msgtype) if of_ros2 else store.generate_msgdef(msgtype)[1]
 
 
 class Bag:
@@ -84,7 +67,7 @@ class Bag:
         self.path = path
         self._reader = reader
         self._is_ros2 = isinstance(reader, Reader2)
-        self._types = _ros2_types() if self._is_ros2 else _ros1_types()
+        self._types = _types(self._is_ros2)
         counts: dict[tuple[str, str], int] = {}
         # Typed, but metadata is YAML, in which anything may stand anywhere.
         connections: Any = reader.connections
@@ -113,35 +96,28 @@ class Bag:
         return 'reliable' if QosReliability.RELIABLE in offered else ''
 
     def find_topics(self, options: TopicOptions | None = None) -> SensorTopics:
-        """The sensors' topics; see `find_sensor_topics`."""
-        return find_sensor_topics(self.path, self.topics, options or TopicOptions())
+        """The sensors' topics; see `TopicFinder.find`."""
+        return TopicFinder(self.path, self.topics).find(options or TopicOptions())
 
     def messages(self, topics: Sequence[Topic]) -> Iterator[BagMessage]:
         """Messages of `topics` in the order of bag time; their arrays are read-only.
 
-        Raises
-        ------
-        InputError
-            The bag is damaged, or a message cannot be decoded.
+        A damaged bag or a message that cannot be decoded raises InputError.
         """
+        read = self._types.deserialize_cdr if self._is_ros2 else self._types.deserialize_ros1
         for connection, bag_time_ns, data in self._raw(topics):
             self._check_type(connection)
             with self._decoding(connection):
-                read = (self._types.store.deserialize_cdr if self._is_ros2
-                        else self._types.store.deserialize_ros1)
                 message = read(data, connection.msgtype)
             yield BagMessage(connection.topic, bag_time_ns, message)
 
     def raw_messages(self, topics: Sequence[Topic]) -> Iterator[RawMessage]:
         """Messages of `topics` in the order of bag time, in CDR as publishers take them.
 
-        Raises
-        ------
-        InputError
-            The bag is damaged, or a ROS 1 message has no counterpart in ROS 2.
+        A damaged bag or a ROS 1 message without a counterpart in ROS 2 raises InputError.
         """
         # Of ROS 2, not of the bag: headers of ROS 1 have a number more.
-        typestore = _ros2_types().store
+        typestore = _types(of_ros2=True)
         for connection, bag_time_ns, data in self._raw(topics):
             if not self._is_ros2:
                 if connection.msgtype not in typestore.fielddefs:
@@ -173,11 +149,12 @@ class Bag:
 
     def _check_type(self, connection: Connection) -> None:
         """A type of the same name may have had other fields where the bag was recorded."""
-        known = self._types.hash(connection.msgtype, self._is_ros2)
-        if known and connection.digest and connection.digest != known:
+        if (connection.msgtype in self._types.fielddefs and connection.digest
+                and connection.digest != _type_hash(connection.msgtype, self._is_ros2)):
+            name = 'ROS 2 Jazzy' if self._is_ros2 else 'ROS 1 Noetic'
             raise InputError(f'topic {connection.topic} of {self.path} is of another '
-                             f'{connection.msgtype} than that of {self._types.name}: its type '
-                             f'hash is {str(connection.digest)[:80]!r}')
+                             f'{connection.msgtype} than that of {name}: its type hash is '
+                             f'{str(connection.digest)[:80]!r}')
 
     @contextmanager
     def _decoding(self, connection: Connection) -> Iterator[None]:
@@ -191,43 +168,25 @@ class Bag:
 
 @contextmanager
 def open_bag(path: Path | str) -> Iterator[Bag]:
-    """Open a bag for reading.
+    """Open a rosbag2 directory, or a single ``.mcap``, ``.db3`` or ROS 1 ``.bag`` file.
 
-    Parameters
-    ----------
-    path : path-like
-        rosbag2 directory, or a single ``.mcap``, ``.db3`` or ROS 1 ``.bag`` file.
-
-    Yields
-    ------
-    Bag
-
-    Raises
-    ------
-    MissingInputError
-        There is nothing at `path`.
-    InputError
-        It is no bag, or it is truncated or damaged; one sentence says which.
+    MissingInputError where there is nothing at `path`; InputError where it is no bag, or truncated
+    or damaged: one sentence says which.
     """
     path = Path(path)
     _check_path(path)
-    reader = None
-    try:
-        reader = Reader1(path) if path.suffix == '.bag' and path.is_file() else Reader2(path)
-        reader.open()
-    except PermissionError as error:
-        raise InputError(f'{path} cannot be read: {error.strerror}') from error
-    # A damaged file makes the parsers fail in any way.
-    except Exception as error:
-        raise InputError(_why_not_opened(path, error)) from error
-    try:
+    with ExitStack() as stack:
         try:
+            reader = Reader1(path) if path.suffix == '.bag' and path.is_file() else Reader2(path)
+            reader.open()
+            stack.callback(reader.close)
             bag = Bag(path, reader)
-        except (TypeError, ValueError, OverflowError) as error:
+        except PermissionError as error:
+            raise InputError(f'{path} cannot be read: {error.strerror}') from error
+        # A damaged file makes the parsers fail in any way.
+        except Exception as error:
             raise InputError(_why_not_opened(path, error)) from error
         yield bag
-    finally:
-        reader.close()
 
 
 def _check_path(path: Path) -> None:

@@ -53,36 +53,21 @@ class SensorTopics:
     truth: Topic | None
 
 
-def find_sensor_topics(bag: Path, topics: Sequence[Topic], options: TopicOptions) -> SensorTopics:
-    """The sensors' topics: as chosen, or by type where only one can be meant.
-
-    Of several CameraInfo topics the one beside the image is taken, and of two Imu topics one with
-    'gyro' and one with 'accel' in its name make a pair (RealSense).
-
-    Parameters
-    ----------
-    bag : Path
-        Named in errors.
-    topics : sequence of Topic
-        All that the bag has.
-    options : TopicOptions
-
-    Raises
-    ------
-    MissingInputError
-        A topic is absent; says which there are.
-    InputError
-        Several could be meant, or the chosen one has another type or is rectified.
-    """
-    return _Finder(bag, topics).find(options)
-
-
 @dataclass(frozen=True, slots=True)
-class _Finder:
+class TopicFinder:
+    """Finds the sensors' topics among all `topics` that a `bag` has, which errors name."""
+
     bag: Path
     topics: Sequence[Topic]
 
     def find(self, options: TopicOptions) -> SensorTopics:
+        """The sensors' topics: as chosen, or by type where only one can be meant.
+
+        Of several CameraInfo topics the one beside the image is taken, and of two Imu topics one
+        with 'gyro' and one with 'accel' in its name make a pair (RealSense). MissingInputError
+        where one is absent; InputError where several could be meant, or the chosen one has another
+        type or is rectified.
+        """
         image = self._one(options.image, (IMAGE, COMPRESSED_IMAGE), 'image', '--image-topic')
         if 'image_rect' in image.name:
             raise InputError(f'{image.name} is a rectified image, in which a row no longer has '

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.calibrate.axis_maps import nearest_axis_map
-from rs_relpose_ros.calibrate.tracks import Pairs
 from rs_relpose_ros.geometry.so3 import aligning_rotation
 
 Array = NDArray[np.float64]
@@ -24,56 +23,26 @@ _ONE_AXIS = 0.05
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Start:
-    """A coarse calibration.
+    """A coarse calibration."""
 
-    Attributes
-    ----------
-    offset : float
-        Of the middle row [s]: ``t_imu = stamp + offset``.
-    R_cam_imu : (3, 3) ndarray
-    bias : (3,) ndarray
-        IMU frame [rad/s].
-    focal_factor : float
-    misfit : float
-        Share of the rotation's variance that the two do not have in common.
-    scale : float
-        What was seen over what the gyro measured; 1 where that is taken to be known.
-    explained : float
-        Share of what was seen that the gyro explains, whatever its scale: 0 to 1.
-    """
-
-    offset: float
-    R_cam_imu: Array
-    bias: Array
+    offset: float          # of the middle row [s]: t_imu = stamp + offset
+    R_cam_imu: Array       # (3, 3)
+    bias: Array            # (3,) IMU frame [rad/s]
     focal_factor: float
-    misfit: float
-    scale: float
-    explained: float
+    misfit: float          # share of the rotation's variance that the two do not have in common
+    scale: float           # seen over measured by the gyro; 1 where that is taken to be known
+    explained: float       # share of what was seen that the gyro explains at any scale, 0 to 1
 
 
-def seen_rates(pairs: Pairs, points1: Array, points2: Array, intervals: Array) -> Array:
+def seen_rates(begin: NDArray[np.int64], rays1: Array, rays2: Array, intervals: Array) -> Array:
     """Angular velocity (P, 3) [rad/s], camera frame, that turns the rays of each pair.
 
-    Translation is left out: a robust fit follows the far points, and what remains averages out.
-
-    Parameters
-    ----------
-    pairs : Pairs
-    points1, points2 : (N, 2) ndarray
-        Normalised.
-    intervals : (P,) ndarray
-        [s].
+    Of unit rays (N, 3), those of pair p from ``begin[p]`` on, and intervals (P,) [s]. Translation
+    is left out: a robust fit follows the far points, and what remains averages out.
     """
-    rays1, rays2 = _unit(points1), _unit(points2)
-    rates = np.empty((len(pairs), 3))
-    for p, (begin, end) in enumerate(itertools.pairwise(pairs.begin)):
-        rates[p] = _turn(rays1[begin:end], rays2[begin:end]) / intervals[p]
-    return rates
-
-
-def _unit(points: Array) -> Array:
-    rays = np.column_stack([points, np.ones(len(points))])
-    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    turns = [_turn(rays1[first:last], rays2[first:last])
+             for first, last in itertools.pairwise(begin)]
+    return np.array(turns).reshape(-1, 3) / intervals[:, None]
 
 
 def _turn(rays1: Array, rays2: Array) -> Array:
@@ -98,19 +67,10 @@ def find_starts(rates: Array, begins: Array, ends: Array, gyro_times: Array, gyr
                 scale_known: bool = True) -> list[Start]:
     """Offsets at which the gyro, turned, agrees best with what was seen; best first.
 
-    Parameters
-    ----------
-    rates : (P, 3) ndarray
-        Seen between `begins` and `ends` (P,) on the camera clock [s].
-    gyro_times, gyro_rates : (K,), (K, 3) ndarray
-    max_offset, step : float
-        Offsets searched [s].
-    focal_factors : (F,) ndarray
-        Factors of the assumed focal length that are tried.
-    count : int
-        At most so many starts, of different offsets.
-    scale_known : bool
-        Whether the gyro's scale is taken to be right; where not, neither is the unit of `bias`.
+    `rates` (P, 3) were seen between `begins` and `ends` (P,) [s] on the camera clock. Offsets to
+    +- `max_offset` [s] are searched in steps of `step`, with each of the `focal_factors` of the
+    assumed focal length; at most `count` starts of different offsets are returned. Where the
+    gyro's scale is not known to be right, neither is the unit of `bias`.
     """
     steps = np.diff(gyro_times)[:, None]
     turned = np.concatenate([

@@ -27,40 +27,20 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationInput:
-    """Tracks, gyro and camera of a bag.
-
-    Attributes
-    ----------
-    tracks : Tracks
-        Pixels of the full sensor.
-    gyro : GyroSeries
-    camera : RollingShutterCamera
-        Of the full sensor, its read-out time 0.
-    focal_known : bool
-        Whether the CameraInfo has intrinsics; else `camera` is a guess.
-    unused : dict
-        Number of messages that were not used, by the sentence that says why.
-    """
+    """Tracks (pixels of the full sensor), gyro and camera of a bag."""
 
     tracks: Tracks
     gyro: GyroSeries
-    camera: RollingShutterCamera
-    focal_known: bool
-    unused: dict[str, int]
+    camera: RollingShutterCamera    # of the full sensor, its read-out time 0
+    focal_known: bool               # the CameraInfo has intrinsics; else `camera` is a guess
+    unused: dict[str, int]          # messages that were not used, by the sentence that says why
 
 
 def read_recording(bag: Bag, topics: SensorTopics, tracking: TrackingConfig | None = None, *,
                    on_image: Callable[[], object] = lambda: None) -> CalibrationInput:
-    """Follow points through the images of a bag, and collect its gyro.
+    """Follow points through the images of an open bag, and collect its gyro.
 
-    Parameters
-    ----------
-    bag : Bag
-        Open.
-    topics : SensorTopics
-    tracking : TrackingConfig, optional
-    on_image : callable
-        Called after each image, for a progress bar.
+    `on_image` is called after each image, for a progress bar.
 
     Raises
     ------
@@ -117,16 +97,14 @@ class _Reader:
         self._size = image.shape[1], image.shape[0]
 
     def recording(self) -> CalibrationInput:
-        images, imu = self._topics.image.name, self._topics.imu.name
         if self._size is None:
-            raise InputError(f'no image of {images} can be used{self._why()}')
+            raise InputError(f'no image of {self._topics.image.name} can be used{self._why()}')
         if not self._gyro:
-            raise MissingInputError(f'no message of {imu} has a gyro{self._why()}: record the '
-                                    'angular velocity together with the images')
-        camera = self._camera(self._size)
-        intrinsics = self._intrinsics
-        tracks = (self._follower.tracks() if intrinsics is None
-                  else self._follower.tracks(intrinsics.to_sensor))
+            raise MissingInputError(f'no message of {self._topics.imu.name} has a gyro'
+                                    f'{self._why()}: record the angular velocity together with '
+                                    'the images')
+        camera, intrinsics = self._camera(self._size), self._intrinsics
+        tracks = self._follower.tracks(None if intrinsics is None else intrinsics.to_sensor)
         return CalibrationInput(tracks, GyroSeries.by_stamp(self._gyro), camera,
                                 intrinsics is not None, self._unused)
 

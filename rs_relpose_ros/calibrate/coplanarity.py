@@ -105,9 +105,19 @@ class _Sight(NamedTuple):
 
 
 class _Residual(NamedTuple):
-    """Residual of a match and its derivatives."""
+    """Residual ``r = e / s`` of a match, and what its derivatives are made of."""
 
-    r: float        # [px]
+    r: float         # [px]
+    s: float
+    c1: Vector       # c_1 = m_2 x b and c_2 = b x m_1: e = m_1 . c_1 = m_2 . c_2
+    c2: Vector
+    k1: Vector       # k_i = M_i P_i P_i^T M_i^T c_i, P_i the derivative by the pixel
+    k2: Vector
+
+
+class _Derivatives(NamedTuple):
+    """Derivatives of a residual."""
+
     by_m1: Vector   # by the rays m_1 and m_2
     by_m2: Vector
     by_1: Vector    # by a small rotation of all of frame 1, and of frame 2
@@ -170,23 +180,26 @@ def _less(a: Vector, factor: float, b: Vector, divisor: float) -> Vector:
 @inlined_kernel
 def _residual(M1: Array, M2: Array, m1: Vector, m2: Vector, b: Vector, by_pixel1: Array,
               by_pixel2: Array, stretch: float) -> _Residual:
-    """``r = e / s`` with ``dr = (de - (e / s^2) (k_1 . dc_1 + k_2 . dc_2)) / s``.
-
-    As ``e = m_1 . c_1 = m_2 . c_2`` and ``s^2 = |P_1^T M_1^T c_1|^2 + |P_2^T M_2^T c_2|^2``.
-    """
+    """``r = e / s`` with ``s^2 = |P_1^T M_1^T c_1|^2 + |P_2^T M_2^T c_2|^2``."""
     c1, c2 = cross(m2, b), cross(b, m1)
-    e = dot(m1, c1)
     square1, k1 = _by_pixels(M1, by_pixel1, stretch, c1)
     square2, k2 = _by_pixels(M2, by_pixel2, stretch, c2)
-    s2 = max(square1 + square2, 1e-16)
-    s, ratio = math.sqrt(s2), e / s2
+    s = math.sqrt(max(square1 + square2, 1e-16))
+    return _Residual(dot(m1, c1) / s, s, c1, c2, k1, k2)
+
+
+@inlined_kernel
+def _derivatives(found: _Residual, m1: Vector, m2: Vector, b: Vector) -> _Derivatives:
+    """``dr = (de - (e / s^2) (k_1 . dc_1 + k_2 . dc_2)) / s``."""
+    s, c1, c2, k1, k2 = found.s, found.c1, found.c2, found.k1, found.k2
+    ratio = found.r / s
     by_m1 = _less(c1, ratio, cross(k2, b), s)
     by_m2 = _less(c2, ratio, cross(b, k1), s)
     # A rotation of a frame turns its M together with its ray.
     by_1 = _less(cross(m1, by_m1), -ratio / s, cross(c1, k1), 1.0)
     by_2 = _less(cross(m2, by_m2), -ratio / s, cross(c2, k2), 1.0)
     by_b = _less(_less(cross(m1, m2), ratio, cross(k1, m2), 1.0), ratio, cross(m1, k2), s)
-    return _Residual(e / s, by_m1, by_m2, by_1, by_2, by_b)
+    return _Derivatives(by_m1, by_m2, by_1, by_2, by_b)
 
 
 @inlined_kernel
@@ -254,22 +267,24 @@ def accumulate(problem: Problem, path: GyroPath, unknowns: Unknowns, tangent: Ar
             rows = row1 + row2
             b = (straight[0] + rows * bend[0], straight[1] + rows * bend[1],
                  straight[2] + rows * bend[2])
-            found = _residual(sight1.M, sight2.M, _ray(sight1.M, f1), _ray(sight2.M, f2), b,
-                              view1.by_pixel[n], view2.by_pixel[n], stretch)
+            m1, m2 = _ray(sight1.M, f1), _ray(sight2.M, f2)
+            found = _residual(sight1.M, sight2.M, m1, m2, b, view1.by_pixel[n],
+                              view2.by_pixel[n], stretch)
             sums.residuals[n] = found.r
             distance2 = found.r**2 * per_noise2
             level = 1.0 / (1.0 + distance2 / ROBUST**2)
             loss += 0.5 * distance2 * level
             if not derivatives:
                 continue
+            by = _derivatives(found, m1, m2, b)
             J[:] = 0.0
             _integral_since(path, middle, k1, t1, sight1.by_bias)
             _integral_since(path, middle, k2, t2, sight2.by_bias)
-            _add_view(J, found.by_1, sight1, row1, view1.covariates[p], -0.5, Q_middle)
-            _add_view(J, found.by_2, sight2, row2, view2.covariates[p], 0.5, Q_middle)
+            _add_view(J, by.by_1, sight1, row1, view1.covariates[p], -0.5, Q_middle)
+            _add_view(J, by.by_2, sight2, row2, view2.covariates[p], 0.5, Q_middle)
             # m and s both shrink with a longer focal length.
-            J[FOCAL] = found.r - dot(found.by_m1, f1) - dot(found.by_m2, f2)
-            by_b = rotated_back(Q_middle, found.by_b)
+            J[FOCAL] = found.r - dot(by.by_m1, f1) - dot(by.by_m2, f2)
+            by_b = rotated_back(Q_middle, by.by_b)
             J[DIRECTION] = dot(tangent[p, 0], by_b)
             J[DIRECTION + 1] = dot(tangent[p, 1], by_b)
             for i in range(3):

@@ -31,22 +31,8 @@ def jackknife(scores: Array, curvatures: Array, groups: NDArray[np.int64],
     (the sum of the groups' squared scores), it does not take for agreement that the few groups
     have, together, been fitted by the parameters.
 
-    Parameters
-    ----------
-    scores : (P, G) ndarray
-        Gradients of the cost by the parameters at the optimum, by pair.
-    curvatures : (P, G, G) ndarray
-        Their derivatives.
-    groups : (P,) ndarray of int
-    prior : (G,) ndarray
-        Inverse variances known before, which count as known.
-
-    Returns
-    -------
-    (G, G) ndarray
-
-    References
-    ----------
+    `scores` (P, G) are the gradients of the cost at the optimum by pair, `curvatures` (P, G, G)
+    their derivatives, `prior` (G,) inverse variances that count as known; returns (G, G). See
     B. Efron and R. Tibshirani, An Introduction to the Bootstrap, 1993, chapter 11.
     """
     total = curvatures.sum(axis=0) + np.diag(prior)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import itertools
+import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,8 +47,8 @@ _NOISE_RANGE = (0.6, 4.0)
 
 
 def initial(problem: Problem, R_imu_cam: Array, offset: float, readout: float = 0.0,
-          bias: Array | None = None, log_focal: float = 0.0,
-          noise: float = _NOISE_AT_START) -> Unknowns:
+            bias: Array | None = None, log_focal: float = 0.0,
+            noise: float = _NOISE_AT_START) -> Unknowns:
     """A calibration, and the directions of the pairs that it makes likely."""
     parameters, pairs = np.zeros(GLOBAL), problem.pairs
     parameters[READOUT], parameters[OFFSET], parameters[FOCAL] = readout, offset, log_focal
@@ -63,7 +65,7 @@ def restarted(problem: Problem, unknowns: Unknowns, caution: float = 1.0) -> Unk
     """The calibration of `unknowns` for other pairs, with a multiple of its median noise."""
     p = unknowns.parameters
     return initial(problem, unknowns.R_imu_cam, p[OFFSET], p[READOUT], p[BIAS:BIAS + 3], p[FOCAL],
-                 caution * float(np.median(unknowns.noise)))
+                   caution * float(np.median(unknowns.noise)))
 
 
 def stepped(unknowns: Unknowns, step: Array, local: Array) -> Unknowns:
@@ -92,24 +94,14 @@ def _tangents(directions: Array) -> Array:
 class Evaluation:
     """Cost of all pairs, and their normal equations without the pairs' own unknowns.
 
-    Attributes
-    ----------
-    losses : (P,) ndarray
-        Robust losses of the matches and the prior of the pair.
-    residuals : (N,) ndarray
-        [px].
-    score, reduced : (P, GLOBAL), (P, GLOBAL, GLOBAL) ndarray
-        Gradient and Hessian by the parameters; empty where derivatives were not asked for.
-    back : (P, LOCAL, GLOBAL + 1) ndarray
-        ``H_ll^-1 [H_lg, g_l]``: a step dg moves the pair's own unknowns by
-        ``-back[:, -1] - back[:, :-1] dg``.
+    The last three are empty where derivatives were not asked for.
     """
 
-    losses: Array
-    residuals: Array
-    score: Array
-    reduced: Array
-    back: Array
+    losses: Array       # (P,) robust losses of the matches and the prior of the pair
+    residuals: Array    # (N,) [px]
+    score: Array        # (P, GLOBAL) gradient by the parameters
+    reduced: Array      # (P, GLOBAL, GLOBAL) Hessian by the parameters
+    back: Array         # (P, LOCAL, GLOBAL + 1) H_ll^-1 [H_lg, g_l]
 
     @property
     def cost(self) -> float:
@@ -145,12 +137,13 @@ def evaluate(problem: Problem, unknowns: Unknowns, derivatives: bool = True) -> 
     weights = np.repeat([np.ones(pairs), problem.bend_sigma**-2, problem.turn_sigma**-2],
                         [2, 3, 3], axis=0).T
     losses = sums.losses + 0.5 * (weights * own**2).sum(axis=1)
-    own, weights = own[:size], weights[:size]
+    if not derivatives:
+        return Evaluation(losses, sums.residuals, *3 * (np.empty(0),))
     H = sums.hessian + np.tril(sums.hessian, -1).swapaxes(1, 2)
     g_g, H_gg = sums.gradient[:, :GLOBAL], H[:, :GLOBAL, :GLOBAL]
     g_l, H_lg = sums.gradient[:, GLOBAL:] + weights * own, H[:, GLOBAL:, :GLOBAL]
     H_ll = H[:, GLOBAL:, GLOBAL:] + weights[:, :, None] * np.eye(LOCAL)
-    H_ll *= 1.0 + unknowns.damping[:size, None, None] * np.eye(LOCAL)
+    H_ll *= 1.0 + unknowns.damping[:, None, None] * np.eye(LOCAL)
     # Schur complement: score = g_g - H_gl H_ll^-1 g_l, reduced = H_gg - H_gl H_ll^-1 H_lg.
     back = np.linalg.solve(H_ll, np.concatenate([H_lg, g_l[:, :, None]], axis=2))
     eliminated = H_lg.swapaxes(1, 2) @ back
@@ -169,11 +162,15 @@ def with_bends(problem: Problem, unknowns: Unknowns) -> Problem:
         seen = np.column_stack([view.points / np.exp(parameters[FOCAL]),
                                 np.ones(len(view.points))])
         rays.append(np.einsum('nij,nj->ni', turns, seen / np.linalg.norm(seen, axis=1)[:, None]))
-    angles = np.linalg.norm(np.cross(rays[0], rays[1]), axis=1)
-    medians = np.array([np.median(angles[begin:end]) for begin, end in itertools.pairwise(
-        problem.begin)])
-    passing = np.maximum(medians / (problem.view2.times - problem.view1.times), 1e-6)
+    angles = _medians(problem, np.linalg.norm(np.cross(rays[0], rays[1]), axis=1))
+    passing = np.maximum(angles / (problem.view2.times - problem.view1.times), 1e-6)
     return problem._replace(bend_sigma=np.clip(_BEND / passing, *_BEND_RANGE))
+
+
+def _medians(problem: Problem, values: Array) -> Array:
+    """Median (P,) over the matches of each pair of values (N,)."""
+    return np.array([np.median(values[begin:end])
+                     for begin, end in itertools.pairwise(problem.begin)])
 
 
 def _path(problem: Problem, unknowns: Unknowns) -> GyroPath:
@@ -183,17 +180,13 @@ def _path(problem: Problem, unknowns: Unknowns) -> GyroPath:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """Result of a fit to the data of `problem`.
-
-    `covariance` (GLOBAL, GLOBAL): zero rows and columns where a parameter was held.
-    `information` (GLOBAL, GLOBAL): the Hessian, before any prior.
-    """
+    """Result of a fit to the data of `problem`."""
 
     problem: Problem
     unknowns: Unknowns
-    evaluation: Evaluation
-    covariance: Array
-    information: Array
+    weights: Array        # (N,) of the matches, 1 where the residual is 0
+    covariance: Array     # (GLOBAL, GLOBAL), zero rows and columns where a parameter was held
+    information: Array    # (GLOBAL, GLOBAL) the Hessian, before any prior
     converged: bool
 
 
@@ -201,38 +194,33 @@ def fit(problem: Problem, unknowns: Unknowns, free: NDArray[np.bool_], *, rounds
         bias_sigma: float = 0.03, tolerance: float = 0.1) -> Fit:
     """Minimise the cost over the `free` (GLOBAL,) parameters, and learn the noise on the way.
 
-    Parameters
-    ----------
-    bias_sigma : float
-        What a gyro's bias may be, 1 sigma [rad/s].
-    tolerance : float
-        Newton steps shorter than this [sigma of the parameters] end the fit.
+    `bias_sigma`: 1 sigma of a gyro's bias [rad/s]. Newton steps shorter than `tolerance` [sigma of
+    the parameters] end the fit.
     """
     prior = np.zeros(GLOBAL)
     prior[BIAS:BIAS + 3] = bias_sigma**-2
-    evaluation = evaluate(problem, unknowns)
+    at = _Iterate(unknowns, evaluate(problem, unknowns))
     converged = False
-    damping = 1e-3
     for _ in range(rounds):
-        unknowns, evaluation, damping, length = _step(
-            problem, unknowns, evaluation, free, prior, damping)
-        if length > _NEAR:
+        at = _step(problem, at, free, prior)
+        if at.length > _NEAR:
             continue
         # Noise is learned near the optimum only: far from it, residuals are no noise.
-        noise = learned(problem, unknowns, evaluation)
-        change = float(np.median(np.abs(np.log(noise / unknowns.noise))))
-        if length < tolerance and change < 0.03:
-            converged = True
+        noise = _learned_noise(problem, at)
+        change = float(np.median(np.abs(np.log(noise / at.unknowns.noise))))
+        converged = at.length < tolerance and change < 0.03
+        if converged:
             break
-        unknowns = unknowns._replace(noise=noise)
+        unknowns = at.unknowns._replace(noise=noise)
         if change > 0.1:
             # The cost is not convex in the directions: less noise tells more of them apart.
             unknowns = _better_directions(problem, unknowns)
-        evaluation = evaluate(problem, unknowns)
-    unknowns = unknowns._replace(damping=np.zeros(problem.pairs))
+        at = at._replace(unknowns=unknowns, evaluation=evaluate(problem, unknowns))
+    unknowns = at.unknowns._replace(damping=np.zeros(problem.pairs))
     evaluation = evaluate(problem, unknowns)
-    return Fit(problem, unknowns, evaluation,
-               _covariance(problem, unknowns, evaluation, free, prior),
+    noise = np.repeat(unknowns.noise, np.diff(problem.begin))
+    weights = np.asarray((1.0 + (evaluation.residuals / (ROBUST * noise)) ** 2) ** -2)
+    return Fit(problem, unknowns, weights, _covariance(problem, evaluation, weights, free, prior),
                evaluation.reduced.sum(axis=0), converged)
 
 
@@ -272,55 +260,54 @@ def _chosen(problem: Problem, moved: Unknowns, kept: Unknowns) -> tuple[Unknowns
     return unknowns, float(np.minimum(losses, others).sum())
 
 
-def _step(problem: Problem, unknowns: Unknowns, evaluation: Evaluation, free: NDArray[np.bool_],
-          prior: Array, damping: float) -> tuple[Unknowns, Evaluation, float, float]:
-    """Unknowns after a step that lowers the cost, the damping, and Newton's step in sigma."""
-    cost = evaluation.cost + _prior_cost(unknowns, prior)
-    H = (evaluation.reduced.sum(axis=0) + np.diag(prior))[np.ix_(free, free)]
-    gradient = (evaluation.score.sum(axis=0) + prior * unknowns.parameters)[free]
+class _Iterate(NamedTuple):
+    """Where the fit is."""
+
+    unknowns: Unknowns
+    evaluation: Evaluation
+    damping: float = 1e-3       # Levenberg-Marquardt's, of the calibration's parameters
+    length: float = math.inf    # of Newton's step to here [sigma]
+
+
+def _step(problem: Problem, at: _Iterate, free: NDArray[np.bool_], prior: Array) -> _Iterate:
+    """Where a step leads that lowers the cost; the same place where none does."""
+    cost = at.evaluation.cost + _prior_cost(at.unknowns, prior)
+    H = (at.evaluation.reduced.sum(axis=0) + np.diag(prior))[np.ix_(free, free)]
+    gradient = (at.evaluation.score.sum(axis=0) + prior * at.unknowns.parameters)[free]
     newton = np.linalg.solve(H + 1e-9 * np.diag(np.diag(H)), gradient)
-    length = float(np.sqrt(max(gradient @ newton, 0.0)))
+    length, damping = float(np.sqrt(max(gradient @ newton, 0.0))), at.damping
     for _ in range(8):
         step = np.zeros(GLOBAL)
         step[free] = -np.linalg.solve(H + damping * np.diag(np.diag(H)), gradient)
-        tried = stepped(unknowns, step, evaluation.local_step(step))
+        tried = stepped(at.unknowns, step, at.evaluation.local_step(step))
         result = evaluate(problem, tried)
         if result.cost + _prior_cost(tried, prior) > cost:
-            tried, tried_cost = _chosen(problem, tried, unknowns)
+            tried, tried_cost = _chosen(problem, tried, at.unknowns)
             if tried_cost + _prior_cost(tried, prior) > cost:
                 damping = max(10.0 * damping, 1e-3)
                 continue
             result = evaluate(problem, tried)
-        return tried, result, max(0.1 * damping, 1e-9), length
-    return unknowns, evaluation, damping, length
+        return _Iterate(tried, result, max(0.1 * damping, 1e-9), length)
+    return at._replace(damping=damping, length=length)
 
 
 def _prior_cost(unknowns: Unknowns, prior: Array) -> float:
     return 0.5 * float(prior @ unknowns.parameters**2)
 
 
-def learned(problem: Problem, unknowns: Unknowns, evaluation: Evaluation) -> Array:
+def _learned_noise(problem: Problem, at: _Iterate) -> Array:
     """Noise (P,) of each pair that the residuals show [px]; a third of the last at least."""
     counts = np.diff(problem.begin)
-    sizes = np.abs(evaluation.residuals)
-    medians = np.array([np.median(sizes[begin:end]) for begin, end in itertools.pairwise(
-        problem.begin)])
     # Two unknowns and a bit of each pair hide some of it.
-    noise = 1.4826 * medians * np.sqrt(counts / np.maximum(counts - 3.0, 1.0))
+    noise = 1.4826 * _medians(problem, np.abs(at.evaluation.residuals)) * np.sqrt(
+        counts / np.maximum(counts - 3.0, 1.0))
     middle = max(float(np.median(noise)), _LEAST_NOISE)
     return np.maximum(np.clip(noise, _NOISE_RANGE[0] * middle, _NOISE_RANGE[1] * middle),
-                      unknowns.noise / 3.0)
+                      at.unknowns.noise / 3.0)
 
 
-def robust_weights(problem: Problem, unknowns: Unknowns, evaluation: Evaluation) -> Array:
-    """Weights (N,) of the matches, 1 where the residual is 0."""
-    noise = np.repeat(unknowns.noise, np.diff(problem.begin))
-    return np.asarray((1.0 + (evaluation.residuals / (ROBUST * noise)) ** 2) ** -2)
-
-
-def _covariance(problem: Problem, unknowns: Unknowns, evaluation: Evaluation,
+def _covariance(problem: Problem, evaluation: Evaluation, weights: Array,
                 free: NDArray[np.bool_], prior: Array) -> Array:
-    weights = robust_weights(problem, unknowns, evaluation)
     # Curvature of the loss against the weight that Gauss-Newton takes for it.
     bent = float((weights * (4.0 * np.sqrt(weights) - 3.0)).sum() / weights.sum())
     covariance = np.zeros((GLOBAL, GLOBAL))

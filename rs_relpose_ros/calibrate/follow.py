@@ -60,10 +60,11 @@ class PointFollower:
         self._points.append(matches.points2)
         return len(matches.points2)
 
-    def tracks(self, to_sensor: Callable[[Array], Array] = lambda points: points) -> Tracks:
+    def tracks(self, to_sensor: Callable[[Array], Array] | None) -> Tracks:
         """All that was seen, by stamp; of images with the same stamp the first.
 
-        `to_sensor` maps points (N, 2) of the images to pixels of the full sensor.
+        `to_sensor` maps points (N, 2) of the images to pixels of the full sensor; None where they
+        are that.
         """
         stamps, kept = np.unique(np.array(self._stamps, dtype=np.int64), return_index=True)
         ids = [self._ids[k] for k in kept]
@@ -71,4 +72,4 @@ class PointFollower:
         points = np.concatenate([np.empty((0, 2)), *(self._points[k] for k in kept)])
         return Tracks(stamps, frames, np.concatenate(
             [np.empty(0, dtype=np.int64), *(some.astype(np.int64) for some in ids)]),
-            to_sensor(points))
+            points if to_sensor is None else to_sensor(points))

@@ -9,27 +9,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rs_relpose_ros.compiled import kernel
+from rs_relpose_ros.compiled import inlined_kernel, kernel
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry.so3 import exp_so3, multiply
+from rs_relpose_ros.geometry.so3 import rodrigues
+from rs_relpose_ros.geometry.vectors import cross, dot
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GyroSeries:
-    """Samples of a gyro, IMU frame.
+    """Samples of a gyro; taken as array_likes."""
 
-    Parameters
-    ----------
-    stamps_ns : (K,) array_like of int
-        On the IMU clock, strictly increasing.
-    rates : (K, 3) array_like
-        Angular velocity as measured [rad/s].
-    """
-
-    stamps_ns: NDArray[np.int64]
-    rates: Array
+    stamps_ns: NDArray[np.int64]    # (K,) IMU clock, strictly increasing
+    rates: Array                    # (K, 3) as measured, IMU frame [rad/s]
 
     def __post_init__(self) -> None:
         stamps = np.ascontiguousarray(self.stamps_ns, dtype=np.int64)
@@ -60,14 +53,9 @@ class GyroSeries:
 
 
 def noise_density(times: Array, rates: Array) -> float:
-    """White noise of a gyro [rad/s/sqrt(Hz)], from third differences of its samples.
+    """White noise [rad/s/sqrt(Hz)] of rates (K, 3) at times (K,), from third differences.
 
     A movement that is smooth from sample to sample drops out of them; vibration counts as noise.
-
-    Parameters
-    ----------
-    times, rates : (K,), (K, 3) ndarray
-        [s], [rad/s].
     """
     steps = np.diff(times)
     step = float(np.median(steps))
@@ -110,19 +98,35 @@ def _integrated(times: Array, rates: Array) -> tuple[Array, Array]:
     rotations[0] = np.eye(3)
     for k in range(count - 1):
         dt = times[k + 1] - times[k]
-        multiply(rotations[k], exp_so3(0.5 * dt * (rates[k] + rates[k + 1])), rotations[k + 1])
-        turned[k + 1] = turned[k] + 0.5 * dt * (rotations[k] + rotations[k + 1])
+        _turn(rotations[k], rates[k], rates[k + 1], dt, rotations[k + 1])
+        for i in range(3):
+            for j in range(3):
+                turned[k + 1, i, j] = turned[k, i, j] + 0.5 * dt * (
+                    rotations[k, i, j] + rotations[k + 1, i, j])
     return rotations, turned
 
 
-@kernel
+@inlined_kernel
+def _turn(rotation: Array, rate1: Array, rate2: Array, dt: float, out: Array) -> None:
+    """Write ``R Exp(phi)`` with ``phi = (w_1 + w_2) dt / 2``: Rodrigues' formula for each row."""
+    phi = (0.5 * dt * (rate1[0] + rate2[0]), 0.5 * dt * (rate1[1] + rate2[1]),
+           0.5 * dt * (rate1[2] + rate2[2]))
+    a, b = rodrigues(dot(phi, phi))
+    for i in range(3):
+        side = cross(rotation[i], phi)
+        back = cross(side, phi)
+        for j in range(3):
+            out[i, j] = rotation[i, j] + a * side[j] + b * back[j]
+
+
+@inlined_kernel
 def rotation_at(path: GyroPath, instant: float, k: int, rotation: Array, rate: Array) -> None:
     """Fill the rotation (3, 3) and the rate (3,) at an instant from knot `k` on."""
     dt = instant - path.times[k]
     share = dt / (path.times[k + 1] - path.times[k])
     for i in range(3):
         rate[i] = path.rates[k, i] + share * (path.rates[k + 1, i] - path.rates[k, i])
-    multiply(path.rotations[k], exp_so3(0.5 * dt * (path.rates[k] + rate)), rotation)
+    _turn(path.rotations[k], path.rates[k], rate, dt, rotation)
 
 
 @kernel

@@ -17,7 +17,7 @@ from rs_relpose_ros.calibrate.coplanarity import (
     ROTATION,
     SLOPE,
 )
-from rs_relpose_ros.calibrate.fit import Fit, robust_weights
+from rs_relpose_ros.calibrate.fit import Fit
 from rs_relpose_ros.calibrate.observations import Observations
 from rs_relpose_ros.calibrate.result import AXES, CalibrationResult, CostCurve, Estimate
 from rs_relpose_ros.config.calibration import CalibrationConfig
@@ -62,7 +62,6 @@ def judged(data: Observations, final: Fit, free: NDArray[np.bool_], curve: CostC
                           one_axis)
     if free[SLOPE]:
         slope = _estimate(parameters[SLOPE], sigmas[SLOPE], _MOST_SLOPE_SIGMA)
-    weights = robust_weights(final.problem, final.unknowns, final.evaluation)
     unsettled = '' if final.converged else 'the fit had not settled when it was stopped'
     return CalibrationResult(
         readout_time=_estimate(parameters[READOUT], sigmas[READOUT], config.max_readout_sigma),
@@ -75,7 +74,7 @@ def judged(data: Observations, final: Fit, free: NDArray[np.bool_], curve: CostC
         axis_map=axis_map, gyro_bias=(bias_x, bias_y, bias_z), focal_factor=focal,
         offset_by_interval=slope, rotation_rates=rates, curve=curve,
         pixel_sigma=float(np.median(final.unknowns.noise)),
-        inlier_ratio=float((weights > 0.25).mean()),
+        inlier_ratio=float((final.weights > 0.25).mean()),
         frames=len(data.tracks), pairs=final.problem.pairs, matches=int(final.problem.begin[-1]),
         frame_interval=data.interval, warnings=tuple(filter(None, (unsettled, one_axis))))
 

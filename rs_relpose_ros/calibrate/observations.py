@@ -37,32 +37,16 @@ class PairSelection(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
-    """What was recorded, in seconds since the first frame.
+    """What was recorded, in seconds since the first frame."""
 
-    Attributes
-    ----------
-    tracks : Tracks
-        Those points that the camera model can map to rays.
-    camera : RollingShutterCamera
-        Its read-out time is not looked at.
-    times : (F,) ndarray
-        Stamps of the frames [s].
-    covariates : (F,) ndarray
-        By how much the interval to the next frame is longer than the median one [s]; 0 where
-        frames were lost.
-    gyro_times, gyro_rates : (K,), (K, 3) ndarray
-        [s], [rad/s].
-    gyro_density : float
-        White noise of the gyro [rad/s/sqrt(Hz)].
-    """
-
-    tracks: Tracks
-    camera: RollingShutterCamera
-    times: Array
+    tracks: Tracks                  # of points that the camera model can map to rays
+    camera: RollingShutterCamera    # its read-out time is not looked at
+    times: Array                    # (F,) stamps of the frames [s]
+    # (F,) interval to the next frame less the median one [s]; 0 where frames were lost.
     covariates: Array
-    gyro_times: Array
-    gyro_rates: Array
-    gyro_density: float
+    gyro_times: Array               # (K,) [s]
+    gyro_rates: Array               # (K, 3) [rad/s]
+    gyro_density: float             # white noise of the gyro [rad/s/sqrt(Hz)]
 
     @classmethod
     def of(cls, tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera) -> Observations:
@@ -124,8 +108,8 @@ class Observations:
 
     def seen_rates(self, pairs: Pairs) -> Array:
         """Angular velocity (P, 3) [rad/s], camera frame; see `alignment.seen_rates`."""
-        return seen_rates(pairs, _normalised(self.camera, pairs.points1),
-                          _normalised(self.camera, pairs.points2),
+        return seen_rates(pairs.begin, self.camera.unproject(pairs.points1),
+                          self.camera.unproject(pairs.points2),
                           self.times[pairs.second] - self.times[pairs.first])
 
     def problem(self, pairs: Pairs, offset: float) -> Problem:
@@ -139,21 +123,10 @@ class Observations:
             np.full(len(pairs), _BEND_AT_START), turn_sigma)
 
     def _view(self, frames: NDArray[np.int64], pixels: Array) -> View:
-        camera = self.camera
-        rows = (pixels[:, 1] - 0.5 * (camera.height - 1)) / camera.height
-        points, by_pixel = _normalised_by_pixel(camera, pixels)
-        return View(self.times[frames], self.covariates[frames], points, rows, by_pixel)
-
-
-def _normalised(camera: RollingShutterCamera, points: Array) -> Array:
-    rays = camera.unproject(points)
-    return np.asarray(rays[:, :2] / rays[:, 2:])
-
-
-def _normalised_by_pixel(camera: RollingShutterCamera, points: Array) -> tuple[Array, Array]:
-    """Normalised points (N, 2), and their derivative by the pixels (N, 2, 2)."""
-    rays, jacobian = camera.unproject_with_jacobian(points)
-    normalised = np.asarray(rays[:, :2] / rays[:, 2:])
-    # n = m_xy / m_z, so dn = (dm_xy - n dm_z) / m_z.
-    by_pixel = (jacobian[:, :2] - normalised[:, :, None] * jacobian[:, 2:]) / rays[:, 2:, None]
-    return normalised, np.ascontiguousarray(by_pixel)
+        rays, by_pixel = self.camera.unproject_with_jacobian(pixels)
+        # n = m_xy / m_z, so dn = (dm_xy - n dm_z) / m_z.
+        points = np.asarray(rays[:, :2] / rays[:, 2:])
+        by_pixel = (by_pixel[:, :2] - points[:, :, None] * by_pixel[:, 2:]) / rays[:, 2:, None]
+        height = self.camera.height
+        return View(self.times[frames], self.covariates[frames], points,
+                    (pixels[:, 1] - 0.5 * (height - 1)) / height, np.ascontiguousarray(by_pixel))

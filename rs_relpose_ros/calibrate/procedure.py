@@ -64,7 +64,7 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
     Parameters
     ----------
     tracks : Tracks
-        Raw pixels of `camera`, of the whole recording, frame after frame.
+        Of the whole recording.
     gyro : GyroSeries
         On a clock that differs from the camera's by at most ``config.max_time_offset``.
     camera : RollingShutterCamera

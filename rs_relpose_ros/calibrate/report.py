@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,103 +21,94 @@ _MS = 1e3
 
 def report(result: CalibrationResult, camera: RollingShutterCamera) -> list[str]:
     """Lines for a reader: each figure with its 1 sigma and its verdict."""
-    readout, offset = result.readout_time, result.time_offset
+    readout, slope, focal = result.readout_time, result.offset_by_interval, result.focal_factor
     rates = ', '.join(f'{axis} {np.degrees(rate):.1f}'
                       for axis, rate in zip(AXES, result.rotation_rates, strict=True))
+    sigmas = ', '.join(f'{np.degrees(sigma):.3f}' for sigma in result.rotation_sigma)
     lines = [
         (f'{result.frames} frames, {result.pairs} pairs, {result.matches} matches; '
          f'{100 * result.inlier_ratio:.0f} % inliers, noise of a match '
          f'{result.pixel_sigma:.2f} px'),
         f'rotation of the camera, rms [deg/s]: {rates}',
-        f'shutter: {shutter_text(result)}',
-        _line('read-out time', f'{_MS * abs(readout.value):.2f} +- {_MS * readout.sigma:.2f} ms'
-              + (', read upwards' if _upwards(result) else ''), readout),
-        _line('time offset (row 0)', f'{_MS * offset.value:.2f} +- {_MS * offset.sigma:.2f} ms',
-              offset)]
-    if result.offset_by_interval is not None:
-        slope = result.offset_by_interval
+        f'shutter: {_shutter_text(result)}',
+        _line('read-out time', f'{_ms(readout, abs(readout.value))}'
+              + (', read upwards' if readout.value < 0.0 else ''), readout),
+        _line('time offset (row 0)', _ms(result.time_offset), result.time_offset)]
+    if slope is not None:
+        meaning = ('none that is sure' if abs(slope.value) < 3.0 * slope.sigma
+                   else 'the stamp moves with the exposure')
         lines.append(_line(
             'offset by interval', f'{slope.value:.3f} +- {slope.sigma:.3f} ms per ms of the '
-            f'interval to the next frame ({exposure_text(slope)})', slope))
-    sigmas = ', '.join(f'{np.degrees(sigma):.3f}' for sigma in result.rotation_sigma)
+            f'interval to the next frame ({meaning})', slope))
     lines += [
         _line('rotation IMU to camera', f'{axes_text(result.axis_map)}, and '
               f"{np.degrees(result.rotation.value):.2f} deg off it; 1 sigma about the camera's "
               f'x, y, z: {sigmas} deg', result.rotation),
-        '  quaternion x y z w: ' + ', '.join(f'{v:.6f}' for v in result.quat_cam_imu_xyzw)]
-    lines += [
-        _line(f'gyro bias {axis}', f'{bias.value:.5f} +- {bias.sigma:.5f} rad/s', bias)
-        for axis, bias in zip('xyz', result.gyro_bias, strict=True)]
-    if result.focal_factor is not None:
-        focal = result.focal_factor
-        lines.append(_line('focal length', f'{camera.fx * focal.value:.1f} +- '
-                           f'{camera.fx * focal.sigma:.1f} px (CameraInfo has none: write it '
-                           'there)', focal))
-    lines += [f'note: {warning}' for warning in result.warnings]
-    return lines
+        '  quaternion x y z w: ' + ', '.join(f'{v:.6f}' for v in result.quat_cam_imu_xyzw),
+        *(_line(f'gyro bias {axis}', f'{bias.value:.5f} +- {bias.sigma:.5f} rad/s', bias)
+          for axis, bias in zip('xyz', result.gyro_bias, strict=True))]
+    if focal is not None:
+        lines.append(_line(
+            'focal length', f'{camera.fx * focal.value:.1f} +- {camera.fx * focal.sigma:.1f} px '
+            '(CameraInfo has none: write it there)', focal))
+    return lines + [f'note: {warning}' for warning in result.warnings]
 
 
-def shutter_text(result: CalibrationResult) -> str:
+def _line(name: str, text: str, estimate: Estimate) -> str:
+    verdict = 'observable' if estimate.observable else f'NOT OBSERVABLE: {estimate.remark}'
+    return f'{name}: {text} [{verdict}]'
+
+
+def _ms(estimate: Estimate, value: float | None = None) -> str:
+    """A time with its sigma; `value` is shown in place of its own."""
+    shown = estimate.value if value is None else value
+    return f'{_MS * shown:.2f} +- {_MS * estimate.sigma:.2f} ms'
+
+
+def _shutter_text(result: CalibrationResult) -> str:
     """Rolling or global, and how sure."""
     readout = result.readout_time
+    if result.shutter == 'global':
+        return f'global: the read-out time is {_ms(readout)}'
+    if result.shutter == 'unsure':
+        return f'not sure: {_ms(readout)}; record longer, and turn faster'
     sigmas = abs(readout.value) / max(readout.sigma, 1e-9)
     at_zero = float(np.interp(0.0, result.curve.readout_times, result.curve.costs))
-    if result.shutter == 'rolling':
-        return (f'rolling: the read-out time is {sigmas:.0f} sigma from 0, and the log-likelihood '
-                f'of a global shutter is lower by {at_zero:.0f}')
-    if result.shutter == 'global':
-        return (f'global: the read-out time is {_MS * readout.value:.2f} +- '
-                f'{_MS * readout.sigma:.2f} ms')
-    return (f'not sure: {_MS * readout.value:.2f} +- {_MS * readout.sigma:.2f} ms; record longer, '
-            'and turn faster')
-
-
-def exposure_text(slope: Estimate) -> str:
-    """What a dependence of the offset on the frame interval means."""
-    if abs(slope.value) < 3.0 * slope.sigma:
-        return 'none that is sure'
-    return 'the stamp moves with the exposure'
+    return (f'rolling: the read-out time is {sigmas:.0f} sigma from 0, and the log-likelihood '
+            f'of a global shutter is lower by {at_zero:.0f}')
 
 
 def parameter_file(result: CalibrationResult, title: str, *, compressed: bool,
                    feature_rows: tuple[float, ...] = (0.0, 0.0)) -> str:
     """The node's parameter file; figures that are not observable are left out, and named."""
-    readout, offset = result.readout_time, result.time_offset
+    readout, offset, rotation = result.readout_time, result.time_offset, result.rotation
+    shutter, biases = _shutter_text(result), result.gyro_bias
+    rolling = result.shutter != 'global'
+    # What a file has of each figure that is observable.
+    told = [
+        (readout.observable, f'readout_time ({readout.remark})', [
+            SourcedValue(
+                'readout_time', round(abs(readout.value), 6) if rolling else 0.0,
+                f'{shutter[:1].upper()}{shutter[1:]}. Estimate {_ms(readout)} (1 sigma).'),
+            SourcedValue('readout_direction', 'up' if rolling and readout.value < 0.0 else 'down',
+                         'By the sign of that estimate.')]),
+        (offset.observable, f'time_offset ({offset.remark})', [
+            SourcedValue('stamp_row', 'first', 'Convention of time_offset here.'),
+            SourcedValue('time_offset', round(offset.value, 6),
+                         f'1 sigma {_MS * offset.sigma:.2f} ms.')]),
+        (rotation.observable, f'quat_cam_imu_xyzw ({rotation.remark})', [SourcedValue(
+            'quat_cam_imu_xyzw', tuple(round(v, 7) for v in result.quat_cam_imu_xyzw),
+            f'{axes_text(result.axis_map)}, {np.degrees(rotation.value):.2f} deg off; '
+            f'1 sigma {np.degrees(rotation.sigma):.3f} deg at most.')]),
+        (all(bias.observable for bias in biases), 'gyro_bias', [SourcedValue(
+            'gyro_bias', tuple(round(bias.value, 5) for bias in biases), '1 sigma '
+            + ', '.join(f'{bias.sigma:.5f}' for bias in biases) + ' rad/s.')])]
     values = [SourcedValue('image_transport', 'compressed' if compressed else 'raw',
                            'As the bag has them.')]
-    missing = []
-    if readout.observable:
-        global_shutter = result.shutter == 'global'
-        values.append(SourcedValue(
-            'readout_time', 0.0 if global_shutter else round(abs(readout.value), 6),
-            f'{_capital(shutter_text(result))}. Estimate {_MS * readout.value:.2f} +- '
-            f'{_MS * readout.sigma:.2f} ms (1 sigma).'))
-        values.append(SourcedValue('readout_direction',
-                                   'up' if _upwards(result) and not global_shutter else 'down',
-                                   'By the sign of that estimate.'))
-    else:
-        missing.append(f'readout_time ({readout.remark})')
-    if offset.observable:
-        values.append(SourcedValue('stamp_row', 'first', 'Convention of time_offset here.'))
-        values.append(SourcedValue('time_offset', round(offset.value, 6),
-                                   f'1 sigma {_MS * offset.sigma:.2f} ms.'))
-    else:
-        missing.append(f'time_offset ({offset.remark})')
-    if result.rotation.observable:
-        values.append(SourcedValue(
-            'quat_cam_imu_xyzw', tuple(round(v, 7) for v in result.quat_cam_imu_xyzw),
-            f'{axes_text(result.axis_map)}, {np.degrees(result.rotation.value):.2f} deg off; '
-            f'1 sigma {np.degrees(result.rotation.sigma):.3f} deg at most.'))
-    else:
-        missing.append(f'quat_cam_imu_xyzw ({result.rotation.remark})')
-    if all(bias.observable for bias in result.gyro_bias):
-        values.append(SourcedValue(
-            'gyro_bias', tuple(round(bias.value, 5) for bias in result.gyro_bias), '1 sigma '
-            + ', '.join(f'{bias.sigma:.5f}' for bias in result.gyro_bias) + ' rad/s.'))
-    else:
-        missing.append('gyro_bias')
+    values += [value for observable, _, group in told if observable for value in group]
     if feature_rows[1] > 0.0:
         values.append(SourcedValue('feature_rows', tuple(feature_rows), 'As given to calibrate.'))
+    missing = [name for observable, name, _ in told if not observable]
     if missing:
         title += ' Not observable in this recording, so left out: ' + '; '.join(missing) + '.'
     return parameter_text(title, values)
@@ -124,24 +116,20 @@ def parameter_file(result: CalibrationResult, title: str, *, compressed: bool,
 
 def as_mapping(result: CalibrationResult, camera: RollingShutterCamera) -> dict[str, Any]:
     """The result for a JSON file; seconds, radians, pixels."""
-    def told(estimate: Estimate) -> dict[str, Any]:
-        return {'value': estimate.value, 'sigma': estimate.sigma,
-                'observable': estimate.observable, 'remark': estimate.remark}
-    focal = None
-    if result.focal_factor is not None:
-        focal = told(result.focal_factor)
-        focal['value'] *= camera.fx
-        focal['sigma'] *= camera.fx
+    slope, focal = result.offset_by_interval, result.focal_factor
+    if focal is not None:
+        focal = replace(focal, value=focal.value * camera.fx, sigma=focal.sigma * camera.fx)
     return {
         'observable': result.observable, 'shutter': result.shutter,
-        'readout_time_s': told(result.readout_time), 'time_offset_s': told(result.time_offset),
-        'offset_by_interval': None if result.offset_by_interval is None
-        else told(result.offset_by_interval),
+        'readout_time_s': asdict(result.readout_time),
+        'time_offset_s': asdict(result.time_offset),
+        'offset_by_interval': slope and asdict(slope),
         'quat_cam_imu_xyzw': list(result.quat_cam_imu_xyzw),
         'rotation_sigma_rad': result.rotation_sigma.tolist(),
-        'rotation_from_axis_map_rad': told(result.rotation),
+        'rotation_from_axis_map_rad': asdict(result.rotation),
         'axis_map': result.axis_map.tolist(),
-        'gyro_bias_rad_per_s': [told(bias) for bias in result.gyro_bias], 'focal_px': focal,
+        'gyro_bias_rad_per_s': [asdict(bias) for bias in result.gyro_bias],
+        'focal_px': focal and asdict(focal),
         'rotation_rate_rms_rad_per_s': result.rotation_rates.tolist(),
         'frames': result.frames, 'pairs': result.pairs, 'matches': result.matches,
         'inlier_ratio': result.inlier_ratio, 'pixel_sigma': result.pixel_sigma,
@@ -160,7 +148,7 @@ def draw_curve(result: CalibrationResult, path: Path) -> None:
               color=_BLUE)
     axes.axvline(0.0, color='0.6', linewidth=0.8)
     axes.axvline(_MS * readout.value, color=_ORANGE,
-                 label=f'{_MS * readout.value:.2f} +- {_MS * readout.sigma:.2f} ms')
+                 label=_ms(readout))
     axes.axvspan(_MS * (readout.value - 3 * readout.sigma),
                  _MS * (readout.value + 3 * readout.sigma), color=_ORANGE, alpha=0.25,
                  label='3 sigma')
@@ -171,16 +159,3 @@ def draw_curve(result: CalibrationResult, path: Path) -> None:
     axes.legend()
     axes.grid(alpha=0.3)
     save_picture(figure, path)
-
-
-def _upwards(result: CalibrationResult) -> bool:
-    return result.readout_time.value < 0.0
-
-
-def _line(name: str, text: str, estimate: Estimate) -> str:
-    verdict = 'observable' if estimate.observable else f'NOT OBSERVABLE: {estimate.remark}'
-    return f'{name}: {text} [{verdict}]'
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]

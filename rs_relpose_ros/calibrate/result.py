@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,17 +28,10 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CostCurve:
-    """Cost of the whole fit over the read-out time, everything else fitted anew.
+    """Cost of the whole fit over the read-out time, everything else fitted anew."""
 
-    Attributes
-    ----------
-    readout_times : (K,) ndarray
-        Signed [s]: negative is read upwards.
-    costs : (K,) ndarray
-        Minus the log-likelihood above that of the best; thinned out to independent pairs.
-    """
-
-    readout_times: Array
+    readout_times: Array    # (K,) signed [s]: negative is read upwards
+    # (K,) minus the log-likelihood above that of the best; thinned out to independent pairs.
     costs: Array
 
 
@@ -48,58 +41,27 @@ class CalibrationResult:
 
     ``t_imu(row v) = stamp + time_offset + v / height * readout_time``: a negative read-out time is
     read upwards, with `time_offset` still that of row 0.
-
-    Attributes
-    ----------
-    readout_time : Estimate
-        Signed [s].
-    time_offset : Estimate
-        Of row 0 [s], at the median interval between frames.
-    R_cam_imu : (3, 3) ndarray
-        ``v_cam = R_cam_imu v_imu``.
-    rotation_sigma : (3,) ndarray
-        1 sigma about the camera's axes [rad].
-    rotation : Estimate
-        Angle to `axis_map` [rad]; its sigma is the largest of `rotation_sigma`.
-    axis_map : (3, 3) ndarray
-        The rotation between axes that is nearest.
-    gyro_bias : tuple of Estimate
-        IMU frame [rad/s].
-    focal_factor : Estimate or None
-        True focal length over the one that was assumed; None where it was given.
-    offset_by_interval : Estimate or None
-        How much the offset changes by the interval to the next frame [s/s]; None where all
-        intervals are alike.
-    rotation_rates : (3,) ndarray
-        Root mean square of the angular velocity about the camera's axes, mean removed [rad/s].
-    curve : CostCurve
-    pixel_sigma : float
-        Of a match, as seen [px].
-    inlier_ratio : float
-    frames, pairs, matches : int
-    frame_interval : float
-        Median [s].
-    warnings : tuple of str
     """
 
-    readout_time: Estimate
-    time_offset: Estimate
-    R_cam_imu: Array
-    rotation_sigma: Array
-    rotation: Estimate
-    axis_map: Array
-    gyro_bias: tuple[Estimate, Estimate, Estimate]
-    focal_factor: Estimate | None
+    readout_time: Estimate                  # signed [s]
+    time_offset: Estimate                   # of row 0 [s], at the median interval between frames
+    R_cam_imu: Array                        # (3, 3) v_cam = R_cam_imu v_imu
+    rotation_sigma: Array                   # (3,) 1 sigma about the camera's axes [rad]
+    rotation: Estimate                      # angle to `axis_map` [rad], with the largest sigma
+    axis_map: Array                         # (3, 3) the nearest rotation between axes
+    gyro_bias: tuple[Estimate, Estimate, Estimate]   # IMU frame [rad/s]
+    focal_factor: Estimate | None           # true over assumed focal length; None where given
+    # Change of the offset by the interval to the next frame [s/s]; None where all are alike.
     offset_by_interval: Estimate | None
-    rotation_rates: Array
+    rotation_rates: Array                   # (3,) rms about the camera's axes less mean [rad/s]
     curve: CostCurve
-    pixel_sigma: float
+    pixel_sigma: float                      # of a match, as seen [px]
     inlier_ratio: float
     frames: int
     pairs: int
     matches: int
-    frame_interval: float
-    warnings: tuple[str, ...] = field(default=())
+    frame_interval: float                   # median [s]
+    warnings: tuple[str, ...] = ()
 
     @property
     def observable(self) -> bool:

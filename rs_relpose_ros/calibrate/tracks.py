@@ -15,29 +15,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracks:
-    """Where points were seen.
+    """Where points were seen; taken as array_likes."""
 
-    Parameters
-    ----------
-    stamps_ns : (F,) array_like of int
-        Stamps of the frames, camera clock, strictly increasing.
-    frames : (N,) array_like of int
-        Frame of each observation, not decreasing.
-    ids : (N,) array_like of int
-        Track of each observation; at most once per frame.
-    points : (N, 2) array_like
-        Raw (distorted) pixels.
-    """
-
-    stamps_ns: NDArray[np.int64]
-    frames: NDArray[np.int64]
-    ids: NDArray[np.int64]
-    points: Array
+    stamps_ns: NDArray[np.int64]    # (F,) of the frames, camera clock, strictly increasing
+    frames: NDArray[np.int64]       # (N,) frame of each observation, not decreasing
+    ids: NDArray[np.int64]          # (N,) its track; at most once per frame
+    points: Array                   # (N, 2) raw (distorted) pixels
 
     def __post_init__(self) -> None:
-        stamps = np.ascontiguousarray(self.stamps_ns, dtype=np.int64)
-        frames = np.ascontiguousarray(self.frames, dtype=np.int64)
-        ids = np.ascontiguousarray(self.ids, dtype=np.int64)
+        stamps, frames, ids = (np.ascontiguousarray(values, dtype=np.int64)
+                               for values in (self.stamps_ns, self.frames, self.ids))
         points = np.ascontiguousarray(self.points, dtype=np.float64)
         if stamps.ndim != 1 or not (np.diff(stamps) > 0).all():
             raise InputError('stamps_ns of the tracks must be (F,) and strictly increasing')
@@ -63,22 +50,12 @@ class Tracks:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """Pairs of frames with their common points, matches of a pair one after the other.
+    """Pairs of frames with their common points, matches of a pair one after the other."""
 
-    Attributes
-    ----------
-    first, second : (P,) ndarray of int
-        Frames.
-    begin : (P + 1,) ndarray of int
-        Matches of pair p: ``begin[p]`` to ``begin[p + 1]``.
-    points1, points2 : (N, 2) ndarray
-        Raw pixels.
-    """
-
-    first: NDArray[np.int64]
+    first: NDArray[np.int64]     # (P,) frames
     second: NDArray[np.int64]
-    begin: NDArray[np.int64]
-    points1: Array
+    begin: NDArray[np.int64]     # (P + 1,) matches of pair p: begin[p] to begin[p + 1]
+    points1: Array               # (N, 2) raw pixels
     points2: Array
 
     def __len__(self) -> int:
@@ -98,21 +75,14 @@ def make_pairs(tracks: Tracks, gaps: Sequence[int], *, max_matches: int, min_mat
                max_interval: float, rng: np.random.Generator) -> Pairs:
     """Pairs of frames `gaps` frames apart, at every frame.
 
-    Parameters
-    ----------
-    tracks : Tracks
-    gaps : sequence of int
-    max_matches, min_matches : int
-        More are drawn from, a pair with fewer is left out.
-    max_interval : float
-        Pairs further apart than `max_interval` times the gap [s] have lost frames in between and
-        are left out.
-    rng : numpy.random.Generator
+    More than `max_matches` are drawn from, a pair with fewer than `min_matches` is left out, and
+    so is one further apart than `max_interval` times the gap [s], which has lost frames.
     """
     borders = np.searchsorted(tracks.frames, np.arange(len(tracks) + 1))
     order = np.lexsort((tracks.ids, tracks.frames))
     ids = tracks.ids[order]
-    first, second, counts, rows1, rows2 = [], [], [], [], []
+    none = np.empty(0, dtype=np.int64)
+    first, second, counts, rows1, rows2 = [], [], [], [none], [none]
     for gap in gaps:
         for i in range(len(tracks) - gap):
             j = i + gap
@@ -131,9 +101,6 @@ def make_pairs(tracks: Tracks, gaps: Sequence[int], *, max_matches: int, min_mat
             counts.append(len(in1))
             rows1.append(order[borders[i] + in1])
             rows2.append(order[borders[j] + in2])
-    none = np.empty(0, dtype=np.int64)
-    points1 = tracks.points[np.concatenate([none, *rows1])]
-    points2 = tracks.points[np.concatenate([none, *rows2])]
     begin = np.concatenate([[0], np.cumsum(np.array(counts, dtype=np.int64))])
     return Pairs(np.array(first, dtype=np.int64), np.array(second, dtype=np.int64), begin,
-                 points1, points2)
+                 tracks.points[np.concatenate(rows1)], tracks.points[np.concatenate(rows2)])

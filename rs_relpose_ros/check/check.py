@@ -14,7 +14,7 @@ from rs_relpose_ros.bags.topics import (
     TopicOptions,
 )
 from rs_relpose_ros.check import judge_images, judge_imu, judge_turning
-from rs_relpose_ros.check.findings import CheckReport, Finding, Verdict
+from rs_relpose_ros.check.findings import CheckReport, FAILURE, Finding, Verdict, WARNING
 from rs_relpose_ros.check.scan import Chosen, scan
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
@@ -48,17 +48,9 @@ def choose_topics(bag: Bag, options: TopicOptions) -> Chosen:
 
 def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters,
               on_message: Callable[[], object] = lambda: None) -> CheckReport:
-    """Read the chosen topics once and judge them.
+    """Read the chosen topics of an open bag once, and judge them and the node's parameters.
 
-    Parameters
-    ----------
-    bag : Bag
-        Open.
-    chosen : Chosen
-    parameters : Parameters
-        Of the node; those that were not given are judged as such.
-    on_message : callable
-        Called after each message, for a progress bar.
+    `on_message` is called after each message, for a progress bar.
 
     Raises
     ------
@@ -94,7 +86,7 @@ def _topics(bag: Bag, chosen: Chosen) -> Finding:
     if not absent:
         return Finding('topics', Verdict.OK, text, figures=figures)
     there = ', '.join(map(str, bag.topics)) or 'no topics at all'
-    return Finding('topics', Verdict.FAILURE,
+    return Finding('topics', FAILURE,
                    f'no {" and no ".join(absent)} topic; the bag has {there}',
                    'record images (raw or compressed), their CameraInfo and a sensor_msgs/Imu '
                    'with gyro', figures)
@@ -103,7 +95,7 @@ def _topics(bag: Bag, chosen: Chosen) -> Finding:
 def _parameters(parameters: Parameters) -> Finding:
     missing = parameters.sensor.missing()
     if missing:
-        return Finding('parameters', Verdict.WARNING, f'{" and ".join(missing)} not given',
+        return Finding('parameters', WARNING, f'{" and ".join(missing)} not given',
                        'the node needs them: give --params FILE, or find them from a recording '
                        'with "rs_relpose calibrate"', {'missing': missing})
     return Finding('parameters', Verdict.OK, 'readout_time '

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 import textwrap
-from typing import Any
+from typing import Any, NamedTuple
 
 
 class Verdict(str, Enum):
@@ -17,28 +17,37 @@ class Verdict(str, Enum):
     FAILURE = 'failure'
 
 
+# Short, for the tables of cases.
+WARNING, FAILURE = Verdict.WARNING, Verdict.FAILURE
+
+
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One line of the report.
+    """One line of the report."""
 
-    Attributes
-    ----------
-    name : str
-        What was looked at.
-    verdict : Verdict
-    text : str
-        What was found, with units.
-    remedy : str
-        What to do about it; empty where nothing need be done.
-    figures : dict
-        The same in numbers, SI units unless the name says otherwise.
-    """
-
-    name: str
+    name: str            # what was looked at
     verdict: Verdict
-    text: str
-    remedy: str = ''
+    text: str            # what was found, with units
+    remedy: str = ''     # what to do about it; empty where nothing need be done
+    # The same in numbers, SI units unless the name says otherwise.
     figures: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Case(NamedTuple):
+    """Verdict and remedy where a condition holds; `more` follows the text of the finding."""
+
+    holds: bool
+    verdict: Verdict
+    remedy: str
+    more: str = ''
+
+
+def judged(name: str, text: str, figures: Mapping[str, Any], *cases: Case) -> Finding:
+    """Finding by the first of the `cases` that holds; OK where none does."""
+    for case in cases:
+        if case.holds:
+            return Finding(name, case.verdict, text + case.more, case.remedy, figures)
+    return Finding(name, Verdict.OK, text, figures=figures)
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from rs_relpose_ros.calibrate.axis_maps import axes_text, nearest_axis_map
-from rs_relpose_ros.check.findings import Finding, Verdict
+from rs_relpose_ros.check.findings import Case, FAILURE, Finding, judged, Verdict, WARNING
 from rs_relpose_ros.check.scan import Scan
 from rs_relpose_ros.check.turning import Alignment
 from rs_relpose_ros.config.parameters import Parameters
@@ -35,7 +35,7 @@ _NO_EFFECT, _STRONG_EFFECT = 1.0, 4.0
 def findings(seen: Scan, parameters: Parameters) -> list[Finding]:
     """What is said of both sensors together."""
     found = [_overlap(seen, parameters), _texture(seen)]
-    if found[0].verdict is not Verdict.FAILURE:
+    if found[0].verdict is not FAILURE:
         sensor = parameters.sensor
         readout = sensor.readout_time
         if readout is not None and sensor.readout_direction == 'up':
@@ -50,29 +50,27 @@ def findings(seen: Scan, parameters: Parameters) -> list[Finding]:
 
 def _overlap(seen: Scan, parameters: Parameters) -> Finding:
     """Whether the gyro covers the images in time, as stamped."""
-    images, imu = seen.image_stamps.summary(), seen.imu_stamps.summary()
+    name, images, imu = 'clocks', seen.image_stamps, seen.imu_stamps
+    if not images.count or not imu.count:
+        return Finding(name, FAILURE, 'no stamps to compare', 'see above')
     offset_ns = round(parameters.sensor.time_offset * 1e9)
     first, last = images.first_ns + offset_ns, images.last_ns + offset_ns
     common = (min(last, imu.last_ns) - max(first, imu.first_ns)) * 1e-9
-    apart = images.delay - imu.delay
-    figures = {'common_s': common, 'image_delay_s': images.delay, 'imu_delay_s': imu.delay}
-    name = 'clocks'
-    if not images.count or not imu.count:
-        return Finding(name, Verdict.FAILURE, 'no stamps to compare', 'see above')
+    delay, imu_delay = images.delay, imu.delay
+    apart = delay - imu_delay
+    figures = {'common_s': common, 'image_delay_s': delay, 'imu_delay_s': imu_delay}
     if common <= 0.0 or abs(apart + parameters.sensor.time_offset) > max(
             _SAME_CLOCK, 0.5 * images.duration):
-        return Finding(name, Verdict.FAILURE, f'images and IMU are stamped {abs(apart):.3f} s '
-                       'apart', 'let both drivers use one clock (ROS time, not time since boot), '
-                       f'or set time_offset: {apart:.3f} if the difference is constant', figures)
-    text = (f'{common:.1f} s in common; recorded {1e3 * images.delay:.0f} ms (images) and '
-            f'{1e3 * imu.delay:.0f} ms (IMU) after their stamps')
-    if common < 0.8 * images.duration:
-        return Finding(name, Verdict.WARNING, text, "images outside of the IMU's time are "
-                       'refused: start the IMU first and stop it last', figures)
-    if abs(apart) > _SAME_CLOCK:
-        return Finding(name, Verdict.WARNING, text, 'the delays differ: see that both stamp the '
-                       'instant of measuring', figures)
-    return Finding(name, Verdict.OK, text, figures=figures)
+        return Finding(name, FAILURE, f'images and IMU are stamped {abs(apart):.3f} s apart',
+                       'let both drivers use one clock (ROS time, not time since boot), or set '
+                       f'time_offset: {apart:.3f} if the difference is constant', figures)
+    return judged(
+        name, f'{common:.1f} s in common; recorded {1e3 * delay:.0f} ms (images) and '
+        f'{1e3 * imu_delay:.0f} ms (IMU) after their stamps', figures,
+        Case(common < 0.8 * images.duration, WARNING, "images outside of the IMU's time are "
+             'refused: start the IMU first and stop it last'),
+        Case(abs(apart) > _SAME_CLOCK, WARNING,
+             'the delays differ: see that both stamp the instant of measuring'))
 
 
 def _texture(seen: Scan) -> Finding:
@@ -82,15 +80,13 @@ def _texture(seen: Scan) -> Finding:
                        'CameraInfo')
     median = float(np.median(points))
     poor = float(np.mean(np.array(points) < 30))
-    figures = {'median_points': median, 'poor_share': poor}
-    text = f'{median:.0f} points tracked from image to image in the median'
-    if median < 15:
-        return Finding('texture', Verdict.FAILURE, text, 'record a textured scene, in focus, with '
-                       'an exposure below 10 ms', figures)
-    if poor > 0.3:
-        return Finding('texture', Verdict.WARNING, f'{text}, fewer than 30 in {100 * poor:.0f} %',
-                       'more light, more texture or slower motion', figures)
-    return Finding('texture', Verdict.OK, text, figures=figures)
+    return judged(
+        'texture', f'{median:.0f} points tracked from image to image in the median',
+        {'median_points': median, 'poor_share': poor},
+        Case(median < 15, FAILURE,
+             'record a textured scene, in focus, with an exposure below 10 ms'),
+        Case(poor > 0.3, WARNING, 'more light, more texture or slower motion',
+             f', fewer than 30 in {100 * poor:.0f} %'))
 
 
 def _aligned(found: Alignment, seen: Scan, parameters: Parameters) -> list[Finding]:
@@ -101,34 +97,29 @@ def _aligned(found: Alignment, seen: Scan, parameters: Parameters) -> list[Findi
                         'some seconds', figures)]
     text = f'the gyro explains {100 * found.explained:.0f} % of how the images turn'
     if found.explained < _EXPLAINED:
-        doubtful = found.explained < _DOUBTFUL
         return [Finding(
-            'axes and clock', Verdict.FAILURE if doubtful else Verdict.WARNING, text,
+            'axes and clock', FAILURE if found.explained < _DOUBTFUL else WARNING, text,
             'is it the IMU of this camera, are both clocks within 0.25 s, is electronic '
             'stabilisation off and the scene at rest? Then record more turning and less moving',
             figures)]
-    both = [Finding('gyro and images', Verdict.OK, text, figures=figures), _scale(found)]
-    if both[1].verdict is Verdict.FAILURE:
+    both = [Finding('gyro and images', Verdict.OK, text, figures=figures), _scale(found.scale)]
+    if both[1].verdict is FAILURE:
         return both
     return [*both, _clock(found, parameters), _axes(found, seen, parameters)]
 
 
-def _scale(found: Alignment) -> Finding:
-    text = f'images turn {found.scale:.3f} times as far as the gyro'
-    figures = {'scale': found.scale}
-    if not 0.5 < found.scale < 2.0:
-        return Finding('scale', Verdict.FAILURE, text, 'correct the unit of the gyro (rad/s) or '
-                       'the focal length of the CameraInfo', figures)
-    if abs(found.scale - 1.0) > _SCALE_LIMIT:
-        return Finding('scale', Verdict.WARNING, text, 'the focal length of the CameraInfo may be '
-                       'of another resolution, or the gyro off in scale', figures)
-    return Finding('scale', Verdict.OK, text, figures=figures)
+def _scale(scale: float) -> Finding:
+    return judged(
+        'scale', f'images turn {scale:.3f} times as far as the gyro', {'scale': scale},
+        Case(not 0.5 < scale < 2.0, FAILURE,
+             'correct the unit of the gyro (rad/s) or the focal length of the CameraInfo'),
+        Case(abs(scale - 1.0) > _SCALE_LIMIT, WARNING, 'the focal length of the CameraInfo may be '
+             'of another resolution, or the gyro off in scale'))
 
 
 def _clock(found: Alignment, parameters: Parameters) -> Finding:
     """Offset of the middle row, taken to that of the stamped row where the read-out is known."""
-    sensor, sigma = parameters.sensor, found.offset_sigma
-    name = 'time offset'
+    name, sensor, sigma = 'time offset', parameters.sensor, found.offset_sigma
     if sensor.readout_time is None:
         return Finding(name, Verdict.OK, f'the middle row is seen {1e3 * found.offset:+.1f} +- '
                        f"{1e3 * sigma:.1f} ms after its stamp by the IMU's clock: time_offset "
@@ -140,49 +131,42 @@ def _clock(found: Alignment, parameters: Parameters) -> Finding:
     down = 1.0 if sensor.readout_direction == 'down' else -1.0
     offset = found.offset - rows * down * sensor.readout_time - shift * sensor.exposure_time
     off = max(abs(offset - sensor.time_offset) - 2.0 * sigma, 0.0)
-    figures = {'middle_row_s': found.offset, 'time_offset_s': offset, 'sigma_s': sigma}
-    text = (f'{1e3 * offset:+.1f} +- {1e3 * sigma:.1f} ms by images and gyro, time_offset says '
-            f'{1e3 * sensor.time_offset:+.1f} ms')
     remedy = (f'set time_offset: {offset:.4f}, or have it measured with "rs_relpose calibrate"; '
               'track_time_offset follows it')
-    if off > _OFFSET_LIMITS[1]:
-        return Finding(name, Verdict.FAILURE, text, remedy, figures)
-    if off > _OFFSET_LIMITS[0]:
-        return Finding(name, Verdict.WARNING, text, remedy, figures)
-    return Finding(name, Verdict.OK, text, figures=figures)
+    return judged(
+        name, f'{1e3 * offset:+.1f} +- {1e3 * sigma:.1f} ms by images and gyro, time_offset says '
+        f'{1e3 * sensor.time_offset:+.1f} ms',
+        {'middle_row_s': found.offset, 'time_offset_s': offset, 'sigma_s': sigma},
+        Case(off > _OFFSET_LIMITS[1], FAILURE, remedy),
+        Case(off > _OFFSET_LIMITS[0], WARNING, remedy))
 
 
 def _axes(found: Alignment, seen: Scan, parameters: Parameters) -> Finding:
     nearest = axes_text(nearest_axis_map(found.R_cam_imu))
     figures = {'nearest': nearest, 'R_cam_imu': found.R_cam_imu.tolist(),
                'balance': found.balance}
-    text = f'nearest map {nearest}'
-    force = seen.inertial.summary().force
     if parameters.sensor.quat_cam_imu_xyzw is None:
         if found.balance < _BALANCED:
-            return Finding('axes', Verdict.WARNING, 'the camera turns about one axis only: the '
-                           'map of axes is not known', 'turn it about all three', figures)
+            return Finding('axes', WARNING, 'the camera turns about one axis only: the map of '
+                           'axes is not known', 'turn it about all three', figures)
+        text, force = f'nearest map {nearest}', seen.inertial.force
         if np.isfinite(force).all():
             down = -found.R_cam_imu @ force / np.linalg.norm(force)
             text += f'; gravity is at {_words(down)} of the image'
         return Finding('axes', Verdict.OK, text, 'rs_relpose calibrate finds quat_cam_imu_xyzw',
                        figures)
-    R = parameters.sensor.R_cam_imu
-    apart = math.degrees(float(np.linalg.norm(log_so3(np.ascontiguousarray(
-        found.R_cam_imu @ R.T)))))
-    figures['apart_deg'] = apart
-    text = f'{apart:.1f} deg between quat_cam_imu_xyzw and images with gyro ({nearest})'
-    if found.balance < _BALANCED:
-        return Finding('axes', Verdict.OK, f'{text}, but the camera turns about one axis only',
-                       'turn it about all three for a verdict', figures)
+    difference = np.ascontiguousarray(found.R_cam_imu @ parameters.sensor.R_cam_imu.T)
+    apart = math.degrees(float(np.linalg.norm(log_so3(difference))))
     remedy = ('see that quat_cam_imu_xyzw turns IMU vectors into the camera (a static transform '
               'with parent imu holds the inverse), or have it measured with '
               '"rs_relpose calibrate"')
-    if apart > _AXES_LIMITS[1]:
-        return Finding('axes', Verdict.FAILURE, text, remedy, figures)
-    if apart > _AXES_LIMITS[0]:
-        return Finding('axes', Verdict.WARNING, text, remedy, figures)
-    return Finding('axes', Verdict.OK, text, figures=figures)
+    return judged(
+        'axes', f'{apart:.1f} deg between quat_cam_imu_xyzw and images with gyro ({nearest})',
+        figures | {'apart_deg': apart},
+        Case(found.balance < _BALANCED, Verdict.OK, 'turn it about all three for a verdict',
+             ', but the camera turns about one axis only'),
+        Case(apart > _AXES_LIMITS[1], FAILURE, remedy),
+        Case(apart > _AXES_LIMITS[0], WARNING, remedy))
 
 
 def _words(down: np.ndarray) -> str:
@@ -194,30 +178,24 @@ def _words(down: np.ndarray) -> str:
 
 def _effect(seen: Scan, parameters: Parameters) -> Finding | None:
     """Displacement of the last against the first row by rotation alone [px]."""
-    intrinsics, summary = seen.intrinsics, seen.inertial.summary()
-    if intrinsics is None or not len(summary.rates):
+    intrinsics, inertial = seen.intrinsics, seen.inertial
+    if intrinsics is None or not len(inertial.rates):
         return None
-    given = parameters.sensor.readout_time
+    given, rest = parameters.sensor.readout_time, inertial.rest()
     readout = _EXAMPLE_READOUT if given is None else given
-    bias = summary.rest_bias
-    if bias is None:
-        bias = np.array(parameters.imu.gyro_bias)
-    rates = np.linalg.norm(summary.rates - bias, axis=1)
+    bias = np.array(parameters.imu.gyro_bias) if rest is None else rest.value
+    rates = np.linalg.norm(inertial.rates - bias, axis=1)
     median, high = (readout * intrinsics.fx * float(np.percentile(rates, p)) for p in (50, 95))
     figures = {'readout_s': readout, 'given': given is not None, 'median_px': median,
                'p95_px': high}
     name = 'rolling shutter'
-    assumed = '' if given is not None else ' (assumed; give readout_time)'
-    text = (f'turning moves the last row by {median:.1f} px against the first in the median, '
-            f'{high:.1f} px at 95 %, at a read-out of {1e3 * readout:.1f} ms{assumed}')
     if readout == 0.0:
         return Finding(name, Verdict.OK, 'global shutter (readout_time 0): any method will do',
                        figures=figures)
-    if high < _NO_EFFECT:
-        return Finding(name, Verdict.OK, f'{text}: a global-shutter method would do as well',
-                       figures=figures)
-    if median > _STRONG_EFFECT:
-        return Finding(name, Verdict.OK, f'{text}: a global-shutter method would not do',
-                       figures=figures)
-    return Finding(name, Verdict.OK, f'{text}: a global-shutter method loses accuracy',
+    assumed = '' if given is not None else ' (assumed; give readout_time)'
+    method = ('would do as well' if high < _NO_EFFECT else
+              'would not do' if median > _STRONG_EFFECT else 'loses accuracy')
+    return Finding(name, Verdict.OK, f'turning moves the last row by {median:.1f} px against the '
+                   f'first in the median, {high:.1f} px at 95 %, at a read-out of '
+                   f'{1e3 * readout:.1f} ms{assumed}: a global-shutter method {method}',
                    figures=figures)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -39,40 +39,56 @@ class Chosen:
         return [topic for topic in (self.image, self.camera_info, self.imu, self.accel) if topic]
 
 
-@dataclass(slots=True, eq=False)
 class Scan:
-    """What one pass saw.
+    """What one pass saw; `images` is the number of images to come."""
 
-    Attributes
-    ----------
-    encodings : dict
-        Number of images by encoding or format.
-    sizes : dict
-        Number of decoded images by (width, height).
-    largest_image : int
-        Bytes of the largest image message.
-    image_problem, calibration_problem, imu_problem : str
-        The first reason why a message cannot be used; `bad_images` and so on count them.
-    calibrations : int
-        Number of different ones in turn.
-    """
+    def __init__(self, images: int, tracking: TrackingConfig) -> None:
+        self.turning = TurningImages(images, tracking)
+        self.image_stamps, self.imu_stamps, self.inertial = Stamps(), Stamps(), Inertial()
+        self.encodings: dict[str, int] = {}            # number of images by encoding or format
+        self.sizes: dict[tuple[int, int], int] = {}    # of decoded images by (width, height)
+        self.largest_image = 0                         # message of an image [bytes]
+        self.intrinsics: Intrinsics | None = None
+        self.calibrations = 0                          # number of different ones in turn
+        self.bad_images = self.bad_imu = 0             # messages that cannot be used
+        self.problems: dict[Role, str] = {}            # the first reason for that
+        self.feed = SensorFeed({Role.IMU: self._imu, Role.ACCEL: self.inertial.add,
+                                Role.CAMERA_INFO: self._camera_info, Role.IMAGE: self._image})
+        self._recorded_ns = 0
 
-    turning: TurningImages
-    image_stamps: Stamps = field(default_factory=Stamps)
-    imu_stamps: Stamps = field(default_factory=Stamps)
-    inertial: Inertial = field(default_factory=Inertial)
-    encodings: dict[str, int] = field(default_factory=dict)
-    sizes: dict[tuple[int, int], int] = field(default_factory=dict)
-    largest_image: int = 0
-    image_problem: str = ''
-    bad_images: int = 0
-    intrinsics: Intrinsics | None = None
-    calibrations: int = 0
-    calibration_problem: str = ''
-    imu_problem: str = ''
-    bad_imu: int = 0
-    gyro_samples: int = 0
-    accel_samples: int = 0
+    def take(self, role: Role, message: BagMessage) -> None:
+        """Take in the next message."""
+        self._recorded_ns = message.bag_time_ns
+        try:
+            self.feed.receive(role, message.message)
+        except RsRelposeError as error:
+            self.bad_images += role is Role.IMAGE
+            self.bad_imu += role in (Role.IMU, Role.ACCEL)
+            self.problems.setdefault(Role.IMU if role is Role.ACCEL else role, str(error))
+
+    def _imu(self, sample: ImuSample) -> None:
+        self.imu_stamps.add(sample.stamp_ns, self._recorded_ns)
+        self.inertial.add(sample)
+        if sample.angular_velocity is not None:
+            self.turning.add_rate(sample.stamp_ns, self._recorded_ns,
+                                  np.array(sample.angular_velocity))
+
+    def _camera_info(self, intrinsics: Intrinsics) -> None:
+        self.calibrations += intrinsics != self.intrinsics
+        self.intrinsics = intrinsics
+
+    def _image(self, published: PublishedImage) -> None:
+        _count(self.encodings, published.image.encoding[:60])
+        self.largest_image = max(self.largest_image, len(published.image.data))
+        self.image_stamps.add(published.stamp_ns, self._recorded_ns)
+        if not self.turning.wants_next():
+            return
+        image = published.image.decoded()
+        size = image.shape[1], image.shape[0]
+        _count(self.sizes, size)
+        intrinsics = self.intrinsics
+        if intrinsics is not None and (intrinsics.image_width, intrinsics.image_height) == size:
+            self.turning.add_image(published.stamp_ns, self._recorded_ns, image, intrinsics)
 
 
 def scan(bag: Bag, chosen: Chosen, tracking: TrackingConfig,
@@ -84,68 +100,11 @@ def scan(bag: Bag, chosen: Chosen, tracking: TrackingConfig,
     InputError
         The bag is damaged.
     """
-    seen = Scan(turning=TurningImages(chosen.image.count if chosen.image else 0, tracking))
-    reader = _Reader(seen)
-    for role, message in reader.feed.messages(bag, chosen):
-        reader.take(role, message)
+    seen = Scan(chosen.image.count if chosen.image else 0, tracking)
+    for role, message in seen.feed.messages(bag, chosen):
+        seen.take(role, message)
         on_message()
     return seen
-
-
-class _Reader:
-    """Sorts messages into a `Scan`."""
-
-    def __init__(self, seen: Scan) -> None:
-        self._seen = seen
-        self._recorded_ns = 0
-        self.feed = SensorFeed({Role.IMU: self._imu, Role.ACCEL: self._accel,
-                                Role.CAMERA_INFO: self._camera_info, Role.IMAGE: self._image})
-
-    def take(self, role: Role, message: BagMessage) -> None:
-        seen, self._recorded_ns = self._seen, message.bag_time_ns
-        try:
-            self.feed.receive(role, message.message)
-        except RsRelposeError as error:
-            if role is Role.IMAGE:
-                seen.bad_images += 1
-                seen.image_problem = seen.image_problem or str(error)
-            elif role is Role.CAMERA_INFO:
-                seen.calibration_problem = seen.calibration_problem or str(error)
-            else:
-                seen.bad_imu += 1
-                seen.imu_problem = seen.imu_problem or str(error)
-
-    def _imu(self, sample: ImuSample) -> None:
-        seen = self._seen
-        seen.imu_stamps.add(sample.stamp_ns, self._recorded_ns)
-        seen.inertial.add(sample)
-        seen.accel_samples += sample.linear_acceleration is not None
-        if sample.angular_velocity is not None:
-            seen.gyro_samples += 1
-            seen.turning.add_rate(sample.stamp_ns, self._recorded_ns,
-                                  np.array(sample.angular_velocity))
-
-    def _accel(self, sample: ImuSample) -> None:
-        self._seen.accel_samples += 1
-        self._seen.inertial.add(sample)
-
-    def _camera_info(self, intrinsics: Intrinsics) -> None:
-        self._seen.calibrations += intrinsics != self._seen.intrinsics
-        self._seen.intrinsics = intrinsics
-
-    def _image(self, published: PublishedImage) -> None:
-        seen = self._seen
-        _count(seen.encodings, published.image.encoding[:60])
-        seen.largest_image = max(seen.largest_image, len(published.image.data))
-        seen.image_stamps.add(published.stamp_ns, self._recorded_ns)
-        if not seen.turning.wants_next():
-            return
-        image = published.image.decoded()
-        size = image.shape[1], image.shape[0]
-        _count(seen.sizes, size)
-        intrinsics = seen.intrinsics
-        if intrinsics is not None and (intrinsics.image_width, intrinsics.image_height) == size:
-            seen.turning.add_image(published.stamp_ns, self._recorded_ns, image, intrinsics)
 
 
 def _count(counts: dict[_Key, int], key: _Key) -> None:

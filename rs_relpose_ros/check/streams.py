@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 import heapq
 
 import numpy as np
@@ -15,13 +14,7 @@ _LONGEST_KEPT = 4096
 
 
 class Thinned:
-    """Every n-th value of a stream; n doubles whenever too many have come.
-
-    Parameters
-    ----------
-    width : int
-        Numbers per value.
-    """
+    """Every n-th value, of `width` numbers, of a stream; n doubles whenever too many have come."""
 
     def __init__(self, width: int = 1) -> None:
         self._values = np.empty((2 * _KEPT, width))
@@ -47,68 +40,33 @@ class Thinned:
         return self._values[:self._kept]
 
 
-@dataclass(frozen=True, slots=True)
-class StampSummary:
-    """Stamps of a topic.
-
-    Attributes
-    ----------
-    count : int
-    first_ns, last_ns : int
-        Smallest and largest stamp.
-    interval : float
-        Median of the steps between consecutive messages [s]; NaN of fewer than two.
-    jitter : float
-        Their spread, 1.48 times the median deviation [s].
-    repeated, backwards : int
-        Steps of zero, and back in time.
-    furthest_back : float
-        The largest of the latter [s].
-    delay : float
-        Median of recording time minus stamp [s].
-    """
-
-    count: int
-    first_ns: int
-    last_ns: int
-    interval: float
-    jitter: float
-    repeated: int
-    backwards: int
-    furthest_back: float
-    delay: float
-
-    @property
-    def duration(self) -> float:
-        """From the smallest to the largest stamp [s]."""
-        return (self.last_ns - self.first_ns) * 1e-9
-
-
 class Stamps:
-    """Takes in the stamps of a topic in the order of recording."""
+    """Stamps of a topic, in the order of recording."""
 
     def __init__(self) -> None:
-        self._count = self._repeated = self._backwards = self._furthest_back = 0
-        self._first_ns = self._last_ns = 0
+        self.count = 0
+        self.first_ns = self.last_ns = 0         # smallest and largest stamp
+        self.repeated = self.backwards = 0       # steps of zero, and back in time
+        self.furthest_back = 0.0                 # largest of the latter [s]
         self._before_ns: int | None = None
         self._steps, self._delays = Thinned(), Thinned()
         self._longest: list[int] = []
 
     def add(self, stamp_ns: int, recorded_ns: int) -> None:
         """Take in the next message."""
-        self._count += 1
+        self.count += 1
         self._delays.add((recorded_ns - stamp_ns) * 1e-9)
         if self._before_ns is None:
-            self._first_ns = self._last_ns = self._before_ns = stamp_ns
+            self.first_ns = self.last_ns = self._before_ns = stamp_ns
             return
         step = stamp_ns - self._before_ns
         self._before_ns = stamp_ns
-        self._first_ns, self._last_ns = min(self._first_ns, stamp_ns), max(self._last_ns, stamp_ns)
+        self.first_ns, self.last_ns = min(self.first_ns, stamp_ns), max(self.last_ns, stamp_ns)
         if step == 0:
-            self._repeated += 1
+            self.repeated += 1
         elif step < 0:
-            self._backwards += 1
-            self._furthest_back = max(self._furthest_back, -step)
+            self.backwards += 1
+            self.furthest_back = max(self.furthest_back, -step * 1e-9)
         else:
             self._steps.add(step * 1e-9)
             if len(self._longest) < _LONGEST_KEPT:
@@ -116,16 +74,27 @@ class Stamps:
             else:
                 heapq.heappushpop(self._longest, step)
 
-    def summary(self) -> StampSummary:
-        """Figures of what came so far."""
+    @property
+    def interval(self) -> float:
+        """Median of the steps forwards [s]; NaN where there is none."""
         steps = self._steps.values
-        median = float(np.median(steps)) if len(steps) else float('nan')
-        return StampSummary(
-            count=self._count, first_ns=self._first_ns, last_ns=self._last_ns, interval=median,
-            jitter=1.4826 * float(np.median(np.abs(steps - median))) if len(steps) else 0.0,
-            repeated=self._repeated, backwards=self._backwards,
-            furthest_back=self._furthest_back * 1e-9,
-            delay=float(np.median(self._delays.values)) if self._count else float('nan'))
+        return float(np.median(steps)) if len(steps) else float('nan')
+
+    @property
+    def jitter(self) -> float:
+        """Spread of these steps, 1.48 times the median deviation [s]."""
+        steps = self._steps.values
+        return 1.4826 * float(np.median(np.abs(steps - self.interval))) if len(steps) else 0.0
+
+    @property
+    def delay(self) -> float:
+        """Median of recording time minus stamp [s]; NaN without a message."""
+        return float(np.median(self._delays.values)) if self.count else float('nan')
+
+    @property
+    def duration(self) -> float:
+        """From the smallest to the largest stamp [s]."""
+        return (self.last_ns - self.first_ns) * 1e-9
 
     def longer_than(self, seconds: float) -> tuple[int, float]:
         """Number of steps that are longer (at most some thousand are told) and the longest [s]."""

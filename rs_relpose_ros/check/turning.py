@@ -48,44 +48,23 @@ _LEAST_SIGMA = 7e-4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """Gyro and images laid upon each other.
+    """Gyro and images laid upon each other."""
 
-    Attributes
-    ----------
-    R_cam_imu : (3, 3) ndarray
-        Best rotation IMU to camera.
-    offset, offset_sigma : float
-        Best time from a frame's stamp to the gyro's [s]; it belongs to the middle row.
-    explained : float
-        Share of the images' turning that the gyro explains then, 0 to 1.
-    scale : float
-        Turning by the images over that by the gyro.
-    rate : float
-        Root mean square rate of the images [rad/s].
-    balance : float
-        Second over first principal rate: near 0 where the camera turned about one axis only.
-    pairs : int
-    """
-
-    R_cam_imu: Array
-    offset: float
-    offset_sigma: float
-    explained: float
-    scale: float
-    rate: float
-    balance: float
+    R_cam_imu: Array        # (3, 3)
+    offset: float           # from a frame's stamp to the gyro's [s], of the middle row
+    offset_sigma: float     # [s]
+    explained: float        # share of the images' turning that the gyro explains then, 0 to 1
+    scale: float            # turning by the images over that by the gyro
+    rate: float             # root mean square rate of the images [rad/s]
+    balance: float          # second over first principal rate: near 0 where it is about one axis
     pairs: int
 
 
 class TurningImages:
     """Takes in the images and the gyro, in the order of recording.
 
-    Parameters
-    ----------
-    images : int
-        Their number.
-    tracking : TrackingConfig
-        Its detector is used, with settings for small images.
+    `images` is the number of images; of `tracking` the detector is used, with settings for small
+    images.
     """
 
     def __init__(self, images: int, tracking: TrackingConfig) -> None:

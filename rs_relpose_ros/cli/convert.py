@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
-from rs_relpose_ros.cli.options import progress_bar, refuse_existing
-from rs_relpose_ros.config.parameter_file import SourcedValue, write_parameters
+from rs_relpose_ros.bags.writer import refuse_existing
+from rs_relpose_ros.cli.options import progress_bar
+from rs_relpose_ros.config.parameter_file import write_parameters
 from rs_relpose_ros.convert import realsense, xiaomi
 from rs_relpose_ros.convert.recording import Recording, write_bag
 from rs_relpose_ros.errors import MissingInputError
@@ -22,19 +21,8 @@ HELP = ('Turn a public recording into a rosbag2 directory (MCAP) with the topics
         'github.com/lhaippp/gyro-video-stabilization (gyro.txt, framestamp.txt, images/).')
 
 
-@dataclass(frozen=True, slots=True)
-class Dataset:
-    """How the recordings of one source are read, and what the node must know of them."""
-
-    read: Callable[[Path], Recording]
-    title: str
-    parameters: tuple[SourcedValue, ...]
-
-
-DATASETS: Mapping[str, Dataset] = {
-    'realsense_rgb_rs': Dataset(realsense.read_recording, realsense.TITLE, realsense.PARAMETERS),
-    'xiaomi_cc9_rs': Dataset(xiaomi.read_recording, xiaomi.TITLE, xiaomi.PARAMETERS),
-}
+# Source -> module: how its recordings are read, and what the node must know of them.
+DATASETS = {'realsense_rgb_rs': realsense, 'xiaomi_cc9_rs': xiaomi}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,16 +35,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the bag and its parameter file."""
-    dataset: Dataset = DATASETS[args.dataset]
+    dataset = DATASETS[args.dataset]
     folder: Path = args.folder
     parameters = args.out_bag.with_name(args.out_bag.name + '.yaml')
     if not folder.is_dir():
         raise MissingInputError(f'there is no folder {folder}')
     refuse_existing(args.out_bag, parameters)
-    recording = dataset.read(folder)
+    recording: Recording = dataset.read_recording(folder)
     with progress_bar(len(recording.images), 'image', args.out_bag.name) as bar:
         write_bag(recording, args.out_bag, on_image=bar.update)
-    write_parameters(parameters, dataset.title, dataset.parameters)
+    write_parameters(parameters, dataset.TITLE, dataset.PARAMETERS)
     size = sum(file.stat().st_size for file in args.out_bag.iterdir())
     print(f'{args.out_bag}: {len(recording.images)} images, {len(recording.cropped_imu())} IMU '
           f'samples, {size / 1e6:.1f} MB; parameters of the node: {parameters}')

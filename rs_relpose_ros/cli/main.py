@@ -9,7 +9,8 @@ import importlib.util
 import logging
 import os
 import sys
-from typing import Any, cast, Protocol
+from types import ModuleType
+from typing import Any
 
 from rs_relpose_ros.errors import MissingInputError, RsRelposeError
 
@@ -42,18 +43,6 @@ PIPE_CLOSED = 141  # 128 + SIGPIPE
 _logger = logging.getLogger(__name__)
 
 
-class Command(Protocol):
-    """What a command's module offers."""
-
-    HELP: str
-
-    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """Declare the command's arguments."""
-
-    def run(self, args: argparse.Namespace) -> int:
-        """Do the work; return 0 when done, 1 when it ran and failed."""
-
-
 class _Version(argparse.Action):
     """``--version``; looks the version up only when asked."""
 
@@ -63,20 +52,18 @@ class _Version(argparse.Action):
         parser.exit()
 
 
-def load_command(name: str) -> Command:
-    """Import the module of command `name`.
+def load_command(name: str) -> ModuleType:
+    """Import the module of command `name`: its HELP, `add_arguments(parser)` and `run(args)`.
 
-    Raises
-    ------
-    MissingInputError
-        It belongs to the laboratory, which is not installed.
+    `run` returns 0 when done, 1 when it ran and failed. MissingInputError where the command
+    belongs to the laboratory, which is not installed.
     """
     module, _ = COMMANDS[name]
     package = module.partition('.')[0]
     if importlib.util.find_spec(package) is None:
         raise MissingInputError(f'the command {name} needs the package {package}, which is not '
                                 'installed')
-    return cast('Command', importlib.import_module(module))
+    return importlib.import_module(module)
 
 
 def make_parser(selected: str | None) -> argparse.ArgumentParser:
@@ -126,7 +113,7 @@ def _run(arguments: list[str]) -> int:
         return end.code if isinstance(end.code, int) else BAD_INPUT
     _set_up_logging(args.verbose)
     try:
-        return load_command(args.command).run(args)
+        return int(load_command(args.command).run(args))
     except RsRelposeError as error:
         _logger.debug('refused here', exc_info=True)
         return _complain(f'error: {error}', BAD_INPUT)

@@ -1,4 +1,4 @@
-"""What several commands have in common: options, progress bars, refused paths, the version."""
+"""What several commands have in common: options, progress bars, the version."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import sys
 from tqdm import tqdm
 
 from rs_relpose_ros.bags.topics import TopicOptions
-from rs_relpose_ros.errors import InputError
 
 # Role of a topic -> what it holds.
 _ROLES = {
@@ -55,13 +54,6 @@ def bag_name(bag: Path) -> str:
     """Name of a bag without its folder, and without the suffix where it is a file."""
     bag = bag.resolve()
     return bag.stem if bag.is_file() else bag.name
-
-
-def refuse_existing(*paths: Path) -> None:
-    """Raise an InputError where one of the files or folders to be written exists."""
-    for path in paths:
-        if path.exists():
-            raise InputError(f'{path} exists already: remove it or choose another path')
 
 
 def progress_bar(total: int, unit: str, description: str | None = None) -> tqdm:

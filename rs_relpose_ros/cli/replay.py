@@ -21,7 +21,7 @@ from rs_relpose_ros.cli.options import (
 from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.errors import MissingInputError
 from rs_relpose_ros.replay.outputs import replay_into, ReplayOutcome, SUMMARY_FILE
-from rs_relpose_ros.replay.stamps import read_stamps
+from rs_relpose_ros.replay.run import read_stamps
 from rs_relpose_ros.replay.summary import with_provenance, write_summary
 
 HELP = (
@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
             outcome.figures, bag=args.bag, topics=topics, parameters=parameters, command=sys.argv,
             package_version=package_version())
     write_summary(folder / SUMMARY_FILE, summary)
-    for reason, count in outcome.counts.reasons.items():
+    for reason, count in summary['not_used'].items():
         _logger.warning('not used, %d times: %s', count, reason)
     for line in report(outcome, folder):
         print(line)
@@ -83,10 +83,10 @@ def run(args: argparse.Namespace) -> int:
 
 def report(outcome: ReplayOutcome, folder: Path) -> list[str]:
     """The outcome in some lines."""
-    figures, counts = outcome.figures, outcome.counts
-    pairs = figures['pairs']
-    refused = sum(counts.sequencer.refused.values()) + counts.failed_frames
-    lines = [f'{counts.sequencer.frames_taken} of {counts.images} images processed'
+    figures = outcome.figures
+    pairs, frames = figures['pairs'], figures['frames']
+    refused = sum(frames['refused'].values()) + frames['failed']
+    lines = [f'{frames["processed"]} of {frames["in_bag"]} images processed'
              + (f', {refused} refused' if refused else '')
              + f' ({_text(figures["timing"]["processing_per_frame_ms"], "ms per image")})',
              f'{pairs["total"]} pairs, {pairs["answered"]} with a pose'
@@ -96,7 +96,7 @@ def report(outcome: ReplayOutcome, folder: Path) -> list[str]:
         lines.append('no pair was closed: the bag is shorter than a keyframe interval, or too few '
                      'frames could be used')
     elif not pairs['answered']:
-        reasons = sorted({record.reason for record in outcome.records})
+        reasons = sorted({record.pose.reason for record in outcome.records})
         lines += [f'no pose: {reason}' for reason in reasons[:5]]
     errors, medians = figures['errors_against_truth'], figures['medians']
     if errors:

@@ -74,18 +74,16 @@ def declared(field: dataclasses.Field[Any]) -> Declared:
 def check_settings(config: Any) -> None:
     """Check every declared field of a configuration dataclass; call it in ``__post_init__``."""
     for field in dataclasses.fields(config):
-        if 'declared' in field.metadata:
-            value = getattr(config, field.name)
-            kind = declared(field).kind
-            if value is None and field.default is None:
-                continue
-            if kind is tuple and isinstance(value, list | tuple):
-                value = tuple(float(v) if type(v) is int else v for v in value)
-                object.__setattr__(config, field.name, value)
-            if kind is float and type(value) is int:
-                object.__setattr__(config, field.name, float(value))
-            elif (not isinstance(value, float) if kind is float
-                  else kind in (bool, int, str, tuple) and type(value) is not kind):
-                raise InputError(
-                    f'{field.name} must be of type {kind.__name__}, got {value!r}')
-            declared(field).check(field.name, value)
+        if 'declared' not in field.metadata:
+            continue
+        value, kind = getattr(config, field.name), declared(field).kind
+        if value is None and field.default is None:
+            continue
+        if kind is tuple and isinstance(value, list | tuple):
+            value = tuple(float(v) if type(v) is int else v for v in value)
+        elif kind is float and type(value) is int:
+            value = float(value)
+        object.__setattr__(config, field.name, value)
+        if not isinstance(value, float) if kind is float else type(value) is not kind:
+            raise InputError(f'{field.name} must be of type {kind.__name__}, got {value!r}')
+        declared(field).check(field.name, value)

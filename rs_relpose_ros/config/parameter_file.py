@@ -13,7 +13,6 @@ from typing import Any
 
 import yaml
 
-from rs_relpose_ros.config.declarations import Declared
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
 
@@ -38,18 +37,8 @@ class SourcedValue:
 def read_parameters(path: Path | str | None, assignments: Sequence[str] = ()) -> Parameters:
     """Parameters at their defaults, then from a file, then from ``NAME=VALUE`` assignments.
 
-    Parameters
-    ----------
-    path : path-like or None
-        As ``ros2 run --params-file`` takes it.
-    assignments : sequence of str
-        Values in YAML, such as ``gyro_bias=[0.01, 0, 0]``.
-
-    Raises
-    ------
-    InputError, MissingInputError
-        The file is absent or no parameter file; an unknown name (with near matches) or an illegal
-        value.
+    The file is as ``ros2 run --params-file`` takes it, the values of assignments are in YAML, such
+    as ``gyro_bias=[0.01, 0, 0]``.
     """
     parameters = Parameters()
     if path is not None:
@@ -79,19 +68,12 @@ def parameter_text(title: str, values: Sequence[SourcedValue]) -> str:
 
 
 def write_parameters(path: Path, title: str, values: Sequence[SourcedValue]) -> None:
-    """Write `parameter_text` to a new file.
-
-    Raises
-    ------
-    InputError
-        The file exists already or cannot be written.
-    """
+    """Write `parameter_text` to a new file."""
     try:
         with path.open('x', encoding='utf-8') as file:
             file.write(parameter_text(title, values))
     except FileExistsError:
-        raise InputError(
-            f'{path} exists already: remove it or choose another path') from None
+        raise InputError(f'{path} exists already: remove it or choose another path') from None
     except OSError as error:
         raise InputError(f'cannot write {path}: {error.strerror}') from error
 
@@ -151,14 +133,14 @@ def _values(path: Path) -> dict[str, Any]:
 
 def _converted(values: Mapping[str, Any]) -> dict[str, Any]:
     """Lists to tuples, and 1e-5 to a number as in ROS (to PyYAML it is a text)."""
-    declared = {name: declaration for name, _, declaration in Parameters.declarations()}
-    return {name: _convert(value, declared.get(name)) for name, value in values.items()}
+    kinds = {name: declared.kind for name, _, declared in Parameters.declarations()}
+    return {name: _convert(value, kinds.get(name)) for name, value in values.items()}
 
 
-def _convert(value: Any, declared: Declared | None) -> Any:
+def _convert(value: Any, kind: type | None) -> Any:
     if isinstance(value, list):
-        return tuple(_convert(item, declared) for item in value)
-    if isinstance(value, str) and declared is not None and declared.kind in (float, tuple):
+        return tuple(_convert(item, kind) for item in value)
+    if isinstance(value, str) and kind in (float, tuple):
         try:
             return float(value)
         except ValueError:

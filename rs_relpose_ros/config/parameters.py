@@ -118,17 +118,14 @@ class Parameters:
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> Parameters:
-        """Defaults overridden by `values`, by flat name.
-
-        Raises
-        ------
-        InputError
-            An unknown name (with near matches) or an illegal value.
-        """
+        """Defaults overridden by `values`, by flat name."""
         return cls().updated(values)
 
     def updated(self, values: Mapping[str, Any]) -> Parameters:
-        """A copy with some parameters changed, by flat name."""
+        """A copy with some parameters changed, by flat name.
+
+        An unknown name (named with near matches) or an illegal value raises InputError.
+        """
         known = [name for name, _, _ in self.declarations()]
         for name in values:
             if name not in known:
@@ -138,13 +135,13 @@ class Parameters:
         groups = {}
         for group in dataclasses.fields(self):
             config = getattr(self, group.name)
-            names = {item.name for item in dataclasses.fields(config)}
-            changed = {name: value for name, value in values.items() if name in names}
+            changed = {item.name: values[item.name] for item in dataclasses.fields(config)
+                       if item.name in values}
             groups[group.name] = dataclasses.replace(config, **changed)
         return Parameters(**groups)
 
     def to_mapping(self) -> dict[str, Any]:
         """Every parameter by flat name."""
-        return {item.name: getattr(getattr(self, group.name), item.name)
-                for group in dataclasses.fields(self)
-                for item in dataclasses.fields(getattr(self, group.name))}
+        configs = [getattr(self, group.name) for group in dataclasses.fields(self)]
+        return {item.name: getattr(config, item.name)
+                for config in configs for item in dataclasses.fields(config)}

@@ -44,13 +44,7 @@ PARAMETERS = (
 
 
 def read_recording(folder: Path) -> Recording:
-    """Read what the module's docstring describes; images are read when the bag is written.
-
-    Raises
-    ------
-    InputError, MissingInputError
-        A file is missing, or something in it cannot be used.
-    """
+    """Read what the module's docstring describes; images are read when the bag is written."""
     return Recording(
         camera=_read_camera(folder / 'camera.txt'),
         images=_read_frames(folder),

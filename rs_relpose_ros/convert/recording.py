@@ -20,6 +20,7 @@ from rs_relpose_ros.bags.layout import (
     IMU_FRAME,
     IMU_TOPIC,
 )
+from rs_relpose_ros.bags.topics import CAMERA_INFO, COMPRESSED_IMAGE, IMU
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
@@ -32,8 +33,8 @@ _IMU_AFTER_NS = 3 * NANOSECONDS
 # No camera makes JPEGs of this size.
 _MAX_IMAGE_BYTES = 1 << 27
 
-# Bag time [ns], topic, type and a function that makes the message.
-_Entry = tuple[int, str, str, Callable[[], Any]]
+# Bag time [ns], topic, type, message.
+_Entry = tuple[int, str, str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,23 +47,12 @@ class ImageFile:
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """One camera and one IMU.
-
-    Attributes
-    ----------
-    camera : RollingShutterCamera
-    images : tuple of ImageFile
-        By stamp, at least one; stamps on the camera's clock.
-    image_format : str
-        As in sensor_msgs/CompressedImage.
-    imu : tuple of ImuSample
-        By stamp, on the IMU's clock and in its own axes.
-    """
+    """One camera and one IMU, at least one image and one sample, each by its sensor's clock."""
 
     camera: RollingShutterCamera
     images: tuple[ImageFile, ...]
-    image_format: str
-    imu: tuple[ImuSample, ...]
+    image_format: str   # as in sensor_msgs/CompressedImage
+    imu: tuple[ImuSample, ...]   # in its own axes
 
     def __post_init__(self) -> None:
         if not self.images or not self.imu:
@@ -85,13 +75,7 @@ class Recording:
 
 
 def ordered_samples(samples: Iterable[ImuSample]) -> tuple[ImuSample, ...]:
-    """Samples by stamp, exact duplicates once.
-
-    Raises
-    ------
-    InputError
-        Two samples of one stamp differ.
-    """
+    """Samples by stamp, exact duplicates once."""
     by_stamp: dict[int, ImuSample] = {}
     for sample in samples:
         if by_stamp.setdefault(sample.stamp_ns, sample) != sample:
@@ -103,55 +87,35 @@ def write_bag(recording: Recording, path: Path | str,
               on_image: Callable[[], object] = lambda: None) -> None:
     """Write a recording as a bag, in the order in which drivers would have delivered.
 
-    Stamps stay as recorded, JPEG bytes unchanged.
-
-    Parameters
-    ----------
-    recording : Recording
-    path : path-like
-        Directory to create.
-    on_image : callable
-        Called after each image.
-
-    Raises
-    ------
-    InputError, MissingInputError
-        The path exists already or cannot be created, or an image cannot be used; then no bag is
-        left behind.
+    Stamps stay as recorded, JPEG bytes unchanged. `on_image` is called after each image. Where the
+    bag cannot be created or an image cannot be used, no bag is left behind.
     """
     with BagWriter(path) as bag:
-        entries = heapq.merge(_images(recording, bag, on_image), _imu(recording, bag),
-                              key=itemgetter(0))
-        for bag_time_ns, topic, msgtype, make in entries:
-            bag.write(topic, msgtype, make(), bag_time_ns)
+        for bag_time_ns, topic, msgtype, message in heapq.merge(
+                _images(recording, bag, on_image), _imu(recording, bag), key=itemgetter(0)):
+            bag.write(topic, msgtype, message, bag_time_ns)
 
 
 def _images(recording: Recording, bag: BagWriter,
             on_image: Callable[[], object]) -> Iterator[_Entry]:
     delay_ns = to_nanoseconds(recording.camera.readout_time + IMAGE_DELAY)
     for image in recording.images:
-        def info(stamp_ns: int = image.stamp_ns) -> Any:
-            return bag.camera_info(stamp_ns, CAMERA_FRAME, recording.camera)
-
-        def jpeg(image: ImageFile = image) -> Any:
-            data = _read_jpeg(image.path, recording.camera)
-            on_image()
-            return bag.compressed_image(image.stamp_ns, CAMERA_FRAME, data,
-                                        recording.image_format)
-
         bag_time_ns = image.stamp_ns + delay_ns
-        yield bag_time_ns, CAMERA_INFO_TOPIC, 'sensor_msgs/msg/CameraInfo', info
-        yield bag_time_ns, COMPRESSED_TOPIC, 'sensor_msgs/msg/CompressedImage', jpeg
+        yield (bag_time_ns, CAMERA_INFO_TOPIC, CAMERA_INFO,
+               bag.camera_info(image.stamp_ns, CAMERA_FRAME, recording.camera))
+        yield (bag_time_ns, COMPRESSED_TOPIC, COMPRESSED_IMAGE,
+               bag.compressed_image(image.stamp_ns, CAMERA_FRAME,
+                                    _read_jpeg(image.path, recording.camera),
+                                    recording.image_format))
+        on_image()
 
 
 def _imu(recording: Recording, bag: BagWriter) -> Iterator[_Entry]:
     delay_ns = to_nanoseconds(IMU_DELAY)
     for sample in recording.cropped_imu():
-        def message(sample: ImuSample = sample) -> Any:
-            return bag.imu(sample.stamp_ns, IMU_FRAME, sample.angular_velocity,
-                           sample.linear_acceleration)
-
-        yield sample.stamp_ns + delay_ns, IMU_TOPIC, 'sensor_msgs/msg/Imu', message
+        yield (sample.stamp_ns + delay_ns, IMU_TOPIC, IMU,
+               bag.imu(sample.stamp_ns, IMU_FRAME, sample.angular_velocity,
+                       sample.linear_acceleration))
 
 
 def _read_jpeg(path: Path, camera: RollingShutterCamera) -> bytes:

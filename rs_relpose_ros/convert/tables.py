@@ -66,18 +66,7 @@ class Row:
 def read_rows(path: Path, columns: int, separator: str | None = None) -> Iterator[Row]:
     """Lines of a text file, without the empty ones and those that begin with '#'.
 
-    Parameters
-    ----------
-    path : Path
-    columns : int
-        Number of columns that every line must have.
-    separator : str, optional
-        White space by default.
-
-    Raises
-    ------
-    InputError, MissingInputError
-        No such file, or a line with another number of columns.
+    Each must have so many `columns`, with a `separator` between them, white space by default.
     """
     if not path.is_file():
         raise MissingInputError(f'{path.name} is missing: there is no file {path}')

@@ -58,13 +58,7 @@ _IMAGE_NAME = re.compile(r'RE_frame-([0-9]{1,6})\.jpg')
 
 
 def read_recording(folder: Path) -> Recording:
-    """Read what the module's docstring describes; images are read when the bag is written.
-
-    Raises
-    ------
-    InputError, MissingInputError
-        A file is missing, or something in it cannot be used.
-    """
+    """Read what the module's docstring describes; images are read when the bag is written."""
     return Recording(
         camera=CAMERA,
         images=_find_images(folder),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 
 import numpy as np
@@ -9,47 +10,45 @@ from numpy.typing import ArrayLike, NDArray
 
 from rs_relpose_ros.config.estimator import EstimatorConfig
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.estimator import sampson
 from rs_relpose_ros.estimator.alternating import refine_alternating
+from rs_relpose_ros.estimator.arguments import (
+    checked_interval,
+    checked_matches,
+    checked_rotation,
+)
 from rs_relpose_ros.estimator.consensus import SCALES
 from rs_relpose_ros.estimator.hypotheses import draw_hypotheses, MODES, SolverMode
-from rs_relpose_ros.estimator.local_optimisation import (
-    cheirality_sign,
-    optimise,
-    select_inliers,
-    signed,
-)
-from rs_relpose_ros.estimator.map_fit import (
-    inverse,
-    linearised,
-    normal_equations,
-    PINNED,
-    Priors,
-    State,
-)
+from rs_relpose_ros.estimator.information import inverse
+from rs_relpose_ros.estimator.inliers import cheirality_sign, Flags, Matches, select_inliers
+from rs_relpose_ros.estimator.local_optimisation import optimise
+from rs_relpose_ros.estimator.map_fit import FitMatches
+from rs_relpose_ros.estimator.priors import PINNED, Priors, with_velocity_sigma
 from rs_relpose_ros.estimator.problem import (
     build_problem,
-    middle_row_delay,
     PairState,
     to_reference_row,
     TwoViewProblem,
 )
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.estimator.rotation_only import fit_rotation, transfer_errors
+from rs_relpose_ros.estimator.sampson import residuals
 from rs_relpose_ros.estimator.spread import (
     correlation,
     distance_from_a_plane,
     distinct_directions,
 )
+from rs_relpose_ros.estimator.state import hypothesis_state, signed, TwoViewState
+from rs_relpose_ros.estimator.uncertainty import local_covariance, pair_state
 from rs_relpose_ros.estimator.velocity_prior import (
     fit_with_evidence,
     GRID,
     LEAST_VELOCITY_CHANGE,
-    with_velocity_sigma,
+    Noise,
+    Refined,
 )
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
-from rs_relpose_ros.geometry.so3 import aligning_rotation, exp_so3, skew
+from rs_relpose_ros.geometry.so3 import aligning_rotation, exp_so3
 from rs_relpose_ros.solvers.solver import Solutions
 
 Array = NDArray[np.float64]
@@ -65,8 +64,6 @@ RAYS = (0, 9)
 ROTATION_ONLY_SIGMAS = 2.5
 # Points whose root mean square distance from a line is below so many thresholds lie on it.
 DEGENERATE_THRESHOLDS = 2.0
-# Of a predicted rotation [rad^2]: far beyond "anything is possible", which is 10.
-_LARGEST_COVARIANCE = 1e12
 # A translation direction less certain than this says nothing.
 MAX_TRANSLATION_SIGMA = 0.5
 
@@ -128,12 +125,10 @@ def estimate_relative_pose(
     """
     started = time.perf_counter()
     config = EstimatorConfig() if config is None else config
-    points1, points2, order = _checked_matches(points1, points2, quality)
-    rotation, rotation_covariance = _checked_rotation(
+    points1, points2, order = checked_matches(points1, points2, quality)
+    rotation, rotation_covariance = checked_rotation(
         relative_rotation, relative_rotation_covariance)
-    if interval is not None and not 1e-6 <= interval <= 1e6:
-        raise InputError('interval must be a positive number of seconds in [1e-6, 1e6] or None, '
-                         f'got {interval}')
+    interval = checked_interval(interval)
     mode = MODES[config.solver]
     if mode.needs_gravity and (motion1.gravity is None or motion2.gravity is None):
         raise InputError(f'solver {config.solver!r} needs gravity in both frames; use auto, '
@@ -141,13 +136,23 @@ def estimate_relative_pose(
     problem = build_problem(points1, points2, camera, motion1, motion2, rotation,
                             rotation_covariance, mode.model.derotated)
     seed = np.array([np.random.default_rng(rng).integers(2**63)], dtype=np.uint64)
-    pose = _Estimation(problem, mode, config, order, seed, interval).run(middle_row_delay(camera))
+    pose = Estimation(problem, mode, config, order, seed, interval).run()
     object.__setattr__(pose, 'duration', time.perf_counter() - started)
     return pose
 
 
-class _Estimation:
-    """The steps of one estimate, in the order of `run`."""
+class Estimation:
+    """The steps of one estimate, in the order of `run` (docs/estimator.md).
+
+    Parameters
+    ----------
+    order : (N,) ndarray of int64
+        The order in which matches are sampled.
+    seed : (1,) ndarray of uint64
+        State of the random numbers.
+    interval : float or None
+        Seconds between the frames.
+    """
 
     def __init__(self, problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig,
                  order: NDArray[np.int64], seed: NDArray[np.uint64],
@@ -155,114 +160,115 @@ class _Estimation:
         self.problem, self.mode, self.config = problem, mode, config
         self.order = order[problem.valid[order]]
         self.seed = seed
-        self.angle_sigma = config.pixel_sigma / problem.focal
+        self.matches = Matches(problem.observations, problem.valid,
+                               config.pixel_sigma / problem.focal)
         self.priors = _priors(problem, mode, config, interval)
         self.interval = interval
         self.iterations = 0
-        self.unasked = False
+        self.deadline = (time.perf_counter() + config.time_limit if config.time_limit > 0.0
+                         else math.inf)
+        # Whether solvers were spared, since one before them explained enough.
+        self.some_unasked = False
 
-    def run(self, delay: float) -> RelativePose:
-        config = self.config
-        if len(self.order) < config.min_inliers:
+    def run(self) -> RelativePose:
+        """The pose, or the reason why there is none."""
+        if len(self.order) < self.config.min_inliers:
             return self._failure(Status.TOO_FEW_MATCHES,
                                  f'{len(self.order)} usable matches, fewer than min_inliers = '
-                                 f'{config.min_inliers}')
-        # 1. Solutions from minimal samples, ranked by multi-scale MSAC.
-        return self.refine(self.sample(), delay)
+                                 f'{self.config.min_inliers}')
+        # 1. Hypotheses from minimal samples, ranked by multi-scale MSAC.
+        return self.refine(self.sample())
 
-    def refine(self, hypotheses: Solutions, delay: float) -> RelativePose:
+    def refine(self, hypotheses: Solutions) -> RelativePose:
         """All steps after the first."""
-        config = self.config
         # 2. Local optimisation of each; the best in the cost of the full model.
         state = self._best(hypotheses)
-        if self.unasked and (state is None or self._explained(state) <= EXPLAINED):
+        if self.some_unasked and (state is None or self._explained(state) <= EXPLAINED):
             # Angular hypotheses may explain matches by chance that the uniform model then loses.
             state = self._best(self.sample(enough=1.0))
         if state is None:
             return self._failure(Status.NO_CONSENSUS, 'no hypothesis explains the matches')
         # 3. Refinement on its inliers.
-        state, inliers, velocity_sigma, sigma, local = self._refine(state)
-        observations, cell = self.problem.observations, config.threshold / self.problem.focal
-        count = min(distinct_directions(observations, inliers, f, cell) for f in RAYS)
-        chance = self._inliers_by_chance()
-        if count < max(config.min_inliers, chance):
-            return self._failure(
-                Status.NO_CONSENSUS, f'{count} distinct of {len(self.order)} matches agree, fewer '
-                f'than max(min_inliers = {config.min_inliers}, {chance} expected by chance)')
-        if min(distance_from_a_plane(observations, inliers, f)
-               for f in RAYS) < DEGENERATE_THRESHOLDS * cell:
-            return self._failure(
-                Status.NO_CONSENSUS, f'the {count} matches that agree lie on one line: many poses '
-                'explain them')
+        refined = self._refined(state)
+        reason = self._no_consensus(refined.inliers)
+        if reason:
+            return self._failure(Status.NO_CONSENSUS, reason)
         # 4. Is there a translation at all?
-        turned = self._rotation_only(state, inliers, sigma, delay)
+        turned = self._rotation_only(refined)
         if turned is not None:
             return turned
         # 5. Covariance at the optimum, then from the middle to the reference row.
-        if local is None:
-            local = self._local_covariance(state, inliers, velocity_sigma, sigma)
-        final = self._with_covariance(state, local)
-        pose = to_reference_row(final, -delay, *self._turns(state, -delay))
-        return self._result(pose, state, inliers, velocity_sigma)
-
-    # -- steps -------------------------------------------------------------------------------
+        at_middle = pair_state(self.problem, refined.state, refined.covariance)
+        pose = to_reference_row(at_middle, self.problem.reference_row_time,
+                                *self._turns_to_reference_row(refined.state))
+        return self._result(pose, refined)
 
     def sample(self, enough: float = EXPLAINED) -> Solutions:
         """The best hypotheses, of solvers asked until one explains `enough` of the matches."""
         drawn = draw_hypotheses(self.problem, self.mode, self.config, self.order, self.seed,
-                                enough)
+                                enough, self.deadline)
         self.iterations += drawn.samples
-        self.unasked = drawn.some_unasked
+        self.some_unasked = drawn.some_unasked
         return drawn.hypotheses
 
-    def _best(self, hypotheses: Solutions) -> State | None:
-        config, problem = self.config, self.problem
+    def _best(self, hypotheses: Solutions) -> TwoViewState | None:
+        config, model = self.config, self.mode.model
         if not len(hypotheses.R):
             return None
         if config.refinement != 'map':
             # The paper's way: the best hypothesis as it is.
-            R, x, zero = hypotheses.R[0], hypotheses.x[0], np.zeros(3)
-            return self._in_front(State(R, x[:3], x[3:6], x[6:], zero, zero))
+            return self._in_front(hypothesis_state(hypotheses.R[0], hypotheses.x[0]))
         priors = with_velocity_sigma(self.priors, SAMPLING_VELOCITY_SIGMA) \
-            if self.mode.model.velocities or self.mode.model.derotated else self.priors
-        state, found = optimise(problem.observations, problem.valid, hypotheses.R, hypotheses.x,
-                                priors, config.pixel_sigma, config.threshold, self.angle_sigma)
+            if model.velocities or model.derotated else self.priors
+        state, found = optimise(self.matches, hypotheses, priors, config.pixel_sigma,
+                                config.threshold)
         return state if found else None
 
-    def _explained(self, state: State) -> float:
+    def _explained(self, state: TwoViewState) -> float:
         """Share of the matches that are inliers of the uniform model."""
-        inliers = select_inliers(self.problem.observations, self.problem.valid, state,
-                                 self.config.threshold, self.angle_sigma)
+        inliers = select_inliers(self.matches, state, self.config.threshold)
         return float(inliers.sum()) / len(self.order)
 
-    def _in_front(self, state: State) -> State:
-        near = np.abs(sampson.residuals(self.problem.observations, *state)) \
-            < self.config.threshold * SCALES[1]
-        return signed(state, cheirality_sign(
-            self.problem.observations, near & self.problem.valid, state))
+    def _in_front(self, state: TwoViewState) -> TwoViewState:
+        """The state or its mirror image, whichever has more matches in front of the cameras."""
+        errors = np.abs(residuals(self.matches.observations, state))
+        near = (errors < self.config.threshold * SCALES[1]) & self.matches.valid
+        return signed(state, cheirality_sign(self.matches.observations, near, state))
 
-    def _refine(self, state: State,
-                ) -> tuple[State, NDArray[np.bool_], float, float, Array | None]:
-        """State, inliers, sigma of velocities and of matches [px], and covariance if known."""
-        config, problem = self.config, self.problem
+    def _refined(self, state: TwoViewState) -> Refined:
+        config, matches = self.config, self.matches
         model = self.mode.model
         free = model.velocities or (model.derotated and config.refinement == 'map')
         if config.refinement == 'map':
             grid = GRID if free else np.array([1.0 / np.sqrt(PINNED)])
             if free and self.interval is not None:
                 grid = GRID[GRID >= LEAST_VELOCITY_CHANGE]
-            return fit_with_evidence(
-                problem.observations, problem.valid, state, self.priors, config.pixel_sigma,
-                config.threshold, self.angle_sigma, grid)
-        inliers = select_inliers(problem.observations, problem.valid, state, config.threshold,
-                                 self.angle_sigma)
+            return fit_with_evidence(matches, state, self.priors,
+                                     Noise(config.pixel_sigma, config.threshold), grid)
+        inliers = select_inliers(matches, state, config.threshold)
         if config.refinement == 'alternating' and inliers.sum() >= 12:
             state = self._in_front(refine_alternating(
-                problem.observations, inliers, state, config.pixel_sigma, free))
-            inliers = select_inliers(problem.observations, problem.valid, state, config.threshold,
-                                     self.angle_sigma)
-        sigma = SAMPLING_VELOCITY_SIGMA if free else 1.0 / np.sqrt(PINNED)
-        return state, inliers, sigma, config.pixel_sigma, None
+                matches.observations, inliers, state, config.pixel_sigma, free))
+            inliers = select_inliers(matches, state, config.threshold)
+        velocity_sigma = SAMPLING_VELOCITY_SIGMA if free else 1.0 / np.sqrt(PINNED)
+        covariance = local_covariance(
+            FitMatches(matches.observations, inliers, config.pixel_sigma), state,
+            with_velocity_sigma(self.priors, velocity_sigma))
+        return Refined(state, inliers, velocity_sigma, config.pixel_sigma, covariance)
+
+    def _no_consensus(self, inliers: Flags) -> str:
+        """Why the matches that agree tell no pose; empty where they may."""
+        config, observations = self.config, self.problem.observations
+        cell = config.threshold / self.problem.focal   # [rad]
+        count = min(distinct_directions(observations, inliers, f, cell) for f in RAYS)
+        chance = self._inliers_by_chance()
+        if count < max(config.min_inliers, chance):
+            return (f'{count} distinct of {len(self.order)} matches agree, fewer than '
+                    f'max(min_inliers = {config.min_inliers}, {chance} expected by chance)')
+        if min(distance_from_a_plane(observations, inliers, f)
+               for f in RAYS) < DEGENERATE_THRESHOLDS * cell:
+            return f'the {count} matches that agree lie on one line: many poses explain them'
+        return ''
 
     def _inliers_by_chance(self) -> int:
         """Inliers that the best of many fits reaches on random matches (about 5 sigma)."""
@@ -270,14 +276,14 @@ class _Estimation:
         expected = len(self.order) * min(4.0 * self.config.threshold / size, 0.5)
         return int(expected + 5.0 * np.sqrt(expected)) + self.mode.fitted_points
 
-    def _rotation_only(self, state: State, inliers: NDArray[np.bool_], sigma: float,
-                       delay: float) -> RelativePose | None:
+    def _rotation_only(self, refined: Refined) -> RelativePose | None:
         """The result without a translation, where none can be seen; None where one can.
 
         A rotation alone may absorb nearly all of the motion in front of a far plane, so it must
         explain the matches to within their noise, not to within some pixels.
         """
         problem, config = self.problem, self.config
+        state, inliers, sigma = refined.state, refined.inliers, refined.sigma
         parallax = float(np.median(transfer_errors(
             problem.observations, inliers, np.ascontiguousarray(state.R), problem.focal)))
         # Not from the pose's own rotation: on a line of points that may be any.
@@ -294,7 +300,8 @@ class _Estimation:
                   f'median parallax of {parallax:.2f} px is below min_parallax = '
                   f'{config.min_parallax:g} px')
         # Turned back to the reference row; the translation takes no part.
-        turn1, turn2 = self._turns(state._replace(R=R, dw1=np.zeros(3), dw2=np.zeros(3)), -delay)
+        turn1, turn2 = self._turns_to_reference_row(
+            state._replace(R=R, dw1=np.zeros(3), dw2=np.zeros(3)))
         covariance = np.full((6, 6), np.nan)
         # No rotation is less certain than half a turn: points in one place show only two angles.
         covariance[3:, 3:] = turn1.T @ inverse(information + np.eye(3) / np.pi**2) @ turn1
@@ -305,48 +312,19 @@ class _Estimation:
             angular_velocity2=problem.motion2.angular_velocity, model='angular',
             iterations=self.iterations, residual_rms=float(np.sqrt(np.mean(left**2))))
 
-    def _local_covariance(self, state: State, inliers: NDArray[np.bool_], velocity_sigma: float,
-                          sigma: float) -> Array:
-        """Covariance (17, 17) of the local parameters from the regularised Hessian."""
-        priors = with_velocity_sigma(self.priors, velocity_sigma)
-        hessian, gradient, _ = normal_equations(
-            linearised(self.problem.observations, inliers, state, sigma), state, priors)
-        local = inverse(hessian)
-        # A state that is not the optimum is off by about this step.
-        step = local @ gradient
-        return local + np.outer(step, step)
-
-    def _with_covariance(self, state: State, local: Array) -> PairState:
-        """The state with the covariance of (dt, dtheta, dv_1, dv_2, dw_1, dw_2)."""
-        # Local parameters (theta, tangent, d1, d2, dw1, dw2 in frame 1) to the state's.
-        jacobian = np.zeros((18, 17))
-        jacobian[0:3, 3:5] = sampson.tangent_basis(state.t)
-        jacobian[3:6, 0:3] = np.eye(3)
-        jacobian[6:9, 5:8] = np.eye(3)
-        # v_2 = R^T d_2, w_2 = w + R^T dw_2: the error of R turns them with it.
-        jacobian[9:12, 8:11] = state.R.T
-        jacobian[9:12, 0:3] = state.R.T @ skew(state.d2)
-        jacobian[12:15, 11:14] = np.eye(3)
-        jacobian[15:18, 14:17] = state.R.T
-        w1 = self.problem.motion1.angular_velocity + state.dw1
-        w2 = self.problem.motion2.angular_velocity + state.R.T @ state.dw2
-        return PairState(state.R, state.t, state.d1, state.R.T @ state.d2, w1, w2,
-                         jacobian @ local @ jacobian.T)
-
-    def _turns(self, state: State, delay: float) -> tuple[Array, Array]:
-        """How each camera turns from the middle row to the one `delay` later, as corrected."""
-        problem = self.problem
-        turn1 = problem.motion1.rotations([delay])[0]
-        turn2 = problem.motion2.rotations([delay])[0]
+    def _turns_to_reference_row(self, state: TwoViewState) -> tuple[Array, Array]:
+        """How each camera turns from the middle row to the reference row, as corrected."""
         if not self.mode.model.derotated:
             return np.eye(3), np.eye(3)
+        problem, delay = self.problem, self.problem.reference_row_time
+        turn1 = problem.motion1.rotations([delay])[0]
+        turn2 = problem.motion2.rotations([delay])[0]
         return (exp_so3(delay * state.dw1) @ turn1,
                 exp_so3(delay * (state.R.T @ state.dw2)) @ turn2)
 
-    def _result(self, pose: PairState, state: State, inliers: NDArray[np.bool_],
-                velocity_sigma: float) -> RelativePose:
+    def _result(self, pose: PairState, refined: Refined) -> RelativePose:
         translation_sigma = np.sqrt(max(np.trace(pose.covariance[:3, :3]), 0.0))
-        r = sampson.residuals(self.problem.observations, *state)[inliers]
+        r = residuals(self.problem.observations, refined.state)[refined.inliers]
         carries_pose = translation_sigma <= MAX_TRANSLATION_SIGMA
         v2w2 = np.r_[9:12, 15:18]
         return RelativePose(
@@ -355,9 +333,9 @@ class _Estimation:
             f'{np.degrees(translation_sigma):.0f} deg: too little parallax',
             R=pose.R, t=pose.t if carries_pose else np.full(3, np.nan),
             linear_velocity1=pose.v1, linear_velocity2=pose.v2, angular_velocity1=pose.w1,
-            angular_velocity2=pose.w2, inliers=inliers, covariance=pose.covariance[:6, :6],
+            angular_velocity2=pose.w2, inliers=refined.inliers, covariance=pose.covariance[:6, :6],
             velocity_covariance=pose.covariance[np.ix_(v2w2, v2w2)], model=self.mode.model.name,
-            velocity_sigma=velocity_sigma, iterations=self.iterations,
+            velocity_sigma=refined.velocity_sigma, iterations=self.iterations,
             residual_rms=float(np.sqrt(np.mean(r**2))))
 
     def _failure(self, status: Status, reason: str) -> RelativePose:
@@ -366,44 +344,9 @@ class _Estimation:
                             inliers=np.zeros(len(self.problem.valid), dtype=bool))
 
 
-def warm_up() -> None:
-    """Compile (or load from the cache) every kernel, so that the first estimate is not slow."""
-    points1, points2, camera, motion = _sideways()
-    for solver in MODES:
-        estimate_relative_pose(points1, points2, camera, motion, motion, np.eye(3),
-                               1e-4 * np.eye(3), config=EstimatorConfig(solver=solver))
-
-
-def warm_up_sampling() -> None:
-    """Compile the kernels of the first step alone."""
-    _warm_estimation().sample()
-
-
-def warm_up_refinement() -> None:
-    """Compile the kernels of all steps but the first."""
-    _warm_estimation().refine(Solutions(np.eye(3)[None], np.eye(1, 9)), 0.0)
-
-
-def _warm_estimation() -> _Estimation:
-    points1, points2, camera, motion = _sideways()
-    problem = build_problem(points1, points2, camera, motion, motion, np.eye(3),
-                            1e-4 * np.eye(3))
-    return _Estimation(problem, MODES['auto'], EstimatorConfig(), np.arange(len(points1)),
-                       np.zeros(1, dtype=np.uint64), None)
-
-
-def _sideways() -> tuple[Array, Array, RollingShutterCamera, FrameMotion]:
-    """Matches of a camera that moves to its right, for the warm-up."""
-    rng = np.random.default_rng(0)
-    camera = RollingShutterCamera(width=640, height=480, fx=450.0, fy=450.0, cx=319.5, cy=239.5,
-                                  readout_time=0.03)
-    motion = FrameMotion(np.array([0.0, 0.1, 0.0]), gravity=np.array([0.0, 1.0, 0.0]))
-    world = rng.uniform([-4.0, -3.0, 4.0], [4.0, 3.0, 12.0], (100, 3))
-    return camera.project(world), camera.project(world - [0.5, 0.0, 0.0]), camera, motion
-
-
 def _priors(problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig,
             interval: float | None) -> Priors:
+    """What the IMU says of this pair; velocities as loose as hypotheses are compared with."""
     g1, g2 = problem.motion1.gravity, problem.motion2.gravity
     known = g1 is not None and g2 is not None
     free = mode.model.velocities or mode.model.derotated
@@ -418,52 +361,3 @@ def _priors(problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig,
         1.0 / interval if free and interval is not None else 0.0,
         np.ascontiguousarray(rotation),
         np.ascontiguousarray(information) if information is not None else np.zeros((3, 3)))
-
-
-def _checked_matches(points1: ArrayLike, points2: ArrayLike, quality: ArrayLike | None,
-                     ) -> tuple[Array, Array, NDArray[np.int64]]:
-    checked = []
-    for name, value in (('points1', points1), ('points2', points2)):
-        points = np.ascontiguousarray(value, dtype=np.float64)
-        if points.size == 0:
-            points = points.reshape(0, 2)
-        if points.ndim != 2 or points.shape[1] != 2:
-            raise InputError(f'{name} must have shape (N, 2), got {points.shape}')
-        if not np.isfinite(points).all():
-            raise InputError(f'{name} must be finite pixels, got NaN or inf in row '
-                             f'{int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])}')
-        if points.size and np.abs(points).max() > 1e6:
-            raise InputError(f'{name} must be pixels within 1e6, got {np.abs(points).max():g}')
-        checked.append(points)
-    if len(checked[0]) != len(checked[1]):
-        raise InputError('points1 and points2 must have the same length, '
-                         f'got {len(checked[0])} and {len(checked[1])}')
-    order = np.arange(len(checked[0]))
-    if quality is not None:
-        values = np.asarray(quality, dtype=np.float64)
-        if values.shape != order.shape or not np.isfinite(values).all():
-            raise InputError(f'quality must be {len(order)} finite numbers, '
-                             f'got shape {values.shape}')
-        order = np.argsort(-values, kind='stable')
-    return checked[0], checked[1], order
-
-
-def _checked_rotation(rotation: ArrayLike | None, covariance: ArrayLike | None,
-                      ) -> tuple[Array | None, Array | None]:
-    if rotation is None and covariance is None:
-        return None, None
-    if rotation is None or covariance is None:
-        raise InputError('relative_rotation and relative_rotation_covariance go together: give '
-                         'both or neither')
-    R = np.array(rotation, dtype=np.float64)
-    # Bounded first, so that the product cannot overflow.
-    if R.shape != (3, 3) or not (np.abs(R).max() < 2.0
-                                 and np.allclose(R @ R.T, np.eye(3), atol=1e-6)
-                                 and np.linalg.det(R) > 0.0):
-        raise InputError(f'relative_rotation must be a (3, 3) rotation matrix, got {R.tolist()}')
-    C = np.array(covariance, dtype=np.float64)
-    if C.shape != (3, 3) or not np.abs(C).max() < _LARGEST_COVARIANCE \
-            or not np.allclose(C, C.T, atol=1e-9) or np.linalg.eigvalsh(C).min() < -1e-12:
-        raise InputError('relative_rotation_covariance must be a (3, 3) covariance matrix '
-                         f'[rad^2], got {C.tolist()}')
-    return R, C

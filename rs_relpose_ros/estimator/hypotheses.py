@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
+import time
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +27,8 @@ from rs_relpose_ros.solvers.table import GYRO_2PT, SOLVERS, UNIFORM
 
 # Hypotheses that are optimised further.
 POOL_SIZE = 6
+# Samples between two looks at the clock, where there is a time limit: some 0.2 ms.
+_TIMED_BLOCK = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +72,7 @@ class DrawnHypotheses(NamedTuple):
 
 def draw_hypotheses(problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig,
                     order: NDArray[np.int64], seed: NDArray[np.uint64],
-                    enough: float) -> DrawnHypotheses:
+                    enough: float, deadline: float = math.inf) -> DrawnHypotheses:
     """Ask the solvers of a mode until one explains a share `enough` of the matches.
 
     Parameters
@@ -77,6 +81,8 @@ def draw_hypotheses(problem: TwoViewProblem, mode: SolverMode, config: Estimator
         Usable matches, best first.
     seed : (1,) ndarray of uint64
         State of the random numbers, moved on.
+    deadline : float
+        Instant of `time.perf_counter` [s] at which sampling ends.
     """
     known = _knowledge(problem)
     matches = Matches(problem.points, order, (config.threshold * SCALES / problem.focal)**2)
@@ -87,15 +93,22 @@ def draw_hypotheses(problem: TwoViewProblem, mode: SolverMode, config: Estimator
             if (known.predicted or not solver.needs_rotation)
             and (has_gravity or not solver.needs_gravity)]
     pool = empty_pool(POOL_SIZE)
+    block = config.max_iterations if math.isinf(deadline) else _TIMED_BLOCK
     samples = inliers = 0
     some_unasked = False
     for solver, address in able:
-        some_unasked = inliers > enough * len(order)
+        some_unasked = (inliers > enough * len(order)
+                        or (samples > 0 and time.perf_counter() >= deadline))
         if some_unasked:
             break
-        drawn, inliers = sample_hypotheses(
-            address, solver.sample_size, matches, known, stop, inliers,
-            empty_solutions(solver.most_solutions), pool, seed)
+        out = empty_solutions(solver.most_solutions)
+        drawn, new = 0, block
+        while new == block:
+            before = drawn
+            drawn, inliers = sample_hypotheses(
+                address, solver.sample_size, matches, known, stop, drawn, block, inliers, out,
+                pool, seed)
+            new = drawn - before if time.perf_counter() < deadline else 0
         samples += drawn
     found = np.argsort(pool.cost)[:np.isfinite(pool.cost).sum()]
     return DrawnHypotheses(Solutions(pool.R[found], pool.x[found]), samples, some_unasked)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel
-from rs_relpose_ros.estimator.map_fit import Priors
+from rs_relpose_ros.estimator.priors import Priors
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
 from rs_relpose_ros.solvers.linear_algebra import cholesky, cholesky_solve
 

@@ -125,7 +125,7 @@ def _offer(R: Array, x: Array, cost: float, pool: Pool) -> None:
 
 @kernel
 def sample_hypotheses(solver: int, size: int, matches: Matches, known: Knowledge, stop: Stop,
-                      best_inliers: int, out: Solutions, pool: Pool,
+                      drawn: int, block: int, best_inliers: int, out: Solutions, pool: Pool,
                       seed: NDArray[np.uint64]) -> tuple[int, int]:
     """Draw samples for one solver and fill the pool.
 
@@ -133,8 +133,10 @@ def sample_hypotheses(solver: int, size: int, matches: Matches, known: Knowledge
     ----------
     solver, size : int
         Address of its kernel, and matches of a sample.
+    drawn, block : int
+        Samples drawn by an earlier call, and most samples of this one.
     best_inliers : int
-        Inliers that an earlier solver reached: the stopping rule starts from there.
+        Inliers of the best hypothesis of the pool: the stopping rule starts from there.
     out : Solutions
         Room for the solutions of one sample.
     pool : Pool
@@ -143,21 +145,21 @@ def sample_hypotheses(solver: int, size: int, matches: Matches, known: Knowledge
     Returns
     -------
     samples, inliers : int
-        Samples drawn, and the inliers (middle scale) of the best hypothesis.
+        Samples drawn so far, and the inliers (middle scale) of the best hypothesis.
     """
     usable = matches.order.shape[0]
     if usable < size:
-        return 0, best_inliers
+        return drawn, best_inliers
     chosen = np.empty(size, dtype=np.int64)
     sample = Sample(np.empty((size, 3)), np.empty((size, 3)), np.empty(size), np.empty(size))
     needed = float(stop.max_samples)
-    drawn = 0
+    last = min(drawn + block, stop.max_samples)
     # Minimal sets are noisy: an outlier-free one is not yet an accurate one.
     least = min(40, stop.max_samples)
     best = pool.cost.min()
     if best < math.inf:
         needed = samples_needed(best_inliers / usable, size, stop)
-    while drawn < stop.max_samples and (drawn < least or drawn < needed):
+    while drawn < last and (drawn < least or drawn < needed):
         # The set grows to all matches over 100 samples.
         head = min(usable, max(2 * size, (usable * (drawn + 1)) // 100))
         draw(matches.order, head, chosen, seed)

@@ -15,9 +15,6 @@ An observation row (20 floats) holds, for one match,
 Matches are evaluated in blocks, each laid out so that neighbours of one quantity are neighbours in
 memory: the compiler then works on several matches at once. For that it must know the strides,
 hence the arrays of fixed shape and the forced inlining.
-
-The state is ``R, t`` (unit), ``d_1, d_2`` and gyro corrections ``dw_1, dw_2``, all in frame 1;
-its 17 local parameters are ``(theta, t tangent, d_1, d_2, dw_1, dw_2)``, ``R <- Exp(theta) R``.
 """
 
 from __future__ import annotations
@@ -27,12 +24,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.compiled import inlined_kernel, kernel
+from rs_relpose_ros.compiled import inlined_kernel, kernel, linked_kernel
+from rs_relpose_ros.estimator.state import PARAMETERS, TwoViewState
+from rs_relpose_ros.geometry.vectors import cross, dot, norm, rotated, tangent_basis
 
 Array = NDArray[np.float64]
-
-PARAMETERS = 17
-THETA, TANGENT, D1, D2, DW1, DW2 = 0, 3, 5, 8, 11, 14
 
 # Matches of a block: enough to vectorise, few enough for the nearest cache.
 BLOCK = 64
@@ -43,32 +39,12 @@ def _cross(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
-@kernel
-def tangent_basis(t: Array) -> Array:
-    """Two orthonormal columns (3, 2) perpendicular to the unit vector `t`."""
-    basis = np.empty((3, 2))
-    # The axis least aligned with t keeps the cross product well conditioned.
-    k = 0
-    if abs(t[1]) < abs(t[k]):
-        k = 1
-    if abs(t[2]) < abs(t[k]):
-        k = 2
-    axis = np.zeros(3)
-    axis[k] = 1.0
-    ux, uy, uz = _cross(t[0], t[1], t[2], axis[0], axis[1], axis[2])
-    norm = math.sqrt(ux * ux + uy * uy + uz * uz)
-    basis[0, 0], basis[1, 0], basis[2, 0] = ux / norm, uy / norm, uz / norm
-    basis[0, 1], basis[1, 1], basis[2, 1] = _cross(
-        t[0], t[1], t[2], basis[0, 0], basis[1, 0], basis[2, 0])
-    return basis
-
-
 @inlined_kernel
-def _baselines(t: Array, d1: Array, d2: Array) -> Array:
+def _baselines(state: TwoViewState) -> Array:
     """Coefficients (3, 3) of ``b = t - tau_1 d_1 + tau_2 d_2`` in 1, tau_1, tau_2."""
     out = np.empty((3, 3))
     for k in range(3):
-        out[0, k], out[1, k], out[2, k] = t[k], -d1[k], d2[k]
+        out[0, k], out[1, k], out[2, k] = state.t[k], -state.d1[k], state.d2[k]
     return out
 
 
@@ -187,12 +163,12 @@ def _linearise(o, baselines, turns1, turns2, basis, rows):  # type: ignore[no-un
         rows[17, i] = r
 
 
-@kernel
-def residuals(observations: Array, R: Array, t: Array, d1: Array, d2: Array, dw1: Array,
-              dw2: Array) -> Array:
+@linked_kernel
+def residuals(observations: Array, state: TwoViewState) -> Array:
     """Signed Sampson errors (N,) [px] of observation rows (N, 20)."""
     n = observations.shape[0]
-    baselines, turns1, turns2 = _baselines(t, d1, d2), _turns(dw1, np.eye(3)), _turns(dw2, R)
+    baselines = _baselines(state)
+    turns1, turns2 = _turns(state.dw1, np.eye(3)), _turns(state.dw2, state.R)
     block, errors = np.empty((20, BLOCK)), np.empty(BLOCK)
     everything = np.ones(n, dtype=np.bool_)
     out = np.empty(n)
@@ -207,12 +183,12 @@ def residuals(observations: Array, R: Array, t: Array, d1: Array, d2: Array, dw1
 
 
 @kernel
-def jacobian(observations: Array, R: Array, t: Array, d1: Array, d2: Array, dw1: Array,
-             dw2: Array) -> Array:
+def jacobian(observations: Array, state: TwoViewState) -> Array:
     """Derivatives (N, 17) of the Sampson errors by the local parameters."""
     n = observations.shape[0]
-    baselines, turns1, turns2 = _baselines(t, d1, d2), _turns(dw1, np.eye(3)), _turns(dw2, R)
-    basis = tangent_basis(t)
+    baselines = _baselines(state)
+    turns1, turns2 = _turns(state.dw1, np.eye(3)), _turns(state.dw2, state.R)
+    basis = tangent_basis(state.t)
     block, rows = np.empty((20, BLOCK)), np.empty((PARAMETERS + 1, BLOCK))
     everything = np.ones(n, dtype=np.bool_)
     out = np.empty((n, PARAMETERS))
@@ -225,12 +201,13 @@ def jacobian(observations: Array, R: Array, t: Array, d1: Array, d2: Array, dw1:
     return out
 
 
-@kernel
-def normal_equations(observations: Array, use: NDArray[np.bool_], R: Array, t: Array, d1: Array,
-                     d2: Array, dw1: Array, dw2: Array) -> tuple[Array, Array, float]:
+@linked_kernel
+def normal_equations(observations: Array, use: NDArray[np.bool_],
+                     state: TwoViewState) -> tuple[Array, Array, float]:
     """``J^T J`` (17, 17), ``J^T r`` (17,) and sum of squares over the matches in `use`."""
-    baselines, turns1, turns2 = _baselines(t, d1, d2), _turns(dw1, np.eye(3)), _turns(dw2, R)
-    basis = tangent_basis(t)
+    baselines = _baselines(state)
+    turns1, turns2 = _turns(state.dw1, np.eye(3)), _turns(state.dw2, state.R)
+    basis = tangent_basis(state.t)
     block, rows = np.empty((20, BLOCK)), np.empty((PARAMETERS + 1, BLOCK))
     # The residual as the last column of J: one product holds all three results. By BLAS, whose
     # sums are in one order whoever calls; a block is too small for it to start threads.
@@ -247,8 +224,8 @@ def normal_equations(observations: Array, use: NDArray[np.bool_], R: Array, t: A
 
 
 @kernel
-def triangulated(observations: Array, i: int, R: Array, t: Array, d1: Array,
-                 d2: Array) -> tuple[float, float, float, float]:
+def triangulated(observations: Array, i: int,
+                 state: TwoViewState) -> tuple[float, float, float, float]:
     """Depths of match i along both rays [baselines], its parallax [rad] and length of baseline.
 
     ``l_1 f_1 = l_2 h + b`` in the least-squares sense of its cross products with h and f_1, each
@@ -256,18 +233,13 @@ def triangulated(observations: Array, i: int, R: Array, t: Array, d1: Array,
     """
     o = observations[i]
     tau1, tau2 = o[18], o[19]
-    bx = t[0] - tau1 * d1[0] + tau2 * d2[0]
-    by = t[1] - tau1 * d1[1] + tau2 * d2[1]
-    bz = t[2] - tau1 * d1[2] + tau2 * d2[2]
-    hx = R[0, 0] * o[9] + R[0, 1] * o[10] + R[0, 2] * o[11]
-    hy = R[1, 0] * o[9] + R[1, 1] * o[10] + R[1, 2] * o[11]
-    hz = R[2, 0] * o[9] + R[2, 1] * o[10] + R[2, 2] * o[11]
-    nx, ny, nz = _cross(o[0], o[1], o[2], hx, hy, hz)
-    n2 = nx * nx + ny * ny + nz * nz
-    baseline = math.sqrt(bx * bx + by * by + bz * bz)
+    t, d1, d2 = state.t, state.d1, state.d2
+    b = (t[0] - tau1 * d1[0] + tau2 * d2[0], t[1] - tau1 * d1[1] + tau2 * d2[1],
+         t[2] - tau1 * d1[2] + tau2 * d2[2])
+    f, h = o[0:3], rotated(state.R, o[9:12])
+    n = cross(f, h)
+    n2 = dot(n, n)
+    baseline = norm(b)
     if n2 < 1e-18:
         return math.nan, math.nan, 0.0, baseline
-    cx, cy, cz = _cross(bx, by, bz, hx, hy, hz)
-    ex, ey, ez = _cross(bx, by, bz, o[0], o[1], o[2])
-    return ((cx * nx + cy * ny + cz * nz) / n2, (ex * nx + ey * ny + ez * nz) / n2, math.sqrt(n2),
-            baseline)
+    return dot(cross(b, h), n) / n2, dot(cross(b, f), n) / n2, math.sqrt(n2), baseline

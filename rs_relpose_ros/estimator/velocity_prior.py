@@ -8,24 +8,18 @@ pose where they are large. The Laplace evidence ``-cost/2 - logdet(H)/2 - 6 log 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.compiled import kernel
-from rs_relpose_ros.estimator.local_optimisation import count_behind, within
-from rs_relpose_ros.estimator.map_fit import (
-    DataTerm,
-    fit,
-    inverse,
-    linearised,
-    log_determinant,
-    moved,
-    Priors,
-    State,
-    step_between,
-)
-from rs_relpose_ros.estimator.sampson import PARAMETERS, residuals
+from rs_relpose_ros.compiled import kernel, linked_kernel
+from rs_relpose_ros.estimator.information import inverse, log_determinant
+from rs_relpose_ros.estimator.inliers import count_behind, Flags, Matches, within
+from rs_relpose_ros.estimator.map_fit import DataTerm, fit, FitMatches, linearised
+from rs_relpose_ros.estimator.priors import Priors, with_velocity_sigma
+from rs_relpose_ros.estimator.sampson import residuals
+from rs_relpose_ros.estimator.state import moved, PARAMETERS, step_between, TwoViewState
 
 Array = NDArray[np.float64]
 
@@ -49,12 +43,26 @@ WIDEST = 2.0
 LEAST_EVIDENCE = 6.0
 
 
-@kernel
-def with_velocity_sigma(priors: Priors, sigma: float) -> Priors:
-    """The priors with another sigma of the linear velocities [baselines per second]."""
-    return Priors(priors.gravity1, priors.gravity2, priors.gravity_weight,
-                  priors.gravity_row_time, priors.rate_weight, 1.0 / (sigma * sigma),
-                  priors.velocity_rate, priors.rotation, priors.rotation_information)
+class Noise(NamedTuple):
+    """What is told of the noise: `sigma` and inlier `threshold` [px] of a match."""
+
+    sigma: float
+    threshold: float
+
+
+class Refined(NamedTuple):
+    """A refined state, and what it rests on.
+
+    `inliers` (N,): the matches that the last fits used. `velocity_sigma`: the prior sigma of the
+    most evidence [baselines per second]. `sigma`: noise of a match that the fits used [px].
+    `covariance` (17, 17): of the local parameters, within the fits and between them.
+    """
+
+    state: TwoViewState
+    inliers: Flags
+    velocity_sigma: float
+    sigma: float
+    covariance: Array
 
 
 @kernel
@@ -66,27 +74,16 @@ def noise_sigma(observations_cost: float, count: int, told: float) -> float:
 
 
 @kernel
-def fit_with_evidence(observations: Array, valid: NDArray[np.bool_], start: State, priors: Priors,
-                      told_sigma: float, threshold: float, angle_sigma: float, grid: Array,
-                      ) -> tuple[State, NDArray[np.bool_], float, float, Array]:
+def fit_with_evidence(matches: Matches, start: TwoViewState, priors: Priors, noise: Noise,
+                      grid: Array) -> Refined:
     """Select inliers and fit repeatedly; average over the velocity priors at the end.
 
-    Returns
-    -------
-    state : State
-        Mean over the priors of the grid, weighted by their evidence.
-    inliers : (N,) ndarray of bool
-        The matches that the last fits used.
-    velocity_sigma : float
-        The prior sigma of the most evidence [baselines per second].
-    sigma : float
-        Noise of a match that the fit used [px].
-    covariance : (17, 17) ndarray
-        Of the local parameters: within the fits and between them.
+    `grid` (K,) holds the prior sigmas of the velocities; the state is the mean over them, weighted
+    by their evidence.
     """
     size = grid.shape[0]
     state = start
-    inliers, sigma = _selected(observations, valid, state, threshold, angle_sigma, told_sigma)
+    used = _selected(matches, state, noise.threshold, noise.sigma)
     # Optimum of each prior as a step from `start`, and its evidence in its last round.
     steps = np.zeros((size, PARAMETERS))
     lacking = np.zeros(size)
@@ -98,30 +95,27 @@ def fit_with_evidence(observations: Array, valid: NDArray[np.bool_], start: Stat
         if turn > 0:   # the choice moves little once the inliers stand
             low, high = max(best - 1, 0), min(best + 2, size)
         # From the best prior down and from it up, each fit from its neighbour's optimum.
-        data = linearised(observations, inliers, state, sigma)
+        data = linearised(used, state)
         upwards, upwards_data = state, data
         for turned in range(high - low):
             k = best - turned if turned <= best - low else low + turned
             if k == best + 1:
                 state, data = upwards, upwards_data
             state, data, _, evidences[k] = _candidate(
-                observations, inliers, state, data, priors, sigma, grid[k], threshold,
-                angle_sigma, ITERATIONS)
+                matches, used, state, data, priors, grid[k], noise.threshold, ITERATIONS)
             if k == best:
                 upwards, upwards_data = state, data
             steps[k] = step_between(start, state)
         best = low + int(np.argmax(evidences[low:high]))
         lacking[low:high] = evidences[best] - evidences[low:high]
         state = moved(start, steps[best])
-        chosen_from = inliers
-        inliers, sigma = _selected(observations, valid, state, _reach(threshold, sigma),
-                                   angle_sigma, told_sigma)
-        if (inliers == chosen_from).all():
+        chosen_from = used.use
+        used = _selected(matches, state, _reach(noise.threshold, used.sigma), noise.sigma)
+        if (used.use == chosen_from).all():
             break
-    state, covariance, best = _average(
-        observations, inliers, start, steps, lacking < LEAST_EVIDENCE, priors, sigma, grid,
-        threshold, angle_sigma)
-    return state, inliers, grid[best], sigma, covariance
+    state, covariance, best = _average(matches, used, start, steps, lacking < LEAST_EVIDENCE,
+                                       priors, grid, noise.threshold)
+    return Refined(state, used.use, grid[best], used.sigma, covariance)
 
 
 @kernel
@@ -130,39 +124,38 @@ def _reach(threshold: float, sigma: float) -> float:
     return min(max(threshold, REACH * sigma), WIDEST * threshold)
 
 
-@kernel
-def _selected(observations: Array, valid: NDArray[np.bool_], state: State, threshold: float,
-              angle_sigma: float, told_sigma: float) -> tuple[NDArray[np.bool_], float]:
-    """Inliers of a state, and their noise [px]."""
-    r = residuals(observations, state.R, state.t, state.d1, state.d2, state.dw1, state.dw2)
-    inliers = within(r, observations, valid, state, threshold, angle_sigma)
+@linked_kernel
+def _selected(matches: Matches, state: TwoViewState, threshold: float,
+              told_sigma: float) -> FitMatches:
+    """Inliers of a state, with their noise."""
+    r = residuals(matches.observations, state)
+    inliers = within(r, matches, state, threshold)
     squares = 0.0
     for i in range(len(r)):
         if inliers[i]:
             squares += r[i] * r[i]
-    return inliers, noise_sigma(squares, inliers.sum(), told_sigma)
+    return FitMatches(matches.observations, inliers,
+                      noise_sigma(squares, inliers.sum(), told_sigma))
 
 
-@kernel
-def _candidate(observations: Array, inliers: NDArray[np.bool_], start: State, data: DataTerm,
-               priors: Priors, sigma: float, velocity_sigma: float, threshold: float,
-               angle_sigma: float, iterations: int) -> tuple[State, DataTerm, Array, float]:
+@linked_kernel
+def _candidate(matches: Matches, used: FitMatches, start: TwoViewState, data: DataTerm,
+               priors: Priors, velocity_sigma: float, threshold: float,
+               iterations: int) -> tuple[TwoViewState, DataTerm, Array, float]:
     """Fit with one velocity prior: state, its data term and Hessian, and its log-evidence."""
     state, data, cost, hessian = fit(
-        observations, inliers, start, data, with_velocity_sigma(priors, velocity_sigma), sigma,
-        iterations)
+        used, start, data, with_velocity_sigma(priors, velocity_sigma), iterations)
     # Velocities that carry the camera past its own baseline within a frame explain any residual,
     # with points behind the cameras: those count as outliers.
-    cost += count_behind(observations, inliers, state, angle_sigma) * (threshold / sigma) ** 2
+    cost += count_behind(matches, used.use, state) * (threshold / used.sigma) ** 2
     evidence = (-0.5 * cost - 0.5 * log_determinant(hessian)
                 - (6.0 + SMALL_IS_LIKELIER) * math.log(velocity_sigma))
     return state, data, hessian, evidence
 
 
-@kernel
-def _average(observations: Array, inliers: NDArray[np.bool_], start: State, steps: Array,
-             likely: NDArray[np.bool_], priors: Priors, sigma: float, grid: Array,
-             threshold: float, angle_sigma: float) -> tuple[State, Array, int]:
+@linked_kernel
+def _average(matches: Matches, used: FitMatches, start: TwoViewState, steps: Array, likely: Flags,
+             priors: Priors, grid: Array, threshold: float) -> tuple[TwoViewState, Array, int]:
     """Mean state, its covariance (17, 17), and the number of the prior of the most evidence.
 
     Where the data cannot tell which prior is right, one of them alone would be overconfident. The
@@ -175,8 +168,8 @@ def _average(observations: Array, inliers: NDArray[np.bool_], start: State, step
         if likely[k]:
             own = moved(start, steps[k])
             state, _, hessian, evidences[k] = _candidate(
-                observations, inliers, own, linearised(observations, inliers, own, sigma),
-                priors, sigma, grid[k], threshold, angle_sigma, LAST_ITERATIONS)
+                matches, used, own, linearised(used, own), priors, grid[k], threshold,
+                LAST_ITERATIONS)
             steps[k] = step_between(start, state)
             covariances[k] = inverse(hessian)
     best = int(np.argmax(evidences))

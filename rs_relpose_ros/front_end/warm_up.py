@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.config.parameters import Parameters
-from rs_relpose_ros.estimator.estimate import warm_up_refinement, warm_up_sampling
+from rs_relpose_ros.estimator.warm_up import warm_up_refinement, warm_up_sampling
 from rs_relpose_ros.front_end.frame import Frame
 from rs_relpose_ros.front_end.front_end import FrameProcessed, FrontEnd
 from rs_relpose_ros.geometry.intrinsics import Intrinsics

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.compiled import small_kernel
+from rs_relpose_ros.compiled import kernel, small_kernel
 
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
@@ -58,3 +58,22 @@ def rotated_back(R: Array, v: Vector | Array) -> Vector:
     return (R[0, 0] * v[0] + R[1, 0] * v[1] + R[2, 0] * v[2],
             R[0, 1] * v[0] + R[1, 1] * v[1] + R[2, 1] * v[2],
             R[0, 2] * v[0] + R[1, 2] * v[1] + R[2, 2] * v[2])
+
+
+@kernel
+def tangent_basis(t: Array) -> Array:
+    """Two orthonormal columns (3, 2) perpendicular to the unit vector `t`."""
+    basis = np.empty((3, 2))
+    # The axis least aligned with t keeps the cross product well conditioned.
+    k = 0
+    if abs(t[1]) < abs(t[k]):
+        k = 1
+    if abs(t[2]) < abs(t[k]):
+        k = 2
+    axis = np.zeros(3)
+    axis[k] = 1.0
+    u = cross(t, axis)
+    length = norm(u)
+    basis[0, 0], basis[1, 0], basis[2, 0] = u[0] / length, u[1] / length, u[2] / length
+    basis[0, 1], basis[1, 1], basis[2, 1] = cross(t, basis[:, 0])
+    return basis

@@ -61,13 +61,7 @@ class RawImage:
     is_bigendian: bool
 
     def decoded(self) -> Gray:
-        """Gray image (H, W); of a mono8 image without padding a view of `data`.
-
-        Raises
-        ------
-        InputError
-            Unknown encoding, zero or absurd size, or less data than its size needs.
-        """
+        """Gray image (H, W); of a mono8 image without padding a view of `data`."""
         height, width, encoding = self.height, self.width, self.encoding
         check_image_size(width, height)
         if encoding in _GRAY:
@@ -124,19 +118,13 @@ class CompressedImage:
     encoding: str
 
     def decoded(self) -> Gray:
-        """Gray image (H, W).
-
-        Raises
-        ------
-        InputError
-            Neither JPEG nor PNG, truncated or corrupt, or of zero or absurd size.
-        """
+        """Gray image (H, W)."""
         width, height = encoded_image_size(self.data)
         check_image_size(width, height)
         # Not turned upright: rows must stay in the order in which the sensor reads them.
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
         try:
-            image = cv2.imdecode(self.data,
-                                 cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+            image = cv2.imdecode(self.data, flags)
         except cv2.error:
             image = None
         if image is None or image.shape != (height, width):

@@ -18,13 +18,7 @@ _PADDING = 4096
 
 
 def encoded_image_size(data: NDArray[np.uint8]) -> tuple[int, int]:
-    """Width and height [px] that the header of a JPEG or PNG tells.
-
-    Raises
-    ------
-    InputError
-        Neither of the two, or truncated.
-    """
+    """Width and height [px] that the header of a JPEG or PNG tells."""
     start = data[:24].tobytes()
     if start.startswith(_PNG_SIGNATURE):
         return _png_size(start, data)

@@ -50,11 +50,7 @@ class HangingGyro:
 
     Repetitions are not used from the first one on: between equal values interpolation gives the
     same, if they were true, and drivers that publish faster than the sensor measures do repeat.
-
-    Parameters
-    ----------
-    longest : float
-        Time [s] after which repetitions are a fault; 0 to believe everything.
+    After `longest` [s] repetitions are a fault; 0 believes everything.
     """
 
     def __init__(self, longest: float) -> None:
@@ -65,13 +61,7 @@ class HangingGyro:
         self._counts = [0] * 3
 
     def repeats(self, sample: ImuSample) -> bool:
-        """Whether this sample says nothing new.
-
-        Raises
-        ------
-        InputError
-            It does so for too long.
-        """
+        """Whether this sample says nothing new; InputError where that lasts too long."""
         if sample.angular_velocity is None or self._longest_ns == 0:
             return False
         for axis, value in enumerate(sample.angular_velocity):

@@ -59,16 +59,10 @@ def time_ns(stamp: Any) -> int:
     return seconds * NANOSECONDS + nanoseconds
 
 
-# -- images and poses ------------------------------------------------------------------------
-
-
 def image_from_message(msg: Any) -> PublishedImage:
     """Image of a sensor_msgs/Image or CompressedImage; its `data` is a view of the message's.
 
-    Raises
-    ------
-    InputError
-        The stamp is out of range. What else may be wrong is found when the image is decoded.
+    Only the stamp is checked: what else may be wrong is found when the image is decoded.
     """
     data = np.frombuffer(msg.data, dtype=np.uint8)
     image: EncodedImage
@@ -87,19 +81,8 @@ def pose_from_message(msg: Any) -> TruePose:
                     (q.x, q.y, q.z, q.w))
 
 
-# -- intrinsics ------------------------------------------------------------------------------
-
-
 def intrinsics_from_info(msg: Any) -> Intrinsics:
-    """Intrinsics of a sensor_msgs/CameraInfo, region of interest and binning honoured.
-
-    Raises
-    ------
-    MissingInputError
-        The camera is not calibrated (``k[0] == 0``).
-    InputError
-        Unknown distortion model or number of coefficients, or figures that contradict each other.
-    """
+    """Intrinsics of a sensor_msgs/CameraInfo, region of interest and binning honoured."""
     k = [float(value) for value in _field(msg, 'k')]
     if len(k) != 9:
         raise InputError(f'k of CameraInfo must have 9 elements, got {len(k)}')
@@ -134,20 +117,12 @@ def _field(msg: Any, name: str) -> Any:
     return getattr(msg, name) if hasattr(msg, name) else getattr(msg, name.upper())
 
 
-# -- IMU -------------------------------------------------------------------------------------
-
-
 def imu_sample_from_message(msg: Any) -> ImuSample:
     """Gyro and accelerometer of a sensor_msgs/Imu, each None where the message has no such sensor.
 
     By REP-145 a covariance whose first element is -1 means that the sensor does not exist; drivers
     that publish the two sensors apart leave the other vector zero, and an accelerometer that reads
     exactly zero in all axes is taken for such.
-
-    Raises
-    ------
-    InputError
-        NaN, infinite or beyond any sensor, or neither of the two sensors.
     """
     return _imu_sample(msg, gyro=_has_sensor(msg.angular_velocity_covariance))
 

@@ -21,13 +21,8 @@ _HELD_IMAGES = 4
 class Intake:
     """Handlers of a `SensorFeed` that fill a sequencer; images stay encoded.
 
-    An image goes with the CameraInfo that came last. Not thread-safe: one thread feeds it.
-
-    Parameters
-    ----------
-    sequencer : Sequencer
-    stuck_gyro_time : float
-        As the parameter of that name [s]; 0 believes every gyro.
+    An image goes with the CameraInfo that came last. `stuck_gyro_time` [s] is the parameter of
+    that name; 0 believes every gyro. Not thread-safe: one thread feeds it.
     """
 
     def __init__(self, sequencer: Sequencer, stuck_gyro_time: float = 0.0) -> None:
@@ -35,30 +30,18 @@ class Intake:
             Role.IMU: self._add_imu, Role.ACCEL: sequencer.add_imu,
             Role.CAMERA_INFO: self._add_intrinsics, Role.IMAGE: self._add_image})
         self._sequencer = sequencer
-        self._intrinsics: Intrinsics | None = None
-        self._problem = ''
+        # Those in force.
+        self.intrinsics: Intrinsics | None = None
+        # Why the last CameraInfo cannot be used; empty when it can, or when none came.
+        self.camera_info_problem = ''
         self._held: deque[PublishedImage] = deque()
         self._camera = HangingCamera()
         self._gyro = HangingGyro(stuck_gyro_time)
 
-    @property
-    def intrinsics(self) -> Intrinsics | None:
-        """The intrinsics in force."""
-        return self._intrinsics
-
-    @property
-    def camera_info_problem(self) -> str:
-        """Why the last CameraInfo cannot be used; empty when it can, or when none came."""
-        return self._problem
-
     def receive(self, role: Role, message: Any) -> None:
-        """Take a message; what is wrong with an image is told by the sequencer.
+        """Take a message; one that cannot be used raises, an image is refused by the sequencer.
 
-        Raises
-        ------
-        InputError, MissingInputError
-            It cannot be used. After an unusable CameraInfo no intrinsics are in force, rather
-            than outdated ones.
+        After an unusable CameraInfo no intrinsics are in force, rather than outdated ones.
         """
         try:
             self.feed.receive(role, message)
@@ -67,7 +50,7 @@ class Intake:
                 self._sequencer.refuse(0, Refusal.BAD_IMAGE, str(error))
                 return
             if role is Role.CAMERA_INFO:
-                self._intrinsics, self._problem = None, str(error)
+                self.intrinsics, self.camera_info_problem = None, str(error)
                 self.refuse_held()
             raise
 
@@ -83,14 +66,14 @@ class Intake:
             self._sequencer.add_imu(sample)
 
     def _add_intrinsics(self, intrinsics: Intrinsics) -> None:
-        self._intrinsics, self._problem = intrinsics, ''
+        self.intrinsics, self.camera_info_problem = intrinsics, ''
         while self._held:
             self._add_frame(self._held.popleft(), intrinsics)
 
     def _add_image(self, image: PublishedImage) -> None:
-        if self._intrinsics is not None:
-            self._add_frame(image, self._intrinsics)
-        elif self._problem:
+        if self.intrinsics is not None:
+            self._add_frame(image, self.intrinsics)
+        elif self.camera_info_problem:
             self._refuse_without_intrinsics(image)
         else:
             self._held.append(image)
@@ -107,5 +90,6 @@ class Intake:
             EncodedFrame(image.stamp_ns, image.image, image.frame_id, intrinsics))
 
     def _refuse_without_intrinsics(self, image: PublishedImage) -> None:
-        self._sequencer.refuse(image.stamp_ns, Refusal.NO_CALIBRATION,
-                               self._problem or 'no CameraInfo came before or with the image')
+        self._sequencer.refuse(
+            image.stamp_ns, Refusal.NO_CALIBRATION,
+            self.camera_info_problem or 'no CameraInfo came before or with the image')

@@ -51,61 +51,32 @@ class PairMessages:
 
 def pair_messages(result: PairResult, types: MessageTypes,
                   reference_frame: str = '') -> PairMessages:
-    """Messages of a pair.
+    """Messages of a pair with a pose: there is no message that says "none".
 
-    Parameters
-    ----------
-    result : PairResult
-        With a pose: there is no message that says "none".
-    types : callable
-    reference_frame : str
-        frame_id of the relative pose; empty for ``<camera frame>_reference``.
+    `reference_frame`: frame_id of the relative pose; empty for ``<camera frame>_reference``.
     """
     if not result.pose:
         raise InputError(f'a pair without a pose ({result.pose.status.value}) has no messages')
-    return PairMessages(
-        relative_pose=relative_pose_message(result, types, reference_frame),
-        reference=reference_message(result, types),
-        velocity=velocity_message(result, types),
-        matches=matches_message(result, types))
-
-
-def relative_pose_message(result: PairResult, types: MessageTypes,
-                          reference_frame: str = '') -> Any:
-    """geometry_msgs/PoseWithCovarianceStamped: the current camera in the reference keyframe's.
-
-    The covariance needs no conversion: (dt, dtheta) with ``R_true = Exp(dtheta) R`` in camera 1 is
-    ROS's order x, y, z and rotations about the fixed axes of the header's frame.
-    """
-    frame_id = reference_frame or f'{result.frame_id}_reference'
-    pose = types('geometry_msgs/msg/Pose')(
-        position=_xyz('Point', result.pose.t, types),
-        orientation=_quaternion(result.pose.R, types))
-    return types('geometry_msgs/msg/PoseWithCovarianceStamped')(
-        header=header(result.stamp_ns, frame_id, types),
-        pose=types('geometry_msgs/msg/PoseWithCovariance')(
-            pose=pose, covariance=_covariance(result.pose.covariance)))
-
-
-def reference_message(result: PairResult, types: MessageTypes) -> Any:
-    """sensor_msgs/TimeReference: the stamp of the reference keyframe."""
-    return types('sensor_msgs/msg/TimeReference')(
-        header=header(result.stamp_ns, result.frame_id, types),
-        time_ref=time(result.reference_stamp_ns, types), source='reference_keyframe')
-
-
-def velocity_message(result: PairResult, types: MessageTypes) -> Any:
-    """geometry_msgs/TwistWithCovarianceStamped of the current camera, in its own frame.
-
-    Angular in rad/s, linear in baselines per second.
-    """
+    pose, in_camera = result.pose, header(result.stamp_ns, result.frame_id, types)
+    in_reference = header(result.stamp_ns, reference_frame or f'{result.frame_id}_reference',
+                          types)
     twist = types('geometry_msgs/msg/Twist')(
-        linear=_xyz('Vector3', result.pose.linear_velocity2, types),
-        angular=_xyz('Vector3', result.pose.angular_velocity2, types))
-    return types('geometry_msgs/msg/TwistWithCovarianceStamped')(
-        header=header(result.stamp_ns, result.frame_id, types),
-        twist=types('geometry_msgs/msg/TwistWithCovariance')(
-            twist=twist, covariance=_covariance(result.pose.velocity_covariance)))
+        linear=_geometry('Vector3', pose.linear_velocity2, types),
+        angular=_geometry('Vector3', pose.angular_velocity2, types))
+    return PairMessages(
+        # The covariance needs no conversion: (dt, dtheta) with R_true = Exp(dtheta) R in camera 1
+        # is ROS's order x, y, z and rotations about the fixed axes of the header's frame.
+        relative_pose=types('geometry_msgs/msg/PoseWithCovarianceStamped')(
+            header=in_reference, pose=types('geometry_msgs/msg/PoseWithCovariance')(
+                pose=_pose(pose.R, pose.t, types), covariance=_covariance(pose.covariance))),
+        reference=types('sensor_msgs/msg/TimeReference')(
+            header=in_camera, time_ref=time(result.reference_stamp_ns, types),
+            source='reference_keyframe'),
+        # Of the current camera: angular in rad/s, linear in baselines per second.
+        velocity=types('geometry_msgs/msg/TwistWithCovarianceStamped')(
+            header=in_camera, twist=types('geometry_msgs/msg/TwistWithCovariance')(
+                twist=twist, covariance=_covariance(pose.velocity_covariance))),
+        matches=matches_message(result, types))
 
 
 def matches_message(result: PairResult, types: MessageTypes) -> Any:
@@ -128,10 +99,8 @@ def matches_message(result: PairResult, types: MessageTypes) -> Any:
 def pose_stamped_message(stamp_ns: int, frame_id: str, R: NDArray[np.float64],
                          position: NDArray[np.float64], types: MessageTypes) -> Any:
     """geometry_msgs/PoseStamped."""
-    pose = types('geometry_msgs/msg/Pose')(
-        position=_xyz('Point', position, types), orientation=_quaternion(R, types))
     return types('geometry_msgs/msg/PoseStamped')(
-        header=header(stamp_ns, frame_id, types), pose=pose)
+        header=header(stamp_ns, frame_id, types), pose=_pose(R, position, types))
 
 
 def color_image_message(stamp_ns: int, frame_id: str, pixels: NDArray[np.uint8],
@@ -194,15 +163,16 @@ def quat_xyzw(R: NDArray[np.float64]) -> NDArray[np.float64]:
     return quaternion if quaternion[3] >= 0.0 else -quaternion
 
 
-def _quaternion(R: NDArray[np.float64], types: MessageTypes) -> Any:
-    x, y, z, w = (float(value) for value in quat_xyzw(R))
-    return types('geometry_msgs/msg/Quaternion')(x=x, y=y, z=z, w=w)
+def _pose(R: NDArray[np.float64], position: NDArray[np.float64], types: MessageTypes) -> Any:
+    return types('geometry_msgs/msg/Pose')(
+        position=_geometry('Point', position, types),
+        orientation=_geometry('Quaternion', quat_xyzw(R), types))
 
 
-def _xyz(name: str, vector: NDArray[np.float64], types: MessageTypes) -> Any:
-    """geometry_msgs/Point or Vector3."""
-    x, y, z = (float(value) for value in vector)
-    return types(f'geometry_msgs/msg/{name}')(x=x, y=y, z=z)
+def _geometry(name: str, values: NDArray[np.float64], types: MessageTypes) -> Any:
+    """geometry_msgs message with the fields x, y, z and, of a quaternion, w."""
+    fields = dict(zip('xyzw', map(float, values), strict=False))
+    return types(f'geometry_msgs/msg/{name}')(**fields)
 
 
 def _covariance(covariance: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -23,55 +23,33 @@ _PARALLEL = 1e-18
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathPose:
-    """A camera in the axes of the path's first camera.
-
-    Attributes
-    ----------
-    stamp_ns : int
-    R : (3, 3) ndarray
-    position : (3,) ndarray
-        In baselines of the path's first pair.
-    """
+    """A camera in the axes of the path's first camera."""
 
     stamp_ns: int
-    R: Array
-    position: Array
+    R: Array   # (3, 3)
+    position: Array   # (3,), in baselines of the path's first pair
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathStep:
-    """What a pair adds to the path.
+    """What a pair adds to the path: the current camera.
 
-    Attributes
-    ----------
-    poses : tuple of PathPose
-        The current camera; before it, where a new path begins, that path's first camera.
-    new_path : str
-        Why a new path begins, whose scale has nothing to do with the one before; empty where the
-        path goes on.
-    scale : float
-        The pair's baseline, in baselines of the path's first pair.
-    shared_tracks : int
-        Tracks that told the scale against the pair before.
-    scale_sigma : float
-        1 sigma of that ratio, relative, by the scatter of the tracks; NaN where a path begins. The
-        errors of the two poses, common to all tracks, come on top.
+    Before it, where a new path begins, stands that path's first camera; `new_path` says why it
+    begins, its scale has nothing to do with the one before. `scale_sigma` is by the scatter of the
+    tracks, NaN where a path begins; the errors of the two poses, common to all, come on top.
     """
 
     poses: tuple[PathPose, ...]
-    new_path: str
-    scale: float
-    shared_tracks: int
-    scale_sigma: float
+    new_path: str   # empty where the path goes on
+    scale: float   # the pair's baseline, in baselines of the path's first pair
+    shared_tracks: int   # that told the scale against the pair before
+    scale_sigma: float   # 1 sigma of that ratio, relative
 
 
 class PoseChain:
     """Chains the pairs of one node, in the order of their stamps.
 
-    Parameters
-    ----------
-    min_shared_tracks : int
-        With fewer, the scale is not carried on, and a new path begins.
+    With fewer than `min_shared_tracks` the scale is not carried on, and a new path begins.
     """
 
     def __init__(self, min_shared_tracks: int = 8) -> None:
@@ -125,15 +103,6 @@ def track_distances(pair: PublishedPair) -> tuple[dict[int, float], dict[int, fl
     ``docs/conventions.md``, ``l_1 f_1 = l_2 R f_2 + t - tau_1 d_1 + tau_2 d_2``, in the sense of
     least squares. The velocity of the current camera stands for both. Tracks that would be behind
     a camera, or whose rays are parallel, are left out.
-
-    Parameters
-    ----------
-    pair : PublishedPair
-
-    Returns
-    -------
-    dict, dict
-        Of track id, with the same keys.
     """
     m = pair.matches
     f1 = np.stack([m[name] for name in ('x1', 'y1', 'z1')], axis=1).astype(np.float64)

@@ -27,55 +27,35 @@ Array = NDArray[np.float64]
 
 # Largest deviation from 1 of the length of directions, quaternions and rays.
 _UNIT_TOLERANCE = 1e-3
-# Largest velocity [baselines/s, rad/s]: far above any camera, far below an overflow.
-_MAX_VELOCITY = 1e9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PublishedPair:
     """A keyframe pair with a pose, as published.
 
-    Attributes
-    ----------
-    reference_stamp_ns, stamp_ns : int
-        Header stamps of the reference keyframe and of the current image.
-    frame_id : str
-        Of the current image.
-    R : (3, 3) ndarray
-        Of the current camera in the reference camera, ``X1 = R X2 + t``.
-    t : (3,) ndarray
-        Of length 1: the scale of two views is not observable.
-    covariance : (6, 6) ndarray
-        Of ``(dt, dtheta)`` with ``t_true = t + dt`` and ``R_true = Exp(dtheta) R``, in camera 1.
-    linear_velocity, angular_velocity : (3,) ndarray
-        Of the current camera in its own frame [baselines per second], [rad/s].
-    velocity_covariance : (6, 6) ndarray
-        Of linear and angular velocity.
-    matches : (N,) ndarray of MATCH_DTYPE
-        Inliers: track ``id``, pixels ``u1 v1 u2 v2``, row times ``tau1 tau2`` [s], rays
-        ``x1 y1 z1 x2 y2 z2`` turned to the stamped row.
+    Pose of the current camera in the reference camera, ``X1 = R X2 + t``, with the covariance of
+    ``(dt, dtheta)``: ``t_true = t + dt`` and ``R_true = Exp(dtheta) R``, in camera 1. `matches`
+    are the inliers: track ``id``, pixels ``u1 v1 u2 v2``, row times ``tau1 tau2`` [s], rays
+    ``x1 y1 z1 x2 y2 z2`` turned to the stamped row.
     """
 
-    reference_stamp_ns: int
-    stamp_ns: int
+    reference_stamp_ns: int   # header stamp of the reference keyframe
+    stamp_ns: int   # of the current image, as frame_id
     frame_id: str
-    R: Array
-    t: Array
-    covariance: Array
-    linear_velocity: Array
-    angular_velocity: Array
-    velocity_covariance: Array
-    matches: NDArray[np.void]
+    R: Array   # (3, 3)
+    t: Array   # (3,), of length 1: the scale of two views is not observable
+    covariance: Array   # (6, 6)
+    linear_velocity: Array   # (3,), of the current camera in its own frame [baselines per second]
+    angular_velocity: Array   # (3,), likewise [rad/s]
+    velocity_covariance: Array   # (6, 6), of the two
+    matches: NDArray[np.void]   # (N,), of MATCH_DTYPE
 
 
 class PairSynchronizer:
     """Gathers the messages of a pair by their common stamp, in whatever order they come.
 
-    Parameters
-    ----------
-    capacity : int
-        Most stamps that may wait for the rest of their messages; of more, the one that was begun
-        first is given up: where messages are lost, nothing piles up.
+    At most `capacity` stamps wait for the rest of their messages; of more, the one that was begun
+    first is given up: where messages are lost, nothing piles up. `given_up` counts them.
     """
 
     def __init__(self, capacity: int = 10) -> None:
@@ -83,26 +63,13 @@ class PairSynchronizer:
             raise InputError(f'capacity must be at least 1, got {capacity}')
         self._capacity = capacity
         self._waiting: dict[int, dict[str, Any]] = {}
-        self._given_up = 0
-
-    @property
-    def given_up(self) -> int:
-        """How many stamps were given up."""
-        return self._given_up
+        self.given_up = 0
 
     def add(self, topic: str, message: Any) -> PublishedPair | None:
         """Take a message; the pair that it completes, if it does.
 
-        Parameters
-        ----------
-        topic : {'relative_pose', 'reference', 'velocity', 'matches'}
-        message : message
-            Of the type that the node publishes there.
-
-        Raises
-        ------
-        InputError
-            The pair that it completes cannot be used, or its stamp is out of range.
+        `topic` is 'relative_pose', 'reference', 'velocity' or 'matches'. InputError where the pair
+        cannot be used, or the stamp is out of range.
         """
         if topic not in PAIR_TOPICS:
             raise InputError(f'topic must be one of {", ".join(PAIR_TOPICS)}, got {topic!r}')
@@ -114,19 +81,12 @@ class PairSynchronizer:
             return published_pair(PairMessages(**messages))
         if len(self._waiting) > self._capacity:
             del self._waiting[next(iter(self._waiting))]
-            self._given_up += 1
+            self.given_up += 1
         return None
 
 
 def published_pair(messages: PairMessages) -> PublishedPair:
-    """Arrays of the four messages of one stamp.
-
-    Raises
-    ------
-    InputError
-        NaN, infinite, of another length than 1 where that is published, of different stamps, or
-        matches that are laid out otherwise than published.
-    """
+    """Arrays of the four messages of one stamp; InputError where something cannot be used."""
     stamps = {name: stamp_ns(getattr(messages, name).header) for name in PAIR_TOPICS}
     if len(set(stamps.values())) > 1:
         raise InputError(f'messages of one pair must have the same stamp, got {stamps}')
@@ -146,14 +106,7 @@ def published_pair(messages: PairMessages) -> PublishedPair:
 
 
 def match_records(cloud: Any) -> NDArray[np.void]:
-    """Records of MATCH_DTYPE (N,) of a sensor_msgs/PointCloud2; a view of the message's memory.
-
-    Raises
-    ------
-    InputError
-        Other fields than published, big endian, less or more data than its size, not finite, or
-        rays of another length than 1.
-    """
+    """Records of MATCH_DTYPE (N,) of a sensor_msgs/PointCloud2; a view of the message's memory."""
     found = [(str(f.name), int(f.offset), int(f.datatype), int(f.count)) for f in cloud.fields]
     wanted = [(name, offset, datatype, 1) for name, offset, datatype in MATCH_FIELDS]
     if found != wanted or int(cloud.point_step) != MATCH_DTYPE.itemsize or cloud.is_bigendian:
@@ -186,9 +139,10 @@ def _unit(name: str, message: Any, axes: str) -> Array:
 
 
 def _velocity(name: str, vector: Any) -> Array:
+    largest = 1e9   # [baselines/s, rad/s]: far above any camera, far below an overflow
     values = np.array([vector.x, vector.y, vector.z], dtype=np.float64)
-    if not (np.abs(values) <= _MAX_VELOCITY).all():
-        raise InputError(f'{name} must be at most {_MAX_VELOCITY:g}, got {values.tolist()}')
+    if not (np.abs(values) <= largest).all():
+        raise InputError(f'{name} must be at most {largest:g}, got {values.tolist()}')
     return values
 
 

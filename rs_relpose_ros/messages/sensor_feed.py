@@ -51,35 +51,21 @@ PARTS: Mapping[Role, Part] = {
 class SensorFeed:
     """Hands what the messages say to the handlers of their parts.
 
-    Parameters
-    ----------
-    handlers : dict
-        By role, a function that takes what `PARTS` reads: `ImuSample`, `Intrinsics`,
-        `PublishedImage` or `TruePose`.
+    `handlers`, by role, take what `PARTS` reads: `ImuSample`, `Intrinsics`, `PublishedImage` or
+    `TruePose`.
     """
 
     def __init__(self, handlers: Mapping[Role, Callable[[Any], object]]) -> None:
         self._handlers = handlers
 
     def receive(self, role: Role, message: Any) -> None:
-        """Read a message and hand it over.
-
-        Raises
-        ------
-        InputError, MissingInputError
-            It cannot be read, or its handler cannot use it.
-        """
+        """Read a message and hand it over; raises where it cannot be read or used."""
         self._handlers[role](PARTS[role].read(message))
 
     def messages(self, bag: Any, topics: Any) -> Iterator[tuple[Role, Any]]:
-        """Messages of a bag that play a part with a handler, as `BagMessage`, in bag order.
+        """Messages of a `Bag` that play a part with a handler, as `BagMessage`, in bag order.
 
-        Parameters
-        ----------
-        bag : Bag
-            Open.
-        topics : SensorTopics
-            By the names of the roles; None where nothing plays the part.
+        `topics` has the names of the roles, None where nothing plays the part (`SensorTopics`).
         """
         roles = {topic.name: (role, topic) for role in reversed(Role)
                  if role in self._handlers and (topic := getattr(topics, role.value)) is not None}

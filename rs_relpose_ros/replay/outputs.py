@@ -17,12 +17,13 @@ from rs_relpose_ros.front_end.drift import Drift
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.messages.outgoing import pair_messages, PAIR_TOPICS
-from rs_relpose_ros.replay.record import pair_record, PairRecord
-from rs_relpose_ros.replay.run import read_truth, Replay, ReplayCounts, ReplayedPair
+from rs_relpose_ros.replay.run import read_truth, Replay, ReplayedPair
 from rs_relpose_ros.replay.summary import summarize
 from rs_relpose_ros.replay.tables import (
     error_cells,
     ERROR_COLUMNS,
+    pair_record,
+    PairRecord,
     relative_pose_cells,
     RELATIVE_POSE_COLUMNS,
     TableWriter,
@@ -38,20 +39,11 @@ _PICTURES = ('matches.png', 'errors.png', 'residuals.png', 'rotation.png')
 class ReplayOutcome:
     """What a replay gave.
 
-    Attributes
-    ----------
-    records : list of PairRecord
-    counts : ReplayCounts
-    intrinsics : Intrinsics or None
-        In force at the end.
-    figures : dict
-        As in summary.json, without provenance.
-    files : list of Path
-        Written so far: tables, bag and pictures.
+    `figures`: as in summary.json, without provenance; `intrinsics`: in force at the end; `files`:
+    written so far (tables, bag and pictures).
     """
 
     records: list[PairRecord]
-    counts: ReplayCounts
     intrinsics: Intrinsics | None
     figures: dict[str, Any]
     files: list[Path]
@@ -63,28 +55,9 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
                 on_pair: Callable[[ReplayedPair], object] = lambda pair: None) -> ReplayOutcome:
     """Run `bag` through the pipeline and write tables, pictures and a bag into `folder`.
 
-    Files of an earlier run in `folder` are replaced.
-
-    Parameters
-    ----------
-    folder : Path
-        Created as needed.
-    bag : Bag
-    topics : SensorTopics
-    parameters : Parameters
-    stamps : set of int, optional
-        Only these frames.
-    pictures, with_bag : bool
-        Whether to draw, and whether to write the node's topics as a bag.
-    on_image : callable
-        Called after each image.
-    on_pair : callable
-        Called with each pair; its result carries images where `pictures` are drawn.
-
-    Raises
-    ------
-    InputError, MissingInputError
-        As `Replay.pairs`; or `folder` cannot be written.
+    Files of an earlier run in `folder` are replaced; it is created as needed. `stamps` and
+    `on_image` are as of `Replay`; `with_bag`: whether to write the node's topics as a bag.
+    `on_pair` is called with each pair, which carries images where `pictures` are drawn.
     """
     run = Replay(bag, topics, parameters, stamps=stamps, keep_images=pictures, on_image=on_image)
     truth = read_truth(bag, topics)
@@ -110,15 +83,13 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
             if out_bag is not None and pair.result.pose:
                 _write_messages(out_bag, pair, parameters.pair.reference_frame)
             on_pair(pair)
-            if pictures and _better_shown(pair.result, shown):
+            if pictures and (shown is None or _picture_rank(pair.result) > _picture_rank(shown)):
                 shown = pair.result
     if with_bag:
         files.append(folder / BAG_FOLDER)
-    if pictures and records and shown is not None:
+    if shown is not None:
         files += _draw(folder, records, shown, truth)
-    counts = run.counts()
-    return ReplayOutcome(records, counts, run.intrinsics, summarize(records, counts, drift),
-                         files)
+    return ReplayOutcome(records, run.intrinsics, summarize(records, run, drift), files)
 
 
 def _prepare(folder: Path, with_bag: bool) -> None:
@@ -141,11 +112,9 @@ def _write_messages(bag: BagWriter, pair: ReplayedPair, reference_frame: str) ->
         bag.write(f'/relpose_node/{name}', msgtype, getattr(messages, name), pair.bag_time_ns)
 
 
-def _better_shown(result: PairResult, shown: PairResult | None) -> bool:
-    """Whether a pair is the better picture: with a pose, many inliers and much parallax."""
-    def rank(pair: PairResult) -> tuple[bool, float]:
-        return bool(pair.pose), float(pair.pose.inliers.sum() * pair.parallax)
-    return shown is None or rank(result) > rank(shown)
+def _picture_rank(pair: PairResult) -> tuple[bool, float]:
+    """Larger for the better picture: with a pose, many inliers and much parallax."""
+    return bool(pair.pose), float(pair.pose.inliers.sum() * pair.parallax)
 
 
 def _draw(folder: Path, records: list[PairRecord], shown: PairResult,

@@ -21,15 +21,13 @@ from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.geometry.timing import seconds_between
 from rs_relpose_ros.picture_files import save_picture
-from rs_relpose_ros.replay.record import PairRecord, rotation_sigmas, translation_sigmas
+from rs_relpose_ros.replay.tables import PairRecord, rotation_sigmas, translation_sigmas
 from rs_relpose_ros.replay.truth import rotation_angle, TrueTrajectory
 
 Array = NDArray[np.float64]
 
 _COLORMAP = 'plasma'
 _DPI = 110
-_OUTLIER_COLOR = 'cyan'
-_NO_POSE_COLOR = '0.6'
 # Colours that are told apart in every kind of colour vision (Okabe and Ito).
 _BLUE, _ORANGE, _GREEN, _RED = '#0072B2', '#E69F00', '#009E73', '#D55E00'
 
@@ -39,24 +37,22 @@ def draw_matches(result: PairResult, path: Path) -> None:
     assert result.image1 is not None and result.image2 is not None
     inliers = _inliers(result)
     height, width = result.image1.shape
-    row_times = 1e3 * np.concatenate([result.row_times1, result.row_times2, [0.0]])
+    tau1, tau2 = 1e3 * result.row_times1, 1e3 * result.row_times2
+    row_times = np.concatenate([tau1, tau2, [0.0]])
     norm = Normalize(row_times.min(), max(row_times.max(), row_times.min() + 1e-3))
     figure = Figure(figsize=(13.0, 0.75 + 6.1 * height / width), dpi=_DPI, layout='constrained')
     left, right = figure.subplots(1, 2)
     _image(left, result.image1, 'reference keyframe: inliers, coloured by their row time')
     _image(right, result.image2, 'current image: the same, with their way since the keyframe')
     points1, points2 = result.matches.points1, result.matches.points2
-    tau1, tau2 = 1e3 * result.row_times1, 1e3 * result.row_times2
-    left.scatter(*points1[inliers].T, c=tau1[inliers], cmap=_COLORMAP, norm=norm, s=16,
-                 edgecolors='black', linewidths=0.4)
     ways = LineCollection(list(np.stack([points1[inliers], points2[inliers]], axis=1)),
                           cmap=_COLORMAP, norm=norm, linewidths=1.3)
     ways.set_array(tau2[inliers])
     right.add_collection(ways)
-    right.scatter(*points2[inliers].T, c=tau2[inliers], cmap=_COLORMAP, norm=norm, s=16,
-                  edgecolors='black', linewidths=0.4)
-    for axes, points in ((left, points1), (right, points2)):
-        axes.scatter(*points[~inliers].T, marker='x', color=_OUTLIER_COLOR, s=26, linewidths=1.4,
+    for axes, points, tau in ((left, points1, tau1), (right, points2, tau2)):
+        axes.scatter(*points[inliers].T, c=tau[inliers], cmap=_COLORMAP, norm=norm, s=16,
+                     edgecolors='black', linewidths=0.4)
+        axes.scatter(*points[~inliers].T, marker='x', color='cyan', s=26, linewidths=1.4,
                      label=f'outliers ({np.count_nonzero(~inliers)})')
     if not inliers.all():
         right.legend(loc='lower right', framealpha=0.9, fontsize=9)
@@ -70,55 +66,45 @@ def draw_errors(records: Sequence[PairRecord], path: Path) -> None:
     """Errors against the truth over time, with the sigmas that the estimates claim."""
     figure, axes = _over_time(2, 'errors of the relative poses against the ground truth')
     start_ns = records[0].reference_ns1
-    known = [r for r in records if r.status is Status.OK and r.errors is not None]
-    times = _middles(known, start_ns)
-    rotation = [r.errors.rotation_error for r in known if r.errors]
-    translation = [r.errors.translation_error for r in known if r.errors]
+    known = [(r, r.errors) for r in records if r.pose and r.errors is not None]
+    begins, ends = _spans([r for r, _ in known], start_ns)
     # Of a 3-vector and of a 2-vector with these sigmas: the root of the mean square length.
-    rotation_sigma = [np.degrees(np.linalg.norm(rotation_sigmas(r.covariance))) for r in known]
-    translation_sigma = [np.degrees(np.linalg.norm(translation_sigmas(r.covariance)))
-                         for r in known]
-    for axis, values, sigmas, label in (
-            (axes[0], rotation, rotation_sigma, 'rotation error [deg]'),
-            (axes[1], translation, translation_sigma, 'translation direction\nerror [deg]')):
+    series = (([e.rotation_error for _, e in known], rotation_sigmas, 'rotation error [deg]'),
+              ([e.translation_error for _, e in known], translation_sigmas,
+               'translation direction\nerror [deg]'))
+    for axis, (values, sigmas_of, label) in zip(axes, series, strict=True):
         if known:
-            axis.hlines(sigmas, *_spans(known, start_ns), color=_ORANGE, linewidth=2.2,
+            sigmas = [np.degrees(np.linalg.norm(sigmas_of(r.pose.covariance))) for r, _ in known]
+            axis.hlines(sigmas, begins, ends, color=_ORANGE, linewidth=2.2,
                         label='1 sigma, as estimated')
-            axis.plot(times, values, 'o', color=_BLUE, markersize=5, label='error')
-            axis.axhline(float(np.median(values)), color=_BLUE, linestyle='--', linewidth=1.0,
-                         label=f'median error {np.median(values):.2g} deg')
+            axis.plot(0.5 * (begins + ends), values, 'o', color=_BLUE, markersize=5, label='error')
+            _median_line(axis, values, f'median error {np.median(values):.2g} deg')
             axis.set_yscale('log')
         axis.set_ylabel(label)
         _shade_no_pose(axis, records, start_ns)
-        axis.legend(loc='upper left', bbox_to_anchor=(1.0, 1.0), fontsize=9)
-    axes[-1].set_xlabel('time since the first keyframe [s]')
-    save_picture(figure, path)
+    _save_over_time(figure, axes, path)
 
 
 def draw_residuals(records: Sequence[PairRecord], path: Path) -> None:
     """What can be judged without a truth: residuals, inliers, rotation against the gyro."""
     figure, axes = _over_time(3, 'residuals of the relative poses')
     start_ns = records[0].reference_ns1
-    known = [r for r in records if r.status is Status.OK]
-    times = _middles(known, start_ns)
+    known = [r.figures for r in records if r.pose]
+    begins, ends = _spans([r for r in records if r.pose], start_ns)
     series = (
-        ([r.residual_rms for r in known], 'residual of inliers,\nrms [px]'),
-        ([100.0 * r.inliers / max(r.matches, 1) for r in known], 'inliers [%]'),
-        ([r.figures['rotation_difference_to_gyro_deg'] for r in known],
+        ([f['residual_rms_px'] for f in known], 'residual of inliers,\nrms [px]'),
+        ([100.0 * f['inlier_ratio'] for f in known], 'inliers [%]'),
+        ([f['rotation_difference_to_gyro_deg'] for f in known],
          'rotation: estimate\nagainst gyro [deg]'))
     for axis, (values, label) in zip(axes, series, strict=True):
-        finite = np.isfinite(np.array(values, dtype=np.float64))
-        if finite.any():
-            median = float(np.median(np.array(values)[finite]))
-            axis.plot(times, values, 'o', color=_BLUE, markersize=4)
-            axis.axhline(median, color=_BLUE, linestyle='--', linewidth=1.0,
-                         label=f'median {median:.3g}')
+        finite = [value for value in values if np.isfinite(value)]
+        if finite:
+            axis.plot(0.5 * (begins + ends), values, 'o', color=_BLUE, markersize=4)
+            _median_line(axis, finite, f'median {np.median(finite):.3g}')
         axis.set_ylabel(label)
         axis.set_ylim(bottom=0.0, top=None if '%' not in label else 105.0)
         _shade_no_pose(axis, records, start_ns)
-        axis.legend(loc='upper left', bbox_to_anchor=(1.0, 1.0), fontsize=9)
-    axes[-1].set_xlabel('time since the first keyframe [s]')
-    save_picture(figure, path)
+    _save_over_time(figure, axes, path)
 
 
 def draw_rotation(records: Sequence[PairRecord], path: Path,
@@ -127,7 +113,7 @@ def draw_rotation(records: Sequence[PairRecord], path: Path,
     unknown = np.full((3, 3), np.nan)
     gyro = [unknown if r.gyro_rotation is None else r.gyro_rotation for r in records]
     # Where a pair has no rotation the gyro bridges it, and the span is shaded.
-    chains = {'estimated': _accumulated([g if np.isnan(r.R).any() else r.R
+    chains = {'estimated': _accumulated([g if np.isnan(r.pose.R).any() else r.pose.R
                                          for r, g in zip(records, gyro, strict=True)]),
               'gyro alone': _accumulated(gyro)}
     against = 'gyro alone'
@@ -136,18 +122,16 @@ def draw_rotation(records: Sequence[PairRecord], path: Path,
         against = 'truth'
         chains[against] = _accumulated([unknown if pose is None else pose[0] for pose in poses])
     start_ns = records[0].reference_ns1
-    times = [0.0, *(seconds_between(start_ns, r.reference_ns2) for r in records)]
-    figure, (above, below) = _over_time(2, 'orientation against the first keyframe: the rotations '
-                                        'of the pairs, chained')
+    times = [0.0, *_spans(records, start_ns)[1]]
+    figure, axes = _over_time(2, 'orientation against the first keyframe: the rotations of the '
+                              'pairs, chained')
+    above, below = axes
+    estimated, reference = (_rotation_vectors(chains[name]) for name in ('estimated', against))
     for column, color in enumerate((_BLUE, _RED, _GREEN)):
-        for name, style in (('estimated', 'o-'), (against, '--')):
-            curve = [np.degrees(Rotation.from_matrix(R).as_rotvec())[column]
-                     if np.isfinite(R).all() else np.nan for R in chains[name]]
-            last = style == '--'
-            label = f'{"xyz"[column]} ({("right", "down", "forward")[column]})'
-            above.plot(times, curve, style, color='black' if last else color, markersize=3,
-                       linewidth=1.0 if last else 1.6,
-                       label=label if not last else against if column == 2 else None)
+        above.plot(times, estimated[:, column], 'o-', color=color, markersize=3, linewidth=1.6,
+                   label=f'{"xyz"[column]} ({("right", "down", "forward")[column]})')
+        above.plot(times, reference[:, column], '--', color='black', linewidth=1.0,
+                   label=against if column == 2 else None)
     above.set_ylabel('rotation vector, axes of\nthe camera [deg]')
     for (name, chain), color in zip(chains.items(), (_BLUE, _ORANGE), strict=False):
         if name != against:
@@ -157,12 +141,9 @@ def draw_rotation(records: Sequence[PairRecord], path: Path,
                        label=f'{name} against {against}')
     below.set_ylabel('difference, accumulated\n[deg]')
     below.set_ylim(bottom=0.0)
-    _shade_no_pose(below, [r for r in records if np.isnan(r.R).any()], start_ns,
+    _shade_no_pose(below, [r for r in records if np.isnan(r.pose.R).any()], start_ns,
                    'no rotation: gyro instead')
-    for axis in (above, below):
-        axis.legend(loc='upper left', bbox_to_anchor=(1.0, 1.0), fontsize=9)
-    below.set_xlabel('time since the first keyframe [s]')
-    save_picture(figure, path)
+    _save_over_time(figure, axes, path)
 
 
 # -- parts -----------------------------------------------------------------------------------
@@ -213,30 +194,37 @@ def _over_time(count: int, title: str) -> tuple[Figure, list[Axes]]:
     return figure, axes
 
 
+def _save_over_time(figure: Figure, axes: Sequence[Axes], path: Path) -> None:
+    for axis in axes:
+        axis.legend(loc='upper left', bbox_to_anchor=(1.0, 1.0), fontsize=9)
+    axes[-1].set_xlabel('time since the first keyframe [s]')
+    save_picture(figure, path)
+
+
+def _median_line(axis: Axes, values: Sequence[float], label: str) -> None:
+    axis.axhline(float(np.median(values)), color=_BLUE, linestyle='--', linewidth=1.0, label=label)
+
+
 def _shade_no_pose(axis: Axes, records: Sequence[PairRecord], start_ns: int,
                    label: str = '') -> None:
     """Spans of the pairs without a pose, one entry of the legend per status."""
     labelled = set()
     hatches = {Status.PURE_ROTATION: '', Status.LOW_PARALLAX: '..'}
     for record in records:
-        if record.status is Status.OK:
+        if record.pose:
             continue
         text = label or f'no pose: {record.status.value}'
-        axis.axvspan(seconds_between(start_ns, record.reference_ns1),
-                     seconds_between(start_ns, record.reference_ns2), facecolor=_NO_POSE_COLOR,
-                     alpha=0.35, edgecolor='0.3', linewidth=0.0,
+        (begin,), (end,) = _spans([record], start_ns)
+        axis.axvspan(begin, end, facecolor='0.6', alpha=0.35, edgecolor='0.3', linewidth=0.0,
                      hatch=hatches.get(record.status, '//'),
                      label=None if text in labelled else text)
         labelled.add(text)
 
 
-def _spans(records: Sequence[PairRecord], start_ns: int) -> tuple[list[float], list[float]]:
-    return ([seconds_between(start_ns, r.reference_ns1) for r in records],
-            [seconds_between(start_ns, r.reference_ns2) for r in records])
-
-
-def _middles(records: Sequence[PairRecord], start_ns: int) -> list[float]:
-    return [0.5 * (begin + end) for begin, end in zip(*_spans(records, start_ns), strict=True)]
+def _spans(records: Sequence[PairRecord], start_ns: int) -> tuple[Array, Array]:
+    """Reference instants (N,) of both frames of the pairs [s]."""
+    return (np.array([seconds_between(start_ns, r.reference_ns1) for r in records]),
+            np.array([seconds_between(start_ns, r.reference_ns2) for r in records]))
 
 
 def _accumulated(rotations: Sequence[Array]) -> list[Array]:
@@ -245,3 +233,9 @@ def _accumulated(rotations: Sequence[Array]) -> list[Array]:
     for rotation in rotations:
         products.append(products[-1] @ rotation)
     return products
+
+
+def _rotation_vectors(rotations: Sequence[Array]) -> Array:
+    """Rotation vectors (N, 3) [deg]; NaN for NaN."""
+    return np.degrees([Rotation.from_matrix(R).as_rotvec() if np.isfinite(R).all()
+                       else np.full(3, np.nan) for R in rotations])

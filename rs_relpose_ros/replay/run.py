@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 import logging
+from pathlib import Path
 import time
 from typing import Any
 
@@ -14,10 +15,10 @@ from rs_relpose_ros.bags.reader import Bag, BagMessage
 from rs_relpose_ros.bags.topics import SensorTopics
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
-from rs_relpose_ros.estimator.estimate import warm_up
+from rs_relpose_ros.estimator.warm_up import warm_up
 from rs_relpose_ros.front_end.front_end import FrameFailed, FrontEnd
 from rs_relpose_ros.front_end.pair import PairResult
-from rs_relpose_ros.front_end.sequencer import FrameRefused, SequencerCounts
+from rs_relpose_ros.front_end.sequencer import FrameRefused
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.messages.causes import CauseCounts
 from rs_relpose_ros.messages.incoming import stamp_ns, TruePose
@@ -36,52 +37,27 @@ class ReplayedPair:
     bag_time_ns: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class ReplayCounts:
-    """What came, and what became of it.
+    """What came besides what the sequencer counts, and how long it took [s]."""
 
-    Attributes
-    ----------
-    images : int
-        In the bag; `images_skipped` of them are not among the chosen stamps.
-    sequencer : SequencerCounts
-    invalid_messages, failed_frames : int
-    reasons : dict
-        Number of frames and messages that were not used, by the first sentence of each cause.
-    seconds : float
-        Wall time of the whole, without compilation.
-    processing_seconds : float
-        Of it, in tracking and estimation.
-    bag_seconds : float
-        From the first to the last message.
-    """
-
-    images: int
-    images_skipped: int
-    sequencer: SequencerCounts
-    invalid_messages: int
-    failed_frames: int
-    reasons: dict[str, int]
-    seconds: float
-    processing_seconds: float
-    bag_seconds: float
+    images: int = 0
+    images_skipped: int = 0   # not among the chosen stamps
+    invalid_messages: int = 0
+    failed_frames: int = 0
+    pairs: int = 0
+    seconds: float = 0.0   # wall time of the whole, without compilation
+    processing_seconds: float = 0.0   # of it, in tracking and estimation
+    first_ns: int = 0   # bag time of the first message
+    last_ns: int = 0
 
 
 class Replay:
-    """One run over a bag; iterate over `pairs`, then ask for `counts`.
+    """One run over an open bag; iterate over `pairs`, then read `counts` and `reasons`.
 
-    Parameters
-    ----------
-    bag : Bag
-        Open.
-    topics : SensorTopics
-    parameters : Parameters
-    stamps : set of int, optional
-        Only these frames are handed over, as those that a live node processed.
-    keep_images : bool
-        Whether pairs carry their images.
-    on_image : callable
-        Called after each image of the bag, for a progress bar.
+    With `stamps` only these frames are handed over, as those that a live node processed.
+    `keep_images`: whether pairs carry their images. `on_image` is called after each image of the
+    bag, for a progress bar.
     """
 
     def __init__(self, bag: Bag, topics: SensorTopics, parameters: Parameters, *,
@@ -95,12 +71,12 @@ class Replay:
         self._bag, self._topics, self._stamps = bag, topics, stamps
         self._on_image = on_image
         self._front_end = FrontEnd(parameters, offline=True, keep_images=keep_images)
-        self._intake = Intake(self._front_end.sequencer, parameters.imu.stuck_gyro_time)
+        self.sequencer = self._front_end.sequencer
+        self._intake = Intake(self.sequencer, parameters.imu.stuck_gyro_time)
         self._stamps_found: set[int] = set()
-        self._images = self._skipped = self._invalid = self._failed = self._pairs = 0
-        self._reasons = CauseCounts()
-        self._seconds = self._processing_seconds = 0.0
-        self._first_ns = self._last_ns = 0
+        self.counts = ReplayCounts()
+        # Frames and messages that were not used, by the first sentence of each cause.
+        self.reasons = CauseCounts()
 
     @property
     def intrinsics(self) -> Intrinsics | None:
@@ -110,55 +86,41 @@ class Replay:
     def pairs(self) -> Iterator[ReplayedPair]:
         """Run over the bag; every pair as it closes.
 
-        Raises
-        ------
-        InputError, MissingInputError
-            The bag is damaged, its camera is not calibrated, or no frame of it could be used.
+        Raises where the bag is damaged, its camera is not calibrated, or no frame could be used.
         """
-        warm_up()
+        warm_up(self._front_end.parameters.estimator)
         started = time.perf_counter()
         for role, message in self._intake.feed.messages(self._bag, self._topics):
-            self._first_ns = self._first_ns or message.bag_time_ns
-            self._last_ns = message.bag_time_ns
+            self.counts.first_ns = self.counts.first_ns or message.bag_time_ns
+            self.counts.last_ns = message.bag_time_ns
             self._hand_over(role, message)
             yield from self._drain()
         self._intake.refuse_held()
-        self._front_end.sequencer.close()
+        self.sequencer.close()
         yield from self._drain()
-        self._seconds = time.perf_counter() - started
+        self.counts.seconds = time.perf_counter() - started
         self._check_outcome()
-
-    def counts(self) -> ReplayCounts:
-        """Counts so far."""
-        return ReplayCounts(
-            images=self._images, images_skipped=self._skipped,
-            sequencer=self._front_end.sequencer.counts(), invalid_messages=self._invalid,
-            failed_frames=self._failed, reasons=self._reasons.most_common(),
-            seconds=self._seconds, processing_seconds=self._processing_seconds,
-            bag_seconds=(self._last_ns - self._first_ns) * 1e-9)
-
-    # -- inside ------------------------------------------------------------------------------
 
     def _hand_over(self, role: Role, message: BagMessage) -> None:
         try:
             if role is not Role.IMAGE or self._is_chosen(message.message):
                 self._intake.receive(role, message.message)
         except RsRelposeError as error:
-            if role is Role.CAMERA_INFO and not self._front_end.sequencer.counts().frames_taken:
+            if role is Role.CAMERA_INFO and not self.sequencer.counts().frames_taken:
                 # Without intrinsics no frame can be estimated: end now, not after the whole bag.
                 raise type(error)(f'{message.topic}: {error}') from error
-            self._invalid += 1
+            self.counts.invalid_messages += 1
             self._not_used(f'{message.topic}: {error}')
 
     def _is_chosen(self, image: Any) -> bool:
         """Whether an image message is among the stamps that were asked for."""
-        self._images += 1
+        self.counts.images += 1
         self._on_image()
         if self._stamps is None:
             return True
         stamp = stamp_ns(image.header)
         if stamp not in self._stamps:
-            self._skipped += 1
+            self.counts.images_skipped += 1
             return False
         self._stamps_found.add(stamp)
         return True
@@ -168,20 +130,19 @@ class Replay:
             if isinstance(outcome, FrameRefused):
                 self._not_used(f'{outcome.cause.value}: {outcome.reason}')
             elif isinstance(outcome, FrameFailed):
-                self._failed += 1
+                self.counts.failed_frames += 1
                 self._not_used(str(outcome.error))
             else:
-                self._processing_seconds += outcome.seconds
+                self.counts.processing_seconds += outcome.seconds
                 if outcome.pair is not None:
-                    self._pairs += 1
-                    yield ReplayedPair(outcome.pair, self._last_ns)
+                    self.counts.pairs += 1
+                    yield ReplayedPair(outcome.pair, self.counts.last_ns)
 
     def _not_used(self, reason: str) -> None:
-        if self._reasons.add(reason):
+        if self.reasons.add(reason):
             _logger.info('not used: %s', reason)
 
     def _check_outcome(self) -> None:
-        counts = self._front_end.sequencer.counts()
         if self._stamps is not None:
             absent = len(self._stamps - self._stamps_found)
             if absent == len(self._stamps):
@@ -190,9 +151,9 @@ class Replay:
             if absent:
                 _logger.warning('%d of the %d chosen stamps are not in the bag', absent,
                                 len(self._stamps))
-        reasons = self._reasons.most_common()
-        if reasons and (not counts.frames_taken or (self._failed and not self._pairs)):
-            reason = next(iter(reasons))
+        reason = next(iter(self.reasons.most_common()), None)
+        if reason is not None and (not self.sequencer.counts().frames_taken
+                                   or (self.counts.failed_frames and not self.counts.pairs)):
             raise InputError(f'no frame of {self._bag.path} could be used: {reason}')
 
 
@@ -210,3 +171,24 @@ def read_truth(bag: Bag, topics: SensorTopics) -> TrueTrajectory | None:
                               np.array([pose.quat_xyzw for pose in poses]))
     except InputError as error:
         raise InputError(f'{topics.truth.name}: {error}') from error
+
+
+def read_stamps(path: Path | str) -> frozenset[int]:
+    """Stamps of frames, one integer [ns] per line, as the node's `stamps_file` writes them."""
+    path = Path(path)
+    if not path.is_file():
+        raise MissingInputError(f'there is no file of stamps {path}')
+    stamps = set()
+    with path.open(encoding='utf-8', errors='replace') as file:
+        for number, line in enumerate(file, start=1):
+            text = line.strip()
+            # A table of poses will not do: the frames between keyframes move the tracks as well.
+            if text and not (text.isascii() and text.isdigit()):
+                raise InputError(
+                    f'{path}, line {number}: {text[:40]!r} is no stamp; the file must have one '
+                    'integer [ns] per line, as the parameter stamps_file of the node writes it')
+            if text:
+                stamps.add(int(text))
+    if not stamps:
+        raise InputError(f'{path} has no stamps')
+    return frozenset(stamps)

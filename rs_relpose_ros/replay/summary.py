@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import fields
 import json
 import math
 from pathlib import Path
@@ -20,40 +21,40 @@ from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.front_end.drift import Drift
 from rs_relpose_ros.front_end.pair import PAIR_FIGURES
-from rs_relpose_ros.replay.record import PairRecord
-from rs_relpose_ros.replay.run import ReplayCounts
+from rs_relpose_ros.replay.run import Replay
+from rs_relpose_ros.replay.tables import PairRecord
 from rs_relpose_ros.replay.truth import median_and_p90
 
 
-def summarize(records: Sequence[PairRecord], counts: ReplayCounts,
+def summarize(records: Sequence[PairRecord], run: Replay,
               drift: Drift | None = None) -> dict[str, Any]:
     """Figures of a run; medians are over the answered pairs, null where there are none.
 
     `drift`: as after the last pair.
     """
-    answered = [record for record in records if record.status is Status.OK]
-    by_status = Counter(record.status.value for record in records)
-    seconds = counts.processing_seconds
-    taken = counts.sequencer.frames_taken
+    answered = [record for record in records if record.pose]
+    by_status = Counter(record.status for record in records)
+    counts, sequencer = run.counts, run.sequencer.counts()
+    seconds, taken = counts.processing_seconds, sequencer.frames_taken
     return {
         'pairs': {
             'total': len(records),
             'answered': len(answered),
-            'by_status': {status.value: by_status.get(status.value, 0) for status in Status},
+            'by_status': {status.value: by_status[status] for status in Status},
         },
         'frames': {
             'in_bag': counts.images,
             'not_among_stamps': counts.images_skipped,
             'processed': taken,
-            'refused': {cause.value: n for cause, n in counts.sequencer.refused.items()},
+            'refused': {cause.value: n for cause, n in sequencer.refused.items()},
             'failed': counts.failed_frames,
         },
         'imu': {
-            'samples': counts.sequencer.imu_samples,
-            'gaps': counts.sequencer.imu_gaps,
-            'repeated': counts.sequencer.imu_repeated,
-            'late': counts.sequencer.imu_late,
-            'clock_jumps': counts.sequencer.clock_jumps,
+            'samples': sequencer.imu_samples,
+            'gaps': sequencer.imu_gaps,
+            'repeated': sequencer.imu_repeated,
+            'late': sequencer.imu_late,
+            'clock_jumps': sequencer.clock_jumps,
         },
         'tracked': None if drift is None or not drift.pairs else {
             'gyro_bias_rad_s': drift.gyro_bias.tolist(),
@@ -63,17 +64,17 @@ def summarize(records: Sequence[PairRecord], counts: ReplayCounts,
             'applied_s': drift.applied,
         },
         'invalid_messages': counts.invalid_messages,
-        'not_used': counts.reasons,
+        'not_used': run.reasons.most_common(),
         'medians': {
             figure.name: _median([record.figures[figure.name] for record in answered])
             for figure in PAIR_FIGURES},
         'errors_against_truth': _errors(answered),
         'timing': {
-            'bag_s': _finite(counts.bag_seconds),
-            'wall_s': _finite(counts.seconds),
-            'frame_rate_hz': _finite(taken / seconds) if seconds > 0.0 else None,
-            'processing_per_frame_ms': _finite(1e3 * seconds / taken) if taken else None,
-            'estimate_median_ms': _median([1e3 * r.duration for r in records]),
+            'bag_s': (counts.last_ns - counts.first_ns) * 1e-9,
+            'wall_s': counts.seconds,
+            'frame_rate_hz': taken / seconds if seconds > 0.0 else None,
+            'processing_per_frame_ms': 1e3 * seconds / taken if taken else None,
+            'estimate_median_ms': _median([1e3 * record.pose.duration for record in records]),
         },
     }
 
@@ -82,22 +83,16 @@ def with_provenance(figures: dict[str, Any], *, bag: Path, topics: SensorTopics,
                     parameters: Parameters, command: Sequence[str],
                     package_version: str) -> dict[str, Any]:
     """The figures, and what they were made from."""
-    names = {'image': topics.image, 'camera_info': topics.camera_info, 'imu': topics.imu,
-             'accel': topics.accel, 'truth': topics.truth}
+    by_role = {field.name: getattr(topics, field.name) for field in fields(topics)}
     return {
         'bag': str(bag),
-        'topics': {role: topic.name if topic else None for role, topic in names.items()},
+        'topics': {role: topic and topic.name for role, topic in by_role.items()},
         **figures,
         'parameters': parameters.to_mapping(),
         'command': list(command),
-        'versions': {
-            'rs_relpose_ros': package_version,
-            'python': platform.python_version(),
-            'numpy': np.__version__,
-            'scipy': scipy.__version__,
-            'opencv': cv2.__version__,
-            'numba': numba.__version__,
-        },
+        'versions': {'rs_relpose_ros': package_version, 'python': platform.python_version(),
+                     'numpy': np.__version__, 'scipy': scipy.__version__,
+                     'opencv': cv2.__version__, 'numba': numba.__version__},
     }
 
 
@@ -110,15 +105,15 @@ def _errors(answered: Sequence[PairRecord]) -> dict[str, Any] | None:
     errors = [record.errors for record in answered if record.errors is not None]
     if not errors:
         return None
-    rotation = median_and_p90([e.rotation_error for e in errors])
-    translation = median_and_p90([e.translation_error for e in errors])
+    rotation = [error.rotation_error for error in errors]
+    translation = [error.translation_error for error in errors]
     return {
         'pairs': len(errors),
-        'rotation_median_deg': _finite(rotation[0]),
-        'rotation_p90_deg': _finite(rotation[1]),
-        'translation_median_deg': _finite(translation[0]),
-        'translation_p90_deg': _finite(translation[1]),
-        'baseline_median_m': _median([e.baseline for e in errors]),
+        'rotation_median_deg': _median(rotation),
+        'rotation_p90_deg': _finite(median_and_p90(rotation)[1]),
+        'translation_median_deg': _median(translation),
+        'translation_p90_deg': _finite(median_and_p90(translation)[1]),
+        'baseline_median_m': _median([error.baseline for error in errors]),
     }
 
 

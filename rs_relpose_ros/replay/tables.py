@@ -1,18 +1,23 @@
-"""The tables that a replay writes: relative poses, and errors against the truth."""
+"""What is kept of a pair, without its matches and images, and its rows in the tables."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 import csv
+from dataclasses import dataclass
 import math
 from pathlib import Path
-from types import TracebackType
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.estimator.result import Status
+from rs_relpose_ros.estimator.result import RelativePose, Status
+from rs_relpose_ros.front_end.pair import PAIR_FIGURES, PairResult
 from rs_relpose_ros.messages.outgoing import quat_xyzw
-from rs_relpose_ros.replay.record import PairRecord, rotation_sigmas, translation_sigmas
+from rs_relpose_ros.replay.truth import PairErrors, TrueTrajectory
+
+Array = NDArray[np.float64]
 
 RELATIVE_POSE_COLUMNS = (
     'reference_stamp_ns', 'stamp_ns', 'tx', 'ty', 'tz', 'qx', 'qy', 'qz', 'qw', 'sigma_t1',
@@ -21,6 +26,50 @@ RELATIVE_POSE_COLUMNS = (
 ERROR_COLUMNS = (
     'reference_stamp_ns', 'stamp_ns', 'interval_s', 'baseline_m', 'rotation_deg',
     'rotation_error_deg', 'translation_error_deg', 'status')
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairRecord:
+    """Fields of a `PairResult`, values of `PAIR_FIGURES` by name, errors (None without truth)."""
+
+    reference_stamp_ns: int
+    stamp_ns: int
+    reference_ns1: int
+    reference_ns2: int
+    pose: RelativePose
+    gyro_rotation: Array | None
+    figures: Mapping[str, float]
+    errors: PairErrors | None
+
+    @property
+    def status(self) -> Status:
+        """Status of the pose."""
+        return self.pose.status
+
+
+def pair_record(result: PairResult, truth: TrueTrajectory | None = None) -> PairRecord:
+    """Figures of a pair, and its errors where there is a truth."""
+    pose, ns1, ns2 = result.pose, result.reference_ns1, result.reference_ns2
+    return PairRecord(
+        result.reference_stamp_ns, result.stamp_ns, ns1, ns2, pose, result.gyro_rotation,
+        {figure.name: figure.of(result) for figure in PAIR_FIGURES},
+        None if truth is None else truth.errors(pose.R, pose.t, ns1, ns2))
+
+
+def translation_sigmas(covariance: Array) -> tuple[float, float]:
+    """1 sigma of the translation direction [rad], larger and smaller axis.
+
+    The covariance (6, 6) of (dt, dtheta) has no variance along t, so two of three axes remain.
+    """
+    variances = np.linalg.eigvalsh(covariance[:3, :3])
+    larger, smaller = np.sqrt(np.maximum(variances[[2, 1]], 0.0))
+    return float(larger), float(smaller)
+
+
+def rotation_sigmas(covariance: Array) -> tuple[float, float, float]:
+    """1 sigma of the rotation about the axes x, y, z of camera 1 [rad]."""
+    x, y, z = np.sqrt(np.maximum(np.diag(covariance)[3:], 0.0))
+    return float(x), float(y), float(z)
 
 
 class TableWriter:
@@ -32,11 +81,10 @@ class TableWriter:
         self._writer = csv.writer(self._file, lineterminator='\n')
         self._writer.writerow(columns)
 
-    def __enter__(self) -> TableWriter:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 traceback: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self._file.close()
 
     def write(self, cells: list[str]) -> None:
@@ -51,31 +99,25 @@ def relative_pose_cells(record: PairRecord) -> list[str]:
 
     Floats are written so that they read back bit-equal.
     """
+    pose, matches = record.pose, str(record.figures['matches'])
     stamps = [str(record.reference_stamp_ns), str(record.stamp_ns)]
-    if record.status is not Status.OK:
-        return [*stamps, *[''] * 13, str(record.matches), '', record.status.value]
-    return [*stamps, *pose_cells(record.R, record.t, record.covariance), str(record.inliers),
-            str(record.matches), record.model, record.status.value]
-
-
-def pose_cells(R: NDArray[np.float64], t: NDArray[np.float64],
-               covariance: NDArray[np.float64]) -> list[str]:
-    """The twelve cells from tx to sigma_rz."""
-    figures = [*t, *quat_xyzw(R), *translation_sigmas(covariance), *rotation_sigmas(covariance)]
-    return [number(value) for value in figures]
+    if not pose:
+        return [*stamps, *[''] * 13, matches, '', pose.status.value]
+    figures = [*pose.t, *quat_xyzw(pose.R), *translation_sigmas(pose.covariance),
+               *rotation_sigmas(pose.covariance)]
+    return [*stamps, *map(number, figures), str(record.figures['inliers']), matches, pose.model,
+            pose.status.value]
 
 
 def error_cells(record: PairRecord) -> list[str]:
     """Row of `ERROR_COLUMNS`; empty figures where the truth does not reach or nothing is known."""
     errors = record.errors
-    if errors is None:
-        figures = [''] * 4
-    else:
-        # PURE_ROTATION knows its rotation, but is no pose.
-        figures = [number(errors.baseline), number(errors.rotation),
-                   number(errors.rotation_error), number(errors.translation_error)]
-    return [str(record.reference_stamp_ns), str(record.stamp_ns), number(record.interval),
-            *figures, record.status.value]
+    # PURE_ROTATION knows its rotation, but is no pose.
+    figures = [''] * 4 if errors is None else [
+        number(errors.baseline), number(errors.rotation), number(errors.rotation_error),
+        number(errors.translation_error)]
+    return [str(record.reference_stamp_ns), str(record.stamp_ns),
+            number(record.figures['interval_s']), *figures, record.status.value]
 
 
 def number(value: float) -> str:

@@ -22,37 +22,19 @@ _MIN_POSES = 4
 
 @dataclass(frozen=True, slots=True)
 class PairErrors:
-    """True motion of a pair and the errors of its estimate, NaN where there is no such figure.
+    """True motion of a pair and the errors of its estimate, NaN where there is no such figure."""
 
-    Attributes
-    ----------
-    baseline : float
-        True distance of the two reference instants' positions [m].
-    rotation : float
-        True angle of rotation [deg].
-    rotation_error : float
-        Angle of ``R_estimated^T R_true`` [deg].
-    translation_error : float
-        Angle between the directions of translation [deg], 0 to 180.
-    """
-
-    baseline: float
-    rotation: float
-    rotation_error: float
-    translation_error: float
+    baseline: float   # true distance of the two reference instants' positions [m]
+    rotation: float   # true angle [deg]
+    rotation_error: float   # angle of R_estimated^T R_true [deg]
+    translation_error: float   # angle between the directions of translation [deg], 0 to 180
 
 
 class TrueTrajectory:
     """Camera poses in the world, interpolated: SLERP and a cubic spline of the position.
 
-    Parameters
-    ----------
-    stamps_ns : (K,) array_like of int
-        On the IMU clock.
-    positions : (K, 3) array_like
-        [m].
-    quats_xyzw : (K, 4) array_like
-        Rotation of the camera's optical frame in the world.
+    Stamps (K,) on the IMU clock, positions (K, 3) [m], and rotations of the camera's optical
+    frame in the world as quaternions (K, 4).
     """
 
     def __init__(self, stamps_ns: ArrayLike, positions: ArrayLike, quats_xyzw: ArrayLike) -> None:

@@ -1,0 +1,77 @@
+"""The unknowns of the uniform model and their local parameters."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.compiled import kernel, linked_kernel
+from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
+from rs_relpose_ros.geometry.vectors import tangent_basis
+
+Array = NDArray[np.float64]
+
+# Where each unknown's local parameters begin: a turn on the left of R, two steps of t in its
+# tangent plane, and four vectors.
+PARAMETERS = 17
+THETA, TANGENT, D1, D2, DW1, DW2 = 0, 3, 5, 8, 11, 14
+
+
+class TwoViewState(NamedTuple):
+    """Pose, velocities and corrections of the gyro's rates, all in frame 1.
+
+    ``R, t`` (unit), ``d_1 = v_1, d_2 = R v_2`` [baselines per second], ``dw_1, dw_2`` [rad/s].
+    """
+
+    R: Array
+    t: Array
+    d1: Array
+    d2: Array
+    dw1: Array
+    dw2: Array
+
+
+@kernel
+def hypothesis_state(R: Array, x: Array) -> TwoViewState:
+    """The state of a hypothesis: R (3, 3) and ``x = (t, d_1, d_2)``, gyro as measured."""
+    return TwoViewState(R.copy(), x[0:3].copy(), x[3:6].copy(), x[6:9].copy(), np.zeros(3),
+                        np.zeros(3))
+
+
+@kernel
+def signed(state: TwoViewState, sign: float) -> TwoViewState:
+    """The state with its translation and velocities multiplied by `sign`."""
+    return TwoViewState(state.R, sign * state.t, sign * state.d1, sign * state.d2, state.dw1,
+                        state.dw2)
+
+
+@linked_kernel
+def moved(state: TwoViewState, step: Array) -> TwoViewState:
+    """The state after a step (17,) of its local parameters."""
+    basis = tangent_basis(state.t)
+    t = state.t + basis[:, 0] * step[3] + basis[:, 1] * step[4]
+    return TwoViewState(
+        exp_so3(step[:3]) @ state.R, t / math.sqrt((t * t).sum()),
+        state.d1 + step[D1:D1 + 3], state.d2 + step[D2:D2 + 3],
+        state.dw1 + step[DW1:DW1 + 3], state.dw2 + step[DW2:DW2 + 3])
+
+
+@linked_kernel
+def step_between(state: TwoViewState, other: TwoViewState) -> Array:
+    """The step (17,) of local parameters from `state` to `other`: the inverse of `moved`."""
+    step = np.empty(PARAMETERS)
+    turn = log_so3(other.R @ state.R.T)
+    basis = tangent_basis(state.t)
+    along = (state.t * other.t).sum()
+    for k in range(2):
+        step[TANGENT + k] = (basis[:, k] * other.t).sum() / along
+    for k in range(3):
+        step[THETA + k] = turn[k]
+        step[D1 + k] = other.d1[k] - state.d1[k]
+        step[D2 + k] = other.d2[k] - state.d2[k]
+        step[DW1 + k] = other.dw1[k] - state.dw1[k]
+        step[DW2 + k] = other.dw2[k] - state.dw2[k]
+    return step
