@@ -1,4 +1,4 @@
-"""The drive loop: what becomes of errors, and parameters that change in mid-run."""
+"""The drive loop: errors, what closes a pair, and parameters that change in mid-run."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.config.keyframes import KeyframeConfig
 from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.front_end.frame import Frame
 from rs_relpose_ros.front_end.front_end import FrameFailed, FrameProcessed, FrontEnd, Outcome
-from rs_relpose_ros.front_end.pair import PairResult
+from rs_relpose_ros.front_end.pair import closes_pair, PairResult, SinceKeyframe
 from rs_relpose_ros.front_end.sequencer import FrameRefused
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.imu.samples import ImuSample
@@ -81,6 +82,30 @@ def test_a_refusal_is_an_outcome():
     assert front_end.step() is None
     front_end.sequencer.close()
     assert isinstance(front_end.step(), FrameRefused)
+
+
+# -- pairs -----------------------------------------------------------------------------------
+
+
+POLICY = KeyframeConfig(min_keyframe_parallax=10.0, max_keyframe_interval=0.5,
+                        max_keyframe_frames=12, min_tracked_fraction=0.3)
+
+
+@pytest.mark.parametrize('parallax, interval, frames, fraction, expected', [
+    (9.9, 0.49, 11, 0.3, False),
+    (10.0, 0.03, 1, 1.0, True),
+    (10.0, 0.9, 30, 0.1, True),
+    (0.0, 0.03, 1, 0.29, True),
+    (0.0, 0.5, 3, 1.0, True),
+    (0.0, 0.3, 12, 1.0, True),
+    (np.nan, 0.1, 2, 0.0, True),
+    (np.nan, 0.5, 2, 1.0, True),
+    (np.nan, 0.1, 2, 1.0, False),
+])
+def test_a_pair_closes_when_the_camera_moved_or_it_is_time(parallax, interval, frames, fraction,
+                                                           expected):
+    since = SinceKeyframe(parallax, interval, frames, fraction)
+    assert closes_pair(since, POLICY) is expected
 
 
 # -- parameters that may change while running ------------------------------------------------

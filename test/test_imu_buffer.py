@@ -98,15 +98,6 @@ def test_a_broken_sample_is_refused_and_nothing_of_it_is_kept(broken):
     assert buffer.newest_ns is None
 
 
-def test_gyro_and_accelerometer_in_separate_messages():
-    buffer = ImuBuffer(ImuConfig())
-    for k in range(400):
-        buffer.add(ImuSample(START + k * PERIOD, (0.0, 0.0, 0.0), None))
-        buffer.add(ImuSample(START + k * PERIOD - 1_700_000, None, UP))
-    np.testing.assert_allclose(buffer.gravity(START + 399 * PERIOD).direction, [0.0, 0.0, -1.0],
-                               atol=1e-12)
-
-
 def test_history_is_bounded():
     buffer = filled(samples(wobble, 3000), imu_buffer_seconds=2.0)
     newest = START + 2999 * PERIOD

@@ -129,7 +129,7 @@ def set_parameter(graph: Graph, name: str, value: float) -> Any:
 def test_a_live_parameter_takes_effect(running):
     """Pairs that close at a parallax that is not reached, and so by their age only."""
     refused = set_parameter(running.graph, 'threshold', -1.0)
-    assert (refused.successful, refused.reason[:9]) == (False, 'threshold')
+    assert not refused.successful and 'threshold' in refused.reason
     assert set_parameter(running.graph, 'min_keyframe_parallax', 900.0).successful
     assert set_parameter(running.graph, 'max_keyframe_interval', 0.9).successful
     running.play(Image, CameraInfo, Imu, later=20.0)

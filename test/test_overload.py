@@ -24,7 +24,6 @@ from rs_relpose_ros.front_end.sequencer import FrameRefused, MAILBOX_FRAMES, Ref
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.imu.frame_imu import FrameImu
 from rs_relpose_ros.imu.samples import ImuSample
-from rs_relpose_ros.node.diagnostics import Inputs, Statistics, WARN
 from rs_relpose_ros.node.worker import Worker
 
 # Whoever comes first compiles the kernels.
@@ -119,11 +118,6 @@ def test_the_oldest_frame_goes_and_the_latest_wait(held):
         assert counts.frames == FRAMES
         assert counts.frames_taken == 1
         assert counts.refused == {Refusal.OVERLOAD: lost}
-        report = Statistics().report(Inputs(FRAMES, 1, samples, 0, 0), counts, problem='',
-                                     missing=())
-        assert report.level == WARN
-        assert report.text.startswith(f'{lost} frames were not used')
-        assert dict(report.values)['frames_refused_overload'] == str(lost)
         held.let_go.set()
         wait_until(lambda: len(done()) == 1 + MAILBOX_FRAMES, 'the frames that waited')
     finally:

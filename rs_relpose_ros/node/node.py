@@ -113,9 +113,8 @@ class RelposeNode(Node):
     def _subscribe_when_warm(self) -> None:
         if not self._warm.is_set():
             if self._now_ns() - self._started_ns > _TELL_COMPILING * NANOSECONDS:
-                # Only where the build left none that can be used: see kernel_cache.py.
-                self._info("compiling kernels into the user's cache: this start takes a minute "
-                           'or two, the later ones some seconds')
+                self._info('compiling kernels, as the build left none that fit here: this start '
+                           'takes a minute or two, the later ones, which find them, some seconds')
             return
         self.destroy_timer(self._warm_timer)
         assert self._front_end is not None
