@@ -15,7 +15,7 @@ _ROTATION_TOLERANCE = 1e-6
 
 def _numbers(name: str, value: ArrayLike) -> Array:
     try:
-        array = np.array(value, dtype=np.float64)
+        array = np.array(value, dtype=np.float64, order='C')
     except (TypeError, ValueError):
         raise InputError(f'{name} must be an array of numbers, got {value!r}') from None
     if not np.isfinite(array).all():
