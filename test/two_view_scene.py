@@ -75,6 +75,8 @@ def expose(world, R, p, w, v, reference_row, iterations):
     local, settled = np.empty((len(world), 3)), np.empty(len(world), dtype=bool)
     left = np.arange(len(world))
     for _ in range(iterations):
+        if not len(left):
+            break
         turn = R if R.single else R[left]
         at, velocity, rate = (x if np.ndim(x) == 1 else x[left] for x in (p, v, w))
         tau[left] = (rows[left] - reference_row) * LINE_DELAY

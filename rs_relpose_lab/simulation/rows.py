@@ -75,6 +75,8 @@ def see(world: Array, motion: Motion, view: View, margin: float = 0.0) -> Array:
     left, before, projected = left[ahead], before[ahead], projected[ahead]
     rows, slope = projected, np.zeros(len(left))
     for _ in range(_MAX_ROUNDS):
+        if not len(left):
+            break
         # A row far outside only says "not in the image"; the motion need not reach there.
         rows = np.clip(rows, -view.height, 2 * view.height)
         pixels = project(left, rows)
@@ -88,8 +90,6 @@ def see(world: Array, motion: Motion, view: View, margin: float = 0.0) -> Array:
         beyond = ((rows <= -view.height) & (pixels[:, 1] < rows)
                   | (rows >= 2 * view.height) & (pixels[:, 1] > rows))
         again = ~settled & ~beyond & np.isfinite(pixels[:, 1])
-        if not again.any():
-            break
         left, before, projected, slope = left[again], rows[again], pixels[again, 1], slope[again]
         rows = before + (projected - before) / np.where(slow[again], 1.0 - slope, 1.0)
     inside = ((seen >= -margin)
