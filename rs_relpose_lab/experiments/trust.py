@@ -5,16 +5,19 @@ Each bag is simulated once, run told right, and then run through every row of `R
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+import json
 import math
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_lab.experiments.trust_information import TellingMotion
+from rs_relpose_lab.experiments.tables import grouped, markdown_table, write_csv
+from rs_relpose_lab.experiments.trust_recordings import REAL, real_recording
 from rs_relpose_lab.experiments.trust_rows import RIGHT, ROWS
 from rs_relpose_lab.experiments.trust_runs import (
     FLAGGED,
@@ -23,6 +26,7 @@ from rs_relpose_lab.experiments.trust_runs import (
     Recording,
     run,
     simulated,
+    Source,
     telling_motion,
 )
 from rs_relpose_lab.experiments.trust_tracks import TrackNoise
@@ -34,6 +38,9 @@ from rs_relpose_ros.config.estimator import EstimatorConfig
 from rs_relpose_ros.config.imu import ImuConfig
 from rs_relpose_ros.front_end.pair import PairResult
 
+Array = NDArray[np.float64]
+
+# Of simulated bags.
 MOTIONS = ('hand-held', 'vehicle')
 # Beyond these lie 0.27 % of right poses: three sigmas of one dimension.
 LIMIT_T, LIMIT_R = 11.8, 14.2
@@ -113,8 +120,9 @@ def recording_of(plan: BagPlan) -> Recording:
     if noise is not None and plan.noise:
         # Told is the noise of either image's points; here only those of the second one have any.
         noise = TrackNoise(white=plan.noise * math.sqrt(2.0) * EstimatorConfig().pixel_sigma)
-    return simulated(f'{plan.seed}', simulation_of(plan), noise,
-                     np.random.default_rng([plan.seed, _TRACKS]))
+    name = f'{plan.seed}{"-images" if plan.images else ""}'
+    return simulated(Source(name, plan.motion, plan.scene, plan.seed, plan.noise),
+                     simulation_of(plan), noise, np.random.default_rng([plan.seed, _TRACKS]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,11 +133,10 @@ class BagRow:
     `flagged`: within them; `flagged_after`: after so many of them, NaN where never.
     `named`: figures that were named at the end of that time; `named_right`: at most two, with a
         right one among them.
-    `poses`, `beyond_t`, `beyond_R`: poses at level ok or unknown after the first of these seconds,
-        and those with errors beyond the limits; `all_`: including that second.
-    `nees_t`, `nees_R`: mean of the chi squares by their degrees of freedom, of these poses.
-    Errors and claimed sigma: medians [deg] of these poses. `frame_ms`: median of frames with a
-    pair.
+    `poses`: at level ok or unknown, after the first of these seconds; `direction_beyond`,
+        `rotation_beyond`: those of them with errors beyond the limits; `all_`: from the start.
+    `nees_`: mean of the chi squares by their degrees of freedom; errors and claimed sigma: medians
+        [deg]; of `poses`, and of all where told right. `frame_ms`: median, frames with a pair.
     """
 
     bag: str
@@ -146,42 +153,62 @@ class BagRow:
     named_right: bool
     pairs: int
     poses: int
-    beyond_t: int
-    beyond_R: int
+    direction_beyond: int
+    rotation_beyond: int
     all_poses: int
-    all_beyond_t: int
-    all_beyond_R: int
-    nees_t: float
-    nees_R: float
-    error_t: float
-    sigma_t: float
-    error_R: float
+    all_direction_beyond: int
+    all_rotation_beyond: int
+    nees_direction: float
+    nees_rotation: float
+    direction_error: float
+    direction_sigma: float
+    rotation_error: float
     frame_ms: float
 
 
-def measure(plan: BagPlan, rows: Sequence[str]) -> list[BagRow]:
-    """A simulated bag through the rows; told right first, since that says which seconds tell."""
-    return measured_rows(recording_of(plan), plan, rows)
+class Task(NamedTuple):
+    """A bag to simulate, or the folder of a real recording, and the rows that it goes through."""
+
+    bag: BagPlan | Path
+    rows: tuple[str, ...]
 
 
-def measured_rows(recording: Recording, plan: BagPlan, rows: Sequence[str]) -> list[BagRow]:
-    """The rows that apply to a recording."""
+def tasks(rows: Sequence[str], bags: int, seconds: float, first_seed: int, *, right: int = 0,
+          rendered: int = 0, recordings: Path | None = None) -> list[Task]:
+    """All that is to be measured; arguments as the options of the command."""
+    wrong = tuple(rows)
+    asked = [Task(plan, wrong) for plan in plans(bags, seconds, first_seed)]
+    asked += [Task(task.bag._replace(images=True), wrong) for task in asked[:rendered]
+              if isinstance(task.bag, BagPlan)]
+    if recordings is not None:
+        asked += [Task(recordings / name, wrong) for name in REAL]
+    # Seeds of their own.
+    asked += [Task(plan, (RIGHT,))
+              for plan in plans(right, seconds, first_seed + 10_000, noises=(1.0, 0.5, 2.0))]
+    return asked
+
+
+def measure(task: Task) -> list[BagRow]:
+    """A recording through its rows that apply to it.
+
+    Told right first: that run says which seconds tell what.
+    """
+    recording = (real_recording(task.bag) if isinstance(task.bag, Path)
+                 else recording_of(task.bag))
     right = list(run(recording, recording.told))
     motion = telling_motion(recording, [pair for pair, _ in right])
     found = []
-    for name in rows:
+    for name in task.rows:
         row = ROWS[name]
         # Twice the same stream: what is told and what the laboratory knows of it agree.
-        told, injected = (draw(recording.told, np.random.default_rng([plan.seed, _WRONG]))
-                          for draw in (row.wrong, row.injected))
+        drawn = [recording.source.seed, _WRONG]
+        told = row.wrong(recording.told, np.random.default_rng(drawn))
+        injected = row.injected(recording.told, np.random.default_rng(drawn))
         if injected is not None and not injected.error.any():
             continue   # e.g. no distortion to leave out
         tells = motion.seconds(injected)
-        if name == RIGHT:
-            pairs = right
-        else:
-            pairs = list(run(recording, told, _end(tells, row.within)))
-        found.append(_bag_row(recording, plan, name, tells, pairs))
+        found.append(_bag_row(recording, name, tells, right if name == RIGHT else list(
+            run(recording, told, _end(tells, row.within)))))
     return found
 
 
@@ -191,9 +218,9 @@ def _end(tells: NDArray[np.bool_], within: int) -> float:
     return float(passed[0]) + 1.0 + _AFTERWARDS if len(passed) else math.inf
 
 
-def _bag_row(recording: Recording, plan: BagPlan, name: str, tells: NDArray[np.bool_],
+def _bag_row(recording: Recording, name: str, tells: NDArray[np.bool_],
              results: Sequence[tuple[PairResult, float]]) -> BagRow:
-    row = ROWS[name]
+    row, source = ROWS[name], recording.source
     pairs = [judged(recording, pair, seconds) for pair, seconds in results]
     clocks = [_clock(tells, pair.at) for pair in pairs]
     flags = [(clock, pair) for clock, pair in zip(clocks, pairs, strict=True)
@@ -207,18 +234,21 @@ def _bag_row(recording: Recording, plan: BagPlan, name: str, tells: NDArray[np.b
     counted = later if name != RIGHT else believed
     telling = _clock(tells, recording.seconds)
     return BagRow(
-        bag=recording.name, motion=plan.motion, scene=plan.scene,
-        readout_ms=1e3 * plan.readout_time, noise=plan.noise, row=name, telling=telling,
+        bag=source.name, motion=source.motion, scene=source.scene,
+        readout_ms=1e3 * recording.camera.readout_time, noise=source.noise, row=name,
+        telling=telling,
         qualifies=telling >= row.within, flagged=bool(in_time),
         flagged_after=flags[0][0] if flags else math.nan, named=' '.join(named),
         named_right=len(named) <= 2 and bool(set(named) & set(row.named)), pairs=len(pairs),
-        poses=len(later), beyond_t=_beyond_t(later), beyond_R=_beyond_R(later),
-        all_poses=len(believed), all_beyond_t=_beyond_t(believed),
-        all_beyond_R=_beyond_R(believed), nees_t=_mean([p.chi_t / 2 for p in counted]),
-        nees_R=_mean([p.chi_R / 3 for p in counted]),
-        error_t=_median([p.error_t for p in counted]),
-        sigma_t=_median([p.sigma_t for p in counted]),
-        error_R=_median([p.error_R for p in counted]),
+        poses=len(later), direction_beyond=_directions_beyond(later),
+        rotation_beyond=_rotations_beyond(later), all_poses=len(believed),
+        all_direction_beyond=_directions_beyond(believed),
+        all_rotation_beyond=_rotations_beyond(believed),
+        nees_direction=_mean([p.chi_direction / 2 for p in counted]),
+        nees_rotation=_mean([p.chi_rotation / 3 for p in counted]),
+        direction_error=_median([p.direction_error for p in counted]),
+        direction_sigma=_median([p.direction_sigma for p in counted]),
+        rotation_error=_median([p.rotation_error for p in counted]),
         frame_ms=1e3 * _median([p.seconds for p in pairs]))
 
 
@@ -229,12 +259,12 @@ def _clock(tells: NDArray[np.bool_], at: float) -> float:
     return float(np.count_nonzero(tells[:full])) + running
 
 
-def _beyond_t(pairs: Sequence[JudgedPair]) -> int:
-    return sum(pair.chi_t > LIMIT_T for pair in pairs)
+def _directions_beyond(pairs: Sequence[JudgedPair]) -> int:
+    return sum(pair.chi_direction > LIMIT_T for pair in pairs)
 
 
-def _beyond_R(pairs: Sequence[JudgedPair]) -> int:
-    return sum(pair.chi_R > LIMIT_R for pair in pairs)
+def _rotations_beyond(pairs: Sequence[JudgedPair]) -> int:
+    return sum(pair.chi_rotation > LIMIT_R for pair in pairs)
 
 
 def _mean(values: Sequence[float]) -> float:
@@ -245,4 +275,126 @@ def _median(values: Sequence[float]) -> float:
     return float(np.median(values)) if values else math.nan
 
 
-__all__ = ['BagPlan', 'BagRow', 'TellingMotion', 'fields', 'measure', 'plans']
+
+# -- report -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class RowSummary:
+    """A row over its bags; shares in per cent, NaN where there is nothing to share.
+
+    `flagged`, `named`: of the bags that qualify; `after`: median of the seconds of motion that can
+    tell before the flag. `direction_beyond`, `rotation_beyond`: of the poses after the first such
+    second; `all_`: of all poses.
+    """
+
+    row: str
+    within: int
+    bags: int
+    qualify: float
+    flagged: float
+    named: float
+    after: float
+    poses: int
+    direction_beyond: float
+    rotation_beyond: float
+    all_poses: int
+    all_direction_beyond: float
+    all_rotation_beyond: float
+    direction_error: float
+    direction_sigma: float
+
+
+def summary(name: str, bags: Sequence[BagRow]) -> RowSummary:
+    """One row's bags, or several rows' as one."""
+    fit = [bag for bag in bags if bag.qualifies]
+    poses, all_poses = (sum(getattr(bag, of) for bag in bags) for of in ('poses', 'all_poses'))
+    beyond = {of: _share(sum(getattr(bag, of) for bag in bags),
+                         all_poses if of.startswith('all') else poses)
+              for of in ('direction_beyond', 'rotation_beyond', 'all_direction_beyond',
+                         'all_rotation_beyond')}
+    return RowSummary(
+        row=name, within=ROWS[bags[0].row].within, bags=len(bags),
+        qualify=_share(len(fit), len(bags)),
+        flagged=_share(sum(bag.flagged for bag in fit), len(fit)),
+        named=_share(sum(bag.named_right for bag in fit), len(fit)),
+        after=_finite_median([bag.flagged_after for bag in fit]), poses=poses,
+        all_poses=all_poses, direction_error=_finite_median([bag.direction_error for bag in bags]),
+        direction_sigma=_finite_median([bag.direction_sigma for bag in bags]), **beyond)
+
+
+def write_report(folder: Path, bags: Sequence[BagRow]) -> str:
+    """Write every bag and row (CSV), the summaries (JSON) and the tables (Markdown)."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_csv(folder / 'trust_bags.csv', bags)
+    of_matrix = [bag for bag in bags if not bag.noise]
+    rows = [summary(name, of_row)
+            for name, of_row in grouped(of_matrix, lambda bag: bag.row).items()]
+    if len(rows) > 1:
+        rows.append(summary('all rows', of_matrix))
+    right = grouped([bag for bag in bags if bag.row == RIGHT], _kind)
+    text = ''
+    if rows:
+        text += 'Told wrong (shares in per cent):\n\n' + _matrix_table(rows) + '\n'
+    if right:
+        text += 'Told right:\n\n' + _right_table(right)
+    (folder / 'trust.json').write_text(json.dumps(
+        {'rows': [asdict(row) for row in rows]}, indent=1), encoding='utf-8')
+    (folder / 'trust.md').write_text(text, encoding='utf-8')
+    return text
+
+
+def _matrix_table(rows: Sequence[RowSummary]) -> str:
+    return markdown_table(
+        ['told', 'bags', 'qualify', 'within [s]', 'flagged', 'named right', 'after [s]', 'poses',
+         't beyond', 'R beyond', 'all poses', 't beyond', 'R beyond', 't error [deg]',
+         'claimed'],
+        [[row.row, f'{row.bags}', _text(row.qualify, 0), f'{row.within}', _text(row.flagged, 0),
+          _text(row.named, 0), _text(row.after, 1), f'{row.poses}', _text(row.direction_beyond, 1),
+          _text(row.rotation_beyond, 1), f'{row.all_poses}', _text(row.all_direction_beyond, 1),
+          _text(row.all_rotation_beyond, 1), _text(row.direction_error, 2),
+          _text(row.direction_sigma, 2)]
+         for row in rows])
+
+
+def _kind(bag: BagRow) -> str:
+    noise = f', noise {bag.noise:g} of the told one' if bag.noise else ''
+    return f'{bag.motion if bag.motion != "real" else bag.bag}{noise}'
+
+
+def _right_table(right: Mapping[str, Sequence[BagRow]]) -> str:
+    """False alarms, and errors squared in sigmas by their degrees of freedom."""
+    lines = []
+    for name, bags in right.items():
+        alarms = [bag for bag in bags if not math.isnan(bag.flagged_after)]
+        pairs = sum(bag.pairs for bag in bags)
+        cells = [name, f'{len(bags)}', f'{len(alarms)}', f'{pairs}',
+                 f'{sum(bag.all_poses for bag in bags)}']
+        for of in ('nees_direction', 'nees_rotation'):
+            values = np.array([getattr(bag, of) for bag in bags])
+            weights = np.array([bag.all_poses for bag in bags])
+            cells += [_text(_weighted_mean(values, weights), 2),
+                      ' .. '.join(_text(float(end), 2) for end in (values.min(), values.max()))]
+        lines.append([*cells, _text(_finite_median([bag.direction_error for bag in bags]), 2),
+                      _text(_finite_median([bag.rotation_error for bag in bags]), 3),
+                      _text(_finite_median([bag.frame_ms for bag in bags]), 1)])
+    return markdown_table(
+        ['motion', 'bags', 'alarms', 'pairs', 'poses', 'NEES t', 'by bag', 'NEES R', 'by bag',
+         't error [deg]', 'R error [deg]', 'frame with pair [ms]'], lines)
+
+
+def _weighted_mean(values: Array, weights: Array) -> float:
+    known = np.isfinite(values)
+    return float(np.average(values[known], weights=weights[known])) if known.any() else math.nan
+
+
+def _share(part: int, whole: int) -> float:
+    return 100.0 * part / whole if whole else math.nan
+
+
+def _finite_median(values: Sequence[float]) -> float:
+    return _median([value for value in values if math.isfinite(value)])
+
+
+def _text(value: float, digits: int) -> str:
+    return '' if math.isnan(value) else f'{value:.{digits}f}'

@@ -190,8 +190,8 @@ def _rectified(points: Array, camera: RollingShutterCamera) -> Array:
 
 def _rectified_image(image: Gray, camera: RollingShutterCamera) -> Gray:
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    rays = np.column_stack([(u.ravel() - camera.cx) / camera.fx, (v.ravel() - camera.cy) / camera.fy,
-                            np.ones(u.size)])
+    rays = np.column_stack([(u.ravel() - camera.cx) / camera.fx,
+                            (v.ravel() - camera.cy) / camera.fy, np.ones(u.size)])
     source = camera.project(rays).astype(np.float32).reshape(camera.height, camera.width, 2)
     return np.asarray(cv2.remap(image, source[..., 0], source[..., 1], cv2.INTER_LINEAR),
                       dtype=np.uint8)
@@ -200,6 +200,9 @@ def _rectified_image(image: Gray, camera: RollingShutterCamera) -> Gray:
 RECTIFIED = Geometry(_rectified, _rectified_image)
 UPSIDE_DOWN = Geometry(lambda points, camera: _corner(camera) - points,
                        lambda image, camera: np.ascontiguousarray(image[::-1, ::-1]))
+FLIPPED = Geometry(
+    lambda points, camera: np.column_stack([points[:, 0], camera.height - 1.0 - points[:, 1]]),
+    lambda image, camera: np.ascontiguousarray(image[::-1]))
 MIRRORED = Geometry(
     lambda points, camera: np.column_stack([camera.width - 1.0 - points[:, 0], points[:, 1]]),
     lambda image, camera: np.ascontiguousarray(image[:, ::-1]))
@@ -221,6 +224,7 @@ ROWS: Mapping[str, Row] = {
     'rectified': Row(('distortion', 'image_geometry'), GROSS, _shown(RECTIFIED),
                      _distortion_error),
     'upside-down': Row(('image_geometry',), GROSS, _shown(UPSIDE_DOWN)),
+    'flipped': Row(('image_geometry',), GROSS, _shown(FLIPPED)),
     'imu-late-30ms': Row(('time_offset',), GROSS, _arrives(_stamped_late),
                          lambda told, rng: Injected('time_offset', np.array([0.03]))),
     'readout-2': Row(('readout_time',), GROSS, _readout(2.0), _readout_error(2.0)),

@@ -1,4 +1,4 @@
-"""A recording run through the real front end, told right or wrong, and what its pairs are worth."""
+"""A recording through the real front end, told right or wrong, and what its pairs are worth."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from rs_relpose_lab.experiments.trust_information import (
 from rs_relpose_lab.experiments.trust_rows import FIGURES, Told
 from rs_relpose_lab.experiments.trust_tracks import (
     numbered_image,
-    sightings,
     Sightings,
+    sightings,
     SimulatedTracker,
     TrackNoise,
 )
@@ -52,6 +52,20 @@ class Arrival(NamedTuple):
     arrives_ns: int
 
 
+class Source(NamedTuple):
+    """Where a recording comes from; `noise`: of the told one, 0 where nobody chose it."""
+
+    name: str
+    motion: str
+    scene: str
+    seed: int
+    noise: float = 0.0
+
+
+# Time of arrival [ns], and what arrives.
+_Event = tuple[int, ImuSample | Arrival]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
     """What a run needs, and what is true.
@@ -62,7 +76,7 @@ class Recording:
     camera frame, on the IMU clock.
     """
 
-    name: str
+    source: Source
     told: Told
     camera: RollingShutterCamera
     arrivals: Sequence[Arrival]
@@ -87,7 +101,7 @@ def intrinsics_of(camera: RollingShutterCamera) -> Intrinsics:
         image_width=camera.width, image_height=camera.height)
 
 
-def simulated(name: str, simulation: Simulation, noise: TrackNoise | None,
+def simulated(source: Source, simulation: Simulation, noise: TrackNoise | None,
               rng: np.random.Generator) -> Recording:
     """A recording of a simulation: tracks with `noise`, or rendered images where it is None."""
     config, imu = simulation.config, simulation.imu
@@ -103,7 +117,7 @@ def simulated(name: str, simulation: Simulation, noise: TrackNoise | None,
         return R1.T @ R2, R1.T @ (states.position[1] - states.position[0])
 
     return Recording(
-        name, Told(right_parameters(simulation), intrinsics_of(simulation.camera)),
+        source, Told(right_parameters(simulation), intrinsics_of(simulation.camera)),
         simulation.camera, [Arrival(k, stamp, stamp + delay_ns) for k, stamp in enumerate(stamps)],
         [ImuSample(stamp, tuple(rate), tuple(force)) for stamp, rate, force in zip(
             imu.stamps_ns.tolist(), imu.angular_velocities.tolist(),
@@ -137,24 +151,25 @@ def verdict_of(pair: PairResult) -> Verdict:
 class JudgedPair:
     """A pair of a run, against the truth.
 
-    `at`: stamp since the recording's first [s]; `verdict`; `chi_t` (2 dof), `chi_R` (3 dof): of a
-    pose, NaN without one; errors and claimed 1 sigma [deg]; `seconds`: wall time of its frame.
+    `at`: stamp since the recording's first [s]; `seconds`: wall time of its frame. Of a pose, NaN
+    without one: errors squared in sigmas, `chi_direction` (2 dof) and `chi_rotation` (3 dof);
+    errors and claimed 1 sigma [deg].
     """
 
     at: float
     status: str
     verdict: Verdict
     seconds: float
-    chi_t: float = math.nan
-    chi_R: float = math.nan
-    error_t: float = math.nan
-    error_R: float = math.nan
-    sigma_t: float = math.nan
+    chi_direction: float = math.nan
+    chi_rotation: float = math.nan
+    direction_error: float = math.nan
+    rotation_error: float = math.nan
+    direction_sigma: float = math.nan
 
     @property
     def has_pose(self) -> bool:
         """Whether a pose was published, and its truth is known."""
-        return not math.isnan(self.error_t)
+        return not math.isnan(self.direction_error)
 
 
 def run(recording: Recording, told: Told, until: float = math.inf,
@@ -170,11 +185,12 @@ def run(recording: Recording, told: Told, until: float = math.inf,
         parameters.tracking.max_features)
     front_end = FrontEnd(parameters, offline=True, tracker=tracker)
     first_ns = recording.arrivals[0].stamp_ns
-    samples = ((sample.stamp_ns + to_nanoseconds(IMU_DELAY), 0, sample)
-               for sample in recording.samples)
-    frames = ((arrival.arrives_ns, 1, arrival) for arrival in recording.arrivals
-              if seconds_between(first_ns, arrival.stamp_ns) <= until)
-    for _, _, arrived in heapq.merge(samples, frames, key=lambda event: event[:2]):
+    samples: Iterator[_Event] = (
+        (sample.stamp_ns + to_nanoseconds(IMU_DELAY), sample) for sample in recording.samples)
+    frames: Iterator[_Event] = (
+        (arrival.arrives_ns, arrival) for arrival in recording.arrivals
+        if seconds_between(first_ns, arrival.stamp_ns) <= until)
+    for _, arrived in heapq.merge(samples, frames, key=lambda event: event[0]):
         if isinstance(arrived, ImuSample):
             front_end.sequencer.add_imu(told.sample(arrived))
         else:
@@ -228,7 +244,8 @@ def _true_pair(recording: Recording, pair: PairResult) -> TruePair | None:
     """A pair with the truth, or, where that is not known, as it was estimated."""
     if not pair.pose:
         return None
-    R, t = recording.true_pose(pair.reference_stamp_ns, pair.stamp_ns) or (pair.pose.R, pair.pose.t)
+    truth = recording.true_pose(pair.reference_stamp_ns, pair.stamp_ns)
+    R, t = truth or (pair.pose.R, pair.pose.t)
     if not np.linalg.norm(t) > 0.0:
         return None
     camera, inliers = recording.camera, pair.pose.inliers

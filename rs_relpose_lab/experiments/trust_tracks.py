@@ -1,4 +1,4 @@
-"""Tracks of simulated recordings without images: the real front end, a tracker that knows the truth.
+"""Tracks of simulated recordings for the real front end, without images.
 
 A rendered image costs 0.2 s, its tracks 20 ms. `SimulatedTracker` hands them out as `KltTracker`
 does: corners of the reference keyframe, found again with noise, lost where the prediction is far
@@ -44,15 +44,15 @@ _SCATTER = 2654435761
 class TrackNoise:
     """Errors of a track, as those of `KltTracker` in a rendered bag (docs/lab/trust.md).
 
-    `white` [px]: 1 sigma per coordinate of each match. Of the corners, shares `soft` and `wrong`
-    slip off their place as the camera moves on, by sigmas of `slip` and `slide` [px/m].
+    `white` [px]: 1 sigma per coordinate of each match. As the camera moves on, each corner slips
+    off its place, in a direction of its own, by Student's t of 2 degrees of freedom times `slip`
+    [px/m]; a share `wrong` of them by a normal one times `slide` [px/m].
     """
 
-    white: float = 0.06
-    soft: float = 0.13
-    slip: float = 1.7
-    wrong: float = 0.02
-    slide: float = 40.0
+    white: float = 0.04
+    slip: float = 0.17
+    wrong: float = 0.005
+    slide: float = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,9 +100,9 @@ def sightings(simulation: Simulation, noise: TrackNoise, rng: np.random.Generato
         seen_pixels.append(pixels)
     positions = simulation.trajectory.poses(instants)[0]
     steps = np.linalg.norm(np.diff(positions, axis=0, prepend=positions[:1]), axis=1)
-    kind = rng.uniform(size=following)
-    sigmas = np.where(kind < noise.wrong, noise.slide,
-                      np.where(kind < noise.wrong + noise.soft, noise.slip, 0.0))
+    # Normal by the root of chi squared over its 2 degrees of freedom.
+    sigmas = noise.slip / np.sqrt(0.5 * rng.chisquare(2, following))
+    sigmas[rng.uniform(size=following) < noise.wrong] = noise.slide
     return Sightings(tuple(seen_ids), tuple(seen_pixels),
                      tuple(rng.standard_normal((len(frame), 2)) for frame in seen_ids),
                      np.cumsum(steps), sigmas[:, None] * rng.standard_normal((following, 2)),
@@ -179,8 +179,8 @@ class SimulatedTracker:
         rows = np.searchsorted(known.ids[frame], self._corners)
         rows = np.minimum(rows, len(known.ids[frame]) - 1)
         way = known.travelled[frame] - known.travelled[self._reference]
-        places = (known.pixels[frame][rows] + self._offsets + known.white * known.noise[frame][rows]
-                  + way * known.slips[self._corners])
+        places = (known.pixels[frame][rows] + self._offsets
+                  + known.white * known.noise[frame][rows] + way * known.slips[self._corners])
         points = self._published(places)
         expected = points if predicted is None else np.where(
             np.isfinite(predicted), predicted, self._matches.points2)
@@ -197,7 +197,7 @@ class SimulatedTracker:
 
     def promote(self) -> None:
         """Make the current image the reference; tracks go on, new corners fill the gaps."""
-        ids, pixels = (of[self._frame] for of in (self._sightings.ids, self._sightings.pixels))
+        ids, pixels = self._sightings.ids[self._frame], self._sightings.pixels[self._frame]
         kept = keep_apart(self.points, 0.5 * _LEAST_DISTANCE)
         corners, places = self._corners[kept], self._places[kept]
         free = ~np.isin(ids, corners) & self._inside(self._published(pixels))

@@ -1,4 +1,4 @@
-"""A wheeled robot as a trajectory: it drives where it heads, stops at times, rocks on its springs."""
+"""A wheeled robot as a trajectory: it drives where it heads, stops, and rocks on its springs."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ _STOP_EVERY, _STOP = 9.0, 2.4
 
 
 def vehicle(rng: np.random.Generator, start: float, end: float, *, speed: float) -> Trajectory:
-    """Trajectory that is defined at least from `start` to `end` [s]; `speed` [m/s] while it drives.
+    """Trajectory that is defined at least from `start` to `end` [s].
 
-    The camera looks ahead; position and heading obey ``p' = v (cos yaw, sin yaw)``.
+    `speed` [m/s]: while it drives. The camera looks ahead; position and heading obey
+    ``p' = v (cos yaw, sin yaw)``.
     """
     margin = 6 * CONTROL_SPACING
     count = math.ceil((end - start + 2 * margin) / CONTROL_SPACING) + 1
