@@ -36,7 +36,6 @@ from rs_relpose_lab.simulation.simulation import simulate, Simulation
 from rs_relpose_lab.simulation.vehicle import vehicle
 from rs_relpose_ros.config.estimator import EstimatorConfig
 from rs_relpose_ros.config.imu import ImuConfig
-from rs_relpose_ros.front_end.pair import PairResult
 
 Array = NDArray[np.float64]
 
@@ -207,8 +206,9 @@ def measure(task: Task) -> list[BagRow]:
         if injected is not None and not injected.error.any():
             continue   # e.g. no distortion to leave out
         tells = motion.seconds(injected)
-        found.append(_bag_row(recording, name, tells, right if name == RIGHT else list(
-            run(recording, told, _end(tells, row.within)))))
+        results = right if name == RIGHT else run(recording, told, _end(tells, row.within))
+        found.append(bag_row(recording, name, tells,
+                             [judged(recording, *result) for result in results]))
     return found
 
 
@@ -218,10 +218,10 @@ def _end(tells: NDArray[np.bool_], within: int) -> float:
     return float(passed[0]) + 1.0 + _AFTERWARDS if len(passed) else math.inf
 
 
-def _bag_row(recording: Recording, name: str, tells: NDArray[np.bool_],
-             results: Sequence[tuple[PairResult, float]]) -> BagRow:
+def bag_row(recording: Recording, name: str, tells: NDArray[np.bool_],
+            pairs: Sequence[JudgedPair]) -> BagRow:
+    """What came of a row; `tells`: which seconds of the recording can tell its error."""
     row, source = ROWS[name], recording.source
-    pairs = [judged(recording, pair, seconds) for pair, seconds in results]
     clocks = [_clock(tells, pair.at) for pair in pairs]
     flags = [(clock, pair) for clock, pair in zip(clocks, pairs, strict=True)
              if pair.verdict.state in FLAGGED]

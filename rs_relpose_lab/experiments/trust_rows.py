@@ -210,7 +210,7 @@ MIRRORED = Geometry(
 _HALF_TURN = Rotation.from_rotvec([0.0, 0.0, math.pi])
 _CYCLE = Rotation.from_matrix([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
-RIGHT = 'told right'
+RIGHT = 'right'
 ROWS: Mapping[str, Row] = {
     RIGHT: Row((), SMALL, lambda told, rng: told),
     'imu-xy-negated': Row(('axes',), GROSS, _axes_turned(lambda rng: _HALF_TURN)),

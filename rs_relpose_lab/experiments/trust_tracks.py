@@ -45,13 +45,15 @@ class TrackNoise:
     """Errors of a track, as those of `KltTracker` in a rendered bag (docs/lab/trust.md).
 
     `white` [px]: 1 sigma per coordinate of each match. As the camera moves on, each corner slips
-    off its place, in a direction of its own, by Student's t of 2 degrees of freedom times `slip`
-    [px/m]; a share `wrong` of them by a normal one times `slide` [px/m].
+    off its place, in a direction of its own: within `settled` metres by `slip` [px] times Student's
+    t of `freedom` degrees. A share `wrong` of them slides by a normal number times `slide` [px/m].
     """
 
     white: float = 0.04
-    slip: float = 0.17
-    wrong: float = 0.005
+    slip: float = 0.08
+    freedom: float = 2.5
+    settled: float = 0.2
+    wrong: float = 0.003
     slide: float = 10.0
 
 
@@ -61,7 +63,8 @@ class Sightings:
 
     `ids`: of each frame's corners (N,), increasing; one that is lost does not come back.
     `pixels`: their places (N, 2) on the sensor; `noise`: standard normal (N, 2).
-    `travelled` (F,): way of the camera up to each frame [m]. `slips` (M, 2), by id [px/m].
+    `travelled` (F,): way of the camera up to each frame [m]. `slips` [px], `slides` [px/m]: (M, 2)
+    by id.
     """
 
     ids: tuple[Ids, ...]
@@ -69,7 +72,8 @@ class Sightings:
     noise: tuple[Array, ...]
     travelled: Array
     slips: Array
-    white: float
+    slides: Array
+    errors: TrackNoise
 
 
 def sightings(simulation: Simulation, noise: TrackNoise, rng: np.random.Generator) -> Sightings:
@@ -100,13 +104,14 @@ def sightings(simulation: Simulation, noise: TrackNoise, rng: np.random.Generato
         seen_pixels.append(pixels)
     positions = simulation.trajectory.poses(instants)[0]
     steps = np.linalg.norm(np.diff(positions, axis=0, prepend=positions[:1]), axis=1)
-    # Normal by the root of chi squared over its 2 degrees of freedom.
-    sigmas = noise.slip / np.sqrt(0.5 * rng.chisquare(2, following))
-    sigmas[rng.uniform(size=following) < noise.wrong] = noise.slide
+    # Student's t: a normal number by the root of chi squared over its degrees of freedom.
+    sigmas = noise.slip / np.sqrt(rng.chisquare(noise.freedom, following) / noise.freedom)
+    slides = noise.slide * (rng.uniform(size=following) < noise.wrong)
+    directions = rng.standard_normal((2, following, 2))
     return Sightings(tuple(seen_ids), tuple(seen_pixels),
                      tuple(rng.standard_normal((len(frame), 2)) for frame in seen_ids),
-                     np.cumsum(steps), sigmas[:, None] * rng.standard_normal((following, 2)),
-                     noise.white)
+                     np.cumsum(steps), sigmas[:, None] * directions[0],
+                     slides[:, None] * directions[1], noise)
 
 
 def _new_corners(rng: np.random.Generator, taken: Array, width: int, height: int) -> Array:
@@ -180,7 +185,9 @@ class SimulatedTracker:
         rows = np.minimum(rows, len(known.ids[frame]) - 1)
         way = known.travelled[frame] - known.travelled[self._reference]
         places = (known.pixels[frame][rows] + self._offsets
-                  + known.white * known.noise[frame][rows] + way * known.slips[self._corners])
+                  + known.errors.white * known.noise[frame][rows]
+                  + min(way / known.errors.settled, 1.0) * known.slips[self._corners]
+                  + way * known.slides[self._corners])
         points = self._published(places)
         expected = points if predicted is None else np.where(
             np.isfinite(predicted), predicted, self._matches.points2)
