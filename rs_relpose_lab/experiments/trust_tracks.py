@@ -45,8 +45,9 @@ class TrackNoise:
     """Errors of a track, as those of `KltTracker` in a rendered bag (docs/lab/trust.md).
 
     `white` [px]: 1 sigma per coordinate of each match. As the camera moves on, each corner slips
-    off its place, in a direction of its own: within `settled` metres by `slip` [px] times Student's
-    t of `freedom` degrees. A share `wrong` of them slides by a normal number times `slide` [px/m].
+    off its place, in a direction of its own: within `settled` metres by `slip` [px] times
+    Student's t of `freedom` degrees. A share `wrong` slides by a normal number times `slide`
+    [px/m].
     """
 
     white: float = 0.04
