@@ -31,8 +31,9 @@ PLACES: Mapping[str, slice] = {name: slice(end - FIGURES[name], end)
                                for name, end in _ENDS.items()}
 _UNKNOWNS = 11   # x: rotation, direction of translation, velocities
 _FREE = sum(FIGURES.values())
-# Steps of the finite differences, and what is known of each figure before any motion, 1 sigma.
-_STEPS = np.repeat([1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 1e-5], list(FIGURES.values()))
+# Of the finite differences, in the units of `Injected` and of x.
+_STEP = 1e-5
+# What is known of each figure before any motion, 1 sigma.
 _BEFORE = np.repeat([0.5, 0.1, 0.05, 0.1, 0.2, 0.3, 0.3], list(FIGURES.values()))
 # Velocities differ from t / interval by so many baselines per second, 1 sigma.
 _VELOCITY_SIGMA = 1.0
@@ -74,13 +75,9 @@ class PairInformation(NamedTuple):
 
 def pair_information(pair: TruePair, camera: RollingShutterCamera) -> PairInformation:
     """What a pair tells about the figures, and how far it turned."""
-    residuals = _Residuals(pair, camera)
-    zero = np.zeros(_UNKNOWNS + _FREE)
-    at_truth = residuals(zero)
-    steps = np.concatenate([np.full(_UNKNOWNS, 1e-5), _STEPS])
-    jacobian = np.column_stack([
-        (residuals(zero + step * unit) - at_truth) / step
-        for step, unit in zip(steps, np.eye(len(zero)), strict=True)])
+    unknowns = _UNKNOWNS + _FREE
+    residuals = _Residuals(pair, camera)(_STEP * np.eye(unknowns + 1, unknowns, -1))
+    jacobian = (residuals[1:] - residuals[0]).T / _STEP
     by_x, by_c = jacobian[:, :_UNKNOWNS], jacobian[:, _UNKNOWNS:]
     H, mixed = by_x.T @ by_x, by_x.T @ by_c
     # By the images alone, without the last three residuals, which are the gyro's.
@@ -93,7 +90,10 @@ def pair_information(pair: TruePair, camera: RollingShutterCamera) -> PairInform
 
 
 class _Residuals:
-    """Residuals, each by its sigma, of matches, velocities and gyro around the truth."""
+    """Residuals, each by its sigma, of matches, velocities and gyro around the truth.
+
+    They are evaluated at K sets of unknowns at once: arrays of matches are (K, N, ...).
+    """
 
     def __init__(self, pair: TruePair, camera: RollingShutterCamera) -> None:
         chosen = slice(None, None, -(-len(pair.pixels1) // _MOST_MATCHES))
@@ -109,79 +109,86 @@ class _Residuals:
         self._slopes = self._gradient_lengths()
 
     def __call__(self, unknowns: Array) -> Array:
-        x, c = unknowns[:_UNKNOWNS], unknowns[_UNKNOWNS:]
-        pair = self._pair
-        t = pair.t + x[3:5] @ self._tangent
-        d = np.stack([x[5:8], x[8:11]])
-        R = Rotation.from_rotvec(x[:3]).as_matrix() @ pair.R
+        """Residuals (K, M) of unknowns (K, 22)."""
+        x, c = unknowns[:, :_UNKNOWNS], unknowns[:, _UNKNOWNS:]
+        pair, count = self._pair, len(unknowns)
+        t = pair.t + x[:, 3:5] @ self._tangent
+        d = x[:, 5:].reshape(count, 2, 3)
+        R = Rotation.from_rotvec(x[:, :3]).as_matrix() @ pair.R
+        matches = self._matches(R, t, d + pair.t / pair.interval, c)
+        # Prior of the velocities: that of the baseline, which goes with t.
+        slower = d - (t - pair.t)[:, None] / pair.interval
         # Prior of the rotation: Log(R R_gyro(c)^T), whose change by c is linear.
-        theta = x[:3] - self._gyro_change(c)
-        return np.concatenate([
-            self._matches(R, t, d + pair.t / pair.interval, c) / (self._sigma * self._slopes),
-            (d - (t - pair.t) / pair.interval).ravel() / _VELOCITY_SIGMA,
-            theta / self._turn_sigma])
+        theta = x[:, :3] - self._gyro_change(c)
+        return np.hstack([matches / (self._sigma * self._slopes),
+                          slower.reshape(count, 6) / _VELOCITY_SIGMA, theta / self._turn_sigma])
 
     def _gyro_change(self, c: Array) -> Array:
-        """Change (3,) of the gyro's rotation by c: axes, offset, bias, scale.
+        """Change (K, 3) of the gyro's rotation by c (K, 11): axes, offset, bias, scale.
 
         ``Exp(a) R Exp(-a) = Exp(a - R a) R``; later by o: ``Exp(R w_2 o - w_1 o) R``.
         """
         pair = self._pair
-        axes = c[PLACES['axes']]
-        offset = float(c[PLACES['time_offset']][0])
+        axes = c[:, PLACES['axes']]
         mean = 0.5 * pair.interval * (np.eye(3) + pair.R)
         return np.asarray(
-            axes - pair.R @ axes + offset * (pair.R @ pair.rate2 - pair.rate1)
-            - mean @ c[PLACES['gyro_bias']]
-            + c[PLACES['gyro_scale']] * Rotation.from_matrix(pair.R).as_rotvec())
+            axes - axes @ pair.R.T
+            + c[:, PLACES['time_offset']] * (pair.R @ pair.rate2 - pair.rate1)
+            - c[:, PLACES['gyro_bias']] @ mean.T
+            + c[:, PLACES['gyro_scale']] * Rotation.from_matrix(pair.R).as_rotvec())
 
     def _matches(self, R: Array, t: Array, velocities: Array, c: Array) -> Array:
-        """``(p_2 - p_1) . (g_1 x g_2)`` (N,) of rays and positions at their rows."""
+        """``(p_2 - p_1) . (g_1 x g_2)`` (K, N) of rays and positions at their rows."""
         pair = self._pair
-        place1, ray1 = self._row(pair.pixels1, pair.rates1, velocities[0], c)
-        place2, ray2 = self._row(pair.pixels2, pair.rates2, velocities[1], c)
-        return np.einsum('ni,ni->n', t + place2 - place1, np.cross(ray1, ray2 @ R.T))
+        place1, ray1 = self._row(pair.pixels1, pair.rates1, velocities[:, 0], c)
+        place2, ray2 = self._row(pair.pixels2, pair.rates2, velocities[:, 1], c)
+        across = np.cross(ray1, ray2 @ np.swapaxes(R, 1, 2))
+        return np.asarray(((t[:, None] + place2 - place1) * across).sum(axis=2))
 
     def _row(self, pixels: Array, rates: Array, velocity: Array, c: Array) -> tuple[Array, Array]:
-        """Way since the middle row (N, 3), and rays (N, 3) turned to it."""
+        """Way since the middle row (K, N, 3), and rays (K, N, 3) turned to it."""
         camera = self._camera
         away = pixels[:, 1] - 0.5 * (camera.height - 1)
-        readout = camera.line_delay * camera.height + c[PLACES['readout_time']]
-        times = (away * readout / camera.height)[:, None]
-        # The gyro's rate as c has it, at a row that is `offset` later; the change of the rate
-        # itself within the offset is in the rotation between the frames.
-        turned = Rotation.from_rotvec(c[PLACES['axes']]).apply(rates)
-        turned = (1.0 + c[PLACES['gyro_scale']]) * turned - c[PLACES['gyro_bias']]
+        readout = camera.line_delay * camera.height + c[:, PLACES['readout_time']]
+        times = (readout * away / camera.height)[..., None]
+        # The gyro's rate as c has it; its change within the offset is in the rotation between
+        # the frames.
+        axes, bias, scale = (c[:, None, PLACES[name]]
+                             for name in ('axes', 'gyro_bias', 'gyro_scale'))
+        angles = times * ((1.0 + scale) * (rates + np.cross(axes, rates)) - bias)
         rays = self._rays(pixels, c)
-        angles = times * turned
-        rays = rays + np.cross(angles, rays) + 0.5 * np.cross(angles, np.cross(angles, rays))
-        return times * velocity, rays
+        turned = np.cross(angles, rays)
+        return times * velocity[:, None], rays + turned + 0.5 * np.cross(angles, turned)
 
     def _rays(self, pixels: Array, c: Array) -> Array:
-        """Rays (N, 3) at z = 1 with another focal length and first coefficient, to first order.
+        """Rays (K, N, 3) at z = 1 with another focal length and first coefficient.
 
         ``x_d = x (1 + k1 r^2)``: a change dk1 moves the undistorted point by ``-dk1 r^2 x``.
         """
         rays = self._camera.unproject(pixels)
         points = rays[:, :2] / rays[:, 2:]
         squares = (points**2).sum(axis=1, keepdims=True)
-        points = points * (1.0 - c[PLACES['focal_length']] - c[PLACES['distortion']] * squares)
-        return np.column_stack([points, np.ones(len(points))])
+        focal, distortion = (c[:, None, PLACES[name]] for name in ('focal_length', 'distortion'))
+        points = points * (1.0 - focal - distortion * squares)
+        return np.concatenate([points, np.ones((*points.shape[:2], 1))], axis=2)
 
     def _gradient_lengths(self) -> Array:
         """Length (N,) of each residual's gradient by its four pixel coordinates."""
         pair = self._pair
-        zero = np.zeros(_FREE)
-        velocities = np.stack([pair.t, pair.t]) / pair.interval
         squares = np.zeros(len(pair.pixels1))
-        middle = self._matches(pair.R, pair.t, velocities, zero)
+        middle = self._at_truth()
         for name in ('pixels1', 'pixels2'):
             for shift in 0.01 * np.eye(2):
                 self._pair = pair._replace(**{name: getattr(pair, name) + shift})
-                moved = self._matches(pair.R, pair.t, velocities, zero)
-                squares += ((moved - middle) / 0.01) ** 2
+                squares += ((self._at_truth() - middle) / 0.01) ** 2
         self._pair = pair
         return np.sqrt(squares)
+
+    def _at_truth(self) -> Array:
+        pair = self._pair
+        velocities = np.stack([pair.t, pair.t]) / pair.interval
+        return np.asarray(self._matches(pair.R[None], pair.t[None], velocities[None],
+                                        np.zeros((1, _FREE)))[0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -143,7 +143,7 @@ def verdict_of(pair: PairResult) -> Verdict:
     health = getattr(pair, 'health', None)
     if health is None:
         return NO_HEALTH
-    return Verdict(str(health.state), tuple(
+    return Verdict(health.state.value, tuple(
         finding.figure for finding in health.findings if finding.state in FLAGGED))
 
 

@@ -92,15 +92,15 @@ def sightings(simulation: Simulation, noise: TrackNoise, rng: np.random.Generato
         pixels = see(world, path.from_instant(instant), view, margin=-_BORDER)
         kept = np.isfinite(pixels).all(axis=1) & (rng.uniform(size=len(ids)) >= _LOST)
         ids, world, pixels = ids[kept], world[kept], pixels[kept]
-        there, _ = simulation.renderer.locate(instant, pixels)
-        kept = np.linalg.norm(there - world, axis=1) < _HIDDEN
-        ids, world, pixels = ids[kept], world[kept], pixels[kept]
         new = _new_corners(rng, pixels, camera.width, camera.height)
-        there, hits = simulation.renderer.locate(instant, new)
-        new, there = new[hits >= 0], there[hits >= 0]
+        pixels = np.concatenate([pixels, new])
+        there, hits = simulation.renderer.locate(instant, pixels)
         ids = np.concatenate([ids, following + np.arange(len(new))])
         following += len(new)
-        world, pixels = np.concatenate([world, there]), np.concatenate([pixels, new])
+        world = np.concatenate([world, there[len(world):]])
+        # Not where something is in front of it, nor where there is nothing.
+        kept = (hits >= 0) & (np.linalg.norm(there - world, axis=1) < _HIDDEN)
+        ids, world, pixels = ids[kept], world[kept], pixels[kept]
         seen_ids.append(ids)
         seen_pixels.append(pixels)
     positions = simulation.trajectory.poses(instants)[0]
