@@ -336,7 +336,7 @@ def test_the_command_tells_wrong_from_right(tmp_path):
     assert int(right['all_direction_beyond']) <= 0.15 * int(right['all_poses'])
     assert float(right['direction_error']) < 3.0
     summary = {row['row']: row for row in json.loads(
-        (tmp_path / 'trust.json').read_text())['rows']}
+        (tmp_path / 'trust.json').read_text())['tracks']}
     assert summary['imu-cycled']['bags'] == 1
     # Whatever is believed of it is wrong: a product with health withholds it.
     if int(cycled['poses']):

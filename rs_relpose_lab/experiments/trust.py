@@ -5,12 +5,12 @@ Each bag is simulated once, run told right, and then run through every row of `R
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 import json
 import math
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +21,16 @@ from rs_relpose_lab.experiments.trust_recordings import REAL, real_recording
 from rs_relpose_lab.experiments.trust_rows import RIGHT, ROWS
 from rs_relpose_lab.experiments.trust_runs import (
     FLAGGED,
+    IMAGES,
     judged,
     JudgedPair,
+    RECORDING,
     Recording,
     run,
     simulated,
     Source,
     telling_motion,
+    TRACKS,
 )
 from rs_relpose_lab.experiments.trust_tracks import TrackNoise
 from rs_relpose_lab.simulation.config import SimulationConfig
@@ -119,9 +122,10 @@ def recording_of(plan: BagPlan) -> Recording:
     if noise is not None and plan.noise:
         # Told is the noise of either image's points; here only those of the second one have any.
         noise = TrackNoise(white=plan.noise * math.sqrt(2.0) * EstimatorConfig().pixel_sigma)
-    name = f'{plan.seed}{"-images" if plan.images else ""}'
-    return simulated(Source(name, plan.motion, plan.scene, plan.seed, plan.noise),
-                     simulation_of(plan), noise, np.random.default_rng([plan.seed, _TRACKS]))
+    source = Source(f'{plan.seed}', IMAGES if plan.images else TRACKS, plan.motion, plan.scene,
+                    plan.seed, plan.noise)
+    return simulated(source, simulation_of(plan), noise,
+                     np.random.default_rng([plan.seed, _TRACKS]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,6 +143,7 @@ class BagRow:
     """
 
     bag: str
+    kind: str
     motion: str
     scene: str
     readout_ms: float
@@ -234,7 +239,7 @@ def bag_row(recording: Recording, name: str, tells: NDArray[np.bool_],
     counted = later if name != RIGHT else believed
     telling = _clock(tells, recording.seconds)
     return BagRow(
-        bag=source.name, motion=source.motion, scene=source.scene,
+        bag=source.name, kind=source.kind, motion=source.motion, scene=source.scene,
         readout_ms=1e3 * recording.camera.readout_time, noise=source.noise, row=name,
         telling=telling,
         qualifies=telling >= row.within, flagged=bool(in_time),
@@ -323,25 +328,81 @@ def summary(name: str, bags: Sequence[BagRow]) -> RowSummary:
         direction_sigma=_finite_median([bag.direction_sigma for bag in bags]), **beyond)
 
 
+@dataclass(frozen=True, slots=True)
+class RightSummary:
+    """Bags of a kind, told right: false alarms, and errors squared in sigmas by their freedom.
+
+    NEES over all poses, and the least and the largest mean of a bag; medians over the bags.
+    """
+
+    kind: str
+    bags: int
+    alarms: int
+    pairs: int
+    poses: int
+    nees_direction: float
+    nees_direction_least: float
+    nees_direction_largest: float
+    nees_rotation: float
+    nees_rotation_least: float
+    nees_rotation_largest: float
+    direction_error: float
+    rotation_error: float
+    frame_ms: float
+
+
+def right_summary(kind: str, bags: Sequence[BagRow]) -> RightSummary:
+    """Bags that were told right."""
+    nees = {}
+    for name in ('nees_direction', 'nees_rotation'):
+        known = [(getattr(bag, name), bag.all_poses) for bag in bags if bag.all_poses]
+        means = [mean for mean, _ in known]
+        poses = sum(count for _, count in known)
+        nees[name] = sum(mean * count for mean, count in known) / poses if poses else math.nan
+        nees[f'{name}_least'] = min(means, default=math.nan)
+        nees[f'{name}_largest'] = max(means, default=math.nan)
+    return RightSummary(
+        kind=kind, bags=len(bags), alarms=sum(not math.isnan(bag.flagged_after) for bag in bags),
+        pairs=sum(bag.pairs for bag in bags), poses=sum(bag.all_poses for bag in bags), **nees,
+        direction_error=_finite_median([bag.direction_error for bag in bags]),
+        rotation_error=_finite_median([bag.rotation_error for bag in bags]),
+        frame_ms=_finite_median([bag.frame_ms for bag in bags]))
+
+
+_TITLES = {TRACKS: 'Simulated, without images', IMAGES: 'Simulated, with images'}
+
+
 def write_report(folder: Path, bags: Sequence[BagRow]) -> str:
     """Write every bag and row (CSV), the summaries (JSON) and the tables (Markdown)."""
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / 'trust_bags.csv', bags)
-    of_matrix = [bag for bag in bags if not bag.noise]
-    rows = [summary(name, of_row)
-            for name, of_row in grouped(of_matrix, lambda bag: bag.row).items()]
-    if len(rows) > 1:
-        rows.append(summary('all rows', of_matrix))
-    right = grouped([bag for bag in bags if bag.row == RIGHT], _kind)
-    text = ''
-    if rows:
-        text += 'Told wrong (shares in per cent):\n\n' + _matrix_table(rows) + '\n'
+    parts, told = [], {}
+    for kind, title in _TITLES.items():
+        of_kind = [bag for bag in bags if bag.kind == kind and not bag.noise]
+        rows = [summary(name, of_row)
+                for name, of_row in grouped(of_kind, lambda bag: bag.row).items()]
+        if len(rows) > 1:
+            rows.append(summary('all rows', of_kind))
+        if rows:
+            told[kind] = [_as_json(row) for row in rows]
+            parts.append(f'{title} (shares in per cent):\n\n{_matrix_table(rows)}')
+    recorded = [bag for bag in bags if bag.kind == RECORDING]
+    if recorded:
+        parts.append('Recordings (flagged after so many seconds that can tell, of how many; '
+                     f'figures):\n\n{_recordings_table(recorded)}')
+    right = [right_summary(kind, of_kind) for kind, of_kind in grouped(
+        [bag for bag in bags if bag.row == RIGHT], _kind).items()]
     if right:
-        text += 'Told right:\n\n' + _right_table(right)
+        parts.append(f'Told right:\n\n{_right_table(right)}')
+    text = '\n'.join(parts)
     (folder / 'trust.json').write_text(json.dumps(
-        {'rows': [asdict(row) for row in rows]}, indent=1), encoding='utf-8')
+        {**told, 'right': [_as_json(row) for row in right]}, indent=1), encoding='utf-8')
     (folder / 'trust.md').write_text(text, encoding='utf-8')
     return text
+
+
+def _as_json(row: RowSummary | RightSummary) -> dict[str, Any]:
+    return {name: None if value != value else value for name, value in asdict(row).items()}
 
 
 def _matrix_table(rows: Sequence[RowSummary]) -> str:
@@ -350,42 +411,39 @@ def _matrix_table(rows: Sequence[RowSummary]) -> str:
          't beyond', 'R beyond', 'all poses', 't beyond', 'R beyond', 't error [deg]',
          'claimed'],
         [[row.row, f'{row.bags}', _text(row.qualify, 0), f'{row.within}', _text(row.flagged, 0),
-          _text(row.named, 0), _text(row.after, 1), f'{row.poses}', _text(row.direction_beyond, 1),
-          _text(row.rotation_beyond, 1), f'{row.all_poses}', _text(row.all_direction_beyond, 1),
-          _text(row.all_rotation_beyond, 1), _text(row.direction_error, 2),
-          _text(row.direction_sigma, 2)]
+          _text(row.named, 0), _text(row.after, 1), f'{row.poses}',
+          _text(row.direction_beyond, 1), _text(row.rotation_beyond, 1), f'{row.all_poses}',
+          _text(row.all_direction_beyond, 1), _text(row.all_rotation_beyond, 1),
+          _text(row.direction_error, 2), _text(row.direction_sigma, 2)]
          for row in rows])
+
+
+def _recordings_table(bags: Sequence[BagRow]) -> str:
+    names = tuple(grouped(bags, lambda bag: bag.bag))
+    cells = {(bag.row, bag.bag): f'{_text(bag.flagged_after, 1) or "-"} / {bag.telling:.1f} '
+                                 f'{bag.named}'.rstrip() for bag in bags}
+    return markdown_table(
+        ['told', *names],
+        [[row, *(cells.get((row, name), '') for name in names)]
+         for row in grouped(bags, lambda bag: bag.row)])
 
 
 def _kind(bag: BagRow) -> str:
     noise = f', noise {bag.noise:g} of the told one' if bag.noise else ''
-    return f'{bag.motion if bag.motion != "real" else bag.bag}{noise}'
+    return bag.bag if bag.kind == RECORDING else f'{bag.motion}, {bag.kind}{noise}'
 
 
-def _right_table(right: Mapping[str, Sequence[BagRow]]) -> str:
-    """False alarms, and errors squared in sigmas by their degrees of freedom."""
-    lines = []
-    for name, bags in right.items():
-        alarms = [bag for bag in bags if not math.isnan(bag.flagged_after)]
-        pairs = sum(bag.pairs for bag in bags)
-        cells = [name, f'{len(bags)}', f'{len(alarms)}', f'{pairs}',
-                 f'{sum(bag.all_poses for bag in bags)}']
-        for of in ('nees_direction', 'nees_rotation'):
-            values = np.array([getattr(bag, of) for bag in bags])
-            weights = np.array([bag.all_poses for bag in bags])
-            cells += [_text(_weighted_mean(values, weights), 2),
-                      ' .. '.join(_text(float(end), 2) for end in (values.min(), values.max()))]
-        lines.append([*cells, _text(_finite_median([bag.direction_error for bag in bags]), 2),
-                      _text(_finite_median([bag.rotation_error for bag in bags]), 3),
-                      _text(_finite_median([bag.frame_ms for bag in bags]), 1)])
+def _right_table(rows: Sequence[RightSummary]) -> str:
     return markdown_table(
-        ['motion', 'bags', 'alarms', 'pairs', 'poses', 'NEES t', 'by bag', 'NEES R', 'by bag',
-         't error [deg]', 'R error [deg]', 'frame with pair [ms]'], lines)
-
-
-def _weighted_mean(values: Array, weights: Array) -> float:
-    known = np.isfinite(values)
-    return float(np.average(values[known], weights=weights[known])) if known.any() else math.nan
+        ['recordings', 'bags', 'alarms', 'pairs', 'poses', 'NEES t', 'by bag', 'NEES R', 'by bag',
+         't error [deg]', 'R error [deg]', 'frame with pair [ms]'],
+        [[row.kind, f'{row.bags}', f'{row.alarms}', f'{row.pairs}', f'{row.poses}',
+          _text(row.nees_direction, 2),
+          f'{row.nees_direction_least:.2f} .. {row.nees_direction_largest:.2f}',
+          _text(row.nees_rotation, 2),
+          f'{row.nees_rotation_least:.2f} .. {row.nees_rotation_largest:.2f}',
+          _text(row.direction_error, 2), _text(row.rotation_error, 3), _text(row.frame_ms, 1)]
+         for row in rows])
 
 
 def _share(part: int, whole: int) -> float:

@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.experiments.trust_rows import Told
-from rs_relpose_lab.experiments.trust_runs import Arrival, intrinsics_of, Recording, Source
+from rs_relpose_lab.experiments.trust_runs import (
+    Arrival,
+    intrinsics_of,
+    RECORDING,
+    Recording,
+    Source,
+)
 from rs_relpose_ros.bags.layout import IMAGE_DELAY
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.config.parameter_file import read_parameters
@@ -84,7 +90,7 @@ def real_recording(folder: Path) -> Recording:
             raise MissingInputError(f'{path} is no image')
         return np.asarray(found, dtype=np.uint8)
 
-    return _recording(Source(folder.name, 'real', '', 0), values, intrinsics_of(files.camera),
+    return _recording(Source(folder.name, RECORDING), values, intrinsics_of(files.camera),
                       [file.stamp_ns for file in files.images], files.cropped_imu(), image,
                       lambda stamp1_ns, stamp2_ns: None)
 
@@ -106,7 +112,7 @@ def bag_recording(bag_path: Path, parameter_file: Path) -> Recording:
                            np.array([pose.quat_xyzw for pose in poses]))
     offset_ns = to_nanoseconds(parameters.sensor.time_offset)
     return _recording(
-        Source(bag_path.name, 'bag', '', 0), parameters.to_mapping(), intrinsics[0],
+        Source(bag_path.name, RECORDING), parameters.to_mapping(), intrinsics[0],
         [image.stamp_ns for image in images], samples,
         lambda number: images[number].image.decoded(),
         lambda stamp1_ns, stamp2_ns: truth.relative_pose(stamp1_ns + offset_ns,

@@ -52,13 +52,18 @@ class Arrival(NamedTuple):
     arrives_ns: int
 
 
+# Kinds of recordings: simulated, without images and with them, and others.
+TRACKS, IMAGES, RECORDING = 'tracks', 'images', 'recording'
+
+
 class Source(NamedTuple):
     """Where a recording comes from; `noise`: of the told one, 0 where nobody chose it."""
 
     name: str
-    motion: str
-    scene: str
-    seed: int
+    kind: str
+    motion: str = ''
+    scene: str = ''
+    seed: int = 0
     noise: float = 0.0
 
 
