@@ -251,17 +251,19 @@ def test_noise_of_the_matches_goes_into_the_sigma():
 
 
 def test_seconds_that_tell():
-    information = np.zeros((3, 11, 11))
+    information = np.zeros((4, 11, 11))
     offset = PLACES['time_offset'].start
-    information[1, offset, offset] = 1.0 / 0.001**2
-    information[2, offset, offset] = 1.0 / 0.003**2
-    turns = np.stack([np.diag(values) for values in
-                      ([0.0, 0.0, 0.0], [400.0, 0.0, 0.0], [400.0, 30.0, 0.0])])
+    # Sigmas of 3 ms, then of 2.1 ms and 1.7 ms together; at last the camera rests.
+    information[:3, offset, offset] = 1.0 / 0.003**2
+    turns = np.stack([np.diag(values) for values in (
+        [400.0, 0.0, 0.0], [400.0, 0.0, 0.0], [0.0, 30.0, 0.0], [0.0, 0.0, 0.0])])
     motion = TellingMotion(information, turns)
     assert motion.seconds(Injected('time_offset', np.array([0.01]))).tolist() == [
-        False, True, False]
+        False, False, True, False]
+    assert motion.seconds(Injected('time_offset', np.array([0.02]))).tolist() == [
+        True, True, True, False]
     # Turning about one axis does not say where the others are.
-    assert motion.seconds(None).tolist() == [False, False, True]
+    assert motion.seconds(None).tolist() == [False, False, True, False]
 
 
 # --- what comes of a bag

@@ -41,6 +41,8 @@ _VELOCITY_SIGMA = 1.0
 _LEAST_PIXEL, _LEAST_TURN = 0.05, 3e-4
 # An injected error must be so many times its sigma.
 TELLING = 5.0
+# Share of the information that tells it, which a second must hold to count.
+_LEAST_PART = 0.01
 # Matches of a pair that are used, at most.
 _MOST_MATCHES = 150
 
@@ -199,27 +201,29 @@ class TellingMotion:
     turns: Array
 
     def seconds(self, injected: Injected | None) -> NDArray[np.bool_]:
-        """Which seconds (F,) tell an error; None: that axes are another way round."""
+        """Which seconds (F,) can tell an error; None: that axes are another way round.
+
+        What has been seen up to a second's end tells the error, and the second adds to it: a
+        camera that rests tells nothing, whatever it has told before.
+        """
         if injected is None:
-            return np.array([_axes_told(turn) for turn in self.turns], dtype=bool)
-        place = PLACES[injected.figure]
-        before = np.diag(1.0 / _BEFORE**2)
-        # The figure itself is not known before.
-        before[place, place] = 0.0
-        told = np.zeros(len(self.figures), dtype=bool)
-        for second, information in enumerate(self.figures):
-            if not information.any():
-                continue
-            # Information on the figure alone: the others eliminated.
-            total = information + before
-            rest = np.setdiff1d(np.arange(_FREE), np.arange(_FREE)[place])
-            mixed = total[np.ix_(rest, np.arange(_FREE)[place])]
-            alone = total[place, place] - mixed.T @ np.linalg.solve(
-                total[np.ix_(rest, rest)], mixed)
-            told[second] = injected.error @ alone @ injected.error >= TELLING**2
-        return told
+            # A quarter turn, squared in sigmas, by the turning about one axis and about a second.
+            quarter = (math.pi / 2)**2
+            each = quarter * np.linalg.eigvalsh(self.turns)[:, 2]
+            so_far = quarter * np.linalg.eigvalsh(np.cumsum(self.turns, axis=0))[:, 1]
+        else:
+            each, so_far = (
+                np.array([_squared_error(injected, figures) for figures in information])
+                for information in (self.figures, np.cumsum(self.figures, axis=0)))
+        return np.asarray((so_far >= TELLING**2) & (each >= _LEAST_PART * TELLING**2))
 
 
-def _axes_told(turn: Array) -> bool:
-    """Whether the turning about a second axis tells a quarter turn at `TELLING` sigmas."""
-    return math.sqrt(max(float(np.linalg.eigvalsh(turn)[1]), 0.0)) * math.pi / 2 >= TELLING
+def _squared_error(injected: Injected, figures: Array) -> float:
+    """An error squared in sigmas that the information gives its figure, the others eliminated."""
+    place = np.arange(_FREE)[PLACES[injected.figure]]
+    rest = np.setdiff1d(np.arange(_FREE), place)
+    # Of the figure itself nothing is known before.
+    others = figures[np.ix_(rest, rest)] + np.diag(1.0 / _BEFORE[rest]**2)
+    mixed = figures[np.ix_(rest, place)]
+    alone = figures[np.ix_(place, place)] - mixed.T @ np.linalg.solve(others, mixed)
+    return float(injected.error @ alone @ injected.error)
