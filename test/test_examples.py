@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 import signal
 
@@ -48,8 +49,7 @@ def recorded(bundled_bag: Path) -> tuple[list[PairMessages], TrueTrajectory]:
         truth = read_truth(bag, topics)
         assert truth is not None
         replay = Replay(bag, topics, read_parameters(BUNDLED_PARAMETERS))
-        return [pair_messages(pair.result, message_class) for pair in replay.pairs()
-                if pair.result.pose], truth
+        return [pair_messages(pair.result, message_class) for pair in replay.pairs()], truth
 
 
 @pytest.fixture(scope='module')
@@ -64,8 +64,9 @@ def run(module_ros_domain_id: int,
         graph.wait_for_publisher('/relpose_node/pose_chain/path')
         for count, pair in enumerate(pairs):
             # In any order: their stamps say what belongs together.
-            for name in sorted(PAIR_TOPICS, reverse=count % 2 == 1):
-                publishers[name].publish(getattr(pair, name))
+            for name, message in sorted(pair.by_topic(), key=itemgetter(0),
+                                        reverse=count % 2 == 1):
+                publishers[name].publish(message)
             wait_until(lambda n=count: len(paths) > n, 'a path', example)
         code, _ = example.signal(signal.SIGINT)
         yield Chained(pairs, paths, truth, example.output, code)
@@ -80,7 +81,7 @@ def whole_paths(run: Chained) -> list[PathMessage]:
 def test_each_pair_extends_a_path(run):
     assert len(run.paths) == len(run.pairs) > 20
     for path, pair in zip(run.paths, run.pairs, strict=True):
-        assert path.header.stamp == pair.relative_pose.header.stamp
+        assert path.header.stamp == pair.pairs.header.stamp
     assert run.exit_code == 0
     assert 'Traceback' not in run.output
 

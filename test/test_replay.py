@@ -87,7 +87,14 @@ def test_table_has_the_header_and_whole_rows(replayed):
             assert 0 < int(row['inliers']) <= int(row['matches'])
             assert row['model'] == 'uniform'
         else:
-            assert figures == [''] * 12 and row['inliers'] == '' and row['model'] == ''
+            # The rotation alone: this bag has no pair without one.
+            assert figures[:3] == [''] * 3 and figures[7:9] == [''] * 2
+            values = np.array(figures[3:7] + figures[9:], dtype=float)
+            assert np.linalg.norm(values[:4]) == pytest.approx(1.0, abs=1e-9)
+            assert (values[4:] > 0.0).all() and (values[4:] < 0.01).all()
+            assert 0 < int(row['inliers']) <= int(row['matches'])
+            assert row['model'] == 'angular'
+    assert 'PURE_ROTATION' in statuses
 
 
 def test_errors_agree_with_an_independent_calculation(replayed, bundled_bag):
@@ -107,11 +114,13 @@ def test_errors_agree_with_an_independent_calculation(replayed, bundled_bag):
         told = errors[row['stamp_ns']]
         assert float(told['baseline_m']) == pytest.approx(np.linalg.norm(p2 - p1), abs=1e-4)
         assert told['status'] == row['status']
-        if row['status'] != 'OK':
-            assert told['translation_error_deg'] == ''
-            continue
         estimated = Rotation.from_quat([float(row[c]) for c in ('qx', 'qy', 'qz', 'qw')])
         rotation = np.degrees((estimated.inv() * R1.inv() * R2).magnitude())
+        if row['status'] != 'OK':
+            assert told['translation_error_deg'] == ''
+            assert float(told['rotation_error_deg']) == pytest.approx(rotation, abs=1e-4)
+            assert rotation <= 0.15
+            continue
         t_true = R1.inv().apply(p2 - p1)
         t_true /= np.linalg.norm(t_true)
         t_estimated = np.array([float(row[c]) for c in ('tx', 'ty', 'tz')])
@@ -157,14 +166,15 @@ def test_pictures_are_drawn(replayed):
 
 
 def test_the_bag_of_the_poses_equals_the_table(replayed):
-    answered = [row for row in rows_of(replayed / 'relative_poses.csv') if row['status'] == 'OK']
+    rows = rows_of(replayed / 'relative_poses.csv')
+    answered = [row for row in rows if row['status'] == 'OK']
     topics: dict[str, list] = {}
     with AnyReader([replayed / 'relpose_bag']) as reader:
         for connection, _, data in reader.messages():
             topics.setdefault(connection.topic, []).append(
                 reader.deserialize(data, connection.msgtype))
     assert sorted(topics) == [f'/relpose_node/{name}' for name in (
-        'matches', 'reference', 'relative_pose', 'velocity')]
+        'matches', 'pairs', 'reference', 'relative_pose', 'relative_rotation', 'velocity')]
     for row, pose, matches in zip(answered, topics['/relpose_node/relative_pose'],
                                   topics['/relpose_node/matches'], strict=True):
         stamp = pose.header.stamp
@@ -172,6 +182,17 @@ def test_the_bag_of_the_poses_equals_the_table(replayed):
         assert pose.pose.pose.position.x == float(row['tx'])
         assert pose.pose.pose.orientation.w == float(row['qw'])
         assert matches.width == int(row['inliers'])
+    for row, rotation, told in zip(rows, topics['/relpose_node/relative_rotation'],
+                                   topics['/relpose_node/pairs'], strict=True):
+        assert rotation.orientation.w == float(row['qw'])
+        np.testing.assert_array_equal(np.sqrt(rotation.orientation_covariance[[0, 4, 8]]), [
+            float(row[name]) for name in ('sigma_rx', 'sigma_ry', 'sigma_rz')])
+        [status] = told.status
+        values = {item.key: item.value for item in status.values}
+        for name in ('reference_stamp_ns', 'status', 'model', 'inliers', 'matches'):
+            assert values[name] == row[name]
+        assert float(values['rotation_difference_to_gyro_deg']) < 0.5
+        assert abs(np.array(values['gyro_bias_rad_s'].split(), dtype=float)).max() < 0.01
 
 
 def test_two_runs_are_equal_and_stamps_restrict(replayed, bundled_bag, parameters_file, tmp_path,

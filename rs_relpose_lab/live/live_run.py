@@ -25,9 +25,9 @@ from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.messages.incoming import stamp_ns, time_ns
 from rs_relpose_ros.messages.outgoing import PAIR_TOPICS
+from rs_relpose_ros.messages.pair_status import number
 from rs_relpose_ros.node.message_types import message_class
 from rs_relpose_ros.replay.tables import (
-    number,
     RELATIVE_POSE_COLUMNS,
     rotation_sigmas,
     table_writer,

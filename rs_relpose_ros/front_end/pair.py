@@ -54,6 +54,7 @@ class PairResult:
     rays2: Array
     parallax: float   # [px] median after derotation
     gyro_rotation: Array | None = None   # (3, 3) R_1^T R_2 integrated from the gyro
+    gyro_bias: Array | None = None   # (3,) [rad/s] that was removed for it, IMU frame
     drift: Drift | None = None   # as tracked up to this pair
     image1: NDArray[np.uint8] | None = None   # both only where the front end keeps images
     image2: NDArray[np.uint8] | None = None

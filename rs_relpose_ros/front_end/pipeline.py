@@ -218,7 +218,9 @@ class Pipeline:
             frame_id=view.frame.frame_id, interval=_interval(reference, view), pose=pose,
             matches=matches, row_times1=rays1.row_times, row_times2=rays2.row_times,
             rays1=rays1.rays, rays2=rays2.rays, parallax=self._parallax(rays1, rays2, sensor),
-            gyro_rotation=None if gyro is None else gyro.rotation, drift=self._drift.estimate(),
+            gyro_rotation=None if gyro is None else gyro.rotation,
+            gyro_bias=None if gyro is None else (
+                parameters.sensor.R_cam_imu.T @ gyro.segment.bias), drift=self._drift.estimate(),
             image1=reference.frame.image if self._keep_images else None,
             image2=view.frame.image if self._keep_images else None)
 
