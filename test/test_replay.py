@@ -185,14 +185,16 @@ def test_the_bag_of_the_poses_equals_the_table(replayed):
     for row, rotation, told in zip(rows, topics['/relpose_node/relative_rotation'],
                                    topics['/relpose_node/pairs'], strict=True):
         assert rotation.orientation.w == float(row['qw'])
-        np.testing.assert_array_equal(np.sqrt(rotation.orientation_covariance[[0, 4, 8]]), [
-            float(row[name]) for name in ('sigma_rx', 'sigma_ry', 'sigma_rz')])
+        np.testing.assert_allclose(np.sqrt(rotation.orientation_covariance[[0, 4, 8]]), [
+            float(row[name]) for name in ('sigma_rx', 'sigma_ry', 'sigma_rz')], rtol=1e-12)
         [status] = told.status
         values = {item.key: item.value for item in status.values}
         for name in ('reference_stamp_ns', 'status', 'model', 'inliers', 'matches'):
             assert values[name] == row[name]
         assert float(values['rotation_difference_to_gyro_deg']) < 0.5
-        assert abs(np.array(values['gyro_bias_rad_s'].split(), dtype=float)).max() < 0.01
+        # As the parameter file beside the bag has it, or as seen at rest.
+        np.testing.assert_allclose(np.array(values['gyro_bias_rad_s'].split(), dtype=float),
+                                   [0.010885, -0.007021, 0.005061], atol=2e-3)
 
 
 def test_two_runs_are_equal_and_stamps_restrict(replayed, bundled_bag, parameters_file, tmp_path,

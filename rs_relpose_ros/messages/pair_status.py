@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.front_end.pair import PAIR_FIGURES, PairResult
+from rs_relpose_ros.front_end.pair import PAIR_FIGURES, PairFigure, PairResult
 
 Array = NDArray[np.float64]
 
@@ -34,14 +34,17 @@ class PairValue(NamedTuple):
     text: Callable[[PairResult], str]
 
 
+def _figure(figure: PairFigure) -> PairValue:
+    return PairValue(figure.name, lambda pair: number(figure.of(pair)))
+
+
 # In the order in which they are shown. `TOPICS_KEY` follows: it tells what else was published.
 PAIR_VALUES = (
     PairValue('reference_stamp_ns', lambda pair: str(pair.reference_stamp_ns)),
     PairValue('status', lambda pair: pair.pose.status.value),
     PairValue('reason', lambda pair: pair.pose.reason),
     PairValue('model', lambda pair: pair.pose.model),
-    *(PairValue(figure.name, lambda pair, of=figure.of: number(of(pair)))
-      for figure in PAIR_FIGURES),
+    *(_figure(figure) for figure in PAIR_FIGURES),
     PairValue('baseline_m', lambda pair: number(pair.pose.baseline)),
     PairValue('baseline_log_sigma', lambda pair: number(pair.pose.baseline_log_sigma)),
     # Instants of the two stamped rows on the IMU's clock.
