@@ -14,6 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from simulated_pairs import simulated_flight
 
+from rs_relpose_ros.config.intrinsics import IntrinsicsConfig
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.estimator.result import RelativePose, Status
@@ -447,11 +448,12 @@ def test_diagnostics(types):
 # -- intake ----------------------------------------------------------------------------------
 
 
-def intake(*, calibrated: bool = False) -> tuple[Intake, Sequencer]:
+def intake(*, calibrated: bool = False,
+           told: IntrinsicsConfig | None = None) -> tuple[Intake, Sequencer]:
     """An intake that has received the IMU of the first second."""
     sequencer = Sequencer(Parameters.from_mapping({
         'readout_time': 0.02, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0]}), offline=True)
-    target = Intake(sequencer)
+    target = Intake(sequencer, told=told)
     for stamp_ns in range(0, 10**9, 5_000_000):
         target.receive(Role.IMU, build.imu(build.rosbags_types, stamp_ns))
     if calibrated:
@@ -485,7 +487,7 @@ def test_images_without_camera_info_are_counted():
     for k in range(6):
         image = build.gray_image(build.rosbags_types, PIXELS, stamp_ns=k * 10**8)
         target.receive(Role.IMAGE, image)
-    target.refuse_held()
+    target.release_held()
     refused = taken(sequencer)
     assert [item.stamp_ns for item in refused] == [k * 10**8 for k in range(6)]
     assert {item.cause for item in refused} == {Refusal.NO_CALIBRATION}
@@ -501,6 +503,62 @@ def test_no_outdated_calibration_is_used():
     [refused] = taken(sequencer)
     assert refused.cause is Refusal.NO_CALIBRATION
     assert 'uncalibrated' in refused.reason
+
+
+TOLD = IntrinsicsConfig(
+    camera_matrix=(400.0, 0.0, 320.0, 0.0, 401.0, 241.0, 0.0, 0.0, 1.0),
+    distortion_coefficients=(0.1, -0.2, 0.0, 0.0))
+
+
+def receive_images(target: Intake, first: int, count: int) -> None:
+    for k in range(first, first + count):
+        pixels = np.roll(PIXELS, k)   # each another
+        target.receive(Role.IMAGE, build.compressed(
+            build.rosbags_types, build.jpeg(pixels), stamp_ns=k * 10**8))
+
+
+def test_told_intrinsics_take_the_place_of_those_that_are_missing():
+    target, sequencer = intake(told=TOLD)
+    target.receive(Role.CAMERA_INFO, build.camera_info(build.rosbags_types, k=(0.0,) * 9))
+    assert target.camera_info_problem == ''
+    receive_images(target, 1, 2)
+    frames = taken(sequencer)
+    assert [frame.frame.stamp_ns for frame in frames] == [10**8, 2 * 10**8]
+    for frame in frames:
+        assert frame.frame.intrinsics == TOLD.of_image(640, 480) == target.intrinsics
+    # A calibration that comes later is better, and one that goes is not used any more.
+    target.receive(Role.CAMERA_INFO, build.camera_info(build.rosbags_types))
+    receive_images(target, 3, 1)
+    assert taken(sequencer)[0].frame.intrinsics.fx == 450.0
+    target.receive(Role.CAMERA_INFO, build.camera_info(build.rosbags_types, k=(0.0,) * 9))
+    receive_images(target, 4, 1)
+    assert taken(sequencer)[0].frame.intrinsics == TOLD.of_image(640, 480)
+    # One that cannot be used is no missing one.
+    with pytest.raises(InputError):
+        target.receive(Role.CAMERA_INFO, build.camera_info(build.rosbags_types, model='bananas'))
+    receive_images(target, 5, 1)
+    [refused] = taken(sequencer)
+    assert (refused.cause, 'bananas' in refused.reason) == (Refusal.NO_CALIBRATION, True)
+
+
+def test_without_a_camera_info_the_first_images_wait():
+    target, sequencer = intake(told=TOLD)
+    receive_images(target, 1, 4)
+    assert taken(sequencer) == [] and target.intrinsics is None
+    receive_images(target, 5, 1)
+    assert [frame.frame.intrinsics.fy for frame in taken(sequencer)] == [401.0] * 5
+    # Of each image the size is its own.
+    target.receive(Role.IMAGE, build.gray_image(build.rosbags_types, PIXELS[:240], 6 * 10**8))
+    [frame] = taken(sequencer)
+    assert frame.frame.intrinsics == TOLD.of_image(640, 240)
+    target.receive(Role.IMAGE, build.compressed(build.rosbags_types, b'none', stamp_ns=7 * 10**8))
+    [refused] = taken(sequencer)
+    assert (refused.cause, refused.stamp_ns) == (Refusal.BAD_IMAGE, 7 * 10**8)
+    # A recording that ends before.
+    target, sequencer = intake(told=TOLD)
+    receive_images(target, 1, 2)
+    target.release_held()
+    assert len(taken(sequencer)) == 2
 
 
 def test_image_of_another_size_is_refused():
