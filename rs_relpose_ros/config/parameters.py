@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_ros.config.declarations import check_settings, Declared, declared, setting
 from rs_relpose_ros.config.estimator import EstimatorConfig
 from rs_relpose_ros.config.imu import ImuConfig
+from rs_relpose_ros.config.intrinsics import IntrinsicsConfig
 from rs_relpose_ros.config.keyframes import KeyframeConfig
 from rs_relpose_ros.config.tracking import TrackingConfig
 from rs_relpose_ros.errors import InputError, MissingInputError
@@ -106,6 +107,7 @@ class Parameters:
     """All parameters, grouped by the module that they configure; flat names are unique."""
 
     sensor: SensorConfig = field(default_factory=SensorConfig)
+    intrinsics: IntrinsicsConfig = field(default_factory=IntrinsicsConfig)
     pair: PairConfig = field(default_factory=PairConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)

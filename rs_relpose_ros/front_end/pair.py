@@ -59,6 +59,7 @@ class PairResult:
     health: Health = NOT_JUDGED   # of what was told, all three as after this pair
     tracked: Tracked | None = None
     applied: Applied = NOTHING_APPLIED
+    gyro_bias: Array | None = None   # (3,) [rad/s] that was removed for it, IMU frame
     image1: NDArray[np.uint8] | None = None   # both only where the front end keeps images
     image2: NDArray[np.uint8] | None = None
 

@@ -235,6 +235,8 @@ class Pipeline:
             gyro_rotation=None if gyro is None else gyro.rotation,
             images_against_gyro=None if seen is None else seen.images_against_gyro,
             health=self._health.health, tracked=self._seen, applied=self._applied,
+            gyro_bias=None if gyro is None else (
+                parameters.sensor.R_cam_imu.T @ gyro.segment.bias),
             image1=reference.frame.image if self._keep_images else None,
             image2=view.frame.image if self._keep_images else None)
 

@@ -81,7 +81,7 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
             write_pose(relative_pose_cells(record))
             if write_error is not None:
                 write_error(error_cells(record))
-            if out_bag is not None and pair.result.pose:
+            if out_bag is not None:
                 _write_messages(out_bag, pair, parameters.pair.reference_frame)
             on_pair(pair)
             if pictures and (shown is None or _picture_rank(pair.result) > _picture_rank(shown)):
@@ -109,8 +109,8 @@ def _prepare(folder: Path, with_bag: bool) -> None:
 
 def _write_messages(bag: BagWriter, pair: ReplayedPair, reference_frame: str) -> None:
     messages = pair_messages(pair.result, bag.type, reference_frame)
-    for name, msgtype in PAIR_TOPICS.items():
-        bag.write(f'/relpose_node/{name}', msgtype, getattr(messages, name), pair.bag_time_ns)
+    for topic, message in messages.by_topic():
+        bag.write(f'/relpose_node/{topic}', PAIR_TOPICS[topic], message, pair.bag_time_ns)
 
 
 def _picture_rank(pair: PairResult) -> tuple[bool, float]:
