@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.calibrate.alignment import seen_rates
-from rs_relpose_ros.calibrate.coplanarity import Problem, View
-from rs_relpose_ros.calibrate.gyro_path import GyroSeries, noise_density
+from rs_relpose_ros.calibrate.coplanarity import BIAS, EXPOSURE, GLOBAL, Problem, View
+from rs_relpose_ros.calibrate.gyro_path import blur, GyroSeries, noise_density
 from rs_relpose_ros.calibrate.tracks import make_pairs, Pairs, Tracks
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 _LOST = 1.5
 # Prior of `bend`, 1 sigma, before the parallax is known.
 _BEND_AT_START = 0.1
+# 1 sigma of a gyro's bias [rad/s], and of the exposure, as a share of the interval.
+_BIAS_SIGMA, _EXPOSED = 0.03, 0.8
 # Rotation between two frames that even a gyro without noise misses between its samples [rad].
 _LEAST_TURN = 2e-5
 # Cosine of the angle to the optical axis beyond which a point has no normalised coordinates.
@@ -117,10 +119,14 @@ class Observations:
         times1, times2 = self.times[pairs.first], self.times[pairs.second]
         middles = np.searchsorted(self.gyro_times, 0.5 * (times1 + times2) + offset)
         turn_sigma = np.sqrt(self.gyro_density**2 * (times2 - times1) + _LEAST_TURN**2)
+        prior = np.zeros(GLOBAL)
+        prior[BIAS:BIAS + 3] = _BIAS_SIGMA**-2
+        prior[EXPOSURE] = (_EXPOSED * self.interval)**-4
         return Problem(
-            self.gyro_times, self.gyro_rates, pairs.begin, middles,
+            self.gyro_times, self.gyro_rates, *blur(self.gyro_times, self.gyro_rates), pairs.begin,
+            middles,
             self._view(pairs.first, pairs.points1), self._view(pairs.second, pairs.points2),
-            np.full(len(pairs), _BEND_AT_START), turn_sigma)
+            np.full(len(pairs), _BEND_AT_START), turn_sigma, prior)
 
     def _view(self, frames: NDArray[np.int64], pixels: Array) -> View:
         rays, by_pixel = self.camera.unproject_with_jacobian(pixels)
