@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 
 _RECORD_MORE = ('too little rotation, too short, or too few points: record 10 s or more of a '
                 'textured scene while turning 20 to 60 deg/s about all three axes')
+# Error of every focal length, relative: the residual is not linear in the noise of the points.
+_LEAST_FOCAL_SIGMA = 2e-4
 # Sigma of an observable slope of the offset [s/s].
 _MOST_SLOPE_SIGMA = 0.5
 
@@ -45,6 +47,7 @@ def judged(data: Observations, final: Fit, free: NDArray[np.bool_], curve: CostC
     tracker[[READOUT, OFFSET]] = config.tracking_time_sigma
     tracker[ROTATION:ROTATION + 3] = config.tracking_rotation_sigma
     tracker[BIAS:BIAS + 3] = config.tracking_bias_sigma
+    tracker[FOCAL] = _LEAST_FOCAL_SIGMA
     covariance = final.covariance + np.diag(np.where(free, tracker, 0.0)**2)
     parameters, R_cam_imu = final.unknowns.parameters, final.unknowns.R_imu_cam.T
     rates, one_axis = _excitation(data, parameters[BIAS:BIAS + 3], R_cam_imu, config)

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +33,8 @@ Array = NDArray[np.float64]
 
 # Regions of the image: columns and rows of equally many points.
 _COLUMNS, _ROWS = 4, 3
+# Mean square, in sigmas, by which the figures of two halves differ by chance, at most.
+_CHANCE = 1.75
 
 
 class ModelErrors(NamedTuple):
@@ -51,8 +54,8 @@ UNCALIBRATED = ModelErrors(focal=0.0, aspect=0.005, center=0.02, radial=0.05)
 
 def widened(final: Fit, free: NDArray[np.bool_], errors: ModelErrors | None) -> Fit:
     """The fit with a covariance that holds for more than the noise of the matches."""
-    scatter = final.covariance + _between_regions(final, free)
-    scatter *= _disagreement(final, free)
+    wider = np.sqrt(_between_regions(final, free) * _disagreement(final, free))
+    scatter = final.covariance * np.outer(wider, wider)
     if errors is not None:
         moves = np.array([_move(final, free, problem) for problem in _perturbed(final, errors)])
         scatter = scatter + moves.T @ moves
@@ -60,10 +63,10 @@ def widened(final: Fit, free: NDArray[np.bool_], errors: ModelErrors | None) -> 
 
 
 def _between_regions(final: Fit, free: NDArray[np.bool_]) -> Array:
-    """What the scatter between regions of the image has beyond that of all cells, (G, G).
+    """Factors (G,) of the variances by what regions of the image scatter more than cells do.
 
-    Cells are regions times stretches of time. Where the regions scatter no more than the cells,
-    the stretches have it all.
+    Cells are regions times stretches of time: where the regions scatter no more than these, by
+    more than chance, the stretches have it all.
     """
     problem, curve = final.problem, bent(final.weights)
     index = np.ix_(free, free)
@@ -79,14 +82,11 @@ def _between_regions(final: Fit, free: NDArray[np.bool_]) -> Array:
         moves.append(np.linalg.pinv(rest_curvature, hermitian=True) @ own.sum(axis=0))
         of_cells = np.stack([own[stretch == k].sum(axis=0) for k in np.unique(stretch)]) @ inverse
         cells += of_cells.T @ of_cells
-    # What is positive of the difference, in units of `cells`.
-    root = np.linalg.cholesky(cells + 1e-9 * np.diag(np.diag(cells)))
-    unit = np.linalg.inv(root)
-    values, vectors = np.linalg.eigh(unit @ (jackknife_of(np.array(moves)) - cells) @ unit.T)
-    beyond = root @ (vectors * np.maximum(values, 0.0)) @ vectors.T @ root.T
-    covariance = np.zeros((GLOBAL, GLOBAL))
-    covariance[index] = beyond
-    return covariance
+    by_chance = 1.0 + math.sqrt(2.0 / (len(moves) - 1))
+    beyond = np.diag(jackknife_of(np.array(moves)) - by_chance * cells)
+    factors = np.ones(GLOBAL)
+    factors[free] += np.maximum(beyond, 0.0) / np.diag(final.covariance)[free]
+    return factors
 
 
 def _regions(points: Array) -> NDArray[np.int64]:
@@ -98,7 +98,7 @@ def _regions(points: Array) -> NDArray[np.int64]:
 
 
 def _disagreement(final: Fit, free: NDArray[np.bool_]) -> float:
-    """Mean square of the difference of both halves in their sigmas; 1 at least."""
+    """Mean square of the difference of both halves in their sigmas; 1 where chance explains it."""
     middles = final.problem.middles
     first = middles < np.median(middles)
     halves = [fit(final.problem.pairs_of(part), final.unknowns.pairs_of(part), free, rounds=15)
@@ -108,8 +108,8 @@ def _disagreement(final: Fit, free: NDArray[np.bool_]) -> float:
     difference[ROTATION:ROTATION + 3] = log_so3(
         one.unknowns.R_imu_cam @ other.unknowns.R_imu_cam.T)
     variances = np.diag(one.covariance + other.covariance)
-    ratios = difference[free]**2 / variances[free]
-    return max(float(ratios.mean()), 1.0)
+    mean = float((difference[free]**2 / variances[free]).mean())
+    return mean if mean > _CHANCE else 1.0
 
 
 def _move(final: Fit, free: NDArray[np.bool_], problem: Problem) -> Array:
