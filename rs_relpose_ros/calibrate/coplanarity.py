@@ -15,12 +15,13 @@ to frame 2 that the noise of the gyro hides. Priors keep the last two small. The
 in units of |b| and does not contain the read-out time: a read-out time that is too long gains no
 freedom by it.
 
-A row is exposed for a time h in which the camera turns, and shows the mean of that time: a rotation
-that is smoother than the gyro's, with the rate ``w + h^2 / 24 w''``. See `gyro_path.blur`.
+A row is exposed for a time h in which the camera turns, and shows the mean of that time: a
+rotation smoother than the gyro's, with the rate ``w + h^2 / 24 w''``. See `gyro_path.blur`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import math
 from typing import NamedTuple
 
@@ -50,7 +51,7 @@ class View(NamedTuple):
     """One of the two frames of each of P pairs, and what it shows of their N matches."""
 
     times: Array        # (P,) stamps [s]
-    covariates: Array   # (P,) interval to the next frame less the median one, k_i above [s]
+    covariates: Array   # (P,) what the offset may follow, k_i above; see `FrameTimes` [s]
     points: Array       # (N, 2) undistorted and normalised with the assumed focal length
     rows: Array         # (N,) s(v) of the raw rows
     by_pixel: Array     # (N, 2, 2) derivative of the normalised point by the pixel
@@ -88,10 +89,8 @@ class Problem(NamedTuple):
     def matches(self, kept: NDArray[np.bool_]) -> Problem:
         """The same pairs with some of their matches (N,)."""
         before = np.concatenate([[0], np.cumsum(kept)])
-        return self._replace(begin=before[self.begin], **{
-            name: view._replace(points=view.points[kept], rows=view.rows[kept],
-                                by_pixel=view.by_pixel[kept])
-            for name, view in (('view1', self.view1), ('view2', self.view2))})
+        return self._replace(begin=before[self.begin]).seen_as(lambda view: view._replace(
+            points=view.points[kept], rows=view.rows[kept], by_pixel=view.by_pixel[kept]))
 
     def pairs_of(self, kept: NDArray[np.bool_]) -> Problem:
         """Some of the pairs (P,)."""
@@ -99,9 +98,12 @@ class Problem(NamedTuple):
         return some._replace(
             begin=np.concatenate([[0], np.cumsum(np.diff(self.begin)[kept])]),
             middle=self.middle[kept], bend_sigma=self.bend_sigma[kept],
-            turn_sigma=self.turn_sigma[kept], **{
-                name: view._replace(times=view.times[kept], covariates=view.covariates[kept])
-                for name, view in (('view1', some.view1), ('view2', some.view2))})
+            turn_sigma=self.turn_sigma[kept]).seen_as(lambda view: view._replace(
+                times=view.times[kept], covariates=view.covariates[kept]))
+
+    def seen_as(self, change: Callable[[View], View]) -> Problem:
+        """The same data with both views changed alike."""
+        return self._replace(view1=change(self.view1), view2=change(self.view2))
 
 
 class Unknowns(NamedTuple):

@@ -357,5 +357,5 @@ def _covariance(problem: Problem, evaluation: Evaluation, weights: Array,
 
 
 def bent(weights: Array) -> float:
-    """Curvature of the loss over the weight that Gauss-Newton takes for it, of all (N,) matches."""
+    """Curvature of the loss, all (N,) matches, over the weight that Gauss-Newton takes."""
     return float((weights * (4.0 * np.sqrt(weights) - 3.0)).sum() / weights.sum())

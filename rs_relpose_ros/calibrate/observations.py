@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rs_relpose_ros.calibrate.alignment import seen_rates
 from rs_relpose_ros.calibrate.coplanarity import BIAS, EXPOSURE, GLOBAL, Problem, View
 from rs_relpose_ros.calibrate.gyro_path import blur, GyroSeries, noise_density
+from rs_relpose_ros.calibrate.stamps import frame_times, FrameTimes
 from rs_relpose_ros.calibrate.tracks import make_pairs, Pairs, Tracks
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
@@ -44,8 +45,7 @@ class Observations:
     tracks: Tracks                  # of points that the camera model can map to rays
     camera: RollingShutterCamera    # its read-out time is not looked at
     times: Array                    # (F,) stamps of the frames [s]
-    # (F,) interval to the next frame less the median one [s]; 0 where frames were lost.
-    covariates: Array
+    stamps: FrameTimes              # what the stamps tell of exposure and jitter
     gyro_times: Array               # (K,) [s]
     gyro_rates: Array               # (K, 3) [rad/s]
     gyro_density: float             # white noise of the gyro [rad/s/sqrt(Hz)]
@@ -59,12 +59,7 @@ class Observations:
                          points=tracks.points[ahead])
         times, gyro_times = (np.asarray((stamps_ns - tracks.stamps_ns[0]) * 1e-9)
                              for stamps_ns in (tracks.stamps_ns, gyro.stamps_ns))
-        intervals = np.diff(times)
-        to_next = np.append(intervals, intervals[-1])
-        longer = to_next - np.median(intervals)
-        # Where frames are lost, the interval tells nothing of the exposure.
-        longer[longer > (_LOST - 1.0) * np.median(intervals)] = 0.0
-        return cls(tracks, camera, times, longer, gyro_times, gyro.rates,
+        return cls(tracks, camera, times, frame_times(tracks.stamps_ns), gyro_times, gyro.rates,
                    noise_density(gyro_times, gyro.rates))
 
     @property
@@ -134,5 +129,5 @@ class Observations:
         points = np.asarray(rays[:, :2] / rays[:, 2:])
         by_pixel = (by_pixel[:, :2] - points[:, :, None] * by_pixel[:, 2:]) / rays[:, 2:, None]
         height = self.camera.height
-        return View(self.times[frames], self.covariates[frames], points,
+        return View(self.times[frames], self.stamps.covariates[frames], points,
                     (pixels[:, 1] - 0.5 * (height - 1)) / height, np.ascontiguousarray(by_pixel))

@@ -38,8 +38,6 @@ _LEAST_MATCHES = 20
 _ALL_PAIRS = PairSelection((0.033, 0.067, 0.133, 0.267), 80, _LEAST_MATCHES, 800)
 _SOME_PAIRS = _ALL_PAIRS._replace(max_matches=40, most_pairs=100)
 _PAIRS_AT_START = _SOME_PAIRS._replace(spans=(0.067,))
-# Intervals between frames that differ by more than this share may have exposures that differ.
-_VARYING = 0.02
 _FOCAL_FACTORS = np.geomspace(0.5, 2.0, 9)
 
 
@@ -77,8 +75,7 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
     free[FOCAL], free[EXPOSURE] = not focal_known, False
     coarse = _coarse_fit(data, starts, free, config, rng)
     progress(0.4)
-    low, high = np.quantile(data.covariates, (0.1, 0.9))
-    free[SLOPE] = high - low > _VARYING * data.interval
+    free[SLOPE] = bool(data.stamps.covariates.any())
     free[EXPOSURE] = config.exposed
     offset = coarse.parameters[OFFSET]
     final = refit(_problem(data, _ALL_PAIRS, offset, config, rng), coarse, free)

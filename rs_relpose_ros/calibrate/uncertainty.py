@@ -18,15 +18,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.calibrate.coplanarity import GLOBAL, Problem, ROTATION
+from rs_relpose_ros.calibrate.coplanarity import GLOBAL, Problem, ROTATION, View
 from rs_relpose_ros.calibrate.covariance import jackknife_of, stretches
-from rs_relpose_ros.calibrate.fit import bent, evaluate, fit, Fit
+from rs_relpose_ros.calibrate.fit import bent, evaluate, Fit, fit
 from rs_relpose_ros.geometry.so3 import log_so3
 
 Array = NDArray[np.float64]
@@ -126,13 +127,16 @@ def _perturbed(final: Fit, errors: ModelErrors) -> Iterator[Problem]:
     """The data with each of the errors of the model in turn, one sigma of it."""
     problem = final.problem
     for change in _lens_changes(problem, errors):
-        yield problem._replace(**{name: view._replace(points=change(view.points)) for name, view in
-                                  (('view1', problem.view1), ('view2', problem.view2))})
+        yield problem.seen_as(partial(_through, change))
     for i in range(3):
         for j in range(i + 1):
             mixing = np.zeros((3, 3))
             mixing[i, j] = mixing[j, i] = errors.gyro_scale if i == j else errors.gyro_skew
             yield problem._replace(gyro_rates=problem.gyro_rates @ (np.eye(3) + mixing))
+
+
+def _through(change: Callable[[Array], Array], view: View) -> View:
+    return view._replace(points=np.ascontiguousarray(change(view.points)))
 
 
 def _lens_changes(problem: Problem, errors: ModelErrors) -> list[Callable[[Array], Array]]:

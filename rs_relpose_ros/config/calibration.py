@@ -48,4 +48,5 @@ class CalibrationConfig:
 # Errors that a tracker makes alike over all of a recording, which its scatter does not show: found
 # on rendered bags with KLT.
 TRACKED_IN_IMAGES = CalibrationConfig(
-    exposed=True, tracking_time_sigma=5e-5, tracking_rotation_sigma=1e-3, tracking_bias_sigma=2.5e-4)
+    exposed=True, tracking_time_sigma=5e-5, tracking_rotation_sigma=1e-3,
+    tracking_bias_sigma=2.5e-4)

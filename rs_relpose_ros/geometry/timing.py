@@ -1,11 +1,13 @@
 """Time: integer nanoseconds everywhere, and the one equation that gives a row its instant.
 
-    t_imu(row v) = stamp + time_offset + k (T - T_ref) + exposure_shift + (v - v_stamp) * line_delay
+    t_imu(row v) = stamp + time_offset + k (T - T_ref) + exposure_shift
+                   + (v - v_stamp) * line_delay
 
 ``v_stamp`` is row 0, (height - 1) / 2 or height - 1 for a driver that stamps the first, middle or
 last row; ``exposure_shift`` is +exposure/2, 0 or -exposure/2 for a driver that stamps the start,
-middle or end of the exposure. k is ``time_offset_per_interval``: with automatic exposure, the middle
-of the exposure moves against the stamp as the interval T between frames changes (`FrameIntervals`).
+middle or end of the exposure. k is ``time_offset_per_interval``: with automatic exposure, the
+middle of the exposure moves against the stamp as the interval T between frames changes
+(`FrameIntervals`).
 """
 
 from __future__ import annotations
