@@ -47,8 +47,9 @@ class Truth:
     features: int = 200
     speed: float = 1.0
     rotation_rate: float = math.radians(30.0)
-    exposure_slope: float = 0.0          # of the offset, by the interval to the next frame
+    exposure_slope: float = 0.0          # of the offset, by the interval to the frame before
     long_interval: float = 1.0           # intervals of the second half, relative to the first
+    stamp_jitter: float = 0.0            # 1 sigma of each stamp [s]
 
 
 def drawn(rng: np.random.Generator, axis_map: int | None = None, **given: Any) -> Truth:
@@ -100,13 +101,16 @@ def record(truth: Truth, rng: np.random.Generator,
     intervals[truth.frames // 2:] *= truth.long_interval
     # Instants of the first row on the IMU clock, which is the trajectory's.
     instants = np.concatenate([[0.0], np.cumsum(intervals[:-1])])
-    offsets = truth.time_offset + truth.exposure_slope * (intervals - np.median(intervals))
+    before = np.concatenate([intervals[:1], intervals[:-1]])
+    offsets = truth.time_offset + truth.exposure_slope * (before - np.median(before))
     end = instants[-1] + 0.2
     if trajectory is None:
         trajectory = hand_held(rng, -0.7, end + 0.5, Plan.parse(f'walk:{end + 1.0}'),
                                speed=truth.speed, rotation_rate=truth.rotation_rate)
-    stamps = START_NS + np.rint((instants - offsets) * 1e9).astype(np.int64)
     frames = _frames(truth, trajectory, instants, _world(rng), rng)
+    if truth.stamp_jitter:
+        offsets = offsets + truth.stamp_jitter * rng.standard_normal(truth.frames)
+    stamps = START_NS + np.rint((instants - offsets) * 1e9).astype(np.int64)
     return Recorded(Tracks(stamps, *frames), _gyro(truth, trajectory, end, rng), truth, trajectory)
 
 
