@@ -45,9 +45,6 @@ def warm_up_pipeline(parameters: Parameters) -> None:
         front_end = FrontEnd(parameters, offline=True)
         sequencer = front_end.sequencer
         images = list(_images())
-        for image in images:
-            # A raw image is read-only memory of its message: kernels for that are apart.
-            image.flags.writeable = force is None
         for stamp_ns in range(NANOSECONDS, NANOSECONDS + (len(images) + 3) * _FRAME_NS, _IMU_NS):
             sequencer.add_imu(ImuSample(stamp_ns, (0.01, 0.02, 0.03), force))
         for k, image in enumerate(images):
