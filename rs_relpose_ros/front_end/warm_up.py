@@ -16,7 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.config.parameters import Parameters
-from rs_relpose_ros.estimator.warm_up import warm_up_refinement, warm_up_sampling
+from rs_relpose_ros.estimator.warm_up import (
+    warm_up_refinement,
+    warm_up_sampling,
+    warm_up_solvers,
+)
 from rs_relpose_ros.front_end.frame import Frame
 from rs_relpose_ros.front_end.front_end import FrameProcessed, FrontEnd
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
@@ -70,16 +74,18 @@ def fill_cache() -> None:
     Other solvers are compiled when they are chosen.
     """
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context('spawn')) as pool:
-        other_half = pool.submit(_compile_all_but_sampling)
-        warm_up_sampling()
+        other_half = pool.submit(_warm_up_estimate)
+        warm_up_solvers()
+        # No pair has that many matches: everything but the estimate.
+        warm_up_pipeline(Parameters.from_mapping({'min_inliers': 10_000}))
         other_half.result()
     warm_up_pipeline(Parameters())
 
 
-def _compile_all_but_sampling() -> None:
+def _warm_up_estimate() -> None:
     warm_up_refinement()
-    # No pair has that many matches: everything but the estimate.
-    warm_up_pipeline(Parameters.from_mapping({'min_inliers': 10_000}))
+    # By then the solvers are compiled, which are most of it.
+    warm_up_sampling()
 
 
 if __name__ == '__main__':

@@ -156,8 +156,8 @@ def rotations_between(knot_times: Array, knot_rotations: Array, times: Array,
                       after: NDArray[np.int64]) -> tuple[Array, bool]:
     """Orientations (N, 3, 3) at times (N,) within the knots, at a constant rate between two.
 
-    `after` (N,) tells the first knot after each time.
-    Also whether the knots enclose all times; beyond them nothing turns on.
+    `after` (N,) tells the first knot after each time. Also whether the knots enclose all
+    times; beyond them nothing turns on.
     """
     out = np.empty((len(times), 3, 3))
     steps = np.empty((len(knot_times) - 1, 3))
