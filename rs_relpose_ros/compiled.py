@@ -20,7 +20,8 @@ T = TypeVar('T')
 
 kernel_cache.install()
 # Nothing calls a kernel as a C function: a wrapper for that costs a tenth of the compilation.
-_OPTIONS: dict[str, Any] = {'cache': True, 'nogil': True, 'error_model': 'numpy', 'no_cfunc_wrapper': True}
+_OPTIONS: dict[str, Any] = {
+    'cache': True, 'nogil': True, 'error_model': 'numpy', 'no_cfunc_wrapper': True}
 kernel = numba.njit(**_OPTIONS)
 # Put into its callers by Numba: for the innermost loops, whose arrays' shapes must be known there.
 inlined_kernel = numba.njit(**_OPTIONS, forceinline=True)
