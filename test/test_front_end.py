@@ -158,7 +158,7 @@ def figures(pair: PairResult) -> tuple[Any, ...]:
     pose = pair.pose
     return (pair.reference_stamp_ns, pair.stamp_ns, pose.status, pose.iterations,
             pose.R.tobytes(), pose.t.tobytes(), pose.covariance.tobytes(),
-            pose.inliers.tobytes(), pair.drift.applied)
+            pose.inliers.tobytes(), pair.applied.time_offset)
 
 
 def pairs_of_run(recorded: list[Any], parameters: Parameters,
