@@ -129,7 +129,7 @@ MAY_IMPORT = {
     'imu': BASE,
     'tracking': BASE,
     'estimator': BASE | {'solvers'},
-    'health': BASE | {'estimator'},
+    'health': BASE | {'estimator', 'imu'},
     'front_end': CORE | {'health'},
     'messages': CORE | {'front_end', 'health'},
     'bags': {'geometry'},

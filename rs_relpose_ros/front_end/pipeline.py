@@ -25,12 +25,14 @@ from rs_relpose_ros.health.pair_information import middle_share, PairEvidence
 from rs_relpose_ros.health.tracked import Applied, Tracked
 from rs_relpose_ros.health.turning import rotation_of_rays
 from rs_relpose_ros.imu.frame_imu import FrameImu, GyroSegment
-from rs_relpose_ros.imu.integration import bias_jacobian, integrate_rotation
+from rs_relpose_ros.imu.integration import integrate_rotation, turn_sensitivity
 from rs_relpose_ros.tracking.matches import Matches
 from rs_relpose_ros.tracking.tracker import make_tracker, Tracker
 
 Array = NDArray[np.float64]
 
+# Points of which the turning of the images is taken, of the longest tracks.
+_TURNING_POINTS = 120
 # Largest 1 sigma of the gravity direction that the estimator takes [rad].
 _LARGEST_GRAVITY_SIGMA = 1.5
 
@@ -245,13 +247,12 @@ class Pipeline:
     def _compare_turns(self, stamp_ns: int, matches: Matches, segment: GyroSegment,
                        sensor: Sensor, parameters: Parameters) -> None:
         """Compare how the image turned since the one before, without the gyro, with the gyro."""
-        before = self._current_points
-        self._current_points = matches.track_ids, sensor.camera.unproject(
-            sensor.intrinsics.to_sensor(matches.points2))
+        before, ids = self._current_points, matches.track_ids[:_TURNING_POINTS]
+        self._current_points = ids, sensor.camera.unproject(
+            sensor.intrinsics.to_sensor(matches.points2[:_TURNING_POINTS]))
         if before is None:
             return
-        _, old, new = np.intersect1d(before[0], matches.track_ids, assume_unique=True,
-                                     return_indices=True)
+        _, old, new = np.intersect1d(before[0], ids, assume_unique=True, return_indices=True)
         turned = rotation_of_rays(before[1][old], self._current_points[1][new])
         if turned is not None:
             self._health.add_turn(stamp_ns, turned, log_so3(integrate_rotation(
@@ -284,15 +285,12 @@ def _evidence(pose: RelativePose, matches: Matches, reference: _View, view: _Vie
               sensor: Sensor, parameters: Parameters) -> PairEvidence:
     """A pair as the recursive calibration needs it."""
     segment = gyro.segment
-    stamps_ns, rates = segment.stamps_ns, segment.angular_velocities
-    step = 1e-4
-    scaled, _ = integrate_rotation(stamps_ns, (1.0 + step) * rates, parameters.imu)
-    _, noise = integrate_rotation(stamps_ns, rates, parameters.imu, bias_sigma=0.0)
     return PairEvidence(
         sensor.intrinsics.to_sensor(matches.points1), sensor.intrinsics.to_sensor(matches.points2),
         sensor.camera, reference.imu.motion, view.imu.motion, _interval(reference, view),
-        pose.R, pose.t, gyro.rotation, noise, bias_jacobian(stamps_ns, rates),
-        log_so3(np.ascontiguousarray(scaled @ gyro.rotation.T)) / step, (rates[0], rates[-1]),
+        pose.R, pose.t, gyro.rotation, turn_sensitivity(
+            segment.stamps_ns, segment.angular_velocities, parameters.imu),
+        (segment.angular_velocities[0], segment.angular_velocities[-1]),
         parameters.sensor.R_cam_imu, parameters.estimator.gyro_sigma)
 
 

@@ -102,6 +102,11 @@ class Cause(NamedTuple):
     certainty: float   # in sigmas
     shift: float   # of the pose, in its own sigmas (Mahalanobis)
 
+    @property
+    def matters(self) -> bool:
+        """Whether it moves the pose by a share of the pose's own sigma."""
+        return self.shift > _MATTERS
+
 
 def causes(seen: Calibration, effects: list[Effect], in_force: Array) -> list[Cause]:
     """The fewest figures that explain the pairs, by forward selection; the strongest first.
@@ -161,7 +166,7 @@ def judged(seen: Calibration, explained: list[Cause], turned: TurnComparison | N
                                     if figure.name not in named))
     largest = max((cause.shift for cause in explained), default=0.0)
     faults = {cause.figure.name: cause for cause in explained
-              if cause.shift > max(_MATTERS, _TRACE * largest)}
+              if cause.matters and cause.shift > _TRACE * largest}
     found: list[Finding] = []
     for figure in FIGURES:
         if figure.name in faults:

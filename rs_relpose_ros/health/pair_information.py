@@ -13,6 +13,7 @@ all. ``dx = -H^-1 C c`` is what deviations do to the pose.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -39,6 +40,7 @@ from rs_relpose_ros.health.deviation import (
     READOUT,
     SCALE,
 )
+from rs_relpose_ros.imu.integration import TurnSensitivity
 
 Array = NDArray[np.float64]
 
@@ -49,6 +51,8 @@ _CAUCHY_SIGMAS = 2.4
 # Least noise of matches [px], and of the gyro's turn between two frames [rad].
 _LEAST_SIGMA = 0.05
 _LEAST_TURN_SIGMA = 1e-5
+# Matches that are looked at, evenly over those of the pair: more cost time and tell little more.
+_MOST_MATCHES = 120
 # Step of numerical derivatives: far below what a residual shows, far above rounding.
 _STEP = 1e-5
 # Steps by which a pair is fitted anew.
@@ -68,9 +72,7 @@ class PairEvidence:
     R: Array   # (3, 3) as estimated, between the stamped rows
     t: Array   # (3,) NaN where there is none
     gyro_rotation: Array   # (3, 3) between the stamped rows
-    gyro_noise: Array   # (3, 3) covariance of its white noise alone
-    by_bias: Array   # (3, 3) its turn by a constant rate in the camera frame, [s]
-    by_scale: Array   # (3,) its turn by a relative change of the rates
+    gyro_sensitivity: TurnSensitivity   # of that
     rates: tuple[Array, Array]   # (3,) at the two stamped rows [rad/s]
     R_cam_imu: Array
     gyro_sigma: float   # [rad/s] of the rate within a frame
@@ -92,10 +94,10 @@ def pair_information(pair: PairEvidence, in_force: Array, about: Array) -> PairI
     The pair's material has the deviations `in_force` (11,) applied already. Where others are
     wanted the pair is fitted anew, since its estimate followed those in force.
     """
-    at = about - in_force
-    told = pair.camera
-    pair = replace(pair, camera=_lens(told, at[FOCAL], at[DISTORTION]))
-    noise = pair.gyro_noise + _LEAST_TURN_SIGMA**2 * np.eye(3)
+    at, step = about - in_force, math.ceil(len(pair.points1) / _MOST_MATCHES) or 1
+    pair = replace(pair, camera=_lens(pair.camera, at[FOCAL], at[DISTORTION]),
+                   points1=pair.points1[::step], points2=pair.points2[::step])
+    noise = pair.gyro_sensitivity.noise + _LEAST_TURN_SIGMA**2 * np.eye(3)
     problem = build_problem(pair.points1, pair.points2, pair.camera, pair.motion1, pair.motion2,
                             pair.gyro_rotation, noise)
     keep = problem.valid
@@ -188,8 +190,8 @@ def _gyro(pair: PairEvidence) -> Array:
     turn[:, AXES] = np.eye(3) - pair.gyro_rotation
     turn[:, OFFSET] = pair.gyro_rotation @ pair.rates[1] - pair.rates[0]
     turn[:, READOUT] = middle_share(pair.camera) * turn[:, OFFSET]
-    turn[:, BIAS] = -pair.by_bias @ pair.R_cam_imu
-    turn[:, SCALE] = pair.by_scale
+    turn[:, BIAS] = -pair.gyro_sensitivity.by_rate @ pair.R_cam_imu
+    turn[:, SCALE] = pair.gyro_sensitivity.by_scale
     return turn
 
 

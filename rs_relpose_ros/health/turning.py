@@ -40,11 +40,9 @@ def rotation_of_rays(rays1: Array, rays2: Array) -> Array | None:
         return None
     first, second = rays1[finite], rays2[finite]
     R = aligning_rotation(first.T @ second)
-    for _ in range(2):
-        off = np.sum((first - second @ R.T) ** 2, axis=1)
-        weights = 1.0 / (1.0 + off / max(float(np.median(off)), 1e-12))
-        R = aligning_rotation((first.T * weights) @ second)
-    return log_so3(R)
+    off = np.sum((first - second @ R.T) ** 2, axis=1)
+    weights = 1.0 / (1.0 + off / max(float(np.median(off)), 1e-12))
+    return log_so3(aligning_rotation((first.T * weights) @ second))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
