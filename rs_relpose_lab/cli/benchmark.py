@@ -282,9 +282,9 @@ def _trust_arguments(parser: argparse.ArgumentParser) -> None:
     _number(parser, '--right', 0, 'further bags that are told right, for false alarms: noise at '
                                   'the told level, half of it and twice')
     _number(parser, '--rendered', 0, 'further bags with images: the first ones of the others')
-    parser.add_argument('--recordings', type=Path, metavar='DIR',
-                        help='folder of the real recordings, e.g. "$RS_RELPOSE_DATA" (default: '
-                             'none)')
+    parser.add_argument('--recordings', type=Path, nargs='+', default=[], metavar='PATH',
+                        help='bags with their right parameters beside them (BAG.yaml), or folders '
+                             'of real recordings, e.g. "$RS_RELPOSE_DATA"/android_phone_rs')
 
 
 def _run_trust(args: argparse.Namespace) -> int:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.experiments.tables import grouped, markdown_table, write_csv
-from rs_relpose_lab.experiments.trust_recordings import REAL, real_recording
+from rs_relpose_lab.experiments.trust_recordings import recording_at
 from rs_relpose_lab.experiments.trust_rows import RIGHT, ROWS
 from rs_relpose_lab.experiments.trust_runs import (
     FLAGGED,
@@ -171,21 +171,20 @@ class BagRow:
 
 
 class Task(NamedTuple):
-    """A bag to simulate, or the folder of a real recording, and the rows that it goes through."""
+    """A bag to simulate, or the place of a recording, and the rows that it goes through."""
 
     bag: BagPlan | Path
     rows: tuple[str, ...]
 
 
 def tasks(rows: Sequence[str], bags: int, seconds: float, first_seed: int, *, right: int = 0,
-          rendered: int = 0, recordings: Path | None = None) -> list[Task]:
+          rendered: int = 0, recordings: Sequence[Path] = ()) -> list[Task]:
     """All that is to be measured; arguments as the options of the command."""
     wrong = tuple(rows)
     asked = [Task(plan, wrong) for plan in plans(bags, seconds, first_seed)]
     asked += [Task(task.bag._replace(images=True), wrong) for task in asked[:rendered]
               if isinstance(task.bag, BagPlan)]
-    if recordings is not None:
-        asked += [Task(recordings / name, wrong) for name in REAL]
+    asked += [Task(path, wrong) for path in recordings]
     # Seeds of their own.
     asked += [Task(plan, (RIGHT,))
               for plan in plans(right, seconds, first_seed + 10_000, noises=(1.0, 0.5, 2.0))]
@@ -197,7 +196,7 @@ def measure(task: Task) -> list[BagRow]:
 
     Told right first: that run says which seconds tell what.
     """
-    recording = (real_recording(task.bag) if isinstance(task.bag, Path)
+    recording = (recording_at(task.bag) if isinstance(task.bag, Path)
                  else recording_of(task.bag))
     right = list(run(recording, recording.told))
     motion = telling_motion(recording, [pair for pair, _ in right])
@@ -369,7 +368,8 @@ def right_summary(kind: str, bags: Sequence[BagRow]) -> RightSummary:
         frame_ms=_finite_median([bag.frame_ms for bag in bags]))
 
 
-_TITLES = {TRACKS: 'Simulated, without images', IMAGES: 'Simulated, with images'}
+_TITLES = {TRACKS: 'Simulated, without images', IMAGES: 'Simulated, with images',
+           RECORDING: 'Recordings with truth'}
 
 
 def write_report(folder: Path, bags: Sequence[BagRow]) -> str:
@@ -378,7 +378,10 @@ def write_report(folder: Path, bags: Sequence[BagRow]) -> str:
     write_csv(folder / 'trust_bags.csv', bags)
     parts, told = [], {}
     for kind, title in _TITLES.items():
-        of_kind = [bag for bag in bags if bag.kind == kind and not bag.noise]
+        # A recording without truth has no poses that can be judged.
+        judged_bags = {bag.bag for bag in bags if bag.kind != RECORDING or bag.all_poses}
+        of_kind = [bag for bag in bags if bag.kind == kind and bag.bag in judged_bags
+                   and not bag.noise]
         rows = [summary(name, of_row)
                 for name, of_row in grouped(of_kind, lambda bag: bag.row).items()]
         if len(rows) > 1:
@@ -439,11 +442,15 @@ def _right_table(rows: Sequence[RightSummary]) -> str:
          't error [deg]', 'R error [deg]', 'frame with pair [ms]'],
         [[row.kind, f'{row.bags}', f'{row.alarms}', f'{row.pairs}', f'{row.poses}',
           _text(row.nees_direction, 2),
-          f'{row.nees_direction_least:.2f} .. {row.nees_direction_largest:.2f}',
+          _range(row.nees_direction_least, row.nees_direction_largest),
           _text(row.nees_rotation, 2),
-          f'{row.nees_rotation_least:.2f} .. {row.nees_rotation_largest:.2f}',
+          _range(row.nees_rotation_least, row.nees_rotation_largest),
           _text(row.direction_error, 2), _text(row.rotation_error, 3), _text(row.frame_ms, 1)]
          for row in rows])
+
+
+def _range(least: float, largest: float) -> str:
+    return '' if math.isnan(least) else f'{least:.2f} .. {largest:.2f}'
 
 
 def _share(part: int, whole: int) -> float:

@@ -76,10 +76,19 @@ REAL: Mapping[str, tuple[Callable[[Path], RecordedFiles], Callable[[], Mapping[s
 }
 
 
+def recording_at(path: Path) -> Recording:
+    """A bag with its parameter file beside it, ``BAG.yaml``, or the folder of one of `REAL`."""
+    parameter_file = path.with_name(path.name + '.yaml')
+    if parameter_file.is_file():
+        return bag_recording(path, parameter_file)
+    if path.name not in REAL:
+        raise InputError(f'{path} has no parameter file {parameter_file.name} beside it, and is '
+                         f'none of {", ".join(REAL)}')
+    return real_recording(path)
+
+
 def real_recording(folder: Path) -> Recording:
     """A real recording; what is right of it is as far as known."""
-    if folder.name not in REAL:
-        raise InputError(f'{folder} is none of {", ".join(REAL)}')
     read, right = REAL[folder.name]
     files, values = read(folder), right()
 
@@ -96,7 +105,7 @@ def real_recording(folder: Path) -> Recording:
 
 
 def bag_recording(bag_path: Path, parameter_file: Path) -> Recording:
-    """A simulated bag with its truth, and the parameters that are right."""
+    """A bag, with its truth where it has one, and the parameters that are right."""
     images: list[PublishedImage] = []
     samples: list[ImuSample] = []
     intrinsics: list[Intrinsics] = []
@@ -107,16 +116,16 @@ def bag_recording(bag_path: Path, parameter_file: Path) -> Recording:
         for role, message in feed.messages(bag, bag.find_topics()):
             feed.receive(role, message.message)
     parameters = read_parameters(parameter_file)
-    truth = TrueTrajectory([pose.stamp_ns for pose in poses],
-                           np.array([pose.position for pose in poses]),
-                           np.array([pose.quat_xyzw for pose in poses]))
+    truth = None if not poses else TrueTrajectory(
+        [pose.stamp_ns for pose in poses], np.array([pose.position for pose in poses]),
+        np.array([pose.quat_xyzw for pose in poses]))
     offset_ns = to_nanoseconds(parameters.sensor.time_offset)
     return _recording(
         Source(bag_path.name, RECORDING), parameters.to_mapping(), intrinsics[0],
         [image.stamp_ns for image in images], samples,
         lambda number: images[number].image.decoded(),
-        lambda stamp1_ns, stamp2_ns: truth.relative_pose(stamp1_ns + offset_ns,
-                                                         stamp2_ns + offset_ns))
+        lambda stamp1_ns, stamp2_ns: None if truth is None else truth.relative_pose(
+            stamp1_ns + offset_ns, stamp2_ns + offset_ns))
 
 
 def _recording(source: Source, values: Mapping[str, Any], intrinsics: Intrinsics,

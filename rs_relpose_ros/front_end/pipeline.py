@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -31,8 +31,8 @@ from rs_relpose_ros.tracking.tracker import make_tracker, Tracker
 
 Array = NDArray[np.float64]
 
-# Points of which the turning of the images is taken, of the longest tracks.
-_TURNING_POINTS = 120
+# Points of which the turning of the images is taken, of the longest tracks, and frames between.
+_TURN_POINTS, _TURN_FRAMES = 120, 3
 # Largest 1 sigma of the gravity direction that the estimator takes [rad].
 _LARGEST_GRAVITY_SIGMA = 1.5
 
@@ -52,6 +52,25 @@ class _GyroTurn:
     rotation: Array
     covariance: Array
     segment: GyroSegment
+
+
+@dataclass(slots=True, eq=False)
+class _Turn:
+    """An image that later ones are compared with, and how the gyro has turned since."""
+
+    ids: NDArray[np.uint32]   # (N,) of tracks
+    rays: Array   # (N, 3) as measured
+    by_gyro: Array = field(default_factory=lambda: np.eye(3))
+    frames: int = 0
+
+    @classmethod
+    def none(cls) -> _Turn:
+        """No image yet: the next one is the first."""
+        return cls(np.zeros(0, dtype=np.uint32), np.zeros((0, 3)), frames=_TURN_FRAMES)
+
+    def go_on(self, rotation: Array) -> None:
+        """Count a frame that the gyro has turned by `rotation` since the one before."""
+        self.by_gyro, self.frames = self.by_gyro @ rotation, self.frames + 1
 
 
 class _GravityPrior(NamedTuple):
@@ -87,8 +106,7 @@ class Pipeline:
         self._gyro: _GyroTurn | None = None
         self._reference_rays: DerotatedRays | None = None
         self._current_rays: DerotatedRays | None = None
-        # Of the image before: track ids (N,), and rays (N, 3) as measured.
-        self._current_points: tuple[NDArray[np.uint32], Array] | None = None
+        self._turn = _Turn.none()
         self._promotion_due = False
 
     @property
@@ -100,7 +118,8 @@ class Pipeline:
         """Forget the reference keyframe: the next frame starts anew."""
         self._tracker.reset()
         self._reference = self._previous = self._gyro = None
-        self._reference_rays = self._current_rays = self._current_points = None
+        self._reference_rays = self._current_rays = None
+        self._turn = _Turn.none()
         self._frames = 0
         self._promotion_due = False
 
@@ -119,13 +138,16 @@ class Pipeline:
             self._restart_from(view)
             return None
         self._frames += 1
-        predicted = self._predicted(self._previous.imu.motion, imu, sensor, parameters)
+        rotation, _ = integrate_rotation(imu.since_previous.stamps_ns,
+                                         imu.since_previous.angular_velocities, parameters.imu)
+        self._turn.go_on(rotation)
+        predicted = self._predicted(self._previous.imu.motion, imu.motion, rotation, sensor)
         matches = self._tracker.track(
             frame.image, predicted,
             seconds_between(self._previous.frame.stamp_ns, frame.stamp_ns))
         self._previous = view
         self._gyro = self._turn_with(imu.since_previous, parameters)
-        self._compare_turns(frame.stamp_ns, matches, imu.since_previous, sensor, parameters)
+        self._compare_turns(frame.stamp_ns, matches, sensor)
         rays1, rays2 = self._derotate(matches, self._reference.imu.motion, imu.motion, sensor)
         since = SinceKeyframe(self._parallax(rays1, rays2, sensor),
                               _interval(self._reference, view), self._frames,
@@ -161,24 +183,23 @@ class Pipeline:
 
     # -- gyro and rays -----------------------------------------------------------------------
 
-    def _predicted(self, previous: FrameMotion, imu: FrameImu, sensor: Sensor,
-                   parameters: Parameters) -> Array | None:
+    def _predicted(self, previous: FrameMotion, current: FrameMotion, rotation: Array,
+                   sensor: Sensor) -> Array | None:
         """Where the gyro expects the tracker's points (N, 2) in the current image [px].
 
-        None without gyro, and for a tracker that looks for no points.
+        `rotation` (3, 3): ``R_1^T R_2`` since the previous image. None for a tracker that looks
+        for no points.
         """
-        points, segment = self._tracker.points, imu.since_previous
-        if segment is None or not len(points):
+        points = self._tracker.points
+        if not len(points):
             return None
-        rotation, _ = integrate_rotation(segment.stamps_ns, segment.angular_velocities,
-                                         parameters.imu)
         known = self._current_rays
         if known is not None and np.array_equal(known.points, points):
             rays, row_times = known.rays, known.row_times
         else:
             rays, row_times = sensor.derotated(points, previous)
         # f_2 = R^T f_1 for R = R_1^T R_2, in rows.
-        return sensor.seen(rays @ rotation, row_times, imu.motion)
+        return sensor.seen(rays @ rotation, row_times, current)
 
     def _turn_with(self, segment: GyroSegment, parameters: Parameters) -> _GyroTurn | None:
         """Gyro since the reference, continued by a frame; None once a part was missing."""
@@ -244,19 +265,17 @@ class Pipeline:
 
     # -- health ------------------------------------------------------------------------------
 
-    def _compare_turns(self, stamp_ns: int, matches: Matches, segment: GyroSegment,
-                       sensor: Sensor, parameters: Parameters) -> None:
-        """Compare how the image turned since the one before, without the gyro, with the gyro."""
-        before, ids = self._current_points, matches.track_ids[:_TURNING_POINTS]
-        self._current_points = ids, sensor.camera.unproject(
-            sensor.intrinsics.to_sensor(matches.points2[:_TURNING_POINTS]))
-        if before is None:
+    def _compare_turns(self, stamp_ns: int, matches: Matches, sensor: Sensor) -> None:
+        """Compare how images turned over some frames, without the gyro, with the gyro."""
+        if self._turn.frames < _TURN_FRAMES:
             return
-        _, old, new = np.intersect1d(before[0], ids, assume_unique=True, return_indices=True)
-        turned = rotation_of_rays(before[1][old], self._current_points[1][new])
+        before, ids = self._turn, matches.track_ids[:_TURN_POINTS]
+        rays = sensor.camera.unproject(sensor.intrinsics.to_sensor(matches.points2[:_TURN_POINTS]))
+        _, old, new = np.intersect1d(before.ids, ids, assume_unique=True, return_indices=True)
+        turned = rotation_of_rays(before.rays[old], rays[new])
         if turned is not None:
-            self._health.add_turn(stamp_ns, turned, log_so3(integrate_rotation(
-                segment.stamps_ns, segment.angular_velocities, parameters.imu)[0]))
+            self._health.add_turn(stamp_ns, turned, log_so3(before.by_gyro))
+        self._turn = _Turn(ids, rays)
 
     def _judged(self, pose: RelativePose, matches: Matches, reference: _View, view: _View,
                 sensor: Sensor, parameters: Parameters) -> RelativePose:

@@ -1,7 +1,7 @@
-"""How the images turn from frame to frame, without the gyro, against how the gyro turns.
+"""How the images turn over some frames, without the gyro, against how the gyro turns.
 
 No prior and no pose takes part, so that the comparison holds however wrong axes, unit or sign of
-the gyro are told. Rotation vectors of consecutive frames, ``theta`` by images and ``phi`` by gyro
+the gyro are told. Rotation vectors over some frames, ``theta`` by images and ``phi`` by gyro
 in the camera frame as told, are gathered in ``M = sum theta phi^T``; the rotation Q that maximises
 ``trace(Q^T M)`` lays one upon the other (Kabsch 1976).
 """
@@ -22,11 +22,11 @@ Array = NDArray[np.float64]
 
 # Fewer rays give no rotation.
 _LEAST_RAYS = 12
-# Frames that count: those of the last seconds, at most so many.
+# Turns that count: those of the last seconds, at most so many.
 _WINDOW_NS = to_nanoseconds(8.0)
-_MOST_FRAMES = 480
-# Frames and turning [rad, summed over frames] that a comparison needs.
-_LEAST_FRAMES, _LEAST_TURN = 12, 0.15
+_MOST_TURNS = 160
+# Turns, and turning [rad, their sum], that a comparison needs.
+_LEAST_TURNS, _LEAST_TURN = 5, 0.15
 
 
 def rotation_of_rays(rays1: Array, rays2: Array) -> Array | None:
@@ -58,7 +58,7 @@ class TurnComparison:
     left_mirrored: float   # the best reflection: a gyro whose axes are left-handed
     rotation: Array   # (3, 3) Q: the true gyro is Q times the told one
     scale: float   # images over gyro, after `rotation`
-    by_images: float   # [rad] turning summed over frames
+    by_images: float   # [rad] turning, summed
     by_gyro: float
 
     @property
@@ -68,17 +68,17 @@ class TurnComparison:
 
 
 class TurnSums:
-    """The frames of the last seconds."""
+    """The turns of the last seconds."""
 
     def __init__(self) -> None:
-        self._turns: deque[tuple[int, Array, Array]] = deque(maxlen=_MOST_FRAMES)
+        self._turns: deque[tuple[int, Array, Array]] = deque(maxlen=_MOST_TURNS)
 
     def clear(self) -> None:
-        """Forget all frames."""
+        """Forget all turns."""
         self._turns.clear()
 
     def add(self, stamp_ns: int, by_images: Array, by_gyro: Array) -> None:
-        """Take in the turns (3,) since the frame before, in the order of time."""
+        """Take in the turns (3,) over the same frames, in the order of time."""
         if self._turns and stamp_ns < self._turns[-1][0]:
             self.clear()
         self._turns.append((stamp_ns, by_images, by_gyro))
@@ -87,7 +87,7 @@ class TurnSums:
 
     def compared(self) -> TurnComparison | None:
         """Both upon each other; None where they turned too little, or too few frames came."""
-        if len(self._turns) < _LEAST_FRAMES:
+        if len(self._turns) < _LEAST_TURNS:
             return None
         theta = np.array([turn for _, turn, _ in self._turns])
         phi = np.array([turn for _, _, turn in self._turns])
