@@ -79,6 +79,9 @@ class PairConfig:
         True, 'gyro between the frames as rotation prior and hypothesis (else it only derotates '
         'rows)')
     use_gravity: bool = setting(True, 'gravity as prior and for the 3- and 9-point solvers')
+    withhold_when_wrong: bool = setting(
+        True, 'publish no pose while a figure that was told is seen to be wrong (see health in '
+        '/diagnostics)', live=True)
     reference_frame: str = setting(
         '', 'frame_id of relative poses; empty for <camera frame>_reference')
     image_transport: str = setting('raw', 'transport of the images', choices=('raw', 'compressed'))

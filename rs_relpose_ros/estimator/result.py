@@ -22,6 +22,7 @@ class Status(str, Enum):
     LOW_PARALLAX = 'LOW_PARALLAX'
     PURE_ROTATION = 'PURE_ROTATION'
     BAD_INPUT = 'BAD_INPUT'
+    WITHHELD = 'WITHHELD'   # what was told of camera or IMU is wrong, so the pose would be
 
 
 def _nan(*shape: int) -> Array:

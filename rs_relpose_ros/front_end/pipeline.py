@@ -13,14 +13,19 @@ from rs_relpose_ros.errors import MissingInputError
 from rs_relpose_ros.estimator.estimate import estimate_relative_pose
 from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.front_end.derotated_rays import DerotatedRays, median_parallax, Sensor
-from rs_relpose_ros.front_end.drift import DriftTracker, PairRotation
 from rs_relpose_ros.front_end.frame import Frame, sensor_camera
 from rs_relpose_ros.front_end.pair import closes_pair, PairResult, SinceKeyframe
 from rs_relpose_ros.geometry.motion import FrameMotion
-from rs_relpose_ros.geometry.so3 import aligning_rotation
+from rs_relpose_ros.geometry.so3 import aligning_rotation, log_so3
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between
+from rs_relpose_ros.health.deviation import BIAS, DEVIATIONS, OFFSET
+from rs_relpose_ros.health.judge import Told
+from rs_relpose_ros.health.monitor import HealthMonitor, withheld
+from rs_relpose_ros.health.pair_information import middle_share, PairEvidence
+from rs_relpose_ros.health.tracked import Applied, Tracked
+from rs_relpose_ros.health.turning import rotation_of_rays
 from rs_relpose_ros.imu.frame_imu import FrameImu, GyroSegment
-from rs_relpose_ros.imu.integration import integrate_rotation
+from rs_relpose_ros.imu.integration import bias_jacobian, integrate_rotation
 from rs_relpose_ros.tracking.matches import Matches
 from rs_relpose_ros.tracking.tracker import make_tracker
 
@@ -68,7 +73,9 @@ class Pipeline:
             raise MissingInputError('parameters are missing: ' + ', '.join(missing))
         self._keep_images = keep_images
         self._tracker = make_tracker(parameters.tracking)
-        self._drift = DriftTracker(parameters)
+        self._health = HealthMonitor()
+        self._seen: Tracked | None = None
+        self._applied = Applied()
         self._sensor: Sensor | None = None
         self._reference: _View | None = None
         self._previous: _View | None = None
@@ -76,18 +83,20 @@ class Pipeline:
         self._gyro: _GyroTurn | None = None
         self._reference_rays: DerotatedRays | None = None
         self._current_rays: DerotatedRays | None = None
+        # Of the image before: track ids (N,), and rays (N, 3) as measured.
+        self._current_points: tuple[NDArray[np.uint32], Array] | None = None
         self._promotion_due = False
 
     @property
     def applied_offset_ns(self) -> int:
         """Tracked time offset that the next frame is to be shifted by [ns]."""
-        return self._drift.applied_ns
+        return self._applied.time_offset_ns
 
     def reset(self) -> None:
         """Forget the reference keyframe: the next frame starts anew."""
         self._tracker.reset()
         self._reference = self._previous = self._gyro = None
-        self._reference_rays = self._current_rays = None
+        self._reference_rays = self._current_rays = self._current_points = None
         self._frames = 0
         self._promotion_due = False
 
@@ -112,6 +121,7 @@ class Pipeline:
             seconds_between(self._previous.frame.stamp_ns, frame.stamp_ns))
         self._previous = view
         self._gyro = self._turn_with(imu.since_previous, parameters)
+        self._compare_turns(frame.stamp_ns, matches, imu.since_previous, sensor, parameters)
         rays1, rays2 = self._derotate(matches, self._reference.imu.motion, imu.motion, sensor)
         since = SinceKeyframe(self._parallax(rays1, rays2, sensor),
                               _interval(self._reference, view), self._frames,
@@ -136,6 +146,7 @@ class Pipeline:
         """Camera model of the frame; another one than before starts anew."""
         if self._sensor is None or frame.intrinsics != self._sensor.intrinsics:
             self.reset()
+            self._health.clear()
             self._sensor = Sensor(sensor_camera(frame.intrinsics, parameters), frame.intrinsics)
         return self._sensor
 
@@ -210,8 +221,9 @@ class Pipeline:
             config=replace(parameters.estimator, gravity_sigma=gravity.sigma),
             quality=matches.quality,
             rng=np.random.default_rng([parameters.pair.seed, stamp1_ns, stamp2_ns]))
-        self._follow_drift(pose, reference.imu, view.imu, parameters)
+        pose = self._judged(pose, matches, reference, view, sensor, parameters)
         rays1, rays2 = self._derotate(matches, reference.imu.motion, view.imu.motion, sensor)
+        seen = self._health.latest
         return PairResult(
             reference_stamp_ns=stamp1_ns, stamp_ns=stamp2_ns,
             reference_ns1=reference.imu.reference_ns, reference_ns2=view.imu.reference_ns,
@@ -220,22 +232,66 @@ class Pipeline:
             rays1=rays1.rays, rays2=rays2.rays, parallax=self._parallax(rays1, rays2, sensor),
             gyro_rotation=None if gyro is None else gyro.rotation,
             gyro_bias=None if gyro is None else (
-                parameters.sensor.R_cam_imu.T @ gyro.segment.bias), drift=self._drift.estimate(),
+                parameters.sensor.R_cam_imu.T @ gyro.segment.bias),
+            images_against_gyro=None if seen is None else seen.images_against_gyro,
+            health=self._health.health, tracked=self._seen, applied=self._applied,
             image1=reference.frame.image if self._keep_images else None,
             image2=view.frame.image if self._keep_images else None)
 
-    def _follow_drift(self, pose: RelativePose, imu1: FrameImu, imu2: FrameImu,
-                      parameters: Parameters) -> None:
-        """Compare the pair's rotation with the gyro's, and decide on the offset to apply."""
-        gyro = self._gyro
-        if gyro is not None:
-            self._drift.add(PairRotation(
-                stamp_ns=imu2.reference_ns, R=pose.R, covariance=pose.covariance[3:, 3:],
-                gyro_rotation=gyro.rotation,
-                gyro_covariance=gyro.covariance if parameters.pair.use_gyro_rotation else None,
-                gyro=gyro.segment, applied1=imu1.applied_offset_ns / NANOSECONDS,
-                applied2=imu2.applied_offset_ns / NANOSECONDS))
-        self._drift.apply(parameters.sensor.track_time_offset)
+    # -- health ------------------------------------------------------------------------------
+
+    def _compare_turns(self, stamp_ns: int, matches: Matches, segment: GyroSegment,
+                       sensor: Sensor, parameters: Parameters) -> None:
+        """Compare how the image turned since the one before, without the gyro, with the gyro."""
+        before = self._current_points
+        self._current_points = matches.track_ids, sensor.camera.unproject(
+            sensor.intrinsics.to_sensor(matches.points2))
+        if before is None:
+            return
+        _, old, new = np.intersect1d(before[0], matches.track_ids, assume_unique=True,
+                                     return_indices=True)
+        turned = rotation_of_rays(before[1][old], self._current_points[1][new])
+        if turned is not None:
+            self._health.add_turn(stamp_ns, turned, log_so3(integrate_rotation(
+                segment.stamps_ns, segment.angular_velocities, parameters.imu)[0]))
+
+    def _judged(self, pose: RelativePose, matches: Matches, reference: _View, view: _View,
+                sensor: Sensor, parameters: Parameters) -> RelativePose:
+        """The pose with a covariance that holds, or withheld; what is tracked moves on."""
+        evidence = None
+        if self._gyro is not None and np.isfinite(pose.R).all():
+            evidence = _evidence(pose, matches, reference, view, self._gyro, sensor, parameters)
+        told = self._told(view, sensor, parameters)
+        pose = self._health.add_pair(view.frame.stamp_ns, evidence, pose, told)
+        self._seen = Tracked.of(self._health.calibration, parameters.sensor, told.gyro_bias,
+                                middle_share(sensor.camera))
+        self._applied = self._applied.moved(self._seen, parameters.sensor.time_offset,
+                                            track_offset=parameters.sensor.track_time_offset)
+        return withheld(pose, self._health.health) if parameters.pair.withhold_when_wrong else pose
+
+    def _told(self, view: _View, sensor: Sensor, parameters: Parameters) -> Told:
+        bias = np.array(parameters.imu.gyro_bias)
+        in_force = np.zeros(DEVIATIONS)
+        in_force[OFFSET] = view.imu.applied_offset_ns / NANOSECONDS
+        if self._gyro is not None:
+            in_force[BIAS] = parameters.sensor.R_cam_imu.T @ self._gyro.segment.bias - bias
+        return Told(parameters.sensor, sensor.camera, bias, in_force)
+
+
+def _evidence(pose: RelativePose, matches: Matches, reference: _View, view: _View, gyro: _GyroTurn,
+              sensor: Sensor, parameters: Parameters) -> PairEvidence:
+    """A pair as the recursive calibration needs it."""
+    segment = gyro.segment
+    stamps_ns, rates = segment.stamps_ns, segment.angular_velocities
+    step = 1e-4
+    scaled, _ = integrate_rotation(stamps_ns, (1.0 + step) * rates, parameters.imu)
+    _, noise = integrate_rotation(stamps_ns, rates, parameters.imu, bias_sigma=0.0)
+    return PairEvidence(
+        sensor.intrinsics.to_sensor(matches.points1), sensor.intrinsics.to_sensor(matches.points2),
+        sensor.camera, reference.imu.motion, view.imu.motion, _interval(reference, view),
+        pose.R, pose.t, gyro.rotation, noise, bias_jacobian(stamps_ns, rates),
+        log_so3(np.ascontiguousarray(scaled @ gyro.rotation.T)) / step, (rates[0], rates[-1]),
+        parameters.sensor.R_cam_imu, parameters.estimator.gyro_sigma)
 
 
 def _interval(reference: _View, view: _View) -> float:
