@@ -351,7 +351,8 @@ def told(messages: outgoing.PairMessages) -> dict[str, str]:
 
 
 def test_every_pair_is_told(types):
-    result = replace(pair(), gyro_rotation=pair().pose.R, gyro_bias=np.array([1e-3, 0.0, -2e-3]))
+    result = replace(pair(), images_against_gyro=np.array([0.0, 3e-3, 4e-3]),
+                     gyro_bias=np.array([1e-3, 0.0, -2e-3]))
     messages = outgoing.pair_messages(result, types)
     assert incoming.stamp_ns(messages.pairs.header) == result.stamp_ns
     [status] = messages.pairs.status
@@ -363,7 +364,7 @@ def test_every_pair_is_told(types):
         result.reference_ns1, result.reference_ns2)
     assert (values['status'], values['reason'], values['model']) == ('OK', '', 'uniform')
     assert (values['matches'], values['inliers']) == ('40', str(result.pose.inliers.sum()))
-    assert float(values['rotation_difference_to_gyro_deg']) == pytest.approx(0.0, abs=1e-6)
+    assert float(values['rotation_difference_to_gyro_deg']) == pytest.approx(np.degrees(5e-3))
     assert values['residual_rms_px'] == values['baseline_m'] == values['baseline_log_sigma'] == ''
     assert values['gyro_bias_rad_s'] == '0.001 0.0 -0.002'
     assert values['topics'] == 'relative_pose reference velocity matches relative_rotation'
