@@ -41,6 +41,13 @@ class SensorConfig:
     time_offset: float = setting(
         0.0, 'IMU clock minus camera clock: t_imu = stamp + time_offset', 's', low=-10.0,
         high=10.0)
+    time_offset_per_interval: float = setting(
+        0.0, 'change of time_offset by the interval T between frames (automatic exposure): '
+        't_imu = stamp + time_offset + time_offset_per_interval (T - '
+        'time_offset_reference_interval)', 's/s', low=-5.0, high=5.0)
+    time_offset_reference_interval: float = setting(
+        0.0, 'interval between frames at which time_offset holds; used with '
+        'time_offset_per_interval', 's', low=0.0, high=10.0)
     track_time_offset: bool = setting(
         False, 'apply the time offset that is tracked while running (it is always reported)',
         live=True)
@@ -64,6 +71,11 @@ class SensorConfig:
             raise MissingInputError('parameter quat_cam_imu_xyzw is not set: give the rotation '
                                     'from IMU to camera, v_cam = R(q) v_imu, as [x, y, z, w]')
         return Rotation.from_quat(self.quat_cam_imu_xyzw).as_matrix()
+
+    def offset_at(self, interval: float) -> float:
+        """`time_offset` [s] at an interval between frames [s]."""
+        return self.time_offset + self.time_offset_per_interval * (
+            interval - self.time_offset_reference_interval)
 
     def missing(self) -> list[str]:
         """Names of the settings that have no default and were not given."""

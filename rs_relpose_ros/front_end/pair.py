@@ -54,12 +54,12 @@ class PairResult:
     rays2: Array
     parallax: float   # [px] median after derotation
     gyro_rotation: Array | None = None   # (3, 3) R_1^T R_2 integrated from the gyro
-    gyro_bias: Array | None = None   # (3,) [rad/s] that was removed for it, IMU frame
     # (3,) [rad] rotation by the images alone against the gyro's; None without either
     images_against_gyro: Array | None = None
     health: Health = NOT_JUDGED   # of what was told, all three as after this pair
     tracked: Tracked | None = None
     applied: Applied = NOTHING_APPLIED
+    gyro_bias: Array | None = None   # (3,) [rad/s] that was removed for it, IMU frame
     image1: NDArray[np.uint8] | None = None   # both only where the front end keeps images
     image2: NDArray[np.uint8] | None = None
 

@@ -27,7 +27,7 @@ from rs_relpose_ros.health.turning import rotation_of_rays
 from rs_relpose_ros.imu.frame_imu import FrameImu, GyroSegment
 from rs_relpose_ros.imu.integration import bias_jacobian, integrate_rotation
 from rs_relpose_ros.tracking.matches import Matches
-from rs_relpose_ros.tracking.tracker import make_tracker
+from rs_relpose_ros.tracking.tracker import make_tracker, Tracker
 
 Array = NDArray[np.float64]
 
@@ -64,15 +64,17 @@ class Pipeline:
     """Tracks frames against a reference keyframe and estimates a pose whenever a pair closes.
 
     Parameters that may change while running (declared `live`) are not kept: `process` gets the
-    current ones with each frame. With `keep_images` results carry the two images.
+    current ones with each frame. With `keep_images` results carry the two images. `tracker`:
+    instead of the one that the parameters name.
     """
 
-    def __init__(self, parameters: Parameters, keep_images: bool = False) -> None:
+    def __init__(self, parameters: Parameters, keep_images: bool = False,
+                 tracker: Tracker | None = None) -> None:
         missing = parameters.sensor.missing()
         if missing:
             raise MissingInputError('parameters are missing: ' + ', '.join(missing))
         self._keep_images = keep_images
-        self._tracker = make_tracker(parameters.tracking)
+        self._tracker = make_tracker(parameters.tracking) if tracker is None else tracker
         self._health = HealthMonitor()
         self._seen: Tracked | None = None
         self._applied = Applied()
@@ -231,10 +233,10 @@ class Pipeline:
             matches=matches, row_times1=rays1.row_times, row_times2=rays2.row_times,
             rays1=rays1.rays, rays2=rays2.rays, parallax=self._parallax(rays1, rays2, sensor),
             gyro_rotation=None if gyro is None else gyro.rotation,
-            gyro_bias=None if gyro is None else (
-                parameters.sensor.R_cam_imu.T @ gyro.segment.bias),
             images_against_gyro=None if seen is None else seen.images_against_gyro,
             health=self._health.health, tracked=self._seen, applied=self._applied,
+            gyro_bias=None if gyro is None else (
+                parameters.sensor.R_cam_imu.T @ gyro.segment.bias),
             image1=reference.frame.image if self._keep_images else None,
             image2=view.frame.image if self._keep_images else None)
 

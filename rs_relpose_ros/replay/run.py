@@ -122,6 +122,7 @@ class Replay:
         stamp = stamp_ns(image.header)
         if stamp not in self._stamps:
             self.counts.images_skipped += 1
+            self.sequencer.pass_over(stamp)
             return False
         self._stamps_found.add(stamp)
         return True
