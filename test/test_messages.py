@@ -20,10 +20,12 @@ from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.front_end.sequencer import FrameRefused, ReadyFrame, Refusal, Sequencer
+from rs_relpose_ros.health.findings import Finding, Health, HealthState
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.messages import incoming, outgoing
 from rs_relpose_ros.messages.hanging import HangingCamera, HangingGyro
 from rs_relpose_ros.messages.intake import Intake
+from rs_relpose_ros.messages.published_pair import published_pair
 from rs_relpose_ros.messages.sensor_feed import Role
 
 # Luma of ITU-R BT.601.
@@ -349,7 +351,8 @@ def told(messages: outgoing.PairMessages) -> dict[str, str]:
 
 
 def test_every_pair_is_told(types):
-    result = replace(pair(), gyro_rotation=pair().pose.R, gyro_bias=np.array([1e-3, 0.0, -2e-3]))
+    result = replace(pair(), images_against_gyro=np.array([0.0, 3e-3, 4e-3]),
+                     gyro_bias=np.array([1e-3, 0.0, -2e-3]))
     messages = outgoing.pair_messages(result, types)
     assert incoming.stamp_ns(messages.pairs.header) == result.stamp_ns
     [status] = messages.pairs.status
@@ -361,10 +364,21 @@ def test_every_pair_is_told(types):
         result.reference_ns1, result.reference_ns2)
     assert (values['status'], values['reason'], values['model']) == ('OK', '', 'uniform')
     assert (values['matches'], values['inliers']) == ('40', str(result.pose.inliers.sum()))
-    assert float(values['rotation_difference_to_gyro_deg']) == pytest.approx(0.0, abs=1e-6)
+    assert float(values['rotation_difference_to_gyro_deg']) == pytest.approx(np.degrees(5e-3))
     assert values['residual_rms_px'] == values['baseline_m'] == values['baseline_log_sigma'] == ''
     assert values['gyro_bias_rad_s'] == '0.001 0.0 -0.002'
     assert values['topics'] == 'relative_pose reference velocity matches relative_rotation'
+
+
+@pytest.mark.parametrize(('state', 'level'), [('ok', 0), ('suspect', 1), ('wrong', 2)])
+def test_health_is_told_with_every_pair(types, state, level):
+    finding = Finding('time_offset', 0.03, 0.0, 6e-4, 's', True, HealthState(state), 'as it is')
+    messages = outgoing.pair_messages(replace(pair(), health=Health((finding,))), types)
+    values = told(messages)
+    assert (values['health'], values['health_findings']) == (
+        state, f'time_offset {state}: as it is')
+    assert messages.pairs.status[0].level in (level, bytes([level]))
+    assert published_pair(messages).health == state
 
 
 @pytest.mark.parametrize('status', [Status.PURE_ROTATION, Status.LOW_PARALLAX])

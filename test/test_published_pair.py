@@ -240,9 +240,9 @@ def test_a_malformed_cloud_is_refused(pairs, path, value, sentence):
     ('pairs', 'status.0.values.0.key', 'other', 'must have the key reference_stamp_ns'),
     ('pairs', 'status.0.values.0.value', '-5', 'reference_stamp_ns .* an instant'),
     ('pairs', 'status.0.values.0.value', '9' * 20, 'reference_stamp_ns .* an instant'),
-    ('pairs', 'status.0.values.-2.value', '0.1 0.2', 'gyro_bias_rad_s .* three numbers'),
-    ('pairs', 'status.0.values.-2.value', '0.1 0.2 inf', 'gyro_bias_rad_s .* finite'),
-    ('pairs', 'status.0.values.-2.value', ' ', 'gyro_bias_rad_s .* finite'),
+    ('pairs', 'status.0.values.-4.value', '0.1 0.2', 'gyro_bias_rad_s .* three numbers'),
+    ('pairs', 'status.0.values.-4.value', '0.1 0.2 inf', 'gyro_bias_rad_s .* finite'),
+    ('pairs', 'status.0.values.-4.value', ' ', 'gyro_bias_rad_s .* finite'),
     ('pairs', 'status.0.values.-1.value', 'matches', 'must name all others'),
     ('pairs', 'status.0.values.-1.value', 'relative_rotation', 'tells of pairs relative_rotation'),
 ])

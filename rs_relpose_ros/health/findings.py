@@ -58,6 +58,12 @@ class Health:
         return tuple(finding for state in (HealthState.WRONG, HealthState.SUSPECT)
                      for finding in self.findings if finding.state is state)
 
+    @property
+    def text(self) -> str:
+        """Figure, state and sentence of each finding, in one line."""
+        return '; '.join(f'{finding.figure} {finding.state.value}: {finding.sentence}'
+                         for finding in self.findings)
+
     def as_json(self) -> Mapping[str, Any]:
         """As summary.json has it."""
         return {'state': self.state.value,

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.geometry.timing import NANOSECONDS
+from rs_relpose_ros.health.findings import HealthState
 from rs_relpose_ros.messages.pair_status import PAIR_VALUES, TOPICS_KEY
 
 MessageTypes = Callable[[str], Any]
@@ -135,7 +136,7 @@ def _pair_status_message(result: PairResult, others: Sequence[str], types: Messa
     text = f'{pose.status.value}: {pose.reason}' if pose.reason else pose.status.value
     values = [(value.key, value.text(result)) for value in PAIR_VALUES]
     return diagnostics_message(result.stamp_ns, status_message(
-        0 if pose else 1, 'keyframe pair', text, result.frame_id,
+        _level(result), 'keyframe pair', text, result.frame_id,
         [*values, (TOPICS_KEY, ' '.join(others))], types), types)
 
 
@@ -201,6 +202,13 @@ def status_message(level: int, name: str, text: str, hardware_id: str,
     return status_type(
         level=bytes([level]) if _is_rclpy(status_type) else level, name=name, message=text,
         hardware_id=hardware_id, values=[key_value(key=key, value=value) for key, value in values])
+
+
+def _level(result: PairResult) -> int:
+    """2: what was told is wrong; 1: it may be, or there is no pose; 0: all is well."""
+    if result.health.state is HealthState.WRONG:
+        return 2
+    return 0 if result.pose and result.health.state is not HealthState.SUSPECT else 1
 
 
 # -- parts -----------------------------------------------------------------------------------

@@ -51,6 +51,8 @@ PAIR_VALUES = (
     PairValue('reference_imu_ns', lambda pair: str(pair.reference_ns1)),
     PairValue('current_imu_ns', lambda pair: str(pair.reference_ns2)),
     PairValue('gyro_bias_rad_s', lambda pair: numbers(pair.gyro_bias)),
+    PairValue('health', lambda pair: pair.health.state.value),
+    PairValue('health_findings', lambda pair: pair.health.text),
 )
 TOPICS_KEY = 'topics'
 

@@ -59,6 +59,7 @@ class PublishedPair:
     baseline: float   # [m]
     baseline_log_sigma: float   # 1 sigma of its logarithm
     gyro_bias: Array   # (3,) [rad/s] that was removed, in the axes of the IMU
+    health: str   # of what was told of camera and IMU, as of `HealthState`
     matches: NDArray[np.void]   # (N,), of MATCH_DTYPE
 
     def __bool__(self) -> bool:
@@ -165,7 +166,7 @@ def published_pair(messages: PairMessages) -> PublishedPair:
         covariance=covariance, linear_velocity=linear_velocity, angular_velocity=angular_velocity,
         velocity_covariance=velocity_covariance, baseline=status.real('baseline_m'),
         baseline_log_sigma=status.real('baseline_log_sigma'),
-        gyro_bias=status.vector('gyro_bias_rad_s'), matches=matches)
+        gyro_bias=status.vector('gyro_bias_rad_s'), health=status.text('health'), matches=matches)
 
 
 def pair_status(pairs: Any) -> PairStatus:

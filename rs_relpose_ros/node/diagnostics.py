@@ -179,6 +179,4 @@ def _tracked_values(last: PairResult | None) -> tuple[tuple[str, str], ...]:
 def _health_values(last: PairResult | None) -> tuple[tuple[str, str], ...]:
     """State of what was told, and a sentence for each figure."""
     health = NOT_JUDGED if last is None else last.health
-    return (('health', health.state.value),
-            ('health_findings', '; '.join(f'{finding.figure} {finding.state.value}: '
-                                          f'{finding.sentence}' for finding in health.findings)))
+    return ('health', health.state.value), ('health_findings', health.text)
