@@ -460,3 +460,58 @@ def test_two_topics_are_not_late_to_each_other(live):
         live.add_imu(sample(ms, force=None))
         live.add_imu(sample(ms - 2, gyro=None))
     assert live.counts().imu_late == 0
+
+
+# -- offset by the interval --------------------------------------------------------------------
+
+BY_INTERVAL = {'time_offset_per_interval': -0.5, 'time_offset_reference_interval': 0.04}
+
+
+def first_rows(sequencer: Sequencer) -> list[float]:
+    """Instants of the first rows of what is ready, after their stamps [ms]."""
+    return [(ready.imu.reference_ns - ready.frame.stamp_ns) / MS
+            for ready in drain(sequencer) if isinstance(ready, ReadyFrame)]
+
+
+def test_offset_follows_the_interval_to_the_frame_before():
+    sequencer = Sequencer(parameters(**BY_INTERVAL), offline=True)
+    add_imu(sequencer, 0, 500)
+    for ms in (50, 90, 140, 190, 300, 350):
+        sequencer.add_frame(frame(ms))
+    # The first frame has no interval; 110 ms after 50 ms are frames lost.
+    assert first_rows(sequencer) == [0.0, 0.0, -5.0, -5.0, -5.0, -5.0]
+
+
+def test_offset_by_interval_is_that_of_the_live_node_where_frames_are_dropped(clock):
+    stamps_ms = [50, 90, 130, 170, 220, 270, 320, 370, 430, 490]
+    live = Sequencer(parameters(**BY_INTERVAL), clock=clock)
+    add_imu(live, 0, 600)
+    for ms in stamps_ms:
+        live.add_frame(frame(ms))
+    ready = [item for item in drain(live) if isinstance(item, ReadyFrame)]
+    assert len(ready) == MAILBOX_FRAMES < len(stamps_ms)
+    # Replayed with the stamps that the node processed, the others are passed over.
+    kept = {item.frame.stamp_ns for item in ready}
+    replay = Sequencer(parameters(**BY_INTERVAL), offline=True)
+    add_imu(replay, 0, 600)
+    for ms in stamps_ms:
+        if frame(ms).stamp_ns in kept:
+            replay.add_frame(frame(ms))
+        else:
+            replay.pass_over(frame(ms).stamp_ns)
+    assert first_rows(replay) == [(item.imu.reference_ns - item.frame.stamp_ns) / MS
+                                  for item in ready]
+
+
+def test_a_frame_of_a_longer_interval_waits_for_its_own_last_row():
+    sequencer = Sequencer(parameters(time_offset_per_interval=1.0,
+                                     time_offset_reference_interval=0.04), offline=True)
+    add_imu(sequencer, 0, 160)
+    for ms in (50, 90, 140):
+        sequencer.add_frame(frame(ms))
+    # 140 + 10 + 19 = 169 ms.
+    assert stamps(drain(sequencer)) == [50.0, 90.0]
+    sequencer.add_imu(sample(165))
+    assert sequencer.take() is None
+    sequencer.add_imu(sample(170))
+    assert stamps(drain(sequencer)) == [140.0]

@@ -310,6 +310,32 @@ def _run_trust(args: argparse.Namespace) -> int:
     return _tell(report, args.output)
 
 
+def _stretches_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('bags', nargs='+', type=Path, metavar='BAG',
+                        help='recordings of one camera with one IMU')
+    parser.add_argument('--seconds', type=float, default=4.0, metavar='S',
+                        help='length of a part (default: %(default)s)')
+    parser.add_argument('--rows', metavar=('FIRST', 'LAST'), type=float, nargs=2,
+                        default=(0.0, 0.0), help='use only these image rows')
+
+
+def _run_calibration_stretches(args: argparse.Namespace) -> int:
+    from rs_relpose_lab.experiments.calibration_stretches import (
+        calibrated_parts,
+        figures_of,
+        read_bag,
+        write_report,
+    )
+
+    if args.seconds <= 0.0:
+        raise InputError(f'--seconds must be positive, got {args.seconds:g}')
+    parts = [part for bag in args.bags for part in calibrated_parts(
+        bag.name, read_bag(bag, tuple(args.rows)), args.seconds, print)]
+    if not parts:
+        raise InputError('no part of these bags can be calibrated')
+    return _tell(write_report(args.output, figures_of(parts)), args.output)
+
+
 def _all_arguments(parser: argparse.ArgumentParser) -> None:
     _number(parser, '--trials', 200, 'problems a cell of the accuracy benchmark')
     _number(parser, '--soak', 100_000, 'see whether memory grows over N estimates')
@@ -370,6 +396,11 @@ BENCHMARKS = {
         'poses in their own sigmas. docs/lab/trust.md explains the columns.',
         _trust_arguments, _run_trust, 'trust', first_seed=1001, seed_of='bag',
         jobs='processes'),
+    'calibration-stretches': Benchmark(
+        'whether parts of real recordings agree within the sigmas of `rs_relpose calibrate`',
+        'Cuts recordings of one camera into parts, calibrates each from nothing, and prints '
+        'chi^2 of every figure over the parts.',
+        _stretches_arguments, _run_calibration_stretches, 'calibration_stretches'),
     'all': Benchmark(
         'accuracy and speed, as the project reports them',
         'Both with their defaults, told sigmas also half and twice the true ones, and memory over '

@@ -58,7 +58,9 @@ def frame_times(stamps_ns: NDArray[np.int64]) -> FrameTimes:
     low, high = np.quantile(longer, (0.1, 0.9))
     if high - low <= _VARYING * median:
         return none
-    deviations = longer[1:] - longer[1:].mean()
+    # A few frames, as those of a camera that has just been started, must not decide.
+    deviations = np.clip(longer[1:], *np.quantile(longer[1:], (0.05, 0.95)))
+    deviations -= deviations.mean()
     correlation = float(deviations[1:] @ deviations[:-1] / max(deviations @ deviations, 1e-24))
     if correlation > _TOLD_APART:
         return FrameTimes(Varying.EXPOSURE, longer, 0.0)
