@@ -11,7 +11,7 @@ from rs_relpose_ros.check import judge_images, judge_imu, judge_together
 from rs_relpose_ros.check.completion import completed, Completion
 from rs_relpose_ros.check.findings import CheckReport, FAILURE, Finding, Verdict, WARNING
 from rs_relpose_ros.check.scan import Chosen, Scan
-from rs_relpose_ros.check.trial import part_of, Trial
+from rs_relpose_ros.check.trial import middle_of, Trial
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.messages.sensor_feed import PARTS, Role
@@ -62,7 +62,7 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters,
     if chosen.image is not None and chosen.imu is not None:
         completion = completed(
             bag, SensorTopics(chosen.image, chosen.camera_info, chosen.imu, chosen.accel, None),
-            parameters, part_of(images, 1), on_message)
+            parameters, middle_of(images), on_message)
         if not completion.parameters.sensor.missing():
             trial = Trial(images, completion.parameters)
     for role, message in seen.feed.messages(bag, chosen):

@@ -27,12 +27,18 @@ _APART_NS = to_nanoseconds(3.0)
 _MOST_WAITING = 64
 
 
-def part_of(images: int, part: int) -> range:
+def _part_of(images: int, part: int) -> range:
     """Indices of the images of a part of a recording of so many `images`, 0 to 2."""
     if images <= _PARTS * _PART_IMAGES:
         return range(part * images // _PARTS, (part + 1) * images // _PARTS)
     first = part * (images - _PART_IMAGES) // (_PARTS - 1)
     return range(first, first + _PART_IMAGES)
+
+
+def middle_of(images: int) -> range:
+    """Indices of as many images as a part has, in the middle of the recording."""
+    first = max(images - _PART_IMAGES, 0) // 2
+    return range(first, first + min(images, _PART_IMAGES))
 
 
 class Trial:
@@ -46,7 +52,7 @@ class Trial:
         told = parameters.updated({'withhold_when_wrong': False, 'track_time_offset': False})
         self._front_end = FrontEnd(told, offline=True)
         self._intake = Intake(self._front_end.sequencer, told.imu.stuck_gyro_time, told.intrinsics)
-        self._parts = tuple(part_of(images, part) for part in range(_PARTS))
+        self._parts = tuple(_part_of(images, part) for part in range(_PARTS))
         self._index = -1
         self._before = NOT_JUDGED   # of what is judged so far
         self._last: PairResult | None = None
