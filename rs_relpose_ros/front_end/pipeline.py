@@ -307,7 +307,7 @@ def _evidence(pose: RelativePose, matches: Matches, reference: _View, view: _Vie
     return PairEvidence(
         sensor.intrinsics.to_sensor(matches.points1), sensor.intrinsics.to_sensor(matches.points2),
         sensor.camera, reference.imu.motion, view.imu.motion, _interval(reference, view),
-        pose.R, pose.t, gyro.rotation, turn_sensitivity(
+        pose.R, pose.t, gyro.rotation, gyro.covariance, turn_sensitivity(
             segment.stamps_ns, segment.angular_velocities, parameters.imu),
         (segment.angular_velocities[0], segment.angular_velocities[-1]),
         parameters.sensor.R_cam_imu, parameters.estimator.gyro_sigma)
