@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 _VARYING = 0.02
 # Correlation of successive intervals beyond which, up or down, they are told apart.
 _TOLD_APART = 0.15
+# Steps of so many medians have an image missing.
+_MISSING = 1.8
 # The smooth line: straight within so many frames (1 sigma of the weights).
 _SMOOTH = 10.0
 
@@ -68,6 +70,15 @@ def frame_times(stamps_ns: NDArray[np.int64]) -> FrameTimes:
         late = _smooth(stamps_ns, median)
         return FrameTimes(Varying.JITTER, late, float(np.sqrt((late**2).mean())))
     return none._replace(varying=Varying.UNCLEAR)
+
+
+def _of_successive(steps: Array) -> float:
+    """Correlation of successive steps, shares of their median; with no image missing between."""
+    whole = steps < _MISSING
+    both = whole[1:] & whole[:-1]
+    deviations = steps - (steps[whole].mean() if whole.any() else 1.0)
+    first, second = deviations[:-1][both], deviations[1:][both]
+    return float(first @ second / max(0.5 * (first @ first + second @ second), 1e-24))
 
 
 def _smooth(stamps_ns: NDArray[np.int64], interval: float) -> Array:
