@@ -147,12 +147,15 @@ class Pipeline:
             seconds_between(self._previous.frame.stamp_ns, frame.stamp_ns))
         self._previous = view
         self._gyro = self._turn_with(imu.since_previous, parameters)
-        self._compare_turns(frame.stamp_ns, matches, sensor)
         rays1, rays2 = self._derotate(matches, self._reference.imu.motion, imu.motion, sensor)
         since = SinceKeyframe(self._parallax(rays1, rays2, sensor),
                               _interval(self._reference, view), self._frames,
                               self._tracker.tracked_fraction)
-        if not closes_pair(since, parameters.keyframes):
+        closing = closes_pair(since, parameters.keyframes)
+        # Where tracks are lost pairs close early, and few tracks outlive them.
+        if closing or self._turn.frames >= _TURN_FRAMES:
+            self._compare_turns(frame.stamp_ns, matches, sensor)
+        if not closing:
             return None
         result = self._close_pair(self._reference, view, sensor, parameters)
         self._restart_from(view)
@@ -267,8 +270,6 @@ class Pipeline:
 
     def _compare_turns(self, stamp_ns: int, matches: Matches, sensor: Sensor) -> None:
         """Compare how images turned over some frames, without the gyro, with the gyro."""
-        if self._turn.frames < _TURN_FRAMES:
-            return
         before, ids = self._turn, matches.track_ids[:_TURN_POINTS]
         rays = sensor.camera.unproject(sensor.intrinsics.to_sensor(matches.points2[:_TURN_POINTS]))
         _, old, new = np.intersect1d(before.ids, ids, assume_unique=True, return_indices=True)
@@ -297,7 +298,8 @@ class Pipeline:
         in_force[OFFSET] = view.imu.applied_offset_ns / NANOSECONDS
         if self._gyro is not None:
             in_force[BIAS] = parameters.sensor.R_cam_imu.T @ self._gyro.segment.bias - bias
-        return Told(parameters.sensor, sensor.camera, bias, in_force)
+        return Told(parameters.sensor, sensor.camera, bias, parameters.imu.gyro_bias_sigma,
+                    in_force)
 
 
 def _evidence(pose: RelativePose, matches: Matches, reference: _View, view: _View, gyro: _GyroTurn,
