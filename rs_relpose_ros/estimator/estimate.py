@@ -111,7 +111,7 @@ def estimate_relative_pose(
     -----
     Design: hypotheses from derotated rays (gyro rotation and 2 points, angular 3- and 5-point),
     multi-scale MSAC, local optimisation of the uniform model on a shrinking threshold, joint MAP
-    fit with the velocity prior chosen by its evidence, covariance from the Hessian; see
+    fit with the velocity prior chosen by its evidence, sandwich covariance over image regions; see
     `docs/estimator.md`.
 
     Examples
@@ -197,8 +197,9 @@ class Estimation:
         turned = self._rotation_only(refined)
         if turned is not None:
             return turned
-        # 5. Covariance at the optimum, then from the middle to the reference row.
-        at_middle = pair_state(self.problem, refined.state, refined.covariance)
+        # 5. Covariances at the optimum, then from the middle to the reference row.
+        at_middle = pair_state(self.problem, refined.state,
+                               np.stack([refined.covariance, refined.fitted_covariance]))
         pose = to_reference_row(at_middle, self.problem.reference_row_time,
                                 *self._turns_to_reference_row(refined.state))
         return self._result(pose, refined)
@@ -244,7 +245,8 @@ class Estimation:
             if free and self.interval is not None:
                 grid = GRID[GRID >= LEAST_VELOCITY_CHANGE]
             return fit_with_evidence(matches, state, self.priors,
-                                     Noise(config.pixel_sigma, config.threshold), grid)
+                                     Noise(config.pixel_sigma, config.threshold), grid,
+                                     self._gyro_error())
         inliers = select_inliers(matches, state, config.threshold)
         if config.refinement == 'alternating' and inliers.sum() >= 12:
             state = self._in_front(refine_alternating(
@@ -254,7 +256,21 @@ class Estimation:
         covariance = local_covariance(
             FitMatches(matches.observations, inliers, config.pixel_sigma), state,
             with_velocity_sigma(self.priors, velocity_sigma))
-        return Refined(state, inliers, velocity_sigma, config.pixel_sigma, covariance)
+        return Refined(state, inliers, velocity_sigma, config.pixel_sigma, covariance, covariance)
+
+    def _gyro_error(self) -> Array:
+        """Covariance (3, 3) of the gyro's rotation by errors s of the stamps, in frame 1.
+
+        The gyro is integrated between instants that are off: ``s^2 (w_1 w_1^T + w_2 w_2^T)``, w_2
+        turned into frame 1. Not in the prior, whose weight it would lower to the images' gain:
+        on recordings with such stamps the poses did not get better (docs/estimator.md).
+        """
+        problem, sigma = self.problem, self.config.stamp_sigma
+        if problem.rotation is None or sigma == 0.0:
+            return np.zeros((3, 3))
+        turned = np.column_stack([problem.motion1.angular_velocity,
+                                  problem.rotation @ problem.motion2.angular_velocity])
+        return np.asarray(sigma**2 * turned @ turned.T)
 
     def _no_consensus(self, inliers: Flags) -> str:
         """Why the matches that agree tell no pose; empty where they may."""
@@ -304,10 +320,13 @@ class Estimation:
             state._replace(R=R, dw1=np.zeros(3), dw2=np.zeros(3)))
         covariance = np.full((6, 6), np.nan)
         # No rotation is less certain than half a turn: points in one place show only two angles.
-        covariance[3:, 3:] = turn1.T @ inverse(information + np.eye(3) / np.pi**2) @ turn1
+        fitted = inverse(information + np.eye(3) / np.pi**2)
+        of_gyro = fitted @ self.priors.rotation_information
+        covariance[3:, 3:] = turn1.T @ (fitted + of_gyro @ self._gyro_error() @ of_gyro.T) @ turn1
         return RelativePose(
             status=Status.PURE_ROTATION if turned_only else Status.LOW_PARALLAX, reason=reason,
-            R=turn1.T @ R @ turn2, covariance=covariance, inliers=inliers,
+            R=turn1.T @ R @ turn2, covariance=covariance,
+            fitted_rotation_covariance=turn1.T @ fitted @ turn1, inliers=inliers,
             angular_velocity1=problem.motion1.angular_velocity,
             angular_velocity2=problem.motion2.angular_velocity, model='angular',
             iterations=self.iterations, residual_rms=float(np.sqrt(np.mean(left**2))))
@@ -323,7 +342,8 @@ class Estimation:
                 exp_so3(delay * (state.R.T @ state.dw2)) @ turn2)
 
     def _result(self, pose: PairState, refined: Refined) -> RelativePose:
-        translation_sigma = np.sqrt(max(np.trace(pose.covariance[:3, :3]), 0.0))
+        covariance, fitted_covariance = pose.covariance
+        translation_sigma = np.sqrt(max(np.trace(covariance[:3, :3]), 0.0))
         r = residuals(self.problem.observations, refined.state)[refined.inliers]
         carries_pose = translation_sigma <= MAX_TRANSLATION_SIGMA
         v2w2 = np.r_[9:12, 15:18]
@@ -333,8 +353,9 @@ class Estimation:
             f'{np.degrees(translation_sigma):.0f} deg: too little parallax',
             R=pose.R, t=pose.t if carries_pose else np.full(3, np.nan),
             linear_velocity1=pose.v1, linear_velocity2=pose.v2, angular_velocity1=pose.w1,
-            angular_velocity2=pose.w2, inliers=refined.inliers, covariance=pose.covariance[:6, :6],
-            velocity_covariance=pose.covariance[np.ix_(v2w2, v2w2)], model=self.mode.model.name,
+            angular_velocity2=pose.w2, inliers=refined.inliers, covariance=covariance[:6, :6],
+            velocity_covariance=covariance[np.ix_(v2w2, v2w2)],
+            fitted_rotation_covariance=fitted_covariance[3:6, 3:6], model=self.mode.model.name,
             velocity_sigma=refined.velocity_sigma, iterations=self.iterations,
             residual_rms=float(np.sqrt(np.mean(r**2))))
 

@@ -136,8 +136,8 @@ def _checked_columns(observations: Array) -> tuple[NDArray[np.bool_], Array]:
 class PairState:
     """A pose between two rows with its covariance; velocities each in its own camera's frame.
 
-    ``covariance`` (18, 18) is of ``(dt, dtheta, dv_1, dv_2, dw_1, dw_2)``: dt and dtheta in
-    camera 1 as in `RelativePose`, velocities in their own frames.
+    ``covariance`` (..., 18, 18) is of ``(dt, dtheta, dv_1, dv_2, dw_1, dw_2)``: dt and dtheta in
+    camera 1 as in `RelativePose`, velocities in their own frames. There may be several.
     """
 
     R: Array

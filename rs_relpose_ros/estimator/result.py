@@ -53,6 +53,9 @@ class RelativePose:
         ``R_true = Exp(dtheta) R``, both in camera 1.
     velocity_covariance : (6, 6) ndarray
         Of `linear_velocity2` and `angular_velocity2`, in camera 2.
+    fitted_rotation_covariance : (3, 3) ndarray
+        Of dtheta as the fit weighed images and gyro: what remains once the gyro's information is
+        taken out of its inverse is the images'. The errors themselves follow `covariance`.
     model : str
         'uniform', 'angular', 'linear' or 'global'.
     velocity_sigma : float
@@ -76,6 +79,7 @@ class RelativePose:
     inliers: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
     covariance: Array = field(default_factory=lambda: _nan(6, 6))
     velocity_covariance: Array = field(default_factory=lambda: _nan(6, 6))
+    fitted_rotation_covariance: Array = field(default_factory=lambda: _nan(3, 3))
     model: str = ''
     velocity_sigma: float = float('nan')
     iterations: int = 0
@@ -100,6 +104,7 @@ class RelativePose:
             linear_velocity1=self.linear_velocity2, linear_velocity2=self.linear_velocity1,
             angular_velocity1=self.angular_velocity2, angular_velocity2=self.angular_velocity1,
             inliers=self.inliers, covariance=jacobian @ self.covariance @ jacobian.T,
+            fitted_rotation_covariance=R_inv @ self.fitted_rotation_covariance @ R_inv.T,
             model=self.model, velocity_sigma=self.velocity_sigma, iterations=self.iterations,
             residual_rms=self.residual_rms, duration=self.duration)
 

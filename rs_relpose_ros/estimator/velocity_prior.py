@@ -20,6 +20,7 @@ from rs_relpose_ros.estimator.map_fit import DataTerm, fit, FitMatches, linearis
 from rs_relpose_ros.estimator.priors import Priors, with_velocity_sigma
 from rs_relpose_ros.estimator.sampson import residuals
 from rs_relpose_ros.estimator.state import moved, PARAMETERS, step_between, TwoViewState
+from rs_relpose_ros.estimator.uncertainty import sandwich, score_covariance
 
 Array = NDArray[np.float64]
 
@@ -55,7 +56,8 @@ class Refined(NamedTuple):
 
     `inliers` (N,): the matches that the last fits used. `velocity_sigma`: the prior sigma of the
     most evidence [baselines per second]. `sigma`: noise of a match that the fits used [px].
-    `covariance` (17, 17): of the local parameters, within the fits and between them.
+    `covariance` (17, 17): of the local parameters, within the fits and between them;
+    `fitted_covariance` (17, 17): the same as the weights of the fits have it.
     """
 
     state: TwoViewState
@@ -63,6 +65,7 @@ class Refined(NamedTuple):
     velocity_sigma: float
     sigma: float
     covariance: Array
+    fitted_covariance: Array
 
 
 @kernel
@@ -75,11 +78,11 @@ def noise_sigma(observations_cost: float, count: int, told: float) -> float:
 
 @kernel
 def fit_with_evidence(matches: Matches, start: TwoViewState, priors: Priors, noise: Noise,
-                      grid: Array) -> Refined:
+                      grid: Array, gyro_error: Array) -> Refined:
     """Select inliers and fit repeatedly; average over the velocity priors at the end.
 
     `grid` (K,) holds the prior sigmas of the velocities; the state is the mean over them, weighted
-    by their evidence.
+    by their evidence. `gyro_error` (3, 3) is that of `score_covariance`.
     """
     size = grid.shape[0]
     state = start
@@ -113,9 +116,9 @@ def fit_with_evidence(matches: Matches, start: TwoViewState, priors: Priors, noi
         used = _selected(matches, state, _reach(noise.threshold, used.sigma), noise.sigma)
         if (used.use == chosen_from).all():
             break
-    state, covariance, best = _average(matches, used, start, steps, lacking < LEAST_EVIDENCE,
-                                       priors, grid, noise.threshold)
-    return Refined(state, used.use, grid[best], used.sigma, covariance)
+    state, covariances, best = _average(matches, used, start, steps, lacking < LEAST_EVIDENCE,
+                                        priors, grid, noise.threshold, gyro_error)
+    return Refined(state, used.use, grid[best], used.sigma, covariances[1], covariances[0])
 
 
 @kernel
@@ -155,26 +158,30 @@ def _candidate(matches: Matches, used: FitMatches, start: TwoViewState, data: Da
 
 @linked_kernel
 def _average(matches: Matches, used: FitMatches, start: TwoViewState, steps: Array, likely: Flags,
-             priors: Priors, grid: Array, threshold: float) -> tuple[TwoViewState, Array, int]:
-    """Mean state, its covariance (17, 17), and the number of the prior of the most evidence.
+             priors: Priors, grid: Array, threshold: float,
+             gyro_error: Array) -> tuple[TwoViewState, Array, int]:
+    """Mean state, its covariances (2, 17, 17), and the number of the prior of the most evidence.
 
     Where the data cannot tell which prior is right, one of them alone would be overconfident. The
-    fits go on from `steps` (K, 17) from `start`, for the `likely` (K,) priors.
+    fits go on from `steps` (K, 17) from `start`, for the `likely` (K,) priors. The covariances
+    are that of the weights, and that of the errors that matches and gyro show.
     """
     size = grid.shape[0]
     evidences = np.full(size, -math.inf)
-    covariances = np.zeros((size, PARAMETERS, PARAMETERS))
+    hessians = np.zeros((size, PARAMETERS, PARAMETERS))
+    of_data = np.zeros((size, PARAMETERS, PARAMETERS))
     for k in range(size):
         if likely[k]:
             own = moved(start, steps[k])
-            state, _, hessian, evidences[k] = _candidate(
+            state, data, hessians[k], evidences[k] = _candidate(
                 matches, used, own, linearised(used, own), priors, grid[k], threshold,
                 LAST_ITERATIONS)
             steps[k] = step_between(start, state)
-            covariances[k] = inverse(hessian)
+            of_data[k] = data.hessian
     best = int(np.argmax(evidences))
     # Around the best one, where the local parameters of all of them are small.
     origin = moved(start, steps[best])
+    scores = score_covariance(used, origin, of_data[best], hessians[best], priors, gyro_error)
     weights = np.exp(evidences - evidences[best])
     weights /= weights.sum()
     mean = np.zeros(PARAMETERS)
@@ -183,9 +190,13 @@ def _average(matches: Matches, used: FitMatches, start: TwoViewState, steps: Arr
         if likely[k]:
             away[k] = step_between(origin, moved(start, steps[k]))
             mean += weights[k] * away[k]
-    covariance = np.zeros((PARAMETERS, PARAMETERS))
+    covariances = np.zeros((2, PARAMETERS, PARAMETERS))
     for k in range(size):
         if likely[k]:
             rest = away[k] - mean
-            covariance += weights[k] * (covariances[k] + np.outer(rest, rest))
-    return moved(origin, mean), covariance, best
+            spread = np.outer(rest, rest)
+            fitted = inverse(hessians[k])
+            covariances[0] += weights[k] * (fitted + spread)
+            covariances[1] += weights[k] * (
+                sandwich(hessians[k], of_data[k], fitted, scores) + spread)
+    return moved(origin, mean), covariances, best

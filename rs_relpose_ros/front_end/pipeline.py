@@ -16,6 +16,7 @@ from rs_relpose_ros.front_end.derotated_rays import DerotatedRays, median_parall
 from rs_relpose_ros.front_end.drift import DriftTracker, PairRotation
 from rs_relpose_ros.front_end.frame import Frame, sensor_camera
 from rs_relpose_ros.front_end.pair import closes_pair, PairResult, SinceKeyframe
+from rs_relpose_ros.front_end.stamp_scatter import StampScatter
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import aligning_rotation
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between
@@ -69,6 +70,7 @@ class Pipeline:
         self._keep_images = keep_images
         self._tracker = make_tracker(parameters.tracking)
         self._drift = DriftTracker(parameters)
+        self._stamps = StampScatter()
         self._sensor: Sensor | None = None
         self._reference: _View | None = None
         self._previous: _View | None = None
@@ -86,6 +88,7 @@ class Pipeline:
     def reset(self) -> None:
         """Forget the reference keyframe: the next frame starts anew."""
         self._tracker.reset()
+        self._stamps.reset()
         self._reference = self._previous = self._gyro = None
         self._reference_rays = self._current_rays = None
         self._frames = 0
@@ -100,6 +103,7 @@ class Pipeline:
         self.prepare()
         sensor = self._sensor_of(frame, parameters)
         view = _View(frame, imu)
+        self._stamps.add(frame.stamp_ns)
         # Without the gyro tracks are not predicted, and wrong ones that agree by chance pass.
         if self._reference is None or self._previous is None or imu.since_previous is None:
             self._tracker.start(frame.image)
@@ -207,7 +211,8 @@ class Pipeline:
             relative_rotation=None if told is None else told.rotation,
             relative_rotation_covariance=None if told is None else told.covariance,
             interval=_interval(reference, view),
-            config=replace(parameters.estimator, gravity_sigma=gravity.sigma),
+            config=replace(parameters.estimator, gravity_sigma=gravity.sigma, stamp_sigma=max(
+                parameters.estimator.stamp_sigma, self._stamps.sigma)),
             quality=matches.quality,
             rng=np.random.default_rng([parameters.pair.seed, stamp1_ns, stamp2_ns]))
         self._follow_drift(pose, reference.imu, view.imu, parameters)
@@ -228,7 +233,8 @@ class Pipeline:
         gyro = self._gyro
         if gyro is not None:
             self._drift.add(PairRotation(
-                stamp_ns=imu2.reference_ns, R=pose.R, covariance=pose.covariance[3:, 3:],
+                stamp_ns=imu2.reference_ns, R=pose.R,
+                covariance=pose.fitted_rotation_covariance,
                 gyro_rotation=gyro.rotation,
                 gyro_covariance=gyro.covariance if parameters.pair.use_gyro_rotation else None,
                 gyro=gyro.segment, applied1=imu1.applied_offset_ns / NANOSECONDS,
