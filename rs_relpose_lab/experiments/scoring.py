@@ -40,23 +40,36 @@ def pose_error(R: Array, t: Array, true_R: Array, true_t: Array, covariance: Arr
     `covariance` (6, 6): of ``(dt, dtheta)`` with ``t_true = t + dt`` (dt perpendicular to t) and
         ``R_true = Exp(dtheta) R``, both in camera 1.
     """
+    error, basis = pose_difference(R, t, true_R, true_t)
+    rotation = float(np.degrees(np.linalg.norm(error[2:])))
+    translation = float(np.degrees(np.linalg.norm(error[:2])))
+    if covariance is None:
+        return PoseError(rotation, translation)
+    return PoseError(rotation, translation,
+                     normalised_square(error, basis.T @ covariance @ basis))
+
+
+def pose_difference(R: Array, t: Array, true_R: Array, true_t: Array) -> tuple[Array, Array]:
+    """Error (5,) [rad] of a pose, two of the direction of t and three of R, and its basis (6, 5).
+
+    The basis leads from it to ``(dt, dtheta)``; arguments as of `pose_error`.
+    """
     true_t = true_t / np.linalg.norm(true_t)
     turn = Rotation.from_matrix(true_R @ R.T).as_rotvec()
     away = true_t - (true_t @ t) * t
     sine = float(np.linalg.norm(away))
     angle = float(np.arctan2(sine, true_t @ t))
-    rotation = float(np.degrees(np.linalg.norm(turn)))
-    translation = float(np.degrees(angle))
-    if covariance is None:
-        return PoseError(rotation, translation)
     # Along the great circle: the direction of t is no vector space once the error is large.
     shift = away * (angle / sine) if sine > 0.0 else away
     basis = np.zeros((6, POSE_FREEDOM))
     basis[:3, :2] = np.linalg.svd(t[None])[2][1:].T
     basis[3:, 2:] = np.eye(3)
-    error = basis.T @ np.concatenate([shift, turn])
-    nees = error @ np.linalg.solve(basis.T @ covariance @ basis, error)
-    return PoseError(rotation, translation, float(nees))
+    return basis.T @ np.concatenate([shift, turn]), basis
+
+
+def normalised_square(error: Array, covariance: Array) -> float:
+    """``e^T C^-1 e``: chi-square of as many degrees of freedom where the covariance is right."""
+    return float(error @ np.linalg.solve(covariance, error))
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,8 +26,8 @@ from rs_relpose_ros.solvers.linear_algebra import cholesky, cholesky_solve
 
 Array = NDArray[np.float64]
 
-# Regions along each side of the field that the matches cover.
-REGIONS = 4
+# Regions of the field that the matches cover: columns and rows.
+REGIONS = (4, 3)
 # The Hessian's covariance of the gradient counts as so many regions beside those of the image: few
 # regions alone would make a noisy one.
 HESSIAN_REGIONS = 8
@@ -95,7 +95,7 @@ def _of_matches(matches: FitMatches, state: TwoViewState, data_hessian: Array,
     total = np.zeros((PARAMETERS, PARAMETERS))
     factor = np.zeros((PARAMETERS, PARAMETERS))
     filled, cost = 0, 0.0
-    for g in range(REGIONS * REGIONS):
+    for g in range(REGIONS[0] * REGIONS[1]):
         use = regions == g
         if not use.any():
             continue
@@ -130,7 +130,7 @@ def _regions(matches: FitMatches) -> NDArray[np.int64]:
             number = 0
             for k in range(2):
                 share = (matches.observations[i, k] - low[k]) / max(high[k] - low[k], 1e-12)
-                number = REGIONS * number + min(int(REGIONS * share), REGIONS - 1)
+                number = REGIONS[k] * number + min(int(REGIONS[k] * share), REGIONS[k] - 1)
             regions[i] = number
     return regions
 
