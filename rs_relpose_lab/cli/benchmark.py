@@ -256,6 +256,7 @@ def _run_consistency(args: argparse.Namespace) -> int:
         configurations,
         on_recording,
         on_simulated_bag,
+        PairConsistency,
         write_report,
     )
 
@@ -263,7 +264,7 @@ def _run_consistency(args: argparse.Namespace) -> int:
     if not args.bags and not args.recording:
         raise InputError('--bags 0 needs a --recording: there is nothing to measure')
     args.output.mkdir(parents=True, exist_ok=True)
-    pairs = []
+    pairs: list[PairConsistency] = []
     with progress_bar(args.bags + len(args.recording), 'bag') as bar:
         for recording in args.recording:
             pairs += on_recording(*recording)

@@ -61,7 +61,7 @@ class PairConsistency:
 
 
 class TruePair(NamedTuple):
-    """Pose ``X1 = R X2 + t`` of the stamped rows of two frames, and 1 sigma of t per axis [rad]."""
+    """Pose ``X1 = R X2 + t`` of two frames' stamped rows, and 1 sigma of t per axis [rad]."""
 
     stamp1_ns: int
     stamp2_ns: int
@@ -116,7 +116,7 @@ def on_simulated_bag(config: SimulationConfig, folder: Path) -> Iterator[PairCon
 
 
 def read_true_pairs(path: Path) -> list[TruePair]:
-    """Pairs of a table ``stamp1_ns,stamp2_ns,r11,..,r33,tx,ty,tz,sigma_t_deg``, columns by name."""
+    """Pairs of a table with columns stamp1_ns, stamp2_ns, r11 to r33, tx, ty, tz, sigma_t_deg."""
     if not path.is_file():
         raise MissingInputError(f'there is no table of true pairs {path}')
     with path.open(newline='', encoding='utf-8') as file:

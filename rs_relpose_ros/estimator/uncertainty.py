@@ -83,12 +83,15 @@ def sandwich(hessian: Array, data_hessian: Array, covariance: Array,
 @kernel
 def _of_matches(matches: FitMatches, state: TwoViewState, data_hessian: Array,
                 hessian: Array) -> Array:
-    """Covariance of the matches' gradient, by image regions g and by the Hessian::
+    """Covariance of the matches' gradient, by image regions g and by the Hessian.
+
+    By regions, from their gradients s_g and Hessians H_g::
 
         sum_g u_g u_g^T,   u_g = (s_g + (I - H_g H^-1)^-1 s_g) / 2
 
-    The fit has adapted to each region: without it, it would leave ``(I - H_g H^-1)^-1 s_g``. The
-    mean of both is that of independent residuals to second order (CR2 of Bell and McCaffrey).
+    The fit has adapted to each region: a fit without it would leave ``(I - H_g H^-1)^-1 s_g``
+    there, which is too much, as s_g is too little. For independent residuals the mean of the two
+    is right to first order in H_g (as CR2: Bell and McCaffrey, Survey Methodology 28, 2002).
     """
     regions = _regions(matches)
     weight = 1.0 / (matches.sigma * matches.sigma)
@@ -139,9 +142,12 @@ def _regions(matches: FitMatches) -> NDArray[np.int64]:
 def gyro_surprise(state: TwoViewState, priors: Priors, covariance: Array) -> float:
     """How many times the variance of the gyro seems to be the told one, from one pair.
 
-    ``(1 + chi2) / (1 + freedom)`` with ``chi2 = theta^T (Lambda^-1 - C)^-1 theta + |dw|^2 / s_w^2``
-    at an optimum of `covariance` (17, 17): theta is the turn from the gyro's rotation, and
-    ``Lambda^-1 - C`` its covariance where both are right.
+    ``(1 + chi2) / (1 + freedom)`` at an optimum of covariance C (17, 17), with::
+
+        chi2 = theta^T (Lambda^-1 - C_theta)^-1 theta + (|dw_1|^2 + |dw_2|^2) / s_w^2
+
+    theta is the turn from the gyro's rotation; ``Lambda^-1 - C_theta`` is its covariance, and the
+    rates have ``6 - tr(C_w) / s_w^2`` degrees of freedom, where gyro and images are both right.
     """
     chi2, freedom = 0.0, 0.0
     if priors.rotation_information[0, 0] > 0.0:
