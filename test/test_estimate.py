@@ -25,6 +25,11 @@ from rs_relpose_ros import (
     RollingShutterCamera,
     Status,
 )
+from rs_relpose_ros.estimator.map_fit import FitMatches
+from rs_relpose_ros.estimator.priors import Priors
+from rs_relpose_ros.estimator.problem import build_problem
+from rs_relpose_ros.estimator.state import TwoViewState
+from rs_relpose_ros.estimator.uncertainty import local_covariance
 
 
 def make_camera(**changes):
@@ -136,20 +141,39 @@ def rotation_nees(pose, scene, covariance):
     return turn @ np.linalg.solve(covariance, turn) / 3
 
 
+def hessian_covariance(pose, scene, camera):
+    """Covariance of the rotation by the inverse of the Hessian at a pose of the middle rows."""
+    problem = build_problem(
+        scene.points1, scene.points2, camera, FrameMotion(scene.measured_rate1),
+        FrameMotion(scene.measured_rate2), None, None)
+    R = pose.R
+    state = TwoViewState(R, pose.t, pose.linear_velocity1, R @ pose.linear_velocity2,
+                         pose.angular_velocity1 - scene.measured_rate1,
+                         R @ (pose.angular_velocity2 - scene.measured_rate2))
+    priors = Priors(scene.measured_gravity1, scene.measured_gravity2, TOLD.gravity_sigma**-2, 0.0,
+                    TOLD.gyro_sigma**-2, pose.velocity_sigma**-2, 0.0, np.eye(3),
+                    np.zeros((3, 3)))
+    matches = FitMatches(problem.observations, pose.inliers, pose.residual_rms)
+    return local_covariance(matches, state, priors)[:3, :3]
+
+
 def test_covariance_holds_where_neighbours_share_their_errors():
     """All matches in a square of 240 px are displaced alike, by twice the noise of each."""
-    fitted, told = [], []
+    camera = make_camera(reference_row='middle')
+    by_hessian, told = [], []
     for seed in range(40):
-        scene = make_scene(seed, outliers=0.0, pixel_noise=0.3, gravity_noise=0.0)
+        scene = make_scene(seed, outliers=0.0, pixel_noise=0.3, gravity_noise=0.0,
+                           reference='middle')
         column, row = (scene.points1 // 240.0).astype(int).T
-        shared = 0.6 * np.random.default_rng([seed, 1]).normal(size=(8, 5, 2))
-        pose = estimate(replace(scene, points2=scene.points2 + shared[column, row]), rng=seed)
+        shared = 0.6 * np.random.default_rng([seed, 1]).normal(size=(9, 6, 2))
+        scene = replace(scene, points2=scene.points2 + shared[column, row])
+        pose = estimate(scene, camera=camera, rng=seed)
         assert pose
-        fitted.append(rotation_nees(pose, scene, pose.fitted_rotation_covariance))
+        by_hessian.append(rotation_nees(pose, scene, hessian_covariance(pose, scene, camera)))
         told.append(rotation_nees(pose, scene, pose.covariance[3:, 3:]))
-    # By the Hessian, which takes 300 matches for independent, sigmas would be 1.7 times too small.
-    assert np.mean(fitted) > 2.5
-    assert np.median(fitted) > 2.0
+    # The Hessian takes 300 matches for independent: its sigmas are 1.7 times too small.
+    assert np.mean(by_hessian) > 2.5
+    assert np.median(by_hessian) > 2.0
     assert np.mean(told) < 2.0
     assert np.median(told) < 1.4
 
@@ -166,11 +190,8 @@ def test_a_gyro_that_disagrees_with_the_images_widens_the_covariance():
     right, wrong = gyro_prior(scene), gyro_prior(scene, error=2e-3)
     sigmas = [np.sqrt(np.trace(pose.covariance[3:, 3:])) for pose in (right, wrong)]
     assert sigmas[1] > 2.0 * sigmas[0]
-    # As its weight has it, it knows no better.
-    assert np.trace(wrong.fitted_rotation_covariance) == pytest.approx(
-        np.trace(right.fitted_rotation_covariance), rel=0.2)
     assert rotation_nees(wrong, scene, wrong.covariance[3:, 3:]) < 3.0
-    assert rotation_nees(wrong, scene, wrong.fitted_rotation_covariance) > 6.0
+    assert rotation_nees(wrong, scene, right.covariance[3:, 3:]) > 6.0
 
 
 def test_errors_of_the_stamps_are_in_the_covariance_and_not_in_the_pose():
@@ -243,6 +264,37 @@ def test_pure_rotation_has_a_rotation_and_no_translation():
         assert rotation_error(pose.R, scene.R) < 0.1
         sigma = np.degrees(np.sqrt(np.trace(pose.covariance[3:, 3:])))
         assert rotation_error(pose.R, scene.R) < 4.0 * sigma
+        # The rates are the gyro's.
+        np.testing.assert_array_equal(pose.velocity_covariance[3:, 3:],
+                                      TOLD.gyro_sigma**2 * np.eye(3))
+
+
+def test_a_direction_that_is_too_uncertain_is_no_pose():
+    scene = make_scene(8)
+    pose = estimate(scene)
+    sigma = np.degrees(np.sqrt(np.trace(pose.covariance[:3, :3])))
+    assert estimate(scene, config=replace(TOLD, max_translation_sigma=1.01 * sigma))
+    turned = estimate(scene, config=replace(TOLD, max_translation_sigma=0.99 * sigma))
+    assert turned.status is Status.LOW_PARALLAX
+    assert turned.reason == (
+        f'the direction of translation is uncertain by {sigma:.3g} deg (1 sigma), more than '
+        f'max_translation_sigma = {0.99 * sigma:g} deg')
+    # The rotation is that of the pose, and the translation takes no part.
+    np.testing.assert_array_equal(turned.R, pose.R)
+    np.testing.assert_array_equal(turned.covariance[3:, 3:], pose.covariance[3:, 3:])
+    np.testing.assert_array_equal(turned.velocity_covariance[3:, 3:],
+                                  pose.velocity_covariance[3:, 3:])
+    np.testing.assert_array_equal(turned.inliers, pose.inliers)
+    for unknown in (turned.t, turned.linear_velocity1, turned.linear_velocity2,
+                    turned.covariance[:3], turned.covariance[:, :3],
+                    turned.velocity_covariance[:3]):
+        assert np.isnan(unknown).all()
+    assert turned.rotation_known
+    # And the other way round.
+    back = turned.inverse()
+    np.testing.assert_allclose(back.R, pose.R.T)
+    np.testing.assert_allclose(back.covariance[3:, 3:], pose.inverse().covariance[3:, 3:],
+                               rtol=1e-9)
 
 
 def test_random_matches_have_no_consensus():

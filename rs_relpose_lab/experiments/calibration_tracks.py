@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_lab.simulation.fine_path import FinePath
 from rs_relpose_lab.simulation.hand_held import hand_held, Plan
-from rs_relpose_lab.simulation.rows import Motion, see, View
+from rs_relpose_lab.simulation.rows import see, View
 from rs_relpose_lab.simulation.trajectory import Trajectory
 from rs_relpose_ros.calibrate.axis_maps import axis_maps
 from rs_relpose_ros.calibrate.gyro_path import GyroSeries
@@ -46,8 +47,9 @@ class Truth:
     features: int = 200
     speed: float = 1.0
     rotation_rate: float = math.radians(30.0)
-    exposure_slope: float = 0.0          # of the offset, by the interval to the next frame
+    exposure_slope: float = 0.0          # of the offset, by the interval to the frame before
     long_interval: float = 1.0           # intervals of the second half, relative to the first
+    stamp_jitter: float = 0.0            # 1 sigma of each stamp [s]
 
 
 def drawn(rng: np.random.Generator, axis_map: int | None = None, **given: Any) -> Truth:
@@ -99,13 +101,16 @@ def record(truth: Truth, rng: np.random.Generator,
     intervals[truth.frames // 2:] *= truth.long_interval
     # Instants of the first row on the IMU clock, which is the trajectory's.
     instants = np.concatenate([[0.0], np.cumsum(intervals[:-1])])
-    offsets = truth.time_offset + truth.exposure_slope * (intervals - np.median(intervals))
+    before = np.concatenate([intervals[:1], intervals[:-1]])
+    offsets = truth.time_offset + truth.exposure_slope * (before - np.median(before))
     end = instants[-1] + 0.2
     if trajectory is None:
         trajectory = hand_held(rng, -0.7, end + 0.5, Plan.parse(f'walk:{end + 1.0}'),
                                speed=truth.speed, rotation_rate=truth.rotation_rate)
-    stamps = START_NS + np.rint((instants - offsets) * 1e9).astype(np.int64)
     frames = _frames(truth, trajectory, instants, _world(rng), rng)
+    if truth.stamp_jitter:
+        offsets = offsets + truth.stamp_jitter * rng.standard_normal(truth.frames)
+    stamps = START_NS + np.rint((instants - offsets) * 1e9).astype(np.int64)
     return Recorded(Tracks(stamps, *frames), _gyro(truth, trajectory, end, rng), truth, trajectory)
 
 
@@ -130,31 +135,6 @@ def _world(rng: np.random.Generator, count: int = 4000) -> Array:
     return points
 
 
-class _Path:
-    """Poses on a fine grid, linear in between."""
-
-    step = 1e-3
-
-    def __init__(self, trajectory: Trajectory, begin: float, end: float) -> None:
-        self.begin = begin
-        times = begin + self.step * np.arange(math.ceil((end - begin) / self.step) + 1)
-        self.positions, self.rotations = trajectory.poses(times)
-        self.turns = Rotation.from_matrix(
-            np.einsum('nji,njk->nik', self.rotations[:-1], self.rotations[1:])).as_rotvec()
-
-    def from_instant(self, instant: float) -> Motion:
-        """Motion of a frame, whose times count from the `instant` of its first row."""
-        def to_camera(points: Array, times: Array) -> Array:
-            at = (instant + times - self.begin) / self.step
-            k = np.clip(at.astype(int), 0, len(self.turns) - 1)
-            share = (at - k)[:, None]
-            position = self.positions[k] + share * (self.positions[k + 1] - self.positions[k])
-            turned = np.einsum('nji,nj->ni', self.rotations[k], points - position)
-            # Of 1e-3 rad: exact to 1e-6.
-            return np.asarray(turned - share * np.cross(self.turns[k], turned))
-        return to_camera
-
-
 def _frames(truth: Truth, trajectory: Trajectory, instants: Array, world: Array,
             rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     center = 0.5 * (np.array([truth.width, truth.height]) - 1.0)
@@ -162,7 +142,7 @@ def _frames(truth: Truth, trajectory: Trajectory, instants: Array, world: Array,
                 lambda pixels: np.column_stack([(pixels - center) / truth.focal,
                                                 np.ones(len(pixels))]),
                 truth.width, truth.height, truth.readout_time / truth.height, reference_row=0.0)
-    path = _Path(trajectory, instants[0] - 0.1, instants[-1] + 0.15)
+    path = FinePath(trajectory, instants[0] - 0.1, instants[-1] + 0.15)
     ids = np.full(len(world), -1, dtype=np.int64)       # track of a point that is followed
     drift, start = np.zeros((len(world), 2)), np.zeros(len(world))
     next_id, frame, track, pixels = 0, [], [], []

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_lab.experiments.scoring import normalised_square, pose_difference
+from rs_relpose_lab.experiments.scoring import chi_squares, pose_error
 from rs_relpose_lab.experiments.tables import grouped, markdown_table, write_csv
 from rs_relpose_lab.simulation import SimulationConfig
 from rs_relpose_lab.simulation.bag import render_once
@@ -73,15 +73,12 @@ class TruePair(NamedTuple):
 def pair_consistency(source: str, bag: str, interval: float, pose: RelativePose, R: Array,
                      t: Array, translation_sigma: float = 0.0) -> PairConsistency:
     """Compare an estimate with the truth (R, t), whose t is known to `translation_sigma` [rad]."""
-    error, basis = pose_difference(pose.R, pose.t, R, t)
-    covariance = basis.T @ pose.covariance @ basis
-    translation, rotation = slice(0, T_FREEDOM), slice(T_FREEDOM, T_FREEDOM + R_FREEDOM)
-    of_translation = covariance[translation, translation] + translation_sigma**2 * np.eye(2)
-    return PairConsistency(
-        source, bag, interval, float(np.degrees(np.linalg.norm(error[rotation]))),
-        float(np.degrees(np.linalg.norm(error[translation]))),
-        normalised_square(error[rotation], covariance[rotation, rotation]) / R_FREEDOM,
-        normalised_square(error[translation], of_translation) / T_FREEDOM)
+    error = pose_error(pose.R, pose.t, R, t)
+    covariance = pose.covariance.copy()
+    covariance[:3, :3] += translation_sigma**2 * np.eye(3)
+    nees = chi_squares(pose.R, pose.t, R, t, covariance)
+    return PairConsistency(source, bag, interval, error.rotation, error.translation,
+                           nees.rotation / R_FREEDOM, nees.translation / T_FREEDOM)
 
 
 def configurations(bags: int, first_seed: int) -> list[SimulationConfig]:

@@ -14,10 +14,14 @@ a change of velocity, which adds ``bend (s_1 + s_2)`` to b; and `turn`, the rota
 to frame 2 that the noise of the gyro hides. Priors keep the last two small. The prior of `bend` is
 in units of |b| and does not contain the read-out time: a read-out time that is too long gains no
 freedom by it.
+
+A row is exposed for a time h in which the camera turns, and shows the mean of that time: a
+rotation smoother than the gyro's, with the rate ``w + h^2 / 24 w''``. See `gyro_path.blur`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import math
 from typing import NamedTuple
 
@@ -33,12 +37,12 @@ Array = NDArray[np.float64]
 
 # Parameters of the calibration, in this order: read-out [s], offset of the middle row [s], slope
 # of the offset, rotation vector on the left of R_imu_cam (3) [rad], bias (3) [rad/s], logarithm of
-# the factor of the focal length.
-READOUT, OFFSET, SLOPE, ROTATION, BIAS, FOCAL = 0, 1, 2, 3, 6, 9
-GLOBAL = 10
+# the factor of the focal length, square of the exposure [s^2].
+READOUT, OFFSET, SLOPE, ROTATION, BIAS, FOCAL, EXPOSURE = 0, 1, 2, 3, 6, 9, 10
+GLOBAL = 11
 # Unknowns of a pair: step of the direction in its tangent plane (2), bend (3), turn (3) [rad].
-DIRECTION, BEND, TURN = 10, 12, 15
-ALL = 18
+DIRECTION, BEND, TURN = 11, 13, 16
+ALL = 19
 # Residual [sigma] beyond which the Geman-McClure loss is nearly constant.
 ROBUST = 3.0
 
@@ -47,7 +51,7 @@ class View(NamedTuple):
     """One of the two frames of each of P pairs, and what it shows of their N matches."""
 
     times: Array        # (P,) stamps [s]
-    covariates: Array   # (P,) interval to the next frame less the median one, k_i above [s]
+    covariates: Array   # (P,) what the offset may follow, k_i above; see `FrameTimes` [s]
     points: Array       # (N, 2) undistorted and normalised with the assumed focal length
     rows: Array         # (N,) s(v) of the raw rows
     by_pixel: Array     # (N, 2, 2) derivative of the normalised point by the pixel
@@ -58,6 +62,10 @@ class Problem(NamedTuple):
 
     gyro_times: Array             # (K,) [s]
     gyro_rates: Array             # (K, 3) [rad/s]
+    # (K, 3) what an exposure does to the gyro's rates, over its square [rad/s^3], and the integral
+    # of that over time [rad/s^2]; see `gyro_path.blur`.
+    blur_rates: Array
+    blur_turns: Array
     begin: NDArray[np.int64]      # (P + 1,) matches of pair p: begin[p] to begin[p + 1]
     # (P,) knot of the gyro near the middle of the pair. `direction`, `bend` and `turn` are in the
     # frame of that knot: in that of the start they would rotate with each step of the bias.
@@ -66,11 +74,36 @@ class Problem(NamedTuple):
     view2: View
     bend_sigma: Array             # (P,) 1 sigma of each component of `bend`
     turn_sigma: Array             # (P,) 1 sigma of each component of `turn` [rad]
+    prior: Array                  # (GLOBAL,) inverse variances of the parameters around zero
 
     @property
     def pairs(self) -> int:
         """Number of pairs."""
         return len(self.middle)
+
+    @property
+    def middles(self) -> Array:
+        """Instants (P,) of the middle of each pair on the camera clock [s]."""
+        return 0.5 * (self.view1.times + self.view2.times)
+
+    def matches(self, kept: NDArray[np.bool_]) -> Problem:
+        """The same pairs with some of their matches (N,)."""
+        before = np.concatenate([[0], np.cumsum(kept)])
+        return self._replace(begin=before[self.begin]).seen_as(lambda view: view._replace(
+            points=view.points[kept], rows=view.rows[kept], by_pixel=view.by_pixel[kept]))
+
+    def pairs_of(self, kept: NDArray[np.bool_]) -> Problem:
+        """Some of the pairs (P,)."""
+        some = self.matches(np.repeat(kept, np.diff(self.begin)))
+        return some._replace(
+            begin=np.concatenate([[0], np.cumsum(np.diff(self.begin)[kept])]),
+            middle=self.middle[kept], bend_sigma=self.bend_sigma[kept],
+            turn_sigma=self.turn_sigma[kept]).seen_as(lambda view: view._replace(
+                times=view.times[kept], covariates=view.covariates[kept]))
+
+    def seen_as(self, change: Callable[[View], View]) -> Problem:
+        """The same data with both views changed alike."""
+        return self._replace(view1=change(self.view1), view2=change(self.view2))
 
 
 class Unknowns(NamedTuple):
@@ -84,6 +117,12 @@ class Unknowns(NamedTuple):
     turn: Array         # (P, 3) [rad]
     noise: Array        # (P,) 1 sigma of the residuals [px]
     damping: Array      # (P,) Levenberg-Marquardt damping of the pair's own unknowns
+
+    def pairs_of(self, kept: NDArray[np.bool_]) -> Unknowns:
+        """The same calibration for some of the pairs (P,)."""
+        return self._replace(direction=self.direction[kept], bend=self.bend[kept],
+                             turn=self.turn[kept], noise=self.noise[kept],
+                             damping=self.damping[kept])
 
 
 class Sums(NamedTuple):
@@ -101,6 +140,7 @@ class _Sight(NamedTuple):
     Q: Array         # (3, 3) rotation of the IMU
     M: Array         # (3, 3) rotation of the camera
     rate: Array      # (3,) of the IMU [rad/s]
+    blur: Array      # (3,) turn of the IMU by the square of the exposure [rad/s^2]
     by_bias: Array   # (3, 3) integral of the rotations since the middle of the pair [s]
 
 
@@ -127,7 +167,8 @@ class _Derivatives(NamedTuple):
 
 @kernel
 def _new_sight() -> _Sight:
-    return _Sight(np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty((3, 3)))
+    return _Sight(np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3),
+                  np.empty((3, 3)))
 
 
 @inlined_kernel
@@ -213,6 +254,7 @@ def _add_view(J: Array, by_turn: Vector, sight: _Sight, row: float, covariate: f
     J[READOUT] += row * by_time
     J[OFFSET] += by_time
     J[SLOPE] += covariate * by_time
+    J[EXPOSURE] += dot(by_turn, rotated(sight.Q, sight.blur))
     by_rotation = rotated_back(sight.Q, by_turn)
     by_bias = rotated_back(sight.by_bias, by_turn)
     by_own_turn = rotated_back(Q_middle, by_turn)
@@ -220,6 +262,15 @@ def _add_view(J: Array, by_turn: Vector, sight: _Sight, row: float, covariate: f
         J[ROTATION + i] += by_rotation[i]
         J[BIAS + i] -= by_bias[i]
         J[TURN + i] += share * by_own_turn[i]
+
+
+@inlined_kernel
+def _blur_at(problem: Problem, k: int, instant: float, out: Array) -> None:
+    """Turn (3,) by the square of the exposure at an instant after knot `k` [rad/s^2]."""
+    share = (instant - problem.gyro_times[k]) / (problem.gyro_times[k + 1] - problem.gyro_times[k])
+    for i in range(3):
+        out[i] = problem.blur_turns[k, i] + share * (
+            problem.blur_turns[k + 1, i] - problem.blur_turns[k, i])
 
 
 @inlined_kernel
@@ -279,6 +330,8 @@ def accumulate(problem: Problem, path: GyroPath, unknowns: Unknowns, tangent: Ar
             J[:] = 0.0
             _integral_since(path, middle, k1, t1, sight1.by_bias)
             _integral_since(path, middle, k2, t2, sight2.by_bias)
+            _blur_at(problem, k1, t1, sight1.blur)
+            _blur_at(problem, k2, t2, sight2.blur)
             _add_view(J, by.by_1, sight1, row1, view1.covariates[p], -0.5, Q_middle)
             _add_view(J, by.by_2, sight2, row2, view2.covariates[p], 0.5, Q_middle)
             # m and s both shrink with a longer focal length.

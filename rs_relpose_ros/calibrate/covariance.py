@@ -40,11 +40,15 @@ def jackknife(scores: Array, curvatures: Array, groups: NDArray[np.int64],
     moves = np.stack([
         np.linalg.pinv(total - curvatures[groups == name].sum(axis=0), hermitian=True)
         @ scores[groups == name].sum(axis=0) for name in names])
-    moves -= moves.mean(axis=0)
     inverse = np.linalg.pinv(total, hermitian=True)
-    count = len(names)
+    return np.asarray(jackknife_of(moves) + inverse @ np.diag(prior) @ inverse)
+
+
+def jackknife_of(moves: Array) -> Array:
+    """Covariance (G, G) from the moves (K, G) of the optimum without each of K groups."""
+    count = len(moves)
+    moves = moves - moves.mean(axis=0)
     # Few groups tell their own scatter roughly only, so that errors by sigma follow Student's t:
     # widened, one sigma covers what it does for a normal deviate.
     wider = student_t.ppf(norm.cdf(1.0), count - 1) ** 2
-    return np.asarray(wider * (count - 1) / count * moves.T @ moves
-                      + inverse @ np.diag(prior) @ inverse)
+    return np.asarray(wider * (count - 1) / count * moves.T @ moves)

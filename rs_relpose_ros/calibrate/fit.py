@@ -16,6 +16,7 @@ from rs_relpose_ros.calibrate.coplanarity import (
     accumulate,
     ALL,
     BIAS,
+    EXPOSURE,
     find_directions,
     FOCAL,
     GLOBAL,
@@ -176,8 +177,9 @@ def _medians(problem: Problem, values: Array) -> Array:
 
 
 def _path(problem: Problem, unknowns: Unknowns) -> GyroPath:
-    return GyroPath.integrated(problem.gyro_times, problem.gyro_rates,
-                               unknowns.parameters[BIAS:BIAS + 3])
+    parameters = unknowns.parameters
+    seen = problem.gyro_rates + parameters[EXPOSURE] * problem.blur_rates
+    return GyroPath.integrated(problem.gyro_times, seen, parameters[BIAS:BIAS + 3])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -193,14 +195,12 @@ class Fit:
 
 
 def fit(problem: Problem, unknowns: Unknowns, free: NDArray[np.bool_], *, rounds: int = 40,
-        bias_sigma: float = 0.03, tolerance: float = 0.1) -> Fit:
+        tolerance: float = 0.1) -> Fit:
     """Minimise the cost over the `free` (GLOBAL,) parameters, and learn the noise on the way.
 
-    `bias_sigma`: 1 sigma of a gyro's bias [rad/s]. Newton steps shorter than `tolerance` [sigma of
-    the parameters] end the fit.
+    Newton steps shorter than `tolerance` [sigma of the parameters] end the fit.
     """
-    prior = np.zeros(GLOBAL)
-    prior[BIAS:BIAS + 3] = bias_sigma**-2
+    prior = problem.prior
     at = _Iterate(unknowns, evaluate(problem, unknowns))
     converged = False
     for _ in range(rounds):
@@ -253,8 +253,8 @@ def cost_curve(problem: Problem, final: Fit, free: NDArray[np.bool_], interval: 
             progress(float(np.isfinite(costs).mean()))
     # One match of a frame serves in many pairs: scaled so that the curvature at the minimum is
     # 1 / sigma^2.
-    information = final.information[np.ix_(free, free)] * (
-        problem.begin[-1] / final.problem.begin[-1])
+    information = (final.information * (problem.begin[-1] / final.problem.begin[-1])
+                   + np.diag(problem.prior))[np.ix_(free, free)]
     naive = float(np.linalg.inv(information)[0, 0])
     return CostCurve(values, (costs - costs.min()) * naive / final.covariance[READOUT, READOUT])
 
@@ -264,10 +264,10 @@ def _refitted(problem: Problem, unknowns: Unknowns, free: NDArray[np.bool_],
     """Unknowns after plain Gauss-Newton steps."""
     for _ in range(rounds):
         evaluation = evaluate(problem, unknowns)
-        H = evaluation.reduced.sum(axis=0)[np.ix_(free, free)]
+        H = (evaluation.reduced.sum(axis=0) + np.diag(problem.prior))[np.ix_(free, free)]
+        score = evaluation.score.sum(axis=0) + problem.prior * unknowns.parameters
         step = np.zeros(GLOBAL)
-        step[free] = -np.linalg.solve(H + 1e-6 * np.diag(np.diag(H)),
-                                      evaluation.score.sum(axis=0)[free])
+        step[free] = -np.linalg.solve(H + 1e-6 * np.diag(np.diag(H)), score[free])
         unknowns = stepped(unknowns, step, evaluation.local_step(step))
     return unknowns
 
@@ -349,10 +349,13 @@ def _learned_noise(problem: Problem, at: _Iterate) -> Array:
 
 def _covariance(problem: Problem, evaluation: Evaluation, weights: Array,
                 free: NDArray[np.bool_], prior: Array) -> Array:
-    # Curvature of the loss against the weight that Gauss-Newton takes for it.
-    bent = float((weights * (4.0 * np.sqrt(weights) - 3.0)).sum() / weights.sum())
     covariance = np.zeros((GLOBAL, GLOBAL))
     covariance[np.ix_(free, free)] = jackknife(
-        evaluation.score[:, free], bent * evaluation.reduced[:, free][:, :, free],
-        stretches(0.5 * (problem.view1.times + problem.view2.times)), prior[free])
+        evaluation.score[:, free], bent(weights) * evaluation.reduced[:, free][:, :, free],
+        stretches(problem.middles), prior[free])
     return covariance
+
+
+def bent(weights: Array) -> float:
+    """Curvature of the loss, all (N,) matches, over the weight that Gauss-Newton takes."""
+    return float((weights * (4.0 * np.sqrt(weights) - 3.0)).sum() / weights.sum())

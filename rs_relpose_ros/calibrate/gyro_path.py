@@ -16,6 +16,9 @@ from rs_relpose_ros.geometry.vectors import cross, dot
 
 Array = NDArray[np.float64]
 
+# Exposure whose effect stands for that of others, by its square [s].
+_EXPOSURE = 0.03
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GyroSeries:
@@ -62,6 +65,27 @@ def noise_density(times: Array, rates: Array) -> float:
         return 0.0
     # 1, -3, 3, -1 of independent samples; the median of a normal deviate's size is 0.6745.
     return float(np.median(third) / 0.6745 / np.sqrt(20.0) * np.sqrt(step))
+
+
+def blur(times: Array, rates: Array) -> tuple[Array, Array]:
+    """What an exposure does to rates (K, 3) at times (K,), over its square, and its integral.
+
+    An image that is exposed for h shows the mean over h of the rotation, ``w + h^2 / 24 w''`` of
+    the rate w to second order: returned are ``(mean of w over _EXPOSURE - w) / _EXPOSURE^2``
+    [rad/s^3], which is ``w'' / 24`` without its noise, and the integral over time [rad/s^2].
+    """
+    steps = np.diff(times)[:, None]
+    turned = np.concatenate([np.zeros((1, 3)),
+                             np.cumsum(0.5 * steps * (rates[1:] + rates[:-1]), axis=0)])
+    begin, end = (np.clip(times + shift, times[0], times[-1])
+                  for shift in (-0.5 * _EXPOSURE, 0.5 * _EXPOSURE))
+    means = np.stack([np.interp(end, times, turned[:, i]) - np.interp(begin, times, turned[:, i])
+                      for i in range(3)], axis=1) / (end - begin)[:, None]
+    changes = (means - rates) / _EXPOSURE**2
+    turns = np.concatenate([np.zeros((1, 3)),
+                            np.cumsum(0.5 * steps * (changes[1:] + changes[:-1]), axis=0)])
+    # A turn that is always the same is a part of the rotation between IMU and camera.
+    return changes, turns - turns.mean(axis=0)
 
 
 class GyroPath(NamedTuple):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 import math
 
 import numpy as np
@@ -20,6 +21,7 @@ from rs_relpose_ros.calibrate.coplanarity import (
 from rs_relpose_ros.calibrate.fit import Fit
 from rs_relpose_ros.calibrate.observations import Observations
 from rs_relpose_ros.calibrate.result import AXES, CalibrationResult, CostCurve, Estimate
+from rs_relpose_ros.calibrate.stamps import Varying
 from rs_relpose_ros.config.calibration import CalibrationConfig
 from rs_relpose_ros.errors import InputError
 
@@ -27,6 +29,12 @@ Array = NDArray[np.float64]
 
 _RECORD_MORE = ('too little rotation, too short, or too few points: record 10 s or more of a '
                 'textured scene while turning 20 to 60 deg/s about all three axes')
+# Error of every focal length, relative: the residual is not linear in the noise of the points.
+_LEAST_FOCAL_SIGMA = 2e-4
+# A note where the intervals between frames vary for an unknown reason.
+_UNCLEAR = defaultdict(str, {Varying.UNCLEAR: (
+    'the intervals between frames vary neither as automatic exposure does nor as jitter: the '
+    'offset is taken to be the same in all frames')})
 # Sigma of an observable slope of the offset [s/s].
 _MOST_SLOPE_SIGMA = 0.5
 
@@ -45,6 +53,7 @@ def judged(data: Observations, final: Fit, free: NDArray[np.bool_], curve: CostC
     tracker[[READOUT, OFFSET]] = config.tracking_time_sigma
     tracker[ROTATION:ROTATION + 3] = config.tracking_rotation_sigma
     tracker[BIAS:BIAS + 3] = config.tracking_bias_sigma
+    tracker[FOCAL] = _LEAST_FOCAL_SIGMA
     covariance = final.covariance + np.diag(np.where(free, tracker, 0.0)**2)
     parameters, R_cam_imu = final.unknowns.parameters, final.unknowns.R_imu_cam.T
     rates, one_axis = _excitation(data, parameters[BIAS:BIAS + 3], R_cam_imu, config)
@@ -72,11 +81,15 @@ def judged(data: Observations, final: Fit, free: NDArray[np.bool_], curve: CostC
         factor = math.exp(parameters[FOCAL])
         focal = _estimate(factor, factor * sigmas[FOCAL], factor * config.max_focal_sigma,
                           one_axis)
+    beyond = '' if abs(readout) <= data.interval else (
+        f'beyond the {1e3 * data.interval:.1f} ms between frames, which no camera can do: record '
+        'longer, and turn faster about all three axes')
     if free[SLOPE]:
         slope = _estimate(parameters[SLOPE], sigmas[SLOPE], _MOST_SLOPE_SIGMA)
+    jitters = data.stamps.varying is Varying.JITTER
     unsettled = '' if final.converged else 'the fit had not settled when it was stopped'
     return CalibrationResult(
-        readout_time=_estimate(readout, readout_sigma, config.max_readout_sigma),
+        readout_time=_estimate(readout, readout_sigma, config.max_readout_sigma, beyond),
         time_offset=_estimate(float(to_first @ parameters),
                               math.sqrt(to_first @ covariance @ to_first),
                               config.max_offset_sigma),
@@ -84,11 +97,14 @@ def judged(data: Observations, final: Fit, free: NDArray[np.bool_], curve: CostC
         rotation=_estimate(math.acos(np.clip(cosine, -1.0, 1.0)), rotation_sigma.max(),
                            config.max_rotation_sigma, one_axis),
         axis_map=axis_map, gyro_bias=(bias_x, bias_y, bias_z), focal_factor=focal,
-        offset_by_interval=slope, rotation_rates=rates, curve=curve,
+        offset_by_interval=None if jitters else slope,
+        offset_by_jitter=slope if jitters else None, stamp_jitter=data.stamps.jitter,
+        rotation_rates=rates, curve=curve,
         pixel_sigma=float(np.median(final.unknowns.noise)),
         inlier_ratio=float((final.weights > 0.25).mean()),
         frames=len(data.tracks), pairs=final.problem.pairs, matches=int(final.problem.begin[-1]),
-        frame_interval=data.interval, warnings=tuple(filter(None, (unsettled, one_axis))))
+        frame_interval=data.interval,
+        warnings=tuple(filter(None, (unsettled, one_axis, _UNCLEAR[data.stamps.varying]))))
 
 
 def _estimate(value: float, sigma: float, limit: float, obstacle: str = '') -> Estimate:

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.calibrate.alignment import seen_rates
-from rs_relpose_ros.calibrate.coplanarity import Problem, View
-from rs_relpose_ros.calibrate.gyro_path import GyroSeries, noise_density
+from rs_relpose_ros.calibrate.coplanarity import BIAS, EXPOSURE, GLOBAL, Problem, View
+from rs_relpose_ros.calibrate.gyro_path import blur, GyroSeries, noise_density
+from rs_relpose_ros.calibrate.stamps import frame_times, FrameTimes
 from rs_relpose_ros.calibrate.tracks import make_pairs, Pairs, Tracks
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
@@ -20,6 +21,8 @@ Array = NDArray[np.float64]
 _LOST = 1.5
 # Prior of `bend`, 1 sigma, before the parallax is known.
 _BEND_AT_START = 0.1
+# 1 sigma of a gyro's bias [rad/s], and of the exposure, as a share of the interval.
+_BIAS_SIGMA, _EXPOSED = 0.03, 0.8
 # Rotation between two frames that even a gyro without noise misses between its samples [rad].
 _LEAST_TURN = 2e-5
 # Cosine of the angle to the optical axis beyond which a point has no normalised coordinates.
@@ -42,8 +45,7 @@ class Observations:
     tracks: Tracks                  # of points that the camera model can map to rays
     camera: RollingShutterCamera    # its read-out time is not looked at
     times: Array                    # (F,) stamps of the frames [s]
-    # (F,) interval to the next frame less the median one [s]; 0 where frames were lost.
-    covariates: Array
+    stamps: FrameTimes              # what the stamps tell of exposure and jitter
     gyro_times: Array               # (K,) [s]
     gyro_rates: Array               # (K, 3) [rad/s]
     gyro_density: float             # white noise of the gyro [rad/s/sqrt(Hz)]
@@ -57,12 +59,7 @@ class Observations:
                          points=tracks.points[ahead])
         times, gyro_times = (np.asarray((stamps_ns - tracks.stamps_ns[0]) * 1e-9)
                              for stamps_ns in (tracks.stamps_ns, gyro.stamps_ns))
-        intervals = np.diff(times)
-        to_next = np.append(intervals, intervals[-1])
-        longer = to_next - np.median(intervals)
-        # Where frames are lost, the interval tells nothing of the exposure.
-        longer[longer > (_LOST - 1.0) * np.median(intervals)] = 0.0
-        return cls(tracks, camera, times, longer, gyro_times, gyro.rates,
+        return cls(tracks, camera, times, frame_times(tracks.stamps_ns), gyro_times, gyro.rates,
                    noise_density(gyro_times, gyro.rates))
 
     @property
@@ -117,10 +114,14 @@ class Observations:
         times1, times2 = self.times[pairs.first], self.times[pairs.second]
         middles = np.searchsorted(self.gyro_times, 0.5 * (times1 + times2) + offset)
         turn_sigma = np.sqrt(self.gyro_density**2 * (times2 - times1) + _LEAST_TURN**2)
+        prior = np.zeros(GLOBAL)
+        prior[BIAS:BIAS + 3] = _BIAS_SIGMA**-2
+        prior[EXPOSURE] = (_EXPOSED * self.interval)**-4
         return Problem(
-            self.gyro_times, self.gyro_rates, pairs.begin, middles,
+            self.gyro_times, self.gyro_rates, *blur(self.gyro_times, self.gyro_rates), pairs.begin,
+            middles,
             self._view(pairs.first, pairs.points1), self._view(pairs.second, pairs.points2),
-            np.full(len(pairs), _BEND_AT_START), turn_sigma)
+            np.full(len(pairs), _BEND_AT_START), turn_sigma, prior)
 
     def _view(self, frames: NDArray[np.int64], pixels: Array) -> View:
         rays, by_pixel = self.camera.unproject_with_jacobian(pixels)
@@ -128,5 +129,5 @@ class Observations:
         points = np.asarray(rays[:, :2] / rays[:, 2:])
         by_pixel = (by_pixel[:, :2] - points[:, :, None] * by_pixel[:, 2:]) / rays[:, 2:, None]
         height = self.camera.height
-        return View(self.times[frames], self.covariates[frames], points,
+        return View(self.times[frames], self.stamps.covariates[frames], points,
                     (pixels[:, 1] - 0.5 * (height - 1)) / height, np.ascontiguousarray(by_pixel))

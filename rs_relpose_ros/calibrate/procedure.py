@@ -8,13 +8,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.calibrate.alignment import find_starts, Start
-from rs_relpose_ros.calibrate.coplanarity import FOCAL, GLOBAL, OFFSET, Problem, SLOPE, Unknowns
+from rs_relpose_ros.calibrate.coplanarity import (
+    EXPOSURE,
+    FOCAL,
+    GLOBAL,
+    OFFSET,
+    Problem,
+    SLOPE,
+    Unknowns,
+)
 from rs_relpose_ros.calibrate.fit import cost_curve, fit, initial, refit, with_bends
 from rs_relpose_ros.calibrate.gyro_path import GyroSeries
 from rs_relpose_ros.calibrate.judgement import judged
 from rs_relpose_ros.calibrate.observations import Observations, PairSelection
 from rs_relpose_ros.calibrate.result import CalibrationResult
 from rs_relpose_ros.calibrate.tracks import Tracks
+from rs_relpose_ros.calibrate.uncertainty import ModelErrors, UNCALIBRATED, widened
 from rs_relpose_ros.config.calibration import CalibrationConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
@@ -29,8 +38,6 @@ _LEAST_MATCHES = 20
 _ALL_PAIRS = PairSelection((0.033, 0.067, 0.133, 0.267), 80, _LEAST_MATCHES, 800)
 _SOME_PAIRS = _ALL_PAIRS._replace(max_matches=40, most_pairs=100)
 _PAIRS_AT_START = _SOME_PAIRS._replace(spans=(0.067,))
-# Intervals between frames that differ by more than this share may have exposures that differ.
-_VARYING = 0.02
 _FOCAL_FACTORS = np.geomspace(0.5, 2.0, 9)
 
 
@@ -65,13 +72,16 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
     progress(0.15)
     free = np.ones(GLOBAL, dtype=bool)
     free[SLOPE] = False
-    free[FOCAL] = not focal_known
+    free[FOCAL], free[EXPOSURE] = not focal_known, False
     coarse = _coarse_fit(data, starts, free, config, rng)
     progress(0.4)
-    low, high = np.quantile(data.covariates, (0.1, 0.9))
-    free[SLOPE] = high - low > _VARYING * data.interval
+    free[SLOPE] = bool(data.stamps.covariates.any())
+    free[EXPOSURE] = config.exposed
     offset = coarse.parameters[OFFSET]
     final = refit(_problem(data, _ALL_PAIRS, offset, config, rng), coarse, free)
+    progress(0.7)
+    errors = None if not config.exposed else ModelErrors() if focal_known else UNCALIBRATED
+    final = widened(final, free, errors)
     progress(0.8)
     offset = final.unknowns.parameters[OFFSET]
     some = with_bends(_problem(data, _SOME_PAIRS, offset, config, rng), final.unknowns)

@@ -21,7 +21,8 @@ _MS = 1e3
 
 def report(result: CalibrationResult, camera: RollingShutterCamera) -> list[str]:
     """Lines for a reader: each figure with its 1 sigma and its verdict."""
-    readout, slope, focal = result.readout_time, result.offset_by_interval, result.focal_factor
+    readout, focal = result.readout_time, result.focal_factor
+    slope, jitter = result.offset_by_interval, result.offset_by_jitter
     rates = ', '.join(f'{axis} {np.degrees(rate):.1f}'
                       for axis, rate in zip(AXES, result.rotation_rates, strict=True))
     sigmas = ', '.join(f'{np.degrees(sigma):.3f}' for sigma in result.rotation_sigma)
@@ -35,11 +36,17 @@ def report(result: CalibrationResult, camera: RollingShutterCamera) -> list[str]
               + (', read upwards' if readout.value < 0.0 else ''), readout),
         _line('time offset (row 0)', _ms(result.time_offset), result.time_offset)]
     if slope is not None:
-        meaning = ('none that is sure' if abs(slope.value) < 3.0 * slope.sigma
-                   else 'the stamp moves with the exposure')
+        meaning = ('the exposure moves against the stamp' if result.follows_exposure
+                   else 'none that is sure')
         lines.append(_line(
             'offset by interval', f'{slope.value:.3f} +- {slope.sigma:.3f} ms per ms of the '
-            f'interval to the next frame ({meaning})', slope))
+            f'interval to the frame before, {_MS * result.frame_interval:.2f} ms in the median '
+            f'({meaning})', slope))
+    if jitter is not None:
+        lines.append(_line(
+            'stamps jitter', f'{_MS * result.stamp_jitter:.2f} ms rms about a smooth line, which '
+            f'the images follow by {jitter.value:.2f} +- {jitter.sigma:.2f} (1: the stamps alone '
+            'are at fault); not taken for exposure', jitter))
     lines += [
         _line('rotation IMU to camera', f'{axes_text(result.axis_map)}, and '
               f"{np.degrees(result.rotation.value):.2f} deg off it; 1 sigma about the camera's "
@@ -50,7 +57,7 @@ def report(result: CalibrationResult, camera: RollingShutterCamera) -> list[str]
     if focal is not None:
         lines.append(_line(
             'focal length', f'{camera.fx * focal.value:.1f} +- {camera.fx * focal.sigma:.1f} px '
-            '(CameraInfo has none: write it there)', focal))
+            '(CameraInfo has none: camera_matrix takes its place)', focal))
     return lines + [f'note: {warning}' for warning in result.warnings]
 
 
@@ -78,9 +85,12 @@ def _shutter_text(result: CalibrationResult) -> str:
             f'of a global shutter is lower by {at_zero:.0f}')
 
 
-def parameter_file(result: CalibrationResult, title: str, *, compressed: bool,
-                   feature_rows: tuple[float, ...] = (0.0, 0.0)) -> str:
-    """The node's parameter file; figures that are not observable are left out, and named."""
+def parameter_file(result: CalibrationResult, title: str, *, camera: RollingShutterCamera,
+                   compressed: bool, feature_rows: tuple[float, ...] = (0.0, 0.0)) -> str:
+    """The node's parameter file; figures that are not observable are left out, and named.
+
+    `camera` is what was calibrated with: a guess where the focal length was not known.
+    """
     readout, offset, rotation = result.readout_time, result.time_offset, result.rotation
     shutter, biases = _shutter_text(result), result.gyro_bias
     rolling = result.shutter != 'global'
@@ -95,7 +105,7 @@ def parameter_file(result: CalibrationResult, title: str, *, compressed: bool,
         (offset.observable, f'time_offset ({offset.remark})', [
             SourcedValue('stamp_row', 'first', 'Convention of time_offset here.'),
             SourcedValue('time_offset', round(offset.value, 6),
-                         f'1 sigma {_MS * offset.sigma:.2f} ms.')]),
+                         f'1 sigma {_MS * offset.sigma:.2f} ms.'), *_by_interval(result)]),
         (rotation.observable, f'quat_cam_imu_xyzw ({rotation.remark})', [SourcedValue(
             'quat_cam_imu_xyzw', tuple(round(v, 7) for v in result.quat_cam_imu_xyzw),
             f'{axes_text(result.axis_map)}, {np.degrees(rotation.value):.2f} deg off; '
@@ -103,20 +113,43 @@ def parameter_file(result: CalibrationResult, title: str, *, compressed: bool,
         (all(bias.observable for bias in biases), 'gyro_bias', [SourcedValue(
             'gyro_bias', tuple(round(bias.value, 5) for bias in biases), '1 sigma '
             + ', '.join(f'{bias.sigma:.5f}' for bias in biases) + ' rad/s.')])]
+    focal = result.focal_factor
+    if focal is not None:
+        told.append((focal.observable, f'camera_matrix ({focal.remark})', [SourcedValue(
+            'camera_matrix',
+            (round(camera.fx * focal.value, 2), 0.0, camera.cx, 0.0,
+             round(camera.fy * focal.value, 2), camera.cy, 0.0, 0.0, 1.0),
+            f'Focal length, 1 sigma {camera.fx * focal.sigma:.2f} px; for images of '
+            f'{camera.width}x{camera.height}. The principal point is assumed in the middle, '
+            'without distortion. A calibrated CameraInfo comes first.')]))
     values = [SourcedValue('image_transport', 'compressed' if compressed else 'raw',
                            'As the bag has them.')]
     values += [value for observable, _, group in told if observable for value in group]
     if feature_rows[1] > 0.0:
         values.append(SourcedValue('feature_rows', tuple(feature_rows), 'As given to calibrate.'))
     missing = [name for observable, name, _ in told if not observable]
+    if result.focal_factor is not None and not result.focal_factor.observable:
+        missing.append(f'focal length ({result.focal_factor.remark})')
     if missing:
         title += ' Not observable in this recording, so left out: ' + '; '.join(missing) + '.'
     return parameter_text(title, values)
 
 
+def _by_interval(result: CalibrationResult) -> list[SourcedValue]:
+    """Parameters of an offset that follows automatic exposure; none where it does not."""
+    slope = result.offset_by_interval
+    if slope is None or not result.follows_exposure:
+        return []
+    return [SourcedValue('time_offset_per_interval', round(slope.value, 4),
+                         f'Automatic exposure; 1 sigma {slope.sigma:.3f} s/s.'),
+            SourcedValue('time_offset_reference_interval', round(result.frame_interval, 6),
+                         'Median interval between frames, at which time_offset holds.')]
+
+
 def as_mapping(result: CalibrationResult, camera: RollingShutterCamera) -> dict[str, Any]:
     """The result for a JSON file; seconds, radians, pixels."""
-    slope, focal = result.offset_by_interval, result.focal_factor
+    slope, jitter = result.offset_by_interval, result.offset_by_jitter
+    focal = result.focal_factor
     if focal is not None:
         focal = replace(focal, value=focal.value * camera.fx, sigma=focal.sigma * camera.fx)
     return {
@@ -124,6 +157,7 @@ def as_mapping(result: CalibrationResult, camera: RollingShutterCamera) -> dict[
         'readout_time_s': asdict(result.readout_time),
         'time_offset_s': asdict(result.time_offset),
         'offset_by_interval': slope and asdict(slope),
+        'offset_by_jitter': jitter and asdict(jitter), 'stamp_jitter_s': result.stamp_jitter,
         'quat_cam_imu_xyzw': list(result.quat_cam_imu_xyzw),
         'rotation_sigma_rad': result.rotation_sigma.tolist(),
         'rotation_from_axis_map_rad': asdict(result.rotation),

@@ -51,8 +51,13 @@ class CalibrationResult:
     axis_map: Array                         # (3, 3) the nearest rotation between axes
     gyro_bias: tuple[Estimate, Estimate, Estimate]   # IMU frame [rad/s]
     focal_factor: Estimate | None           # true over assumed focal length; None where given
-    # Change of the offset by the interval to the next frame [s/s]; None where all are alike.
+    # Change of the offset by the interval between frames [s/s], which automatic exposure makes;
+    # None where the intervals do not vary like that.
     offset_by_interval: Estimate | None
+    # Change of the offset by how early a stamp is against a smooth line [s/s], 1 where only the
+    # stamps jitter; None where they do not.
+    offset_by_jitter: Estimate | None
+    stamp_jitter: float                     # rms about the smooth line [s]
     rotation_rates: Array                   # (3,) rms about the camera's axes less mean [rad/s]
     curve: CostCurve
     pixel_sigma: float                      # of a match, as seen [px]
@@ -70,6 +75,12 @@ class CalibrationResult:
         if self.focal_factor is not None:
             parts.append(self.focal_factor)
         return all(part.observable for part in parts)
+
+    @property
+    def follows_exposure(self) -> bool:
+        """Whether the offset surely moves with the interval between frames."""
+        slope = self.offset_by_interval
+        return slope is not None and slope.observable and abs(slope.value) > 3.0 * slope.sigma
 
     @property
     def quat_cam_imu_xyzw(self) -> tuple[float, float, float, float]:

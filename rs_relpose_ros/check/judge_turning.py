@@ -105,7 +105,8 @@ def _aligned(found: Alignment, seen: Scan, parameters: Parameters) -> list[Findi
     both = [Finding('gyro and images', Verdict.OK, text, figures=figures), _scale(found.scale)]
     if both[1].verdict is FAILURE:
         return both
-    return [*both, _clock(found, parameters), _axes(found, seen, parameters)]
+    told = parameters.sensor.offset_at(seen.image_stamps.interval)
+    return [*both, _clock(found, parameters, told), _axes(found, seen, parameters)]
 
 
 def _scale(scale: float) -> Finding:
@@ -117,8 +118,11 @@ def _scale(scale: float) -> Finding:
              'of another resolution, or the gyro off in scale'))
 
 
-def _clock(found: Alignment, parameters: Parameters) -> Finding:
-    """Offset of the middle row, taken to that of the stamped row where the read-out is known."""
+def _clock(found: Alignment, parameters: Parameters, told: float) -> Finding:
+    """Offset of the middle row, taken to that of the stamped row where the read-out is known.
+
+    `told` is the offset [s] that the parameters say at the usual interval between the frames.
+    """
     name, sensor, sigma = 'time offset', parameters.sensor, found.offset_sigma
     if sensor.readout_time is None:
         return Finding(name, Verdict.OK, f'the middle row is seen {1e3 * found.offset:+.1f} +- '
@@ -130,12 +134,12 @@ def _clock(found: Alignment, parameters: Parameters) -> Finding:
     shift = {'start': 0.5, 'middle': 0.0, 'end': -0.5}[sensor.stamp_exposure]
     down = 1.0 if sensor.readout_direction == 'down' else -1.0
     offset = found.offset - rows * down * sensor.readout_time - shift * sensor.exposure_time
-    off = max(abs(offset - sensor.time_offset) - 2.0 * sigma, 0.0)
+    off = max(abs(offset - told) - 2.0 * sigma, 0.0)
     remedy = (f'set time_offset: {offset:.4f}, or have it measured with "rs_relpose calibrate"; '
               'track_time_offset follows it')
     return judged(
         name, f'{1e3 * offset:+.1f} +- {1e3 * sigma:.1f} ms by images and gyro, time_offset says '
-        f'{1e3 * sensor.time_offset:+.1f} ms',
+        f'{1e3 * told:+.1f} ms',
         {'middle_row_s': found.offset, 'time_offset_s': offset, 'sigma_s': sigma},
         Case(off > _OFFSET_LIMITS[1], FAILURE, remedy),
         Case(off > _OFFSET_LIMITS[0], WARNING, remedy))

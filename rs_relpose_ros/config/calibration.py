@@ -32,6 +32,8 @@ class CalibrationConfig:
     max_focal_sigma: float = setting(
         0.03, 'sigma of an observable focal length, relative', low=1e-4, high=1.0)
 
+    exposed: bool = setting(
+        False, 'whether the points come from images, each of which is exposed for a while')
     tracking_time_sigma: float = setting(
         0.0, 'error of read-out and offset by the tracker, beyond scatter', 's', low=0.0, high=0.1)
     tracking_rotation_sigma: float = setting(
@@ -46,4 +48,5 @@ class CalibrationConfig:
 # Errors that a tracker makes alike over all of a recording, which its scatter does not show: found
 # on rendered bags with KLT.
 TRACKED_IN_IMAGES = CalibrationConfig(
-    tracking_time_sigma=5e-5, tracking_rotation_sigma=1e-3, tracking_bias_sigma=2.5e-4)
+    exposed=True, tracking_time_sigma=5e-5, tracking_rotation_sigma=1e-3,
+    tracking_bias_sigma=2.5e-4)

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_ros.config.declarations import check_settings, Declared, declared, setting
 from rs_relpose_ros.config.estimator import EstimatorConfig
 from rs_relpose_ros.config.imu import ImuConfig
+from rs_relpose_ros.config.intrinsics import IntrinsicsConfig
 from rs_relpose_ros.config.keyframes import KeyframeConfig
 from rs_relpose_ros.config.tracking import TrackingConfig
 from rs_relpose_ros.errors import InputError, MissingInputError
@@ -40,6 +41,13 @@ class SensorConfig:
     time_offset: float = setting(
         0.0, 'IMU clock minus camera clock: t_imu = stamp + time_offset', 's', low=-10.0,
         high=10.0)
+    time_offset_per_interval: float = setting(
+        0.0, 'change of time_offset by the interval T between frames (automatic exposure): '
+        't_imu = stamp + time_offset + time_offset_per_interval (T - '
+        'time_offset_reference_interval)', 's/s', low=-5.0, high=5.0)
+    time_offset_reference_interval: float = setting(
+        0.0, 'interval between frames at which time_offset holds; used with '
+        'time_offset_per_interval', 's', low=0.0, high=10.0)
     track_time_offset: bool = setting(
         False, 'apply the time offset that is tracked while running (it is always reported)',
         live=True)
@@ -64,6 +72,11 @@ class SensorConfig:
                                     'from IMU to camera, v_cam = R(q) v_imu, as [x, y, z, w]')
         return Rotation.from_quat(self.quat_cam_imu_xyzw).as_matrix()
 
+    def offset_at(self, interval: float) -> float:
+        """`time_offset` [s] at an interval between frames [s]."""
+        return self.time_offset + self.time_offset_per_interval * (
+            interval - self.time_offset_reference_interval)
+
     def missing(self) -> list[str]:
         """Names of the settings that have no default and were not given."""
         return [name for name in ('readout_time', 'quat_cam_imu_xyzw')
@@ -78,6 +91,9 @@ class PairConfig:
         True, 'gyro between the frames as rotation prior and hypothesis (else it only derotates '
         'rows)')
     use_gravity: bool = setting(True, 'gravity as prior and for the 3- and 9-point solvers')
+    withhold_when_wrong: bool = setting(
+        True, 'publish no pose while a figure that was told is seen to be wrong (see health in '
+        '/diagnostics)', live=True)
     reference_frame: str = setting(
         '', 'frame_id of relative poses; empty for <camera frame>_reference')
     image_transport: str = setting('raw', 'transport of the images', choices=('raw', 'compressed'))
@@ -103,6 +119,7 @@ class Parameters:
     """All parameters, grouped by the module that they configure; flat names are unique."""
 
     sensor: SensorConfig = field(default_factory=SensorConfig)
+    intrinsics: IntrinsicsConfig = field(default_factory=IntrinsicsConfig)
     pair: PairConfig = field(default_factory=PairConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)

@@ -22,7 +22,7 @@ from rs_relpose_ros.estimator.problem import PairState, TwoViewProblem
 from rs_relpose_ros.estimator.state import DW1, PARAMETERS, THETA, TwoViewState
 from rs_relpose_ros.geometry.so3 import log_so3, skew
 from rs_relpose_ros.geometry.vectors import tangent_basis
-from rs_relpose_ros.solvers.linear_algebra import cholesky, cholesky_solve
+from rs_relpose_ros.solvers.linear_algebra import cholesky, newton_step
 
 Array = NDArray[np.float64]
 
@@ -81,6 +81,25 @@ def sandwich(hessian: Array, data_hessian: Array, covariance: Array,
 
 
 @kernel
+def as_much_wider(covariance: Array, believed: Array, shown: Array) -> Array:
+    """``T C T^T`` with ``T believed T^T = shown``: C as much wider as `shown` is than `believed`.
+
+    T is lower triangular. C is returned as it is where one of the two others is singular.
+    """
+    n = len(covariance)
+    of_believed, of_shown, T = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
+    if not (cholesky(believed, of_believed) and cholesky(shown, of_shown)):
+        return covariance
+    for i in range(n):
+        for j in range(i, -1, -1):   # T L_believed = L_shown
+            value = of_shown[i, j]
+            for k in range(j + 1, i + 1):
+                value -= T[i, k] * of_believed[k, j]
+            T[i, j] = value / of_believed[j, j]
+    return T @ covariance @ T.T
+
+
+@kernel
 def _of_matches(matches: FitMatches, state: TwoViewState, data_hessian: Array,
                 hessian: Array) -> Array:
     """Covariance of the matches' gradient, by image regions g and by the Hessian.
@@ -109,8 +128,10 @@ def _of_matches(matches: FitMatches, state: TwoViewState, data_hessian: Array,
         adjusted = score
         if cholesky(hessian - weight * own, factor):
             # (I - H_g H^-1)^-1 s = H (H - H_g)^-1 s
-            adjusted = 0.5 * (score + hessian @ cholesky_solve(factor, score))
-        total += np.outer(adjusted, adjusted)
+            adjusted = 0.5 * (score - hessian @ newton_step(factor, score))
+        for i in range(PARAMETERS):
+            for j in range(PARAMETERS):
+                total[i, j] += adjusted[i] * adjusted[j]
     # Noise as the residuals have it, without what was told: (units of sigma)^2.
     variance = (1.0 + cost) / (1.0 + max(matches.use.sum() - FITTED, 0))
     share = filled / (filled + HESSIAN_REGIONS)
@@ -153,8 +174,10 @@ def gyro_surprise(state: TwoViewState, priors: Priors, covariance: Array) -> flo
     if priors.rotation_information[0, 0] > 0.0:
         theta = log_so3(state.R @ priors.rotation.T)
         away = inverse(priors.rotation_information)
-        away = (1.0 + LEAST_DISAGREEMENT) * away \
-            - covariance[THETA:THETA + 3, THETA:THETA + 3]
+        for i in range(3):
+            for j in range(3):
+                away[i, j] *= 1.0 + LEAST_DISAGREEMENT
+                away[i, j] -= covariance[THETA + i, THETA + j]
         chi2 += (theta * (inverse(away) @ theta)).sum()
         freedom += 3.0
     chi2 += priors.rate_weight * ((state.dw1**2).sum() + (state.dw2**2).sum())
@@ -179,8 +202,8 @@ def pair_state(problem: TwoViewProblem, state: TwoViewState, local: Array) -> Pa
 
     Parameters
     ----------
-    local : (..., 17, 17) ndarray
-        Covariances of the state's local parameters ``(theta, tangent, d_1, d_2, dw_1, dw_2)``,
+    local : (17, 17) ndarray
+        Covariance of the state's local parameters ``(theta, tangent, d_1, d_2, dw_1, dw_2)``,
         which are in frame 1.
     """
     jacobian = np.zeros((18, 17))

@@ -20,7 +20,8 @@ from rs_relpose_ros.estimator.map_fit import DataTerm, fit, FitMatches, linearis
 from rs_relpose_ros.estimator.priors import Priors, with_velocity_sigma
 from rs_relpose_ros.estimator.sampson import residuals
 from rs_relpose_ros.estimator.state import moved, PARAMETERS, step_between, TwoViewState
-from rs_relpose_ros.estimator.uncertainty import sandwich, score_covariance
+from rs_relpose_ros.estimator.uncertainty import as_much_wider, sandwich, score_covariance
+from rs_relpose_ros.geometry.vectors import copy_matrix, copy_vector
 
 Array = NDArray[np.float64]
 
@@ -56,8 +57,7 @@ class Refined(NamedTuple):
 
     `inliers` (N,): the matches that the last fits used. `velocity_sigma`: the prior sigma of the
     most evidence [baselines per second]. `sigma`: noise of a match that the fits used [px].
-    `covariance` (17, 17): of the local parameters, within the fits and between them;
-    `fitted_covariance` (17, 17): the same as the weights of the fits have it.
+    `covariance` (17, 17): of the local parameters, within the fits and between them.
     """
 
     state: TwoViewState
@@ -65,7 +65,6 @@ class Refined(NamedTuple):
     velocity_sigma: float
     sigma: float
     covariance: Array
-    fitted_covariance: Array
 
 
 @kernel
@@ -108,17 +107,18 @@ def fit_with_evidence(matches: Matches, start: TwoViewState, priors: Priors, noi
                 matches, used, state, data, priors, grid[k], noise.threshold, ITERATIONS)
             if k == best:
                 upwards, upwards_data = state, data
-            steps[k] = step_between(start, state)
+            copy_vector(step_between(start, state), steps[k])
         best = low + int(np.argmax(evidences[low:high]))
-        lacking[low:high] = evidences[best] - evidences[low:high]
+        for k in range(low, high):
+            lacking[k] = evidences[best] - evidences[k]
         state = moved(start, steps[best])
         chosen_from = used.use
         used = _selected(matches, state, _reach(noise.threshold, used.sigma), noise.sigma)
         if (used.use == chosen_from).all():
             break
-    state, covariances, best = _average(matches, used, start, steps, lacking < LEAST_EVIDENCE,
-                                        priors, grid, noise.threshold, gyro_error)
-    return Refined(state, used.use, grid[best], used.sigma, covariances[1], covariances[0])
+    state, covariance, best = _average(matches, used, start, steps, lacking < LEAST_EVIDENCE,
+                                       priors, grid, noise.threshold, gyro_error)
+    return Refined(state, used.use, grid[best], used.sigma, covariance)
 
 
 @kernel
@@ -160,11 +160,10 @@ def _candidate(matches: Matches, used: FitMatches, start: TwoViewState, data: Da
 def _average(matches: Matches, used: FitMatches, start: TwoViewState, steps: Array, likely: Flags,
              priors: Priors, grid: Array, threshold: float,
              gyro_error: Array) -> tuple[TwoViewState, Array, int]:
-    """Mean state, its covariances (2, 17, 17), and the number of the prior of the most evidence.
+    """Mean state, its covariance (17, 17), and the number of the prior of the most evidence.
 
     Where the data cannot tell which prior is right, one of them alone would be overconfident. The
-    fits go on from `steps` (K, 17) from `start`, for the `likely` (K,) priors. The covariances
-    are that of the weights, and that of the errors that matches and gyro show.
+    fits go on from `steps` (K, 17) from `start`, for the `likely` (K,) priors.
     """
     size = grid.shape[0]
     evidences = np.full(size, -math.inf)
@@ -173,11 +172,12 @@ def _average(matches: Matches, used: FitMatches, start: TwoViewState, steps: Arr
     for k in range(size):
         if likely[k]:
             own = moved(start, steps[k])
-            state, data, hessians[k], evidences[k] = _candidate(
+            state, data, hessian, evidences[k] = _candidate(
                 matches, used, own, linearised(used, own), priors, grid[k], threshold,
                 LAST_ITERATIONS)
-            steps[k] = step_between(start, state)
-            of_data[k] = data.hessian
+            copy_vector(step_between(start, state), steps[k])
+            copy_matrix(hessian, hessians[k])
+            copy_matrix(data.hessian, of_data[k])
     best = int(np.argmax(evidences))
     # Around the best one, where the local parameters of all of them are small.
     origin = moved(start, steps[best])
@@ -188,15 +188,18 @@ def _average(matches: Matches, used: FitMatches, start: TwoViewState, steps: Arr
     away = np.zeros((size, PARAMETERS))
     for k in range(size):
         if likely[k]:
-            away[k] = step_between(origin, moved(start, steps[k]))
+            copy_vector(step_between(origin, moved(start, steps[k])), away[k])
             mean += weights[k] * away[k]
-    covariances = np.zeros((2, PARAMETERS, PARAMETERS))
+    believed = np.zeros((PARAMETERS, PARAMETERS))
+    spread = np.zeros((PARAMETERS, PARAMETERS))
     for k in range(size):
         if likely[k]:
-            rest = away[k] - mean
-            spread = np.outer(rest, rest)
-            fitted = inverse(hessians[k])
-            covariances[0] += weights[k] * (fitted + spread)
-            covariances[1] += weights[k] * (
-                sandwich(hessians[k], of_data[k], fitted, scores) + spread)
-    return moved(origin, mean), covariances, best
+            rest, own = away[k] - mean, inverse(hessians[k])
+            for i in range(PARAMETERS):
+                for j in range(PARAMETERS):
+                    believed[i, j] += weights[k] * own[i, j]
+                    spread[i, j] += weights[k] * rest[i] * rest[j]
+    # The errors are those that the best one shows: another's misfit is no noise to it.
+    own = inverse(hessians[best])
+    shown = sandwich(hessians[best], of_data[best], own, scores)
+    return moved(origin, mean), as_much_wider(believed, own, shown) + spread, best

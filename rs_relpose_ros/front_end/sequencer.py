@@ -18,7 +18,13 @@ from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.front_end.frame import EncodedFrame, Frame, sensor_camera
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
-from rs_relpose_ros.geometry.timing import ImageClock, NANOSECONDS, seconds_between, to_nanoseconds
+from rs_relpose_ros.geometry.timing import (
+    FrameIntervals,
+    ImageClock,
+    NANOSECONDS,
+    seconds_between,
+    to_nanoseconds,
+)
 from rs_relpose_ros.imu.buffer import AddResult, Coverage, ImuBuffer
 from rs_relpose_ros.imu.frame_imu import frame_imu, FrameImu
 from rs_relpose_ros.imu.samples import ImuSample
@@ -153,6 +159,7 @@ class Sequencer:
         self._intrinsics: Intrinsics | None = None
         self._image_clock: ImageClock | None = None
         self._last_stamp_ns: int | None = None
+        self._intervals = FrameIntervals()
         self._previous_reference_ns: int | None = None
         # Tracked time offset, and how often time jumped: when frames came, and as they are taken.
         self._offset_ns = 0
@@ -189,14 +196,21 @@ class Sequencer:
         with self._changed:
             self._count['frames'] += 1
             clock = self._clock_of(frame.intrinsics)
-            start_ns, end_ns = clock.row_span_ns(frame.stamp_ns)
-            if not self._goes_on(frame.stamp_ns, end_ns):
+            if not self._goes_on(frame.stamp_ns, clock.row_span_ns(frame.stamp_ns)[1]):
                 return
             self._last_stamp_ns = frame.stamp_ns
+            # Of all frames that come, whatever becomes of them: live as in replay.
+            interval_ns = self._intervals.add(frame.stamp_ns)
             self._waiting.append(_Waiting(
-                frame, start_ns, end_ns, clock.reference_ns(frame.stamp_ns),
+                frame, *clock.row_span_ns(frame.stamp_ns, interval_ns),
+                clock.reference_ns(frame.stamp_ns, interval_ns),
                 received_ns=self._now(), generation=self._generation))
             self._sort_out()
+
+    def pass_over(self, stamp_ns: int) -> None:
+        """Learn of a frame that is left out on purpose: it tells the interval of the next one."""
+        with self._changed:
+            self._intervals.add(stamp_ns)
 
     def refuse(self, stamp_ns: int, cause: Refusal, reason: str) -> None:
         """Count a frame that could not even be added."""
@@ -342,7 +356,8 @@ class Sequencer:
             sensor = self._parameters.sensor
             self._image_clock = ImageClock(
                 sensor_camera(intrinsics, self._parameters), sensor.time_offset,
-                sensor.stamp_exposure, sensor.exposure_time)
+                sensor.stamp_exposure, sensor.exposure_time, sensor.time_offset_per_interval,
+                sensor.time_offset_reference_interval)
             self._intrinsics = intrinsics
         return self._image_clock
 
@@ -418,3 +433,4 @@ class Sequencer:
         while self._waiting:
             self._refuse(self._waiting.popleft().frame.stamp_ns, cause, reason)
         self._last_stamp_ns = self._previous_reference_ns = None
+        self._intervals = FrameIntervals()

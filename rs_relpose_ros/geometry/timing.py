@@ -1,10 +1,13 @@
 """Time: integer nanoseconds everywhere, and the one equation that gives a row its instant.
 
-    t_imu(row v) = stamp + time_offset + exposure_shift + (v - v_stamp) * line_delay
+    t_imu(row v) = stamp + time_offset + k (T - T_ref) + exposure_shift
+                   + (v - v_stamp) * line_delay
 
 ``v_stamp`` is row 0, (height - 1) / 2 or height - 1 for a driver that stamps the first, middle or
 last row; ``exposure_shift`` is +exposure/2, 0 or -exposure/2 for a driver that stamps the start,
-middle or end of the exposure.
+middle or end of the exposure. k is ``time_offset_per_interval``: with automatic exposure, the
+middle of the exposure moves against the stamp as the interval T between frames changes
+(`FrameIntervals`).
 """
 
 from __future__ import annotations
@@ -43,12 +46,16 @@ class ImageClock:
         The instant of that row's exposure which the stamp marks.
     exposure_time : float
         Exposure of one row [s]; needed unless `stamp_exposure` is 'middle'.
+    offset_per_interval, reference_interval : float
+        k [s/s] and T_ref [s]: the offset of a frame is longer by ``k (T - T_ref)``.
     """
 
     camera: RollingShutterCamera
     time_offset: float = 0.0
     stamp_exposure: str = 'middle'
     exposure_time: float = 0.0
+    offset_per_interval: float = 0.0
+    reference_interval: float = 0.0
 
     def __post_init__(self) -> None:
         if self.stamp_exposure not in STAMP_EXPOSURES:
@@ -57,13 +64,49 @@ class ImageClock:
         if not self.exposure_time >= 0.0:
             raise InputError(f'exposure_time must be >= 0 s, got {self.exposure_time}')
 
-    def reference_ns(self, stamp_ns: int) -> int:
-        """Instant of the reference row's mid-exposure on the IMU clock [ns]."""
-        shift = {'start': 0.5, 'middle': 0.0, 'end': -0.5}[self.stamp_exposure]
-        return stamp_ns + to_nanoseconds(self.time_offset + shift * self.exposure_time)
+    def reference_ns(self, stamp_ns: int, interval_ns: int | None = None) -> int:
+        """Instant of the reference row's mid-exposure on the IMU clock [ns].
 
-    def row_span_ns(self, stamp_ns: int) -> tuple[int, int]:
+        `interval_ns`: T of the frame; None where it is not known, T_ref then.
+        """
+        shift = {'start': 0.5, 'middle': 0.0, 'end': -0.5}[self.stamp_exposure]
+        offset = self.time_offset + shift * self.exposure_time
+        if interval_ns is not None:
+            offset += self.offset_per_interval * (
+                interval_ns / NANOSECONDS - self.reference_interval)
+        return stamp_ns + to_nanoseconds(offset)
+
+    def row_span_ns(self, stamp_ns: int, interval_ns: int | None = None) -> tuple[int, int]:
         """Instants of the earliest and the latest row of the frame on the IMU clock [ns]."""
-        reference = self.reference_ns(stamp_ns)
+        reference = self.reference_ns(stamp_ns, interval_ns)
         earliest, latest = self.camera.row_time_span
         return reference + to_nanoseconds(earliest), reference + to_nanoseconds(latest)
+
+
+class FrameIntervals:
+    """Interval T of each frame to the one before; stamps that do not increase tell nothing.
+
+    Where frames are missing in between, the last T is kept: a difference more than 1.5 times as
+    long as T is one, unless that before was as long, to a tenth of it: then the frame rate has
+    changed.
+    """
+
+    def __init__(self) -> None:
+        self._stamp_ns: int | None = None
+        self._difference_ns = 0
+        self._interval_ns: int | None = None
+
+    def add(self, stamp_ns: int) -> int | None:
+        """T of the frame of this stamp [ns]; None of the first one."""
+        if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
+            return self._interval_ns
+        if self._stamp_ns is not None:
+            difference, kept = stamp_ns - self._stamp_ns, self._interval_ns
+            # 2 d > 3 T and |d - d_before| > d / 10, in integers.
+            missing = (kept is not None and 2 * difference > 3 * kept
+                       and 10 * abs(difference - self._difference_ns) > difference)
+            if not missing:
+                self._interval_ns = difference
+            self._difference_ns = difference
+        self._stamp_ns = stamp_ns
+        return self._interval_ns
