@@ -194,12 +194,12 @@ def _average(matches: Matches, used: FitMatches, start: TwoViewState, steps: Arr
     spread = np.zeros((PARAMETERS, PARAMETERS))
     for k in range(size):
         if likely[k]:
-            rest, own = away[k] - mean, inverse(hessians[k])
+            rest, fitted = away[k] - mean, inverse(hessians[k])
             for i in range(PARAMETERS):
                 for j in range(PARAMETERS):
-                    believed[i, j] += weights[k] * own[i, j]
+                    believed[i, j] += weights[k] * fitted[i, j]
                     spread[i, j] += weights[k] * rest[i] * rest[j]
     # The errors are those that the best one shows: another's misfit is no noise to it.
-    own = inverse(hessians[best])
-    shown = sandwich(hessians[best], of_data[best], own, scores)
-    return moved(origin, mean), as_much_wider(believed, own, shown) + spread, best
+    fitted = inverse(hessians[best])
+    shown = sandwich(hessians[best], of_data[best], fitted, scores)
+    return moved(origin, mean), as_much_wider(believed, fitted, shown) + spread, best
