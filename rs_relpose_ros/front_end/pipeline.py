@@ -15,6 +15,7 @@ from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.front_end.derotated_rays import DerotatedRays, median_parallax, Sensor
 from rs_relpose_ros.front_end.frame import Frame, sensor_camera
 from rs_relpose_ros.front_end.pair import closes_pair, PairResult, SinceKeyframe
+from rs_relpose_ros.front_end.stamp_scatter import StampScatter
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import aligning_rotation, log_so3
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between
@@ -96,6 +97,7 @@ class Pipeline:
             raise MissingInputError('parameters are missing: ' + ', '.join(missing))
         self._keep_images = keep_images
         self._tracker = make_tracker(parameters.tracking) if tracker is None else tracker
+        self._stamps = StampScatter()
         self._health = HealthMonitor()
         self._seen: Tracked | None = None
         self._applied = Applied()
@@ -117,6 +119,7 @@ class Pipeline:
     def reset(self) -> None:
         """Forget the reference keyframe: the next frame starts anew."""
         self._tracker.reset()
+        self._stamps.reset()
         self._reference = self._previous = self._gyro = None
         self._reference_rays = self._current_rays = None
         self._turn = _Turn.none()
@@ -132,6 +135,7 @@ class Pipeline:
         self.prepare()
         sensor = self._sensor_of(frame, parameters)
         view = _View(frame, imu)
+        self._stamps.add(frame.stamp_ns)
         # Without the gyro tracks are not predicted, and wrong ones that agree by chance pass.
         if self._reference is None or self._previous is None or imu.since_previous is None:
             self._tracker.start(frame.image)
@@ -246,7 +250,8 @@ class Pipeline:
             relative_rotation=None if told is None else told.rotation,
             relative_rotation_covariance=None if told is None else told.covariance,
             interval=_interval(reference, view),
-            config=replace(parameters.estimator, gravity_sigma=gravity.sigma),
+            config=replace(parameters.estimator, gravity_sigma=gravity.sigma, stamp_sigma=max(
+                parameters.estimator.stamp_sigma, self._stamps.sigma)),
             quality=matches.quality,
             rng=np.random.default_rng([parameters.pair.seed, stamp1_ns, stamp2_ns]))
         pose = self._judged(pose, matches, reference, view, sensor, parameters)
