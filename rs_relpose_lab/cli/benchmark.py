@@ -243,6 +243,40 @@ def _run_unseen(args: argparse.Namespace) -> int:
     return _tell(write_report(args.output, bags), args.output)
 
 
+def _consistency_arguments(parser: argparse.ArgumentParser) -> None:
+    _number(parser, '--bags', 12, 'simulated bags')
+    parser.add_argument('--recording', nargs=3, type=Path, action='append', default=[],
+                        metavar=('BAG', 'PARAMETERS', 'PAIRS'),
+                        help='a recording, its parameter file and a table of true pairs '
+                        '(pseudo_truth.csv); may be given several times')
+
+
+def _run_consistency(args: argparse.Namespace) -> int:
+    from rs_relpose_lab.experiments.consistency import (
+        configurations,
+        on_recording,
+        on_simulated_bag,
+        PairConsistency,
+        write_report,
+    )
+
+    _check_at_least(0, args, 'bags')
+    if not args.bags and not args.recording:
+        raise InputError('--bags 0 needs a --recording: there is nothing to measure')
+    args.output.mkdir(parents=True, exist_ok=True)
+    pairs: list[PairConsistency] = []
+    with progress_bar(args.bags + len(args.recording), 'bag') as bar:
+        for recording in args.recording:
+            pairs += on_recording(*recording)
+            bar.update()
+        for config in configurations(args.bags, args.seed):
+            pairs += on_simulated_bag(config, args.output / f'seed_{config.seed}')
+            bar.update()
+    if not pairs:
+        raise InputError('no pair could be compared with the truth')
+    return _tell(write_report(args.output, pairs), args.output)
+
+
 def _run_calibration(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments.calibration_accuracy import run_calibration, write_report
     from rs_relpose_lab.experiments.workers import in_processes
@@ -375,6 +409,12 @@ BENCHMARKS = {
         'that suits it best) with the truth. Needs ROS.',
         lambda parser: _number(parser, '--bags', 10, 'number of bags'), _run_unseen, 'unseen',
         first_seed=201, seed_of='bag'),
+    'consistency': Benchmark(
+        'whether covariances hold, on simulated bags and on recordings',
+        'Squared errors of rotation and direction of translation in units of their covariance '
+        '(NEES by degrees of freedom: 1 where it is right), over the pairs of rendered bags of '
+        'walks, and over the true pairs of recordings, short and long ones.',
+        _consistency_arguments, _run_consistency, 'consistency', first_seed=401, seed_of='bag'),
     'calibration': Benchmark(
         '`rs_relpose calibrate` on simulated tracks, against the truth',
         'Errors, sigmas and verdicts of the calibration over many simulated recordings of 300 '

@@ -144,7 +144,8 @@ def pair_information(pair: PairEvidence, in_force: Array, about: Array) -> PairI
     information_told = np.linalg.inv(pair.gyro_covariance)
     H[THETA:THETA + 3, THETA:THETA + 3] += information_told - information
     C[THETA:THETA + 3] += (information - information_told) @ D
-    return PairInformation(S, b + S @ about, _pose_by_deviation(problem, state, -inverse(H) @ C), images)
+    moved = _pose_by_deviation(problem, state, -inverse(H) @ C)
+    return PairInformation(S, b + S @ about, moved, images)
 
 
 def _without_gyro(H: Array, gradient: Array, information: Array, theta: Array) -> Array:
