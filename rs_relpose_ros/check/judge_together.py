@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 import math
 
 import numpy as np
@@ -35,8 +36,13 @@ _EXAMPLE_READOUT = 0.030
 # Displacement below the noise of matches, and one that spoils a global-shutter pose [px].
 _NO_EFFECT, _STRONG_EFFECT = 1.0, 4.0
 
+# Sigmas from which on a figure is off for certain, whether poses show it or not; and how many
+# times the largest sigma of an observable one it may be off before the poses are called wrong.
+_CERTAIN, _GROSS = 4.0, 3.0
+_LIMITS = {figure.name: _GROSS * figure.observable for figure in FIGURES}
 _VERDICTS = {HealthState.OK: Verdict.OK, HealthState.UNKNOWN: UNKNOWN,
              HealthState.SUSPECT: WARNING, HealthState.WRONG: FAILURE}
+_MEASURE = 'have it measured with "rs_relpose calibrate"'
 # Figures by the parameters that tell them.
 _TOLD_BY = {'quat_cam_imu_xyzw': 'axes', 'readout_time': 'readout_time'}
 
@@ -118,10 +124,32 @@ def _texture(trial: Trial, health: Health) -> Finding:
 def _figures(health: Health, why: str) -> Iterator[Finding]:
     """Each figure, by the trial; `why` none is known where there is none."""
     for seen in health.findings:
-        yield Finding(seen.figure, _VERDICTS[seen.state], seen.sentence, figures=seen.as_json())
+        state = _state(seen)
+        yield Finding(
+            seen.figure, _VERDICTS[state], seen.sentence,
+            _MEASURE if state is not seen.state is HealthState.OK else
+            'then check again: a figure that is far off hides others, and is not seen to its sigma'
+            if state is HealthState.WRONG else '', replace(seen, state=state).as_json())
     if not health.findings:
         for figure in FIGURES:
             yield _unknown(figure.name, figure.unit, f'not measured: {why}')
+
+
+def _state(seen: Seen) -> HealthState:
+    """That of a figure by itself: a figure that is off is told where no pose suffers, too."""
+    if seen.told is None or seen.seen is None or seen.sigma is None:
+        return seen.state
+    apart = abs(seen.seen - seen.told)
+    if apart < _CERTAIN * seen.sigma:
+        return seen.state
+    if seen.unit == 'deg':
+        apart = math.radians(apart)
+    elif seen.unit == 'px':
+        apart /= seen.told
+    figure = 'readout_time' if seen.figure == 'readout_direction' else seen.figure
+    if seen.state is HealthState.WRONG or apart > _LIMITS.get(figure, math.inf):
+        return HealthState.WRONG
+    return HealthState.SUSPECT
 
 
 def _unknown(name: str, unit: str, text: str, remedy: str = '',
@@ -134,7 +162,7 @@ def _unknown(name: str, unit: str, text: str, remedy: str = '',
 
 def _not_told(name: str, completion: Completion, seen: Scan) -> Finding:
     """A figure that the node needs, as the calibration sees it."""
-    found, remedy = completion.found, 'have it measured with "rs_relpose calibrate"'
+    found, remedy = completion.found, _MEASURE
     unit = 's' if name == 'readout_time' else 'deg'
     if found is None:
         return _unknown(name, unit, f'not told, and not found: {completion.problem}', remedy)
@@ -178,7 +206,8 @@ def _effect(seen: Scan, health: Health, parameters: Parameters) -> Finding | Non
     told = parameters.sensor.readout_time
     shown = {finding.figure: finding for finding in health.findings}.get('readout_time')
     readout, source, verdict = told, '', Verdict.OK
-    if shown is not None and shown in health.faults and shown.seen is not None:
+    faulty = shown is not None and _state(shown) in (HealthState.SUSPECT, HealthState.WRONG)
+    if faulty and shown is not None and shown.seen is not None:
         readout, source = shown.seen, ' as seen'
     elif told is None:
         readout, source, verdict = _EXAMPLE_READOUT, ' (assumed; give readout_time)', UNKNOWN
