@@ -31,6 +31,8 @@ from rs_relpose_ros.health.judge import FIGURES
 _SAME_CLOCK = 0.5
 # Matches of a pair in the median that give no estimate, and that are few.
 _NO_MATCHES, _FEW_MATCHES = 15, 30
+# Share of the pairs that have a pose where the camera moves and the figures are right.
+_MOST_POSED = 0.7
 # Read-out that is taken for example where none is known [s].
 _EXAMPLE_READOUT = 0.030
 # Displacement below the noise of matches, and one that spoils a global-shutter pose [px].
@@ -98,7 +100,10 @@ def _pairs(trial: Trial) -> Finding:
                'too few images were processed')
     return judged(
         'pairs', f'{pairs} pairs in {trial.frames} images, {posed} with a pose', figures,
-        Case(not posed, UNKNOWN, '', f': {why}'))
+        Case(not posed, UNKNOWN, '', f': {why}'),
+        Case(posed < _MOST_POSED * pairs, WARNING, 'move more, beside turning; where the camera '
+             'does, a figure is too far off to be seen: have all measured with "rs_relpose '
+             'calibrate"', f'; without: {why}'))
 
 
 def _texture(trial: Trial, health: Health) -> Finding:
