@@ -19,7 +19,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -66,8 +65,8 @@ def widened(final: Fit, free: NDArray[np.bool_], errors: ModelErrors | None) -> 
 def _between_regions(final: Fit, free: NDArray[np.bool_]) -> Array:
     """Factors (G,) of the variances by what regions of the image scatter more than cells do.
 
-    Cells are regions times stretches of time: where the regions scatter no more than these, by
-    more than chance, the stretches have it all.
+    Cells are regions times stretches of time: where the regions scatter no more than these, the
+    stretches have it all.
     """
     problem, curve = final.problem, bent(final.weights)
     index = np.ix_(free, free)
@@ -83,8 +82,7 @@ def _between_regions(final: Fit, free: NDArray[np.bool_]) -> Array:
         moves.append(np.linalg.pinv(rest_curvature, hermitian=True) @ own.sum(axis=0))
         of_cells = np.stack([own[stretch == k].sum(axis=0) for k in np.unique(stretch)]) @ inverse
         cells += of_cells.T @ of_cells
-    by_chance = 1.0 + math.sqrt(2.0 / (len(moves) - 1))
-    beyond = np.diag(jackknife_of(np.array(moves)) - by_chance * cells)
+    beyond = np.diag(jackknife_of(np.array(moves)) - cells)
     factors = np.ones(GLOBAL)
     factors[free] += np.maximum(beyond, 0.0) / np.diag(final.covariance)[free]
     return factors
