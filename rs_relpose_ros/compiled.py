@@ -8,7 +8,7 @@ that a process's results would depend on which caller it ran first.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import numba
 
@@ -19,12 +19,15 @@ P = ParamSpec('P')
 T = TypeVar('T')
 
 kernel_cache.install()
-kernel = numba.njit(cache=True, nogil=True, error_model='numpy')
+# Nothing calls a kernel as a C function: a wrapper for that costs a tenth of the compilation.
+_OPTIONS: dict[str, Any] = {
+    'cache': True, 'nogil': True, 'error_model': 'numpy', 'no_cfunc_wrapper': True}
+kernel = numba.njit(**_OPTIONS)
 # Put into its callers by Numba: for the innermost loops, whose arrays' shapes must be known there.
-inlined_kernel = numba.njit(cache=True, nogil=True, error_model='numpy', forceinline=True)
+inlined_kernel = numba.njit(**_OPTIONS, forceinline=True)
 # Copied into its callers before types are inferred, so that it costs them no compilation of its
 # own: for functions of a few lines, such as a cross product.
-small_kernel = numba.njit(cache=True, nogil=True, error_model='numpy', inline='always')
+small_kernel = numba.njit(**_OPTIONS, inline='always')
 
 
 def linked_kernel(function: Callable[P, T]) -> Callable[P, T]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,11 +56,16 @@ def view(world: NDArray[np.float64], time: float, rng: np.random.Generator) -> V
 
 
 def simulated_flight(seed: int, points: int = 120,
-                     tracks: Iterable[NDArray[np.int64]] | None = None) -> Flight:
-    """`tracks`: which points are matched, for each pair; all of them by default."""
+                     tracks: Iterable[NDArray[np.int64]] | None = None,
+                     places: Sequence[float] = TIMES) -> Flight:
+    """`tracks`: which points are matched, for each pair; all of them by default.
+
+    `places`: at which time's place each keyframe is [s]; where it is that of the keyframe before,
+    the pair is a pure rotation.
+    """
     rng = np.random.default_rng(seed)
     world = rng.uniform([-4.0, -2.0, 6.0], [4.0, 2.0, 20.0], (points, 3))
-    views = [view(world, time, rng) for time in TIMES]
+    views = [view(world, time, rng) for time in places]
     chosen = [np.arange(points)] * (len(TIMES) - 1) if tracks is None else list(tracks)
     first, pairs, baselines = views[0], [], []
     for k, (a, b, use) in enumerate(zip(views[:-1], views[1:], chosen, strict=True)):
@@ -70,10 +75,14 @@ def simulated_flight(seed: int, points: int = 120,
         # Shuffled: only the ids tell what belongs together.
         use = rng.permutation(use)
         pose = RelativePose(
-            status=Status.OK, R=(a.rotation.inv() * b.rotation).as_matrix(), t=t / length,
-            linear_velocity2=b.rotation.inv().apply(VELOCITY) / length,
+            status=Status.OK, R=(a.rotation.inv() * b.rotation).as_matrix(),
             angular_velocity2=b.angular_velocity, inliers=np.ones(len(use), dtype=bool),
             covariance=1e-6 * np.eye(6), velocity_covariance=1e-4 * np.eye(6), model='uniform')
+        if length > 0.0:
+            pose = replace(pose, t=t / length,
+                           linear_velocity2=b.rotation.inv().apply(VELOCITY) / length)
+        else:
+            pose = pose.without_translation(Status.PURE_ROTATION, 'no translation')
         pairs.append(PairResult(
             reference_stamp_ns=START_NS + round(1e9 * TIMES[k]),
             stamp_ns=START_NS + round(1e9 * TIMES[k + 1]),

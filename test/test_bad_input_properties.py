@@ -264,7 +264,8 @@ def test_any_interval(interval, config):
 
 @examples(100)
 @given(st.sampled_from(['threshold', 'pixel_sigma', 'gravity_sigma', 'gyro_sigma', 'confidence',
-                        'max_iterations', 'time_limit', 'min_inliers', 'min_parallax']),
+                        'max_iterations', 'time_limit', 'min_inliers', 'min_parallax',
+                        'max_translation_sigma']),
        any_float | st.integers(-10**20, 10**20) | st.text(max_size=3) | st.none())
 def test_any_setting(name, value):
     """What is legal gives no pose of random matches either."""

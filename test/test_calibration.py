@@ -95,9 +95,12 @@ def test_cost_curve_has_its_minimum_at_the_read_out_time():
 
 
 def test_parameter_file_is_the_nodes(tmp_path):
-    _, result = usual()
+    recorded, result = usual()
     path = tmp_path / 'calibration.yaml'
-    path.write_text(parameter_file(result, 'A test.', compressed=True))
+    camera = camera_of(recorded.truth)
+    path.write_text(parameter_file(result, 'A test.', camera=camera, compressed=True))
+    # The CameraInfo has the focal length.
+    assert not read_parameters(path).intrinsics.given
     sensor = read_parameters(path).sensor
     assert sensor.readout_time == pytest.approx(result.readout_time.value, abs=1e-6)
     assert sensor.time_offset == pytest.approx(result.time_offset.value, abs=1e-6)
@@ -106,16 +109,30 @@ def test_parameter_file_is_the_nodes(tmp_path):
     np.testing.assert_allclose(sensor.R_cam_imu, result.R_cam_imu, atol=1e-6)
 
 
-def test_camera_read_upwards_with_unknown_focal_length():
+def test_camera_read_upwards_with_unknown_focal_length(tmp_path):
     rng = np.random.default_rng(12)
     truth = drawn(rng, readout_time=0.02, focal=900.0, **SHORT)
     truth = dataclasses.replace(truth, readout_time=-0.02)
     recorded = record(truth, rng)
     guess = 0.8 * truth.width
-    result = calibrate(recorded.tracks, recorded.gyro, camera_of(truth, guess), focal_known=False)
+    camera = camera_of(truth, guess)
+    result = calibrate(recorded.tracks, recorded.gyro, camera, focal_known=False)
     assert_right(result, truth)
     assert result.focal_factor.value * guess == pytest.approx(900.0, rel=0.02)
-    assert "readout_direction: 'up'" in parameter_file(result, 'A test.', compressed=False)
+    path = tmp_path / 'calibration.yaml'
+    path.write_text(parameter_file(result, 'A test.', camera=camera, compressed=False))
+    told = read_parameters(path)
+    assert told.sensor.readout_direction == 'up'
+    # What the node and replay take where no CameraInfo tells it.
+    intrinsics = told.intrinsics.of_image(camera.width, camera.height)
+    assert intrinsics.fx == intrinsics.fy == pytest.approx(
+        result.focal_factor.value * guess, abs=0.01)
+    assert (intrinsics.cx, intrinsics.cy) == (camera.cx, camera.cy)
+    # Left out, and named, where the recording does not tell it.
+    unknown = dataclasses.replace(result, focal_factor=dataclasses.replace(
+        result.focal_factor, observable=False, remark='too slow'))
+    text = parameter_file(unknown, 'A test.', camera=camera, compressed=False)
+    assert 'camera_matrix (too slow)' in text and 'camera_matrix:' not in text
 
 
 @pytest.mark.long
@@ -153,7 +170,8 @@ def test_global_shutter_is_told_through_a_fisheye():
     result = calibrate(bent, recorded.gyro, fisheye)
     assert_right(result, recorded.truth)
     assert result.shutter == 'global'
-    assert 'readout_time: 0.0' in parameter_file(result, 'A test.', compressed=False)
+    assert 'readout_time: 0.0' in parameter_file(result, 'A test.', camera=fisheye,
+                                                 compressed=False)
 
 
 def test_offset_that_follows_the_exposure_is_reported():
@@ -171,12 +189,14 @@ def test_offset_that_follows_the_exposure_is_reported():
 def test_rotation_about_one_axis_is_not_observable():
     rng = np.random.default_rng(15)
     recorded = record(drawn(rng, readout_time=0.02, **SHORT), rng, about_one_axis(0, 6.0))
-    result = calibrate(recorded.tracks, recorded.gyro, camera_of(recorded.truth))
+    camera = camera_of(recorded.truth)
+    result = calibrate(recorded.tracks, recorded.gyro, camera)
     assert not result.rotation.observable and not result.observable
     assert 'one axis only, nearly y (yaw)' in result.rotation.remark
     assert 'x (pitch)' in result.rotation.remark.partition('turn about')[2]
     assert 'left out: quat_cam_imu_xyzw' in ' '.join(
-        parameter_file(result, 'A test.', compressed=False).replace('\n# ', ' ').split())
+        parameter_file(result, 'A test.', camera=camera, compressed=False).replace(
+            '\n# ', ' ').split())
 
 
 def few_frames(recorded: Recorded, count: int) -> Tracks:

@@ -1,4 +1,4 @@
-"""Stamps of frames: automatic exposure against jitter, in calibration and in the node's instants."""
+"""Stamps of frames: automatic exposure against jitter, calibrated and in the node."""
 
 from __future__ import annotations
 

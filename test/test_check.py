@@ -252,6 +252,20 @@ def test_what_is_broken_is_said_with_its_remedy(case, tmp_path):
     assert max(map(len, report.lines(100)[:-1])) <= 100     # the last one has the path
 
 
+@pytest.mark.parametrize('changes', [{'info': uncalibrated}, {'info_topic': ''}])
+def test_intrinsics_by_parameters(changes, tmp_path):
+    """As good as those of a CameraInfo, which comes first where it has some."""
+    told = Parameters.from_mapping(GIVEN | {
+        'camera_matrix': (61.0, 0.0, 31.5, 0.0, 61.0, 23.5, 0.0, 0.0, 1.0),
+        'distortion_coefficients': (-0.1, 0.0, 0.0, 0.0)})
+    findings, report = checked(broken(**changes).write(tmp_path / 'bag'), told)
+    assert not report.failed
+    assert findings['calibration'].text == '64x48, f 61.0 61.0 px, plumb_bob by camera_matrix'
+    assert findings['calibration'].figures['fx'] == 61.0
+    findings, _ = checked(Small().write(tmp_path / 'calibrated'), told)
+    assert findings['calibration'].text == '64x48, f 60.0 60.0 px, plumb_bob'
+
+
 def test_parameters_that_are_missing_are_a_warning(tmp_path):
     findings, _ = checked(Small().write(tmp_path / 'bag'), Parameters())
     assert findings['parameters'].verdict is Verdict.WARNING

@@ -1,5 +1,7 @@
 """The whole estimate of a pair: accuracy, covariance, degeneracy, conventions, bad input."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -186,6 +188,37 @@ def test_pure_rotation_has_a_rotation_and_no_translation():
         assert rotation_error(pose.R, scene.R) < 0.1
         sigma = np.degrees(np.sqrt(np.trace(pose.covariance[3:, 3:])))
         assert rotation_error(pose.R, scene.R) < 4.0 * sigma
+        # The rates are the gyro's.
+        np.testing.assert_array_equal(pose.velocity_covariance[3:, 3:],
+                                      TOLD.gyro_sigma**2 * np.eye(3))
+
+
+def test_a_direction_that_is_too_uncertain_is_no_pose():
+    scene = make_scene(8)
+    pose = estimate(scene)
+    sigma = np.degrees(np.sqrt(np.trace(pose.covariance[:3, :3])))
+    assert estimate(scene, config=replace(TOLD, max_translation_sigma=1.01 * sigma))
+    turned = estimate(scene, config=replace(TOLD, max_translation_sigma=0.99 * sigma))
+    assert turned.status is Status.LOW_PARALLAX
+    assert turned.reason == (
+        f'the direction of translation is uncertain by {sigma:.3g} deg (1 sigma), more than '
+        f'max_translation_sigma = {0.99 * sigma:g} deg')
+    # The rotation is that of the pose, and the translation takes no part.
+    np.testing.assert_array_equal(turned.R, pose.R)
+    np.testing.assert_array_equal(turned.covariance[3:, 3:], pose.covariance[3:, 3:])
+    np.testing.assert_array_equal(turned.velocity_covariance[3:, 3:],
+                                  pose.velocity_covariance[3:, 3:])
+    np.testing.assert_array_equal(turned.inliers, pose.inliers)
+    for unknown in (turned.t, turned.linear_velocity1, turned.linear_velocity2,
+                    turned.covariance[:3], turned.covariance[:, :3],
+                    turned.velocity_covariance[:3]):
+        assert np.isnan(unknown).all()
+    assert turned.rotation_known
+    # And the other way round.
+    back = turned.inverse()
+    np.testing.assert_allclose(back.R, pose.R.T)
+    np.testing.assert_allclose(back.covariance[3:, 3:], pose.inverse().covariance[3:, 3:],
+                               rtol=1e-9)
 
 
 def test_random_matches_have_no_consensus():

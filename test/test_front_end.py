@@ -116,7 +116,8 @@ LIVE = [name for name, _, declared in Parameters.declarations() if declared.live
 CHANGED: dict[str, Any] = {
     'threshold': 0.3, 'pixel_sigma': 1.5, 'gravity_sigma': 0.3, 'gyro_sigma': 0.1,
     'confidence': 0.6, 'max_iterations': 2, 'time_limit': 1e-9, 'min_inliers': 5000,
-    'min_parallax': 400.0, 'min_keyframe_parallax': 2.0, 'max_keyframe_interval': 0.01,
+    'min_parallax': 400.0, 'max_translation_sigma': 0.01,
+    'min_keyframe_parallax': 2.0, 'max_keyframe_interval': 0.01,
     'max_keyframe_frames': 2, 'min_tracked_fraction': 1.0, 'track_time_offset': True}
 # Shows in what the node publishes.
 OF_THE_NODE = {'publish_debug_image'}
@@ -157,7 +158,7 @@ def figures(pair: PairResult) -> tuple[Any, ...]:
     pose = pair.pose
     return (pair.reference_stamp_ns, pair.stamp_ns, pose.status, pose.iterations,
             pose.R.tobytes(), pose.t.tobytes(), pose.covariance.tobytes(),
-            pose.inliers.tobytes(), pair.drift.applied)
+            pose.inliers.tobytes(), pair.applied.time_offset)
 
 
 def pairs_of_run(recorded: list[Any], parameters: Parameters,

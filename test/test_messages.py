@@ -14,15 +14,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 from simulated_pairs import simulated_flight
 
+from rs_relpose_ros.config.intrinsics import IntrinsicsConfig
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
-from rs_relpose_ros.estimator.result import Status
+from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.front_end.sequencer import FrameRefused, ReadyFrame, Refusal, Sequencer
+from rs_relpose_ros.health.findings import Finding, Health, HealthState
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.messages import incoming, outgoing
 from rs_relpose_ros.messages.hanging import HangingCamera, HangingGyro
 from rs_relpose_ros.messages.intake import Intake
+from rs_relpose_ros.messages.published_pair import published_pair
 from rs_relpose_ros.messages.sensor_feed import Role
 
 # Luma of ITU-R BT.601.
@@ -292,7 +295,7 @@ def test_impossible_stamp_is_refused():
 # -- outgoing --------------------------------------------------------------------------------
 
 
-def pair(status: Status = Status.OK) -> PairResult:
+def pair() -> PairResult:
     """A pair with covariances, outliers, and a turn that is told by a quaternion with w < 0."""
     rng = np.random.default_rng(3)
     result = simulated_flight(0, 40).pairs[0]
@@ -301,7 +304,7 @@ def pair(status: Status = Status.OK) -> PairResult:
     # By more than 180 degrees about z.
     R = Rotation.from_euler('xyz', [0.1, -0.2, 3.3]).as_matrix()
     return replace(result, pose=replace(
-        result.pose, status=status, R=R, inliers=rng.random(40) < 0.7, covariance=covariance,
+        result.pose, R=R, inliers=rng.random(40) < 0.7, covariance=covariance,
         velocity_covariance=velocity_covariance))
 
 
@@ -320,8 +323,8 @@ def test_pair_messages(types):
         Rotation.from_quat([orientation.x, orientation.y, orientation.z, orientation.w]
                            ).as_matrix(), result.pose.R, atol=1e-12)
     # ROS: row-major, x y z rotX rotY rotZ.
-    np.testing.assert_array_equal(
-        np.reshape(pose.pose.covariance, (6, 6)), result.pose.covariance)
+    np.testing.assert_allclose(
+        np.reshape(pose.pose.covariance, (6, 6)), result.pose.covariance, rtol=1e-9)
     time_ref = messages.reference.time_ref
     assert time_ref.sec * 10**9 + time_ref.nanosec == result.reference_stamp_ns
     velocity = messages.velocity
@@ -329,8 +332,95 @@ def test_pair_messages(types):
     linear, angular = velocity.twist.twist.linear, velocity.twist.twist.angular
     assert [linear.x, linear.y, linear.z] == result.pose.linear_velocity2.tolist()
     assert [angular.x, angular.y, angular.z] == result.pose.angular_velocity2.tolist()
-    np.testing.assert_array_equal(
-        np.reshape(velocity.twist.covariance, (6, 6)), result.pose.velocity_covariance)
+    np.testing.assert_allclose(
+        np.reshape(velocity.twist.covariance, (6, 6)), result.pose.velocity_covariance, rtol=1e-9)
+    rotation = messages.relative_rotation
+    assert rotation.header == pose.header
+    assert rotation.orientation == orientation
+    np.testing.assert_allclose(np.reshape(rotation.orientation_covariance, (3, 3)),
+                               result.pose.covariance[3:, 3:], rtol=1e-9)
+    assert rotation.angular_velocity == angular
+    np.testing.assert_allclose(np.reshape(rotation.angular_velocity_covariance, (3, 3)),
+                               result.pose.velocity_covariance[3:, 3:], rtol=1e-9)
+    assert rotation.linear_acceleration_covariance[0] == -1.0
+
+
+def told(messages: outgoing.PairMessages) -> dict[str, str]:
+    [status] = messages.pairs.status
+    return {item.key: item.value for item in status.values}
+
+
+def test_every_pair_is_told(types):
+    result = replace(pair(), images_against_gyro=np.array([0.0, 3e-3, 4e-3]),
+                     gyro_bias=np.array([1e-3, 0.0, -2e-3]))
+    messages = outgoing.pair_messages(result, types)
+    assert incoming.stamp_ns(messages.pairs.header) == result.stamp_ns
+    [status] = messages.pairs.status
+    assert (status.level, status.message, status.hardware_id) in [
+        (level, 'OK', 'camera') for level in (0, b'\x00')]
+    values = told(messages)
+    assert int(values['reference_stamp_ns']) == result.reference_stamp_ns
+    assert (int(values['reference_imu_ns']), int(values['current_imu_ns'])) == (
+        result.reference_ns1, result.reference_ns2)
+    assert (values['status'], values['reason'], values['model']) == ('OK', '', 'uniform')
+    assert (values['matches'], values['inliers']) == ('40', str(result.pose.inliers.sum()))
+    assert float(values['rotation_difference_to_gyro_deg']) == pytest.approx(np.degrees(5e-3))
+    assert values['residual_rms_px'] == values['baseline_m'] == values['baseline_log_sigma'] == ''
+    assert values['gyro_bias_rad_s'] == '0.001 0.0 -0.002'
+    assert values['topics'] == 'relative_pose reference velocity matches relative_rotation'
+
+
+@pytest.mark.parametrize(('state', 'level'), [('ok', 0), ('suspect', 1), ('wrong', 2)])
+def test_health_is_told_with_every_pair(types, state, level):
+    finding = Finding('time_offset', 0.03, 0.0, 6e-4, 's', True, HealthState(state), 'as it is')
+    messages = outgoing.pair_messages(replace(pair(), health=Health((finding,))), types)
+    values = told(messages)
+    assert (values['health'], values['health_findings']) == (
+        state, f'time_offset {state}: as it is')
+    assert messages.pairs.status[0].level in (level, bytes([level]))
+    assert published_pair(messages).health == state
+
+
+@pytest.mark.parametrize('status', [Status.PURE_ROTATION, Status.LOW_PARALLAX])
+def test_a_pair_with_a_rotation_alone(types, status):
+    whole = pair()
+    result = replace(whole, pose=whole.pose.without_translation(status, 'as it is'))
+    messages = outgoing.pair_messages(result, types, 'base')
+    assert [topic for topic, _ in messages.by_topic()] == ['relative_rotation', 'pairs']
+    rotation = messages.relative_rotation
+    same = outgoing.pair_messages(whole, types, 'base').relative_rotation
+    assert (rotation.orientation, rotation.angular_velocity) == (
+        same.orientation, same.angular_velocity)
+    for name in ('orientation_covariance', 'angular_velocity_covariance'):
+        np.testing.assert_array_equal(getattr(rotation, name), getattr(same, name))
+    assert rotation.header.frame_id == 'base'
+    assert messages.pairs.status[0].message == f'{status.value}: as it is'
+    assert messages.pairs.status[0].level in (1, b'\x01')
+    assert told(messages)['topics'] == 'relative_rotation'
+
+
+def test_a_pair_without_a_rotation(types):
+    result = replace(pair(), pose=RelativePose(status=Status.NO_CONSENSUS, reason='none'))
+    messages = outgoing.pair_messages(result, types)
+    assert [topic for topic, _ in messages.by_topic()] == ['pairs']
+    assert told(messages)['topics'] == ''
+    assert told(messages)['reason'] == 'none'
+
+
+def test_published_covariances_have_no_negative_eigenvalue():
+    """Of rank 5, in any basis, as those of a pose are; and of figures of very different size."""
+    rng = np.random.default_rng(0)
+    lowest = []
+    for _ in range(300):
+        factor = rng.normal(size=(6, 5)) * 10.0**rng.uniform(-4.0, 0.0, (6, 1))
+        covariance = factor @ factor.T
+        lowest.append(np.linalg.eigvalsh(covariance)[0])
+        covariance[0, 5] *= 1.0 + 1e-15
+        published = outgoing.published_covariance(covariance).reshape(6, 6)
+        assert np.linalg.eigvalsh(published)[0] >= 0.0
+        np.testing.assert_array_equal(published, published.T)
+        assert np.abs(published - covariance).max() <= 1e-13 * np.trace(covariance)
+    assert min(lowest) < 0.0
 
 
 def test_matches_are_the_inliers(types):
@@ -356,8 +446,7 @@ def test_both_worlds_serialise_alike():
     from rclpy.serialization import deserialize_message
     ours = outgoing.pair_messages(pair(), build.rclpy_types)
     theirs = outgoing.pair_messages(pair(), build.rosbags_types)
-    for name in ('relative_pose', 'reference', 'velocity', 'matches'):
-        message = getattr(theirs, name)
+    for name, message in theirs.by_topic():
         data = build.TYPESTORE.serialize_cdr(message, message.__msgtype__)
         assert deserialize_message(bytes(data), type(getattr(ours, name))) == getattr(ours, name)
 
@@ -370,19 +459,15 @@ def test_diagnostics(types):
     assert [(v.key, v.value) for v in message.status[0].values] == [('a', '1')]
 
 
-def test_no_message_without_a_pose():
-    with pytest.raises(InputError, match='LOW_PARALLAX'):
-        outgoing.pair_messages(pair(status=Status.LOW_PARALLAX), build.rosbags_types)
-
-
 # -- intake ----------------------------------------------------------------------------------
 
 
-def intake(*, calibrated: bool = False) -> tuple[Intake, Sequencer]:
+def intake(*, calibrated: bool = False,
+           told: IntrinsicsConfig | None = None) -> tuple[Intake, Sequencer]:
     """An intake that has received the IMU of the first second."""
     sequencer = Sequencer(Parameters.from_mapping({
         'readout_time': 0.02, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0]}), offline=True)
-    target = Intake(sequencer)
+    target = Intake(sequencer, told=told)
     for stamp_ns in range(0, 10**9, 5_000_000):
         target.receive(Role.IMU, build.imu(build.rosbags_types, stamp_ns))
     if calibrated:
@@ -416,7 +501,7 @@ def test_images_without_camera_info_are_counted():
     for k in range(6):
         image = build.gray_image(build.rosbags_types, PIXELS, stamp_ns=k * 10**8)
         target.receive(Role.IMAGE, image)
-    target.refuse_held()
+    target.release_held()
     refused = taken(sequencer)
     assert [item.stamp_ns for item in refused] == [k * 10**8 for k in range(6)]
     assert {item.cause for item in refused} == {Refusal.NO_CALIBRATION}
@@ -432,6 +517,62 @@ def test_no_outdated_calibration_is_used():
     [refused] = taken(sequencer)
     assert refused.cause is Refusal.NO_CALIBRATION
     assert 'uncalibrated' in refused.reason
+
+
+TOLD = IntrinsicsConfig(
+    camera_matrix=(400.0, 0.0, 320.0, 0.0, 401.0, 241.0, 0.0, 0.0, 1.0),
+    distortion_coefficients=(0.1, -0.2, 0.0, 0.0))
+
+
+def receive_images(target: Intake, first: int, count: int) -> None:
+    for k in range(first, first + count):
+        pixels = np.roll(PIXELS, k)   # each another
+        target.receive(Role.IMAGE, build.compressed(
+            build.rosbags_types, build.jpeg(pixels), stamp_ns=k * 10**8))
+
+
+def test_told_intrinsics_take_the_place_of_those_that_are_missing():
+    target, sequencer = intake(told=TOLD)
+    target.receive(Role.CAMERA_INFO, build.camera_info(build.rosbags_types, k=(0.0,) * 9))
+    assert target.camera_info_problem == ''
+    receive_images(target, 1, 2)
+    frames = taken(sequencer)
+    assert [frame.frame.stamp_ns for frame in frames] == [10**8, 2 * 10**8]
+    for frame in frames:
+        assert frame.frame.intrinsics == TOLD.of_image(640, 480) == target.intrinsics
+    # A calibration that comes later is better, and one that goes is not used any more.
+    target.receive(Role.CAMERA_INFO, build.camera_info(build.rosbags_types))
+    receive_images(target, 3, 1)
+    assert taken(sequencer)[0].frame.intrinsics.fx == 450.0
+    target.receive(Role.CAMERA_INFO, build.camera_info(build.rosbags_types, k=(0.0,) * 9))
+    receive_images(target, 4, 1)
+    assert taken(sequencer)[0].frame.intrinsics == TOLD.of_image(640, 480)
+    # One that cannot be used is no missing one.
+    with pytest.raises(InputError):
+        target.receive(Role.CAMERA_INFO, build.camera_info(build.rosbags_types, model='bananas'))
+    receive_images(target, 5, 1)
+    [refused] = taken(sequencer)
+    assert (refused.cause, 'bananas' in refused.reason) == (Refusal.NO_CALIBRATION, True)
+
+
+def test_without_a_camera_info_the_first_images_wait():
+    target, sequencer = intake(told=TOLD)
+    receive_images(target, 1, 4)
+    assert taken(sequencer) == [] and target.intrinsics is None
+    receive_images(target, 5, 1)
+    assert [frame.frame.intrinsics.fy for frame in taken(sequencer)] == [401.0] * 5
+    # Of each image the size is its own.
+    target.receive(Role.IMAGE, build.gray_image(build.rosbags_types, PIXELS[:240], 6 * 10**8))
+    [frame] = taken(sequencer)
+    assert frame.frame.intrinsics == TOLD.of_image(640, 240)
+    target.receive(Role.IMAGE, build.compressed(build.rosbags_types, b'none', stamp_ns=7 * 10**8))
+    [refused] = taken(sequencer)
+    assert (refused.cause, refused.stamp_ns) == (Refusal.BAD_IMAGE, 7 * 10**8)
+    # A recording that ends before.
+    target, sequencer = intake(told=TOLD)
+    receive_images(target, 1, 2)
+    target.release_held()
+    assert len(taken(sequencer)) == 2
 
 
 def test_image_of_another_size_is_refused():

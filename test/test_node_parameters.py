@@ -78,7 +78,9 @@ def test_an_illegal_value_is_refused_with_its_reason(node, parameters, changes, 
 def test_what_the_node_was_built_with_is_read_only(node, parameters, name):
     value = DEFAULTS[name]
     if value is None:
-        value = {'readout_time': 0.02, 'quat_cam_imu_xyzw': (0.0, 0.0, 0.0, 1.0)}[name]
+        value = {'readout_time': 0.02, 'quat_cam_imu_xyzw': (0.0, 0.0, 0.0, 1.0),
+                 'camera_matrix': (5.0, 0.0, 2.0, 0.0, 5.0, 2.0, 0.0, 0.0, 1.0),
+                 'distortion_coefficients': (0.1, 0.0, 0.0, 0.0)}[name]
     value = list(value) if isinstance(value, tuple) else value
     [result] = node.set_parameters([Parameter(name, value=value)])
     assert not result.successful

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from rs_relpose_ros.estimator.result import RelativePose, Status
-from rs_relpose_ros.front_end.drift import Drift
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.front_end.sequencer import Refusal, SequencerCounts
+from rs_relpose_ros.health.findings import Finding, Health, HealthState
+from rs_relpose_ros.health.tracked import Applied, Tracked
 from rs_relpose_ros.node.cause_log import CauseLog
 from rs_relpose_ros.node.diagnostics import ERROR, Inputs, OK, Statistics, WARN
 from rs_relpose_ros.tracking.matches import Matches
@@ -46,6 +47,7 @@ EXPECTED = {
     'tracked_gyro_bias_rad_s': '0.01000 -0.02000 0.03000',
     'tracked_gyro_bias_sigma_rad_s': '0.00100 0.00200 0.00300', 'tracked_time_offset_ms': '4.00',
     'tracked_time_offset_sigma_ms': '0.50', 'applied_time_offset_ms': '-1.50',
+    'health': 'ok', 'health_findings': 'time_offset ok: 4 ms',
     'latency_p50_ms': '15.0', 'latency_p99_ms': '15.0',
     'frame_time_p50_ms': '30.0', 'frame_time_p99_ms': '30.0', 'worker_busy_percent': '2',
     'last_reason_no_pose': 'LOW_PARALLAX: it stands'}
@@ -162,11 +164,13 @@ def test_every_counter_has_its_own_figure(clock):
     refused = {cause: 100 + k for k, cause in enumerate(Refusal)}
     for _ in range(3):
         statistics.add_failure('a frame failed')
-    with_drift = replace(pair(Status.LOW_PARALLAX, 'it stands'), drift=Drift(
-        gyro_bias=np.array([0.01, -0.02, 0.03]), gyro_bias_sigma=np.array([1e-3, 2e-3, 3e-3]),
-        time_offset=0.004, time_offset_sigma=0.0005, applied=-0.0015, pairs=7))
+    finding = Finding('time_offset', 0.0, 0.004, 0.0005, 's', True, HealthState.OK, '4 ms')
+    last = replace(
+        pair(Status.LOW_PARALLAX, 'it stands'), health=Health((finding,)), tracked=Tracked(
+            gyro_bias=np.array([0.01, -0.02, 0.03]), gyro_bias_sigma=np.array([1e-3, 2e-3, 3e-3]),
+            time_offset=0.004, time_offset_sigma=0.0005, pairs=7), applied=Applied(-0.0015))
     clock.now = SECOND
-    for result in (pair(), pair(), with_drift):
+    for result in (pair(), pair(), last):
         statistics.add_pair(result, clock.now - 15 * 10**6)
     statistics.add_frame(clock.now - 30 * 10**6)
     counted = SequencerCounts(frames=2000, frames_taken=1064, refused=refused, imu_samples=9000,

@@ -194,6 +194,32 @@ ESTIMATES = {'readout_time': 0.03, 'quat_cam_imu_xyzw': '[0.0, 0.0, 0.0, 1.0]'}
 OVERRIDE = 'qos_overrides./image.subscription'
 
 
+def test_a_camera_without_camera_info_gives_poses(ros_domain_id, bundled_bag):
+    """Its calibration stands in the parameters."""
+    messages = read_messages(bundled_bag, 1.5)
+    info = next(message for _, message in messages if isinstance(message, CameraInfo))
+    parameters = {'camera_matrix': info.k.tolist(), 'distortion_model': info.distortion_model,
+                  'distortion_coefficients': list(info.d), 'image_transport': 'raw'}
+    with Graph() as graph, node_process(
+            BUNDLED_PARAMETERS, remap=BAG_TOPICS, parameters=parameters) as node:
+        poses = graph.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
+        diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
+        node.wait_for('ready')
+        graph.wait_for_publisher('/relpose_node/relative_pose')
+        publishers = {kind: graph.publisher(kind, topic) for kind, topic in
+                      zip((Image, CameraInfo, Imu), BAG_TOPICS.values(), strict=True)
+                      if kind is not CameraInfo}
+        publish_in_time((publishers[type(message)], bag_time_ns, message)
+                        for bag_time_ns, message in messages if type(message) in publishers)
+        wait_until(lambda: len(poses) >= 3, 'three poses', node)
+        # The first images waited for a CameraInfo, and were used.
+        count = len(diagnostics)
+        wait_until(lambda: len(diagnostics) > count, 'diagnostics', node)
+        values = diagnostic_values(diagnostics[-1])
+        assert 'no CameraInfo' not in node.output
+    assert values['frames_refused_no_calibration'] == '0'
+
+
 @pytest.mark.parametrize(('parameters', 'sentence'), [
     ({'readout_time': 3.0}, 'readout_time'),
     ({'readout_time': 'fast'}, 'readout_time must be of type float'),

@@ -129,11 +129,12 @@ MAY_IMPORT = {
     'imu': BASE,
     'tracking': BASE,
     'estimator': BASE | {'solvers'},
-    'front_end': CORE,
-    'messages': CORE | {'front_end'},
+    'health': BASE | {'estimator', 'imu'},
+    'front_end': CORE | {'health'},
+    'messages': CORE | {'front_end', 'health'},
     'bags': {'geometry'},
-    'node': BASE | {'front_end', 'messages'},
-    'replay': CORE | {'front_end', 'messages', 'bags'},
+    'node': BASE | {'front_end', 'health', 'messages'},
+    'replay': CORE | {'front_end', 'health', 'messages', 'bags'},
     'calibrate': CORE | {'messages', 'bags'},
     'check': CORE | {'messages', 'bags', 'calibrate'},
     'convert': BASE | {'images', 'imu', 'messages', 'bags'},
@@ -147,7 +148,7 @@ MAY_IMPORT_IN_THE_LABORATORY = {
     'cli': {'simulation', 'live', 'experiments'},
 }
 FREE_OF_ROS = ('geometry', 'config', 'images', 'solvers', 'estimator', 'imu', 'tracking',
-               'front_end', 'messages')
+               'health', 'front_end', 'messages')
 
 
 def room_of(module: str) -> tuple[str, str]:

@@ -11,6 +11,7 @@ from simulated_pairs import simulated_flight
 
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator import sampson
+from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.estimator.state import TwoViewState
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.messages.outgoing import pair_messages
@@ -23,9 +24,10 @@ def published(pairs: list[PairResult]) -> list[PublishedPair]:
     return [published_pair(pair_messages(pair, build.rosbags_types)) for pair in pairs]
 
 
-def assert_at(poses: list[PathPose], positions: np.ndarray, rotations: list[np.ndarray]) -> None:
+def assert_at(poses: list[PathPose], positions: np.ndarray, rotations: list[np.ndarray],
+              atol: float = 2e-5) -> None:
     # Rays come as float32.
-    np.testing.assert_allclose([pose.position for pose in poses], positions, atol=2e-5)
+    np.testing.assert_allclose([pose.position for pose in poses], positions, atol=atol)
     np.testing.assert_allclose([pose.R for pose in poses], rotations, atol=1e-9)
 
 
@@ -124,11 +126,64 @@ def test_too_few_shared_tracks_begin_a_new_path():
     steps = [chain.add(pair) for pair in published(flight.pairs)]
     assert [step.shared_tracks for step in steps] == [0, 8, 0, 23]
     assert steps[2].new_path == ('7 shared tracks do not carry the scale, it takes 8: the path '
-                                 'starts anew')
+                                 'starts anew, at another scale')
     # A user may ask for more.
     chain = PoseChain(min_shared_tracks=9)
     assert [bool(chain.add(pair).new_path) for pair in published(flight.pairs)] == [
         True, True, True, False]
+
+
+def test_a_pure_rotation_is_part_of_the_path():
+    """The camera is where it was; place, axes and scale go on behind it."""
+    flight = simulated_flight(0, places=(0.0, 0.2, 0.2, 0.2, 0.6))
+    chain = PoseChain()
+    steps = [chain.add(pair) for pair in published(flight.pairs)]
+    assert [bool(step.new_path) for step in steps] == [True, False, False, False]
+    # The points are in other rows before and after, where this camera is not quite where it was.
+    assert_at([pose for step in steps for pose in step.poses],
+              flight.positions / flight.baselines[0], flight.R, atol=1e-3)
+    assert np.isnan([step.scale for step in steps[1:3]]).all()
+    assert steps[3].scale == pytest.approx(flight.baselines[3] / flight.baselines[0], rel=1e-3)
+    assert [step.shared_tracks for step in steps] == [0, 0, 0, 120]
+
+
+def test_a_path_may_begin_with_a_pure_rotation():
+    flight = simulated_flight(0, places=(0.0, 0.0, 0.5, 0.6, 1.0))
+    chain = PoseChain()
+    steps = [chain.add(pair) for pair in published(flight.pairs)]
+    assert [bool(step.new_path) for step in steps] == [True, False, False, False]
+    # Of the first pair that has a baseline.
+    assert_at([pose for step in steps for pose in step.poses],
+              flight.positions / flight.baselines[1], flight.R)
+
+
+def test_an_unknown_translation_ends_the_path_but_not_its_axes():
+    flight = simulated_flight(0)
+    pairs = list(flight.pairs)
+    pairs[1] = replace(pairs[1], pose=pairs[1].pose.without_translation(
+        Status.LOW_PARALLAX, 'too little'))
+    chain = PoseChain()
+    steps = [chain.add(pair) for pair in published(pairs)]
+    assert [len(step.poses) for step in steps] == [2, 0, 2, 1]
+    assert [step.new_path for step in steps[1:]] == [
+        '', 'a pair has no translation (LOW_PARALLAX): the path starts anew, at another scale', '']
+    assert [step.new_axes for step in steps] == [True, False, False, False]
+    # Shifted and of another scale, but not turned.
+    assert_at([pose for step in steps[2:] for pose in step.poses],
+              (flight.positions[2:] - flight.positions[2]) / flight.baselines[2], flight.R[2:])
+
+
+def test_without_a_rotation_the_axes_end():
+    flight = simulated_flight(0)
+    pairs = list(flight.pairs)
+    pairs[1] = replace(pairs[1], pose=RelativePose(
+        status=Status.NO_CONSENSUS, reason='none', inliers=pairs[1].pose.inliers))
+    chain = PoseChain()
+    steps = [chain.add(pair) for pair in published(pairs)]
+    assert [len(step.poses) for step in steps] == [2, 0, 2, 1]
+    assert steps[2].new_path.startswith('a pair has no rotation (NO_CONSENSUS): ')
+    assert [step.new_axes for step in steps] == [True, False, True, False]
+    np.testing.assert_array_equal(steps[2].poses[0].R, np.eye(3))
 
 
 def test_wrong_tracks_do_not_move_the_scale_much():

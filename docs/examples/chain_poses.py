@@ -34,6 +34,8 @@ class PathNode(Node):
         if step.new_path:
             self.get_logger().warning(step.new_path)
             self.path.poses = []
+        if not step.poses:
+            return
         self.path.poses += [
             pose_stamped_message(pose.stamp_ns, 'path', pose.R, pose.position, message_class)
             for pose in step.poses]

@@ -298,6 +298,44 @@ def _run_calibration_stretches(args: argparse.Namespace) -> int:
     return _tell(write_report(args.output, figures_of(parts)), args.output)
 
 
+def _trust_arguments(parser: argparse.ArgumentParser) -> None:
+    _number(parser, '--bags', 20, 'simulated bags that go through all rows')
+    parser.add_argument('--rows', nargs='+', default=['all'], metavar='NAME',
+                        help='what is told wrong, with * as in file names, e.g. "readout-*" '
+                             '(default: all)')
+    parser.add_argument('--seconds', type=float, default=30.0, metavar='S',
+                        help='length of a simulated bag (default: %(default)s)')
+    _number(parser, '--right', 0, 'further bags that are told right, for false alarms: noise at '
+                                  'the told level, half of it and twice')
+    _number(parser, '--rendered', 0, 'further bags with images: the first ones of the others')
+    parser.add_argument('--recordings', type=Path, nargs='+', default=[], metavar='PATH',
+                        help='bags with their right parameters beside them (BAG.yaml), or folders '
+                             'of real recordings, e.g. "$RS_RELPOSE_DATA"/android_phone_rs')
+
+
+def _run_trust(args: argparse.Namespace) -> int:
+    from rs_relpose_lab.experiments.trust import measure, tasks, write_report
+    from rs_relpose_lab.experiments.trust_rows import ROWS
+    from rs_relpose_lab.experiments.workers import in_processes
+
+    _check_at_least(0, args, 'bags', 'right', 'rendered')
+    # Shorter than what must be enough to tell a gross error, nothing is measured.
+    _check_at_least(6, args, 'seconds')
+    asked = tasks(matching_cells(args.rows, ROWS), args.bags, args.seconds, args.seed,
+                  right=args.right, rendered=args.rendered, recordings=args.recordings)
+    if not asked:
+        raise InputError('there is nothing to measure: give --bags, --right, --rendered or '
+                         '--recordings')
+    bags, report = [], ''
+    with progress_bar(len(asked), 'recording') as bar:
+        for found in in_processes(measure, asked, args.jobs):
+            bags += found
+            # A run that is stopped leaves what it has.
+            report = write_report(args.output, bags)
+            bar.update()
+    return _tell(report, args.output)
+
+
 def _all_arguments(parser: argparse.ArgumentParser) -> None:
     _number(parser, '--trials', 200, 'problems a cell of the accuracy benchmark')
     _number(parser, '--soak', 100_000, 'see whether memory grows over N estimates')
@@ -355,6 +393,14 @@ BENCHMARKS = {
         'Cuts recordings of one camera into parts, calibrates each from nothing, and prints '
         'chi^2 of every figure over the parts.',
         _stretches_arguments, _run_calibration_stretches, 'calibration_stretches'),
+    'trust': Benchmark(
+        'figures told wrong: which are flagged, and which poses are believed all the same',
+        'Runs simulated bags (hand-held and vehicle, three scenes, read-outs of 12 to 35 ms; '
+        'tracks without images) and real recordings through the front end, told right and told '
+        'wrong in each way of a table, and shows what the health says of it, and errors of the '
+        'poses in their own sigmas. docs/lab/trust.md explains the columns.',
+        _trust_arguments, _run_trust, 'trust', first_seed=1001, seed_of='bag',
+        jobs='processes'),
     'all': Benchmark(
         'accuracy and speed, as the project reports them',
         'Both with their defaults, told sigmas also half and twice the true ones, and memory over '

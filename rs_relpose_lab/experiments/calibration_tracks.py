@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_lab.simulation.fine_path import FinePath
 from rs_relpose_lab.simulation.hand_held import hand_held, Plan
-from rs_relpose_lab.simulation.rows import Motion, see, View
+from rs_relpose_lab.simulation.rows import see, View
 from rs_relpose_lab.simulation.trajectory import Trajectory
 from rs_relpose_ros.calibrate.axis_maps import axis_maps
 from rs_relpose_ros.calibrate.gyro_path import GyroSeries
@@ -134,31 +135,6 @@ def _world(rng: np.random.Generator, count: int = 4000) -> Array:
     return points
 
 
-class _Path:
-    """Poses on a fine grid, linear in between."""
-
-    step = 1e-3
-
-    def __init__(self, trajectory: Trajectory, begin: float, end: float) -> None:
-        self.begin = begin
-        times = begin + self.step * np.arange(math.ceil((end - begin) / self.step) + 1)
-        self.positions, self.rotations = trajectory.poses(times)
-        self.turns = Rotation.from_matrix(
-            np.einsum('nji,njk->nik', self.rotations[:-1], self.rotations[1:])).as_rotvec()
-
-    def from_instant(self, instant: float) -> Motion:
-        """Motion of a frame, whose times count from the `instant` of its first row."""
-        def to_camera(points: Array, times: Array) -> Array:
-            at = (instant + times - self.begin) / self.step
-            k = np.clip(at.astype(int), 0, len(self.turns) - 1)
-            share = (at - k)[:, None]
-            position = self.positions[k] + share * (self.positions[k + 1] - self.positions[k])
-            turned = np.einsum('nji,nj->ni', self.rotations[k], points - position)
-            # Of 1e-3 rad: exact to 1e-6.
-            return np.asarray(turned - share * np.cross(self.turns[k], turned))
-        return to_camera
-
-
 def _frames(truth: Truth, trajectory: Trajectory, instants: Array, world: Array,
             rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     center = 0.5 * (np.array([truth.width, truth.height]) - 1.0)
@@ -166,7 +142,7 @@ def _frames(truth: Truth, trajectory: Trajectory, instants: Array, world: Array,
                 lambda pixels: np.column_stack([(pixels - center) / truth.focal,
                                                 np.ones(len(pixels))]),
                 truth.width, truth.height, truth.readout_time / truth.height, reference_row=0.0)
-    path = _Path(trajectory, instants[0] - 0.1, instants[-1] + 0.15)
+    path = FinePath(trajectory, instants[0] - 0.1, instants[-1] + 0.15)
     ids = np.full(len(world), -1, dtype=np.int64)       # track of a point that is followed
     drift, start = np.zeros((len(world), 2)), np.zeros(len(world))
     next_id, frame, track, pixels = 0, [], [], []

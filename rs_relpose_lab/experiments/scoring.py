@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,23 +41,53 @@ def pose_error(R: Array, t: Array, true_R: Array, true_t: Array, covariance: Arr
     `covariance` (6, 6): of ``(dt, dtheta)`` with ``t_true = t + dt`` (dt perpendicular to t) and
         ``R_true = Exp(dtheta) R``, both in camera 1.
     """
-    true_t = true_t / np.linalg.norm(true_t)
-    turn = Rotation.from_matrix(true_R @ R.T).as_rotvec()
-    away = true_t - (true_t @ t) * t
-    sine = float(np.linalg.norm(away))
-    angle = float(np.arctan2(sine, true_t @ t))
+    turn, shift = _turn_and_shift(R, t, true_R, true_t)
     rotation = float(np.degrees(np.linalg.norm(turn)))
-    translation = float(np.degrees(angle))
+    translation = float(np.degrees(np.linalg.norm(shift)))
     if covariance is None:
         return PoseError(rotation, translation)
-    # Along the great circle: the direction of t is no vector space once the error is large.
-    shift = away * (angle / sine) if sine > 0.0 else away
     basis = np.zeros((6, POSE_FREEDOM))
-    basis[:3, :2] = np.linalg.svd(t[None])[2][1:].T
+    basis[:3, :2] = _tangent(t)
     basis[3:, 2:] = np.eye(3)
     error = basis.T @ np.concatenate([shift, turn])
     nees = error @ np.linalg.solve(basis.T @ covariance @ basis, error)
     return PoseError(rotation, translation, float(nees))
+
+
+class ChiSquares(NamedTuple):
+    """Squared errors in sigmas: of the direction of translation (2), of the rotation (3)."""
+
+    translation: float
+    rotation: float
+
+
+def chi_squares(R: Array, t: Array, true_R: Array, true_t: Array,
+                covariance: Array) -> ChiSquares:
+    """Each error of a pose by its own part of the covariance; arguments as in `pose_error`."""
+    turn, shift = _turn_and_shift(R, t, true_R, true_t)
+    tangent = _tangent(t)
+    across = tangent.T @ shift
+    return ChiSquares(
+        float(across @ np.linalg.solve(tangent.T @ covariance[:3, :3] @ tangent, across)),
+        float(turn @ np.linalg.solve(covariance[3:, 3:], turn)))
+
+
+def _turn_and_shift(R: Array, t: Array, true_R: Array, true_t: Array) -> tuple[Array, Array]:
+    """Errors dtheta (3,) and dt (3,) of a pose [rad], dt along the great circle to the truth.
+
+    The direction of t is no vector space once the error is large.
+    """
+    true_t = true_t / np.linalg.norm(true_t)
+    away = true_t - (true_t @ t) * t
+    sine = float(np.linalg.norm(away))
+    angle = float(np.arctan2(sine, true_t @ t))
+    direction = away / sine if sine > 0.0 else _tangent(t)[:, 0]
+    return Rotation.from_matrix(true_R @ R.T).as_rotvec(), angle * direction
+
+
+def _tangent(t: Array) -> Array:
+    """Two directions (3, 2) across t."""
+    return np.asarray(np.linalg.svd(t[None])[2][1:].T)
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,9 +25,9 @@ from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.messages.incoming import stamp_ns, time_ns
 from rs_relpose_ros.messages.outgoing import PAIR_TOPICS
+from rs_relpose_ros.messages.pair_status import number
 from rs_relpose_ros.node.message_types import message_class
 from rs_relpose_ros.replay.tables import (
-    number,
     RELATIVE_POSE_COLUMNS,
     rotation_sigmas,
     table_writer,
@@ -48,10 +48,10 @@ def run_live(bag: Path, parameters: Path, folder: Path) -> LiveRun:
     with open_bag(bag) as opened:
         topics, duration = opened.find_topics(), opened.duration
     run = LiveRun(folder / 'live.csv', folder / 'live_stamps.txt')
-    remap = {'image': topics.image.name.removesuffix('/compressed'),
-             'camera_info': topics.camera_info.name, 'imu': topics.imu.name}
-    if topics.accel is not None:
-        remap['accel'] = topics.accel.name
+    remap = {'image': topics.image.name.removesuffix('/compressed'), 'imu': topics.imu.name}
+    for name, topic in (('camera_info', topics.camera_info), ('accel', topics.accel)):
+        if topic is not None:
+            remap[name] = topic.name
     with private_domain(), Graph() as graph, node_process(
             parameters, remap=remap, parameters={'stamps_file': run.stamps},
             log=folder / 'relpose_node.log') as node:
@@ -82,8 +82,8 @@ class Recorder:
     def write(self, path: Path) -> int:
         """Write the pairs that came, and return their number.
 
-        The live topics carry neither pairs without a pose nor the number of matches and the model:
-        these cells stay empty.
+        Pairs without a pose are left out, and the cells of the number of matches and the model
+        stay empty.
         """
         poses, references, matches = (
             {stamp_ns(msg.header): msg for msg in self._received[name]}

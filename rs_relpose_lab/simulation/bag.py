@@ -90,9 +90,16 @@ def made_once(folder: Path, name: str,
 
 def write_parameters(simulation: Simulation, path: Path, *, raw: bool = False) -> None:
     """Write the parameters of the node that the recording needs; `raw` as in `write_bag`."""
+    values = {'image_transport': 'raw' if raw else 'compressed', **right_parameters(simulation)}
+    parameter_file.write_parameters(
+        path, 'Parameters of relpose_node for the simulated bag of the same name.',
+        [SourcedValue(name, value, '') for name, value in values.items()])
+
+
+def right_parameters(simulation: Simulation) -> dict[str, Any]:
+    """What a calibrated node is told of the recording's camera and IMU, by parameter name."""
     config = simulation.config
-    values = {
-        'image_transport': 'raw' if raw else 'compressed',
+    return {
         'readout_time': config.readout_time,
         'readout_direction': config.readout_direction,
         'stamp_row': config.stamp_row,
@@ -101,9 +108,6 @@ def write_parameters(simulation: Simulation, path: Path, *, raw: bool = False) -
         'quat_cam_imu_xyzw': config.quat_cam_imu_xyzw,
         'gyro_bias': tuple(round(float(value), 6) for value in simulation.calibrated_gyro_bias),
     }
-    parameter_file.write_parameters(
-        path, 'Parameters of relpose_node for the simulated bag of the same name.',
-        [SourcedValue(name, value, '') for name, value in values.items()])
 
 
 def jpeg(pixels: NDArray[np.uint8], quality: int) -> bytes:

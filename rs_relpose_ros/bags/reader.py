@@ -95,9 +95,11 @@ class Bag:
             return 'best effort'
         return 'reliable' if QosReliability.RELIABLE in offered else ''
 
-    def find_topics(self, options: TopicOptions | None = None) -> SensorTopics:
+    def find_topics(self, options: TopicOptions | None = None, *,
+                    needs_camera_info: bool = True) -> SensorTopics:
         """The sensors' topics; see `TopicFinder.find`."""
-        return TopicFinder(self.path, self.topics).find(options or TopicOptions())
+        finder = TopicFinder(self.path, self.topics)
+        return finder.find(options or TopicOptions(), needs_camera_info)
 
     def messages(self, topics: Sequence[Topic]) -> Iterator[BagMessage]:
         """Messages of `topics` in the order of bag time; their arrays are read-only.

@@ -44,10 +44,13 @@ class TopicOptions:
 
 @dataclass(frozen=True, slots=True)
 class SensorTopics:
-    """Topics to read; `accel` only where the driver publishes the accelerometer apart."""
+    """Topics to read; `accel` only where the driver publishes the accelerometer apart.
+
+    `camera_info` is None only where it is not needed.
+    """
 
     image: Topic
-    camera_info: Topic
+    camera_info: Topic | None
     imu: Topic
     accel: Topic | None
     truth: Topic | None
@@ -60,7 +63,7 @@ class TopicFinder:
     bag: Path
     topics: Sequence[Topic]
 
-    def find(self, options: TopicOptions) -> SensorTopics:
+    def find(self, options: TopicOptions, needs_camera_info: bool = True) -> SensorTopics:
         """The sensors' topics: as chosen, or by type where only one can be meant.
 
         Of several CameraInfo topics the one beside the image is taken, and of two Imu topics one
@@ -73,8 +76,10 @@ class TopicFinder:
             raise InputError(f'{image.name} is a rectified image, in which a row no longer has '
                              'one instant: choose the raw one with --image-topic')
         imu, accel = self._imu(options)
-        return SensorTopics(image, self._camera_info(options.camera_info, image), imu, accel,
-                            self._truth(options.truth))
+        camera_info = None
+        if needs_camera_info or options.camera_info or self._of_type(CAMERA_INFO):
+            camera_info = self._camera_info(options.camera_info, image)
+        return SensorTopics(image, camera_info, imu, accel, self._truth(options.truth))
 
     def _one(self, chosen: str, msgtypes: tuple[str, ...], what: str, option: str) -> Topic:
         if chosen:

@@ -32,7 +32,7 @@ class CalibrationInput:
     tracks: Tracks
     gyro: GyroSeries
     camera: RollingShutterCamera    # of the full sensor, its read-out time 0
-    focal_known: bool               # the CameraInfo has intrinsics; else `camera` is a guess
+    focal_known: bool               # by the CameraInfo; else `camera` is a guess
     unused: dict[str, int]          # messages that were not used, by the sentence that says why
 
 
@@ -62,7 +62,7 @@ class _Reader:
         self.feed = SensorFeed({Role.IMU: self._take_sample, Role.CAMERA_INFO: self._take_info,
                                 Role.IMAGE: self._take_image})
         self._intrinsics: Intrinsics | None = None
-        self._uncalibrated = False
+        self._uncalibrated = topics.camera_info is None
         self._size: tuple[int, int] | None = None
         self._gyro: dict[int, tuple[float, float, float]] = {}
         self._unused: dict[str, int] = {}
@@ -121,7 +121,7 @@ class _Reader:
                     'needs a CameraInfo of its own')
             return intrinsics.global_shutter_camera()
         if not self._uncalibrated:
-            raise MissingInputError(f'no message of {self._topics.camera_info.name} can be used'
+            raise MissingInputError(f'no message of {self._topics.camera_info} can be used'
                                     f'{self._why()}')
         guess = _FOCAL_GUESS * max(size)
         return RollingShutterCamera(

@@ -57,7 +57,7 @@ def report(result: CalibrationResult, camera: RollingShutterCamera) -> list[str]
     if focal is not None:
         lines.append(_line(
             'focal length', f'{camera.fx * focal.value:.1f} +- {camera.fx * focal.sigma:.1f} px '
-            '(CameraInfo has none: write it there)', focal))
+            '(CameraInfo has none: camera_matrix takes its place)', focal))
     return lines + [f'note: {warning}' for warning in result.warnings]
 
 
@@ -85,9 +85,12 @@ def _shutter_text(result: CalibrationResult) -> str:
             f'of a global shutter is lower by {at_zero:.0f}')
 
 
-def parameter_file(result: CalibrationResult, title: str, *, compressed: bool,
-                   feature_rows: tuple[float, ...] = (0.0, 0.0)) -> str:
-    """The node's parameter file; figures that are not observable are left out, and named."""
+def parameter_file(result: CalibrationResult, title: str, *, camera: RollingShutterCamera,
+                   compressed: bool, feature_rows: tuple[float, ...] = (0.0, 0.0)) -> str:
+    """The node's parameter file; figures that are not observable are left out, and named.
+
+    `camera` is what was calibrated with: a guess where the focal length was not known.
+    """
     readout, offset, rotation = result.readout_time, result.time_offset, result.rotation
     shutter, biases = _shutter_text(result), result.gyro_bias
     rolling = result.shutter != 'global'
@@ -110,6 +113,15 @@ def parameter_file(result: CalibrationResult, title: str, *, compressed: bool,
         (all(bias.observable for bias in biases), 'gyro_bias', [SourcedValue(
             'gyro_bias', tuple(round(bias.value, 5) for bias in biases), '1 sigma '
             + ', '.join(f'{bias.sigma:.5f}' for bias in biases) + ' rad/s.')])]
+    focal = result.focal_factor
+    if focal is not None:
+        told.append((focal.observable, f'camera_matrix ({focal.remark})', [SourcedValue(
+            'camera_matrix',
+            (round(camera.fx * focal.value, 2), 0.0, camera.cx, 0.0,
+             round(camera.fy * focal.value, 2), camera.cy, 0.0, 0.0, 1.0),
+            f'Focal length, 1 sigma {camera.fx * focal.sigma:.2f} px; for images of '
+            f'{camera.width}x{camera.height}. The principal point is assumed in the middle, '
+            'without distortion. A calibrated CameraInfo comes first.')]))
     values = [SourcedValue('image_transport', 'compressed' if compressed else 'raw',
                            'As the bag has them.')]
     values += [value for observable, _, group in told if observable for value in group]

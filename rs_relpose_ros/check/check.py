@@ -23,7 +23,7 @@ def choose_topics(bag: Bag, options: TopicOptions) -> Chosen:
         Several could be meant, or a topic that was asked for is not there.
     """
     try:
-        topics = bag.find_topics(options)
+        topics = bag.find_topics(options, needs_camera_info=False)
     except (InputError, MissingInputError) as error:
         # Asked for by name, it is a mistake; absent altogether or rectified, it is a finding.
         asked = [name for name in (options.image, options.camera_info, options.imu, options.accel)
@@ -51,8 +51,8 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters,
     InputError
         The bag is damaged.
     """
-    seen = scan(bag, chosen, parameters.tracking, on_message)
-    findings = [_topics(bag, chosen), _parameters(parameters)]
+    seen = scan(bag, chosen, parameters.tracking, on_message, parameters.intrinsics)
+    findings = [_topics(bag, chosen, parameters), _parameters(parameters)]
     if chosen.image is not None:
         findings += judge_images.findings(
             seen, chosen.image, bag.reliability(chosen.image), parameters)
@@ -69,11 +69,12 @@ def _first(bag: Bag, name: str, role: Role) -> Topic | None:
                  and (not name or topic.name.lstrip('/') == name.lstrip('/'))), None)
 
 
-def _topics(bag: Bag, chosen: Chosen) -> Finding:
+def _topics(bag: Bag, chosen: Chosen, parameters: Parameters) -> Finding:
     roles = {'image': chosen.image, 'camera_info': chosen.camera_info, 'imu': chosen.imu,
              'accel': chosen.accel}
     figures = {role: topic.name if topic else None for role, topic in roles.items()}
-    absent = [role for role in ('image', 'camera_info', 'imu') if roles[role] is None]
+    needed = ['image', 'imu'] if parameters.intrinsics.given else ['image', 'camera_info', 'imu']
+    absent = [role for role in needed if roles[role] is None]
     text = ', '.join(f'{topic.name} ({topic.count})' for topic in chosen.all)
     if not absent:
         return Finding('topics', Verdict.OK, text, figures=figures)

@@ -96,7 +96,7 @@ def _calibration(seen: Scan) -> Finding:
     if intrinsics is None:
         return Finding(name, FAILURE, seen.problems.get(Role.CAMERA_INFO, 'no CameraInfo'),
                        'calibrate the camera (camera_calibration, OpenCV) and let its driver '
-                       'publish the CameraInfo')
+                       'publish the CameraInfo, or give camera_matrix')
     figures = {'fx': intrinsics.fx, 'fy': intrinsics.fy,
                'distortion_model': intrinsics.distortion_model, 'different': seen.calibrations}
     size = intrinsics.image_width, intrinsics.image_height
@@ -105,7 +105,8 @@ def _calibration(seen: Scan) -> Finding:
     wide = intrinsics.width > 2.0 * intrinsics.fx   # more than 90 deg
     return judged(
         name, f'{intrinsics.width}x{intrinsics.height}, f {intrinsics.fx:.1f} '
-        f'{intrinsics.fy:.1f} px, {intrinsics.distortion_model}', figures,
+        f'{intrinsics.fy:.1f} px, {intrinsics.distortion_model}'
+        + (' by camera_matrix' if seen.by_parameters else ''), figures,
         Case(other != size, FAILURE, 'publish the CameraInfo of this resolution, region of '
              'interest and binning included', f': for images of {size[0]}x{size[1]}, but they are '
              f'{other[0]}x{other[1]}'),

@@ -13,8 +13,9 @@ from rs_relpose_ros.bags.topics import Topic
 from rs_relpose_ros.check.inertial import Inertial
 from rs_relpose_ros.check.streams import Stamps
 from rs_relpose_ros.check.turning import TurningImages
+from rs_relpose_ros.config.intrinsics import IntrinsicsConfig
 from rs_relpose_ros.config.tracking import TrackingConfig
-from rs_relpose_ros.errors import RsRelposeError
+from rs_relpose_ros.errors import MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.messages.incoming import PublishedImage
@@ -40,9 +41,16 @@ class Chosen:
 
 
 class Scan:
-    """What one pass saw; `images` is the number of images to come."""
+    """What one pass saw; `images` is the number of images to come.
 
-    def __init__(self, images: int, tracking: TrackingConfig) -> None:
+    `told`: intrinsics for a camera whose CameraInfo has none.
+    """
+
+    def __init__(self, images: int, tracking: TrackingConfig, told: IntrinsicsConfig,
+                 no_camera_info: bool) -> None:
+        self._told = told
+        # Whether the intrinsics are those of the parameters: there is no calibrated CameraInfo.
+        self.by_parameters = no_camera_info and told.given
         self.turning = TurningImages(images, tracking)
         self.image_stamps, self.imu_stamps, self.inertial = Stamps(), Stamps(), Inertial()
         self.encodings: dict[str, int] = {}            # number of images by encoding or format
@@ -62,6 +70,8 @@ class Scan:
         try:
             self.feed.receive(role, message.message)
         except RsRelposeError as error:
+            if role is Role.CAMERA_INFO and isinstance(error, MissingInputError):
+                self.by_parameters = self._told.given
             self.bad_images += role is Role.IMAGE
             self.bad_imu += role in (Role.IMU, Role.ACCEL)
             self.problems.setdefault(Role.IMU if role is Role.ACCEL else role, str(error))
@@ -75,7 +85,7 @@ class Scan:
 
     def _camera_info(self, intrinsics: Intrinsics) -> None:
         self.calibrations += intrinsics != self.intrinsics
-        self.intrinsics = intrinsics
+        self.intrinsics, self.by_parameters = intrinsics, False
 
     def _image(self, published: PublishedImage) -> None:
         _count(self.encodings, published.image.encoding[:60])
@@ -86,21 +96,26 @@ class Scan:
         image = published.image.decoded()
         size = image.shape[1], image.shape[0]
         _count(self.sizes, size)
+        if self.by_parameters:
+            self.intrinsics = self._told.of_image(*size)
         intrinsics = self.intrinsics
         if intrinsics is not None and (intrinsics.image_width, intrinsics.image_height) == size:
             self.turning.add_image(published.stamp_ns, self._recorded_ns, image, intrinsics)
 
 
-def scan(bag: Bag, chosen: Chosen, tracking: TrackingConfig,
-         on_message: Callable[[], object]) -> Scan:
+def scan(bag: Bag, chosen: Chosen, tracking: TrackingConfig, on_message: Callable[[], object],
+         told: IntrinsicsConfig | None = None) -> Scan:
     """Read `chosen` topics of a bag once, and follow points by the detector of `tracking`.
+
+    `told`: intrinsics for a camera whose CameraInfo has none.
 
     Raises
     ------
     InputError
         The bag is damaged.
     """
-    seen = Scan(chosen.image.count if chosen.image else 0, tracking)
+    seen = Scan(chosen.image.count if chosen.image else 0, tracking, told or IntrinsicsConfig(),
+                no_camera_info=chosen.camera_info is None)
     for role, message in seen.feed.messages(bag, chosen):
         seen.take(role, message)
         on_message()

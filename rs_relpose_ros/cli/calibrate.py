@@ -27,9 +27,9 @@ from rs_relpose_ros.errors import InputError
 HELP = (
     'Calibrate a rolling-shutter camera against its IMU from a bag (rosbag2 or ROS 1) alone, '
     'without a target: read-out time, camera-IMU time offset, rotation IMU to camera, gyro bias, '
-    'and the focal length where the CameraInfo has none (k[0] = 0). Record 10 s or more of a '
-    'textured scene that stands still, with a short exposure, while you turn the camera about all '
-    'three axes, 20 to 60 deg/s. Writes calibration.yaml (parameters of relpose_node), '
+    'and the focal length where the CameraInfo has none (k[0] = 0) or is absent. Record 10 s or '
+    'more of a textured scene that stands still, with a short exposure, while you turn the camera '
+    'about all three axes, 20 to 60 deg/s. Writes calibration.yaml (parameters of relpose_node), '
     'calibration.json and cost_over_readout.png. Exit code 1: something is not observable in this '
     'recording; it says what to record instead.')
 
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
             'max_time_offset', '--max-offset')) from None
     folder: Path = args.out or Path(f'{bag_name(args.bag)}_calibration')
     with open_bag(args.bag) as bag:
-        topics = bag.find_topics(topic_options(args))
+        topics = bag.find_topics(topic_options(args), needs_camera_info=False)
         with progress_bar(topics.image.count, 'image', 'tracking') as bar:
             recording = read_recording(bag, topics, tracking, on_image=bar.update)
     first, last = args.rows
@@ -83,7 +83,8 @@ def run(args: argparse.Namespace) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     text = parameter_file(
         result, f'Parameters of relpose_node from `rs_relpose calibrate {args.bag.name}`.',
-        compressed=topics.image.msgtype == COMPRESSED_IMAGE, feature_rows=tuple(args.rows))
+        camera=recording.camera, compressed=topics.image.msgtype == COMPRESSED_IMAGE,
+        feature_rows=tuple(args.rows))
     (folder / 'calibration.yaml').write_text(text, encoding='utf-8')
     (folder / 'calibration.json').write_text(
         json.dumps(as_mapping(result, recording.camera), indent=1) + '\n', encoding='utf-8')

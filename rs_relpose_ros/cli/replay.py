@@ -60,7 +60,8 @@ def run(args: argparse.Namespace) -> int:
     name = bag_name(args.bag)
     folder = args.out or Path(f'{name}_relpose')
     with open_bag(args.bag) as bag:
-        topics = bag.find_topics(topic_options(args))
+        topics = bag.find_topics(topic_options(args),
+                                 needs_camera_info=not parameters.intrinsics.given)
         missing = parameters.sensor.missing()
         beside = args.bag.resolve().with_name(f'{name}.yaml')
         if missing and args.params is None and beside.is_file():

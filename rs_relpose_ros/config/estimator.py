@@ -44,6 +44,10 @@ class EstimatorConfig:
     min_parallax: float = setting(
         1.0, 'least median parallax after the estimated rotation for a translation', 'px',
         low=0.0, high=500.0, live=True)
+    max_translation_sigma: float = setting(
+        10.0, 'largest 1 sigma of the direction of translation (root of the trace of its '
+        'covariance); beyond it a pair has a rotation but no pose', 'deg', low=0.01, high=180.0,
+        live=True)
 
     def __post_init__(self) -> None:
         check_settings(self)

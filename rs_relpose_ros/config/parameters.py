@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_ros.config.declarations import check_settings, Declared, declared, setting
 from rs_relpose_ros.config.estimator import EstimatorConfig
 from rs_relpose_ros.config.imu import ImuConfig
+from rs_relpose_ros.config.intrinsics import IntrinsicsConfig
 from rs_relpose_ros.config.keyframes import KeyframeConfig
 from rs_relpose_ros.config.tracking import TrackingConfig
 from rs_relpose_ros.errors import InputError, MissingInputError
@@ -90,6 +91,9 @@ class PairConfig:
         True, 'gyro between the frames as rotation prior and hypothesis (else it only derotates '
         'rows)')
     use_gravity: bool = setting(True, 'gravity as prior and for the 3- and 9-point solvers')
+    withhold_when_wrong: bool = setting(
+        True, 'publish no pose while a figure that was told is seen to be wrong (see health in '
+        '/diagnostics)', live=True)
     reference_frame: str = setting(
         '', 'frame_id of relative poses; empty for <camera frame>_reference')
     image_transport: str = setting('raw', 'transport of the images', choices=('raw', 'compressed'))
@@ -115,6 +119,7 @@ class Parameters:
     """All parameters, grouped by the module that they configure; flat names are unique."""
 
     sensor: SensorConfig = field(default_factory=SensorConfig)
+    intrinsics: IntrinsicsConfig = field(default_factory=IntrinsicsConfig)
     pair: PairConfig = field(default_factory=PairConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)

@@ -15,7 +15,7 @@ from rs_relpose_ros.config.parameters import Parameters
 _HEAD = """\
 # Parameters of relpose_node and of `rs_relpose replay --params`, each at its default.
 # Written by `python -m rs_relpose_ros.config.template config/relpose.yaml`; copy it and
-# change the copy. Those without a value have no default: the node says when one is missing.
+# change the copy. Those without a value have no default: the node says when it needs one.
 # [live] can be changed while the node runs (`ros2 param set`).
 
 /**:

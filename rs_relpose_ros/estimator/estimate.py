@@ -64,8 +64,6 @@ RAYS = (0, 9)
 ROTATION_ONLY_SIGMAS = 2.5
 # Points whose root mean square distance from a line is below so many thresholds lie on it.
 DEGENERATE_THRESHOLDS = 2.0
-# A translation direction less certain than this says nothing.
-MAX_TRANSLATION_SIGMA = 0.5
 
 
 def estimate_relative_pose(
@@ -305,11 +303,15 @@ class Estimation:
         covariance = np.full((6, 6), np.nan)
         # No rotation is less certain than half a turn: points in one place show only two angles.
         covariance[3:, 3:] = turn1.T @ inverse(information + np.eye(3) / np.pi**2) @ turn1
+        # The rates are the gyro's, and so is what is known of them.
+        velocity_covariance = np.full((6, 6), np.nan)
+        velocity_covariance[3:, 3:] = config.gyro_sigma**2 * np.eye(3)
         return RelativePose(
             status=Status.PURE_ROTATION if turned_only else Status.LOW_PARALLAX, reason=reason,
             R=turn1.T @ R @ turn2, covariance=covariance, inliers=inliers,
             angular_velocity1=problem.motion1.angular_velocity,
-            angular_velocity2=problem.motion2.angular_velocity, model='angular',
+            angular_velocity2=problem.motion2.angular_velocity,
+            velocity_covariance=velocity_covariance, model='angular',
             iterations=self.iterations, residual_rms=float(np.sqrt(np.mean(left**2))))
 
     def _turns_to_reference_row(self, state: TwoViewState) -> tuple[Array, Array]:
@@ -323,20 +325,23 @@ class Estimation:
                 exp_so3(delay * (state.R.T @ state.dw2)) @ turn2)
 
     def _result(self, pose: PairState, refined: Refined) -> RelativePose:
-        translation_sigma = np.sqrt(max(np.trace(pose.covariance[:3, :3]), 0.0))
+        # Of the two degrees of freedom of a direction, together.
+        sigma = np.degrees(np.sqrt(max(np.trace(pose.covariance[:3, :3]), 0.0)))
         r = residuals(self.problem.observations, refined.state)[refined.inliers]
-        carries_pose = translation_sigma <= MAX_TRANSLATION_SIGMA
         v2w2 = np.r_[9:12, 15:18]
-        return RelativePose(
-            status=Status.OK if carries_pose else Status.LOW_PARALLAX,
-            reason='' if carries_pose else 'the direction of translation is uncertain by '
-            f'{np.degrees(translation_sigma):.0f} deg: too little parallax',
-            R=pose.R, t=pose.t if carries_pose else np.full(3, np.nan),
-            linear_velocity1=pose.v1, linear_velocity2=pose.v2, angular_velocity1=pose.w1,
-            angular_velocity2=pose.w2, inliers=refined.inliers, covariance=pose.covariance[:6, :6],
+        result = RelativePose(
+            status=Status.OK, R=pose.R, t=pose.t, linear_velocity1=pose.v1,
+            linear_velocity2=pose.v2, angular_velocity1=pose.w1, angular_velocity2=pose.w2,
+            inliers=refined.inliers, covariance=pose.covariance[:6, :6],
             velocity_covariance=pose.covariance[np.ix_(v2w2, v2w2)], model=self.mode.model.name,
             velocity_sigma=refined.velocity_sigma, iterations=self.iterations,
             residual_rms=float(np.sqrt(np.mean(r**2))))
+        limit = self.config.max_translation_sigma
+        if sigma <= limit:
+            return result
+        return result.without_translation(
+            Status.LOW_PARALLAX, f'the direction of translation is uncertain by {sigma:.3g} deg '
+            f'(1 sigma), more than max_translation_sigma = {limit:g} deg')
 
     def _failure(self, status: Status, reason: str) -> RelativePose:
         return RelativePose(status=status, reason=reason, model=self.mode.model.name,

@@ -23,10 +23,11 @@ def _scaled_factor(information: Array) -> tuple[Array, Array]:
     scale = np.empty(n)
     for i in range(n):
         scale[i] = 1.0 / math.sqrt(max(information[i, i], 1e-30))
-    scaled = information * scale * scale.reshape(n, 1)
+    scaled, factor = np.empty((n, n)), np.zeros((n, n))
     for i in range(n):
+        for j in range(n):
+            scaled[i, j] = information[i, j] * scale[j] * scale[i]
         scaled[i, i] += 1e-13
-    factor = np.zeros((n, n))
     if not cholesky(scaled, factor):
         factor[:] = np.nan
     return scale, factor
@@ -45,7 +46,9 @@ def inverse(information: Array) -> Array:
             for k in range(j, i):
                 value -= factor[i, k] * rows[k, j]
             rows[i, j] = value / factor[i, i]
-    rows *= scale
+    for i in range(n):
+        for j in range(n):
+            rows[i, j] *= scale[j]
     return rows.T @ rows
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rs_relpose_ros.compiled import kernel, linked_kernel
 from rs_relpose_ros.estimator import sampson
 from rs_relpose_ros.estimator.state import TwoViewState
+from rs_relpose_ros.geometry.order import smallest
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -84,13 +85,12 @@ def gate_depths(matches: Matches, use: Flags, state: TwoViewState) -> None:
         if not math.isnan(depths[i]):
             known[k] = depths[i]
             k += 1
-    known.sort()
     # Near and far side apart: a scene is denser far away, and its few near points, which look like
     # outliers beside the rest, know most of the translation.
     last = count - 1
-    near, centre, far = (math.log(known[int(DEPTH_QUANTILES[0] * last)]),
-                         math.log(known[int(DEPTH_QUANTILES[1] * last)]),
-                         math.log(known[int(DEPTH_QUANTILES[2] * last)]))
+    near, centre, far = (math.log(smallest(known, int(DEPTH_QUANTILES[0] * last))),
+                         math.log(smallest(known, int(DEPTH_QUANTILES[1] * last))),
+                         math.log(smallest(known, int(DEPTH_QUANTILES[2] * last))))
     lowest = math.exp(centre - DEPTH_GATE * max(centre - near, MIN_DEPTH_SPREAD))
     highest = math.exp(centre + DEPTH_GATE * max(far - centre, MIN_DEPTH_SPREAD))
     for i in range(n):
@@ -114,7 +114,9 @@ def count_behind(matches: Matches, use: Flags, state: TwoViewState) -> int:
 @linked_kernel
 def within(r: Array, matches: Matches, state: TwoViewState, threshold: float) -> Flags:
     """Matches whose residuals `r` (N,) at `state` are below `threshold`, of plausible depths."""
-    use = matches.valid & (np.abs(r) < threshold)
+    use = np.empty(len(r), dtype=np.bool_)
+    for i in range(len(r)):
+        use[i] = matches.valid[i] and abs(r[i]) < threshold
     gate_depths(matches, use, state)
     return use
 

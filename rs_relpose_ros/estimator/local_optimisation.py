@@ -34,6 +34,17 @@ def _truncated_cost(r: Array, valid: NDArray[np.bool_], threshold: float, sigma:
 
 
 @kernel
+def _take_least(costs: Array) -> int:
+    """Number of the least of the costs, the first of equal ones, which becomes infinite."""
+    least = 0
+    for k in range(1, len(costs)):
+        if costs[k] < costs[least] or not costs[least] < math.inf:
+            least = k
+    costs[least] = math.inf
+    return least
+
+
+@kernel
 def optimise(matches: Matches, hypotheses: Solutions, priors: Priors, sigma: float,
              threshold: float) -> tuple[TwoViewState, bool]:
     """Fit the uniform model to each hypothesis; the one of the least MSAC cost, priors included.
@@ -80,10 +91,11 @@ def optimise(matches: Matches, hypotheses: Solutions, priors: Priors, sigma: flo
                     + prior_cost(state, priors))
             if cost < costs[k]:
                 states[k], r[k], costs[k] = state, errors, cost
-        order = np.argsort(costs, kind='mergesort')
-        good = int((costs < math.inf).sum())
+        good = 0
+        for cost in costs:
+            good += 1 if cost < math.inf else 0
         if good == 0:
             return states[0], False
-        states = [states[order[k]] for k in range((good + 1) // 2)]
-        r = [r[order[k]] for k in range((good + 1) // 2)]
+        better = [_take_least(costs) for _ in range((good + 1) // 2)]
+        states, r = [states[k] for k in better], [r[k] for k in better]
     return states[0], True

@@ -16,7 +16,8 @@ from rs_relpose_ros.compiled import kernel, linked_kernel
 from rs_relpose_ros.estimator import sampson
 from rs_relpose_ros.estimator.priors import add_priors, Priors
 from rs_relpose_ros.estimator.state import moved, PARAMETERS, TwoViewState
-from rs_relpose_ros.solvers.linear_algebra import cholesky, cholesky_solve
+from rs_relpose_ros.geometry.vectors import copy_matrix
+from rs_relpose_ros.solvers.linear_algebra import cholesky, newton_step
 
 Array = NDArray[np.float64]
 
@@ -54,8 +55,10 @@ def linearised(matches: FitMatches, state: TwoViewState) -> DataTerm:
     hessian, gradient, squares = sampson.normal_equations(
         matches.observations, matches.use, state)
     weight = 1.0 / (matches.sigma * matches.sigma)
-    hessian *= weight
-    gradient *= weight
+    for i in range(PARAMETERS):
+        gradient[i] *= weight
+        for j in range(PARAMETERS):
+            hessian[i, j] *= weight
     return DataTerm(hessian, gradient, squares * weight)
 
 
@@ -94,7 +97,7 @@ def fit(matches: FitMatches, start: TwoViewState, data: DataTerm, priors: Priors
     damped = np.empty((PARAMETERS, PARAMETERS))
     factor = np.zeros((PARAMETERS, PARAMETERS))
     for _ in range(iterations):
-        damped[:] = hessian
+        copy_matrix(hessian, damped)
         for i in range(PARAMETERS):
             damped[i, i] += damping * hessian[i, i] + 1e-12
         if not cholesky(damped, factor):
@@ -102,9 +105,12 @@ def fit(matches: FitMatches, start: TwoViewState, data: DataTerm, priors: Priors
             if damping > 1e8:
                 break
             continue
-        step = cholesky_solve(factor, -gradient)
+        step = newton_step(factor, gradient)
         # What the step promises to gain (Newton's decrement): too little to look at it.
-        if -(gradient * step).sum() < LEAST_GAIN * (1.0 + cost):
+        gain = 0.0
+        for i in range(PARAMETERS):
+            gain -= gradient[i] * step[i]
+        if gain < LEAST_GAIN * (1.0 + cost):
             break
         candidate = moved(state, step)
         # Most steps are taken: their derivatives cost little more than the residuals alone.
@@ -133,5 +139,5 @@ def stepped(matches: FitMatches, start: TwoViewState, priors: Priors,
             hessian[i, i] += FIRST_DAMPING * hessian[i, i] + 1e-12
         if not cholesky(hessian, factor):
             break
-        state = moved(state, cholesky_solve(factor, -gradient))
+        state = moved(state, newton_step(factor, gradient))
     return state

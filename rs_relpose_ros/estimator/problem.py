@@ -8,6 +8,7 @@ the result back, with its covariance.
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,7 +123,9 @@ def _checked_columns(observations: Array) -> tuple[NDArray[np.bool_], Array]:
     valid, points = np.empty(n, dtype=np.bool_), np.full((6, n), np.nan)
     for i in range(n):
         o = observations[i]
-        valid[i] = np.isfinite(o).all()
+        valid[i] = True
+        for k in range(len(o)):
+            valid[i] &= math.isfinite(o[k])
         if not valid[i]:
             o[:] = 0.0
         elif o[2] > 1e-6 and o[11] > 1e-6:

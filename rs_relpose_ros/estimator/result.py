@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
@@ -22,6 +22,7 @@ class Status(str, Enum):
     LOW_PARALLAX = 'LOW_PARALLAX'
     PURE_ROTATION = 'PURE_ROTATION'
     BAD_INPUT = 'BAD_INPUT'
+    WITHHELD = 'WITHHELD'   # what was told of camera or IMU is wrong, so the pose would be
 
 
 def _nan(*shape: int) -> Array:
@@ -35,7 +36,7 @@ class RelativePose:
     Attributes
     ----------
     status : Status
-        `PURE_ROTATION` still fills `R` and its part of `covariance`.
+        `PURE_ROTATION` and `LOW_PARALLAX` still fill `R` and its part of `covariance`.
     reason : str
         One sentence; empty when there is a pose.
     R : (3, 3) ndarray
@@ -50,11 +51,15 @@ class RelativePose:
         One per match.
     covariance : (6, 6) ndarray
         Of ``(dt, dtheta)`` with ``t_true = t + dt`` (dt perpendicular to t) and
-        ``R_true = Exp(dtheta) R``, both in camera 1.
+        ``R_true = Exp(dtheta) R``, both in camera 1; NaN where `t` or `R` is.
     velocity_covariance : (6, 6) ndarray
-        Of `linear_velocity2` and `angular_velocity2`, in camera 2.
+        Of `linear_velocity2` and `angular_velocity2`, in camera 2; NaN where they are not known.
     model : str
         'uniform', 'angular', 'linear' or 'global'.
+    baseline : float
+        Length of the translation [m]; NaN where it is not known: images and gyro do not tell it.
+    baseline_log_sigma : float
+        1 sigma of its logarithm.
     velocity_sigma : float
         Prior sigma of the linear velocities that was used [baselines per second].
     iterations : int
@@ -77,6 +82,8 @@ class RelativePose:
     covariance: Array = field(default_factory=lambda: _nan(6, 6))
     velocity_covariance: Array = field(default_factory=lambda: _nan(6, 6))
     model: str = ''
+    baseline: float = float('nan')
+    baseline_log_sigma: float = float('nan')
     velocity_sigma: float = float('nan')
     iterations: int = 0
     residual_rms: float = float('nan')
@@ -85,6 +92,21 @@ class RelativePose:
     def __bool__(self) -> bool:
         """Whether there is a pose."""
         return self.status is Status.OK
+
+    @property
+    def rotation_known(self) -> bool:
+        """Whether `R` and its covariance are known; of every pose they are."""
+        return bool(np.isfinite(self.R).all())
+
+    def without_translation(self, status: Status, reason: str) -> RelativePose:
+        """The same with the rotation alone, and why."""
+        covariance, velocity_covariance = self.covariance.copy(), self.velocity_covariance.copy()
+        for matrix in (covariance, velocity_covariance):
+            matrix[:3] = matrix[:, :3] = np.nan
+        return replace(
+            self, status=status, reason=reason, t=_nan(3), linear_velocity1=_nan(3),
+            linear_velocity2=_nan(3), covariance=covariance,
+            velocity_covariance=velocity_covariance)
 
     def inverse(self) -> RelativePose:
         """Pose of camera 1 in camera 2, covariance and velocities exchanged accordingly."""
@@ -95,11 +117,14 @@ class RelativePose:
         jacobian[:3, :3] = -R_inv
         jacobian[:3, 3:] = -R_inv @ tx
         jacobian[3:, 3:] = -R_inv
+        covariance = jacobian @ self.covariance @ jacobian.T
+        # Known without a translation, too, whose NaN the product spreads.
+        covariance[3:, 3:] = R_inv @ self.covariance[3:, 3:] @ self.R
         return RelativePose(
             status=self.status, reason=self.reason, R=R_inv, t=-R_inv @ self.t,
             linear_velocity1=self.linear_velocity2, linear_velocity2=self.linear_velocity1,
             angular_velocity1=self.angular_velocity2, angular_velocity2=self.angular_velocity1,
-            inliers=self.inliers, covariance=jacobian @ self.covariance @ jacobian.T,
+            inliers=self.inliers, covariance=covariance,
             model=self.model, velocity_sigma=self.velocity_sigma, iterations=self.iterations,
             residual_rms=self.residual_rms, duration=self.duration)
 

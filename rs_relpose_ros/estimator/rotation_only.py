@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.estimator.priors import Priors
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
-from rs_relpose_ros.solvers.linear_algebra import cholesky, cholesky_solve
+from rs_relpose_ros.solvers.linear_algebra import cholesky, newton_step
 
 Array = NDArray[np.float64]
 
@@ -79,7 +79,7 @@ def fit_rotation(observations: Array, valid: NDArray[np.bool_], start: Array, pr
         information = hessian
         if not cholesky(hessian, factor):
             break
-        step = cholesky_solve(factor, -gradient)
+        step = newton_step(factor, gradient)
         R = exp_so3(step) @ R
         if np.abs(step).max() < 1e-7:
             break

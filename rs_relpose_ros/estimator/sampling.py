@@ -107,6 +107,16 @@ def _same(Ra: Array, xa: Array, Rb: Array, xb: Array) -> bool:
 
 
 @kernel
+def _worst(pool: Pool) -> int:
+    """Place of the most expensive hypothesis, or the first that is free."""
+    worst = 0
+    for k in range(1, len(pool.cost)):
+        if pool.cost[k] > pool.cost[worst]:
+            worst = k
+    return worst
+
+
+@kernel
 def _offer(R: Array, x: Array, cost: float, pool: Pool) -> None:
     """Put a hypothesis into the pool in place of its like or of the worst, if it is better."""
     place = -1
@@ -115,7 +125,7 @@ def _offer(R: Array, x: Array, cost: float, pool: Pool) -> None:
             place = k
             break
     if place < 0:
-        place = int(np.argmax(pool.cost))
+        place = _worst(pool)
     if cost < pool.cost[place]:
         copy_matrix(R, pool.R[place])
         for i in range(9):
@@ -156,7 +166,9 @@ def sample_hypotheses(solver: int, size: int, matches: Matches, known: Knowledge
     last = min(drawn + block, stop.max_samples)
     # Minimal sets are noisy: an outlier-free one is not yet an accurate one.
     least = min(40, stop.max_samples)
-    best = pool.cost.min()
+    best = math.inf
+    for cost in pool.cost:
+        best = min(best, cost)
     if best < math.inf:
         needed = samples_needed(best_inliers / usable, size, stop)
     while drawn < last and (drawn < least or drawn < needed):
@@ -169,7 +181,7 @@ def sample_hypotheses(solver: int, size: int, matches: Matches, known: Knowledge
         out.x[:] = 0.0
         count = solve_at(solver, sample, known, out)
         for k in range(count):
-            limit = pool.cost.max()
+            limit = pool.cost[_worst(pool)]
             cost, inliers = multi_scale_cost(matches.points, out.R[k], out.x[k],
                                              matches.threshold2, limit)
             if cost < limit:

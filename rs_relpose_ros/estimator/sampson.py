@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import inlined_kernel, kernel, linked_kernel
 from rs_relpose_ros.estimator.state import PARAMETERS, TwoViewState
-from rs_relpose_ros.geometry.vectors import cross, dot, norm, rotated, tangent_basis
+from rs_relpose_ros.geometry.vectors import copy_vector, cross, dot, norm, rotated, tangent_basis
 
 Array = NDArray[np.float64]
 
@@ -177,7 +177,7 @@ def residuals(observations: Array, state: TwoViewState) -> Array:
         following, count = _gather(observations, everything, first, block)
         for i in range(BLOCK):
             errors[i] = _residual(block, i, baselines, turns1, turns2)[0]
-        out[first:following] = errors[:count]
+        copy_vector(errors[:count], out[first:])
         first = following
     return out
 

@@ -22,23 +22,11 @@ def correlation(observations: Array, use: NDArray[np.bool_], first: int, second:
     return out
 
 
-@kernel
 def distinct_directions(observations: Array, use: NDArray[np.bool_], first: int,
                         cell: float) -> int:
     """Number of different rays, to `cell` [rad]: copies of one say nothing new."""
-    keys = np.empty(use.sum())
-    count = 0
-    for i in range(observations.shape[0]):
-        if use[i]:
-            keys[count] = round(observations[i, first] / cell) \
-                + 1e6 * round(observations[i, first + 1] / cell)
-            count += 1
-    keys.sort()
-    different = min(count, 1)
-    for k in range(1, count):
-        if keys[k] != keys[k - 1]:
-            different += 1
-    return different
+    column, row = np.rint(observations[use, first:first + 2] / cell).T
+    return len(np.unique(column + 1e6 * row))
 
 
 def distance_from_a_plane(observations: Array, use: NDArray[np.bool_], first: int) -> float:

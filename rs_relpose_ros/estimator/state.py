@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel, linked_kernel
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
-from rs_relpose_ros.geometry.vectors import tangent_basis
+from rs_relpose_ros.geometry.vectors import dot, norm, tangent_basis
 
 Array = NDArray[np.float64]
 
@@ -52,11 +51,15 @@ def signed(state: TwoViewState, sign: float) -> TwoViewState:
 def moved(state: TwoViewState, step: Array) -> TwoViewState:
     """The state after a step (17,) of its local parameters."""
     basis = tangent_basis(state.t)
-    t = state.t + basis[:, 0] * step[3] + basis[:, 1] * step[4]
-    return TwoViewState(
-        exp_so3(step[:3]) @ state.R, t / math.sqrt((t * t).sum()),
-        state.d1 + step[D1:D1 + 3], state.d2 + step[D2:D2 + 3],
-        state.dw1 + step[DW1:DW1 + 3], state.dw2 + step[DW2:DW2 + 3])
+    t, d1, d2, dw1, dw2 = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for i in range(3):
+        t[i] = state.t[i] + basis[i, 0] * step[TANGENT] + basis[i, 1] * step[TANGENT + 1]
+        d1[i], d2[i] = state.d1[i] + step[D1 + i], state.d2[i] + step[D2 + i]
+        dw1[i], dw2[i] = state.dw1[i] + step[DW1 + i], state.dw2[i] + step[DW2 + i]
+    length = norm(t)
+    for i in range(3):
+        t[i] /= length
+    return TwoViewState(exp_so3(step[:3]) @ state.R, t, d1, d2, dw1, dw2)
 
 
 @linked_kernel
@@ -65,9 +68,9 @@ def step_between(state: TwoViewState, other: TwoViewState) -> Array:
     step = np.empty(PARAMETERS)
     turn = log_so3(other.R @ state.R.T)
     basis = tangent_basis(state.t)
-    along = (state.t * other.t).sum()
+    along = dot(state.t, other.t)
     for k in range(2):
-        step[TANGENT + k] = (basis[:, k] * other.t).sum() / along
+        step[TANGENT + k] = dot(basis[:, k], other.t) / along
     for k in range(3):
         step[THETA + k] = turn[k]
         step[D1 + k] = other.d1[k] - state.d1[k]

@@ -20,6 +20,7 @@ from rs_relpose_ros.estimator.map_fit import DataTerm, fit, FitMatches, linearis
 from rs_relpose_ros.estimator.priors import Priors, with_velocity_sigma
 from rs_relpose_ros.estimator.sampson import residuals
 from rs_relpose_ros.estimator.state import moved, PARAMETERS, step_between, TwoViewState
+from rs_relpose_ros.geometry.vectors import copy_matrix, copy_vector
 
 Array = NDArray[np.float64]
 
@@ -105,9 +106,10 @@ def fit_with_evidence(matches: Matches, start: TwoViewState, priors: Priors, noi
                 matches, used, state, data, priors, grid[k], noise.threshold, ITERATIONS)
             if k == best:
                 upwards, upwards_data = state, data
-            steps[k] = step_between(start, state)
+            copy_vector(step_between(start, state), steps[k])
         best = low + int(np.argmax(evidences[low:high]))
-        lacking[low:high] = evidences[best] - evidences[low:high]
+        for k in range(low, high):
+            lacking[k] = evidences[best] - evidences[k]
         state = moved(start, steps[best])
         chosen_from = used.use
         used = _selected(matches, state, _reach(noise.threshold, used.sigma), noise.sigma)
@@ -170,8 +172,8 @@ def _average(matches: Matches, used: FitMatches, start: TwoViewState, steps: Arr
             state, _, hessian, evidences[k] = _candidate(
                 matches, used, own, linearised(used, own), priors, grid[k], threshold,
                 LAST_ITERATIONS)
-            steps[k] = step_between(start, state)
-            covariances[k] = inverse(hessian)
+            copy_vector(step_between(start, state), steps[k])
+            copy_matrix(inverse(hessian), covariances[k])
     best = int(np.argmax(evidences))
     # Around the best one, where the local parameters of all of them are small.
     origin = moved(start, steps[best])
@@ -181,11 +183,13 @@ def _average(matches: Matches, used: FitMatches, start: TwoViewState, steps: Arr
     away = np.zeros((size, PARAMETERS))
     for k in range(size):
         if likely[k]:
-            away[k] = step_between(origin, moved(start, steps[k]))
+            copy_vector(step_between(origin, moved(start, steps[k])), away[k])
             mean += weights[k] * away[k]
     covariance = np.zeros((PARAMETERS, PARAMETERS))
     for k in range(size):
         if likely[k]:
             rest = away[k] - mean
-            covariance += weights[k] * (covariances[k] + np.outer(rest, rest))
+            for i in range(PARAMETERS):
+                for j in range(PARAMETERS):
+                    covariance[i, j] += weights[k] * (covariances[k, i, j] + rest[i] * rest[j])
     return moved(origin, mean), covariance, best

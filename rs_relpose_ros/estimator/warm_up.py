@@ -23,6 +23,12 @@ def warm_up(config: EstimatorConfig | None = None) -> None:
                            config=config)
 
 
+def warm_up_solvers() -> None:
+    """Compile the solvers that are sampled by default."""
+    for solver in MODES[EstimatorConfig().solver].solvers:
+        assert solver.address
+
+
 def warm_up_sampling() -> None:
     """Compile the kernels of the first step alone."""
     _estimation().sample()

@@ -13,6 +13,7 @@ from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.geometry.motion import FrameMotion
+from rs_relpose_ros.geometry.order import median
 from rs_relpose_ros.geometry.vectors import cross, norm, rotated
 
 Array = NDArray[np.float64]
@@ -101,4 +102,4 @@ def median_parallax(rays1: Array, rays2: Array, rotation: Array) -> float:
         if not math.isnan(value):
             values[count] = value
             count += 1
-    return float(np.median(values[:count])) if count else 0.0
+    return median(values[:count]) if count else 0.0

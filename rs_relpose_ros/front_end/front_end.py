@@ -15,6 +15,7 @@ from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.front_end.pipeline import Pipeline
 from rs_relpose_ros.front_end.sequencer import FrameRefused, ReadyFrame, Sequencer
+from rs_relpose_ros.tracking.tracker import Tracker
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,14 +49,15 @@ class FrontEnd:
 
     `offline` and `clock` are those of `Sequencer`. Offline, programming errors leave `step`; live
     they are an outcome, since the node goes on. With `keep_images` pairs carry their two images.
+    `tracker`: instead of the one that the parameters name.
     """
 
     def __init__(self, parameters: Parameters, *, offline: bool = False,
-                 keep_images: bool = False,
+                 keep_images: bool = False, tracker: Tracker | None = None,
                  clock: Callable[[], int] = time.monotonic_ns) -> None:
         self.parameters = parameters
         self.sequencer = Sequencer(parameters, offline=offline, clock=clock)
-        self._pipeline = Pipeline(parameters, keep_images)
+        self._pipeline = Pipeline(parameters, keep_images, tracker)
         self._offline = offline
 
     def step(self, timeout: float = 0.0) -> Outcome | None:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.config.keyframes import KeyframeConfig
 from rs_relpose_ros.estimator.result import RelativePose
-from rs_relpose_ros.front_end.drift import Drift
-from rs_relpose_ros.geometry.so3 import log_so3
+from rs_relpose_ros.health.findings import Health, NOT_JUDGED
+from rs_relpose_ros.health.tracked import Applied, NOTHING_APPLIED, Tracked
 from rs_relpose_ros.tracking.matches import Matches
 
 Array = NDArray[np.float64]
@@ -54,7 +54,12 @@ class PairResult:
     rays2: Array
     parallax: float   # [px] median after derotation
     gyro_rotation: Array | None = None   # (3, 3) R_1^T R_2 integrated from the gyro
-    drift: Drift | None = None   # as tracked up to this pair
+    # (3,) [rad] rotation by the images alone against the gyro's; None without either
+    images_against_gyro: Array | None = None
+    health: Health = NOT_JUDGED   # of what was told, all three as after this pair
+    tracked: Tracked | None = None
+    applied: Applied = NOTHING_APPLIED
+    gyro_bias: Array | None = None   # (3,) [rad/s] that was removed for it, IMU frame
     image1: NDArray[np.uint8] | None = None   # both only where the front end keeps images
     image2: NDArray[np.uint8] | None = None
 
@@ -66,11 +71,10 @@ class PairResult:
 
     @property
     def gyro_difference(self) -> float:
-        """Angle between the rotation by gyro and the estimated one [deg]; NaN without either."""
-        if self.gyro_rotation is None or not np.isfinite(self.pose.R).all():
+        """Angle between the rotations by gyro and by images alone [deg]; NaN without either."""
+        if self.images_against_gyro is None:
             return math.nan
-        turn = log_so3(np.ascontiguousarray(self.pose.R.T @ self.gyro_rotation))
-        return math.degrees(float(np.linalg.norm(turn)))
+        return math.degrees(float(np.linalg.norm(self.images_against_gyro)))
 
 
 class PairFigure(NamedTuple):

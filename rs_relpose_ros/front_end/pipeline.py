@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,19 +13,26 @@ from rs_relpose_ros.errors import MissingInputError
 from rs_relpose_ros.estimator.estimate import estimate_relative_pose
 from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.front_end.derotated_rays import DerotatedRays, median_parallax, Sensor
-from rs_relpose_ros.front_end.drift import DriftTracker, PairRotation
 from rs_relpose_ros.front_end.frame import Frame, sensor_camera
 from rs_relpose_ros.front_end.pair import closes_pair, PairResult, SinceKeyframe
 from rs_relpose_ros.geometry.motion import FrameMotion
-from rs_relpose_ros.geometry.so3 import aligning_rotation
+from rs_relpose_ros.geometry.so3 import aligning_rotation, log_so3
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between
+from rs_relpose_ros.health.deviation import BIAS, DEVIATIONS, OFFSET
+from rs_relpose_ros.health.judge import Told
+from rs_relpose_ros.health.monitor import HealthMonitor, withheld
+from rs_relpose_ros.health.pair_information import middle_share, PairEvidence
+from rs_relpose_ros.health.tracked import Applied, Tracked
+from rs_relpose_ros.health.turning import rotation_of_rays
 from rs_relpose_ros.imu.frame_imu import FrameImu, GyroSegment
-from rs_relpose_ros.imu.integration import integrate_rotation
+from rs_relpose_ros.imu.integration import integrate_rotation, turn_sensitivity
 from rs_relpose_ros.tracking.matches import Matches
-from rs_relpose_ros.tracking.tracker import make_tracker
+from rs_relpose_ros.tracking.tracker import make_tracker, Tracker
 
 Array = NDArray[np.float64]
 
+# Points of which the turning of the images is taken, of the longest tracks, and frames between.
+_TURN_POINTS, _TURN_FRAMES = 120, 3
 # Largest 1 sigma of the gravity direction that the estimator takes [rad].
 _LARGEST_GRAVITY_SIGMA = 1.5
 
@@ -47,6 +54,25 @@ class _GyroTurn:
     segment: GyroSegment
 
 
+@dataclass(slots=True, eq=False)
+class _Turn:
+    """An image that later ones are compared with, and how the gyro has turned since."""
+
+    ids: NDArray[np.uint32]   # (N,) of tracks
+    rays: Array   # (N, 3) as measured
+    by_gyro: Array = field(default_factory=lambda: np.eye(3))
+    frames: int = 0
+
+    @classmethod
+    def none(cls) -> _Turn:
+        """No image yet: the next one is the first."""
+        return cls(np.zeros(0, dtype=np.uint32), np.zeros((0, 3)), frames=_TURN_FRAMES)
+
+    def go_on(self, rotation: Array) -> None:
+        """Count a frame that the gyro has turned by `rotation` since the one before."""
+        self.by_gyro, self.frames = self.by_gyro @ rotation, self.frames + 1
+
+
 class _GravityPrior(NamedTuple):
     """Motions of both frames, with gravity where it is used, and its sigma for the estimator."""
 
@@ -59,16 +85,20 @@ class Pipeline:
     """Tracks frames against a reference keyframe and estimates a pose whenever a pair closes.
 
     Parameters that may change while running (declared `live`) are not kept: `process` gets the
-    current ones with each frame. With `keep_images` results carry the two images.
+    current ones with each frame. With `keep_images` results carry the two images. `tracker`:
+    instead of the one that the parameters name.
     """
 
-    def __init__(self, parameters: Parameters, keep_images: bool = False) -> None:
+    def __init__(self, parameters: Parameters, keep_images: bool = False,
+                 tracker: Tracker | None = None) -> None:
         missing = parameters.sensor.missing()
         if missing:
             raise MissingInputError('parameters are missing: ' + ', '.join(missing))
         self._keep_images = keep_images
-        self._tracker = make_tracker(parameters.tracking)
-        self._drift = DriftTracker(parameters)
+        self._tracker = make_tracker(parameters.tracking) if tracker is None else tracker
+        self._health = HealthMonitor()
+        self._seen: Tracked | None = None
+        self._applied = Applied()
         self._sensor: Sensor | None = None
         self._reference: _View | None = None
         self._previous: _View | None = None
@@ -76,18 +106,20 @@ class Pipeline:
         self._gyro: _GyroTurn | None = None
         self._reference_rays: DerotatedRays | None = None
         self._current_rays: DerotatedRays | None = None
+        self._turn = _Turn.none()
         self._promotion_due = False
 
     @property
     def applied_offset_ns(self) -> int:
         """Tracked time offset that the next frame is to be shifted by [ns]."""
-        return self._drift.applied_ns
+        return self._applied.time_offset_ns
 
     def reset(self) -> None:
         """Forget the reference keyframe: the next frame starts anew."""
         self._tracker.reset()
         self._reference = self._previous = self._gyro = None
         self._reference_rays = self._current_rays = None
+        self._turn = _Turn.none()
         self._frames = 0
         self._promotion_due = False
 
@@ -106,12 +138,16 @@ class Pipeline:
             self._restart_from(view)
             return None
         self._frames += 1
-        predicted = self._predicted(self._previous.imu.motion, imu, sensor, parameters)
+        rotation, _ = integrate_rotation(imu.since_previous.stamps_ns,
+                                         imu.since_previous.angular_velocities, parameters.imu)
+        self._turn.go_on(rotation)
+        predicted = self._predicted(self._previous.imu.motion, imu.motion, rotation, sensor)
         matches = self._tracker.track(
             frame.image, predicted,
             seconds_between(self._previous.frame.stamp_ns, frame.stamp_ns))
         self._previous = view
         self._gyro = self._turn_with(imu.since_previous, parameters)
+        self._compare_turns(frame.stamp_ns, matches, sensor)
         rays1, rays2 = self._derotate(matches, self._reference.imu.motion, imu.motion, sensor)
         since = SinceKeyframe(self._parallax(rays1, rays2, sensor),
                               _interval(self._reference, view), self._frames,
@@ -136,6 +172,7 @@ class Pipeline:
         """Camera model of the frame; another one than before starts anew."""
         if self._sensor is None or frame.intrinsics != self._sensor.intrinsics:
             self.reset()
+            self._health.clear()
             self._sensor = Sensor(sensor_camera(frame.intrinsics, parameters), frame.intrinsics)
         return self._sensor
 
@@ -146,24 +183,23 @@ class Pipeline:
 
     # -- gyro and rays -----------------------------------------------------------------------
 
-    def _predicted(self, previous: FrameMotion, imu: FrameImu, sensor: Sensor,
-                   parameters: Parameters) -> Array | None:
+    def _predicted(self, previous: FrameMotion, current: FrameMotion, rotation: Array,
+                   sensor: Sensor) -> Array | None:
         """Where the gyro expects the tracker's points (N, 2) in the current image [px].
 
-        None without gyro, and for a tracker that looks for no points.
+        `rotation` (3, 3): ``R_1^T R_2`` since the previous image. None for a tracker that looks
+        for no points.
         """
-        points, segment = self._tracker.points, imu.since_previous
-        if segment is None or not len(points):
+        points = self._tracker.points
+        if not len(points):
             return None
-        rotation, _ = integrate_rotation(segment.stamps_ns, segment.angular_velocities,
-                                         parameters.imu)
         known = self._current_rays
         if known is not None and np.array_equal(known.points, points):
             rays, row_times = known.rays, known.row_times
         else:
             rays, row_times = sensor.derotated(points, previous)
         # f_2 = R^T f_1 for R = R_1^T R_2, in rows.
-        return sensor.seen(rays @ rotation, row_times, imu.motion)
+        return sensor.seen(rays @ rotation, row_times, current)
 
     def _turn_with(self, segment: GyroSegment, parameters: Parameters) -> _GyroTurn | None:
         """Gyro since the reference, continued by a frame; None once a part was missing."""
@@ -210,30 +246,71 @@ class Pipeline:
             config=replace(parameters.estimator, gravity_sigma=gravity.sigma),
             quality=matches.quality,
             rng=np.random.default_rng([parameters.pair.seed, stamp1_ns, stamp2_ns]))
-        self._follow_drift(pose, reference.imu, view.imu, parameters)
+        pose = self._judged(pose, matches, reference, view, sensor, parameters)
         rays1, rays2 = self._derotate(matches, reference.imu.motion, view.imu.motion, sensor)
+        seen = self._health.latest
         return PairResult(
             reference_stamp_ns=stamp1_ns, stamp_ns=stamp2_ns,
             reference_ns1=reference.imu.reference_ns, reference_ns2=view.imu.reference_ns,
             frame_id=view.frame.frame_id, interval=_interval(reference, view), pose=pose,
             matches=matches, row_times1=rays1.row_times, row_times2=rays2.row_times,
             rays1=rays1.rays, rays2=rays2.rays, parallax=self._parallax(rays1, rays2, sensor),
-            gyro_rotation=None if gyro is None else gyro.rotation, drift=self._drift.estimate(),
+            gyro_rotation=None if gyro is None else gyro.rotation,
+            images_against_gyro=None if seen is None else seen.images_against_gyro,
+            health=self._health.health, tracked=self._seen, applied=self._applied,
+            gyro_bias=None if gyro is None else (
+                parameters.sensor.R_cam_imu.T @ gyro.segment.bias),
             image1=reference.frame.image if self._keep_images else None,
             image2=view.frame.image if self._keep_images else None)
 
-    def _follow_drift(self, pose: RelativePose, imu1: FrameImu, imu2: FrameImu,
-                      parameters: Parameters) -> None:
-        """Compare the pair's rotation with the gyro's, and decide on the offset to apply."""
-        gyro = self._gyro
-        if gyro is not None:
-            self._drift.add(PairRotation(
-                stamp_ns=imu2.reference_ns, R=pose.R, covariance=pose.covariance[3:, 3:],
-                gyro_rotation=gyro.rotation,
-                gyro_covariance=gyro.covariance if parameters.pair.use_gyro_rotation else None,
-                gyro=gyro.segment, applied1=imu1.applied_offset_ns / NANOSECONDS,
-                applied2=imu2.applied_offset_ns / NANOSECONDS))
-        self._drift.apply(parameters.sensor.track_time_offset)
+    # -- health ------------------------------------------------------------------------------
+
+    def _compare_turns(self, stamp_ns: int, matches: Matches, sensor: Sensor) -> None:
+        """Compare how images turned over some frames, without the gyro, with the gyro."""
+        if self._turn.frames < _TURN_FRAMES:
+            return
+        before, ids = self._turn, matches.track_ids[:_TURN_POINTS]
+        rays = sensor.camera.unproject(sensor.intrinsics.to_sensor(matches.points2[:_TURN_POINTS]))
+        _, old, new = np.intersect1d(before.ids, ids, assume_unique=True, return_indices=True)
+        turned = rotation_of_rays(before.rays[old], rays[new])
+        if turned is not None:
+            self._health.add_turn(stamp_ns, turned, log_so3(before.by_gyro))
+        self._turn = _Turn(ids, rays)
+
+    def _judged(self, pose: RelativePose, matches: Matches, reference: _View, view: _View,
+                sensor: Sensor, parameters: Parameters) -> RelativePose:
+        """The pose with a covariance that holds, or withheld; what is tracked moves on."""
+        evidence = None
+        if self._gyro is not None and np.isfinite(pose.R).all():
+            evidence = _evidence(pose, matches, reference, view, self._gyro, sensor, parameters)
+        told = self._told(view, sensor, parameters)
+        pose = self._health.add_pair(view.frame.stamp_ns, evidence, pose, told)
+        self._seen = Tracked.of(self._health.calibration, parameters.sensor, told.gyro_bias,
+                                middle_share(sensor.camera))
+        self._applied = self._applied.moved(self._seen, parameters.sensor.time_offset,
+                                            track_offset=parameters.sensor.track_time_offset)
+        return withheld(pose, self._health.health) if parameters.pair.withhold_when_wrong else pose
+
+    def _told(self, view: _View, sensor: Sensor, parameters: Parameters) -> Told:
+        bias = np.array(parameters.imu.gyro_bias)
+        in_force = np.zeros(DEVIATIONS)
+        in_force[OFFSET] = view.imu.applied_offset_ns / NANOSECONDS
+        if self._gyro is not None:
+            in_force[BIAS] = parameters.sensor.R_cam_imu.T @ self._gyro.segment.bias - bias
+        return Told(parameters.sensor, sensor.camera, bias, in_force)
+
+
+def _evidence(pose: RelativePose, matches: Matches, reference: _View, view: _View, gyro: _GyroTurn,
+              sensor: Sensor, parameters: Parameters) -> PairEvidence:
+    """A pair as the recursive calibration needs it."""
+    segment = gyro.segment
+    return PairEvidence(
+        sensor.intrinsics.to_sensor(matches.points1), sensor.intrinsics.to_sensor(matches.points2),
+        sensor.camera, reference.imu.motion, view.imu.motion, _interval(reference, view),
+        pose.R, pose.t, gyro.rotation, turn_sensitivity(
+            segment.stamps_ns, segment.angular_velocities, parameters.imu),
+        (segment.angular_velocities[0], segment.angular_velocities[-1]),
+        parameters.sensor.R_cam_imu, parameters.estimator.gyro_sigma)
 
 
 def _interval(reference: _View, view: _View) -> float:

@@ -16,7 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.config.parameters import Parameters
-from rs_relpose_ros.estimator.warm_up import warm_up_refinement, warm_up_sampling
+from rs_relpose_ros.estimator.warm_up import (
+    warm_up_refinement,
+    warm_up_sampling,
+    warm_up_solvers,
+)
 from rs_relpose_ros.front_end.frame import Frame
 from rs_relpose_ros.front_end.front_end import FrameProcessed, FrontEnd
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
@@ -45,9 +49,6 @@ def warm_up_pipeline(parameters: Parameters) -> None:
         front_end = FrontEnd(parameters, offline=True)
         sequencer = front_end.sequencer
         images = list(_images())
-        for image in images:
-            # A raw image is read-only memory of its message: kernels for that are apart.
-            image.flags.writeable = force is None
         for stamp_ns in range(NANOSECONDS, NANOSECONDS + (len(images) + 3) * _FRAME_NS, _IMU_NS):
             sequencer.add_imu(ImuSample(stamp_ns, (0.01, 0.02, 0.03), force))
         for k, image in enumerate(images):
@@ -73,16 +74,18 @@ def fill_cache() -> None:
     Other solvers are compiled when they are chosen.
     """
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context('spawn')) as pool:
-        other_half = pool.submit(_compile_all_but_sampling)
-        warm_up_sampling()
+        other_half = pool.submit(_warm_up_estimate)
+        warm_up_solvers()
+        # No pair has that many matches: everything but the estimate.
+        warm_up_pipeline(Parameters.from_mapping({'min_inliers': 10_000}))
         other_half.result()
     warm_up_pipeline(Parameters())
 
 
-def _compile_all_but_sampling() -> None:
+def _warm_up_estimate() -> None:
     warm_up_refinement()
-    # No pair has that many matches: everything but the estimate.
-    warm_up_pipeline(Parameters.from_mapping({'min_inliers': 10_000}))
+    # By then the solvers are compiled, which are most of it.
+    warm_up_sampling()
 
 
 if __name__ == '__main__':

@@ -40,7 +40,8 @@ def integrated_rotations(seconds: Array, rates: Array) -> Array:
         Angular velocity in the turning frame [rad/s].
     """
     rotations = np.empty((len(seconds), 3, 3))
-    rotations[0] = np.eye(3)
+    rotations[0] = 0.0
+    rotations[0, 0, 0] = rotations[0, 1, 1] = rotations[0, 2, 2] = 1.0
     for k in range(len(seconds) - 1):
         turn = step_turn(rates[k], rates[k + 1], seconds[k + 1] - seconds[k])
         multiply(rotations[k], exp_so3(turn), rotations[k + 1])

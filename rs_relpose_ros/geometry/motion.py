@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3, multiply
+from rs_relpose_ros.geometry.vectors import copy_matrix, copy_vector
 
 Array = NDArray[np.float64]
 
@@ -118,7 +119,8 @@ class FrameMotion:
         if self.knot_times is None or self.knot_rotations is None:
             return rotations_at_rate(self.angular_velocity, tau)
         times = self.knot_times
-        rotations, covered = rotations_between(times, self.knot_rotations, tau)
+        rotations, covered = rotations_between(
+            times, self.knot_rotations, tau, np.searchsorted(times, tau, side='right'))
         if not covered:
             raise InputError(
                 f'row times [{tau.min():.6f}, {tau.max():.6f}] s are not covered by the gyro '
@@ -145,22 +147,22 @@ def rotations_at_rate(rate: Array, times: Array) -> Array:
     """``Exp(w t)`` (N, 3, 3) at the times (N,) [s]."""
     out = np.empty((len(times), 3, 3))
     for i in range(len(times)):
-        out[i] = exp_so3(times[i] * rate)
+        copy_matrix(exp_so3(times[i] * rate), out[i])
     return out
 
 
 @kernel
-def rotations_between(knot_times: Array, knot_rotations: Array,
-                      times: Array) -> tuple[Array, bool]:
+def rotations_between(knot_times: Array, knot_rotations: Array, times: Array,
+                      after: NDArray[np.int64]) -> tuple[Array, bool]:
     """Orientations (N, 3, 3) at times (N,) within the knots, at a constant rate between two.
 
-    Also whether the knots enclose all times; beyond them nothing turns on.
+    `after` (N,) tells the first knot after each time. Also whether the knots enclose all
+    times; beyond them nothing turns on.
     """
     out = np.empty((len(times), 3, 3))
     steps = np.empty((len(knot_times) - 1, 3))
     for k in range(len(steps)):
-        steps[k] = log_so3(knot_rotations[k].T @ knot_rotations[k + 1])
-    after = np.searchsorted(knot_times, times, side='right')
+        copy_vector(log_so3(knot_rotations[k].T @ knot_rotations[k + 1]), steps[k])
     covered = True
     for i in range(len(times)):
         # Written so that NaN is not covered.

@@ -37,10 +37,17 @@ def norm(v: Vector | Array) -> float:
 
 
 @small_kernel
+def copy_vector(source: Array, out: Array) -> None:
+    """``out[:] = source`` of (n,), which Numba takes seconds to compile (for its message)."""
+    for i in range(len(source)):
+        out[i] = source[i]
+
+
+@small_kernel
 def copy_matrix(source: Array, out: Array) -> None:
-    """``out[:] = source`` of (3, 3), which Numba takes seconds to compile (for its message)."""
-    for i in range(3):
-        for j in range(3):
+    """``out[:] = source`` of (n, m)."""
+    for i in range(source.shape[0]):
+        for j in range(source.shape[1]):
             out[i, j] = source[i, j]
 
 

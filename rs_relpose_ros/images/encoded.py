@@ -60,6 +60,11 @@ class RawImage:
     step: int
     is_bigendian: bool
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [px] as told; not checked yet."""
+        return self.width, self.height
+
     def decoded(self) -> Gray:
         """Gray image (H, W); of a mono8 image without padding a view of `data`."""
         height, width, encoding = self.height, self.width, self.encoding
@@ -117,9 +122,14 @@ class CompressedImage:
     data: Bytes
     encoding: str
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [px] as its header tells; not checked yet."""
+        return encoded_image_size(self.data)
+
     def decoded(self) -> Gray:
         """Gray image (H, W)."""
-        width, height = encoded_image_size(self.data)
+        width, height = self.size
         check_image_size(width, height)
         # Not turned upright: rows must stay in the order in which the sensor reads them.
         flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION

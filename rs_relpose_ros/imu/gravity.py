@@ -137,18 +137,17 @@ def _advance(state: _State, noise: _Noise, stamp_ns: int, rate: Array,
 
     `stamp_ns` and `rate` (3,) are those of the sample before.
     """
+    turn = np.empty(3)
     for k in range(len(stamps_ns)):
         if stamps_ns[k] - stamp_ns > gap_ns:
             return k
         dt = (stamps_ns[k] - stamp_ns) * 1e-9
-        _predict(state, noise, 0.5 * (rate + rates[k]), dt)
+        for i in range(3):
+            turn[i] = -(0.5 * (rate[i] + rates[k, i]) - state.bias[i]) * dt
+        _predict(state, noise, turn, dt)
         stamp_ns, rate = stamps_ns[k], rates[k]
-        length = norm(forces[k])
-        if length > 0.0:
-            # Samples closer than the correlation time share one measurement's weight.
-            variance = (_direction_variance(length, noise.acceleration)
-                        * max(_CORRELATION_TIME / dt, 1.0))
-            _correct(state, forces[k] / length, variance, dt)
+        if norm(forces[k]) > 0.0:
+            _correct(state, noise, forces[k], dt)
     return len(stamps_ns)
 
 
@@ -163,84 +162,111 @@ def _direction_variance(length: float, acceleration: float) -> float:
 
 
 @kernel
-def _predict(state: _State, noise: _Noise, rate: Array, dt: float) -> None:
-    """Turn by the measured `rate` (3,), with ``E = Exp(-(w - b) dt)``.
+def _predict(state: _State, noise: _Noise, turn: Array, dt: float) -> None:
+    """Turn by ``E = Exp(turn)`` of ``turn = -(w - b) dt`` (3,).
+
+    A direction that is fixed in the world turns backwards in the IMU frame.
 
     u <- E u        F = | E  dt I |        P <- F P F^T + Q dt
                         | 0     I |
     """
-    up, bias, P, residual = state
-    # A direction that is fixed in the world turns backwards in the IMU frame.
-    E = exp_so3(-(rate - bias) * dt)
-    up[:] = rotated(E, up)
-    residual[:] = rotated(E, residual)
-    F = np.eye(6)
-    F[:3, :3] = E
+    P = state.covariance
+    E = exp_so3(turn)
+    _turn(E, state.up)
+    _turn(E, state.residual)
+    F, FP = np.zeros((6, 6)), np.zeros((6, 6))
     for i in range(3):
-        F[i, 3 + i] = dt
-    P[:] = _product(_product(F, P), F.T)
+        F[i, 3 + i], F[3 + i, 3 + i] = dt, 1.0
+        for j in range(3):
+            F[i, j] = E[i, j]
+    _add_product(F, P, FP)
+    _write_product_transposed(FP, F, P)
     for i in range(3):
         P[i, i] += noise.turning * dt
         P[3 + i, 3 + i] += noise.bias * dt
 
 
 @kernel
-def _correct(state: _State, measured: Array, variance: float, dt: float) -> None:
-    """Kalman update by a measured direction (3,) with its variance per axis.
+def _correct(state: _State, noise: _Noise, force: Array, dt: float) -> None:
+    """Kalman update by a specific force (3,), its direction with some variance per axis.
 
     H = | -[u]x  0 |        S = H P H^T + variance I        K = P H^T S^-1
     (d, e) = K (f / |f| - u)        P <- P - K H P
     u <- Exp(d) u        b <- b + e
     """
     up, bias, P, residual = state
-    innovation = measured - up
-    residual += min(dt / _LASTING, 1.0) * (innovation - residual)
-    H = np.zeros((3, 6))
+    length = norm(force)
+    # Samples closer than the correlation time share one measurement's weight.
+    variance = (_direction_variance(length, noise.acceleration)
+                * max(_CORRELATION_TIME / dt, 1.0))
+    H, PHt = np.zeros((3, 6)), np.empty((6, 3))
     H[0, 1], H[1, 0] = up[2], -up[2]
     H[0, 2], H[2, 0] = -up[1], up[1]
     H[1, 2], H[2, 1] = up[0], -up[0]
-    PHt = _product(P, H.T)
-    S = variance * np.eye(3)
+    _write_product_transposed(P, H, PHt)
+    S, adjugate = np.zeros((3, 3)), np.empty((3, 3))
+    for i in range(3):
+        S[i, i] = variance
     _add_product(H, PHt, S)
     _mirror(S)
-    adjugate, determinant = _symmetric_adjugate(S)
-    K = _product(PHt, adjugate) / determinant
+    determinant = _write_symmetric_adjugate(S, adjugate)
+    K, KHP = np.zeros((6, 3)), np.empty((6, 6))
+    _add_product(PHt, adjugate, K)
     turn = np.zeros(3)
     for j in range(3):
-        turn += K[:3, j] * innovation[j]
-        bias += K[3:, j] * innovation[j]
-    P -= _product(K, PHt.T)
+        innovation = force[j] / length - up[j]
+        residual[j] += min(dt / _LASTING, 1.0) * (innovation - residual[j])
+        for i in range(3):
+            K[i, j] /= determinant
+            K[3 + i, j] /= determinant
+            turn[i] += K[i, j] * innovation
+            bias[i] += K[3 + i, j] * innovation
+    _write_product_transposed(K, PHt, KHP)
+    for i in range(6):
+        for j in range(6):
+            P[i, j] -= KHP[i, j]
     _mirror(P)
-    moved = rotated(exp_so3(turn), up)
-    length = norm(moved)
+    _turn(exp_so3(turn), up)
+    length = norm(up)
     for i in range(3):
-        up[i] = moved[i] / length
+        up[i] /= length
 
 
 @kernel
-def _symmetric_adjugate(S: Array) -> tuple[Array, float]:
-    """Adjugate of a symmetric matrix (3, 3) and its determinant: ``S^-1 = adj S / det S``."""
-    adjugate = np.empty((3, 3))
+def _turn(R: Array, v: Array) -> None:
+    """``v <- R v`` of a vector (3,)."""
+    turned = rotated(R, v)
     for i in range(3):
-        adjugate[i] = cross(S[(i + 1) % 3], S[(i + 2) % 3])
-    return adjugate, dot(S[0], adjugate[0])
+        v[i] = turned[i]
 
 
 @kernel
-def _product(A: Array, B: Array) -> Array:
-    out = np.zeros((A.shape[0], B.shape[1]))
-    _add_product(A, B, out)
-    return out
+def _write_symmetric_adjugate(S: Array, adjugate: Array) -> float:
+    """Adjugate of a symmetric matrix (3, 3); its determinant: ``S^-1 = adj S / det S``."""
+    for i in range(3):
+        adjugate[i, 0], adjugate[i, 1], adjugate[i, 2] = cross(S[(i + 1) % 3], S[(i + 2) % 3])
+    return dot(S[0], adjugate[0])
 
 
 @kernel
 def _add_product(A: Array, B: Array, out: Array) -> None:
     """``out <- out + A B``, term by term in this order; BLAS costs more for small matrices."""
-    for i in range(A.shape[0]):
-        for j in range(B.shape[1]):
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
             total = out[i, j]
             for k in range(A.shape[1]):
                 total += A[i, k] * B[k, j]
+            out[i, j] = total
+
+
+@kernel
+def _write_product_transposed(A: Array, B: Array, out: Array) -> None:
+    """``out <- A B^T``; `out` is another array than A and B."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            total = 0.0
+            for k in range(A.shape[1]):
+                total += A[i, k] * B[j, k]
             out[i, j] = total
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -9,7 +11,7 @@ from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.config.imu import ImuConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.gyro import integrated_rotations, step_turn
-from rs_relpose_ros.geometry.so3 import left_jacobian_so3, multiply
+from rs_relpose_ros.geometry.so3 import left_jacobian_so3, log_so3, multiply
 from rs_relpose_ros.geometry.vectors import dot
 
 Array = NDArray[np.float64]
@@ -56,6 +58,25 @@ def integrate_rotation(stamps_ns: NDArray[np.int64], rates: ArrayLike, config: I
         bias_sigma = config.gyro_bias_sigma
     covariance = config.gyro_noise_density**2 * noise + bias_sigma**2 * derivative @ derivative.T
     return rotation, covariance
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TurnSensitivity:
+    """What moves a rotation integrated from the gyro, as turns on its left."""
+
+    noise: Array   # (3, 3) covariance of its white noise alone [rad^2]
+    by_rate: Array   # (3, 3) by a constant error of the rates [s]
+    by_scale: Array   # (3,) by a relative change of all rates [rad]
+
+
+def turn_sensitivity(stamps_ns: NDArray[np.int64], rates: Array,
+                     config: ImuConfig) -> TurnSensitivity:
+    """Of ``R_start^T R_end``; arguments as in `integrate_rotation`."""
+    seconds, step = (stamps_ns - stamps_ns[0]) * 1e-9, 1e-4
+    rotation, by_rate, noise = _integrate(seconds, np.ascontiguousarray(rates))
+    scaled, _, _ = _integrate(seconds, (1.0 + step) * rates)
+    return TurnSensitivity(config.gyro_noise_density**2 * noise, by_rate,
+                           log_so3(scaled @ rotation.T) / step)
 
 
 def bias_jacobian(stamps_ns: NDArray[np.int64], rates: Array) -> Array:

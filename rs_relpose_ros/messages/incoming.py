@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rs_relpose_ros.config.intrinsics import pinhole_of_matrix
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.geometry.timing import NANOSECONDS
@@ -82,18 +83,16 @@ def pose_from_message(msg: Any) -> TruePose:
 
 
 def intrinsics_from_info(msg: Any) -> Intrinsics:
-    """Intrinsics of a sensor_msgs/CameraInfo, region of interest and binning honoured."""
+    """Intrinsics of a sensor_msgs/CameraInfo, region of interest and binning honoured.
+
+    MissingInputError where it has none.
+    """
     k = [float(value) for value in _field(msg, 'k')]
-    if len(k) != 9:
-        raise InputError(f'k of CameraInfo must have 9 elements, got {len(k)}')
-    if k[0] == 0.0:
+    if len(k) == 9 and k[0] == 0.0:
         raise MissingInputError(
             'the camera is uncalibrated (k[0] of its CameraInfo is 0): calibrate it and let its '
-            'driver publish the result')
-    if not all(math.isfinite(value) for value in k):
-        raise InputError(f'k of CameraInfo must be finite, got {k}')
-    if any(k[i] != 0.0 for i in (1, 3, 6, 7)) or k[8] != 1.0:
-        raise InputError(f'k of CameraInfo must be [fx 0 cx 0 fy cy 0 0 1], got {k}')
+            'driver publish the result, or give camera_matrix')
+    pinhole = pinhole_of_matrix('k of CameraInfo', k)
     width, height = int(msg.width), int(msg.height)
     check_image_size(width, height)
     coefficients = _field(msg, 'd')
@@ -104,7 +103,7 @@ def intrinsics_from_info(msg: Any) -> Intrinsics:
     roi = msg.roi
     roi_width, roi_height = int(roi.width) or width, int(roi.height) or height
     return Intrinsics(
-        width=width, height=height, fx=k[0], fy=k[4], cx=k[2], cy=k[5],
+        width=width, height=height, **pinhole._asdict(),
         distortion_model=str(msg.distortion_model)[:40],
         distortion=tuple(float(value) for value in coefficients),
         x_offset=int(roi.x_offset), y_offset=int(roi.y_offset),

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections import deque
 from typing import Any
 
-from rs_relpose_ros.errors import RsRelposeError
+from rs_relpose_ros.config.intrinsics import IntrinsicsConfig
+from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.front_end.frame import EncodedFrame
 from rs_relpose_ros.front_end.sequencer import Refusal, Sequencer
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
@@ -21,17 +22,22 @@ _HELD_IMAGES = 4
 class Intake:
     """Handlers of a `SensorFeed` that fill a sequencer; images stay encoded.
 
-    An image goes with the CameraInfo that came last. `stuck_gyro_time` [s] is the parameter of
-    that name; 0 believes every gyro. Not thread-safe: one thread feeds it.
+    An image goes with the CameraInfo that came last, or, where that is uncalibrated or none came
+    with the first images, with the intrinsics that are `told` by parameters. `stuck_gyro_time` [s]
+    is the parameter of that name; 0 believes every gyro. Not thread-safe: one thread feeds it.
     """
 
-    def __init__(self, sequencer: Sequencer, stuck_gyro_time: float = 0.0) -> None:
+    def __init__(self, sequencer: Sequencer, stuck_gyro_time: float = 0.0,
+                 told: IntrinsicsConfig | None = None) -> None:
         self.feed = SensorFeed({
             Role.IMU: self._add_imu, Role.ACCEL: sequencer.add_imu,
             Role.CAMERA_INFO: self._add_intrinsics, Role.IMAGE: self._add_image})
         self._sequencer = sequencer
         # Those in force.
         self.intrinsics: Intrinsics | None = None
+        self._told = told if told is not None and told.given else None
+        # Whether images go with what is told.
+        self._use_told = False
         # Why the last CameraInfo cannot be used; empty when it can, or when none came.
         self.camera_info_problem = ''
         self._held: deque[PublishedImage] = deque()
@@ -50,14 +56,29 @@ class Intake:
                 self._sequencer.refuse(0, Refusal.BAD_IMAGE, str(error))
                 return
             if role is Role.CAMERA_INFO:
+                if self._told is not None and isinstance(error, MissingInputError):
+                    self._fall_back()
+                    return
                 self.intrinsics, self.camera_info_problem = None, str(error)
-                self.refuse_held()
+                self._use_told = False
+                self.release_held()
             raise
 
-    def refuse_held(self) -> None:
-        """Give up on the images that wait for a CameraInfo."""
+    def release_held(self) -> None:
+        """Let no image wait for a CameraInfo any longer."""
+        if self._held and self._told is not None and not self.camera_info_problem:
+            self._fall_back()
         while self._held:
             self._refuse_without_intrinsics(self._held.popleft())
+
+    def _fall_back(self) -> None:
+        """Use the intrinsics that are told, from the images on that wait."""
+        if not self._use_told:
+            # Of the next image's size.
+            self.intrinsics = None
+        self._use_told, self.camera_info_problem = True, ''
+        while self._held:
+            self._add_image(self._held.popleft())
 
     # -- handlers ----------------------------------------------------------------------------
 
@@ -67,10 +88,17 @@ class Intake:
 
     def _add_intrinsics(self, intrinsics: Intrinsics) -> None:
         self.intrinsics, self.camera_info_problem = intrinsics, ''
+        self._use_told = False
         while self._held:
             self._add_frame(self._held.popleft(), intrinsics)
 
     def _add_image(self, image: PublishedImage) -> None:
+        if self._use_told and self._told is not None:
+            try:
+                self.intrinsics = _of_size(image.image.size, self.intrinsics, self._told)
+            except InputError as error:
+                self._sequencer.refuse(image.stamp_ns, Refusal.BAD_IMAGE, str(error))
+                return
         if self.intrinsics is not None:
             self._add_frame(image, self.intrinsics)
         elif self.camera_info_problem:
@@ -78,7 +106,10 @@ class Intake:
         else:
             self._held.append(image)
             if len(self._held) > _HELD_IMAGES:
-                self._refuse_without_intrinsics(self._held.popleft())
+                if self._told is not None:
+                    self._fall_back()
+                else:
+                    self._refuse_without_intrinsics(self._held.popleft())
 
     def _add_frame(self, image: PublishedImage, intrinsics: Intrinsics) -> None:
         # Compared before any image is dropped: after a gap a repeated image would pass for new.
@@ -93,3 +124,10 @@ class Intake:
         self._sequencer.refuse(
             image.stamp_ns, Refusal.NO_CALIBRATION,
             self.camera_info_problem or 'no CameraInfo came before or with the image')
+
+
+def _of_size(size: tuple[int, int], last: Intrinsics | None, told: IntrinsicsConfig) -> Intrinsics:
+    """What is told for images of a size: the `last` ones, where they are."""
+    if last is not None and size == (last.image_width, last.image_height):
+        return last
+    return told.of_image(*size)

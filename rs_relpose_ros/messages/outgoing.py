@@ -7,7 +7,7 @@ the bag writer share these functions. All messages of a pair carry the stamp of 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,9 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.geometry.timing import NANOSECONDS
+from rs_relpose_ros.health.findings import HealthState
+from rs_relpose_ros.messages.pair_status import PAIR_VALUES, TOPICS_KEY
 
 MessageTypes = Callable[[str], Any]
 
@@ -30,53 +32,112 @@ MATCH_FIELDS = tuple(
     (name, int(offset), _UINT32 if name == 'id' else _FLOAT32)
     for name, (_, offset, *_) in (MATCH_DTYPE.fields or {}).items())
 
-# What the node publishes of a pair: topic and message type.
+# What the node publishes of a pair, in this order: topic and message type.
 PAIR_TOPICS = {
     'relative_pose': 'geometry_msgs/msg/PoseWithCovarianceStamped',
     'reference': 'sensor_msgs/msg/TimeReference',
     'velocity': 'geometry_msgs/msg/TwistWithCovarianceStamped',
     'matches': 'sensor_msgs/msg/PointCloud2',
+    'relative_rotation': 'sensor_msgs/msg/Imu',
+    'pairs': 'diagnostic_msgs/msg/DiagnosticArray',
 }
+# Those of a pair with a pose only.
+POSE_TOPICS = ('relative_pose', 'reference', 'velocity', 'matches')
+
+# Least eigenvalue of a published covariance, as a share of the largest: that of a matrix of rank 5
+# is then not below 0 by rounding.
+_LEAST_EIGENVALUE = 1e-14
 
 
 @dataclass(frozen=True, slots=True)
 class PairMessages:
-    """The messages of one pair with a pose, all of the same stamp."""
+    """The messages of one pair, all of the same stamp; None where the pair has none.
+
+    `pairs` is there for every pair, `relative_rotation` with every rotation, the others with every
+    pose: there is no message that says "none".
+    """
 
     relative_pose: Any
     reference: Any
     velocity: Any
     matches: Any
+    relative_rotation: Any
+    pairs: Any
+
+    def by_topic(self) -> Iterator[tuple[str, Any]]:
+        """Topic and message of what is to be published, in the order of `PAIR_TOPICS`."""
+        for topic in PAIR_TOPICS:
+            message = getattr(self, topic)
+            if message is not None:
+                yield topic, message
 
 
 def pair_messages(result: PairResult, types: MessageTypes,
                   reference_frame: str = '') -> PairMessages:
-    """Messages of a pair with a pose: there is no message that says "none".
+    """Messages of a pair.
 
-    `reference_frame`: frame_id of the relative pose; empty for ``<camera frame>_reference``.
+    `reference_frame`: frame_id of relative pose and rotation; empty for
+    ``<camera frame>_reference``.
     """
-    if not result.pose:
-        raise InputError(f'a pair without a pose ({result.pose.status.value}) has no messages')
-    pose, in_camera = result.pose, header(result.stamp_ns, result.frame_id, types)
     in_reference = header(result.stamp_ns, reference_frame or f'{result.frame_id}_reference',
                           types)
+    messages: dict[str, Any] = dict.fromkeys(PAIR_TOPICS)
+    if result.pose:
+        messages |= _pose_messages(result, in_reference, types)
+    if result.pose.rotation_known:
+        messages['relative_rotation'] = _rotation_message(result.pose, in_reference, types)
+    messages['pairs'] = _pair_status_message(
+        result, [topic for topic, message in messages.items() if message is not None], types)
+    return PairMessages(**messages)
+
+
+def _pose_messages(result: PairResult, in_reference: Any, types: MessageTypes) -> dict[str, Any]:
+    """Messages of `POSE_TOPICS`."""
+    pose, in_camera = result.pose, header(result.stamp_ns, result.frame_id, types)
     twist = types('geometry_msgs/msg/Twist')(
         linear=_geometry('Vector3', pose.linear_velocity2, types),
         angular=_geometry('Vector3', pose.angular_velocity2, types))
-    return PairMessages(
+    return {
         # The covariance needs no conversion: (dt, dtheta) with R_true = Exp(dtheta) R in camera 1
         # is ROS's order x, y, z and rotations about the fixed axes of the header's frame.
-        relative_pose=types('geometry_msgs/msg/PoseWithCovarianceStamped')(
+        'relative_pose': types('geometry_msgs/msg/PoseWithCovarianceStamped')(
             header=in_reference, pose=types('geometry_msgs/msg/PoseWithCovariance')(
-                pose=_pose(pose.R, pose.t, types), covariance=_covariance(pose.covariance))),
-        reference=types('sensor_msgs/msg/TimeReference')(
+                pose=_pose(pose.R, pose.t, types),
+                covariance=published_covariance(pose.covariance))),
+        'reference': types('sensor_msgs/msg/TimeReference')(
             header=in_camera, time_ref=time(result.reference_stamp_ns, types),
             source='reference_keyframe'),
         # Of the current camera: angular in rad/s, linear in baselines per second.
-        velocity=types('geometry_msgs/msg/TwistWithCovarianceStamped')(
+        'velocity': types('geometry_msgs/msg/TwistWithCovarianceStamped')(
             header=in_camera, twist=types('geometry_msgs/msg/TwistWithCovariance')(
-                twist=twist, covariance=_covariance(pose.velocity_covariance))),
-        matches=matches_message(result, types))
+                twist=twist, covariance=published_covariance(pose.velocity_covariance))),
+        'matches': matches_message(result, types)}
+
+
+def _rotation_message(pose: RelativePose, in_reference: Any, types: MessageTypes) -> Any:
+    """sensor_msgs/Imu: how the current camera is turned in the reference camera, and turns.
+
+    Errors of the rotation are about the axes of the header's frame, as in ``~/relative_pose``; the
+    angular velocity is in the camera's own axes, as in ``~/velocity``.
+    """
+    return types('sensor_msgs/msg/Imu')(
+        header=in_reference, orientation=_geometry('Quaternion', quat_xyzw(pose.R), types),
+        orientation_covariance=published_covariance(pose.covariance[3:, 3:]),
+        angular_velocity=_geometry('Vector3', pose.angular_velocity2, types),
+        angular_velocity_covariance=published_covariance(pose.velocity_covariance[3:, 3:]),
+        linear_acceleration=_geometry('Vector3', np.zeros(3), types),
+        # REP-145: there is no accelerometer.
+        linear_acceleration_covariance=np.array([-1.0, *[0.0] * 8]))
+
+
+def _pair_status_message(result: PairResult, others: Sequence[str], types: MessageTypes) -> Any:
+    """diagnostic_msgs/DiagnosticArray of one status; `others`: topics of the other messages."""
+    pose = result.pose
+    text = f'{pose.status.value}: {pose.reason}' if pose.reason else pose.status.value
+    values = [(value.key, value.text(result)) for value in PAIR_VALUES]
+    return diagnostics_message(result.stamp_ns, status_message(
+        _level(result), 'keyframe pair', text, result.frame_id,
+        [*values, (TOPICS_KEY, ' '.join(others))], types), types)
 
 
 def matches_message(result: PairResult, types: MessageTypes) -> Any:
@@ -143,6 +204,13 @@ def status_message(level: int, name: str, text: str, hardware_id: str,
         hardware_id=hardware_id, values=[key_value(key=key, value=value) for key, value in values])
 
 
+def _level(result: PairResult) -> int:
+    """2: what was told is wrong; 1: it may be, or there is no pose; 0: all is well."""
+    if result.health.state is HealthState.WRONG:
+        return 2
+    return 0 if result.pose and result.health.state is not HealthState.SUSPECT else 1
+
+
 # -- parts -----------------------------------------------------------------------------------
 
 
@@ -175,8 +243,15 @@ def _geometry(name: str, values: NDArray[np.float64], types: MessageTypes) -> An
     return types(f'geometry_msgs/msg/{name}')(**fields)
 
 
-def _covariance(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.ascontiguousarray(covariance, dtype=np.float64).reshape(36)
+def published_covariance(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A covariance (N, N) as a message has it (N * N,): symmetric, no eigenvalue below 0.
+
+    By rounding one that is 0 may be below: that of the translation along itself.
+    """
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    values = np.maximum(values, _LEAST_EIGENVALUE * values[-1])
+    whole = (vectors * values) @ vectors.T
+    return (0.5 * (whole + whole.T)).ravel()
 
 
 def _byte_data(values: NDArray[Any], message_type: Any) -> Any:

@@ -8,92 +8,140 @@ ratio of the baselines. Errors add up as in any odometry.
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.messages.published_pair import PublishedPair
 
 Array = NDArray[np.float64]
 
+_ANEW = 'the path starts anew, at another scale'
 # Squared sine of the angle between two rays below which they count as parallel.
 _PARALLEL = 1e-18
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathPose:
-    """A camera in the axes of the path's first camera."""
+    """A camera of the path, in the axes of the chain: those of its first camera."""
 
     stamp_ns: int
     R: Array   # (3, 3)
-    position: Array   # (3,), in baselines of the path's first pair
+    position: Array   # (3,), in baselines of the path's first pair with a pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathStep:
-    """What a pair adds to the path: the current camera.
+    """What a pair adds to the path: the current camera, if its place on the path is known.
 
     Before it, where a new path begins, stands that path's first camera; `new_path` says why it
-    begins, its scale has nothing to do with the one before. `scale_sigma` is by the scatter of the
-    tracks, NaN where a path begins; the errors of the two poses, common to all, come on top.
+    begins, its place and scale have nothing to do with those before. `scale_sigma` is by the
+    scatter of the tracks; the errors of the two poses, common to all, come on top.
     """
 
     poses: tuple[PathPose, ...]
-    new_path: str   # empty where the path goes on
-    scale: float   # the pair's baseline, in baselines of the path's first pair
-    shared_tracks: int   # that told the scale against the pair before
-    scale_sigma: float   # 1 sigma of that ratio, relative
+    new_path: str   # empty where the path goes on, or where none is begun
+    new_axes: bool   # whether the axes of the path have nothing to do with those before, either
+    scale: float   # the pair's baseline, in baselines of the path's first; NaN without a pose
+    shared_tracks: int   # that told the scale against the last pair with a pose
+    scale_sigma: float   # 1 sigma of that ratio, relative; NaN where there is none
 
 
 class PoseChain:
     """Chains the pairs of one node, in the order of their stamps.
 
-    With fewer than `min_shared_tracks` the scale is not carried on, and a new path begins.
+    A pair with a rotation but no translation:
+
+    - `PURE_ROTATION`: the camera stays where it is, and the path goes on. What it moved is less
+      than the noise of the matches shows; it is missing from the path, and the distances of the
+      tracks, which carry the scale over to the next pair with a pose, are taken for unchanged: the
+      scale is then off by the share of that movement in these distances.
+    - `LOW_PARALLAX`: where the camera is remains unknown. The path ends, and the next pair with a
+      pose begins one at another scale, in the same axes, since the rotation goes on.
+
+    Without a rotation the axes end with the path. With fewer than `min_shared_tracks` the scale is
+    not carried on, and a new path begins.
     """
 
     def __init__(self, min_shared_tracks: int = 8) -> None:
         if min_shared_tracks < 1:
             raise InputError(f'min_shared_tracks must be at least 1, got {min_shared_tracks}')
         self._min_shared_tracks = min_shared_tracks
-        self._end: PathPose | None = None
-        self._scale = 1.0
+        # Of the last camera; None while the rotation or the place is not known.
+        self._stamp_ns = 0
+        self._R: Array | None = None
+        self._position: Array | None = None
+        # Baseline of the last pair with a pose, None while the path has none; distances of the
+        # tracks from the camera that ended it, in these baselines.
+        self._scale: float | None = None
         self._distances: dict[int, float] = {}
+        # For the next path: why it begins, and whether its axes do, too.
+        self._why, self._new_axes = 'the first pair: a path begins', True
 
     def add(self, pair: PublishedPair) -> PathStep:
         """Append a pair; where it does not continue the path, begin a new one with it."""
+        if self._R is not None and pair.reference_stamp_ns != self._stamp_ns:
+            self._lose_rotation(f'a pair is missing: {_ANEW}')
+        if pair:
+            return self._add_pose(pair)
+        if pair.status == Status.PURE_ROTATION.value:
+            return self._step(pair, np.zeros(3))
+        if pair.rotation_known:
+            self._lose_place(f'a pair has no translation ({pair.status}): {_ANEW}')
+            self._turn(pair)
+        else:
+            self._lose_rotation(f'a pair has no rotation ({pair.status}): {_ANEW}')
+        return PathStep((), '', False, math.nan, 0, math.nan)
+
+    def _add_pose(self, pair: PublishedPair) -> PathStep:
         distances1, distances2 = track_distances(pair)
         ratios = np.array([self._distances[track] / distances1[track]
                            for track in distances1.keys() & self._distances.keys()])
-        new_path = self._why_not_continued(pair, len(ratios))
+        if self._scale is not None and len(ratios) < self._min_shared_tracks:
+            self._lose_place(f'{len(ratios)} shared tracks do not carry the scale, it takes '
+                             f'{self._min_shared_tracks}: {_ANEW}')
         self._distances = distances2
-        if new_path:
-            start = PathPose(pair.reference_stamp_ns, np.eye(3), np.zeros(3))
+        if self._scale is None:
             self._scale = 1.0
-            self._end = _moved(start, pair, self._scale)
-            return PathStep((start, self._end), new_path, 1.0, 0, float('nan'))
-        assert self._end is not None
+            return self._step(pair, pair.t, 1.0)
         median = float(np.median(ratios))
         self._scale *= median
-        self._end = _moved(self._end, pair, self._scale)
         # Of a median of normal deviates: sqrt(pi / 2) sigma / sqrt(n), sigma = 1.4826 MAD.
         scatter = float(np.median(np.abs(ratios - median))) / median
-        return PathStep((self._end,), '', self._scale, len(ratios),
-                        1.2533 * 1.4826 * scatter / len(ratios)**0.5)
+        return self._step(pair, self._scale * pair.t, self._scale, len(ratios),
+                          1.2533 * 1.4826 * scatter / len(ratios)**0.5)
 
-    def _why_not_continued(self, pair: PublishedPair, shared_tracks: int) -> str:
-        if self._end is None:
-            return 'the first pair: a path begins'
-        if pair.reference_stamp_ns != self._end.stamp_ns:
-            return 'a pair is missing: the path starts anew, at another scale'
-        if shared_tracks < self._min_shared_tracks:
-            return (f'{shared_tracks} shared tracks do not carry the scale, it takes '
-                    f'{self._min_shared_tracks}: the path starts anew')
-        return ''
+    def _step(self, pair: PublishedPair, movement: Array, scale: float = math.nan,
+              shared_tracks: int = 0, scale_sigma: float = math.nan) -> PathStep:
+        """Move on by `movement` (3,), in the reference camera and the units of the path."""
+        start = np.eye(3) if self._R is None else self._R
+        poses, new_path, new_axes = [], '', False
+        if self._position is None:
+            self._position = np.zeros(3)
+            poses.append(PathPose(pair.reference_stamp_ns, start, self._position))
+            new_path, new_axes, self._new_axes = self._why, self._new_axes, False
+        self._position = self._position + start @ movement
+        poses.append(PathPose(pair.stamp_ns, self._turn(pair), self._position))
+        return PathStep(tuple(poses), new_path, new_axes, scale, shared_tracks, scale_sigma)
 
+    def _turn(self, pair: PublishedPair) -> Array:
+        self._stamp_ns = pair.stamp_ns
+        self._R = pair.R if self._R is None else self._R @ pair.R
+        return self._R
 
-def _moved(start: PathPose, pair: PublishedPair, scale: float) -> PathPose:
-    return PathPose(pair.stamp_ns, start.R @ pair.R, start.position + scale * start.R @ pair.t)
+    def _lose_place(self, why: str) -> None:
+        """End the path; the next one begins for the first reason since."""
+        if self._position is not None:
+            self._why = why
+        self._position = self._scale = None
+        self._distances = {}
+
+    def _lose_rotation(self, why: str) -> None:
+        self._lose_place(why)
+        self._R, self._new_axes = None, True
 
 
 def track_distances(pair: PublishedPair) -> tuple[dict[int, float], dict[int, float]]:

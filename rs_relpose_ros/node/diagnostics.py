@@ -10,10 +10,10 @@ import time
 
 import numpy as np
 
-from rs_relpose_ros.front_end.drift import Drift
 from rs_relpose_ros.front_end.pair import PAIR_FIGURES, PairResult
 from rs_relpose_ros.front_end.sequencer import Refusal, SequencerCounts
 from rs_relpose_ros.geometry.timing import NANOSECONDS
+from rs_relpose_ros.health.findings import HealthState, NOT_JUDGED
 
 OK, WARN, ERROR = 0, 1, 2
 
@@ -123,7 +123,8 @@ class Statistics:
                 ('poses', str(self._poses)),
                 *((figure.name, figure.text(last)) for figure in PAIR_FIGURES),
                 ('model', pose.pose.model if pose else ''),
-                *_drift_values(last.drift if last else None),
+                *_tracked_values(last),
+                *_health_values(last),
                 ('latency_p50_ms', latency[0]),
                 ('latency_p99_ms', latency[1]),
                 ('frame_time_p50_ms', frame_time[0]),
@@ -144,6 +145,10 @@ class Statistics:
         last = self._last_pair
         if last is None:
             return OK, 'no keyframe pair yet'
+        if last.health.faults:
+            fault = last.health.faults[0]
+            return (ERROR if last.health.state is HealthState.WRONG else WARN), (
+                f'{fault.figure} is {fault.state.value}: {fault.sentence}')
         if not last.pose:
             return WARN, f'no pose of the last pair: {self._last_no_pose}'
         return OK, f'estimating: {self._poses} poses of {self._pairs} pairs'
@@ -157,14 +162,21 @@ def _milliseconds(seconds: Collection[float]) -> tuple[str, str]:
     return f'{median:.1f}', f'{p99:.1f}'
 
 
-def _drift_values(drift: Drift | None) -> tuple[tuple[str, str], ...]:
+def _tracked_values(last: PairResult | None) -> tuple[tuple[str, str], ...]:
     """Bias and time offset as tracked; to be compared with the parameters."""
     names = ('tracked_gyro_bias_rad_s', 'tracked_gyro_bias_sigma_rad_s', 'tracked_time_offset_ms',
              'tracked_time_offset_sigma_ms', 'applied_time_offset_ms')
-    if drift is None or not drift.pairs:
+    if last is None or last.tracked is None or not last.tracked.pairs:
         return tuple((name, '') for name in names)
-    texts = (' '.join(f'{value:.5f}' for value in drift.gyro_bias),
-             ' '.join(f'{value:.5f}' for value in drift.gyro_bias_sigma),
+    seen = last.tracked
+    texts = (' '.join(f'{value:.5f}' for value in seen.gyro_bias),
+             ' '.join(f'{value:.5f}' for value in seen.gyro_bias_sigma),
              *(f'{1e3 * seconds:.2f}' for seconds in (
-                 drift.time_offset, drift.time_offset_sigma, drift.applied)))
+                 seen.time_offset, seen.time_offset_sigma, last.applied.time_offset)))
     return tuple(zip(names, texts, strict=True))
+
+
+def _health_values(last: PairResult | None) -> tuple[tuple[str, str], ...]:
+    """State of what was told, and a sentence for each figure."""
+    health = NOT_JUDGED if last is None else last.health
+    return ('health', health.state.value), ('health_findings', health.text)

@@ -103,7 +103,8 @@ class RelposeNode(Node):
         self._timings = FrameTimings(files.timings_file) if files.timings_file else None
         # The images are for ~/debug_image; only references to them are kept.
         self._front_end = FrontEnd(parameters, keep_images=True)
-        self._intake = Intake(self._front_end.sequencer, parameters.imu.stuck_gyro_time)
+        self._intake = Intake(self._front_end.sequencer, parameters.imu.stuck_gyro_time,
+                              parameters.intrinsics)
         self._worker = Worker(self._front_end, self._consume)
         self._worker.start()
         self._started_ns = self._now_ns()
@@ -249,7 +250,8 @@ class RelposeNode(Node):
             return f'not estimating: no image on {image} for {SILENCE:g} s', missing
         if self._intake.intrinsics is None and camera_info in missing:
             text = (f'not estimating: no CameraInfo on {camera_info}; remap camera_info to the '
-                    'topic of the driver, which must publish a calibration')
+                    'topic of the driver, which must publish a calibration, or give '
+                    'camera_matrix')
         elif imu in missing:
             text = (f'not estimating: no IMU message on {imu} for {SILENCE:g} s; remap imu to '
                     'the topic of the driver')
@@ -274,8 +276,8 @@ def _help() -> argparse.ArgumentParser:
             'Relative poses of a rolling-shutter camera, aided by an IMU.\n\n'
             'subscribes: image (or image/compressed with image_transport:=compressed), '
             'camera_info, imu, accel\n'
-            'publishes:  ~/relative_pose, ~/reference, ~/velocity, ~/matches, ~/debug_image, '
-            '/diagnostics\n'
+            'publishes:  ~/relative_pose, ~/reference, ~/velocity, ~/matches, '
+            '~/relative_rotation, ~/pairs,\n            ~/debug_image, /diagnostics\n'
             'service:    ~/reset'),
         epilog='\n'.join(lines))
 

@@ -39,13 +39,11 @@ class PairPublishers:
         self._transforms = _transform_broadcaster(node) if config.publish_tf else None
 
     def publish(self, result: PairResult, config: PairConfig) -> None:
-        """Publish a pair; one without a pose publishes nothing."""
-        if not result.pose:
-            return
+        """Publish what is known of a pair."""
         messages = pair_messages(result, message_class, config.reference_frame)
-        for name, publisher in self._pair.items():
-            publisher.publish(getattr(messages, name))
-        if self._transforms is not None:
+        for topic, message in messages.by_topic():
+            self._pair[topic].publish(message)
+        if self._transforms is not None and messages.relative_pose is not None:
             self._transforms.sendTransform(
                 _transform_to_reference(messages.relative_pose, result.frame_id))
 

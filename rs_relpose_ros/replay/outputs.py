@@ -13,9 +13,9 @@ from rs_relpose_ros.bags.topics import SensorTopics
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.front_end.drift import Drift
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
+from rs_relpose_ros.health.findings import NOT_JUDGED, worst_of
 from rs_relpose_ros.messages.outgoing import pair_messages, PAIR_TOPICS
 from rs_relpose_ros.replay.run import read_truth, Replay, ReplayedPair
 from rs_relpose_ros.replay.summary import summarize
@@ -64,7 +64,7 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
     _prepare(folder, with_bag)
     records: list[PairRecord] = []
     shown: PairResult | None = None
-    drift: Drift | None = None
+    last, health = None, NOT_JUDGED
     files = [folder / POSES_FILE]
     with ExitStack() as stack:
         write_pose = stack.enter_context(
@@ -77,11 +77,11 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
         for pair in run.pairs():
             record = pair_record(pair.result, truth)
             records.append(record)
-            drift = pair.result.drift
+            last, health = pair.result, worst_of(health, pair.result.health)
             write_pose(relative_pose_cells(record))
             if write_error is not None:
                 write_error(error_cells(record))
-            if out_bag is not None and pair.result.pose:
+            if out_bag is not None:
                 _write_messages(out_bag, pair, parameters.pair.reference_frame)
             on_pair(pair)
             if pictures and (shown is None or _picture_rank(pair.result) > _picture_rank(shown)):
@@ -90,7 +90,7 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
         files.append(folder / BAG_FOLDER)
     if shown is not None:
         files += _draw(folder, records, shown, truth)
-    return ReplayOutcome(records, run.intrinsics, summarize(records, run, drift), files)
+    return ReplayOutcome(records, run.intrinsics, summarize(records, run, last, health), files)
 
 
 def _prepare(folder: Path, with_bag: bool) -> None:
@@ -109,8 +109,8 @@ def _prepare(folder: Path, with_bag: bool) -> None:
 
 def _write_messages(bag: BagWriter, pair: ReplayedPair, reference_frame: str) -> None:
     messages = pair_messages(pair.result, bag.type, reference_frame)
-    for name, msgtype in PAIR_TOPICS.items():
-        bag.write(f'/relpose_node/{name}', msgtype, getattr(messages, name), pair.bag_time_ns)
+    for topic, message in messages.by_topic():
+        bag.write(f'/relpose_node/{topic}', PAIR_TOPICS[topic], message, pair.bag_time_ns)
 
 
 def _picture_rank(pair: PairResult) -> tuple[bool, float]:

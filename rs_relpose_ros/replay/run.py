@@ -72,7 +72,8 @@ class Replay:
         self._on_image = on_image
         self._front_end = FrontEnd(parameters, offline=True, keep_images=keep_images)
         self.sequencer = self._front_end.sequencer
-        self._intake = Intake(self.sequencer, parameters.imu.stuck_gyro_time)
+        self._intake = Intake(self.sequencer, parameters.imu.stuck_gyro_time,
+                              parameters.intrinsics)
         self._stamps_found: set[int] = set()
         self.counts = ReplayCounts()
         # Frames and messages that were not used, by the first sentence of each cause.
@@ -95,7 +96,7 @@ class Replay:
             self.counts.last_ns = message.bag_time_ns
             self._hand_over(role, message)
             yield from self._drain()
-        self._intake.refuse_held()
+        self._intake.release_held()
         self.sequencer.close()
         yield from self._drain()
         self.counts.seconds = time.perf_counter() - started

@@ -19,18 +19,18 @@ import scipy
 from rs_relpose_ros.bags.topics import SensorTopics
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.estimator.result import Status
-from rs_relpose_ros.front_end.drift import Drift
-from rs_relpose_ros.front_end.pair import PAIR_FIGURES
+from rs_relpose_ros.front_end.pair import PAIR_FIGURES, PairResult
+from rs_relpose_ros.health.findings import Health, NOT_JUDGED
 from rs_relpose_ros.replay.run import Replay
 from rs_relpose_ros.replay.tables import PairRecord
 from rs_relpose_ros.replay.truth import median_and_p90
 
 
 def summarize(records: Sequence[PairRecord], run: Replay,
-              drift: Drift | None = None) -> dict[str, Any]:
+              last: PairResult | None = None, health: Health = NOT_JUDGED) -> dict[str, Any]:
     """Figures of a run; medians are over the answered pairs, null where there are none.
 
-    `drift`: as after the last pair.
+    `last`: the last pair; `health`: the worst that was found of each figure.
     """
     answered = [record for record in records if record.pose]
     by_status = Counter(record.status for record in records)
@@ -56,13 +56,8 @@ def summarize(records: Sequence[PairRecord], run: Replay,
             'late': sequencer.imu_late,
             'clock_jumps': sequencer.clock_jumps,
         },
-        'tracked': None if drift is None or not drift.pairs else {
-            'gyro_bias_rad_s': drift.gyro_bias.tolist(),
-            'gyro_bias_sigma_rad_s': drift.gyro_bias_sigma.tolist(),
-            'time_offset_s': drift.time_offset,
-            'time_offset_sigma_s': drift.time_offset_sigma,
-            'applied_s': drift.applied,
-        },
+        'tracked': _tracked(last),
+        'health': health.as_json(),
         'invalid_messages': counts.invalid_messages,
         'not_used': run.reasons.most_common(),
         'medians': {
@@ -94,6 +89,19 @@ def write_summary(path: Path, figures: dict[str, Any], *, bag: Path, topics: Sen
                      'opencv': cv2.__version__, 'numba': numba.__version__},
     }
     path.write_text(json.dumps(summary, indent=2, allow_nan=False) + '\n', encoding='utf-8')
+
+
+def _tracked(last: PairResult | None) -> dict[str, Any] | None:
+    if last is None or last.tracked is None or not last.tracked.pairs:
+        return None
+    seen = last.tracked
+    return {
+        'gyro_bias_rad_s': seen.gyro_bias.tolist(),
+        'gyro_bias_sigma_rad_s': seen.gyro_bias_sigma.tolist(),
+        'time_offset_s': seen.time_offset,
+        'time_offset_sigma_s': seen.time_offset_sigma,
+        'applied_s': last.applied.time_offset,
+    }
 
 
 def _errors(answered: Sequence[PairRecord]) -> dict[str, Any] | None:

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.front_end.pair import PAIR_FIGURES, PairResult
-from rs_relpose_ros.messages.outgoing import quat_xyzw
+from rs_relpose_ros.messages.outgoing import published_covariance, quat_xyzw
+from rs_relpose_ros.messages.pair_status import number
 from rs_relpose_ros.replay.truth import PairErrors, TrueTrajectory
 
 Array = NDArray[np.float64]
@@ -59,8 +60,11 @@ def pair_record(result: PairResult, truth: TrueTrajectory | None = None) -> Pair
 def translation_sigmas(covariance: Array) -> tuple[float, float]:
     """1 sigma of the translation direction [rad], larger and smaller axis.
 
-    The covariance (6, 6) of (dt, dtheta) has no variance along t, so two of three axes remain.
+    The covariance (6, 6) of (dt, dtheta) has no variance along t, so two of three axes remain. NaN
+    where there is no translation.
     """
+    if np.isnan(covariance[0, 0]):
+        return math.nan, math.nan
     variances = np.linalg.eigvalsh(covariance[:3, :3])
     larger, smaller = np.sqrt(np.maximum(variances[[2, 1]], 0.0))
     return float(larger), float(smaller)
@@ -88,16 +92,21 @@ def table_writer(path: Path, columns: tuple[str, ...]) -> Iterator[Callable[[lis
 
 
 def relative_pose_cells(record: PairRecord) -> list[str]:
-    """Row of `RELATIVE_POSE_COLUMNS`: a pair without a pose has its status and empty figures.
+    """Row of `RELATIVE_POSE_COLUMNS`: what is not known of a pair is empty.
 
+    A pair without a translation may have a rotation; one without either has its status alone.
     Floats are written so that they read back bit-equal.
     """
     pose, matches = record.pose, str(record.figures['matches'])
     stamps = [str(record.reference_stamp_ns), str(record.stamp_ns)]
-    if not pose:
+    if not pose.rotation_known:
         return [*stamps, *[''] * 13, matches, '', pose.status.value]
-    figures = [*pose.t, *quat_xyzw(pose.R), *translation_sigmas(pose.covariance),
-               *rotation_sigmas(pose.covariance)]
+    # As it is published: of the whole, or of the rotation alone.
+    covariance, known = np.full((6, 6), math.nan), slice(0 if pose else 3, 6)
+    published = published_covariance(pose.covariance[known, known])
+    covariance[known, known] = published.reshape(covariance[known, known].shape)
+    figures = [*pose.t, *quat_xyzw(pose.R), *translation_sigmas(covariance),
+               *rotation_sigmas(covariance)]
     return [*stamps, *map(number, figures), str(record.figures['inliers']), matches, pose.model,
             pose.status.value]
 
@@ -111,8 +120,3 @@ def error_cells(record: PairRecord) -> list[str]:
         number(errors.translation_error)]
     return [str(record.reference_stamp_ns), str(record.stamp_ns),
             number(record.figures['interval_s']), *figures, record.status.value]
-
-
-def number(value: float) -> str:
-    """Shortest text that reads back as the same float; empty for NaN."""
-    return '' if math.isnan(value) else repr(float(value))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.geometry.so3 import exp_so3
-from rs_relpose_ros.geometry.vectors import cross, rotated
+from rs_relpose_ros.geometry.vectors import copy_matrix, copy_vector, cross, rotated
 from rs_relpose_ros.solvers.cheirality import point_forward
 from rs_relpose_ros.solvers.five_point import MAX_SOLUTIONS as MAX_STARTS
 from rs_relpose_ros.solvers.five_point import solve_5pt
@@ -80,7 +80,7 @@ def _null_vector(equations: _Equations, y: Array) -> float:
     """
     n = equations.columns.shape[0]
     factor, diagonal = equations.work[:n], equations.diagonal
-    factor[:] = equations.columns
+    copy_matrix(equations.columns, factor)
     triangularise(factor, n, diagonal, equations.scales)
     tiny = 0.0
     for k in range(n):
@@ -176,11 +176,13 @@ def _reach_rank_8(equations: _Equations, R: Array, y: Array) -> bool:
         step *= min(length, 0.2)
         R_trial = exp_so3(step) @ R
         limit = _SINGULAR * _fill_columns(equations, R_trial)
-        trial[:] = y
+        copy_vector(y, trial)
         sigma_trial = _null_vector(equations, trial)
         accepted = sigma_trial < sigma or sigma_trial < limit
         if accepted:
-            R[:], y[:], sigma = R_trial, trial, sigma_trial
+            copy_matrix(R_trial, R)
+            copy_vector(trial, y)
+            sigma = sigma_trial
             damping = max(0.01 * damping, 1e-20)
             # The step before the last is this long: the iteration squares it.
             if sigma < limit and length < 1e-6:
@@ -208,7 +210,7 @@ def solve_uniform_11pt(sample: Sample, known: Knowledge, out: Solutions) -> int:
         return 0
     starts = 1
     start = Solutions(np.empty((MAX_STARTS, 3, 3)), np.zeros((MAX_STARTS, 9)))
-    start.R[0] = known.rotation
+    copy_matrix(known.rotation, start.R[0])
     if not known.predicted:
         starts = solve_5pt(Sample(sample.f1[:5], sample.f2[:5], sample.tau1[:5], sample.tau2[:5]),
                            known, start)
@@ -219,7 +221,7 @@ def solve_uniform_11pt(sample: Sample, known: Knowledge, out: Solutions) -> int:
     count = 0
     for k in range(starts):
         R, x = out.R[count], out.x[count]
-        R[:] = start.R[k]
+        copy_matrix(start.R[k], R)
         if _reach_rank_8(equations, R, y) and translation_and_velocities(y, factors, x):
             point_forward(sample, R, x)
             count += 1

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.geometry.so3 import exp_so3
-from rs_relpose_ros.geometry.vectors import copy_matrix, cross, dot, norm, rotated
+from rs_relpose_ros.geometry.vectors import copy_matrix, copy_vector, cross, dot, norm, rotated
 from rs_relpose_ros.solvers.cheirality import cheirality_votes
 from rs_relpose_ros.solvers.linear_algebra import null_direction, reflect, triangularise
 from rs_relpose_ros.solvers.polynomial import real_roots
@@ -98,7 +98,7 @@ def _cubic_constraints(basis: Array, M: Array) -> None:
         for j in range(i, 3):
             for k in range(3):
                 _add_quadratic(E[3 * i + k], E[3 * j + k], 1.0, EET[3 * i + j])
-            EET[3 * j + i] = EET[3 * i + j]
+            copy_vector(EET[3 * i + j], EET[3 * j + i])
     for m in range(10):
         half_trace = 0.5 * (EET[0, m] + EET[4, m] + EET[8, m])
         EET[0, m] -= half_trace

@@ -186,10 +186,12 @@ def cholesky(matrix: Array, factor: Array) -> bool:
 
 
 @kernel
-def cholesky_solve(factor: Array, right: Array) -> Array:
-    """Solution of ``L L^T x = right``."""
-    n = right.shape[0]
-    x = right.copy()
+def newton_step(factor: Array, gradient: Array) -> Array:
+    """Solution of ``L L^T x = -gradient`` with the Cholesky factor L."""
+    n = gradient.shape[0]
+    x = np.empty(n)
+    for i in range(n):
+        x[i] = -gradient[i]
     for i in range(n):
         for k in range(i):
             x[i] -= factor[i, k] * x[k]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel
-from rs_relpose_ros.geometry.vectors import rotated_back
+from rs_relpose_ros.geometry.vectors import copy_vector, rotated_back
 from rs_relpose_ros.solvers.cheirality import point_forward
 from rs_relpose_ros.solvers.gravity import (
     align_rays,
@@ -75,10 +75,10 @@ def _null_vectors(equations: _Equations, y: Array) -> float:
     """
     A, pivots, u = equations.A, equations.pivots, equations.left
     lu_factor(A, pivots)
-    u[:] = y
+    copy_vector(y, u)
     lu_solve_transposed(A, pivots, u)
     normalise(u)
-    y[:] = u
+    copy_vector(u, y)
     lu_solve(A, pivots, y)
     return 1.0 / normalise(y)
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel
-from rs_relpose_ros.kernel_interface import KernelInterface
+from rs_relpose_ros.linked_kernel import KernelInterface
 
 Array = NDArray[np.float64]
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel, small_kernel
+from rs_relpose_ros.geometry.order import median
 from rs_relpose_ros.tracking.images import Image
 
 Array = NDArray[np.float64]
@@ -37,8 +38,12 @@ def brightness_table(image1: Image, image2: Image, points1: Array, points2: Arra
 
 
 def with_brightness(image: Image, table: Image | None) -> Image:
-    """`image` as a table of `brightness_table` says."""
-    return image if table is None else cv2.LUT(image, table)  # type: ignore[return-value]
+    """`image` as a table of `brightness_table` says, read-only as images are."""
+    if table is None:
+        return image
+    changed: Image = cv2.LUT(image, table)  # type: ignore[assignment]
+    changed.flags.writeable = False
+    return changed
 
 
 @kernel
@@ -53,8 +58,8 @@ def _exposure(image1: Image, image2: Image, points1: Array, points2: Array,
     textured = contrast2 > 0.0
     if not textured.any():
         return 1.0, 0.0
-    gain = float(np.median(contrast1[textured] / contrast2[textured]))
-    return gain, float(np.median(mean1 - gain * mean2))
+    gain = median(contrast1[textured] / contrast2[textured])
+    return gain, median(mean1 - gain * mean2)
 
 
 @kernel

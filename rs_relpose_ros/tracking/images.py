@@ -13,6 +13,7 @@ Image = NDArray[np.uint8]
 def checked(image: Image, shape: tuple[int, ...] | None) -> Image:
     """`image` as a contiguous (H, W) array of uint8; InputError where it cannot be.
 
+    Read-only, as the memory of a raw image is, so that kernels are compiled for that alone.
     `shape` is that of the images before: a stream has one size.
     """
     image = np.ascontiguousarray(image)
@@ -23,4 +24,6 @@ def checked(image: Image, shape: tuple[int, ...] | None) -> Image:
         raise InputError(
             f'image size changed from {shape[1]}x{shape[0]} to {image.shape[1]}x{image.shape[0]} '
             'in mid-stream: reset the tracker first')
+    image = image.view()
+    image.flags.writeable = False
     return image

@@ -77,20 +77,21 @@ class KltTracker:
         previous, points = self._current, self.points
         current = checked(image, previous.shape)
         expected = predicted is not None or bool(self._unexplained.any())
-        predicted = points if predicted is None else np.where(
-            np.isfinite(predicted).all(axis=1, keepdims=True), predicted, points)
-        guess = predicted + interval * self._unexplained
+        predicted = points if predicted is None else _usable(predicted, points, image.shape)
+        guess = _usable(predicted + interval * self._unexplained, predicted, image.shape)
         seen = with_brightness(current, brightness_table(
             previous, current, points, guess, self._config.klt_window))
         all_levels = self._config.klt_levels
         needed = _NEAR_LEVELS if self._guesses_near else _EXPECTED_LEVELS
         levels = min(needed, all_levels) if expected else all_levels
         found, good = self._follow_and_return(previous, seen, points, guess, levels)
-        lost = ~good
-        if levels < all_levels and np.count_nonzero(lost) > _MOST_LOST * len(good):
-            # The motion was not the expected one.
-            found[lost], good[lost] = self._follow_and_return(
-                previous, seen, points[lost], predicted[lost], all_levels)
+        # Where many are lost the motion was not the expected one, or not even the predicted one.
+        starts = [predicted] * (levels < all_levels) + [points] * (predicted is not points)
+        for start in starts:
+            lost = ~good
+            if np.count_nonzero(lost) > _MOST_LOST * len(good):
+                found[lost], good[lost] = self._follow_and_return(
+                    previous, seen, points[lost], start[lost], all_levels)
         off = found[good] - guess[good]
         far = np.count_nonzero((off**2).sum(axis=1) > (0.5 * _NEAR)**2)
         self._guesses_near = bool(far <= _MOST_FAR * len(off))
@@ -158,3 +159,13 @@ class KltTracker:
                       _CRITERIA)
         error = np.linalg.norm(back.points - points1, axis=1)
         return back.found & (error <= self._config.forward_backward_threshold)
+
+
+def _usable(guess: Array, otherwise: Array, shape: tuple[int, ...]) -> Array:
+    """`guess` (N, 2) [px], `otherwise` where it is not finite or far outside of the image.
+
+    A gyro in a wrong unit predicts points anywhere, which overflow as pixels.
+    """
+    size = np.array(shape[1::-1])
+    near = np.abs(guess - 0.5 * size) <= 1.5 * size   # False for NaN
+    return np.where(near.all(axis=1, keepdims=True), guess, otherwise)

@@ -31,6 +31,9 @@ class Patches:
     # (N, 2), row k added to a point [px] near the centre of patch k gives its place in `image`
     shifts: Array
 
+    def __post_init__(self) -> None:
+        self.image.flags.writeable = False   # as images are: see `images.checked`
+
 
 def cut(image: Image, points: Array, radius: int) -> Patches:
     """Patches of ``2 radius + 1`` pixels around points (N, 2), the border repeated."""

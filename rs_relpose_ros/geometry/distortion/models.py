@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.geometry.distortion import equidistant, rational
-from rs_relpose_ros.kernel_interface import KernelInterface
+from rs_relpose_ros.linked_kernel import KernelInterface
 
 Array = NDArray[np.float64]
 

@@ -1,0 +1,1 @@
+"""Whether what the package was told of camera and IMU agrees with what they show."""

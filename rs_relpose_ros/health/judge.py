@@ -1,0 +1,327 @@
+"""From what was seen to findings: which figure is off, by how much, does it matter, what to do.
+
+A deviation is *suspect* where it is certain (more than `_CERTAIN` sigmas) and moves the pose by a
+share of the pose's own sigma, *wrong* where it moves the pose out of its covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_ros.config.parameters import SensorConfig
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.so3 import exp_so3
+from rs_relpose_ros.health.deviation import (
+    AXES,
+    BIAS,
+    DEVIATIONS,
+    DISTORTION,
+    FOCAL,
+    OFFSET,
+    READOUT,
+    SCALE,
+)
+from rs_relpose_ros.health.findings import Finding, Health, HealthState
+from rs_relpose_ros.health.recursion import Calibration, PRIOR_SIGMA
+from rs_relpose_ros.health.turning import TurnComparison
+
+Array = NDArray[np.float64]
+
+# Sigmas from which on a deviation is certain.
+_CERTAIN = 4.0
+# Shift of the pose in its own sigmas (Mahalanobis) that matters, and that leaves its covariance.
+_MATTERS, _OUTSIDE = 0.5, 3.0
+# Shares of the images' turning that the gyro as told, and at best, leaves unexplained, beyond
+# which its axes are wrong: translation alone leaves some, turned axes nearly all.
+_UNEXPLAINED_AS_TOLD, _EXPLAINED_AT_BEST, _BETTER = 0.7, 0.5, 0.4
+# Images over gyro beyond which only another unit explains the scale (deg/s: 0.017).
+_UNIT_FACTOR = 5.0
+# Turning [rad] of both after which they must agree, and the share that they then must explain.
+_LONG_TURN, _INDEPENDENT = 2.0, 0.85
+# Rotations within this [rad] of half a turn about an axis of the image also are flipped images.
+_HALF_TURN = 0.35
+# Figures that are asked for at most: traces of a gross one need some, too.
+_MOST_CAUSES = 4
+# Part of the told distortion that rectified images have at most.
+_LITTLE_OF = 0.25
+# Deviations that move the pose by less than this share of the largest one's shift are not judged:
+# a gross one leaves traces in all.
+_TRACE = 0.34
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Told:
+    """What the pairs were estimated with."""
+
+    sensor: SensorConfig
+    camera: RollingShutterCamera
+    gyro_bias: Array   # (3,) parameter [rad/s]
+    in_force: Array   # (11,) deviations that were applied already: tracked figures, bias at rest
+
+
+class Effect(NamedTuple):
+    """What deviations do to a pair's pose."""
+
+    pose_by_deviation: Array   # (6, 11) of (dt, dtheta)
+    information: Array   # (6, 6) inverse of the covariance that was claimed
+
+
+class Figure(NamedTuple):
+    """A figure that is seen through deviations."""
+
+    name: str
+    part: slice
+    observable: float   # largest sigma, in units of the deviation
+    unit: str
+
+
+FIGURES = (
+    Figure('axes', AXES, math.radians(1.0), 'deg'),
+    Figure('time_offset', slice(OFFSET, OFFSET + 1), 4e-3, 's'),
+    Figure('readout_time', slice(READOUT, READOUT + 1), 5e-3, 's'),
+    Figure('gyro_bias', BIAS, 0.01, 'rad/s'),
+    Figure('gyro_scale', slice(SCALE, SCALE + 1), 0.03, ''),
+    Figure('focal_length', slice(FOCAL, FOCAL + 1), 0.04, 'px'),
+    Figure('distortion', slice(DISTORTION, DISTORTION + 1), 0.05, ''),
+)
+
+
+class Cause(NamedTuple):
+    """A figure whose deviation explains what the pairs show."""
+
+    figure: Figure
+    deviation: Array   # (11,) from what is in force; of the figure alone
+    sigma: Array   # (11,)
+    certainty: float   # in sigmas
+    shift: float   # of the pose, in its own sigmas (Mahalanobis)
+
+    @property
+    def matters(self) -> bool:
+        """Whether it moves the pose by a share of the pose's own sigma."""
+        return self.shift > _MATTERS
+
+
+def causes(seen: Calibration, effects: list[Effect], in_force: Array) -> list[Cause]:
+    """The fewest figures that explain the pairs, by forward selection; the strongest first.
+
+    All figures at once would share a deviation of one among each other where few pairs tell them
+    apart. A figure alone gains ``b_k^T S_kk^-1 b_k`` in chi-square; the one that gains most is
+    taken for the cause, and the others are asked about what it leaves.
+    """
+    found: list[Cause] = []
+    left, taken = seen.b - seen.S @ in_force, np.zeros(DEVIATIONS, dtype=bool)
+    while seen.pairs and len(found) < _MOST_CAUSES:
+        asked = [_alone(figure, seen, left, taken) for figure in FIGURES
+                 if not taken[figure.part].any()]
+        figure, gain = max(asked, key=lambda item: item[1])
+        size = figure.part.stop - figure.part.start
+        if gain < (_CERTAIN**2 + 2.0 * (size - 1)) * seen.misfit:
+            break
+        taken[figure.part] = True
+        # All causes so far together.
+        covariance = np.linalg.inv(seen.S[np.ix_(taken, taken)])
+        together, sigma = np.zeros(DEVIATIONS), np.zeros(DEVIATIONS)
+        together[taken] = covariance @ (seen.b - seen.S @ in_force)[taken]
+        sigma[taken] = np.sqrt(seen.misfit * np.diag(covariance))
+        left = seen.b - seen.S @ (in_force + together)
+        found = [_cause(other, together, sigma, math.sqrt(gain / seen.misfit), effects)
+                 for other in (*(cause.figure for cause in found), figure)]
+    return found
+
+
+def _alone(figure: Figure, seen: Calibration, left: Array,
+           taken: NDArray[np.bool_]) -> tuple[Figure, float]:
+    """Gain in chi-square of a figure beside those that are taken."""
+    part = figure.part
+    S = seen.S[part, part] + np.diag(PRIOR_SIGMA[part] ** -2.0)
+    if taken.any():
+        cross = seen.S[part][:, taken]
+        S = S - cross @ np.linalg.solve(seen.S[np.ix_(taken, taken)], cross.T)
+    return figure, float(left[part] @ np.linalg.solve(S, left[part]))
+
+
+def _cause(figure: Figure, together: Array, sigma: Array, certainty: float,
+           effects: list[Effect]) -> Cause:
+    deviation = np.zeros(DEVIATIONS)
+    deviation[figure.part] = together[figure.part]
+    return Cause(figure, deviation, sigma, certainty, _shift_in_sigmas(effects, deviation))
+
+
+def judged(seen: Calibration, explained: list[Cause], turned: TurnComparison | None,
+           told: Told) -> Health:
+    """Findings on all figures; `explained`: the `causes` of what the pairs show."""
+    gross = tuple(_gross(turned, told))
+    if gross:
+        # Poses of wrong axes or units say nothing of the other figures.
+        named = {finding.figure for finding in gross}
+        why = f'not judged while {gross[0].figure} is wrong'
+        return Health(gross + tuple(_unknown(figure, why) for figure in FIGURES
+                                    if figure.name not in named))
+    largest = max((cause.shift for cause in explained), default=0.0)
+    faults = {cause.figure.name: cause for cause in explained
+              if cause.matters and cause.shift > _TRACE * largest}
+    found: list[Finding] = []
+    for figure in FIGURES:
+        if figure.name in faults:
+            found += _fault_of(faults[figure.name], told)
+        elif float(seen.sigma[figure.part].max()) > figure.observable:
+            found.append(_unknown(figure, 'this motion does not show it, or too few pairs came'))
+        elif faults:
+            found.append(_unknown(figure, 'not judged while another figure is off'))
+        else:
+            described = _described(figure, (seen.c - told.in_force)[figure.part],
+                                   seen.sigma[figure.part], told)
+            found.append(Finding(figure.name, described.told, described.seen, described.sigma,
+                                 figure.unit, True, HealthState.OK, described.text))
+    return Health(tuple(found))
+
+
+def _shift_in_sigmas(effects: list[Effect], deviation: Array) -> float:
+    """Median shift of the latest poses by a deviation (11,), in their own sigmas."""
+    if not effects:
+        return 0.0
+    moved = np.array([effect.pose_by_deviation @ deviation for effect in effects])
+    information = np.array([effect.information for effect in effects])
+    return math.sqrt(max(float(np.median(np.einsum(
+        'pi,pij,pj->p', moved, information, moved))), 0.0))
+
+
+# -- figures one by one ----------------------------------------------------------------------
+
+
+def _fault_of(cause: Cause, told: Told) -> Iterator[Finding]:
+    """Findings on a figure that is off by enough to matter."""
+    figure = cause.figure
+    sure = cause.shift * (1.0 - 2.0 / cause.certainty)
+    state = HealthState.WRONG if sure > _OUTSIDE else HealthState.SUSPECT
+    described = _described(figure, cause.deviation[figure.part], cause.sigma[figure.part], told)
+    if figure.name == 'readout_time' and described.seen < 0.0:
+        other = 'up' if told.sensor.readout_direction == 'down' else 'down'
+        yield Finding('readout_direction', described.told, described.seen, described.sigma, 's',
+                      True, state, f'rows are read the other way, in {-1e3 * described.seen:.1f} '
+                      f'+- {1e3 * described.sigma:.1f} ms: set readout_direction: {other}')
+        return
+    yield Finding(figure.name, described.told, described.seen, described.sigma, figure.unit, True,
+                  state, f'{described.text} (moves the pose by {cause.shift:.1f} of its sigmas): '
+                  f'{described.remedy}')
+    if figure.name == 'distortion' and described.told and (
+            abs(described.seen) < _LITTLE_OF * abs(described.told)):
+        yield _fault('image_geometry', state, 'the images have hardly any distortion left: are '
+                     'they rectified? subscribe to the raw ones, whose rows have one instant each')
+
+
+class _Described(NamedTuple):
+    """A figure in its own unit and words."""
+
+    told: float
+    seen: float
+    sigma: float
+    text: str   # told and seen
+    remedy: str
+
+
+def _described(figure: Figure, left: Array, sigmas: Array, told: Told) -> _Described:
+    """Value told and seen, in the figure's own unit; of a vector the most certain component."""
+    sensor, camera, force = told.sensor, told.camera, told.in_force
+    worst = int(np.argmax(np.abs(left) / sigmas))
+    deviation, sigma = float(left[worst]), float(sigmas[worst])
+    if figure.part == AXES:
+        angle, spread = math.degrees(float(np.linalg.norm(left))), math.degrees(sigma)
+        xyzw = Rotation.from_matrix(exp_so3(left) @ sensor.R_cam_imu).as_quat()
+        return _Described(0.0, angle, spread, f'the IMU is turned by {angle:.2f} +- {spread:.2f} '
+                          'deg against quat_cam_imu_xyzw',
+                          f'set quat_cam_imu_xyzw: {[round(float(q), 5) for q in xyzw]}')
+    if figure.part == BIAS:
+        before, now = told.gyro_bias + force[BIAS], told.gyro_bias + force[BIAS] + left
+        listed = [round(float(value), 5) for value in now]
+        return _Described(float(before[worst]), float(now[worst]), sigma,
+                          f'{listed} +- {sigma:.5f} rad/s is seen, '
+                          f'{[round(float(value), 5) for value in before]} in force',
+                          f'set gyro_bias: {listed}, and let the camera stand still at the start')
+    if figure.name == 'time_offset':
+        offset = sensor.time_offset + float(force[OFFSET])
+        return _in_ms(offset, offset + deviation, sigma, 'set time_offset: '
+                      f'{offset + deviation:.4f}, or track_time_offset: true')
+    if figure.name == 'readout_time':
+        signed = camera.line_delay * camera.height
+        return _in_ms(abs(signed), (signed + deviation) * math.copysign(1.0, signed), sigma,
+                      f'set readout_time: {abs(signed + deviation):.4f}')
+    if figure.name == 'gyro_scale':
+        return _Described(1.0, 1.0 + deviation, sigma, f'the gyro must be multiplied by '
+                          f'{1.0 + deviation:.3f} +- {sigma:.3f}',
+                          'calibrate the gyro, or correct its driver')
+    if figure.name == 'focal_length':
+        seen = camera.fx / (1.0 + deviation)
+        spread = sigma * seen
+        return _Described(camera.fx, seen, spread, f'{seen:.1f} +- {spread:.1f} px is seen, the '
+                          f'CameraInfo says {camera.fx:.1f} px',
+                          'calibrate the camera at this resolution and focus')
+    first = camera.distortion[0] if camera.distortion else 0.0
+    return _Described(first, first + deviation, sigma, f'the first coefficient is seen as '
+                      f'{first + deviation:+.3f} +- {sigma:.3f}, the CameraInfo says {first:+.3f}',
+                      'calibrate the lens')
+
+
+def _in_ms(told: float, seen: float, sigma: float, remedy: str) -> _Described:
+    return _Described(told, seen, sigma, f'{1e3 * seen:.1f} +- {1e3 * sigma:.1f} ms is seen, '
+                      f'{1e3 * told:.1f} ms in force', remedy)
+
+
+def _fault(figure: str, state: HealthState, sentence: str, told: float | None = None,
+           seen: float | None = None, unit: str = '') -> Finding:
+    return Finding(figure, told, seen, None, unit, True, state, sentence)
+
+
+def _unknown(figure: Figure, why: str) -> Finding:
+    return Finding(figure.name, None, None, None, figure.unit, False, HealthState.UNKNOWN, why)
+
+
+# -- gross errors ----------------------------------------------------------------------------
+
+
+def _gross(turned: TurnComparison | None, told: Told) -> Iterator[Finding]:
+    """Axes, unit and flips, from the turning of images and gyro."""
+    if turned is None:
+        return
+    wrong, explained = HealthState.WRONG, min(turned.left_at_best, turned.left_mirrored)
+    if explained < _EXPLAINED_AT_BEST:
+        if turned.scale * _UNIT_FACTOR < 1.0 or turned.scale > _UNIT_FACTOR:
+            yield _fault('gyro_unit', wrong, f'images turn {turned.scale:.3g} times as far as the '
+                         'gyro: it must be in rad/s, which is pi / 180 = 0.0175 times deg/s',
+                         1.0, turned.scale)
+        if (turned.left_as_told > _UNEXPLAINED_AS_TOLD
+                and turned.left_as_told - explained > _BETTER):
+            yield from _turned_axes(turned, told)
+    elif min(turned.by_images, turned.by_gyro) > _LONG_TURN and explained > _INDEPENDENT:
+        text = ('images and gyro turn independently of each other: is it the IMU of this camera, '
+                'do both stamp by one clock, is electronic stabilisation off?')
+        yield _fault('image_geometry', wrong, text)
+        yield _fault('time_offset', wrong, text)
+
+
+def _turned_axes(turned: TurnComparison, told: Told) -> Iterator[Finding]:
+    wrong = HealthState.WRONG
+    if turned.left_mirrored < turned.left_at_best - 0.5 * _BETTER:
+        yield _fault('axes', wrong, 'the axes of the gyro are left-handed: one of them has the '
+                     'wrong sign')
+        return
+    angle, Q = turned.angle, turned.rotation
+    xyzw = [round(float(q), 3) for q in Rotation.from_matrix(
+        Q @ told.sensor.R_cam_imu).as_quat()]
+    yield _fault('axes', wrong, f'images turn about axes that are {math.degrees(angle):.0f} deg '
+                 f'from those of the gyro by quat_cam_imu_xyzw: about {xyzw} fits, which '
+                 '"rs_relpose calibrate" refines (a static transform with parent imu holds the '
+                 'inverse)', 0.0, math.degrees(angle), 'deg')
+    if abs(angle - math.pi) < _HALF_TURN:
+        axis = np.abs(np.linalg.eigh(Q + Q.T)[1][:, -1])
+        if float(axis.max()) > math.cos(_HALF_TURN):
+            how = 'upside down' if axis[2] == axis.max() else 'mirrored'
+            yield _fault('image_geometry', wrong, f'or the images are {how}: publish them as the '
+                         'sensor gives them')

@@ -1,0 +1,102 @@
+"""The health of what was told, followed over frames and pairs; live and replay alike."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.estimator.result import RelativePose, Status
+from rs_relpose_ros.health.deviation import DEVIATIONS
+from rs_relpose_ros.health.findings import Health, HealthState, NOT_JUDGED
+from rs_relpose_ros.health.judge import Cause, causes, Effect, judged, Told
+from rs_relpose_ros.health.pair_information import PairEvidence, PairInformation
+from rs_relpose_ros.health.recursion import NOTHING_SEEN, Recursion
+from rs_relpose_ros.health.turning import TurnSums
+
+Array = NDArray[np.float64]
+
+# Latest pairs with a pose over which the effect of a deviation is taken.
+_EFFECTS = 15
+# Deviations about which a pair is linearised at most: lens and read-out must stay possible.
+_LARGEST = np.array([0.5] * 3 + [0.06, 0.1] + [0.2] * 3 + [0.3, 0.45, 0.6])
+
+
+class HealthMonitor:
+    """Takes frames and pairs in the order of time; the same bits live and in replay."""
+
+    def __init__(self) -> None:
+        self._turns = TurnSums()
+        self._recursion = Recursion()
+        self._effects: deque[Effect] = deque(maxlen=_EFFECTS)
+        self.health: Health = NOT_JUDGED
+        self.calibration = NOTHING_SEEN
+        self._causes: list[Cause] = []
+        self.latest: PairInformation | None = None   # of the last pair
+
+    def clear(self) -> None:
+        """Start anew: another camera."""
+        self._turns.clear()
+        self._recursion.clear()
+        self._effects.clear()
+        self._causes = []
+        self.health, self.calibration = NOT_JUDGED, NOTHING_SEEN
+
+    def add_turn(self, stamp_ns: int, by_images: Array, by_gyro: Array) -> None:
+        """Take in the turns (3,) of a frame since the one before, by images alone and by gyro."""
+        self._turns.add(stamp_ns, by_images, by_gyro)
+
+    def add_pair(self, stamp_ns: int, evidence: PairEvidence | None, pose: RelativePose,
+                 told: Told) -> RelativePose:
+        """Take in a pair and judge all figures; the pose with a covariance that holds.
+
+        `evidence` is None where the pair has no rotation or no gyro.
+        """
+        self.latest = information = None if evidence is None else self._recursion.add(
+            stamp_ns, evidence, told.in_force, self._linearised_at(told))
+        if information is not None:
+            self.calibration = self._recursion.solved()
+            if pose:
+                self._effects.append(_effect(information, pose))
+            self._causes = causes(self.calibration, list(self._effects), told.in_force)
+            pose = _widened(pose, information.pose_by_deviation @ self._deviation())
+        self.health = judged(self.calibration, self._causes, self._turns.compared(), told)
+        return pose
+
+    def _deviation(self) -> Array:
+        """(11,) from what is in force, of all causes."""
+        return np.sum([cause.deviation for cause in self._causes], axis=0) \
+            if self._causes else np.zeros(DEVIATIONS)
+
+    def _linearised_at(self, told: Told) -> Array:
+        """What is in force, or, once a figure is found off, what is seen."""
+        if not any(cause.matters for cause in self._causes):
+            return told.in_force
+        return np.asarray(told.in_force + np.clip(self._deviation(), -_LARGEST, _LARGEST))
+
+
+def withheld(pose: RelativePose, health: Health) -> RelativePose:
+    """The pose without its figures, and why, where these are outside of their covariance."""
+    if health.state is not HealthState.WRONG or not np.isfinite(pose.R).all():
+        return pose
+    fault = health.faults[0]
+    return RelativePose(
+        status=Status.WITHHELD, reason=f'{fault.figure} is wrong: {fault.sentence}',
+        inliers=pose.inliers, model=pose.model, iterations=pose.iterations,
+        residual_rms=pose.residual_rms, duration=pose.duration)
+
+
+def _effect(information: PairInformation, pose: RelativePose) -> Effect:
+    # t is a direction: along itself it has no variance, and nothing moves it there.
+    along = np.concatenate([pose.t, np.zeros(3)])
+    return Effect(information.pose_by_deviation, np.asarray(
+        np.linalg.inv(pose.covariance + np.outer(along, along))))
+
+
+def _widened(pose: RelativePose, shift: Array) -> RelativePose:
+    """The pose with a shift (6,) that it may have in its covariance."""
+    if not shift.any():
+        return pose
+    return replace(pose, covariance=pose.covariance + np.outer(shift, shift))

@@ -1,0 +1,125 @@
+"""Recursive calibration: the pairs of the last seconds, added up and solved.
+
+``(sum S_p + P^-1) c = sum b_p`` with a wide prior P, so that what this motion does not show stays
+at what was told, with the sigma that it had. The inverse Hessian is widened by the misfit of the
+scores ``g_p = b_p - S_p c`` of the pairs (sandwich; White, Econometrica 1982), axis by axis: about
+the solution, since about zero they hold the very deviation that is sought.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.geometry.timing import to_nanoseconds
+from rs_relpose_ros.health.deviation import DEVIATIONS
+from rs_relpose_ros.health.pair_information import (
+    pair_information,
+    PairEvidence,
+    PairInformation,
+)
+
+Array = NDArray[np.float64]
+
+# Pairs that count: those of the last seconds, at most so many.
+_WINDOW_NS = to_nanoseconds(20.0)
+_MOST_PAIRS = 100
+# Older pairs that are linearised anew with each new one, once a figure is found off.
+_ANEW = 3
+# Fewer pairs give no covariance; that of few is widened as if there were so many fewer.
+_LEAST_PAIRS, _UNSEEN_PAIRS = 3, 4
+# Deviations before the first pair, 1 sigma: rad, s, s, rad/s, -, -, -.
+PRIOR_SIGMA = np.array([0.2] * 3 + [0.05, 0.03] + [0.1] * 3 + [0.2, 0.3, 0.5])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """Deviations from what was told, as seen."""
+
+    c: Array   # (11,)
+    covariance: Array   # (11, 11)
+    S: Array   # (11, 11) and (11,): sums of the pairs, without a prior
+    b: Array
+    misfit: float   # variance of the scores over that by S: 1 where residuals are independent
+    pairs: int
+
+    @property
+    def sigma(self) -> Array:
+        """(11,) 1 sigma of each."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+
+NOTHING_SEEN = Calibration(np.zeros(DEVIATIONS), np.diag(PRIOR_SIGMA**2),
+                           np.zeros((DEVIATIONS, DEVIATIONS)), np.zeros(DEVIATIONS), 1.0, 0)
+
+
+class _Entry(NamedTuple):
+    """A pair, and where it was linearised."""
+
+    stamp_ns: int
+    evidence: PairEvidence
+    in_force: Array   # (11,)
+    about: Array   # (11,)
+    information: PairInformation
+
+
+class Recursion:
+    """The pairs of the last seconds."""
+
+    def __init__(self) -> None:
+        self._pairs: deque[_Entry] = deque(maxlen=_MOST_PAIRS)
+
+    def clear(self) -> None:
+        """Forget all pairs: they belong to another camera or another time."""
+        self._pairs.clear()
+
+    def add(self, stamp_ns: int, evidence: PairEvidence, in_force: Array,
+            about: Array) -> PairInformation | None:
+        """Take in a pair, in the order of time; a stamp further back starts anew.
+
+        It is linearised about the deviations `about` (11,), which differ from those `in_force`
+        once a figure is found off: then some of the older pairs are, too, those first whose
+        linearisation is furthest from there. What the pair says; None with too few matches.
+        """
+        if self._pairs and stamp_ns < self._pairs[-1].stamp_ns:
+            self.clear()
+        information = pair_information(evidence, in_force, about)
+        if information is None:
+            return None
+        if (about != in_force).any():
+            self._linearise_anew(about)
+        self._pairs.append(_Entry(stamp_ns, evidence, in_force, about, information))
+        while self._pairs[0].stamp_ns < stamp_ns - _WINDOW_NS:
+            self._pairs.popleft()
+        return information
+
+    def _linearise_anew(self, about: Array) -> None:
+        apart = [float(np.linalg.norm((pair.about - about) / PRIOR_SIGMA)) for pair in self._pairs]
+        for k in np.argsort(apart, kind='stable')[::-1][:_ANEW]:
+            pair = self._pairs[k]
+            information = pair_information(pair.evidence, pair.in_force, about)
+            if information is not None:
+                self._pairs[k] = pair._replace(about=about, information=information)
+
+    def solved(self) -> Calibration:
+        """What the pairs show together."""
+        n = len(self._pairs)
+        if n < _LEAST_PAIRS:
+            return NOTHING_SEEN
+        S = np.array([pair.information.S for pair in self._pairs])
+        b = np.array([pair.information.b for pair in self._pairs])
+        # Scaled by the prior: the deviations have units of their own.
+        scale = PRIOR_SIGMA
+        hessian = S.sum(axis=0) * np.outer(scale, scale) + np.eye(DEVIATIONS)
+        inverse = np.linalg.inv(hessian) * np.outer(scale, scale)
+        c = inverse @ b.sum(axis=0)
+        scores = b - S @ c
+        sandwich = inverse @ (scores.T @ scores) @ inverse
+        ratios = np.maximum(np.diag(sandwich) / np.diag(inverse), 1.0) * (n + _UNSEEN_PAIRS) / n
+        wider = np.sqrt(ratios)
+        return Calibration(c, inverse * np.outer(wider, wider), S.sum(axis=0), b.sum(axis=0),
+                           float(ratios.mean()), n)

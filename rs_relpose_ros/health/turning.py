@@ -1,0 +1,111 @@
+"""How the images turn over some frames, without the gyro, against how the gyro turns.
+
+No prior and no pose takes part, so that the comparison holds however wrong axes, unit or sign of
+the gyro are told. Rotation vectors over some frames, ``theta`` by images and ``phi`` by gyro
+in the camera frame as told, are gathered in ``M = sum theta phi^T``; the rotation Q that maximises
+``trace(Q^T M)`` lays one upon the other (Kabsch 1976).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.geometry.so3 import aligning_rotation, log_so3
+from rs_relpose_ros.geometry.timing import to_nanoseconds
+
+Array = NDArray[np.float64]
+
+# Fewer rays give no rotation.
+_LEAST_RAYS = 12
+# Turns that count: those of the last seconds, at most so many.
+_WINDOW_NS = to_nanoseconds(8.0)
+_MOST_TURNS = 160
+# Turns, and turning [rad, their sum], that a comparison needs.
+_LEAST_TURNS, _LEAST_TURN = 5, 0.15
+
+
+def rotation_of_rays(rays1: Array, rays2: Array) -> Array | None:
+    """Rotation vector (3,) of ``R_1^T R_2`` that lays unit rays (N, 3) upon each other best.
+
+    Translation is not modelled: rays that move most count least (Cauchy weights about the
+    median). None where there are too few rays.
+    """
+    finite = np.isfinite(rays1).all(axis=1) & np.isfinite(rays2).all(axis=1)
+    if np.count_nonzero(finite) < _LEAST_RAYS:
+        return None
+    first, second = rays1[finite], rays2[finite]
+    R = aligning_rotation(first.T @ second)
+    off = np.sum((first - second @ R.T) ** 2, axis=1)
+    weights = 1.0 / (1.0 + off / max(float(np.median(off)), 1e-12))
+    return log_so3(aligning_rotation((first.T * weights) @ second))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TurnComparison:
+    """Images and gyro over the last seconds.
+
+    Shares are those of the images' turning (sum of squares) that is left when the gyro's is
+    turned by a rotation and scaled: 0 where it explains all, 1 or more where it explains nothing.
+    """
+
+    left_as_told: float   # no rotation
+    left_at_best: float   # `rotation`
+    left_mirrored: float   # the best reflection: a gyro whose axes are left-handed
+    rotation: Array   # (3, 3) Q: the true gyro is Q times the told one
+    scale: float   # images over gyro, after `rotation`
+    by_images: float   # [rad] turning, summed
+    by_gyro: float
+
+    @property
+    def angle(self) -> float:
+        """Of `rotation` [rad]."""
+        return float(np.linalg.norm(log_so3(self.rotation)))
+
+
+class TurnSums:
+    """The turns of the last seconds."""
+
+    def __init__(self) -> None:
+        self._turns: deque[tuple[int, Array, Array]] = deque(maxlen=_MOST_TURNS)
+
+    def clear(self) -> None:
+        """Forget all turns."""
+        self._turns.clear()
+
+    def add(self, stamp_ns: int, by_images: Array, by_gyro: Array) -> None:
+        """Take in the turns (3,) over the same frames, in the order of time."""
+        if self._turns and stamp_ns < self._turns[-1][0]:
+            self.clear()
+        self._turns.append((stamp_ns, by_images, by_gyro))
+        while self._turns[0][0] < stamp_ns - _WINDOW_NS:
+            self._turns.popleft()
+
+    def compared(self) -> TurnComparison | None:
+        """Both upon each other; None where they turned too little, or too few frames came."""
+        if len(self._turns) < _LEAST_TURNS:
+            return None
+        theta = np.array([turn for _, turn, _ in self._turns])
+        phi = np.array([turn for _, _, turn in self._turns])
+        by_images = float(np.linalg.norm(theta, axis=1).sum())
+        by_gyro = float(np.linalg.norm(phi, axis=1).sum())
+        if by_images < _LEAST_TURN or by_gyro < 1e-3 * _LEAST_TURN:
+            return None
+        M, power, gyro = theta.T @ phi, float((theta**2).sum()), float((phi**2).sum())
+
+        def left(trace: float) -> float:
+            # min over s of sum |theta - s Q phi|^2 / sum |theta|^2; a negative scale is worse
+            return 1.0 - trace * abs(trace) / (power * gyro)
+
+        U, singular, Vt = np.linalg.svd(M)
+        handed = math.copysign(1.0, float(np.linalg.det(U @ Vt)))
+        rotation = np.ascontiguousarray((U * (1.0, 1.0, handed)) @ Vt)
+        trace = float(singular[0] + singular[1] + handed * singular[2])
+        return TurnComparison(
+            left(float(np.trace(M))), left(trace),
+            left(float(singular[0] + singular[1] - handed * singular[2])), rotation,
+            trace / gyro, by_images, by_gyro)

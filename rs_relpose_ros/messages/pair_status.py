@@ -1,0 +1,101 @@
+"""What ``~/pairs`` says of every pair: the keys of its status, and how they are read back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.front_end.pair import PAIR_FIGURES, PairFigure, PairResult
+
+Array = NDArray[np.float64]
+
+
+def number(value: float) -> str:
+    """Shortest text that reads back as the same number; empty for NaN."""
+    if isinstance(value, int):
+        return str(value)
+    return '' if math.isnan(value) else repr(float(value))
+
+
+def numbers(values: Array | None) -> str:
+    """The numbers of a vector, with blanks between them; empty for None."""
+    return '' if values is None else ' '.join(map(number, values))
+
+
+class PairValue(NamedTuple):
+    """A key of the status of a pair and its value, an empty text where it is not known."""
+
+    key: str
+    text: Callable[[PairResult], str]
+
+
+def _figure(figure: PairFigure) -> PairValue:
+    return PairValue(figure.name, lambda pair: number(figure.of(pair)))
+
+
+# In the order in which they are shown. `TOPICS_KEY` follows: it tells what else was published.
+PAIR_VALUES = (
+    PairValue('reference_stamp_ns', lambda pair: str(pair.reference_stamp_ns)),
+    PairValue('status', lambda pair: pair.pose.status.value),
+    PairValue('reason', lambda pair: pair.pose.reason),
+    PairValue('model', lambda pair: pair.pose.model),
+    *(_figure(figure) for figure in PAIR_FIGURES),
+    PairValue('baseline_m', lambda pair: number(pair.pose.baseline)),
+    PairValue('baseline_log_sigma', lambda pair: number(pair.pose.baseline_log_sigma)),
+    # Instants of the two stamped rows on the IMU's clock.
+    PairValue('reference_imu_ns', lambda pair: str(pair.reference_ns1)),
+    PairValue('current_imu_ns', lambda pair: str(pair.reference_ns2)),
+    PairValue('gyro_bias_rad_s', lambda pair: numbers(pair.gyro_bias)),
+    PairValue('health', lambda pair: pair.health.state.value),
+    PairValue('health_findings', lambda pair: pair.health.text),
+)
+TOPICS_KEY = 'topics'
+
+
+class PairStatus:
+    """The values of a status, by key; InputError where one is absent or cannot be read."""
+
+    def __init__(self, values: Mapping[str, str]) -> None:
+        self._values = values
+
+    def text(self, key: str) -> str:
+        """A text."""
+        if key not in self._values:
+            raise InputError(f'~/pairs must have the key {key}')
+        return self._values[key]
+
+    def nanoseconds(self, key: str) -> int:
+        """An instant [ns]."""
+        text = self.text(key)
+        # Of the length of an int64 at most.
+        if not (text.isascii() and text.isdigit() and len(text) < 20):
+            raise InputError(f'{key} of ~/pairs must be an instant [ns], got {text[:40]!r}')
+        return int(text)
+
+    def real(self, key: str) -> float:
+        """A number; NaN where it is empty."""
+        text = self.text(key)
+        return self._reals(key, text)[0] if text else math.nan
+
+    def vector(self, key: str) -> Array:
+        """Three numbers (3,); NaN where they are empty."""
+        text = self.text(key)
+        values = self._reals(key, text) if text else [math.nan] * 3
+        if len(values) != 3:
+            raise InputError(f'{key} of ~/pairs must be three numbers, got {text[:60]!r}')
+        return np.array(values)
+
+    @staticmethod
+    def _reals(key: str, text: str) -> list[float]:
+        try:
+            values = [float(word) for word in text[:200].split()]
+        except ValueError:
+            values = []
+        if not values or not all(map(math.isfinite, values)):
+            raise InputError(f'{key} of ~/pairs must be finite, got {text[:60]!r}')
+        return values
