@@ -6,7 +6,6 @@ import csv
 from functools import lru_cache
 
 import numpy as np
-import pytest
 
 from rs_relpose_lab.experiments.calibration_stretches import (
     calibrated_parts,
@@ -17,7 +16,7 @@ from rs_relpose_lab.experiments.calibration_stretches import (
 from rs_relpose_lab.experiments.calibration_tracks import drawn, record, Recorded
 from rs_relpose_ros.calibrate.bag_streams import CalibrationInput
 from rs_relpose_ros.calibrate.coplanarity import BIAS, EXPOSURE, FOCAL, GLOBAL, READOUT, SLOPE
-from rs_relpose_ros.calibrate.fit import fit, Fit, initial, with_bends
+from rs_relpose_ros.calibrate.fit import Fit, fit, initial, with_bends
 from rs_relpose_ros.calibrate.gyro_path import blur, GyroSeries
 from rs_relpose_ros.calibrate.judgement import judged
 from rs_relpose_ros.calibrate.observations import Observations
@@ -149,7 +148,7 @@ def test_parts_are_whole_and_keep_their_points():
     assert [begin for begin, _ in parts] == [0.0, 1.5]
     for begin, part in parts:
         assert len(part) == 45
-        first = int(round(begin * 30.0))
+        first = round(begin * 30.0)
         np.testing.assert_array_equal(part.stamps_ns, tracks.stamps_ns[first:first + 45])
         assert len(part.points) == ((tracks.frames >= first) & (tracks.frames < first + 45)).sum()
     assert len(list(parts_of(tracks, 60.0))) == 1

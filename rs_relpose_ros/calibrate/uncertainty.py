@@ -49,7 +49,7 @@ class ModelErrors(NamedTuple):
 
 
 # Of a camera whose CameraInfo has no intrinsics.
-UNCALIBRATED = ModelErrors(focal=0.0, aspect=0.005, center=0.02, radial=0.05)
+UNCALIBRATED = ModelErrors(focal=0.0, aspect=0.005, center=0.01, radial=0.05)
 
 
 def widened(final: Fit, free: NDArray[np.bool_], errors: ModelErrors | None) -> Fit:
