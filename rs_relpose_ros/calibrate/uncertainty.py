@@ -33,8 +33,9 @@ Array = NDArray[np.float64]
 
 # Regions of the image: columns and rows of equally many points.
 _COLUMNS, _ROWS = 4, 3
-# Mean square, in sigmas, by which the figures of two halves differ by chance, at most.
-_CHANCE = 1.75
+# Square, in sigmas, by which the figures of two halves differ by chance, at most: in the mean
+# over all of them, and each.
+_CHANCE, _GROSS = 1.75, 9.0
 
 
 class ModelErrors(NamedTuple):
@@ -96,8 +97,12 @@ def _regions(points: Array) -> NDArray[np.int64]:
     return band(points[:, 0], _COLUMNS) + _COLUMNS * band(points[:, 1], _ROWS)
 
 
-def _disagreement(final: Fit, free: NDArray[np.bool_]) -> float:
-    """Mean square of the difference of both halves in their sigmas; 1 where chance explains it."""
+def _disagreement(final: Fit, free: NDArray[np.bool_]) -> Array:
+    """Factors (G,) of the variances by the difference of both halves; 1 where chance explains it.
+
+    They share the mean square of the differences in sigmas, in which a figure counts up to
+    `_GROSS`; a figure with a larger one has that.
+    """
     middles = final.problem.middles
     first = middles < np.median(middles)
     halves = [fit(final.problem.pairs_of(part), final.unknowns.pairs_of(part), free, rounds=15)
@@ -107,8 +112,12 @@ def _disagreement(final: Fit, free: NDArray[np.bool_]) -> float:
     difference[ROTATION:ROTATION + 3] = log_so3(
         one.unknowns.R_imu_cam @ other.unknowns.R_imu_cam.T)
     variances = np.diag(one.covariance + other.covariance)
-    mean = float((difference[free]**2 / variances[free]).mean())
-    return mean if mean > _CHANCE else 1.0
+    squares = difference[free]**2 / variances[free]
+    mean = float(np.minimum(squares, _GROSS).mean())
+    factors = np.ones(GLOBAL)
+    factors[free] = np.maximum(mean if mean > _CHANCE else 1.0,
+                               np.where(squares > _GROSS, squares, 1.0))
+    return factors
 
 
 def _move(final: Fit, free: NDArray[np.bool_], problem: Problem) -> Array:
