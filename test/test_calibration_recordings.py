@@ -93,7 +93,7 @@ def test_slow_hand(recordings, tmp_path):
     figures = calibrated(recordings, 'realsense_rgb_rs', tmp_path)
     readout = figures['readout_time_s']
     assert not readout['observable']
-    assert abs(readout['value'] - 0.028) < 3.0 * readout['sigma'] < 15e-3
+    assert abs(readout['value'] - 0.028) < 2.0 * readout['sigma'] < 15e-3
     assert figures['shutter'] == 'rolling'
     assert figures['time_offset_s']['value'] == pytest.approx(-0.057, abs=5e-3)
     assert figures['offset_by_interval']['value'] < 0.0
