@@ -25,6 +25,11 @@ from rs_relpose_ros import (
     RollingShutterCamera,
     Status,
 )
+from rs_relpose_ros.estimator.map_fit import FitMatches
+from rs_relpose_ros.estimator.priors import Priors
+from rs_relpose_ros.estimator.problem import build_problem
+from rs_relpose_ros.estimator.state import TwoViewState
+from rs_relpose_ros.estimator.uncertainty import local_covariance
 
 
 def make_camera(**changes):
@@ -128,6 +133,77 @@ def test_normalised_errors_are_chi_square():
         values.append(error @ np.linalg.solve(project @ pose.covariance @ project.T, error))
     # Mean of 40 draws of chi-square(5) is 5 +- 0.5; heavy tails of a false covariance reach tens.
     assert 2.5 < np.mean(values) < 8.0
+
+
+def rotation_nees(pose, scene, covariance):
+    """NEES by degrees of freedom: 1 on average, 0.79 in the median where the covariance holds."""
+    turn = Rotation.from_matrix(scene.R @ pose.R.T).as_rotvec()
+    return turn @ np.linalg.solve(covariance, turn) / 3
+
+
+def hessian_covariance(pose, scene, camera):
+    """Covariance of the rotation by the inverse of the Hessian at a pose of the middle rows."""
+    problem = build_problem(
+        scene.points1, scene.points2, camera, FrameMotion(scene.measured_rate1),
+        FrameMotion(scene.measured_rate2), None, None)
+    R = pose.R
+    state = TwoViewState(R, pose.t, pose.linear_velocity1, R @ pose.linear_velocity2,
+                         pose.angular_velocity1 - scene.measured_rate1,
+                         R @ (pose.angular_velocity2 - scene.measured_rate2))
+    priors = Priors(scene.measured_gravity1, scene.measured_gravity2, TOLD.gravity_sigma**-2, 0.0,
+                    TOLD.gyro_sigma**-2, pose.velocity_sigma**-2, 0.0, np.eye(3),
+                    np.zeros((3, 3)))
+    matches = FitMatches(problem.observations, pose.inliers, pose.residual_rms)
+    return local_covariance(matches, state, priors)[:3, :3]
+
+
+def test_covariance_holds_where_neighbours_share_their_errors():
+    """All matches in a square of 320 px are displaced alike, by twice the noise of each."""
+    camera = make_camera(reference_row='middle')
+    by_hessian, told = [], []
+    for seed in range(40):
+        scene = make_scene(seed, outliers=0.0, pixel_noise=0.3, gravity_noise=0.0,
+                           reference='middle')
+        column, row = (scene.points1 // 320.0).astype(int).T
+        shared = 0.6 * np.random.default_rng([seed, 1]).normal(size=(9, 6, 2))
+        scene = replace(scene, points2=scene.points2 + shared[column, row])
+        pose = estimate(scene, camera=camera, rng=seed)
+        assert pose
+        by_hessian.append(rotation_nees(pose, scene, hessian_covariance(pose, scene, camera)))
+        told.append(rotation_nees(pose, scene, pose.covariance[3:, 3:]))
+    # The Hessian takes 300 matches for independent: its sigmas are half of what they should be.
+    assert np.mean(by_hessian) > 3.5
+    assert np.median(by_hessian) > 2.5
+    assert np.mean(told) < 2.7
+    assert np.median(told) < 1.8
+
+
+def gyro_prior(scene, error=0.0, sigma=2e-4, **config):
+    """The pose with the gyro's rotation, which is off by `error` [rad] about an axis."""
+    rotation = Rotation.from_rotvec([0.0, error, 0.0]).as_matrix() @ scene.R
+    return estimate(scene, replace(TOLD, **config), relative_rotation=rotation,
+                    relative_rotation_covariance=sigma**2 * np.eye(3))
+
+
+def test_a_gyro_that_disagrees_with_the_images_widens_the_covariance():
+    scene = make_scene(1, outliers=0.0, gravity_noise=0.0, gyro_noise=0.0)
+    right, wrong = gyro_prior(scene), gyro_prior(scene, error=2e-3)
+    sigmas = [np.sqrt(np.trace(pose.covariance[3:, 3:])) for pose in (right, wrong)]
+    assert sigmas[1] > 2.0 * sigmas[0]
+    assert rotation_nees(wrong, scene, wrong.covariance[3:, 3:]) < 3.0
+    assert rotation_nees(wrong, scene, right.covariance[3:, 3:]) > 6.0
+
+
+def test_errors_of_the_stamps_are_in_the_covariance_and_not_in_the_pose():
+    scene = make_scene(2, outliers=0.0, gravity_noise=0.0)
+    sigma = 3e-3
+    exact, late = (gyro_prior(scene, sigma=1e-5, stamp_sigma=s) for s in (0.0, sigma))
+    assert np.array_equal(late.R, exact.R) and np.array_equal(late.t, exact.t)
+    # The gyro is told to be so good that it decides: R takes over all of its error.
+    w1, w2 = scene.measured_rate1, scene.R @ scene.measured_rate2
+    expected = sigma**2 * (np.outer(w1, w1) + np.outer(w2, w2))
+    added = late.covariance[3:, 3:] - exact.covariance[3:, 3:]
+    assert added == pytest.approx(expected, abs=0.1 * np.abs(expected).max())
 
 
 def test_covariance_has_no_part_along_the_translation():

@@ -243,6 +243,40 @@ def _run_unseen(args: argparse.Namespace) -> int:
     return _tell(write_report(args.output, bags), args.output)
 
 
+def _consistency_arguments(parser: argparse.ArgumentParser) -> None:
+    _number(parser, '--bags', 12, 'simulated bags')
+    parser.add_argument('--recording', nargs=3, type=Path, action='append', default=[],
+                        metavar=('BAG', 'PARAMETERS', 'PAIRS'),
+                        help='a recording, its parameter file and a table of true pairs '
+                        '(pseudo_truth.csv); may be given several times')
+
+
+def _run_consistency(args: argparse.Namespace) -> int:
+    from rs_relpose_lab.experiments.consistency import (
+        configurations,
+        on_recording,
+        on_simulated_bag,
+        PairConsistency,
+        write_report,
+    )
+
+    _check_at_least(0, args, 'bags')
+    if not args.bags and not args.recording:
+        raise InputError('--bags 0 needs a --recording: there is nothing to measure')
+    args.output.mkdir(parents=True, exist_ok=True)
+    pairs: list[PairConsistency] = []
+    with progress_bar(args.bags + len(args.recording), 'bag') as bar:
+        for recording in args.recording:
+            pairs += on_recording(*recording)
+            bar.update()
+        for config in configurations(args.bags, args.seed):
+            pairs += on_simulated_bag(config, args.output / f'seed_{config.seed}')
+            bar.update()
+    if not pairs:
+        raise InputError('no pair could be compared with the truth')
+    return _tell(write_report(args.output, pairs), args.output)
+
+
 def _run_calibration(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments.calibration_accuracy import run_calibration, write_report
     from rs_relpose_lab.experiments.workers import in_processes
@@ -270,32 +304,6 @@ def _run_calibration_bags(args: argparse.Namespace) -> int:
             bags.append(measure(seed, kind, args.output / f'{seed}'))
             bar.update()
     return _tell(write_report(args.output, bags), args.output)
-
-
-def _stretches_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('bags', nargs='+', type=Path, metavar='BAG',
-                        help='recordings of one camera with one IMU')
-    parser.add_argument('--seconds', type=float, default=4.0, metavar='S',
-                        help='length of a part (default: %(default)s)')
-    parser.add_argument('--rows', metavar=('FIRST', 'LAST'), type=float, nargs=2,
-                        default=(0.0, 0.0), help='use only these image rows')
-
-
-def _run_calibration_stretches(args: argparse.Namespace) -> int:
-    from rs_relpose_lab.experiments.calibration_stretches import (
-        calibrated_parts,
-        figures_of,
-        read_bag,
-        write_report,
-    )
-
-    if args.seconds <= 0.0:
-        raise InputError(f'--seconds must be positive, got {args.seconds:g}')
-    parts = [part for bag in args.bags for part in calibrated_parts(
-        bag.name, read_bag(bag, tuple(args.rows)), args.seconds, print)]
-    if not parts:
-        raise InputError('no part of these bags can be calibrated')
-    return _tell(write_report(args.output, figures_of(parts)), args.output)
 
 
 def _trust_arguments(parser: argparse.ArgumentParser) -> None:
@@ -334,6 +342,32 @@ def _run_trust(args: argparse.Namespace) -> int:
             report = write_report(args.output, bags)
             bar.update()
     return _tell(report, args.output)
+
+
+def _stretches_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('bags', nargs='+', type=Path, metavar='BAG',
+                        help='recordings of one camera with one IMU')
+    parser.add_argument('--seconds', type=float, default=4.0, metavar='S',
+                        help='length of a part (default: %(default)s)')
+    parser.add_argument('--rows', metavar=('FIRST', 'LAST'), type=float, nargs=2,
+                        default=(0.0, 0.0), help='use only these image rows')
+
+
+def _run_calibration_stretches(args: argparse.Namespace) -> int:
+    from rs_relpose_lab.experiments.calibration_stretches import (
+        calibrated_parts,
+        figures_of,
+        read_bag,
+        write_report,
+    )
+
+    if args.seconds <= 0.0:
+        raise InputError(f'--seconds must be positive, got {args.seconds:g}')
+    parts = [part for bag in args.bags for part in calibrated_parts(
+        bag.name, read_bag(bag, tuple(args.rows)), args.seconds, print)]
+    if not parts:
+        raise InputError('no part of these bags can be calibrated')
+    return _tell(write_report(args.output, figures_of(parts)), args.output)
 
 
 def _all_arguments(parser: argparse.ArgumentParser) -> None:
@@ -375,6 +409,12 @@ BENCHMARKS = {
         'that suits it best) with the truth. Needs ROS.',
         lambda parser: _number(parser, '--bags', 10, 'number of bags'), _run_unseen, 'unseen',
         first_seed=201, seed_of='bag'),
+    'consistency': Benchmark(
+        'whether covariances hold, on simulated bags and on recordings',
+        'Squared errors of rotation and direction of translation in units of their covariance '
+        '(NEES by degrees of freedom: 1 where it is right), over the pairs of rendered bags of '
+        'walks, and over the true pairs of recordings, short and long ones.',
+        _consistency_arguments, _run_consistency, 'consistency', first_seed=401, seed_of='bag'),
     'calibration': Benchmark(
         '`rs_relpose calibrate` on simulated tracks, against the truth',
         'Errors, sigmas and verdicts of the calibration over many simulated recordings of 300 '
@@ -388,11 +428,6 @@ BENCHMARKS = {
         'shutter and one whose camera turns about one axis only, and runs the command on each.',
         lambda parser: _number(parser, '--bags', 6, 'bags of a walk'), _run_calibration_bags,
         'calibration_bags', first_seed=301, seed_of='bag'),
-    'calibration-stretches': Benchmark(
-        'whether parts of real recordings agree within the sigmas of `rs_relpose calibrate`',
-        'Cuts recordings of one camera into parts, calibrates each from nothing, and prints '
-        'chi^2 of every figure over the parts.',
-        _stretches_arguments, _run_calibration_stretches, 'calibration_stretches'),
     'trust': Benchmark(
         'figures told wrong: which are flagged, and which poses are believed all the same',
         'Runs simulated bags (hand-held and vehicle, three scenes, read-outs of 12 to 35 ms; '
@@ -401,6 +436,11 @@ BENCHMARKS = {
         'poses in their own sigmas. docs/lab/trust.md explains the columns.',
         _trust_arguments, _run_trust, 'trust', first_seed=1001, seed_of='bag',
         jobs='processes'),
+    'calibration-stretches': Benchmark(
+        'whether parts of real recordings agree within the sigmas of `rs_relpose calibrate`',
+        'Cuts recordings of one camera into parts, calibrates each from nothing, and prints '
+        'chi^2 of every figure over the parts.',
+        _stretches_arguments, _run_calibration_stretches, 'calibration_stretches'),
     'all': Benchmark(
         'accuracy and speed, as the project reports them',
         'Both with their defaults, told sigmas also half and twice the true ones, and memory over '

@@ -31,6 +31,10 @@ class EstimatorConfig:
     gyro_sigma: float = setting(
         0.005, "noise of one frame's mean angular rate, 1 sigma per axis, bias error included",
         'rad/s', low=1e-6, high=1.0, live=True)
+    stamp_sigma: float = setting(
+        0.0, "error of an image's stamp, 1 sigma; the scatter of the stamps about an even rhythm "
+        'where that is larger. Covariances follow it, poses do not', 's', low=0.0, high=0.1,
+        live=True)
     confidence: float = setting(
         0.999, 'probability of an outlier-free sample at which sampling stops', low=0.5,
         high=0.999999, live=True)

@@ -109,7 +109,7 @@ def estimate_relative_pose(
     -----
     Design: hypotheses from derotated rays (gyro rotation and 2 points, angular 3- and 5-point),
     multi-scale MSAC, local optimisation of the uniform model on a shrinking threshold, joint MAP
-    fit with the velocity prior chosen by its evidence, covariance from the Hessian; see
+    fit with the velocity prior chosen by its evidence, sandwich covariance over image regions; see
     `docs/estimator.md`.
 
     Examples
@@ -242,7 +242,8 @@ class Estimation:
             if free and self.interval is not None:
                 grid = GRID[GRID >= LEAST_VELOCITY_CHANGE]
             return fit_with_evidence(matches, state, self.priors,
-                                     Noise(config.pixel_sigma, config.threshold), grid)
+                                     Noise(config.pixel_sigma, config.threshold), grid,
+                                     self._gyro_error())
         inliers = select_inliers(matches, state, config.threshold)
         if config.refinement == 'alternating' and inliers.sum() >= 12:
             state = self._in_front(refine_alternating(
@@ -253,6 +254,20 @@ class Estimation:
             FitMatches(matches.observations, inliers, config.pixel_sigma), state,
             with_velocity_sigma(self.priors, velocity_sigma))
         return Refined(state, inliers, velocity_sigma, config.pixel_sigma, covariance)
+
+    def _gyro_error(self) -> Array:
+        """Covariance (3, 3) of the gyro's rotation by errors s of the stamps, in frame 1.
+
+        The gyro is integrated between instants that are off: ``s^2 (w_1 w_1^T + w_2 w_2^T)``, w_2
+        turned into frame 1. Not in the prior, whose weight it would lower to the images' gain:
+        on a recording with such stamps the poses did not get better (docs/estimator.md).
+        """
+        problem, sigma = self.problem, self.config.stamp_sigma
+        if problem.rotation is None or sigma == 0.0:
+            return np.zeros((3, 3))
+        turned = np.column_stack([problem.motion1.angular_velocity,
+                                  problem.rotation @ problem.motion2.angular_velocity])
+        return np.asarray(sigma**2 * turned @ turned.T)
 
     def _no_consensus(self, inliers: Flags) -> str:
         """Why the matches that agree tell no pose; empty where they may."""
@@ -302,7 +317,9 @@ class Estimation:
             state._replace(R=R, dw1=np.zeros(3), dw2=np.zeros(3)))
         covariance = np.full((6, 6), np.nan)
         # No rotation is less certain than half a turn: points in one place show only two angles.
-        covariance[3:, 3:] = turn1.T @ inverse(information + np.eye(3) / np.pi**2) @ turn1
+        fitted = inverse(information + np.eye(3) / np.pi**2)
+        of_gyro = fitted @ self.priors.rotation_information
+        covariance[3:, 3:] = turn1.T @ (fitted + of_gyro @ self._gyro_error() @ of_gyro.T) @ turn1
         # The rates are the gyro's, and so is what is known of them.
         velocity_covariance = np.full((6, 6), np.nan)
         velocity_covariance[3:, 3:] = config.gyro_sigma**2 * np.eye(3)

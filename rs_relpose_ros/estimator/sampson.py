@@ -77,8 +77,9 @@ def _turned(turns, tau, x, y, z):  # type: ignore[no-untyped-def]
         + (turns[0, 2, 2] + tau * turns[1, 2, 2] + s * turns[2, 2, 2]) * z)
 
 
-@inlined_kernel
-def _gather(observations, use, first, block):  # type: ignore[no-untyped-def]
+@linked_kernel
+def _gather(observations: Array, use: NDArray[np.bool_], first: int,
+            block: Array) -> tuple[int, int]:
     """Fill `block` (20, BLOCK) with the matches in `use` from number `first` on.
 
     Returns the number from which to go on, and how many matches there are. The rest of the block

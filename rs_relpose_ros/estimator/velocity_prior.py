@@ -20,6 +20,7 @@ from rs_relpose_ros.estimator.map_fit import DataTerm, fit, FitMatches, linearis
 from rs_relpose_ros.estimator.priors import Priors, with_velocity_sigma
 from rs_relpose_ros.estimator.sampson import residuals
 from rs_relpose_ros.estimator.state import moved, PARAMETERS, step_between, TwoViewState
+from rs_relpose_ros.estimator.uncertainty import as_much_wider, sandwich, score_covariance
 from rs_relpose_ros.geometry.vectors import copy_matrix, copy_vector
 
 Array = NDArray[np.float64]
@@ -76,11 +77,11 @@ def noise_sigma(observations_cost: float, count: int, told: float) -> float:
 
 @kernel
 def fit_with_evidence(matches: Matches, start: TwoViewState, priors: Priors, noise: Noise,
-                      grid: Array) -> Refined:
+                      grid: Array, gyro_error: Array) -> Refined:
     """Select inliers and fit repeatedly; average over the velocity priors at the end.
 
     `grid` (K,) holds the prior sigmas of the velocities; the state is the mean over them, weighted
-    by their evidence.
+    by their evidence. `gyro_error` (3, 3) is that of `score_covariance`.
     """
     size = grid.shape[0]
     state = start
@@ -116,7 +117,7 @@ def fit_with_evidence(matches: Matches, start: TwoViewState, priors: Priors, noi
         if (used.use == chosen_from).all():
             break
     state, covariance, best = _average(matches, used, start, steps, lacking < LEAST_EVIDENCE,
-                                       priors, grid, noise.threshold)
+                                       priors, grid, noise.threshold, gyro_error)
     return Refined(state, used.use, grid[best], used.sigma, covariance)
 
 
@@ -157,7 +158,8 @@ def _candidate(matches: Matches, used: FitMatches, start: TwoViewState, data: Da
 
 @linked_kernel
 def _average(matches: Matches, used: FitMatches, start: TwoViewState, steps: Array, likely: Flags,
-             priors: Priors, grid: Array, threshold: float) -> tuple[TwoViewState, Array, int]:
+             priors: Priors, grid: Array, threshold: float,
+             gyro_error: Array) -> tuple[TwoViewState, Array, int]:
     """Mean state, its covariance (17, 17), and the number of the prior of the most evidence.
 
     Where the data cannot tell which prior is right, one of them alone would be overconfident. The
@@ -165,18 +167,21 @@ def _average(matches: Matches, used: FitMatches, start: TwoViewState, steps: Arr
     """
     size = grid.shape[0]
     evidences = np.full(size, -math.inf)
-    covariances = np.zeros((size, PARAMETERS, PARAMETERS))
+    hessians = np.zeros((size, PARAMETERS, PARAMETERS))
+    of_data = np.zeros((size, PARAMETERS, PARAMETERS))
     for k in range(size):
         if likely[k]:
             own = moved(start, steps[k])
-            state, _, hessian, evidences[k] = _candidate(
+            state, data, hessian, evidences[k] = _candidate(
                 matches, used, own, linearised(used, own), priors, grid[k], threshold,
                 LAST_ITERATIONS)
             copy_vector(step_between(start, state), steps[k])
-            copy_matrix(inverse(hessian), covariances[k])
+            copy_matrix(hessian, hessians[k])
+            copy_matrix(data.hessian, of_data[k])
     best = int(np.argmax(evidences))
     # Around the best one, where the local parameters of all of them are small.
     origin = moved(start, steps[best])
+    scores = score_covariance(used, origin, of_data[best], hessians[best], priors, gyro_error)
     weights = np.exp(evidences - evidences[best])
     weights /= weights.sum()
     mean = np.zeros(PARAMETERS)
@@ -185,11 +190,16 @@ def _average(matches: Matches, used: FitMatches, start: TwoViewState, steps: Arr
         if likely[k]:
             copy_vector(step_between(origin, moved(start, steps[k])), away[k])
             mean += weights[k] * away[k]
-    covariance = np.zeros((PARAMETERS, PARAMETERS))
+    believed = np.zeros((PARAMETERS, PARAMETERS))
+    spread = np.zeros((PARAMETERS, PARAMETERS))
     for k in range(size):
         if likely[k]:
-            rest = away[k] - mean
+            rest, fitted = away[k] - mean, inverse(hessians[k])
             for i in range(PARAMETERS):
                 for j in range(PARAMETERS):
-                    covariance[i, j] += weights[k] * (covariances[k, i, j] + rest[i] * rest[j])
-    return moved(origin, mean), covariance, best
+                    believed[i, j] += weights[k] * fitted[i, j]
+                    spread[i, j] += weights[k] * rest[i] * rest[j]
+    # The errors are those that the best one shows: another's misfit is no noise to it.
+    fitted = inverse(hessians[best])
+    shown = sandwich(hessians[best], of_data[best], fitted, scores)
+    return moved(origin, mean), as_much_wider(believed, fitted, shown) + spread, best

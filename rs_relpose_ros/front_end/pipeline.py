@@ -15,6 +15,7 @@ from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.front_end.derotated_rays import DerotatedRays, median_parallax, Sensor
 from rs_relpose_ros.front_end.frame import Frame, sensor_camera
 from rs_relpose_ros.front_end.pair import closes_pair, PairResult, SinceKeyframe
+from rs_relpose_ros.front_end.stamp_scatter import StampScatter
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import aligning_rotation, log_so3
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between
@@ -96,6 +97,7 @@ class Pipeline:
             raise MissingInputError('parameters are missing: ' + ', '.join(missing))
         self._keep_images = keep_images
         self._tracker = make_tracker(parameters.tracking) if tracker is None else tracker
+        self._stamps = StampScatter()
         self._health = HealthMonitor()
         self._seen: Tracked | None = None
         self._applied = Applied()
@@ -117,6 +119,7 @@ class Pipeline:
     def reset(self) -> None:
         """Forget the reference keyframe: the next frame starts anew."""
         self._tracker.reset()
+        self._stamps.reset()
         self._reference = self._previous = self._gyro = None
         self._reference_rays = self._current_rays = None
         self._turn = _Turn.none()
@@ -132,6 +135,7 @@ class Pipeline:
         self.prepare()
         sensor = self._sensor_of(frame, parameters)
         view = _View(frame, imu)
+        self._stamps.add(frame.stamp_ns)
         # Without the gyro tracks are not predicted, and wrong ones that agree by chance pass.
         if self._reference is None or self._previous is None or imu.since_previous is None:
             self._tracker.start(frame.image)
@@ -147,12 +151,15 @@ class Pipeline:
             seconds_between(self._previous.frame.stamp_ns, frame.stamp_ns))
         self._previous = view
         self._gyro = self._turn_with(imu.since_previous, parameters)
-        self._compare_turns(frame.stamp_ns, matches, sensor)
         rays1, rays2 = self._derotate(matches, self._reference.imu.motion, imu.motion, sensor)
         since = SinceKeyframe(self._parallax(rays1, rays2, sensor),
                               _interval(self._reference, view), self._frames,
                               self._tracker.tracked_fraction)
-        if not closes_pair(since, parameters.keyframes):
+        closing = closes_pair(since, parameters.keyframes)
+        # Where tracks are lost pairs close early, and few tracks outlive them.
+        if closing or self._turn.frames >= _TURN_FRAMES:
+            self._compare_turns(frame.stamp_ns, matches, sensor)
+        if not closing:
             return None
         result = self._close_pair(self._reference, view, sensor, parameters)
         self._restart_from(view)
@@ -243,7 +250,8 @@ class Pipeline:
             relative_rotation=None if told is None else told.rotation,
             relative_rotation_covariance=None if told is None else told.covariance,
             interval=_interval(reference, view),
-            config=replace(parameters.estimator, gravity_sigma=gravity.sigma),
+            config=replace(parameters.estimator, gravity_sigma=gravity.sigma, stamp_sigma=max(
+                parameters.estimator.stamp_sigma, self._stamps.sigma)),
             quality=matches.quality,
             rng=np.random.default_rng([parameters.pair.seed, stamp1_ns, stamp2_ns]))
         pose = self._judged(pose, matches, reference, view, sensor, parameters)
@@ -267,8 +275,6 @@ class Pipeline:
 
     def _compare_turns(self, stamp_ns: int, matches: Matches, sensor: Sensor) -> None:
         """Compare how images turned over some frames, without the gyro, with the gyro."""
-        if self._turn.frames < _TURN_FRAMES:
-            return
         before, ids = self._turn, matches.track_ids[:_TURN_POINTS]
         rays = sensor.camera.unproject(sensor.intrinsics.to_sensor(matches.points2[:_TURN_POINTS]))
         _, old, new = np.intersect1d(before.ids, ids, assume_unique=True, return_indices=True)
@@ -297,7 +303,8 @@ class Pipeline:
         in_force[OFFSET] = view.imu.applied_offset_ns / NANOSECONDS
         if self._gyro is not None:
             in_force[BIAS] = parameters.sensor.R_cam_imu.T @ self._gyro.segment.bias - bias
-        return Told(parameters.sensor, sensor.camera, bias, in_force)
+        return Told(parameters.sensor, sensor.camera, bias, parameters.imu.gyro_bias_sigma,
+                    in_force)
 
 
 def _evidence(pose: RelativePose, matches: Matches, reference: _View, view: _View, gyro: _GyroTurn,
@@ -307,7 +314,7 @@ def _evidence(pose: RelativePose, matches: Matches, reference: _View, view: _Vie
     return PairEvidence(
         sensor.intrinsics.to_sensor(matches.points1), sensor.intrinsics.to_sensor(matches.points2),
         sensor.camera, reference.imu.motion, view.imu.motion, _interval(reference, view),
-        pose.R, pose.t, gyro.rotation, turn_sensitivity(
+        pose.R, pose.t, gyro.rotation, gyro.covariance, turn_sensitivity(
             segment.stamps_ns, segment.angular_velocities, parameters.imu),
         (segment.angular_velocities[0], segment.angular_velocities[-1]),
         parameters.sensor.R_cam_imu, parameters.estimator.gyro_sigma)

@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 # Sigmas from which on a deviation is certain.
 _CERTAIN = 4.0
 # Shift of the pose in its own sigmas (Mahalanobis) that matters, and that leaves its covariance.
-_MATTERS, _OUTSIDE = 0.5, 3.0
+_MATTERS, _OUTSIDE = 1.0, 3.0
 # Shares of the images' turning that the gyro as told, and at best, leaves unexplained, beyond
 # which its axes are wrong: translation alone leaves some, turned axes nearly all.
 _UNEXPLAINED_AS_TOLD, _EXPLAINED_AT_BEST, _BETTER = 0.7, 0.5, 0.4
@@ -47,6 +47,8 @@ _UNIT_FACTOR = 5.0
 _LONG_TURN, _INDEPENDENT = 2.0, 0.85
 # Rotations within this [rad] of half a turn about an axis of the image also are flipped images.
 _HALF_TURN = 0.35
+# Sigmas of a figure that was told with one, within which it is as told.
+_AS_TOLD = 2.0
 # Figures that are asked for at most: traces of a gross one need some, too.
 _MOST_CAUSES = 4
 # Part of the told distortion that rectified images have at most.
@@ -63,6 +65,7 @@ class Told:
     sensor: SensorConfig
     camera: RollingShutterCamera
     gyro_bias: Array   # (3,) parameter [rad/s]
+    gyro_bias_sigma: float
     in_force: Array   # (11,) deviations that were applied already: tracked figures, bias at rest
 
 
@@ -102,10 +105,10 @@ class Cause(NamedTuple):
     certainty: float   # in sigmas
     shift: float   # of the pose, in its own sigmas (Mahalanobis)
 
-    @property
-    def matters(self) -> bool:
-        """Whether it moves the pose by a share of the pose's own sigma."""
-        return self.shift > _MATTERS
+    def matters(self, told: Told) -> bool:
+        """Whether it moves the pose by its own sigma, and is beyond the sigma that was told."""
+        beyond = np.abs(self.deviation[BIAS]) > _AS_TOLD * told.gyro_bias_sigma
+        return self.shift > _MATTERS and (self.figure.part != BIAS or bool(beyond.any()))
 
 
 def causes(seen: Calibration, effects: list[Effect], in_force: Array) -> list[Cause]:
@@ -166,7 +169,7 @@ def judged(seen: Calibration, explained: list[Cause], turned: TurnComparison | N
                                     if figure.name not in named))
     largest = max((cause.shift for cause in explained), default=0.0)
     faults = {cause.figure.name: cause for cause in explained
-              if cause.matters and cause.shift > _TRACE * largest}
+              if cause.matters(told) and cause.shift > _TRACE * largest}
     found: list[Finding] = []
     for figure in FIGURES:
         if figure.name in faults:

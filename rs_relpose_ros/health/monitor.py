@@ -72,7 +72,7 @@ class HealthMonitor:
 
     def _linearised_at(self, told: Told) -> Array:
         """What is in force, or, once a figure is found off, what is seen."""
-        if not any(cause.matters for cause in self._causes):
+        if not any(cause.matters(told) for cause in self._causes):
             return told.in_force
         return np.asarray(told.in_force + np.clip(self._deviation(), -_LARGEST, _LARGEST))
 

@@ -72,6 +72,7 @@ class PairEvidence:
     R: Array   # (3, 3) as estimated, between the stamped rows
     t: Array   # (3,) NaN where there is none
     gyro_rotation: Array   # (3, 3) between the stamped rows
+    gyro_covariance: Array   # (3, 3) of that, as the estimate had it
     gyro_sensitivity: TurnSensitivity   # of that
     rates: tuple[Array, Array]   # (3,) at the two stamped rows [rad/s]
     R_cam_imu: Array
@@ -138,8 +139,13 @@ def pair_information(pair: PairEvidence, in_force: Array, about: Array) -> PairI
     S = (J_c.T * weights) @ J_c + D.T @ information @ D - C.T @ solved[:, :-1]
     b = C.T @ solved[:, -1] - (J_c.T * weights) @ r + D.T @ (information @ theta)
     S = 0.5 * (S + S.T)
-    return PairInformation(S, b + S @ about, _pose_by_deviation(problem, state, -solved[:, :-1]),
-                           theta + _without_gyro(H, gradient, information, theta))
+    images = theta + _without_gyro(H, gradient, information, theta)
+    # What deviations do to the pose that was estimated, with the prior that it had.
+    information_told = np.linalg.inv(pair.gyro_covariance)
+    H[THETA:THETA + 3, THETA:THETA + 3] += information_told - information
+    C[THETA:THETA + 3] += (information - information_told) @ D
+    moved = _pose_by_deviation(problem, state, -inverse(H) @ C)
+    return PairInformation(S, b + S @ about, moved, images)
 
 
 def _without_gyro(H: Array, gradient: Array, information: Array, theta: Array) -> Array:

@@ -14,7 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.compiled import kernel
+from rs_relpose_ros.compiled import kernel, linked_kernel
 from rs_relpose_ros.geometry.so3 import exp_so3
 from rs_relpose_ros.geometry.vectors import copy_matrix, copy_vector, cross, dot, norm, rotated
 from rs_relpose_ros.solvers.cheirality import cheirality_votes
@@ -159,7 +159,7 @@ def _eliminate(M: Array) -> float:
     return largest
 
 
-@kernel
+@linked_kernel
 def _reduced_constraints(basis: Array, M: Array) -> bool:
     """Constraints in `M` (10, 20) after elimination, `basis` (4, 9) turned if it must be.
 
@@ -377,14 +377,13 @@ def _polish(sample: Sample, R: Array, t: Array) -> bool:
 
 
 @kernel
-def _is_known(out: Solutions, count: int) -> bool:
-    """Whether solution `count` repeats one before it."""
-    R, x = out.R[count], out.x[count]
-    for j in range(count):
+def _is_known(R: Array, x: Array, rotations: Array, vectors: Array) -> bool:
+    """Whether a solution repeats one of those found before, (K, 3, 3) and (K, 9)."""
+    for j in range(len(rotations)):
         gap = 0.0
         for i in range(3):
-            gap += abs(out.R[j, i, 0] - R[i, 0]) + abs(out.R[j, i, 1] - R[i, 1])
-            gap += abs(out.x[j, i] - x[i])
+            gap += abs(rotations[j, i, 0] - R[i, 0]) + abs(rotations[j, i, 1] - R[i, 1])
+            gap += abs(vectors[j, i] - x[i])
         if gap < 1e-9:
             return True
     return False
@@ -422,6 +421,7 @@ def solve_5pt(sample: Sample, _known: Knowledge, out: Solutions) -> int:
     for k in range(found):
         R, x = out.R[count], out.x[count]
         if _essential_matrix(B, roots[k], basis, E) and _decompose(E, sample, R, x) \
-                and _polish(sample, R, x) and not _is_known(out, count):
+                and _polish(sample, R, x) \
+                and not _is_known(R, x, out.R[:count], out.x[:count]):
             count += 1
     return count

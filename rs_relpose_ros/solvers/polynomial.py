@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.compiled import kernel
+from rs_relpose_ros.compiled import kernel, linked_kernel
 
 Array = NDArray[np.float64]
 
@@ -131,7 +131,7 @@ def _roots_between_cuts(derivatives: Array, m: int, cuts: Array, rule: PairRule,
     return count
 
 
-@kernel
+@linked_kernel
 def roots_in_unit_interval(p: Array, rule: PairRule, roots: Array, half_gaps: Array) -> int:
     """All real roots in [-1, 1], ascending; their number, 0 when a coefficient is not finite.
 

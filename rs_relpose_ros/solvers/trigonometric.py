@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.compiled import kernel
+from rs_relpose_ros.compiled import kernel, linked_kernel
 from rs_relpose_ros.solvers.polynomial import PairRule, roots_in_unit_interval
 
 Array = NDArray[np.float64]
@@ -79,7 +79,7 @@ def _is_known(angle: float, angles: Array) -> bool:
     return False
 
 
-@kernel
+@linked_kernel
 def _append_angles(p: Array, scale: float, offset: float, zeros: _Zeros, count: int) -> int:
     """Add the angles ``2 atan(scale x) + offset`` of the roots of `p` in [-1, 1]; new count."""
     degree = p.shape[0] - 1

@@ -1,0 +1,80 @@
+"""The benchmark of covariances: its statistic, and the pairs of a recording."""
+
+import csv
+
+from conftest import ROOT
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_lab.experiments.consistency import on_recording, pair_consistency, read_true_pairs
+from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.cli.main import main
+from rs_relpose_ros.config.parameter_file import read_parameters
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.estimator.result import RelativePose, Status
+from rs_relpose_ros.replay.run import read_truth, Replay
+
+COLUMNS = ['stamp1_ns', 'stamp2_ns', *(f'r{i}{j}' for i in (1, 2, 3) for j in (1, 2, 3)), 'tx',
+           'ty', 'tz', 'sigma_t_deg']
+PARAMETERS = ROOT / 'bags' / 'hand_held.yaml'
+
+
+@pytest.mark.parametrize('claimed', [1.0, 0.5])
+def test_errors_drawn_from_a_covariance(claimed):
+    """NEES by freedom is 1 where the covariance is right, 4 where its sigmas are half of it."""
+    rng = np.random.default_rng(0)
+    t = np.array([0.6, 0.0, 0.8])
+    across = np.eye(3) - np.outer(t, t)
+    root = 0.01 * rng.normal(size=(6, 6))
+    root[:3] = across @ root[:3]
+    sigma = 0.02   # of the truth
+    found = []
+    for _ in range(2000):
+        error = root @ rng.normal(size=6)
+        true_t = t + error[:3] + sigma * across @ rng.normal(size=3)
+        pose = RelativePose(Status.OK, R=np.eye(3), t=t, covariance=claimed**2 * root @ root.T)
+        found.append(pair_consistency('', '', 0.1, pose,
+                                      Rotation.from_rotvec(error[3:]).as_matrix(), true_t,
+                                      claimed * sigma))
+    assert np.mean([p.rotation_nees for p in found]) == pytest.approx(claimed**-2, rel=0.07)
+    assert np.mean([p.translation_nees for p in found]) == pytest.approx(claimed**-2, rel=0.07)
+
+
+def true_pairs(bag_path, path, frames):
+    """A table of pairs of the bundled bag, by its truth; also what they were written from."""
+    parameters = read_parameters(PARAMETERS)
+    with open_bag(bag_path) as bag:
+        topics = bag.find_topics()
+        truth = read_truth(bag, topics)
+        pairs = Replay(bag, topics, parameters).pairs()
+        results = [pair.result for pair, _ in zip(pairs, range(3), strict=False)]
+    results = [results[k] for k in frames]
+    with path.open('w', newline='', encoding='utf-8') as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        for result in results:
+            R, t = truth.relative_pose(result.reference_ns1, result.reference_ns2)
+            writer.writerow([result.reference_stamp_ns, result.stamp_ns, *R.ravel(),
+                             *t / np.linalg.norm(t), 1.0])
+    return results
+
+
+def test_pairs_of_a_recording_are_those_of_the_table(bundled_bag, tmp_path):
+    table = tmp_path / 'pairs.csv'
+    results = true_pairs(bundled_bag, table, (1, 2))
+    assert [pair.translation_sigma for pair in read_true_pairs(table)] == [np.radians(1.0)] * 2
+    found = list(on_recording(bundled_bag, PARAMETERS, table))
+    assert [p.interval for p in found] == [r.interval for r in results]
+    for pair in found:
+        assert pair.rotation < 0.2 and pair.translation < 8.0
+        assert pair.rotation_nees < 5.0 and pair.translation_nees < 5.0
+
+
+def test_a_table_of_something_else_is_refused(tmp_path, capsys):
+    table = tmp_path / 'table.csv'
+    table.write_text('stamp,x\n1,2\n', encoding='utf-8')
+    with pytest.raises(InputError, match='is no table of true pairs'):
+        read_true_pairs(table)
+    assert main(['benchmark', 'consistency', '--bags', '0', '--output', str(tmp_path)]) == 2
+    assert 'nothing to measure' in capsys.readouterr().err
