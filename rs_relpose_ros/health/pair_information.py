@@ -25,7 +25,7 @@ from rs_relpose_ros.estimator.map_fit import FitMatches, stepped
 from rs_relpose_ros.estimator.priors import add_priors, Priors
 from rs_relpose_ros.estimator.problem import build_problem, TwoViewProblem
 from rs_relpose_ros.estimator.sampson import jacobian, residuals
-from rs_relpose_ros.estimator.state import PARAMETERS, TANGENT, THETA, TwoViewState
+from rs_relpose_ros.estimator.state import D1, PARAMETERS, TANGENT, THETA, TwoViewState
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3, skew
@@ -86,6 +86,7 @@ class PairInformation:
     S: Array   # (11, 11)
     b: Array   # (11,)
     pose_by_deviation: Array   # (6, 11) of (dt, dtheta) in camera 1, first order
+    shift_by_deviation: Array   # (5, 11) the same in sigmas of a pose that is told right, whitened
     images_against_gyro: Array   # (3,) [rad] Log of the rotation by images alone and R_gyro^T
 
 
@@ -144,8 +145,11 @@ def pair_information(pair: PairEvidence, in_force: Array, about: Array) -> PairI
     information_told = np.linalg.inv(pair.gyro_covariance)
     H[THETA:THETA + 3, THETA:THETA + 3] += information_told - information
     C[THETA:THETA + 3] += (information - information_told) @ D
-    moved = _pose_by_deviation(problem, state, -inverse(H) @ C)
-    return PairInformation(S, b + S @ about, moved, images)
+    covariance = inverse(H)
+    moved = -covariance @ C
+    spread = np.linalg.cholesky(covariance[:D1, :D1])
+    return PairInformation(S, b + S @ about, _pose_by_deviation(problem, state, moved),
+                           np.linalg.solve(spread, moved[:D1]), images)
 
 
 def _without_gyro(H: Array, gradient: Array, information: Array, theta: Array) -> Array:
