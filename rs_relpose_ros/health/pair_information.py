@@ -144,7 +144,7 @@ def pair_information(pair: PairEvidence, in_force: Array, about: Array) -> PairI
     information_told = np.linalg.inv(pair.gyro_covariance)
     H[THETA:THETA + 3, THETA:THETA + 3] += information_told - information
     C[THETA:THETA + 3] += (information - information_told) @ D
-    moved = _pose_by_deviation(problem, state, -inverse(H) @ C)
+    moved = _pose_by_deviation(pair, problem, state, -inverse(H) @ C)
     return PairInformation(S, b + S @ about, moved, images)
 
 
@@ -175,11 +175,18 @@ def _state(pair: PairEvidence, problem: TwoViewProblem, observations: Array) -> 
     return TwoViewState(R, t, velocity, velocity.copy(), np.zeros(3), np.zeros(3))
 
 
-def _pose_by_deviation(problem: TwoViewProblem, state: TwoViewState, moved: Array) -> Array:
-    """(dt, dtheta) (6, 11) at the stamped row of moved states (17, 11), turned there."""
+def _pose_by_deviation(pair: PairEvidence, problem: TwoViewProblem, state: TwoViewState,
+                       moved: Array) -> Array:
+    """(dt, dtheta) (6, 11) at the stamped row of states (17, 11) moved at the middle one."""
     turn = problem.motion1.rotations([problem.reference_row_time])[0].T
-    return np.vstack([turn @ tangent_basis(state.t) @ moved[TANGENT:TANGENT + 2],
-                      turn @ moved[THETA:THETA + 3]])
+    out = np.vstack([turn @ tangent_basis(state.t) @ moved[TANGENT:TANGENT + 2],
+                     turn @ moved[THETA:THETA + 3]])
+    # A longer read-out puts the middle row later, by D = share c, and the stamped one stays:
+    # t = Exp(w_1 D) t_middle, R = Exp(w_1 D) R_middle Exp(w_2 D)^T.
+    share, (rate1, rate2) = middle_share(pair.camera), pair.rates
+    out[:3, READOUT] += share * np.cross(rate1, turn @ state.t)
+    out[3:, READOUT] += share * (rate1 - pair.gyro_rotation @ rate2)
+    return out
 
 
 def _lens(camera: RollingShutterCamera, focal: float, distortion: float) -> RollingShutterCamera:
