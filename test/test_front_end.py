@@ -118,7 +118,8 @@ CHANGED: dict[str, Any] = {
     'confidence': 0.6, 'max_iterations': 2, 'time_limit': 1e-9, 'min_inliers': 5000,
     'min_parallax': 400.0, 'max_translation_sigma': 0.01,
     'min_keyframe_parallax': 2.0, 'max_keyframe_interval': 0.01,
-    'max_keyframe_frames': 2, 'min_tracked_fraction': 1.0, 'track_time_offset': True}
+    'max_keyframe_frames': 2, 'min_tracked_fraction': 1.0, 'track_time_offset': True,
+    'track_readout_time': True}
 # Shows in what the node publishes.
 OF_THE_NODE = {'publish_debug_image'}
 FRAMES = 60

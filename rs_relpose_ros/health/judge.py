@@ -68,6 +68,11 @@ class Told:
     gyro_bias_sigma: float
     in_force: Array   # (11,) deviations that were applied already: tracked figures, bias at rest
 
+    @property
+    def direction(self) -> float:
+        """1 where row 0 is told to be read first, -1 where it is the last."""
+        return 1.0 if self.sensor.readout_direction == 'down' else -1.0
+
 
 class Effect(NamedTuple):
     """What deviations do to a pair's pose."""
