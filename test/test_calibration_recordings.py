@@ -87,12 +87,13 @@ def test_phone_in_a_car(recordings, tmp_path):
 def test_slow_hand(recordings, tmp_path):
     """Its README estimates 28 ms, without a sigma; offset -56 to -58 ms by the exposure.
 
-    4.8 s at 3 to 4 deg/s are too little for the read-out time and the rotation: what is told must
-    agree with the README within its own sigma, which must not be small.
+    4.8 s at 3 to 4 deg/s are too little for the read-out time and the rotation: neither is
+    observable, and what is told agrees with the README within its sigma.
     """
     figures = calibrated(recordings, 'realsense_rgb_rs', tmp_path)
     readout = figures['readout_time_s']
-    assert abs(readout['value'] - 0.028) < 3.5 * readout['sigma'] < 9e-3
+    assert not readout['observable']
+    assert abs(readout['value'] - 0.028) < 2.0 * readout['sigma'] < 15e-3
     assert figures['shutter'] == 'rolling'
     assert figures['time_offset_s']['value'] == pytest.approx(-0.057, abs=5e-3)
     assert figures['offset_by_interval']['value'] < 0.0

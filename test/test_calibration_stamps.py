@@ -1,4 +1,4 @@
-"""Stamps of frames: automatic exposure against jitter, in calibration and in the node."""
+"""Stamps of frames: automatic exposure against jitter, calibrated and in the node."""
 
 from __future__ import annotations
 
@@ -80,7 +80,8 @@ def test_exposure_becomes_two_parameters_of_the_node(tmp_path):
     result = calibrate(recorded.tracks, recorded.gyro, camera_of(recorded))
     assert result.follows_exposure and result.offset_by_jitter is None
     path = tmp_path / 'calibration.yaml'
-    path.write_text(parameter_file(result, 'A test.', compressed=False))
+    path.write_text(parameter_file(result, 'A test.', camera=camera_of(recorded),
+                                   compressed=False))
     sensor = read_parameters(path).sensor
     assert sensor.time_offset_per_interval == pytest.approx(-0.5, abs=0.1)
     assert sensor.time_offset_reference_interval == pytest.approx(result.frame_interval, abs=1e-6)
@@ -104,7 +105,8 @@ def test_jitter_of_stamps_is_not_taken_for_exposure():
     # The mean of all the stamps' own errors remains.
     assert abs(result.time_offset.value - truth.time_offset) < 2e-3
     assert abs(result.readout_time.value - truth.readout_time) < 1e-3
-    assert 'per_interval' not in parameter_file(result, 'A test.', compressed=False)
+    text = parameter_file(result, 'A test.', camera=camera_of(recorded), compressed=False)
+    assert 'per_interval' not in text
     assert any('not taken for exposure' in line for line in report(result, camera_of(recorded)))
 
 

@@ -331,8 +331,8 @@ def calibration(c, sigma, coupled=0.0):
 
 
 SIGMA = np.array([1e-3] * 3 + [5e-4, 1e-3] + [1e-3] * 3 + [5e-3, 5e-3, 0.01])
-# Turns that are a pose's own sigma for ten sigmas of a deviation.
-EFFECT = Effect(np.vstack([np.zeros((5, DEVIATIONS)), 0.1e-3 / SIGMA]), np.eye(6) * 1e6)
+# Ten sigmas of a deviation turn a pose by its own sigma.
+EFFECT = Effect(*(np.vstack([np.zeros((n - 1, DEVIATIONS)), 0.1 / SIGMA]) for n in (5, 6)))
 
 
 def deviation(**values):

@@ -66,7 +66,7 @@ def parts_of(tracks: Tracks, seconds: float) -> Iterator[tuple[float, Tracks]]:
 def read_bag(path: Path, rows: tuple[float, float]) -> CalibrationInput:
     """Tracks and gyro of a bag; of its image only these rows are used, all where both are 0."""
     with open_bag(path) as bag:
-        return read_recording(bag, bag.find_topics(TopicOptions()),
+        return read_recording(bag, bag.find_topics(TopicOptions(), needs_camera_info=False),
                               TrackingConfig(feature_rows=rows))
 
 

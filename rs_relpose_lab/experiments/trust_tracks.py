@@ -36,6 +36,8 @@ _BORDER = 8.0
 _HIDDEN = 5e-3
 # KLT finds no corner whose place was predicted worse than this [px]: the reach of its pyramid.
 _REACH = 40.0
+# Share of lost corners from which on the prediction is not believed.
+_MOST_LOST = 0.15
 # An odd number whose multiples scatter over the integers.
 _SCATTER = 2654435761
 
@@ -192,8 +194,11 @@ class SimulatedTracker:
         points = self._published(places)
         expected = points if predicted is None else np.where(
             np.isfinite(predicted), predicted, self._matches.points2)
-        good = ((known.ids[frame][rows] == self._corners) & self._inside(points)
-                & (np.linalg.norm(points - expected, axis=1) < _REACH))
+        reached = np.linalg.norm(points - expected, axis=1) < _REACH
+        if np.count_nonzero(~reached) > _MOST_LOST * len(reached):
+            # Then `KltTracker` looks where the corners were.
+            reached |= np.linalg.norm(points - self._matches.points2, axis=1) < _REACH
+        good = (known.ids[frame][rows] == self._corners) & self._inside(points) & reached
         self._matches = replace(self._matches, points2=points).kept(good)
         self._corners, self._offsets = self._corners[good], self._offsets[good]
         self._places = places[good]

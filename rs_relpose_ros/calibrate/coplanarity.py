@@ -267,10 +267,11 @@ def _add_view(J: Array, by_turn: Vector, sight: _Sight, row: float, covariate: f
 @inlined_kernel
 def _blur_at(problem: Problem, k: int, instant: float, out: Array) -> None:
     """Turn (3,) by the square of the exposure at an instant after knot `k` [rad/s^2]."""
-    share = (instant - problem.gyro_times[k]) / (problem.gyro_times[k + 1] - problem.gyro_times[k])
+    dt = instant - problem.gyro_times[k]
+    half_share = 0.5 * dt / (problem.gyro_times[k + 1] - problem.gyro_times[k])
     for i in range(3):
-        out[i] = problem.blur_turns[k, i] + share * (
-            problem.blur_turns[k + 1, i] - problem.blur_turns[k, i])
+        change = problem.blur_rates[k + 1, i] - problem.blur_rates[k, i]
+        out[i] = problem.blur_turns[k, i] + dt * (problem.blur_rates[k, i] + half_share * change)
 
 
 @inlined_kernel

@@ -84,8 +84,7 @@ def blur(times: Array, rates: Array) -> tuple[Array, Array]:
     changes = (means - rates) / _EXPOSURE**2
     turns = np.concatenate([np.zeros((1, 3)),
                             np.cumsum(0.5 * steps * (changes[1:] + changes[:-1]), axis=0)])
-    # A turn that is always the same is a part of the rotation between IMU and camera.
-    return changes, turns - turns.mean(axis=0)
+    return changes, turns
 
 
 class GyroPath(NamedTuple):

@@ -48,11 +48,12 @@ def judged(data: Observations, final: Fit, free: NDArray[np.bool_], curve: CostC
     InputError
         The read-out time is longer than the interval between frames.
     """
-    # Errors of the tracker that are alike over all of a recording.
+    # Errors of tracker and model that are alike over all of a recording.
     tracker = np.zeros(GLOBAL)
     tracker[[READOUT, OFFSET]] = config.tracking_time_sigma
     tracker[ROTATION:ROTATION + 3] = config.tracking_rotation_sigma
     tracker[BIAS:BIAS + 3] = config.tracking_bias_sigma
+    tracker[SLOPE] = config.exposure_slope_sigma
     tracker[FOCAL] = _LEAST_FOCAL_SIGMA
     covariance = final.covariance + np.diag(np.where(free, tracker, 0.0)**2)
     parameters, R_cam_imu = final.unknowns.parameters, final.unknowns.R_imu_cam.T

@@ -128,8 +128,6 @@ def parameter_file(result: CalibrationResult, title: str, *, camera: RollingShut
     if feature_rows[1] > 0.0:
         values.append(SourcedValue('feature_rows', tuple(feature_rows), 'As given to calibrate.'))
     missing = [name for observable, name, _ in told if not observable]
-    if result.focal_factor is not None and not result.focal_factor.observable:
-        missing.append(f'focal length ({result.focal_factor.remark})')
     if missing:
         title += ' Not observable in this recording, so left out: ' + '; '.join(missing) + '.'
     return parameter_text(title, values)

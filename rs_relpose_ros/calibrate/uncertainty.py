@@ -19,7 +19,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -34,8 +33,9 @@ Array = NDArray[np.float64]
 
 # Regions of the image: columns and rows of equally many points.
 _COLUMNS, _ROWS = 4, 3
-# Mean square, in sigmas, by which the figures of two halves differ by chance, at most.
-_CHANCE = 1.75
+# Square, in sigmas, by which the figures of two halves differ by chance, at most: in the mean
+# over all of them, and each.
+_CHANCE, _GROSS = 1.75, 9.0
 
 
 class ModelErrors(NamedTuple):
@@ -50,7 +50,7 @@ class ModelErrors(NamedTuple):
 
 
 # Of a camera whose CameraInfo has no intrinsics.
-UNCALIBRATED = ModelErrors(focal=0.0, aspect=0.005, center=0.02, radial=0.05)
+UNCALIBRATED = ModelErrors(focal=0.0, aspect=0.005, center=0.01, radial=0.05)
 
 
 def widened(final: Fit, free: NDArray[np.bool_], errors: ModelErrors | None) -> Fit:
@@ -66,8 +66,8 @@ def widened(final: Fit, free: NDArray[np.bool_], errors: ModelErrors | None) -> 
 def _between_regions(final: Fit, free: NDArray[np.bool_]) -> Array:
     """Factors (G,) of the variances by what regions of the image scatter more than cells do.
 
-    Cells are regions times stretches of time: where the regions scatter no more than these, by
-    more than chance, the stretches have it all.
+    Cells are regions times stretches of time: where the regions scatter no more than these, the
+    stretches have it all.
     """
     problem, curve = final.problem, bent(final.weights)
     index = np.ix_(free, free)
@@ -83,8 +83,7 @@ def _between_regions(final: Fit, free: NDArray[np.bool_]) -> Array:
         moves.append(np.linalg.pinv(rest_curvature, hermitian=True) @ own.sum(axis=0))
         of_cells = np.stack([own[stretch == k].sum(axis=0) for k in np.unique(stretch)]) @ inverse
         cells += of_cells.T @ of_cells
-    by_chance = 1.0 + math.sqrt(2.0 / (len(moves) - 1))
-    beyond = np.diag(jackknife_of(np.array(moves)) - by_chance * cells)
+    beyond = np.diag(jackknife_of(np.array(moves)) - cells)
     factors = np.ones(GLOBAL)
     factors[free] += np.maximum(beyond, 0.0) / np.diag(final.covariance)[free]
     return factors
@@ -98,8 +97,12 @@ def _regions(points: Array) -> NDArray[np.int64]:
     return band(points[:, 0], _COLUMNS) + _COLUMNS * band(points[:, 1], _ROWS)
 
 
-def _disagreement(final: Fit, free: NDArray[np.bool_]) -> float:
-    """Mean square of the difference of both halves in their sigmas; 1 where chance explains it."""
+def _disagreement(final: Fit, free: NDArray[np.bool_]) -> Array:
+    """Factors (G,) of the variances by the difference of both halves; 1 where chance explains it.
+
+    They share the mean square of the differences in sigmas, in which a figure counts up to
+    `_GROSS`; a figure with a larger one has that.
+    """
     middles = final.problem.middles
     first = middles < np.median(middles)
     halves = [fit(final.problem.pairs_of(part), final.unknowns.pairs_of(part), free, rounds=15)
@@ -109,8 +112,12 @@ def _disagreement(final: Fit, free: NDArray[np.bool_]) -> float:
     difference[ROTATION:ROTATION + 3] = log_so3(
         one.unknowns.R_imu_cam @ other.unknowns.R_imu_cam.T)
     variances = np.diag(one.covariance + other.covariance)
-    mean = float((difference[free]**2 / variances[free]).mean())
-    return mean if mean > _CHANCE else 1.0
+    squares = difference[free]**2 / variances[free]
+    mean = float(np.minimum(squares, _GROSS).mean())
+    factors = np.ones(GLOBAL)
+    factors[free] = np.maximum(mean if mean > _CHANCE else 1.0,
+                               np.where(squares > _GROSS, squares, 1.0))
+    return factors
 
 
 def _move(final: Fit, free: NDArray[np.bool_], problem: Problem) -> Array:

@@ -34,6 +34,9 @@ class CalibrationConfig:
 
     exposed: bool = setting(
         False, 'whether the points come from images, each of which is exposed for a while')
+    exposure_slope_sigma: float = setting(
+        0.0, 'error of the offset by the interval: the exposure changes within a step of the '
+        'interval, too', 's/s', low=0.0, high=10.0)
     tracking_time_sigma: float = setting(
         0.0, 'error of read-out and offset by the tracker, beyond scatter', 's', low=0.0, high=0.1)
     tracking_rotation_sigma: float = setting(
@@ -48,5 +51,5 @@ class CalibrationConfig:
 # Errors that a tracker makes alike over all of a recording, which its scatter does not show: found
 # on rendered bags with KLT.
 TRACKED_IN_IMAGES = CalibrationConfig(
-    exposed=True, tracking_time_sigma=5e-5, tracking_rotation_sigma=1e-3,
-    tracking_bias_sigma=2.5e-4)
+    exposed=True, exposure_slope_sigma=0.08, tracking_time_sigma=5e-5,
+    tracking_rotation_sigma=1e-3, tracking_bias_sigma=2.5e-4)

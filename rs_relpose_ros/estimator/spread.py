@@ -22,11 +22,25 @@ def correlation(observations: Array, use: NDArray[np.bool_], first: int, second:
     return out
 
 
+@kernel
 def distinct_directions(observations: Array, use: NDArray[np.bool_], first: int,
                         cell: float) -> int:
     """Number of different rays, to `cell` [rad]: copies of one say nothing new."""
-    column, row = np.rint(observations[use, first:first + 2] / cell).T
-    return len(np.unique(column + 1e6 * row))
+    # A hash table with open addressing: a sort takes seconds to compile.
+    slots = np.empty(4 * use.shape[0] + 1)
+    for i in range(slots.shape[0]):
+        slots[i] = np.inf
+    different = 0
+    for i in range(observations.shape[0]):
+        if use[i]:
+            key = round(observations[i, first] / cell) \
+                + 1e6 * round(observations[i, first + 1] / cell)
+            slot = np.int64(abs(key)) % slots.shape[0]
+            while slots[slot] != np.inf and slots[slot] != key:
+                slot = (slot + 1) % slots.shape[0]
+            different += slots[slot] == np.inf
+            slots[slot] = key
+    return different
 
 
 def distance_from_a_plane(observations: Array, use: NDArray[np.bool_], first: int) -> float:

@@ -1,7 +1,7 @@
 """From what was seen to findings: which figure is off, by how much, does it matter, what to do.
 
 A deviation is *suspect* where it is certain (more than `_CERTAIN` sigmas) and moves the pose by a
-share of the pose's own sigma, *wrong* where it moves the pose out of its covariance.
+sigma of a pose that is told right, *wrong* where it moves the pose out of its covariance.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _LONG_TURN, _INDEPENDENT = 2.0, 0.85
 # Rotations within this [rad] of half a turn about an axis of the image also are flipped images.
 _HALF_TURN = 0.35
 # Sigmas of a figure that was told with one, within which it is as told.
-_AS_TOLD = 2.0
+_AS_TOLD = 3.0
 # Figures that are asked for at most: traces of a gross one need some, too.
 _MOST_CAUSES = 4
 # Part of the told distortion that rectified images have at most.
@@ -77,8 +77,8 @@ class Told:
 class Effect(NamedTuple):
     """What deviations do to a pair's pose."""
 
-    pose_by_deviation: Array   # (6, 11) of (dt, dtheta)
-    information: Array   # (6, 6) inverse of the covariance that was claimed
+    shift: Array   # (5, 11) in sigmas of a pose that is told right
+    claimed_shift: Array   # (6, 11) in those that were claimed, which may hold the disagreement
 
 
 class Figure(NamedTuple):
@@ -108,10 +108,12 @@ class Cause(NamedTuple):
     deviation: Array   # (11,) from what is in force; of the figure alone
     sigma: Array   # (11,)
     certainty: float   # in sigmas
-    shift: float   # of the pose, in its own sigmas (Mahalanobis)
+    # Of the pose, Mahalanobis: in sigmas of one that is told right, and in those claimed.
+    shift: float
+    claimed_shift: float
 
     def matters(self, told: Told) -> bool:
-        """Whether it moves the pose by its own sigma, and is beyond the sigma that was told."""
+        """Whether it moves the pose by its sigma, beyond what was told with a sigma."""
         beyond = np.abs(self.deviation[BIAS]) > _AS_TOLD * told.gyro_bias_sigma
         return self.shift > _MATTERS and (self.figure.part != BIAS or bool(beyond.any()))
 
@@ -159,7 +161,9 @@ def _cause(figure: Figure, together: Array, sigma: Array, certainty: float,
            effects: list[Effect]) -> Cause:
     deviation = np.zeros(DEVIATIONS)
     deviation[figure.part] = together[figure.part]
-    return Cause(figure, deviation, sigma, certainty, _shift_in_sigmas(effects, deviation))
+    return Cause(figure, deviation, sigma, certainty,
+                 _median_length([effect.shift @ deviation for effect in effects]),
+                 _median_length([effect.claimed_shift @ deviation for effect in effects]))
 
 
 def judged(seen: Calibration, explained: list[Cause], turned: TurnComparison | None,
@@ -191,14 +195,8 @@ def judged(seen: Calibration, explained: list[Cause], turned: TurnComparison | N
     return Health(tuple(found))
 
 
-def _shift_in_sigmas(effects: list[Effect], deviation: Array) -> float:
-    """Median shift of the latest poses by a deviation (11,), in their own sigmas."""
-    if not effects:
-        return 0.0
-    moved = np.array([effect.pose_by_deviation @ deviation for effect in effects])
-    information = np.array([effect.information for effect in effects])
-    return math.sqrt(max(float(np.median(np.einsum(
-        'pi,pij,pj->p', moved, information, moved))), 0.0))
+def _median_length(shifts: list[Array]) -> float:
+    return float(np.median(np.linalg.norm(shifts, axis=1))) if shifts else 0.0
 
 
 # -- figures one by one ----------------------------------------------------------------------
@@ -207,7 +205,7 @@ def _shift_in_sigmas(effects: list[Effect], deviation: Array) -> float:
 def _fault_of(cause: Cause, told: Told) -> Iterator[Finding]:
     """Findings on a figure that is off by enough to matter."""
     figure = cause.figure
-    sure = cause.shift * (1.0 - 2.0 / cause.certainty)
+    sure = cause.claimed_shift * (1.0 - 2.0 / cause.certainty)
     state = HealthState.WRONG if sure > _OUTSIDE else HealthState.SUSPECT
     described = _described(figure, cause.deviation[figure.part], cause.sigma[figure.part], told)
     if figure.name == 'readout_time' and described.seen < 0.0:
@@ -218,7 +216,7 @@ def _fault_of(cause: Cause, told: Told) -> Iterator[Finding]:
         return
     yield Finding(figure.name, described.told, described.seen, described.sigma, figure.unit, True,
                   state, f'{described.text} (moves the pose by {cause.shift:.1f} of its sigmas): '
-                  f'{described.remedy}')
+                  f'{_remedy(figure, cause.deviation[figure.part], described, told)}')
     if figure.name == 'distortion' and described.told and (
             abs(described.seen) < _LITTLE_OF * abs(described.told)):
         yield _fault('image_geometry', state, 'the images have hardly any distortion left: are '
@@ -232,7 +230,6 @@ class _Described(NamedTuple):
     seen: float
     sigma: float
     text: str   # told and seen
-    remedy: str
 
 
 def _described(figure: Figure, left: Array, sigmas: Array, told: Told) -> _Described:
@@ -240,46 +237,58 @@ def _described(figure: Figure, left: Array, sigmas: Array, told: Told) -> _Descr
     sensor, camera, force = told.sensor, told.camera, told.in_force
     worst = int(np.argmax(np.abs(left) / sigmas))
     deviation, sigma = float(left[worst]), float(sigmas[worst])
-    if figure.part == AXES:
+    if figure.name == 'axes':
         angle, spread = math.degrees(float(np.linalg.norm(left))), math.degrees(sigma)
-        xyzw = Rotation.from_matrix(exp_so3(left) @ sensor.R_cam_imu).as_quat()
         return _Described(0.0, angle, spread, f'the IMU is turned by {angle:.2f} +- {spread:.2f} '
-                          'deg against quat_cam_imu_xyzw',
-                          f'set quat_cam_imu_xyzw: {[round(float(q), 5) for q in xyzw]}')
-    if figure.part == BIAS:
-        before, now = told.gyro_bias + force[BIAS], told.gyro_bias + force[BIAS] + left
-        listed = [round(float(value), 5) for value in now]
+                          'deg against quat_cam_imu_xyzw')
+    if figure.name == 'gyro_bias':
+        before = told.gyro_bias + force[BIAS]
+        now = before + left
         return _Described(float(before[worst]), float(now[worst]), sigma,
-                          f'{listed} +- {sigma:.5f} rad/s is seen, '
-                          f'{[round(float(value), 5) for value in before]} in force',
-                          f'set gyro_bias: {listed}, and let the camera stand still at the start')
+                          f'{_listed(now)} +- {sigma:.5f} rad/s is seen, {_listed(before)} in '
+                          'force')
     if figure.name == 'time_offset':
-        offset = sensor.time_offset + float(force[OFFSET])
-        return _in_ms(offset, offset + deviation, sigma, 'set time_offset: '
-                      f'{offset + deviation:.4f}, or track_time_offset: true')
+        return _in_ms(sensor.time_offset + float(force[OFFSET]), deviation, sigma)
     if figure.name == 'readout_time':
-        signed = camera.line_delay * camera.height
-        return _in_ms(abs(signed), (signed + deviation) * math.copysign(1.0, signed), sigma,
-                      f'set readout_time: {abs(signed + deviation):.4f}')
+        # Signed: the deviation is that of the signed read-out.
+        return _in_ms(camera.readout_time, told.direction * deviation, sigma)
     if figure.name == 'gyro_scale':
         return _Described(1.0, 1.0 + deviation, sigma, f'the gyro must be multiplied by '
-                          f'{1.0 + deviation:.3f} +- {sigma:.3f}',
-                          'calibrate the gyro, or correct its driver')
+                          f'{1.0 + deviation:.3f} +- {sigma:.3f}')
     if figure.name == 'focal_length':
         seen = camera.fx / (1.0 + deviation)
-        spread = sigma * seen
-        return _Described(camera.fx, seen, spread, f'{seen:.1f} +- {spread:.1f} px is seen, the '
-                          f'CameraInfo says {camera.fx:.1f} px',
-                          'calibrate the camera at this resolution and focus')
+        return _Described(camera.fx, seen, sigma * seen, f'{seen:.1f} +- {sigma * seen:.1f} px is '
+                          f'seen, the CameraInfo says {camera.fx:.1f} px')
     first = camera.distortion[0] if camera.distortion else 0.0
     return _Described(first, first + deviation, sigma, f'the first coefficient is seen as '
-                      f'{first + deviation:+.3f} +- {sigma:.3f}, the CameraInfo says {first:+.3f}',
-                      'calibrate the lens')
+                      f'{first + deviation:+.3f} +- {sigma:.3f}, the CameraInfo says {first:+.3f}')
 
 
-def _in_ms(told: float, seen: float, sigma: float, remedy: str) -> _Described:
+def _in_ms(told: float, deviation: float, sigma: float) -> _Described:
+    seen = told + deviation
     return _Described(told, seen, sigma, f'{1e3 * seen:.1f} +- {1e3 * sigma:.1f} ms is seen, '
-                      f'{1e3 * told:.1f} ms in force', remedy)
+                      f'{1e3 * told:.1f} ms in force')
+
+
+def _listed(values: Array, digits: int = 5) -> list[float]:
+    return [round(float(value), digits) for value in values]
+
+
+def _remedy(figure: Figure, left: Array, described: _Described, told: Told) -> str:
+    """What to do about a figure that is off."""
+    seen = described.seen
+    if figure.name == 'axes':
+        xyzw = Rotation.from_matrix(exp_so3(left) @ told.sensor.R_cam_imu).as_quat()
+        return f'set quat_cam_imu_xyzw: {_listed(xyzw)}'
+    if figure.name == 'gyro_bias':
+        return (f'set gyro_bias: {_listed(told.gyro_bias + told.in_force[BIAS] + left)}, and let '
+                'the camera stand still at the start')
+    return {
+        'time_offset': f'set time_offset: {seen:.4f}, or track_time_offset: true',
+        'readout_time': f'set readout_time: {seen:.4f}',
+        'gyro_scale': 'calibrate the gyro, or correct its driver',
+        'focal_length': 'calibrate the camera at this resolution and focus',
+        'distortion': 'calibrate the lens'}[figure.name]
 
 
 def _fault(figure: str, state: HealthState, sentence: str, told: float | None = None,
@@ -321,8 +330,7 @@ def _turned_axes(turned: TurnComparison, told: Told) -> Iterator[Finding]:
                      'wrong sign')
         return
     angle, Q = turned.angle, turned.rotation
-    xyzw = [round(float(q), 3) for q in Rotation.from_matrix(
-        Q @ told.sensor.R_cam_imu).as_quat()]
+    xyzw = _listed(Rotation.from_matrix(Q @ told.sensor.R_cam_imu).as_quat(), 3)
     yield _fault('axes', wrong, f'images turn about axes that are {math.degrees(angle):.0f} deg '
                  f'from those of the gyro by quat_cam_imu_xyzw: about {xyzw} fits, which '
                  '"rs_relpose calibrate" refines (a static transform with parent imu holds the '

@@ -91,8 +91,9 @@ def withheld(pose: RelativePose, health: Health) -> RelativePose:
 def _effect(information: PairInformation, pose: RelativePose) -> Effect:
     # t is a direction: along itself it has no variance, and nothing moves it there.
     along = np.concatenate([pose.t, np.zeros(3)])
-    return Effect(information.pose_by_deviation, np.asarray(
-        np.linalg.inv(pose.covariance + np.outer(along, along))))
+    claimed = np.linalg.cholesky(pose.covariance + np.outer(along, along))
+    return Effect(information.shift_by_deviation, np.asarray(
+        np.linalg.solve(claimed, information.pose_by_deviation)))
 
 
 def _widened(pose: RelativePose, shift: Array) -> RelativePose:

@@ -25,7 +25,7 @@ from rs_relpose_ros.estimator.map_fit import FitMatches, stepped
 from rs_relpose_ros.estimator.priors import add_priors, Priors
 from rs_relpose_ros.estimator.problem import build_problem, TwoViewProblem
 from rs_relpose_ros.estimator.sampson import jacobian, residuals
-from rs_relpose_ros.estimator.state import PARAMETERS, TANGENT, THETA, TwoViewState
+from rs_relpose_ros.estimator.state import D1, PARAMETERS, TANGENT, THETA, TwoViewState
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3, skew
@@ -86,6 +86,7 @@ class PairInformation:
     S: Array   # (11, 11)
     b: Array   # (11,)
     pose_by_deviation: Array   # (6, 11) of (dt, dtheta) in camera 1, first order
+    shift_by_deviation: Array   # (5, 11) the same in sigmas of a pose that is told right, whitened
     images_against_gyro: Array   # (3,) [rad] Log of the rotation by images alone and R_gyro^T
 
 
@@ -144,8 +145,11 @@ def pair_information(pair: PairEvidence, in_force: Array, about: Array) -> PairI
     information_told = np.linalg.inv(pair.gyro_covariance)
     H[THETA:THETA + 3, THETA:THETA + 3] += information_told - information
     C[THETA:THETA + 3] += (information - information_told) @ D
-    moved = _pose_by_deviation(pair, problem, state, -inverse(H) @ C)
-    return PairInformation(S, b + S @ about, moved, images)
+    covariance = inverse(H)
+    moved = _at_stamped_row(pair, problem, state, -covariance @ C)
+    spread = np.linalg.cholesky(covariance[:D1, :D1])
+    return PairInformation(S, b + S @ about, _pose_by_deviation(problem, state, moved),
+                           np.linalg.solve(spread, moved[:D1]), images)
 
 
 def _without_gyro(H: Array, gradient: Array, information: Array, theta: Array) -> Array:
@@ -175,18 +179,28 @@ def _state(pair: PairEvidence, problem: TwoViewProblem, observations: Array) -> 
     return TwoViewState(R, t, velocity, velocity.copy(), np.zeros(3), np.zeros(3))
 
 
-def _pose_by_deviation(pair: PairEvidence, problem: TwoViewProblem, state: TwoViewState,
-                       moved: Array) -> Array:
-    """(dt, dtheta) (6, 11) at the stamped row of states (17, 11) moved at the middle one."""
+def _at_stamped_row(pair: PairEvidence, problem: TwoViewProblem, state: TwoViewState,
+                    moved: Array) -> Array:
+    """Moved states (17, 11) at the middle row, with what moves it against the stamped one.
+
+    A longer read-out puts the middle row later, by D = share c, and the stamped one stays:
+    ``t = Exp(w_1 D) t_middle, R = Exp(w_1 D) R_middle Exp(w_2 D)^T``; w in middle-row axes.
+    """
+    turn = problem.motion1.rotations([problem.reference_row_time])[0]
+    share, rate1 = middle_share(pair.camera), turn @ pair.rates[0]
+    rate2 = turn @ (pair.gyro_rotation @ pair.rates[1])
+    moved = moved.copy()
+    moved[TANGENT:TANGENT + 2, READOUT] += share * (tangent_basis(state.t).T
+                                                    @ np.cross(rate1, state.t))
+    moved[THETA:THETA + 3, READOUT] += share * (rate1 - rate2)
+    return moved
+
+
+def _pose_by_deviation(problem: TwoViewProblem, state: TwoViewState, moved: Array) -> Array:
+    """(dt, dtheta) (6, 11) of moved states (17, 11), in the axes of the stamped row."""
     turn = problem.motion1.rotations([problem.reference_row_time])[0].T
-    out = np.vstack([turn @ tangent_basis(state.t) @ moved[TANGENT:TANGENT + 2],
-                     turn @ moved[THETA:THETA + 3]])
-    # A longer read-out puts the middle row later, by D = share c, and the stamped one stays:
-    # t = Exp(w_1 D) t_middle, R = Exp(w_1 D) R_middle Exp(w_2 D)^T.
-    share, (rate1, rate2) = middle_share(pair.camera), pair.rates
-    out[:3, READOUT] += share * np.cross(rate1, turn @ state.t)
-    out[3:, READOUT] += share * (rate1 - pair.gyro_rotation @ rate2)
-    return out
+    return np.vstack([turn @ tangent_basis(state.t) @ moved[TANGENT:TANGENT + 2],
+                      turn @ moved[THETA:THETA + 3]])
 
 
 def _lens(camera: RollingShutterCamera, focal: float, distortion: float) -> RollingShutterCamera:
