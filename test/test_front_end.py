@@ -121,7 +121,7 @@ CHANGED: dict[str, Any] = {
     'min_parallax': 400.0, 'stamp_sigma': 0.01, 'max_translation_sigma': 0.01,
     'min_keyframe_parallax': 2.0, 'max_keyframe_interval': 0.01,
     'max_keyframe_frames': 2, 'min_tracked_fraction': 1.0, 'track_time_offset': True,
-    'withhold_when_wrong': False}
+    'track_readout_time': True, 'withhold_when_wrong': False}
 # Of these an effect shows with other parameters only.
 BESIDE: dict[str, dict[str, Any]] = {
     # Many samples are needed: the hypotheses of a solver without priors, few of which fit.

@@ -48,6 +48,8 @@ EXPECTED = {
     'tracked_gyro_bias_rad_s': '0.01000 -0.02000 0.03000',
     'tracked_gyro_bias_sigma_rad_s': '0.00100 0.00200 0.00300', 'tracked_time_offset_ms': '4.00',
     'tracked_time_offset_sigma_ms': '0.50', 'applied_time_offset_ms': '-1.50',
+    'tracked_readout_time_ms': '31.00', 'tracked_readout_time_sigma_ms': '0.70',
+    'applied_readout_time_ms': '0.80',
     'health': 'ok', 'health_findings': 'time_offset ok: 4 ms',
     'latency_p50_ms': '15.0', 'latency_p99_ms': '15.0',
     'frame_time_p50_ms': '30.0', 'frame_time_p99_ms': '30.0', 'worker_busy_percent': '2',
@@ -204,7 +206,8 @@ def test_every_counter_has_its_own_figure(clock):
     last = replace(
         pair(Status.LOW_PARALLAX, 'it stands'), health=Health((told,)), tracked=Tracked(
             gyro_bias=np.array([0.01, -0.02, 0.03]), gyro_bias_sigma=np.array([1e-3, 2e-3, 3e-3]),
-            time_offset=0.004, time_offset_sigma=0.0005, pairs=7), applied=Applied(-0.0015))
+            time_offset=0.004, time_offset_sigma=0.0005, readout_time=0.031,
+            readout_time_sigma=0.0007, pairs=7), applied=Applied(-0.0015, 0.0008))
     clock.now = SECOND
     for result in (pair(), pair(), last):
         statistics.add_pair(result, clock.now - 15 * 10**6)

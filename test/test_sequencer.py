@@ -21,6 +21,7 @@ from rs_relpose_ros.front_end.sequencer import (
     WAITING_FRAMES,
 )
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
+from rs_relpose_ros.health.tracked import Applied
 from rs_relpose_ros.images.encoded import CompressedImage
 from rs_relpose_ros.imu.samples import ImuSample
 
@@ -515,3 +516,49 @@ def test_a_frame_of_a_longer_interval_waits_for_its_own_last_row():
     assert sequencer.take() is None
     sequencer.add_imu(sample(170))
     assert stamps(drain(sequencer)) == [140.0]
+
+
+# -- figures that are tracked ------------------------------------------------------------------
+
+
+def since_start_ms(*instants_ns: int) -> list[float]:
+    return [(ns - START) / MS for ns in instants_ns]
+
+
+@pytest.mark.parametrize('offline', [False, True])
+def test_a_shifted_frame_waits_for_its_shifted_rows(offline):
+    sequencer = Sequencer(parameters(), offline=offline, clock=Clock())
+    for ms in (50, 100):
+        sequencer.add_frame(frame(ms))
+    # Both are ready at 119 ms; then the second one is moved by 20 ms.
+    add_imu(sequencer, 0, 120)
+    first = sequencer.take()
+    assert since_start_ms(first.imu.reference_ns) == [50]
+    assert first.imu.applied_offset_ns == 0
+    sequencer.apply(Applied(0.02))
+    assert sequencer.take() is None
+    add_imu(sequencer, 125, 135)
+    assert sequencer.take() is None
+    add_imu(sequencer, 140, 140)
+    second = sequencer.take()
+    assert since_start_ms(second.imu.reference_ns) == [120]
+    assert second.imu.applied_offset_ns == 20 * MS
+    turned = second.imu.since_previous.stamps_ns
+    assert since_start_ms(turned[0], turned[-1]) == [50, 120]
+    # Backwards by more than the gyro knows: a gap, as for any frame.
+    sequencer.apply(Applied(-0.2))
+    sequencer.add_frame(frame(150))
+    assert sequencer.take().cause is Refusal.IMU_GAP
+
+
+def test_a_frame_of_a_longer_readout_waits_for_its_rows(live):
+    live.add_frame(frame(50))
+    add_imu(live, 0, 70)
+    live.apply(Applied(readout_time=0.004, margin=0.0045))
+    assert live.take() is None
+    add_imu(live, 75, 75)
+    ready = live.take()
+    # The rows end at 69 ms as told; the stamped one stays.
+    assert since_start_ms(ready.imu.reference_ns) == [50]
+    times = ready.imu.motion.knot_times
+    assert (times[0], times[-1]) == (pytest.approx(-0.0045), pytest.approx(0.0235))

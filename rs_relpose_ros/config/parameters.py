@@ -51,6 +51,9 @@ class SensorConfig:
     track_time_offset: bool = setting(
         False, 'apply the time offset that is tracked while running (it is always reported)',
         live=True)
+    track_readout_time: bool = setting(
+        False, 'apply the read-out time that is tracked while running (it is always reported)',
+        live=True)
     quat_cam_imu_xyzw: tuple[float, ...] | None = setting(
         None, 'rotation IMU to camera, v_cam = R(q) v_imu; x y z w', low=-1.0, high=1.0, length=4,
         kind=tuple)

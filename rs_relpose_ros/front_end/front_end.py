@@ -77,7 +77,7 @@ class FrontEnd:
             pair = self._pipeline.process(taken.frame, taken.imu, self.parameters)
             seconds = time.perf_counter() - started
             # Between two frames, so that the shift of a frame depends on those before it alone.
-            self.sequencer.apply_time_offset(self._pipeline.applied_offset_ns)
+            self.sequencer.apply(self._pipeline.applied)
             return FrameProcessed(stamp_ns, taken.ready_ns, taken.taken_ns, seconds, pair)
         except Exception as error:
             self._pipeline.reset()

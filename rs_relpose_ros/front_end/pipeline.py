@@ -19,10 +19,10 @@ from rs_relpose_ros.front_end.stamp_scatter import StampScatter
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import aligning_rotation, log_so3
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between
-from rs_relpose_ros.health.deviation import BIAS, DEVIATIONS, OFFSET
+from rs_relpose_ros.health.deviation import BIAS, DEVIATIONS, OFFSET, READOUT
 from rs_relpose_ros.health.judge import Told
 from rs_relpose_ros.health.monitor import HealthMonitor, withheld
-from rs_relpose_ros.health.pair_information import middle_share, PairEvidence
+from rs_relpose_ros.health.pair_information import PairEvidence
 from rs_relpose_ros.health.tracked import Applied, Tracked
 from rs_relpose_ros.health.turning import rotation_of_rays
 from rs_relpose_ros.imu.frame_imu import FrameImu, GyroSegment
@@ -102,6 +102,7 @@ class Pipeline:
         self._seen: Tracked | None = None
         self._applied = Applied()
         self._sensor: Sensor | None = None
+        self._readout = 0.0   # [s] that its camera has beyond the parameter
         self._reference: _View | None = None
         self._previous: _View | None = None
         self._frames = 0   # since the reference keyframe
@@ -112,9 +113,9 @@ class Pipeline:
         self._promotion_due = False
 
     @property
-    def applied_offset_ns(self) -> int:
-        """Tracked time offset that the next frame is to be shifted by [ns]."""
-        return self._applied.time_offset_ns
+    def applied(self) -> Applied:
+        """Tracked figures that the next frame is to have."""
+        return self._applied
 
     def reset(self) -> None:
         """Forget the reference keyframe: the next frame starts anew."""
@@ -180,7 +181,15 @@ class Pipeline:
         if self._sensor is None or frame.intrinsics != self._sensor.intrinsics:
             self.reset()
             self._health.clear()
-            self._sensor = Sensor(sensor_camera(frame.intrinsics, parameters), frame.intrinsics)
+            self._sensor = None
+        if self._sensor is None or self._readout != self._applied.readout_time:
+            camera = sensor_camera(frame.intrinsics, parameters)
+            self._readout = self._applied.readout_time
+            self._sensor = Sensor(replace(
+                camera, readout_time=max(camera.readout_time + self._readout, 0.0)),
+                frame.intrinsics)
+            # Row times of its rays are those of the camera before.
+            self._current_rays = None
         return self._sensor
 
     def _restart_from(self, view: _View) -> None:
@@ -291,10 +300,8 @@ class Pipeline:
             evidence = _evidence(pose, matches, reference, view, self._gyro, sensor, parameters)
         told = self._told(view, sensor, parameters)
         pose = self._health.add_pair(view.frame.stamp_ns, evidence, pose, told)
-        self._seen = Tracked.of(self._health.calibration, parameters.sensor, told.gyro_bias,
-                                middle_share(sensor.camera))
-        self._applied = self._applied.moved(self._seen, parameters.sensor.time_offset,
-                                            track_offset=parameters.sensor.track_time_offset)
+        self._seen = Tracked.of(self._health.calibration, told)
+        self._applied = self._applied.moved(self._seen, parameters.sensor)
         return withheld(pose, self._health.health) if parameters.pair.withhold_when_wrong else pose
 
     def _told(self, view: _View, sensor: Sensor, parameters: Parameters) -> Told:
@@ -303,8 +310,10 @@ class Pipeline:
         in_force[OFFSET] = view.imu.applied_offset_ns / NANOSECONDS
         if self._gyro is not None:
             in_force[BIAS] = parameters.sensor.R_cam_imu.T @ self._gyro.segment.bias - bias
-        return Told(parameters.sensor, sensor.camera, bias, parameters.imu.gyro_bias_sigma,
+        told = Told(parameters.sensor, sensor.camera, bias, parameters.imu.gyro_bias_sigma,
                     in_force)
+        in_force[READOUT] = told.direction * self._readout
+        return told
 
 
 def _evidence(pose: RelativePose, matches: Matches, reference: _View, view: _View, gyro: _GyroTurn,

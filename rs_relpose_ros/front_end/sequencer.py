@@ -25,6 +25,7 @@ from rs_relpose_ros.geometry.timing import (
     seconds_between,
     to_nanoseconds,
 )
+from rs_relpose_ros.health.tracked import Applied
 from rs_relpose_ros.imu.buffer import AddResult, Coverage, ImuBuffer
 from rs_relpose_ros.imu.frame_imu import frame_imu, FrameImu
 from rs_relpose_ros.imu.samples import ImuSample
@@ -161,8 +162,8 @@ class Sequencer:
         self._last_stamp_ns: int | None = None
         self._intervals = FrameIntervals()
         self._previous_reference_ns: int | None = None
-        # Tracked time offset, and how often time jumped: when frames came, and as they are taken.
-        self._offset_ns = 0
+        # Tracked figures, and how often time jumped: when frames came, and as they are taken.
+        self._offset_ns = self._margin_ns = 0
         self._generation = 0
         self._taken_generation = 0
         self._count: Counter[str] = Counter()
@@ -237,14 +238,14 @@ class Sequencer:
 
     # -- output ------------------------------------------------------------------------------
 
-    def apply_time_offset(self, offset_ns: int) -> None:
-        """Shift the frames that are taken from now on by a tracked time offset.
+    def apply(self, applied: Applied) -> None:
+        """Give the frames that are taken from now on tracked figures: shift and rows to cover.
 
-        Call it between `take` and `take`, from the thread that calls these: then the shift of a
+        Call it between `take` and `take`, from the thread that calls these: then the IMU of a
         frame depends on the frames before it alone, live as well as offline.
         """
         with self._changed:
-            self._offset_ns = offset_ns
+            self._offset_ns, self._margin_ns = applied.time_offset_ns, applied.margin_ns
 
     def take(self, timeout: float = 0.0) -> ReadyFrame | FrameRefused | None:
         """The next frame in the order of stamps, or a refusal, or None after `timeout` seconds.
@@ -362,8 +363,9 @@ class Sequencer:
         return self._image_clock
 
     def _span(self, waiting: _Waiting) -> tuple[int, int]:
-        """Instants of its first and last row, with the offset tracked by now."""
-        return waiting.start_ns + self._offset_ns, waiting.end_ns + self._offset_ns
+        """Instants of its first and last row, with offset and read-out tracked by now."""
+        return (waiting.start_ns + self._offset_ns - self._margin_ns,
+                waiting.end_ns + self._offset_ns + self._margin_ns)
 
     def _imu_reaches(self, end_ns: int) -> bool:
         """Whether gyro and accelerometer, which may have a topic each, have come to an instant."""

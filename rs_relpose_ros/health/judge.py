@@ -68,6 +68,11 @@ class Told:
     gyro_bias_sigma: float
     in_force: Array   # (11,) deviations that were applied already: tracked figures, bias at rest
 
+    @property
+    def direction(self) -> float:
+        """1 where row 0 is told to be read first, -1 where it is the last."""
+        return 1.0 if self.sensor.readout_direction == 'down' else -1.0
+
 
 class Effect(NamedTuple):
     """What deviations do to a pair's pose."""
@@ -246,8 +251,7 @@ def _described(figure: Figure, left: Array, sigmas: Array, told: Told) -> _Descr
         return _in_ms(sensor.time_offset + float(force[OFFSET]), deviation, sigma)
     if figure.name == 'readout_time':
         # Signed: the deviation is that of the signed read-out.
-        return _in_ms(camera.readout_time,
-                      deviation if camera.readout_direction == 'down' else -deviation, sigma)
+        return _in_ms(camera.readout_time, told.direction * deviation, sigma)
     if figure.name == 'gyro_scale':
         return _Described(1.0, 1.0 + deviation, sigma, f'the gyro must be multiplied by '
                           f'{1.0 + deviation:.3f} +- {sigma:.3f}')

@@ -146,7 +146,7 @@ def pair_information(pair: PairEvidence, in_force: Array, about: Array) -> PairI
     H[THETA:THETA + 3, THETA:THETA + 3] += information_told - information
     C[THETA:THETA + 3] += (information - information_told) @ D
     covariance = inverse(H)
-    moved = -covariance @ C
+    moved = _at_stamped_row(pair, problem, state, -covariance @ C)
     spread = np.linalg.cholesky(covariance[:D1, :D1])
     return PairInformation(S, b + S @ about, _pose_by_deviation(problem, state, moved),
                            np.linalg.solve(spread, moved[:D1]), images)
@@ -179,8 +179,25 @@ def _state(pair: PairEvidence, problem: TwoViewProblem, observations: Array) -> 
     return TwoViewState(R, t, velocity, velocity.copy(), np.zeros(3), np.zeros(3))
 
 
+def _at_stamped_row(pair: PairEvidence, problem: TwoViewProblem, state: TwoViewState,
+                    moved: Array) -> Array:
+    """Moved states (17, 11) at the middle row, with what moves it against the stamped one.
+
+    A longer read-out puts the middle row later, by D = share c, and the stamped one stays:
+    ``t = Exp(w_1 D) t_middle, R = Exp(w_1 D) R_middle Exp(w_2 D)^T``; w in middle-row axes.
+    """
+    turn = problem.motion1.rotations([problem.reference_row_time])[0]
+    share, rate1 = middle_share(pair.camera), turn @ pair.rates[0]
+    rate2 = turn @ (pair.gyro_rotation @ pair.rates[1])
+    moved = moved.copy()
+    moved[TANGENT:TANGENT + 2, READOUT] += share * (tangent_basis(state.t).T
+                                                    @ np.cross(rate1, state.t))
+    moved[THETA:THETA + 3, READOUT] += share * (rate1 - rate2)
+    return moved
+
+
 def _pose_by_deviation(problem: TwoViewProblem, state: TwoViewState, moved: Array) -> Array:
-    """(dt, dtheta) (6, 11) at the stamped row of moved states (17, 11), turned there."""
+    """(dt, dtheta) (6, 11) of moved states (17, 11), in the axes of the stamped row."""
     turn = problem.motion1.rotations([problem.reference_row_time])[0].T
     return np.vstack([turn @ tangent_basis(state.t) @ moved[TANGENT:TANGENT + 2],
                       turn @ moved[THETA:THETA + 3]])

@@ -166,16 +166,18 @@ def _milliseconds(seconds: Collection[float]) -> tuple[str, str]:
 
 
 def _tracked_values(last: PairResult | None) -> tuple[tuple[str, str], ...]:
-    """Bias and time offset as tracked; to be compared with the parameters."""
+    """Bias, time offset and read-out as tracked; to be compared with the parameters."""
     names = ('tracked_gyro_bias_rad_s', 'tracked_gyro_bias_sigma_rad_s', 'tracked_time_offset_ms',
-             'tracked_time_offset_sigma_ms', 'applied_time_offset_ms')
+             'tracked_time_offset_sigma_ms', 'applied_time_offset_ms', 'tracked_readout_time_ms',
+             'tracked_readout_time_sigma_ms', 'applied_readout_time_ms')
     if last is None or last.tracked is None or not last.tracked.pairs:
         return tuple((name, '') for name in names)
     seen = last.tracked
     texts = (' '.join(f'{value:.5f}' for value in seen.gyro_bias),
              ' '.join(f'{value:.5f}' for value in seen.gyro_bias_sigma),
              *(f'{1e3 * seconds:.2f}' for seconds in (
-                 seen.time_offset, seen.time_offset_sigma, last.applied.time_offset)))
+                 seen.time_offset, seen.time_offset_sigma, last.applied.time_offset,
+                 seen.readout_time, seen.readout_time_sigma, last.applied.readout_time)))
     return tuple(zip(names, texts, strict=True))
 
 

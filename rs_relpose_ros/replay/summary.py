@@ -101,6 +101,9 @@ def _tracked(last: PairResult | None) -> dict[str, Any] | None:
         'time_offset_s': seen.time_offset,
         'time_offset_sigma_s': seen.time_offset_sigma,
         'applied_s': last.applied.time_offset,
+        'readout_time_s': seen.readout_time,
+        'readout_time_sigma_s': seen.readout_time_sigma,
+        'applied_readout_time_s': last.applied.readout_time,
     }
 
 
