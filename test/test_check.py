@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from functools import cache
 import json
+import math
 import re
 
 import cv2
@@ -18,30 +18,28 @@ from rosbags.interfaces import (
     QosTime,
 )
 from rosbags.rosbag2 import StoragePlugin, Writer
-from scipy.spatial.transform import Rotation
 from test_bag_reader import JAZZY, STAMP_NS, write_ros1
 
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.bags.topics import TopicOptions
 from rs_relpose_ros.bags.writer import BagWriter
-from rs_relpose_ros.check import judge_turning
 from rs_relpose_ros.check.check import check_bag, choose_topics
 from rs_relpose_ros.check.findings import CheckReport, Finding, Verdict
-from rs_relpose_ros.check.scan import scan
 from rs_relpose_ros.check.streams import Stamps, Thinned
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.config.parameters import Parameters
-from rs_relpose_ros.config.tracking import TrackingConfig
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.health.judge import FIGURES
 
 START = 1_700_000_000_000_000_000
 MS = 1_000_000
-CAMERA = RollingShutterCamera(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5,
+CAMERA = RollingShutterCamera(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5,
                               readout_time=0.02, distortion=(-0.1, 0.0, 0.0, 0.0, 0.0))
 GIVEN = {'readout_time': 0.02, 'quat_cam_imu_xyzw': (0.0, 0.0, 0.0, 1.0)}
-PIXELS = np.random.default_rng(0).integers(0, 256, (48, 64), dtype=np.uint8)
+PIXELS = cv2.resize(np.random.default_rng(0).integers(0, 256, (30, 40), dtype=np.uint8),
+                    (160, 120))
 
 
 def checked(path, parameters=None, **topics):
@@ -70,7 +68,7 @@ class Small:
         return stamp_ns
 
     def rate(self, t):
-        return 0.3 * np.sin([2.0 * t, 3.0 * t, 4.0 * t]) + 0.002 * self.rng.normal(size=3)
+        return 0.002 * np.sin([2.0 * t, 3.0 * t, 4.0 * t]) + 0.002 * self.rng.normal(size=3)
 
     def force(self, t):
         return np.array([0.0, -9.81, 0.0]) + 0.5 * np.cos([2.0 * t, 3.0 * t, 5.0 * t])
@@ -83,7 +81,9 @@ class Small:
         return bag.camera_info(stamp_ns, 'camera', CAMERA)
 
     def image(self, bag, stamp_ns):
-        return 'sensor_msgs/msg/Image', bag.image(stamp_ns, 'camera', self.pixels)
+        # No camera sends the same image twice.
+        noise = self.rng.integers(0, 4, self.pixels.shape, dtype=np.uint8)
+        return 'sensor_msgs/msg/Image', bag.image(stamp_ns, 'camera', self.pixels // 2 + noise)
 
     def write(self, path):
         with BagWriter(path) as bag:
@@ -107,15 +107,16 @@ def broken(**changes):
 
 def test_a_good_bag_has_no_warning(tmp_path):
     findings, report = checked(Small().write(tmp_path / 'bag'))
-    assert [f.name for f in report.findings if f.verdict is not Verdict.OK] == []
-    # The pixels do not move, so that they say nothing of the gyro.
-    assert 'the camera turns by 0.0 deg/s only' in findings['axes and clock'].text
+    # The camera does not move: but for the bias nothing is known, and nothing of that is ok.
+    assert {f.name for f in report.findings if f.verdict is not Verdict.OK} == {
+        'pairs', 'gyro at rest', *(figure.name for figure in FIGURES)} - {'gyro_bias'}
+    assert {f.verdict for f in report.findings} == {Verdict.OK, Verdict.UNKNOWN}
     assert findings['image rate'].figures['rate_hz'] == pytest.approx(10.0)
     assert findings['imu rate'].figures['rate_hz'] == pytest.approx(200.0)
     assert findings['gravity'].figures['mean_length_m_s2'] == pytest.approx(9.81, abs=0.2)
-    # 0.02 s, 60 px and the median rate.
+    # 0.02 s, 150 px and the median rate.
     assert findings['rolling shutter'].figures['median_px'] == pytest.approx(
-        0.02 * 60.0 * findings['gyro'].figures['median_rad_s'], rel=0.1)
+        0.02 * 150.0 * findings['gyro'].figures['median_rad_s'], rel=0.1)
     assert 'global-shutter method would do' in findings['rolling shutter'].text
 
 
@@ -178,7 +179,7 @@ def uncalibrated(self, bag, stamp_ns):
 
 def of_another_size(self, bag, stamp_ns):
     return bag.camera_info(stamp_ns, 'camera', RollingShutterCamera(
-        width=128, height=96, fx=120.0, fy=120.0, cx=63.5, cy=47.5, readout_time=0.02))
+        width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5, readout_time=0.02))
 
 
 def without_gyro(self, bag, stamp_ns):
@@ -223,9 +224,9 @@ BROKEN = {
                        'stop it last'),
     'no gyro': ({'imu': without_gyro}, 'gyro', F, '--imu-topic'),
     'hanging gyro': ({'rate': lambda self, t: [0.1, 0.0, 0.0]}, 'gyro', F, 'hangs'),
-    'degrees per second': ({'rate': lambda self, t: 57.3 * Small.rate(self, t)}, 'gyro', F,
+    'degrees per second': ({'rate': lambda self, t: 5000.0 * Small.rate(self, t)}, 'gyro', F,
                            'rad/s'),
-    'bias': ({'rate': at_rest, 'force': lambda self, t: [0.0, -9.81, 0.0]}, 'gyro bias', W,
+    'bias': ({'rate': at_rest, 'force': lambda self, t: [0.0, -9.81, 0.0]}, 'gyro at rest', W,
              'gyro_bias: [0.0'),
     'no accelerometer': ({'imu': without_force}, 'gravity', W, '--accel-topic'),
     'in g': ({'force': lambda self, t: [0.0, -1.0, 0.01]}, 'gravity', F, 'm/s^2'),
@@ -234,7 +235,7 @@ BROKEN = {
                           'calibrate'),
     'big images': ({'pixels': np.zeros((800, 800), np.uint8), 'seconds': 0.5}, 'live transport', W,
                    'fastdds.xml'),
-    'no texture': ({'pixels': np.full((48, 64), 90, np.uint8)}, 'texture', F, 'textured'),
+    'no texture': ({'pixels': np.full((120, 160), 90, np.uint8)}, 'texture', F, 'textured'),
 }
 
 
@@ -256,14 +257,14 @@ def test_what_is_broken_is_said_with_its_remedy(case, tmp_path):
 def test_intrinsics_by_parameters(changes, tmp_path):
     """As good as those of a CameraInfo, which comes first where it has some."""
     told = Parameters.from_mapping(GIVEN | {
-        'camera_matrix': (61.0, 0.0, 31.5, 0.0, 61.0, 23.5, 0.0, 0.0, 1.0),
+        'camera_matrix': (151.0, 0.0, 79.5, 0.0, 151.0, 59.5, 0.0, 0.0, 1.0),
         'distortion_coefficients': (-0.1, 0.0, 0.0, 0.0)})
     findings, report = checked(broken(**changes).write(tmp_path / 'bag'), told)
     assert not report.failed
-    assert findings['calibration'].text == '64x48, f 61.0 61.0 px, plumb_bob by camera_matrix'
-    assert findings['calibration'].figures['fx'] == 61.0
+    assert findings['calibration'].text == '160x120, f 151.0 151.0 px, plumb_bob by camera_matrix'
+    assert findings['calibration'].figures['fx'] == 151.0
     findings, _ = checked(Small().write(tmp_path / 'calibrated'), told)
-    assert findings['calibration'].text == '64x48, f 60.0 60.0 px, plumb_bob'
+    assert findings['calibration'].text == '160x120, f 150.0 150.0 px, plumb_bob'
 
 
 def test_parameters_that_are_missing_are_a_warning(tmp_path):
@@ -271,23 +272,28 @@ def test_parameters_that_are_missing_are_a_warning(tmp_path):
     assert findings['parameters'].verdict is Verdict.WARNING
     assert 'readout_time and quat_cam_imu_xyzw' in findings['parameters'].text
     assert 'assumed' in findings['rolling shutter'].text
+    # This recording does not tell them, either.
+    assert [findings[name].verdict for name in ('axes', 'readout_time', 'rolling shutter')] == [
+        Verdict.UNKNOWN] * 3
 
 
 # -- images against the gyro -----------------------------------------------------------------
 
 
-def rewritten(bundled_bag, path, change, seconds=3.0):
-    """The first seconds of the bundled bag, its rates (3,) changed."""
-    with open_bag(bundled_bag) as bag, BagWriter(path) as out:
+def unchanged(message):
+    """A message as it is."""
+
+
+def rewritten(source, path, change, seconds=6.0):
+    """The first seconds of a bag with its messages changed in place."""
+    with open_bag(source) as bag, BagWriter(path) as out:
         topics = bag.find_topics()
         first_ns = None
         for item in bag.messages([topics.image, topics.camera_info, topics.imu]):
             first_ns = first_ns or item.bag_time_ns
             if item.bag_time_ns > first_ns + seconds * 1e9:
                 break
-            if item.topic == topics.imu.name:
-                rate = item.message.angular_velocity
-                rate.x, rate.y, rate.z = map(float, change(np.array([rate.x, rate.y, rate.z])))
+            change(item.message)
             out.write(item.topic, item.message.__msgtype__, item.message, item.bag_time_ns)
     return path
 
@@ -297,86 +303,167 @@ def parameters(bundled_bag):
     return read_parameters(bundled_bag.with_name('hand_held.yaml'))
 
 
-@pytest.fixture(scope='module')
-def good(bundled_bag, tmp_path_factory):
-    return rewritten(bundled_bag, tmp_path_factory.mktemp('good') / 'bag', lambda w: w)
-
-
-@pytest.fixture(scope='module')
-def seen(good):
-    """What one pass saw of it; images and gyro are aligned once for all tests."""
-    with open_bag(good) as bag:
-        seen = scan(bag, choose_topics(bag, TopicOptions()), TrackingConfig(), lambda: None)
-    seen.turning.align = cache(seen.turning.align)
-    return seen
-
-
-def judged(seen, parameters):
-    return {finding.name: finding for finding in judge_turning.findings(seen, parameters)}
-
-
-def test_the_bundled_bag_is_good(good, parameters):
-    findings, report = checked(good, parameters)
-    assert [f for f in report.findings if f.verdict is not Verdict.OK] == []
-    # Against its parameter file, which is the truth.
-    assert abs(findings['time offset'].figures['time_offset_s']) < 2e-3
-    assert findings['axes'].figures['apart_deg'] < 1.0
-    assert findings['axes'].figures['nearest'] == 'cam x = -imu y, cam y = -imu z, cam z = +imu x'
+def test_the_bundled_bag_is_good(bundled_bag, parameters):
+    """Against its parameter file, which is the truth."""
+    findings, report = checked(bundled_bag, parameters)
+    assert {f.verdict for f in report.findings} <= {Verdict.OK, Verdict.UNKNOWN}
+    for figure in FIGURES:
+        figures = findings[figure.name].figures
+        assert (figures['figure'], figures['observable']) == (figure.name, True)
+        assert abs(figures['seen'] - figures['told']) < 4.0 * figures['sigma']
+    assert findings['time_offset'].figures['sigma'] < 2e-3
+    assert findings['parameters'].figures['nearest'] == (
+        'cam x = -imu y, cam y = -imu z, cam z = +imu x')
+    assert findings['pairs'].figures['poses'] > 20
     assert 'global-shutter method loses' in findings['rolling shutter'].text
 
 
-def test_the_chosen_tracker_follows_the_points(good, parameters):
-    findings, report = checked(good, parameters.updated({'detector': 'orb'}))
+WRONG = {
+    'read-out doubled': ({'readout_time': 0.06}, 'readout_time', 0.03, 0.006),
+    'read-out zero': ({'readout_time': 0.0}, 'readout_time', 0.03, 0.006),
+    'read-out upwards': ({'readout_direction': 'up'}, 'readout_direction', -0.03, 0.006),
+    'clock': ({'time_offset': 0.02}, 'time_offset', 0.0, 0.003),
+    'axes': ({'quat_cam_imu_xyzw': (0.0, 0.0, 0.0, 1.0)}, 'axes', 120.0, 25.0),
+}
+
+
+@pytest.mark.parametrize('case', WRONG)
+def test_parameters_that_contradict_the_recording(case, bundled_bag, parameters):
+    changes, name, truth, tolerance = WRONG[case]
+    findings, report = checked(bundled_bag, parameters.updated(changes))
+    assert findings[name].verdict is F, findings[name]
+    assert report.failed
+    assert findings[name].figures['seen'] == pytest.approx(truth, abs=tolerance)
+    assert [f.name for f in report.findings if f.verdict is F] == [name]
+    if 'readout' in name:
+        assert 'time_offset:' not in findings['time_offset'].text
+        # The effect of the read-out is that of the one that is seen.
+        assert findings['rolling shutter'].figures['readout_s'] == pytest.approx(0.03, abs=0.006)
+
+
+def longer(message):
+    if hasattr(message, 'k'):
+        message.k = message.k * [1.1, 1.0, 1.0, 1.0, 1.1, 1.0, 1.0, 1.0, 1.0]
+
+
+def without_distortion(message):
+    if hasattr(message, 'd'):
+        message.d = 0.0 * message.d
+
+
+def too_small(message):
+    if hasattr(message, 'angular_velocity'):
+        rate = message.angular_velocity
+        rate.x, rate.y, rate.z = (0.8 * value for value in (rate.x, rate.y, rate.z))
+
+
+def of_another_body(message):
+    """Rates that have nothing to do with the images."""
+    if hasattr(message, 'angular_velocity'):
+        t = (message.header.stamp.sec % 100) + 1e-9 * message.header.stamp.nanosec
+        rate = message.angular_velocity
+        rate.x, rate.y, rate.z = map(float, np.sin([3.0 * t, 4.0 * t + 1.0, 5.0 * t + 2.0]))
+
+
+@pytest.mark.parametrize('change, name, truth, tolerance', [
+    (longer, 'focal_length', 450.0, 10.0), (without_distortion, 'distortion', -0.1, 0.03),
+    (too_small, 'gyro_scale', 1.25, 0.03)])
+def test_messages_that_contradict_each_other(change, name, truth, tolerance, bundled_bag,
+                                             parameters, tmp_path):
+    path = rewritten(bundled_bag, tmp_path / 'bag', change)
+    findings, _ = checked(path, parameters)
+    assert findings[name].verdict in (W, F), findings[name]
+    # Of the distortion the first coefficient is seen, with the others at zero.
+    assert findings[name].figures['seen'] == pytest.approx(truth, abs=tolerance)
+    assert Verdict.OK not in {findings[figure.name].verdict for figure in FIGURES}
+
+
+def test_a_gyro_of_another_body(bundled_bag, parameters, tmp_path):
+    """Whatever is blamed: the recording fails, and figures that explain nothing are not ok."""
+    findings, report = checked(rewritten(bundled_bag, tmp_path / 'bag', of_another_body),
+                               parameters)
+    assert report.failed
+    assert not any(findings[name].verdict is Verdict.OK
+                   for name in ('axes', 'time_offset', 'gyro_scale'))
+
+
+def test_what_is_not_told_is_looked_for(bundled_bag, tmp_path):
+    """And the rest is judged with it; never ok without having been told."""
+    bag = rewritten(bundled_bag, tmp_path / 'bag', unchanged, 3.0)
+    given = Parameters.from_mapping({'gyro_bias': (0.010885, -0.007021, 0.005061)})
+    findings, report = checked(bag, given)
     assert not report.failed
-    assert abs(findings['time offset'].figures['time_offset_s']) < 5e-3
-    assert findings['axes'].figures['apart_deg'] < 3.0
-    # Those of ORB are others than KLT's.
-    klt, _ = checked(good, parameters)
-    assert findings['texture'].figures != klt['texture'].figures
+    assert findings['axes'].verdict is findings['readout_time'].verdict is Verdict.UNKNOWN
+    assert 'cam x = -imu y, cam y = -imu z, cam z = +imu x' in findings['axes'].text
+    assert 'gravity is at the bottom' in findings['axes'].text
+    assert findings['readout_time'].figures['told'] is None
+    assert findings['readout_time'].figures['seen'] == pytest.approx(0.03, abs=2e-3)
+    assert abs(findings['time_offset'].figures['seen']) < 3e-3
+    assert findings['rolling shutter'].figures['readout_s'] == pytest.approx(0.03, abs=2e-3)
 
 
-@pytest.mark.parametrize('name, assignment, verdict', [
-    ('time offset', 'time_offset=0.01', W), ('time offset', 'time_offset=-0.04', F),
-    ('axes', 'quat_cam_imu_xyzw=[0.0, 0.0, 0.0, 1.0]', F),
-])
-def test_parameters_that_contradict_the_recording(seen, bundled_bag, name, assignment, verdict):
-    findings = judged(seen, read_parameters(
-        bundled_bag.with_name('hand_held.yaml'), [assignment]))
-    assert findings[name].verdict is verdict, findings[name]
+@pytest.fixture(scope='module')
+def converted(recordings, tmp_path_factory):
+    """Bags of the real recordings by name, converted once."""
+    folder = tmp_path_factory.mktemp('recordings')
+
+    def path(name):
+        if not (folder / name).exists():
+            assert main(['convert', name.removesuffix('_b'), str(recordings / name),
+                         str(folder / name)]) == 0
+        return folder / name
+
+    return path
 
 
-def test_small_misalignment_of_the_axes(seen, parameters):
-    R = Rotation.from_rotvec([0.0, 0.15, 0.0]) * Rotation.from_quat(
-        parameters.sensor.quat_cam_imu_xyzw)
-    findings = judged(seen, parameters.updated({'quat_cam_imu_xyzw': tuple(R.as_quat())}))
-    assert findings['axes'].verdict is Verdict.WARNING
-    assert findings['axes'].figures['apart_deg'] == pytest.approx(8.6, abs=1.0)
-
-
-def test_gyro_of_a_wrong_scale_or_another_body(bundled_bag, tmp_path, parameters):
-    scaled = rewritten(bundled_bag, tmp_path / 'scaled', lambda w: 0.3 * w, 2.0)
-    assert checked(scaled, parameters)[0]['scale'].verdict is Verdict.FAILURE
-    rng = np.random.default_rng(0)
-    other = rewritten(bundled_bag, tmp_path / 'other', lambda w: 0.3 * rng.normal(size=3), 2.0)
-    findings, _ = checked(other, parameters)
-    assert findings['axes and clock'].verdict is Verdict.FAILURE
+# READMEs of the recordings, whose figures come from other software; of the second RealSense one
+# its own offset. Three gaps of up to 0.3 s; no accelerometer, and no bias known; little light.
+REAL = {
+    'realsense_rgb_rs': ({}, {'image rate'}),
+    'realsense_rgb_rs_b': ({'time_offset': -0.064}, {'image rate'}),
+    'xiaomi_cc9_rs': ({}, {'gravity', 'gyro_bias'}),
+}
 
 
 @pytest.mark.recordings
-@pytest.mark.parametrize('name, offset', [
-    ('realsense_rgb_rs', -0.057), ('xiaomi_cc9_rs', -0.0024)])
-def test_recordings_of_real_cameras(recordings, tmp_path, name, offset):
-    """Against the READMEs of the recordings, whose figures come from other software."""
-    path = tmp_path / name
-    assert main(['convert', name, str(recordings / name), str(path)]) == 0
-    findings, report = checked(path, read_parameters(f'{path}.yaml'))
+@pytest.mark.parametrize('name', REAL)
+def test_recordings_of_real_cameras(converted, name):
+    path, (changes, warned) = converted(name), REAL[name]
+    findings, report = checked(path, read_parameters(f'{path}.yaml').updated(changes))
     assert not report.failed
-    assert findings['time offset'].figures['time_offset_s'] == pytest.approx(offset, abs=3e-3)
-    assert findings['axes'].verdict is Verdict.OK
-    assert findings['gyro and images'].figures['explained'] > 0.7
-    # RealSense: three gaps of up to 0.3 s. The phone has no accelerometer.
-    expected = {'realsense_rgb_rs': 'image rate', 'xiaomi_cc9_rs': 'gravity'}[name]
-    assert [f.name for f in report.findings if f.verdict is Verdict.WARNING] == [expected]
+    assert {f.name for f in report.findings if f.verdict is W} <= warned
+    assert findings['axes'].verdict in (Verdict.OK, Verdict.UNKNOWN)
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize('changes, name', [
+    ({'time_offset': -0.031}, 'time_offset'),
+    ({'quat_cam_imu_xyzw': (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))}, 'axes'),
+    ({'quat_cam_imu_xyzw': (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))}, 'axes')])
+def test_gross_errors_in_a_recording_in_little_light(converted, changes, name):
+    path = converted('realsense_rgb_rs_b')
+    told = read_parameters(f'{path}.yaml').updated({'time_offset': -0.064} | changes)
+    findings, _ = checked(path, told)
+    assert findings[name].verdict is F, findings[name]
+
+
+@pytest.mark.recordings
+def test_an_offset_too_far_off_to_be_seen_is_not_called_ok(converted):
+    """The other way by 33 ms: few pairs agree with the gyro, which is told instead."""
+    path = converted('realsense_rgb_rs_b')
+    findings, _ = checked(path, read_parameters(f'{path}.yaml').updated({'time_offset': -0.097}))
+    assert findings['time_offset'].verdict in (F, Verdict.UNKNOWN), findings['time_offset']
+    assert findings['pairs'].verdict is W or (
+        findings['time_offset'].verdict is F)
+
+
+@pytest.mark.recordings
+def test_stamps_under_automatic_exposure_are_no_times_of_arrival(converted):
+    path = converted('realsense_rgb_rs_b')
+    findings, _ = checked(path, Parameters.from_mapping(GIVEN))
+    assert 'automatic exposure' in findings['image stamps'].text
+    assert findings['image stamps'].verdict is Verdict.OK
+    assert 'time_offset_per_interval' in findings['image stamps'].remedy
 
 
 # -- containers, options, output -------------------------------------------------------------
@@ -477,4 +564,4 @@ def test_lines_hold_verdict_text_and_remedy():
                           Finding('much longer', Verdict.FAILURE, 'x' * 10, 'do this')))
     assert report.lines() == ['ok       short        fine',
                               'failure  much longer  xxxxxxxxxx -> do this',
-                              'b: 1 ok, 0 warning, 1 failure']
+                              'b: 1 ok, 0 unknown, 0 warning, 1 failure']

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator
+import itertools
 from typing import Any
 from unittest.mock import MagicMock
 
@@ -15,6 +16,7 @@ from rs_relpose_ros.config.keyframes import KeyframeConfig
 from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.front_end.frame import Frame
 from rs_relpose_ros.front_end.front_end import FrameFailed, FrameProcessed, FrontEnd, Outcome
 from rs_relpose_ros.front_end.pair import closes_pair, PairResult, SinceKeyframe
@@ -116,10 +118,16 @@ LIVE = [name for name, _, declared in Parameters.declarations() if declared.live
 CHANGED: dict[str, Any] = {
     'threshold': 0.3, 'pixel_sigma': 1.5, 'gravity_sigma': 0.3, 'gyro_sigma': 0.1,
     'confidence': 0.6, 'max_iterations': 2, 'time_limit': 1e-9, 'min_inliers': 5000,
-    'min_parallax': 400.0, 'max_translation_sigma': 0.01,
+    'min_parallax': 400.0, 'stamp_sigma': 0.01, 'max_translation_sigma': 0.01,
     'min_keyframe_parallax': 2.0, 'max_keyframe_interval': 0.01,
     'max_keyframe_frames': 2, 'min_tracked_fraction': 1.0, 'track_time_offset': True,
-    'track_readout_time': True}
+    'track_readout_time': True, 'withhold_when_wrong': False}
+# Of these an effect shows with other parameters only.
+BESIDE: dict[str, dict[str, Any]] = {
+    # Many samples are needed: the hypotheses of a solver without priors, few of which fit.
+    'confidence': {'solver': 'uniform_9pt', 'threshold': 0.2},
+    # So far off that the health calls it wrong.
+    'withhold_when_wrong': {'time_offset': 0.04}}
 # Shows in what the node publishes.
 OF_THE_NODE = {'publish_debug_image'}
 FRAMES = 60
@@ -182,9 +190,7 @@ def test_every_live_parameter_is_tried():
 
 @pytest.mark.parametrize('name', CHANGED)
 def test_a_live_parameter_has_its_effect_from_the_next_frame_on(recorded, parameters, name):
-    if name == 'confidence':
-        # Many samples are needed: the hypotheses of a solver without priors, few of which fit.
-        parameters = parameters.updated({'solver': 'uniform_9pt', 'threshold': 0.2})
+    parameters = parameters.updated(BESIDE.get(name, {}))
     changed = parameters.updated({name: CHANGED[name]})
     both = zip(pairs_of_run(recorded, parameters, parameters),
                pairs_of_run(recorded, parameters, changed), strict=False)
@@ -192,6 +198,24 @@ def test_a_live_parameter_has_its_effect_from_the_next_frame_on(recorded, parame
         without, with_change = next(both)
         assert with_change == without
     assert any(with_change != without for without, with_change in both)
+
+
+def test_poses_that_were_withheld_appear(recorded, parameters):
+    parameters = parameters.updated(BESIDE['withhold_when_wrong'])
+    published = parameters.updated({'withhold_when_wrong': False})
+    poses = 0
+    both = zip(pairs_of_run(recorded, parameters, parameters),
+               pairs_of_run(recorded, parameters, published), strict=True)
+    for kept, (_, _, status, _, R, *_) in itertools.islice(both, 10):
+        assert status is not Status.WITHHELD
+        if kept[2] is Status.WITHHELD:
+            poses += status is Status.OK
+            assert np.isnan(np.frombuffer(kept[4])).all() and np.isnan(
+                np.frombuffer(kept[5])).all()
+            assert np.isfinite(np.frombuffer(R)).all()
+        else:
+            assert kept[2] is status
+    assert poses >= 1
 
 
 def test_publishing_of_debug_images_can_be_switched_while_running(recorded, parameters):

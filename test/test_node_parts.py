@@ -17,6 +17,7 @@ from rs_relpose_ros.health.findings import Finding, Health, HealthState
 from rs_relpose_ros.health.tracked import Applied, Tracked
 from rs_relpose_ros.node.cause_log import CauseLog
 from rs_relpose_ros.node.diagnostics import ERROR, Inputs, OK, Statistics, WARN
+from rs_relpose_ros.node.health_log import HealthLog
 from rs_relpose_ros.tracking.matches import Matches
 
 SECOND = 10**9
@@ -80,6 +81,41 @@ def test_made_up_causes_do_not_fill_log_or_memory(clock):
         log(f'unknown encoding {a}{b}{c}')
     assert len(lines) <= 65
     assert lines[-1] == 'further problems of other kinds (see /diagnostics)'
+
+
+def finding(state: HealthState, ms: float, figure: str = 'time_offset') -> Finding:
+    return Finding(figure, 0.03, 1e-3 * ms, 0.0005, 's', True, state,
+                   f'{ms} ms is seen, 30.0 ms in force: set {figure}: {1e-3 * ms}')
+
+
+def test_health_is_told_once_a_figure_and_when_it_is_well_again(clock):
+    lines: list[tuple[str, str]] = []
+    log = HealthLog(*(CauseLog(lambda text, level=level: lines.append((level, text)), clock=clock)
+                      for level in ('info', 'warn', 'error')))
+    ok, unknown, suspect, wrong = (Health((finding(state, 0.2),)) for state in HealthState)
+    for health in (unknown, ok, suspect, Health((finding(HealthState.SUSPECT, 1.5),)), wrong,
+                   wrong):
+        log(health, withhold=True)
+    sentence = '0.2 ms is seen, 30.0 ms in force: set time_offset: 0.0002'
+    first, second = lines
+    assert first == ('warn', f'time_offset is suspect: {sentence}')
+    assert second[0] == 'error'
+    assert second[1] == (f'time_offset is wrong: {sentence}; poses are withheld: '
+                         'withhold_when_wrong: false publishes them all the same')
+    # The worst figure first; it is the line's cause.
+    log(Health((finding(HealthState.SUSPECT, 0.2), finding(HealthState.WRONG, 9.0, 'axes'))),
+        withhold=False)
+    assert lines[2][1].startswith('axes is wrong: 9.0 ms is seen')
+    assert lines[2][1].endswith(f'; time_offset is suspect: {sentence}; poses are published all '
+                                'the same, as withhold_when_wrong is false')
+    for health in (unknown, ok):
+        log(health, withhold=True)
+    [back] = lines[3:]
+    assert back == (
+        'info', 'health is unknown: no figure that was told is suspect or wrong any more')
+    clock.now = 31
+    log(wrong, withhold=True)
+    assert lines[4][1].endswith('(1 more since the last such line)')
 
 
 # -- diagnostics -----------------------------------------------------------------------------
@@ -166,9 +202,9 @@ def test_every_counter_has_its_own_figure(clock):
     refused = {cause: 100 + k for k, cause in enumerate(Refusal)}
     for _ in range(3):
         statistics.add_failure('a frame failed')
-    finding = Finding('time_offset', 0.0, 0.004, 0.0005, 's', True, HealthState.OK, '4 ms')
+    told = Finding('time_offset', 0.0, 0.004, 0.0005, 's', True, HealthState.OK, '4 ms')
     last = replace(
-        pair(Status.LOW_PARALLAX, 'it stands'), health=Health((finding,)), tracked=Tracked(
+        pair(Status.LOW_PARALLAX, 'it stands'), health=Health((told,)), tracked=Tracked(
             gyro_bias=np.array([0.01, -0.02, 0.03]), gyro_bias_sigma=np.array([1e-3, 2e-3, 3e-3]),
             time_offset=0.004, time_offset_sigma=0.0005, readout_time=0.031,
             readout_time_sigma=0.0007, pairs=7), applied=Applied(-0.0015, 0.0008))
@@ -213,3 +249,23 @@ def test_level_and_text(clock):
     assert 'LOW_PARALLAX: it stands' in report.text
     statistics.add_pair(pair(), 0)
     assert statistics.report(inputs(), counts(), problem='', missing=()).level == OK
+
+
+@pytest.mark.parametrize(('state', 'level', 'shown'), [
+    (HealthState.OK, OK, 'ok'), (HealthState.UNKNOWN, OK, 'ok'),
+    (HealthState.SUSPECT, WARN, 'degraded'), (HealthState.WRONG, ERROR, 'told wrong')])
+def test_level_and_text_of_the_health(clock, state, level, shown):
+    statistics = Statistics(clock)
+    told = finding(state, 0.2)
+    statistics.add_pair(replace(pair(), health=Health((told,))), 0)
+    report = statistics.report(inputs(), counts(), problem='', missing=())
+    values = dict(report.values)
+    assert (report.level, values['state'], values['health']) == (level, shown, state.value)
+    assert (report.text == told.text) is bool(level)
+    assert told.sentence in values['health_findings']
+    # Frames that are left out do not hide that poses are wrong, nor do they where none comes.
+    dropping = statistics.report(inputs(), counts(9, 4, overload=5), problem='', missing=())
+    assert (dropping.text == told.text) is (state is HealthState.WRONG)
+    cannot = statistics.report(inputs(), counts(), problem='no image', missing=('image',))
+    assert (cannot.level, cannot.text) == (ERROR, 'no image')
+    assert dict(cannot.values)['state'] == 'not estimating'

@@ -220,6 +220,43 @@ def test_a_camera_without_camera_info_gives_poses(ros_domain_id, bundled_bag):
     assert values['frames_refused_no_calibration'] == '0'
 
 
+def test_what_is_told_wrong_is_seen_and_poses_are_withheld(ros_domain_id, bundled_bag):
+    """A time offset that is 40 ms off, until shortly before a second of motion is over."""
+    parameters = {'time_offset': 0.04, 'image_transport': 'raw'}
+    with Graph() as graph, node_process(
+            BUNDLED_PARAMETERS, remap=BAG_TOPICS, parameters=parameters) as node:
+        poses = graph.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
+        pairs = graph.listen(DiagnosticArray, '/relpose_node/pairs')
+        diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
+        node.wait_for('ready')
+        for topic in ('relative_pose', 'pairs'):
+            graph.wait_for_publisher(f'/relpose_node/{topic}')
+        publishers = {kind: graph.publisher(kind, topic) for kind, topic in
+                      zip((Image, CameraInfo, Imu), BAG_TOPICS.values(), strict=True)}
+        publish_in_time((publishers[type(message)], bag_time_ns, message)
+                        for bag_time_ns, message in read_messages(bundled_bag, 0.95))
+        report = wait_until(lambda: next((item for item in diagnostics if diagnostic_values(
+            item)['health'] == 'wrong'), None), 'health: wrong', node)
+        assert node.signal(signal.SIGTERM)[0] == 0
+        [line] = [line for line in node.output.splitlines() if 'ERROR' in line]
+    values = diagnostic_values(report)
+    assert report.status[0].level == ERROR
+    assert report.status[0].message.startswith('time_offset is wrong: ')
+    assert (values['state'], values['last_reason_no_pose'].split(':')[0]) == (
+        'told wrong', 'WITHHELD')
+    assert 'time_offset wrong: ' in values['health_findings']
+    for text in ('time_offset is wrong: ', '40.0 ms in force', 'set time_offset: ',
+                 'poses are withheld: withhold_when_wrong: false publishes them all the same'):
+        assert text in line
+    told = {stamp_of(message): diagnostic_values(message) for message in pairs}
+    wrong = {stamp: value for stamp, value in told.items() if value['health'] == 'wrong'}
+    assert len(wrong) >= 2
+    assert wrong.keys().isdisjoint(map(stamp_of, poses))
+    for value in wrong.values():
+        assert value['status'] == 'WITHHELD'
+        assert value['reason'].startswith('time_offset is wrong: ')
+
+
 @pytest.mark.parametrize(('parameters', 'sentence'), [
     ({'readout_time': 3.0}, 'readout_time'),
     ({'readout_time': 'fast'}, 'readout_time must be of type float'),

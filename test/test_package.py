@@ -136,7 +136,7 @@ MAY_IMPORT = {
     'node': BASE | {'front_end', 'health', 'messages'},
     'replay': CORE | {'front_end', 'health', 'messages', 'bags'},
     'calibrate': CORE | {'messages', 'bags'},
-    'check': CORE | {'messages', 'bags', 'calibrate'},
+    'check': CORE | {'front_end', 'health', 'messages', 'bags', 'calibrate'},
     'convert': BASE | {'images', 'imu', 'messages', 'bags'},
     'cli': BASE | {'bags', 'replay', 'calibrate', 'check', 'convert'},
 }

@@ -261,6 +261,32 @@ def test_intrinsics_by_parameters_are_as_good(replayed, bundled_bag, parameters_
     assert first[:-1] == full[:len(first) - 1]
 
 
+def test_a_wrong_figure_is_told_and_is_exit_code_1(bundled_bag, parameters_file, tmp_path, capsys):
+    """The first second with a time offset that is 40 ms off."""
+    stamps, out = tmp_path / 'stamps.txt', tmp_path / 'out'
+    with open_bag(bundled_bag) as bag:
+        images = bag.messages([bag.find_topics().image])
+        stamps.write_text('\n'.join(str(stamp_ns(item.message.header))
+                                    for item in itertools.islice(images, 33)))
+    assert main(['replay', str(bundled_bag), '--params', parameters_file, '--stamps', str(stamps),
+                 '--set', 'time_offset=0.04', '--out', str(out)]) == 1
+    [line] = [line for line in capsys.readouterr().out.splitlines()
+              if line.startswith('time_offset')]
+    assert line.startswith('time_offset is wrong: ') and 'set time_offset: ' in line
+    rows = rows_of(out / 'relative_poses.csv')
+    withheld = [row for row in rows if row['status'] == 'WITHHELD']
+    assert len(withheld) >= 3
+    assert all(row['tx'] == row['qw'] == row['sigma_rx'] == '' for row in withheld)
+    summary = json.loads((out / 'summary.json').read_text())
+    assert summary['pairs']['by_status']['WITHHELD'] == len(withheld)
+    assert summary['health']['state'] == 'wrong'
+    [finding] = [item for item in summary['health']['findings'] if item['state'] == 'wrong']
+    assert (finding['figure'], finding['told'], finding['unit']) == ('time_offset', 0.04, 's')
+    assert abs(finding['seen']) < 0.01
+    assert finding['sentence'] in line
+    assert len(list(out.glob('*.png'))) == 4
+
+
 # -- recordings of real cameras --------------------------------------------------------------
 
 
@@ -500,6 +526,7 @@ def test_no_pose_is_exit_code_1(tmp_path, capsys, good_bag, monkeypatch):
     assert main(['replay', str(good_bag), *SENSOR]) == 1
     shown = capsys.readouterr()
     assert shown.err == '' and '0 pairs' in shown.out
+    assert 'health: unknown: there was no pair to judge by\n' in shown.out
     assert (tmp_path / 'bag_relpose' / 'relative_poses.csv').read_text() == HEADER + '\n'
     summary = json.loads((tmp_path / 'bag_relpose' / 'summary.json').read_text())
     assert summary['frames']['processed'] == 4 and summary['medians']['inliers'] is None

@@ -37,10 +37,12 @@ class CalibrationInput:
 
 
 def read_recording(bag: Bag, topics: SensorTopics, tracking: TrackingConfig | None = None, *,
+                   images: range | None = None,
                    on_image: Callable[[], object] = lambda: None) -> CalibrationInput:
     """Follow points through the images of an open bag, and collect its gyro.
 
-    `on_image` is called after each image, for a progress bar.
+    Of `images`, by their number in the bag, and of the gyro meanwhile; None takes all. `on_image`
+    is called after each image, for a progress bar.
 
     Raises
     ------
@@ -48,9 +50,12 @@ def read_recording(bag: Bag, topics: SensorTopics, tracking: TrackingConfig | No
         The bag is damaged, or has no usable image or no gyro.
     """
     reader = _Reader(topics, TrackingConfig() if tracking is None else tracking)
+    number = 0
     for role, message in reader.feed.messages(bag, topics):
-        reader.take(role, message)
+        if images is None or role is Role.CAMERA_INFO or number in images:
+            reader.take(role, message)
         if role is Role.IMAGE:
+            number += 1
             on_image()
     return reader.recording()
 

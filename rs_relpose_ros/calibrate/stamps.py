@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 _VARYING = 0.02
 # Correlation of successive intervals beyond which, up or down, they are told apart.
 _TOLD_APART = 0.15
+# Steps of so many medians have an image missing.
+_MISSING = 1.8
 # The smooth line: straight within so many frames (1 sigma of the weights).
 _SMOOTH = 10.0
 
@@ -58,16 +60,27 @@ def frame_times(stamps_ns: NDArray[np.int64]) -> FrameTimes:
     low, high = np.quantile(longer, (0.1, 0.9))
     if high - low <= _VARYING * median:
         return none
-    # A few frames, as those of a camera that has just been started, must not decide.
-    deviations = np.clip(longer[1:], *np.quantile(longer[1:], (0.05, 0.95)))
-    deviations -= deviations.mean()
-    correlation = float(deviations[1:] @ deviations[:-1] / max(deviations @ deviations, 1e-24))
+    correlation = _of_successive(np.diff(stamps_ns) / NANOSECONDS / median)
     if correlation > _TOLD_APART:
         return FrameTimes(Varying.EXPOSURE, longer, 0.0)
     if correlation < -_TOLD_APART:
         late = _smooth(stamps_ns, median)
         return FrameTimes(Varying.JITTER, late, float(np.sqrt((late**2).mean())))
     return none._replace(varying=Varying.UNCLEAR)
+
+
+def _of_successive(steps: Array) -> float:
+    """Correlation of successive steps, shares of their median; with no image missing between."""
+    whole = steps < _MISSING
+    if not whole.any():
+        return 0.0
+    # A few frames, as those of a camera that has just been started, must not decide.
+    low, high = np.quantile(steps[whole], (0.05, 0.95))
+    deviations = np.clip(steps, low, high)
+    deviations -= deviations[whole].mean()
+    both = whole[1:] & whole[:-1]
+    first, second = deviations[:-1][both], deviations[1:][both]
+    return float(first @ second) / max(0.5 * float(first @ first + second @ second), 1e-24)
 
 
 def _smooth(stamps_ns: NDArray[np.int64], interval: float) -> Array:

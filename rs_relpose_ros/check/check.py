@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from rs_relpose_ros.bags.reader import Bag
-from rs_relpose_ros.bags.topics import Topic, TopicOptions
-from rs_relpose_ros.check import judge_images, judge_imu, judge_turning
+from rs_relpose_ros.bags.topics import SensorTopics, Topic, TopicOptions
+from rs_relpose_ros.calibrate.axis_maps import axes_text, nearest_axis_map
+from rs_relpose_ros.check import judge_images, judge_imu, judge_together
+from rs_relpose_ros.check.completion import completed, Completion
 from rs_relpose_ros.check.findings import CheckReport, FAILURE, Finding, Verdict, WARNING
-from rs_relpose_ros.check.scan import Chosen, scan
+from rs_relpose_ros.check.scan import Chosen, Scan
+from rs_relpose_ros.check.trial import middle_of, Trial
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.messages.sensor_feed import PARTS, Role
@@ -42,16 +45,33 @@ def choose_topics(bag: Bag, options: TopicOptions) -> Chosen:
 
 def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters,
               on_message: Callable[[], object] = lambda: None) -> CheckReport:
-    """Read the chosen topics of an open bag once, and judge them and the node's parameters.
+    """Read the chosen topics of an open bag, and judge them and the node's parameters.
 
-    `on_message` is called after each message, for a progress bar.
+    Once, or, where read-out or axes are not told, twice: they are looked for first. `on_message`
+    is called after each message of the last reading, and after each image of the first one, for a
+    progress bar.
 
     Raises
     ------
     InputError
         The bag is damaged.
     """
-    seen = scan(bag, chosen, parameters.tracking, on_message, parameters.intrinsics)
+    images = chosen.image.count if chosen.image else 0
+    seen = Scan(images, parameters.intrinsics, no_camera_info=chosen.camera_info is None)
+    completion, trial = Completion(parameters, None, ''), None
+    if chosen.image is not None and chosen.imu is not None:
+        completion = completed(
+            bag, SensorTopics(chosen.image, chosen.camera_info, chosen.imu, chosen.accel, None),
+            parameters, middle_of(images), on_message)
+        if not completion.parameters.sensor.missing():
+            trial = Trial(images, completion.parameters)
+    for role, message in seen.feed.messages(bag, chosen):
+        seen.take(role, message)
+        if trial is not None:
+            trial.take(role, message)
+        on_message()
+    if trial is not None:
+        trial.close()
     findings = [_topics(bag, chosen, parameters), _parameters(parameters)]
     if chosen.image is not None:
         findings += judge_images.findings(
@@ -59,7 +79,7 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters,
     if chosen.imu is not None:
         findings += judge_imu.findings(seen, bag.reliability(chosen.imu), parameters)
     if chosen.image is not None and chosen.imu is not None:
-        findings += judge_turning.findings(seen, parameters)
+        findings += judge_together.findings(seen, trial, completion, parameters)
     return CheckReport(str(bag.path), tuple(findings))
 
 
@@ -91,7 +111,9 @@ def _parameters(parameters: Parameters) -> Finding:
         return Finding('parameters', WARNING, f'{" and ".join(missing)} not given',
                        'the node needs them: give --params FILE, or find them from a recording '
                        'with "rs_relpose calibrate"', {'missing': missing})
-    return Finding('parameters', Verdict.OK, 'readout_time '
-                   f'{1e3 * (parameters.sensor.readout_time or 0.0):.1f} ms, quat_cam_imu_xyzw '
-                   f'and time_offset {1e3 * parameters.sensor.time_offset:.1f} ms are given',
-                   figures={'missing': []})
+    sensor = parameters.sensor
+    nearest = axes_text(nearest_axis_map(sensor.R_cam_imu))
+    return Finding('parameters', Verdict.OK,
+                   f'readout_time {1e3 * (sensor.readout_time or 0.0):.1f} ms, time_offset '
+                   f'{1e3 * sensor.time_offset:.1f} ms, quat_cam_imu_xyzw (about {nearest}) are '
+                   'given', figures={'missing': [], 'nearest': nearest})

@@ -13,12 +13,13 @@ class Verdict(str, Enum):
     """`FAILURE` is what would make the estimation fail or its results wrong."""
 
     OK = 'ok'
+    UNKNOWN = 'unknown'   # not measured, or not told by this recording
     WARNING = 'warning'
     FAILURE = 'failure'
 
 
 # Short, for the tables of cases.
-WARNING, FAILURE = Verdict.WARNING, Verdict.FAILURE
+UNKNOWN, WARNING, FAILURE = Verdict.UNKNOWN, Verdict.WARNING, Verdict.FAILURE
 
 
 @dataclass(frozen=True, slots=True)

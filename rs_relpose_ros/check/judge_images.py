@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from rs_relpose_ros.bags.topics import COMPRESSED_IMAGE, Topic
+from rs_relpose_ros.calibrate.stamps import frame_times, Varying
 from rs_relpose_ros.check.findings import Case, FAILURE, Finding, judged, Verdict, WARNING
 from rs_relpose_ros.check.scan import Scan
 from rs_relpose_ros.check.streams import Stamps
@@ -19,12 +20,14 @@ _MISSED_SHARE = 0.05
 def findings(seen: Scan, topic: Topic, reliability: str, parameters: Parameters) -> list[Finding]:
     """What is said of the images, their CameraInfo and their transport."""
     return [*_encoding(seen, topic, parameters), _rate(seen.image_stamps),
-            stamp_finding('image stamps', seen.image_stamps, 'the camera'), _calibration(seen),
+            stamp_finding('image stamps', seen.image_stamps, 'the camera', _varying(seen)),
+            _calibration(seen),
             _transport(seen, topic, reliability)]
 
 
-def stamp_finding(name: str, stamps: Stamps, of: str) -> Finding:
-    """Verdict on order and evenness of stamps."""
+def stamp_finding(name: str, stamps: Stamps, of: str,
+                  varying: Varying = Varying.JITTER) -> Finding:
+    """Verdict on order and evenness of stamps; `varying`: why their intervals differ."""
     figures = {'jitter_s': stamps.jitter, 'repeated': stamps.repeated,
                'backwards': stamps.backwards, 'furthest_back_s': stamps.furthest_back,
                'delay_s': stamps.delay if stamps.count else None}
@@ -44,8 +47,20 @@ def stamp_finding(name: str, stamps: Stamps, of: str) -> Finding:
              'recordings: the node starts anew there; record with a steady clock'),
         Case(unordered > 0, WARNING,
              'these messages are not used: look for two publishers on the topic'),
-        Case(stamps.jitter > max(0.2 * stamps.interval, 1e-3), WARNING, 'that looks like times of '
-             f'arrival: let {of} stamp in hardware, or at the interrupt'))
+        Case(stamps.jitter <= max(0.2 * stamps.interval, 1e-3), Verdict.OK, ''),
+        Case(varying is Varying.EXPOSURE, Verdict.OK, 'the time offset moves with it: have '
+             'time_offset_per_interval measured by "rs_relpose calibrate", or fix the exposure',
+             ', which lasts for many frames each, as automatic exposure makes it'),
+        Case(varying is Varying.JITTER, WARNING, 'that looks like times of '
+             f'arrival: let {of} stamp in hardware, or at the interrupt'),
+        Case(True, WARNING, f'see what {of} stamps',
+             ', neither as of times of arrival nor as of automatic exposure'))
+
+
+def _varying(seen: Scan) -> Varying:
+    """Why the intervals between images differ."""
+    stamps_ns = seen.stamps_ns
+    return frame_times(stamps_ns).varying if len(stamps_ns) > 2 else Varying.UNCLEAR
 
 
 def _encoding(seen: Scan, topic: Topic, parameters: Parameters) -> list[Finding]:

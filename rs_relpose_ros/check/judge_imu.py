@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from rs_relpose_ros.check.findings import Case, FAILURE, Finding, judged, Verdict, WARNING
+from rs_relpose_ros.check.findings import Case, FAILURE, Finding, judged, UNKNOWN, Verdict, WARNING
 from rs_relpose_ros.check.inertial import Inertial
 from rs_relpose_ros.check.judge_images import stamp_finding
 from rs_relpose_ros.check.scan import Scan
@@ -74,9 +74,9 @@ def _gyro(inertial: Inertial) -> Finding:
 
 def _bias(inertial: Inertial, parameters: Parameters) -> Finding:
     told, sigma = parameters.imu.gyro_bias, parameters.imu.gyro_bias_sigma
-    name, rest = 'gyro bias', inertial.rest()
+    name, rest = 'gyro at rest', inertial.rest()
     if rest is None:
-        return Finding(name, Verdict.OK, 'not measured: the IMU never stands still here', 'to '
+        return Finding(name, UNKNOWN, 'not measured: the IMU never stands still here', 'to '
                        'have it measured, let the camera stand still for some seconds',
                        {'at_rest_rad_s': None})
     listed = [round(float(value), 5) for value in rest.value]

@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from rs_relpose_ros.bags.reader import Bag, BagMessage
+from rs_relpose_ros.bags.reader import BagMessage
 from rs_relpose_ros.bags.topics import Topic
 from rs_relpose_ros.check.inertial import Inertial
 from rs_relpose_ros.check.streams import Stamps
-from rs_relpose_ros.check.turning import TurningImages
 from rs_relpose_ros.config.intrinsics import IntrinsicsConfig
-from rs_relpose_ros.config.tracking import TrackingConfig
 from rs_relpose_ros.errors import MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.messages.incoming import PublishedImage
 from rs_relpose_ros.messages.sensor_feed import Role, SensorFeed
 
+# Images that are decoded, evenly over the recording.
+_DECODED = 40
+# Stamps that are kept, the first ones: enough to tell jitter from automatic exposure.
+_MOST_STAMPS = 1000
 _MOST_KEYS = 20
 _Key = TypeVar('_Key')
 
@@ -46,12 +48,12 @@ class Scan:
     `told`: intrinsics for a camera whose CameraInfo has none.
     """
 
-    def __init__(self, images: int, tracking: TrackingConfig, told: IntrinsicsConfig,
-                 no_camera_info: bool) -> None:
+    def __init__(self, images: int, told: IntrinsicsConfig, no_camera_info: bool) -> None:
         self._told = told
         # Whether the intrinsics are those of the parameters: there is no calibrated CameraInfo.
         self.by_parameters = no_camera_info and told.given
-        self.turning = TurningImages(images, tracking)
+        self._every = max(images // _DECODED, 1)
+        self._first_stamps: list[int] = []
         self.image_stamps, self.imu_stamps, self.inertial = Stamps(), Stamps(), Inertial()
         self.encodings: dict[str, int] = {}            # number of images by encoding or format
         self.sizes: dict[tuple[int, int], int] = {}    # of decoded images by (width, height)
@@ -79,9 +81,6 @@ class Scan:
     def _imu(self, sample: ImuSample) -> None:
         self.imu_stamps.add(sample.stamp_ns, self._recorded_ns)
         self.inertial.add(sample)
-        if sample.angular_velocity is not None:
-            self.turning.add_rate(sample.stamp_ns, self._recorded_ns,
-                                  np.array(sample.angular_velocity))
 
     def _camera_info(self, intrinsics: Intrinsics) -> None:
         self.calibrations += intrinsics != self.intrinsics
@@ -91,35 +90,19 @@ class Scan:
         _count(self.encodings, published.image.encoding[:60])
         self.largest_image = max(self.largest_image, len(published.image.data))
         self.image_stamps.add(published.stamp_ns, self._recorded_ns)
-        if not self.turning.wants_next():
+        if len(self._first_stamps) < _MOST_STAMPS:
+            self._first_stamps.append(published.stamp_ns)
+        if (self.image_stamps.count - 1) % self._every:
             return
-        image = published.image.decoded()
-        size = image.shape[1], image.shape[0]
-        _count(self.sizes, size)
+        height, width = published.image.decoded().shape
+        _count(self.sizes, (width, height))
         if self.by_parameters:
-            self.intrinsics = self._told.of_image(*size)
-        intrinsics = self.intrinsics
-        if intrinsics is not None and (intrinsics.image_width, intrinsics.image_height) == size:
-            self.turning.add_image(published.stamp_ns, self._recorded_ns, image, intrinsics)
+            self.intrinsics = self._told.of_image(width, height)
 
-
-def scan(bag: Bag, chosen: Chosen, tracking: TrackingConfig, on_message: Callable[[], object],
-         told: IntrinsicsConfig | None = None) -> Scan:
-    """Read `chosen` topics of a bag once, and follow points by the detector of `tracking`.
-
-    `told`: intrinsics for a camera whose CameraInfo has none.
-
-    Raises
-    ------
-    InputError
-        The bag is damaged.
-    """
-    seen = Scan(chosen.image.count if chosen.image else 0, tracking, told or IntrinsicsConfig(),
-                no_camera_info=chosen.camera_info is None)
-    for role, message in seen.feed.messages(bag, chosen):
-        seen.take(role, message)
-        on_message()
-    return seen
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """The first stamps of the images (at most 1000), each once, increasing."""
+        return np.unique(np.array(self._first_stamps, dtype=np.int64))
 
 
 def _count(counts: dict[_Key, int], key: _Key) -> None:

@@ -20,10 +20,10 @@ from rs_relpose_ros.cli.options import (
 from rs_relpose_ros.config.parameter_file import read_parameters
 
 HELP = ('Look through a bag (rosbag2 or ROS 1) for whatever would spoil relative poses: topics, '
-        'rates, gaps, stamps, clocks, encodings, calibration, units, axes, bias, transport, and '
-        'how strong the rolling-shutter effect is. One line for each, with a verdict (ok, '
-        'warning, failure) and the remedy. Exit code 1 where something would make the estimation '
-        'fail.')
+        'rates, gaps, stamps, clocks, encodings, transport, and, from a minute of it run through '
+        'the front end, axes, time offset, read-out, bias, units, focal length and lens. One '
+        'line for each, with a verdict (ok, unknown, warning, failure) and the remedy. Exit code '
+        '1 where something would make the estimation fail or its poses wrong.')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -40,6 +40,8 @@ def run(args: argparse.Namespace) -> int:
     with open_bag(args.bag) as bag:
         chosen = choose_topics(bag, topic_options(args))
         messages = sum(topic.count for topic in chosen.all)
+        if parameters.sensor.missing() and chosen.image is not None:
+            messages += chosen.image.count   # read twice
         with progress_bar(messages, 'message', bag_name(args.bag)) as bar:
             report = check_bag(bag, chosen, parameters, on_message=bar.update)
     if args.json:

@@ -29,9 +29,11 @@ HELP = (
     '1) with the pipeline of relpose_node. Topics are found by their types where only one can be '
     'meant. Writes relative_poses.csv, summary.json and pictures, and errors.csv where the bag '
     "has the camera's true poses (geometry_msgs/PoseStamped of the optical frame, IMU clock). "
-    'Translations are unit vectors. Exit code 1: the bag was processed, but no pair got a pose.')
+    'Translations are unit vectors. Tells which figures that were given (axes, time_offset, ...) '
+    'images and IMU contradict, if any. Exit code 1: the bag was processed, but no pair got a '
+    'pose, or one of these figures is wrong.')
 
-_NO_POSE = 1
+_NO_POSE_OR_WRONG = 1
 
 _logger = logging.getLogger(__name__)
 
@@ -54,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay a bag; 1 when no pair got a pose."""
+    """Replay a bag; 1 when no pair got a pose or what was told is wrong."""
     parameters = read_parameters(args.params, args.set)
     stamps = None if args.stamps is None else read_stamps(args.stamps)
     name = bag_name(args.bag)
@@ -77,7 +79,9 @@ def run(args: argparse.Namespace) -> int:
         _logger.warning('not used, %d times: %s', count, reason)
     for line in report(outcome, folder):
         print(line)
-    return 0 if outcome.figures['pairs']['answered'] else _NO_POSE
+    figures = outcome.figures
+    good = figures['pairs']['answered'] and figures['health']['state'] != 'wrong'
+    return 0 if good else _NO_POSE_OR_WRONG
 
 
 def report(outcome: ReplayOutcome, folder: Path) -> list[str]:
@@ -95,7 +99,9 @@ def report(outcome: ReplayOutcome, folder: Path) -> list[str]:
         lines.append('no pair was closed: the bag is shorter than a keyframe interval, or too few '
                      'frames could be used')
     elif not pairs['answered']:
-        reasons = sorted({record.pose.reason for record in outcome.records})
+        # Why poses are withheld, the health tells below.
+        reasons = sorted({record.pose.reason for record in outcome.records
+                          if record.status.value != 'WITHHELD'})
         lines += [f'no pose: {reason}' for reason in reasons[:5]]
     errors, medians = figures['errors_against_truth'], figures['medians']
     if errors:
@@ -108,9 +114,25 @@ def report(outcome: ReplayOutcome, folder: Path) -> list[str]:
             f'medians: {_text(medians["inliers"], "inliers")}, residual '
             f'{_text(medians["residual_rms_px"], "px")}, rotation against the gyro '
             f'{_text(medians["rotation_difference_to_gyro_deg"], "deg")}')
+    lines += _health_lines(outcome)
     names = [*(path.name for path in outcome.files), SUMMARY_FILE]
     lines.append(f'in {folder}: {", ".join(names)}')
     return lines
+
+
+def _health_lines(outcome: ReplayOutcome) -> list[str]:
+    """A line for each figure that is suspect or wrong; else one that says what was seen."""
+    health = outcome.health
+    if health.faults:
+        return [fault.text for fault in health.faults]
+    if not health.findings:
+        return ['health: unknown: there was no pair to judge by']
+    seen, unseen = (', '.join(finding.figure for finding in health.findings
+                              if finding.observable is observable) for observable in (True, False))
+    if not unseen:
+        return [f'health: ok ({seen} seen)']
+    return [f'health: unknown: {unseen} not seen by this motion'
+            + (f' ({seen} ok)' if seen else '')]
 
 
 def _text(value: Any, unit: str) -> str:

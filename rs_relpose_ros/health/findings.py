@@ -35,6 +35,11 @@ class Finding:
     state: HealthState
     sentence: str   # told, seen, and what to do; for a person
 
+    @property
+    def text(self) -> str:
+        """Figure, state and sentence, as a line of a log."""
+        return f'{self.figure} is {self.state.value}: {self.sentence}'
+
     def as_json(self) -> dict[str, Any]:
         """For summary.json and `check --json`."""
         return asdict(self) | {'state': self.state.value}

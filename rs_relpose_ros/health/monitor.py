@@ -81,9 +81,8 @@ def withheld(pose: RelativePose, health: Health) -> RelativePose:
     """The pose without its figures, and why, where these are outside of their covariance."""
     if health.state is not HealthState.WRONG or not np.isfinite(pose.R).all():
         return pose
-    fault = health.faults[0]
     return RelativePose(
-        status=Status.WITHHELD, reason=f'{fault.figure} is wrong: {fault.sentence}',
+        status=Status.WITHHELD, reason=health.faults[0].text,
         inliers=pose.inliers, model=pose.model, iterations=pose.iterations,
         residual_rms=pose.residual_rms, duration=pose.duration)
 

@@ -23,9 +23,9 @@ class CauseLog:
         self._lock = threading.Lock()
         self._last: dict[str, tuple[float, int]] = {}
 
-    def __call__(self, text: str) -> None:
-        """Log `text`, or count it."""
-        cause = cause_of(text)
+    def __call__(self, text: str, cause: str = '') -> None:
+        """Log `text`, or count it; without a `cause`, texts that differ in numbers share one."""
+        cause = cause or cause_of(text)
         now = self._clock()
         with self._lock:
             if cause not in self._last and len(self._last) >= MOST_CAUSES:

@@ -106,10 +106,12 @@ class Statistics:
             dropped, self._refused = refused - self._refused, refused
             busy, self._busy_ns = self._busy_ns / NANOSECONDS / elapsed, 0
             level, text = self._judge(problem, dropped.total(), dropped[Refusal.OVERLOAD])
+            state = 'not estimating' if problem else {
+                OK: 'ok', WARN: 'degraded', ERROR: 'told wrong'}[level]
             last, pose = self._last_pair, self._last_pose
             latency, frame_time = _milliseconds(self._latencies), _milliseconds(self._frame_times)
             values = [
-                ('state', {OK: 'ok', WARN: 'degraded', ERROR: 'not estimating'}[level]),
+                ('state', state),
                 ('missing', ', '.join(missing)),
                 *((f'{name}_rate_hz', f'{rate:.1f}') for name, rate in rates.items()),
                 ('frames_received', str(counts.frames if counts else inputs.images)),
@@ -137,18 +139,19 @@ class Statistics:
     def _judge(self, problem: str, dropped: int, overload: int) -> tuple[int, str]:
         if problem:
             return ERROR, problem
+        last = self._last_pair
+        faults = () if last is None else last.health.faults
+        if faults and faults[0].state is HealthState.WRONG:
+            return ERROR, faults[0].text
         if overload > 0:
             return WARN, (f'{dropped} frames were not used since the last report, {overload} of '
                           'them because the worker is too slow for the camera')
         if dropped > 0:
             return WARN, f'{dropped} frames were not used since the last report'
-        last = self._last_pair
         if last is None:
             return OK, 'no keyframe pair yet'
-        if last.health.faults:
-            fault = last.health.faults[0]
-            return (ERROR if last.health.state is HealthState.WRONG else WARN), (
-                f'{fault.figure} is {fault.state.value}: {fault.sentence}')
+        if faults:
+            return WARN, faults[0].text
         if not last.pose:
             return WARN, f'no pose of the last pair: {self._last_no_pose}'
         return OK, f'estimating: {self._poses} poses of {self._pairs} pairs'

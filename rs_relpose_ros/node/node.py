@@ -34,6 +34,7 @@ from rs_relpose_ros.messages.sensor_feed import Role
 from rs_relpose_ros.node.cause_log import CauseLog
 from rs_relpose_ros.node.diagnostics import Inputs, SILENCE, Statistics
 from rs_relpose_ros.node.frame_timings import FrameTimings, opened
+from rs_relpose_ros.node.health_log import HealthLog
 from rs_relpose_ros.node.inputs import SensorInputs
 from rs_relpose_ros.node.message_types import message_class
 from rs_relpose_ros.node.outputs import PairPublishers, SHUT_DOWN
@@ -60,6 +61,7 @@ class RelposeNode(Node):
         self._info = CauseLog(lambda text: logger.info(text))
         self._warn = CauseLog(lambda text: logger.warning(text))
         self._error = CauseLog(lambda text: logger.error(text))
+        self._tell_health = HealthLog(self._info, self._warn, self._error)
         self._settings = NodeParameters(self, self._on_parameters)
         for sentence in unknown_overrides(self):
             self._warn(sentence)
@@ -188,6 +190,7 @@ class RelposeNode(Node):
             except SHUT_DOWN:
                 if self.context.ok():   # otherwise the node is being shut down
                     raise
+            self._tell_health(frame.pair.health, withhold=config.withhold_when_wrong)
         self._statistics.add_frame(frame.taken_ns)
         if self._timings is not None:
             self._timings.add(frame)

@@ -15,7 +15,7 @@ from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
-from rs_relpose_ros.health.findings import NOT_JUDGED, worst_of
+from rs_relpose_ros.health.findings import Health, NOT_JUDGED, worst_of
 from rs_relpose_ros.messages.outgoing import pair_messages, PAIR_TOPICS
 from rs_relpose_ros.replay.run import read_truth, Replay, ReplayedPair
 from rs_relpose_ros.replay.summary import summarize
@@ -39,13 +39,15 @@ _PICTURES = ('matches.png', 'errors.png', 'residuals.png', 'rotation.png')
 class ReplayOutcome:
     """What a replay gave.
 
-    `figures`: as in summary.json, without provenance; `intrinsics`: in force at the end; `files`:
-    written so far (tables, bag and pictures).
+    `figures`: as in summary.json, without provenance; `health`: the worst that was found of each
+    figure that was told; `intrinsics`: in force at the end; `files`: written so far (tables, bag
+    and pictures).
     """
 
     records: list[PairRecord]
     intrinsics: Intrinsics | None
     figures: dict[str, Any]
+    health: Health
     files: list[Path]
 
 
@@ -90,7 +92,8 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
         files.append(folder / BAG_FOLDER)
     if shown is not None:
         files += _draw(folder, records, shown, truth)
-    return ReplayOutcome(records, run.intrinsics, summarize(records, run, last, health), files)
+    return ReplayOutcome(records, run.intrinsics, summarize(records, run, last, health), health,
+                         files)
 
 
 def _prepare(folder: Path, with_bag: bool) -> None:

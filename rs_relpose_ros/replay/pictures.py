@@ -209,7 +209,7 @@ def _shade_no_pose(axis: Axes, records: Sequence[PairRecord], start_ns: int,
                    label: str = '') -> None:
     """Spans of the pairs without a pose, one entry of the legend per status."""
     labelled = set()
-    hatches = {Status.PURE_ROTATION: '', Status.LOW_PARALLAX: '..'}
+    hatches = {Status.PURE_ROTATION: '', Status.LOW_PARALLAX: '..', Status.WITHHELD: 'xx'}
     for record in records:
         if record.pose:
             continue
