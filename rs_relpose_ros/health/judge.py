@@ -47,6 +47,8 @@ _UNIT_FACTOR = 5.0
 _LONG_TURN, _INDEPENDENT = 2.0, 0.85
 # Rotations within this [rad] of half a turn about an axis of the image also are flipped images.
 _HALF_TURN = 0.35
+# Quantile of the pairs' shifts that says whether a deviation matters: quiet ones hide it.
+_SEEN_IN = 0.9
 # Sigmas of a figure that was told with one, within which it is as told.
 _AS_TOLD = 3.0
 # Figures that are asked for at most: traces of a gross one need some, too.
@@ -108,7 +110,8 @@ class Cause(NamedTuple):
     deviation: Array   # (11,) from what is in force; of the figure alone
     sigma: Array   # (11,)
     certainty: float   # in sigmas
-    # Of the pose, Mahalanobis: in sigmas of one that is told right, and in those claimed.
+    # Of the pose, Mahalanobis: in sigmas of one that is told right, of the pairs that it moves
+    # most, and in those claimed, in the median.
     shift: float
     claimed_shift: float
 
@@ -123,38 +126,52 @@ def causes(seen: Calibration, effects: list[Effect], in_force: Array) -> list[Ca
 
     All figures at once would share a deviation of one among each other where few pairs tell them
     apart. A figure alone gains ``b_k^T S_kk^-1 b_k`` in chi-square; the one that gains most is
-    taken for the cause, and the others are asked about what it leaves.
+    taken for the cause, and the others are asked about what it leaves. Where that is not certain,
+    a figure is a cause that is certain beside all others.
     """
-    found: list[Cause] = []
-    left, taken = seen.b - seen.S @ in_force, np.zeros(DEVIATIONS, dtype=bool)
-    while seen.pairs and len(found) < _MOST_CAUSES:
-        asked = [_alone(figure, seen, left, taken) for figure in FIGURES
-                 if not taken[figure.part].any()]
-        figure, gain = max(asked, key=lambda item: item[1])
-        size = figure.part.stop - figure.part.start
-        if gain < (_CERTAIN**2 + 2.0 * (size - 1)) * seen.misfit:
+    if not seen.pairs:
+        return []
+    found: list[tuple[Figure, float]] = []
+    together = sigma = np.zeros(DEVIATIONS)
+    taken = np.zeros(DEVIATIONS, dtype=bool)
+    while len(found) < _MOST_CAUSES:
+        left = seen.b - seen.S @ (in_force + together)
+        asked = [figure for figure in FIGURES if not taken[figure.part].any()]
+        figure, certainty = max(((figure, _alone(figure, seen, left, taken)) for figure in asked),
+                                key=lambda item: item[1])
+        if certainty < _CERTAIN:
+            figure, certainty = max(
+                ((figure, _beside_all(figure, seen, in_force)) for figure in asked),
+                key=lambda item: item[1])
+        if certainty < _CERTAIN:
             break
+        found.append((figure, certainty))
         taken[figure.part] = True
         # All causes so far together.
         covariance = np.linalg.inv(seen.S[np.ix_(taken, taken)])
         together, sigma = np.zeros(DEVIATIONS), np.zeros(DEVIATIONS)
         together[taken] = covariance @ (seen.b - seen.S @ in_force)[taken]
         sigma[taken] = np.sqrt(seen.misfit * np.diag(covariance))
-        left = seen.b - seen.S @ (in_force + together)
-        found = [_cause(other, together, sigma, math.sqrt(gain / seen.misfit), effects)
-                 for other in (*(cause.figure for cause in found), figure)]
-    return found
+    return [_cause(figure, together, sigma, certainty, effects)
+            for figure, certainty in found]
 
 
-def _alone(figure: Figure, seen: Calibration, left: Array,
-           taken: NDArray[np.bool_]) -> tuple[Figure, float]:
-    """Gain in chi-square of a figure beside those that are taken."""
+def _beside_all(figure: Figure, seen: Calibration, in_force: Array) -> float:
+    """Sigmas by which a figure is off when all are free."""
+    part = figure.part
+    return float((np.abs(seen.c - in_force)[part] / seen.sigma[part]).max())
+
+
+def _alone(figure: Figure, seen: Calibration, left: Array, taken: NDArray[np.bool_]) -> float:
+    """Sigmas by which a figure is off when, beside those that are taken, it is off alone."""
     part = figure.part
     S = seen.S[part, part] + np.diag(PRIOR_SIGMA[part] ** -2.0)
     if taken.any():
         cross = seen.S[part][:, taken]
         S = S - cross @ np.linalg.solve(seen.S[np.ix_(taken, taken)], cross.T)
-    return figure, float(left[part] @ np.linalg.solve(S, left[part]))
+    gain = float(left[part] @ np.linalg.solve(S, left[part])) / seen.misfit
+    # A vector gains more by chance.
+    return math.sqrt(max(gain - 2.0 * (part.stop - part.start - 1), 0.0))
 
 
 def _cause(figure: Figure, together: Array, sigma: Array, certainty: float,
@@ -162,8 +179,8 @@ def _cause(figure: Figure, together: Array, sigma: Array, certainty: float,
     deviation = np.zeros(DEVIATIONS)
     deviation[figure.part] = together[figure.part]
     return Cause(figure, deviation, sigma, certainty,
-                 _median_length([effect.shift @ deviation for effect in effects]),
-                 _median_length([effect.claimed_shift @ deviation for effect in effects]))
+                 _length([effect.shift @ deviation for effect in effects], _SEEN_IN),
+                 _length([effect.claimed_shift @ deviation for effect in effects], 0.5))
 
 
 def judged(seen: Calibration, explained: list[Cause], turned: TurnComparison | None,
@@ -195,8 +212,8 @@ def judged(seen: Calibration, explained: list[Cause], turned: TurnComparison | N
     return Health(tuple(found))
 
 
-def _median_length(shifts: list[Array]) -> float:
-    return float(np.median(np.linalg.norm(shifts, axis=1))) if shifts else 0.0
+def _length(shifts: list[Array], quantile: float) -> float:
+    return float(np.quantile(np.linalg.norm(shifts, axis=1), quantile)) if shifts else 0.0
 
 
 # -- figures one by one ----------------------------------------------------------------------

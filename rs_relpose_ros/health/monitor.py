@@ -19,7 +19,7 @@ from rs_relpose_ros.health.turning import TurnSums
 Array = NDArray[np.float64]
 
 # Latest pairs with a pose over which the effect of a deviation is taken.
-_EFFECTS = 15
+_EFFECTS = 30
 # Deviations about which a pair is linearised at most: lens and read-out must stay possible.
 _LARGEST = np.array([0.5] * 3 + [0.06, 0.1] + [0.2] * 3 + [0.3, 0.45, 0.6])
 
