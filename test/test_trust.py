@@ -114,10 +114,20 @@ def test_a_track_that_slips_does_so_as_the_camera_moves(simulation):
 def test_a_wrong_prediction_loses_the_track(simulation):
     tracker = tracker_of(simulation, EXACT)
     predicted = tracker.points.copy()
+    predicted[::10] += 100.0
+    ids = tracker.refined_matches().track_ids
+    wrong = set(ids[::10])
+    matches = follow(tracker, [1], predicted)
+    assert not wrong & set(matches.track_ids)
+
+
+def test_where_most_predictions_are_wrong_none_is_believed(simulation):
+    tracker = tracker_of(simulation, EXACT)
+    predicted = tracker.points.copy()
     predicted[::2] += 100.0
     ids = tracker.refined_matches().track_ids
     matches = follow(tracker, [1], predicted)
-    assert set(matches.track_ids) <= set(ids[1::2])
+    assert len(set(ids[::2]) & set(matches.track_ids)) > 0.5 * len(ids[::2])
     assert len(matches) > 100
     assert tracker.tracked_fraction == pytest.approx(len(matches) / len(ids))
 
