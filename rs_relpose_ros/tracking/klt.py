@@ -27,6 +27,8 @@ _NEAR = 2.0
 _EXPECTED_LEVELS, _NEAR_LEVELS, _MOST_FAR = 2, 1, 0.05
 # Share of tracks that may be lost before the search is repeated with all levels.
 _MOST_LOST = 0.15
+# Share from which on the prediction is not believed: a gyro in a wrong unit, or other axes.
+_HOPELESS = 0.5
 
 
 class KltTracker:
@@ -85,11 +87,12 @@ class KltTracker:
         needed = _NEAR_LEVELS if self._guesses_near else _EXPECTED_LEVELS
         levels = min(needed, all_levels) if expected else all_levels
         found, good = self._follow_and_return(previous, seen, points, guess, levels)
-        # Where many are lost the motion was not the expected one, or not even the predicted one.
-        starts = [predicted] * (levels < all_levels) + [points] * (predicted is not points)
-        for start in starts:
+        # Where many are lost the motion was not the expected one, where most are not even the
+        # predicted one.
+        for start, most, wanted in ((predicted, _MOST_LOST, levels < all_levels),
+                                    (points, _HOPELESS, predicted is not points)):
             lost = ~good
-            if np.count_nonzero(lost) > _MOST_LOST * len(good):
+            if wanted and np.count_nonzero(lost) > most * len(good):
                 found[lost], good[lost] = self._follow_and_return(
                     previous, seen, points[lost], start[lost], all_levels)
         off = found[good] - guess[good]
