@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
+import threading
 from types import FrameType
 from typing import NoReturn
 
@@ -33,6 +35,9 @@ def _on_signal(number: int, frame: FrameType | None) -> None:
     if not _started:
         # Nothing was begun that would need an end.
         os._exit(0)
+    # rclpy has ended its contexts by now, but for one that was made at this very moment. In a
+    # thread, since this one may hold a lock that it needs.
+    threading.Thread(target=sys.modules['rclpy'].try_shutdown, daemon=True).start()
 
 
 if __name__ == '__main__':
