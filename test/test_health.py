@@ -701,3 +701,15 @@ def test_live_and_replay_agree_while_figures_are_applied(bundled_bag):
             assert np.array_equal(getattr(a.pose, name), getattr(b.pose, name), equal_nan=True)
         assert a.applied == b.applied
         assert a.health == b.health
+
+
+def test_a_pair_without_rank_costs_no_pose(bundled_bag, monkeypatch):
+    def without_rank(*_: object) -> None:
+        raise np.linalg.LinAlgError('Singular matrix')
+
+    monkeypatch.setattr('rs_relpose_ros.health.recursion.pair_information', without_rank)
+    parameters = read_parameters(bundled_bag.with_name('hand_held.yaml'))
+    with open_bag(bundled_bag) as bag:
+        results = [pair.result for pair in Replay(bag, bag.find_topics(), parameters).pairs()]
+    assert sum(bool(result.pose) for result in results) == 27
+    assert results[-1].health.state is HealthState.UNKNOWN

@@ -45,7 +45,7 @@ class HealthMonitor:
         self.health, self.calibration = NOT_JUDGED, NOTHING_SEEN
 
     def add_turn(self, stamp_ns: int, by_images: Array, by_gyro: Array) -> None:
-        """Take in the turns (3,) of a frame since the one before, by images alone and by gyro."""
+        """Take in the turns (3,) over some frames, by images alone and by gyro."""
         self._turns.add(stamp_ns, by_images, by_gyro)
 
     def add_pair(self, stamp_ns: int, evidence: PairEvidence | None, pose: RelativePose,
@@ -54,16 +54,28 @@ class HealthMonitor:
 
         `evidence` is None where the pair has no rotation or no gyro.
         """
-        self.latest = information = None if evidence is None else self._recursion.add(
-            stamp_ns, evidence, told.in_force, self._linearised_at(told))
-        if information is not None:
-            self.calibration = self._recursion.solved()
-            if pose:
-                self._effects.append(_effect(information, pose))
-            self._causes = causes(self.calibration, list(self._effects), told.in_force)
-            pose = _widened(pose, information.pose_by_deviation @ self._deviation())
+        self.latest = None
+        if evidence is not None:
+            try:
+                pose = self._take_in(stamp_ns, evidence, pose, told)
+            except np.linalg.LinAlgError:
+                # A pair without rank says nothing of the calibration; its pose stays as it is.
+                self._causes = []
         self.health = judged(self.calibration, self._causes, self._turns.compared(), told)
         return pose
+
+    def _take_in(self, stamp_ns: int, evidence: PairEvidence, pose: RelativePose,
+                 told: Told) -> RelativePose:
+        information = self._recursion.add(
+            stamp_ns, evidence, told.in_force, self._linearised_at(told))
+        if information is None:
+            return pose
+        self.latest = information
+        self.calibration = self._recursion.solved()
+        if pose:
+            self._effects.append(_effect(information, pose))
+        self._causes = causes(self.calibration, list(self._effects), told.in_force)
+        return _widened(pose, information.pose_by_deviation @ self._deviation())
 
     def _deviation(self) -> Array:
         """(11,) from what is in force, of all causes."""

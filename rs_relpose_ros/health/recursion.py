@@ -85,12 +85,12 @@ class Recursion:
 
         It is linearised about the deviations `about` (11,), which differ from those `in_force`
         once a figure is found off: then some of the older pairs are, too, those first whose
-        linearisation is furthest from there. What the pair says; None with too few matches.
+        linearisation is furthest from there. What the pair says; None where it says nothing.
         """
         if self._pairs and stamp_ns < self._pairs[-1].stamp_ns:
             self.clear()
         information = pair_information(evidence, in_force, about)
-        if information is None:
+        if information is None or not np.isfinite(information.S).all():
             return None
         if (about != in_force).any():
             self._linearise_anew(about)
