@@ -12,8 +12,8 @@ in the image: the gyro does not tell it, and it depends on depth.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 import math
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -22,9 +22,6 @@ from numpy.typing import NDArray
 from rs_relpose_ros.front_end.derotated_rays import Sensor
 from rs_relpose_ros.geometry.motion import FrameMotion
 
-Array = NDArray[np.float64]
-Map = NDArray[np.float32]
-
 # Pixels from node to node of the grid on which the map is exact; linear in between. At 3 rad/s
 # and a focal length of 450 px that is within 0.015 px (16 px: 0.04).
 _STEP = 8
@@ -32,46 +29,48 @@ _STEP = 8
 _ORIENTATIONS = 129
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+class RowMap(NamedTuple):
+    """A map for one motion.
+
+    `sources`: pixels (H, W, 2), u and v, of the image as read; NaN where the lens sees nothing.
+    `shift`: largest difference of a coordinate of a pixel and its source [px]. `complete`: whether
+    no source is NaN.
+    """
+
+    sources: NDArray[np.float32]
+    shift: float
+    complete: bool
+
+
 class MiddleRow:
-    """The map of one camera for any motion; images are those that its `Intrinsics` publish.
+    """Maps of one camera; images are those that its `Intrinsics` publish.
 
     Attributes
     ----------
-    row : float
-        The middle row of the published image, as a row of the sensor.
+    sensor : Sensor
     delay : float
-        Its row time [s] from the reference row of the camera.
+        Row time [s] of the middle row of the published image, from the reference row of the
+        camera.
     """
 
-    sensor: Sensor
-    row: float = field(init=False)
-    delay: float = field(init=False)
-    _rows: Array = field(init=False, repr=False)   # (N,) of the nodes, on the sensor
-    _rays: Array = field(init=False, repr=False)   # (N, 3) of the nodes
-    _shape: tuple[int, int] = field(init=False, repr=False)   # nodes down and across
-
-    def __post_init__(self) -> None:
-        camera, intrinsics = self.sensor
+    def __init__(self, sensor: Sensor) -> None:
+        self.sensor = sensor
+        camera, intrinsics = sensor
         sizes = intrinsics.image_height, intrinsics.image_width
         # cv2.resize puts node k at pixel (k + 1/2) step - 1/2; one node more on each side, so that
         # all pixels lie between nodes.
         down, across = ((np.arange(math.ceil(size / _STEP) + 2) - 0.5) * _STEP - 0.5
                         for size in sizes)
-        nodes = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
-        pixels = intrinsics.to_sensor(nodes)
-        _, row = intrinsics.to_sensor([[0.0, 0.5 * (sizes[0] - 1)]])[0]
-        values = {'row': float(row), 'delay': float(camera.row_times(row)),
-                  '_rows': np.ascontiguousarray(pixels[:, 1]), '_rays': camera.unproject(pixels),
-                  '_shape': (len(down), len(across))}
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        self._shape = len(down), len(across)
+        self._nodes = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+        pixels = intrinsics.to_sensor(self._nodes)
+        self._rays = camera.unproject(pixels)
+        self._rows = np.ascontiguousarray(pixels[:, 1])   # of the sensor
+        _, middle = intrinsics.to_sensor([[0.0, 0.5 * (sizes[0] - 1)]])[0]
+        self.delay = float(camera.row_times(middle))
 
-    def sources(self, motion: FrameMotion) -> Map:
-        """Pixels (H, W, 2), u and v, of the image as read; NaN where the lens sees nothing.
-
-        `motion` is relative to the camera's reference row and covers all of its rows.
-        """
+    def map(self, motion: FrameMotion) -> RowMap:
+        """Where the pixels come from, for a motion relative to the reference row of the camera."""
         camera, intrinsics = self.sensor
         # From the middle row's frame to that of each of some rows: R(tau)^T R_mid.
         rows = np.linspace(0.0, camera.height - 1.0, _ORIENTATIONS)
@@ -79,7 +78,10 @@ class MiddleRow:
                           motion.rotations([self.delay])[0])
         nodes = intrinsics.to_image(camera.project_turning(self._rays, self._rows, turns))
         down, across = self._shape
+        shift = np.abs(nodes - self._nodes).max(axis=1)
+        complete = not np.isnan(shift).any()
         whole = cv2.resize(nodes.reshape(down, across, 2).astype(np.float32),
                            (across * _STEP, down * _STEP), interpolation=cv2.INTER_LINEAR)
-        return np.asarray(whole[_STEP:_STEP + intrinsics.image_height,
-                                _STEP:_STEP + intrinsics.image_width])
+        sources = whole[_STEP:_STEP + intrinsics.image_height,
+                        _STEP:_STEP + intrinsics.image_width]
+        return RowMap(np.asarray(sources), float(np.nanmax(shift, initial=0.0)), complete)

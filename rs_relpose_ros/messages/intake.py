@@ -38,9 +38,9 @@ class Intake:
             Role.IMU: self._add_imu, Role.ACCEL: sequencer.add_imu,
             Role.CAMERA_INFO: self._add_intrinsics, Role.IMAGE: self._add_image})
         self._sequencer, self._frame = sequencer, frame
-        # Those in force, and the last CameraInfo that could be used.
+        # Those in force.
         self.intrinsics: Intrinsics | None = None
-        self.camera_info: Any = None
+        self._camera_info: Any = None
         self._told = told if told is not None and told.given else None
         # Whether images go with what is told.
         self._use_told = False
@@ -70,7 +70,11 @@ class Intake:
                 self.release_held()
             raise
         if role is Role.CAMERA_INFO:
-            self.camera_info = message
+            self._camera_info = message
+
+    def camera_info_of(self, intrinsics: Intrinsics) -> Any:
+        """The CameraInfo in force; None where it does not tell these intrinsics."""
+        return None if self._use_told or intrinsics != self.intrinsics else self._camera_info
 
     def release_held(self) -> None:
         """Let no image wait for a CameraInfo any longer."""
