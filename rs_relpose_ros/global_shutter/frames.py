@@ -67,15 +67,20 @@ class GlobalShutterFrame:
 
     def image(self) -> Pixels:
         """The turned image, in the encoding of the frame."""
-        values = cv2.remap(self.frame.pixels.values, self.map.sources, _NO_MAP, cv2.INTER_LINEAR,
-                           borderMode=_BORDERS[self.border])
-        if not self.map.complete:
-            values[np.isnan(self.map.sources[..., 0])] = 0
-        return Pixels(values, self.frame.pixels.encoding)
+        values, border = self.frame.pixels.values, _BORDERS[self.border]
+        complete, turned = self.map.complete, np.empty_like(values)
+        for rows, sources in self.map.bands():
+            turned[rows] = cv2.remap(values, sources, _NO_MAP, cv2.INTER_LINEAR, borderMode=border)
+            if not complete:
+                turned[rows][np.isnan(sources[..., 0])] = 0
+        return Pixels(turned, self.frame.pixels.encoding)
 
     def mask(self) -> Pixels:
         """255 where the camera saw what the turned image shows, 0 where its border does."""
-        height, width = self.map.sources.shape[:2]
-        u, v = self.map.sources[..., 0], self.map.sources[..., 1]
-        seen = (u >= 0.0) & (u <= width - 1.0) & (v >= 0.0) & (v <= height - 1.0)
-        return Pixels(np.where(seen, np.uint8(255), np.uint8(0)), 'mono8')
+        width, height = self.map.width, self.map.height
+        mask = np.empty((height, width), dtype=np.uint8)
+        for rows, sources in self.map.bands():
+            u, v = sources[..., 0], sources[..., 1]
+            mask[rows] = np.where((u >= 0.0) & (u <= width - 1.0) & (v >= 0.0)
+                                  & (v <= height - 1.0), 255, 0)
+        return Pixels(mask, 'mono8')

@@ -12,6 +12,7 @@ in the image: the gyro does not tell it, and it depends on depth.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 import math
 from typing import NamedTuple
 
@@ -25,21 +26,42 @@ from rs_relpose_ros.geometry.motion import FrameMotion
 # Pixels from node to node of the grid on which the map is exact; linear in between. At 3 rad/s
 # and a focal length of 450 px that is within 0.015 px (16 px: 0.04).
 _STEP = 8
+# Rows of the image that are looked up at once, a multiple of the step.
+_BAND = 64
 # Orientations over the read-out; linear in between, to 1e-7 rad at 3 rad/s.
 _ORIENTATIONS = 129
 
 
 class RowMap(NamedTuple):
-    """A map for one motion.
+    """A map for one motion, as its nodes.
 
-    `sources`: pixels (H, W, 2), u and v, of the image as read; NaN where the lens sees nothing.
-    `shift`: largest difference of a coordinate of a pixel and its source [px]. `complete`: whether
-    no source is NaN.
+    `nodes`: pixels (rows, columns, 2), u and v, of the image as read; NaN where the lens sees
+    nothing. `width`, `height`: of the image. `shift`: largest difference of a coordinate of a node
+    and its source [px].
     """
 
-    sources: NDArray[np.float32]
+    nodes: NDArray[np.float32]
+    width: int
+    height: int
     shift: float
-    complete: bool
+
+    @property
+    def complete(self) -> bool:
+        """Whether the lens sees every node."""
+        return not np.isnan(self.nodes).any()
+
+    def bands(self) -> Iterator[tuple[slice, NDArray[np.float32]]]:
+        """Rows of the image, some at a time, and their sources (N, W, 2), for `cv2.remap`.
+
+        What is done with a band finds it in the cache; a whole map would not be there.
+        """
+        for top in range(0, self.height, _BAND):
+            bottom = min(top + _BAND, self.height)
+            nodes = self.nodes[top // _STEP:math.ceil(bottom / _STEP) + 2]
+            band = cv2.resize(nodes, (nodes.shape[1] * _STEP, nodes.shape[0] * _STEP),
+                              interpolation=cv2.INTER_LINEAR)
+            yield slice(top, bottom), np.asarray(
+                band[_STEP:_STEP + bottom - top, _STEP:_STEP + self.width])
 
 
 class MiddleRow:
@@ -77,11 +99,6 @@ class MiddleRow:
         turns = np.einsum('nji,jk->nik', motion.rotations(camera.row_times(rows)),
                           motion.rotations([self.delay])[0])
         nodes = intrinsics.to_image(camera.project_turning(self._rays, self._rows, turns))
-        down, across = self._shape
-        shift = np.abs(nodes - self._nodes).max(axis=1)
-        complete = not np.isnan(shift).any()
-        whole = cv2.resize(nodes.reshape(down, across, 2).astype(np.float32),
-                           (across * _STEP, down * _STEP), interpolation=cv2.INTER_LINEAR)
-        sources = whole[_STEP:_STEP + intrinsics.image_height,
-                        _STEP:_STEP + intrinsics.image_width]
-        return RowMap(np.asarray(sources), float(np.nanmax(shift, initial=0.0)), complete)
+        shift = np.nanmax(np.abs(nodes - self._nodes), initial=0.0)
+        return RowMap(nodes.reshape(*self._shape, 2).astype(np.float32), intrinsics.image_width,
+                      intrinsics.image_height, float(shift))
