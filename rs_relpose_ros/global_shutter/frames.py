@@ -12,8 +12,6 @@ from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.global_shutter.row_map import RowMap
 from rs_relpose_ros.images.encoded import CompressedImage, EncodedImage, Pixels
 
-# Both coordinates are in one map.
-_NO_MAP = np.empty(0, dtype=np.float32)
 _BORDERS = {'replicate': cv2.BORDER_REPLICATE, 'black': cv2.BORDER_CONSTANT}
 
 
@@ -70,7 +68,9 @@ class GlobalShutterFrame:
         values, border = self.frame.pixels.values, _BORDERS[self.border]
         complete, turned = self.map.complete, np.empty_like(values)
         for rows, sources in self.map.bands():
-            turned[rows] = cv2.remap(values, sources, _NO_MAP, cv2.INTER_LINEAR, borderMode=border)
+            # None, as the types forbid: OpenCV 5 takes an empty second map for one.
+            turned[rows] = cv2.remap(values, sources, None,  # type: ignore[call-overload]
+                                     cv2.INTER_LINEAR, borderMode=border)
             if not complete:
                 turned[rows][np.isnan(sources[..., 0])] = 0
         return Pixels(turned, self.frame.pixels.encoding)
