@@ -1,4 +1,4 @@
-"""Start relpose_node beside a camera driver.
+"""Start relpose_node, or another node of the package, beside a camera driver.
 
 ::
 
@@ -14,7 +14,8 @@ from launch_ros.substitutions import FindPackageShare
 
 ARGUMENTS = {
     'namespace': ('', 'namespace of the node'),
-    'name': ('relpose_node', 'name of the node'),
+    'executable': ('relpose_node', 'node to start: relpose_node or global_shutter_node'),
+    'name': (LaunchConfiguration('executable'), 'name of the node'),
     'camera_namespace': ('/camera', 'namespace of the camera driver'),
     'image': ('image_raw', 'raw image topic, within camera_namespace unless absolute'),
     'camera_info': ('camera_info', 'CameraInfo topic, likewise'),
@@ -40,7 +41,7 @@ def start_node(context: LaunchContext) -> list[Action]:
     profile = argument['fastdds_profile']
     environment = [SetEnvironmentVariable('FASTRTPS_DEFAULT_PROFILES_FILE', profile)]
     return [*(environment if profile.perform(context) else []), Node(
-        package='rs_relpose_ros', executable='relpose_node', name=argument['name'],
+        package='rs_relpose_ros', executable=argument['executable'], name=argument['name'],
         namespace=argument['namespace'], output='screen',
         parameters=[argument['params_file'], overrides],
         remappings=[

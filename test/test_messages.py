@@ -425,20 +425,25 @@ def test_published_covariances_have_no_negative_eigenvalue():
 
 def test_matches_are_the_inliers(types):
     result = pair()
-    cloud = outgoing.matches_message(result, types)
-    names = ['id', 'u1', 'v1', 'u2', 'v2', 'tau1', 'tau2', 'x1', 'y1', 'z1', 'x2', 'y2', 'z2']
+    cloud = outgoing.pair_messages(result, types).matches
+    assert cloud.header.frame_id == 'camera_reference'
+    assert cloud.is_dense
+    names = ['id', 'u1', 'v1', 'u2', 'v2', 'tau1', 'tau2', 'x1', 'y1', 'z1', 'x2', 'y2', 'z2',
+             'x', 'y', 'z', 'u1_gs', 'v1_gs', 'u2_gs', 'v2_gs']
     assert [field.name for field in cloud.fields] == names
-    assert [field.datatype for field in cloud.fields] == [6] + [7] * 12
+    assert [field.datatype for field in cloud.fields] == [6] + [7] * 19
     count = int(result.pose.inliers.sum())
     assert 0 < count < len(result.pose.inliers)
     assert (cloud.height, cloud.width) == (1, count)
     assert len(cloud.data) == cloud.row_step == count * cloud.point_step
     raw = bytes(cloud.data)
     for row, index in enumerate(np.flatnonzero(result.pose.inliers)):
-        record = struct.unpack_from('<I12f', raw, row * cloud.point_step)
+        record = struct.unpack_from('<I19f', raw, row * cloud.point_step)
         expected = [result.matches.track_ids[index], *result.matches.points1[index],
                     *result.matches.points2[index], result.row_times1[index],
-                    result.row_times2[index], *result.rays1[index], *result.rays2[index]]
+                    result.row_times2[index], *result.rays1[index], *result.rays2[index],
+                    *result.landmarks.points[index], *result.landmarks.pixels1[index],
+                    *result.landmarks.pixels2[index]]
         np.testing.assert_allclose(record, expected, rtol=1e-6)
 
 

@@ -87,15 +87,16 @@ def write_report(folder: Path, maps: Sequence[MapErrors], bags: Sequence[FivePoi
         write_csv(folder / 'five_point.csv', bags)
         rows = [(b.name, f'{b.readout_ms:.0f}', f'{b.raw_rotation:.3f}',
                  f'{b.raw_translation:.2f}', f'{b.turned_rotation:.3f}',
-                 f'{b.turned_translation:.2f}', f'{b.raw_rotation / b.turned_rotation:.1f}',
-                 f'{b.raw_translation / b.turned_translation:.1f}') for b in bags]
-        ratios = [[getattr(b, f'raw_{what}') / getattr(b, f'turned_{what}') for b in bags]
-                  for what in ('rotation', 'translation')]
+                 f'{b.turned_translation:.2f}', f'{b.rotation_ratio:.1f}',
+                 f'{b.translation_ratio:.1f}') for b in bags]
         parts.append("OpenCV's 5-point, median errors [deg]\n\n" + markdown_table(
             ('recording', 'read-out [ms]', 'raw: R', 't', 'turned: R', 't', 'ratio of R',
-             'of t'), rows) + '\nMedian of the ratios: rotation '
-            f'{statistics.median(ratios[0]):.1f}, translation '
-            f'{statistics.median(ratios[1]):.1f}\n')
+             'of t'), rows))
+        walks = [b for b in bags if b.simulated]
+        if walks:
+            parts.append('Median of the ratios of the simulated ones: rotation '
+                         f'{statistics.median(b.rotation_ratio for b in walks):.1f}, translation '
+                         f'{statistics.median(b.translation_ratio for b in walks):.1f}\n')
     if speeds:
         write_csv(folder / 'speed.csv', speeds)
         parts.append('Processor time of a frame [ms]\n\n' + markdown_table(

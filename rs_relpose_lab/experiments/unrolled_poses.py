@@ -56,6 +56,17 @@ class FivePoint:
     turned_pairs: int
     turned_rotation: float
     turned_translation: float
+    simulated: bool = False
+
+    @property
+    def rotation_ratio(self) -> float:
+        """Of the raw images to the turned ones."""
+        return self.raw_rotation / self.turned_rotation
+
+    @property
+    def translation_ratio(self) -> float:
+        """Of the raw images to the turned ones."""
+        return self.raw_translation / self.turned_translation
 
 
 def five_point_on_bag(config: SimulationConfig, folder: Path) -> FivePoint:
@@ -69,7 +80,8 @@ def five_point_on_bag(config: SimulationConfig, folder: Path) -> FivePoint:
     corrected = _five_point(turned, as_global_shutter(parameters))
     return FivePoint(f'{config.scene} {config.seed}', 1e3 * config.readout_time,
                      raw.answered, raw.rotation[0], raw.translation[0],
-                     corrected.answered, corrected.rotation[0], corrected.translation[0])
+                     corrected.answered, corrected.rotation[0], corrected.translation[0],
+                     simulated=True)
 
 
 def as_global_shutter(parameters: Parameters) -> Parameters:
