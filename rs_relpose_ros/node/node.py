@@ -226,9 +226,14 @@ class RelposeNode(Node):
             problem=problem, missing=missing)
         status = status_message(
             report.level, f'{self.get_fully_qualified_name()}: relative pose', report.text,
-            self.resolve_topic_name('image'), report.values, message_class)
+            self._image_topic(), report.values, message_class)
         self._diagnostics.publish(diagnostics_message(
             self.get_clock().now().nanoseconds, status, message_class))
+
+    def _image_topic(self) -> str:
+        """The subscribed one, with its transport, once there is one."""
+        return (self.resolve_topic_name('image') if self._inputs is None
+                else self._inputs.topics[Role.IMAGE])
 
     def _problem(self) -> tuple[str, tuple[str, ...]]:
         """Why nothing is estimated at the moment, and the names of what is missing."""
@@ -292,7 +297,13 @@ def main(arguments: Sequence[str] | None = None,
     `on_started` is called once rclpy handles the signals.
     """
     given = sys.argv if arguments is None else ['relpose_node', *arguments]
-    _help().parse_args(remove_ros_args(given)[1:])
+    try:
+        own = remove_ros_args(given)
+    except rclpy_implementation.RCLInvalidROSArgsError as error:
+        # rcl names its source files behind the sentence.
+        _fatal(str(error).split(', at /')[0].strip())
+        return 2
+    _help().parse_args(own[1:])
     rclpy.init(args=list(given))
     on_started()
     node: RelposeNode | None = None
@@ -306,11 +317,15 @@ def main(arguments: Sequence[str] | None = None,
         if rclpy.ok():
             raise
     except RsRelposeError as error:
-        rclpy.logging.get_logger('relpose_node').fatal(str(error))
+        _fatal(str(error))
         return 2
     finally:
         _finish(node)
     return 0
+
+
+def _fatal(sentence: str) -> None:
+    rclpy.logging.get_logger('relpose_node').fatal(sentence)
 
 
 def _finish(node: RelposeNode | None) -> None:
