@@ -174,8 +174,9 @@ def _row(cell: CellStatistics) -> tuple[str, ...]:
         cell.cell, cell.rotation.text(3), cell.oracle_rotation.text(3),
         cell.rotation_ratio.text(2), cell.translation.text(3), cell.oracle_translation.text(3),
         cell.translation_ratio.text(2), *_against_mixture(cell), f'{cell.lost}',
-        f'{cell.gross}', f'{cell.nees.mean:.2f}', f'{cell.oracle_nees.mean:.2f}', f'{100 * cell.nees.above:.1f}',
-        f'{100 * cell.oracle_nees.above:.1f}', f'{cell.duration:.1f}')
+        f'{cell.gross}', f'{cell.nees.mean:.2f}', f'{cell.oracle_nees.mean:.2f}',
+        f'{100 * cell.nees.above:.1f}', f'{100 * cell.oracle_nees.above:.1f}',
+        f'{cell.duration:.1f}')
 
 
 def _against_mixture(cell: CellStatistics) -> tuple[str, str]:
