@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 from importlib.metadata import distribution
 import py_compile
+import re
 from xml.etree import ElementTree
 
 from conftest import ROOT
@@ -15,6 +16,7 @@ from rs_relpose_lab.live.processes import node_process, Process
 from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.config.template import parameter_template
+from rs_relpose_ros.node import node as node_module
 
 CONFIG = ROOT / 'config'
 LAUNCH_FILE = ROOT / 'launch' / 'relpose.launch.py'
@@ -41,6 +43,16 @@ def test_template_holds_every_parameter_at_its_default():
 
 
 @pytest.mark.live
+def test_help_tells_the_legal_values_of_every_kind(capsys):
+    with pytest.raises(SystemExit):
+        node_module.main(['--help'])
+    shown = capsys.readouterr().out
+    assert re.search(r'^  track_time_offset: .*\. true or false; default False', shown, re.M)
+    assert re.search(r'^  stamps_file: .*\. text; default', shown, re.M)
+    for name, _, declared in Parameters.declarations():
+        assert f'  {name}: {declared.description}' in shown
+
+
 def test_node_takes_the_template(ros_domain_id):
     """Rcl's own YAML parser makes of it what ours does."""
     with node_process(CONFIG / 'relpose.yaml') as node:

@@ -290,6 +290,22 @@ def test_an_illegal_parameter_ends_the_node_with_one_line(
     assert sentence in lines[0]
 
 
+@pytest.mark.parametrize('content, sentence', [
+    (None, 'Error opening YAML file'),
+    ('a: [1\nb: 2', 'Sequences can only be values'),
+])
+def test_a_parameter_file_that_cannot_be_read_is_one_line(tmp_path, content, sentence, capfd):
+    file = tmp_path / 'camera.yaml'
+    if content is not None:
+        file.write_text(content, encoding='utf-8')
+    assert node_module.main(['--ros-args', '--params-file', str(file)]) == 2
+    lines = capfd.readouterr().err.strip().splitlines()
+    assert len(lines) == 1, lines
+    assert 'FATAL' in lines[0]
+    assert str(file) in lines[0]
+    assert sentence in lines[0]
+
+
 @pytest.fixture
 def signal_handlers() -> Iterator[None]:
     """Those of this process, which a node's end replaces."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 import sys
 
-from rs_relpose_ros.config.declarations import Declared
+from rs_relpose_ros.config.declarations import ANY_VALUE, Declared
 from rs_relpose_ros.config.parameter_file import comment, yaml_text
 from rs_relpose_ros.config.parameters import Parameters
 
@@ -38,7 +38,7 @@ def parameter_template() -> str:
 
 def _meaning(declared: Declared) -> str:
     text = declared.description
-    if declared.kind is not bool and declared.legal != 'finite':
+    if declared.legal not in ('finite', *ANY_VALUE.values()):
         text += f': {declared.legal}'
     return f'{text} [live]' if declared.live else text
 

@@ -28,7 +28,14 @@ def run_node(make: Callable[[], SensorNode], name: str, description: str,
     `description` is that of its ``--help``; `on_started` is called once rclpy handles the signals.
     """
     given = sys.argv if arguments is None else [name, *arguments]
-    _help(name, description).parse_args(remove_ros_args(given)[1:])
+    logger = rclpy.logging.get_logger(name)
+    try:
+        own = remove_ros_args(given)
+    except rclpy_implementation.RCLInvalidROSArgsError as error:
+        # rcl names its source files behind the sentence.
+        logger.fatal(str(error).split(', at /')[0].strip())
+        return 2
+    _help(name, description).parse_args(own[1:])
     rclpy.init(args=list(given))
     on_started()
     node: SensorNode | None = None
@@ -42,7 +49,7 @@ def run_node(make: Callable[[], SensorNode], name: str, description: str,
         if rclpy.ok():
             raise
     except RsRelposeError as error:
-        rclpy.logging.get_logger(name).fatal(str(error))
+        logger.fatal(str(error))
         return 2
     finally:
         _finish(node)

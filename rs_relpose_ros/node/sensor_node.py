@@ -213,9 +213,14 @@ class SensorNode(Node):
             problem=problem, missing=missing)
         status = status_message(
             report.level, f'{self.get_fully_qualified_name()}: {self.task}', report.text,
-            self.resolve_topic_name('image'), report.values, message_class)
+            self._image_topic(), report.values, message_class)
         self._diagnostics.publish(diagnostics_message(
             self.get_clock().now().nanoseconds, status, message_class))
+
+    def _image_topic(self) -> str:
+        """The subscribed one, with its transport, once there is one."""
+        return (self.resolve_topic_name('image') if self._inputs is None
+                else self._inputs.topics[Role.IMAGE])
 
     def _problem(self) -> tuple[str, tuple[str, ...]]:
         """Why nothing comes out at the moment, and the names of what is missing."""
