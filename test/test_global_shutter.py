@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+import subprocess
+import sys
 from typing import Any
 
 import cv2
@@ -294,6 +296,14 @@ def test_a_tracked_time_offset_is_applied():
     assert last.stamp_ns == pytest.approx(middle, abs=1.5 * MS)
 
 
+def test_the_command_needs_no_ros():
+    ended = subprocess.run(
+        [sys.executable, '-c', ('import sys, rs_relpose_ros.cli.unroll; '
+                                'print("rclpy" in sys.modules, "rosbags" in sys.modules)')],
+        capture_output=True, text=True, timeout=100, check=True)
+    assert ended.stdout.split() == ['False', 'True']
+
+
 # -- bags ------------------------------------------------------------------------------------
 
 
@@ -391,6 +401,27 @@ def test_images_without_gyro_are_left_out(bag, tmp_path, capsys):
     infos = [m for m in messages_of(tmp_path / 'out') if m.topic.endswith('camera_info')]
     assert 23 <= len(images) == len(infos) <= 28
     assert f'{len(images)} of 30 images turned, {30 - len(images)} left out' in text
+
+
+def test_told_intrinsics_become_a_camera_info(bag, tmp_path):
+    """Of a bag without one."""
+    path, parameters = bag
+    with open_bag(path) as opened:
+        [first, *_] = opened.messages([opened.find_topics().camera_info])
+    bare = rewritten(path, tmp_path / 'bare',
+                     lambda m: None if m.topic == '/camera/camera_info' else m)
+    matrix, distortion = ([float(v) for v in values] for values in (
+        first.message.k, first.message.d))
+    assert unroll(bare, parameters, tmp_path / 'out', '--set', f'camera_matrix={matrix}',
+                  '--set', f'distortion_coefficients={distortion}') == 0
+    with open_bag(tmp_path / 'out') as opened:
+        topics = opened.find_topics()
+        infos = [m.message for m in opened.messages([topics.camera_info])]
+        images = [m.message for m in opened.messages([topics.image])]
+    assert topics.camera_info.name == '/camera/camera_info'
+    assert [stamp_ns(m.header) for m in infos] == [stamp_ns(m.header) for m in images]
+    assert len(infos) == 30
+    assert intrinsics_from_info(infos[0]) == intrinsics_from_info(first.message)
 
 
 def test_unknown_types_are_copied_and_other_images_of_the_same_stamps_told(bag, tmp_path, capsys,

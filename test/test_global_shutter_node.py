@@ -8,7 +8,7 @@ from pathlib import Path
 import signal
 from typing import Any
 
-from conftest import BUNDLED_PARAMETERS
+from conftest import BUNDLED_PARAMETERS, ROOT
 import cv2
 from diagnostic_msgs.msg import DiagnosticArray
 import fault_stream as faults
@@ -17,14 +17,12 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 
+from rs_relpose_lab.experiments.unrolled_poses import frames_of_bag
 from rs_relpose_lab.live.graph import diagnostic_values, Graph
 from rs_relpose_lab.live.processes import node_process, player_process, wait_until
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.config.parameter_file import read_parameters
-from rs_relpose_ros.front_end.front_end import FrameProcessed
-from rs_relpose_ros.global_shutter.frames import EncodedColorFrame, GlobalShutterFrame
-from rs_relpose_ros.global_shutter.unroller import unrolling_loop
-from rs_relpose_ros.messages.intake import Intake
+from rs_relpose_ros.global_shutter.frames import GlobalShutterFrame
 
 # The node may have to compile the kernels.
 pytestmark = [pytest.mark.live, pytest.mark.timeout(600)]
@@ -38,25 +36,11 @@ def stamps_of(messages: list[Any]) -> list[int]:
     return [faults.stamp_of(message) for message in messages]
 
 
-def frames_of(bag_path: Path) -> dict[int, GlobalShutterFrame]:
-    """The turned frames of the bundled bag, offline, by the stamps of the images as read."""
-    parameters = read_parameters(BUNDLED_PARAMETERS)
-    loop = unrolling_loop(parameters, offline=True)
-    intake = Intake(loop.sequencer, parameters.imu.stuck_gyro_time, parameters.intrinsics,
-                    EncodedColorFrame)
-    turned: dict[int, GlobalShutterFrame] = {}
-    with open_bag(bag_path) as bag:
-        for role, message in intake.feed.messages(bag, bag.find_topics()):
-            intake.receive(role, message.message)
-            while (outcome := loop.step()) is not None:
-                assert isinstance(outcome, FrameProcessed), outcome
-                turned[outcome.stamp_ns] = outcome.result
-    return turned
-
-
 @pytest.fixture(scope='module')
 def expected(bundled_bag: Path) -> dict[int, GlobalShutterFrame]:
-    return frames_of(bundled_bag)
+    """Turned offline, by the stamps of the images as read."""
+    return {turned.frame.stamp_ns: turned for turned in frames_of_bag(
+        bundled_bag, read_parameters(BUNDLED_PARAMETERS))}
 
 
 # -- the bundled bag -------------------------------------------------------------------------
@@ -147,6 +131,10 @@ def test_diagnostics_tell_what_happened(run):
     assert int(values['frames_received']) == 180 == int(values['images_published']) + refused
     # A camera that outruns a busy machine is the only reason to leave a frame out.
     assert refused == int(values['frames_refused_overload'])
+    documented = ''.join((ROOT / 'docs' / name).read_text(encoding='utf-8')
+                         for name in ('any_slam.md', 'operation.md'))
+    assert [key for key in values if f'`{key}`' not in documented
+            and not key.startswith('frames_refused_')] == []
     assert 1.0 < float(values['largest_shift_px']) < 30.0
     assert values['applied_time_offset_ms'] == '0.00'
     assert 0.0 < float(values['latency_p50_ms']) <= float(values['latency_p99_ms'])

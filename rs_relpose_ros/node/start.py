@@ -44,9 +44,9 @@ def _on_signal(number: int, frame: FrameType | None) -> None:
     if not _started:
         # Nothing was begun that would need an end.
         os._exit(0)
-    # A thread of rclpy's own ends its contexts, but for one that is made at this very moment. Not at
-    # once: two threads that end one context can crash the process. In a thread, since this one may
-    # hold a lock that it needs.
+    # A thread of rclpy's own ends its contexts, but for one that is made at this very moment. Not
+    # at once: two threads that end one context can crash the process. In a thread, since this one
+    # may hold a lock that it needs.
     late = threading.Timer(_GRACE, sys.modules['rclpy'].try_shutdown)
     late.daemon = True
     late.start()
