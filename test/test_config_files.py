@@ -106,6 +106,16 @@ def test_launch_file_remaps_what_the_node_subscribes_to():
     assert remapped == ['image', 'camera_info', 'imu', 'accel']
 
 
+def test_launch_file_uses_the_profile_unless_the_user_has_one():
+    tree = ast.parse(LAUNCH_FILE.read_text(encoding='utf-8'))
+    [default] = [call for call in ast.walk(tree) if isinstance(call, ast.Call)
+                 and isinstance(call.func, ast.Name) and call.func.id == 'EnvironmentVariable']
+    assert ast.unparse(default.args[0]) == 'PROFILE'
+    [path] = [keyword.value for keyword in default.keywords if keyword.arg == 'default_value']
+    assert "'config', 'fastdds.xml'" in ast.unparse(path)
+    assert (CONFIG / 'fastdds.xml').is_file()
+
+
 @pytest.mark.parametrize(('name', 'nodes'), [
     ('global_shutter', ['global_shutter_node']),
     ('relpose_and_global_shutter', ['relpose_node', 'global_shutter_node'])])
