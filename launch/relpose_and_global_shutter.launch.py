@@ -5,8 +5,8 @@
     ros2 launch rs_relpose_ros relpose_and_global_shutter.launch.py camera_namespace:=/camera \
         imu:=/imu/data_raw params_file:=my_camera.yaml
 
-Its arguments are those of relpose.launch.py. Each node decodes compressed images for itself: that
-costs less than sending them decoded from one to the other (docs/any_slam.md).
+Its arguments are those of relpose.launch.py. Each node decodes compressed images for itself
+(docs/any_slam.md).
 """
 
 from launch import LaunchDescription
