@@ -10,12 +10,11 @@ from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from rs_relpose_ros.config.parameters import Parameters
-from rs_relpose_ros.errors import InputError, RsRelposeError
+from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.front_end.front_end import FrameFailed, FrameLoop, FrameProcessed
 from rs_relpose_ros.front_end.sequencer import FrameRefused, Refusal, Sequencer
 from rs_relpose_ros.geometry.timing import NANOSECONDS
@@ -26,8 +25,12 @@ from rs_relpose_ros.node.cause_log import CauseLog
 from rs_relpose_ros.node.frame_statistics import FrameStatistics, Inputs, SILENCE
 from rs_relpose_ros.node.inputs import SensorInputs
 from rs_relpose_ros.node.message_types import message_class
-from rs_relpose_ros.node.outputs import SHUT_DOWN
-from rs_relpose_ros.node.params import NodeParameters, unknown_overrides, unknown_qos_overrides
+from rs_relpose_ros.node.params import (
+    legal_qos,
+    NodeParameters,
+    unknown_overrides,
+    unknown_qos_overrides,
+)
 from rs_relpose_ros.node.silence import (
     LostImages,
     PATIENCE,
@@ -73,7 +76,8 @@ class SensorNode(Node):
         self._lost_images, self._told_silence = LostImages(), ''
         # For diagnostics and time-outs, which must run although /clock may stand still.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._open_outputs(self._settings.current)
+        with legal_qos():
+            self._open_outputs(self._settings.current)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_service(Trigger, '~/reset', self._reset)
         self._cannot_start = self._why_it_cannot_start()
@@ -140,14 +144,10 @@ class SensorNode(Node):
             return
         self.destroy_timer(self._warm_timer)
         assert self._loop is not None
-        try:
+        with legal_qos():
             inputs = SensorInputs(
                 self, self._intake, self._loop.sequencer.waits_for_imu,
                 self._settings.current.pair.image_transport, self._error, self._steady)
-        except SHUT_DOWN:
-            raise
-        except (ParameterException, RuntimeError) as error:
-            raise InputError(f'a QoS override is not legal: {error}') from error
         for sentence in unknown_qos_overrides(self):
             self._warn(sentence)
         # Objects that exist by now live to the end: the garbage collector need not scan them.
