@@ -145,7 +145,9 @@ def test_a_good_run_ends_well_and_says_little(run):
     assert run.seconds_to_end <= 1.0
     assert run.output.count('ready') == 1
     assert 'ERROR' not in run.output
-    assert run.output.count('[WARN]') == run.output.count('(overload)') <= 1
+    # At most that the machine was busy: the player may take its time, too.
+    assert [line for line in run.output.splitlines() if line.startswith('[WARN]')
+            and '(overload)' not in line and 'no image on' not in line] == []
 
 
 # -- faults ----------------------------------------------------------------------------------
@@ -256,7 +258,7 @@ def test_faults_are_told_and_nothing_else(session):
         assert not fault.said or any(fault.said in line for line in lines), fault.name
     allowed = [fault.said for fault in FAULTS if fault.said] + [
         'newer frames wait for the gyro', 'no gyro sample that covers', '(overload)',
-        'stamps jumped', 'frame is ']
+        'stamps jumped', 'frame is ', 'no image on']
     assert [line for line in lines if not any(text in line for text in allowed)] == []
     assert 'Traceback' not in session.output
 
