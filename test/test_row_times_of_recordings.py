@@ -71,7 +71,7 @@ def robust_cost(rays1, rays2, focal_length):
 
 @pytest.fixture(scope='module', params=['realsense_rgb_rs', 'xiaomi_cc9_rs'])
 def recording(request, recordings, tmp_path_factory):
-    """Its name and the costs (P, 3) of its pairs, in the order of `Costs`."""
+    """Its name and the costs."""
     name = request.param
     path = tmp_path_factory.mktemp(name) / name
     assert main(['convert', name, str(recordings / name), str(path)]) == 0
@@ -93,14 +93,12 @@ def recording(request, recordings, tmp_path_factory):
                      for f, g in zip(measured, derotated, strict=True)]
             costs.append([robust_cost(*rays, camera.fx) for rays in (measured, derotated, wrong)])
     assert len(costs) >= 40
-    return name, np.array(costs)
+    return name, Costs(*np.sum(costs, axis=0))
 
 
 @pytest.mark.recordings
 def test_derotated_rays_fit_one_pose_better_than_measured_rays(recording):
-    name, of_pairs = recording
-    # The median: some pairs, where things move, have a good part of the sum.
-    costs = Costs(*np.median(of_pairs, axis=0))
+    name, costs = recording
     print(f'{name}: {costs}')
     assert costs.derotated < 0.95 * costs.measured
     assert costs.wrong_sign > 1.1 * costs.measured
@@ -109,10 +107,9 @@ def test_derotated_rays_fit_one_pose_better_than_measured_rays(recording):
 @pytest.mark.recordings
 def test_how_much_better(recording, request):
     """The requirement: by 20 % (RealSense) and 40 % (Xiaomi)."""
-    name, of_pairs = recording
-    costs = Costs(*np.sum(of_pairs, axis=0))
+    name, costs = recording
     if name == 'realsense_rgb_rs':
-        # Its camera turns little while it reads: 4 % are reached.
-        request.applymarker(pytest.mark.xfail(strict=True, reason='4 % are reached of 20 %'))
+        # Its camera turns little while it reads: 10 % are reached, 6 % between consecutive frames.
+        request.applymarker(pytest.mark.xfail(strict=True, reason='10 % are reached of 20 %'))
     least = {'realsense_rgb_rs': 0.2, 'xiaomi_cc9_rs': 0.4}[name]
     assert 1.0 - costs.derotated / costs.measured >= least

@@ -22,7 +22,7 @@ from rs_relpose_ros.imu.samples import ImuSample
 
 READOUT_TIME = 0.028
 
-TITLE = ('Parameters of relpose_node for stretches of this dataset (`rs_relpose convert '
+TITLE = ('Parameters of relpose_node for the recording realsense_rgb_rs (`rs_relpose convert '
          'realsense_rgb_rs`): rolling-shutter colour camera of a RealSense, 1280x720.')
 
 PARAMETERS = (
@@ -34,15 +34,9 @@ PARAMETERS = (
     SourcedValue('readout_direction', 'down', 'As that estimate.'),
     SourcedValue('stamp_row', 'first', 'Convention of readout_time and time_offset here.'),
     SourcedValue(
-        'time_offset', -0.0635,
-        'At intervals of 50 ms between frames, estimated with readout_time. Two stretches were in '
-        'view: about -56 ms where the intervals are 33 ms, -58 ms at 40 ms, -64 ms at 50 ms. '
-        'Negative: the rows were exposed before the stamp.'),
-    SourcedValue(
-        'time_offset_per_interval', -0.5,
-        'Automatic exposure fills the interval, and the stamp is a fixed instant after it: its '
-        'middle comes half a millisecond earlier per millisecond. Measured: -0.43 +- 0.04.'),
-    SourcedValue('time_offset_reference_interval', 0.05, 'See time_offset.'),
+        'time_offset', -0.057,
+        'Estimated with readout_time: -56 ms for frames of 33 ms, -58 ms for those of 40 ms '
+        '(auto exposure). Negative: the rows were exposed before the stamp.'),
     SourcedValue('quat_cam_imu_xyzw', (-0.01218755, -0.0025826, -0.00469531, 0.99991137),
         'Rotation of T_cam_imu in camchain.yaml of the dataset (p_cam = T p_imu).'),
     SourcedValue('gyro_bias', (-0.0015, 0.0002, 0.0019), 'Mean of the gyro at rest, about.'),
