@@ -712,7 +712,7 @@ def test_live_and_replay_agree_while_figures_are_applied(bundled_bag):
     front_end = FrontEnd(read_parameters(bundled_bag.with_name('hand_held.yaml'), settings))
     sequencer = front_end.sequencer
     events = []
-    worker = Worker(front_end, events.append)
+    worker = Worker(front_end, lambda: None, events.append)
 
     def processed():
         return [event for event in events if isinstance(event, FrameProcessed)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -14,6 +14,7 @@ from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.geometry.timing import ImageClock
 from rs_relpose_ros.images.encoded import EncodedImage
+from rs_relpose_ros.images.gray_levels import GrayLevels
 
 
 class Waiting(Protocol):
@@ -67,10 +68,12 @@ class EncodedFrame:
     image: EncodedImage
     frame_id: str
     intrinsics: Intrinsics
+    levels: GrayLevels = field(default_factory=GrayLevels)   # of the camera's images so far
 
     def decoded(self) -> Frame:
         """The frame with its image; raises InputError where it cannot be decoded."""
-        return Frame(self.stamp_ns, self.image.decoded(), self.frame_id, self.intrinsics)
+        return Frame(self.stamp_ns, self.image.decoded(self.levels), self.frame_id,
+                     self.intrinsics)
 
 
 def check_size(image: NDArray[Any], intrinsics: Intrinsics) -> None:
