@@ -44,6 +44,9 @@ from rs_relpose_ros.images.encoded import CompressedImage, RawImage
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.messages.incoming import image_from_message, intrinsics_from_info, stamp_ns
 
+# Whoever comes first compiles the kernels.
+pytestmark = pytest.mark.timeout(600)
+
 MS = 10**6
 LENSES = {
     'plumb_bob': (-0.12, 0.05, 0.0008, -0.0005, 0.0),

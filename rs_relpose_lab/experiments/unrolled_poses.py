@@ -33,7 +33,7 @@ from rs_relpose_ros.front_end.frame import sensor_camera
 from rs_relpose_ros.front_end.front_end import FrameProcessed
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
-from rs_relpose_ros.global_shutter.frames import EncodedColorFrame, GlobalShutterFrame
+from rs_relpose_ros.global_shutter.frames import color_frames, GlobalShutterFrame
 from rs_relpose_ros.global_shutter.unroll import unroll
 from rs_relpose_ros.global_shutter.unroller import unrolling_loop
 from rs_relpose_ros.imu.buffer import Coverage, ImuBuffer
@@ -127,7 +127,7 @@ def frames_of_bag(path: Path, parameters: Parameters) -> Iterator[GlobalShutterF
     """The turned frames of a bag."""
     loop = unrolling_loop(parameters, offline=True)
     intake = Intake(loop.sequencer, parameters.imu.stuck_gyro_time, parameters.intrinsics,
-                    EncodedColorFrame)
+                    color_frames())
     with open_bag(path) as bag:
         for role, message in intake.feed.messages(bag, bag.find_topics()):
             intake.receive(role, message.message)

@@ -13,8 +13,8 @@ from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.front_end.front_end import FrameLoop, FrameProcessed
 from rs_relpose_ros.front_end.sequencer import Sequencer
 from rs_relpose_ros.global_shutter.frames import (
+    color_frames,
     ColorFrame,
-    EncodedColorFrame,
     GlobalShutterFrame,
 )
 from rs_relpose_ros.global_shutter.unroller import unrolling_loop
@@ -100,7 +100,7 @@ class GlobalShutterNode(SensorNode):
 
     def _make_intake(self, parameters: Parameters, sequencer: Sequencer[Any]) -> Intake:
         return Intake(sequencer, parameters.imu.stuck_gyro_time, parameters.intrinsics,
-                      EncodedColorFrame)
+                      color_frames())
 
     def _warm_up(self) -> None:
         warm_up_unroller(self._settings.current)

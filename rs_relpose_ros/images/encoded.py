@@ -105,8 +105,8 @@ class RawImage:
         raise InputError(f'image encoding {encoding[:40]!r} is not known; '
                          f'publish one of {", ".join(ENCODINGS)}')
 
-    def pixels(self) -> Pixels:
-        """The image in its own encoding; in mono8 where that is Bayer or YUV."""
+    def pixels(self, levels: GrayLevels | None = None) -> Pixels:
+        """The image in its own encoding; in mono8, as `decoded`, where that is Bayer or YUV."""
         if self.encoding in _COLOR:
             check_image_size(self.width, self.height)
             channels, _ = _COLOR[self.encoding]
@@ -115,7 +115,7 @@ class RawImage:
         if self.encoding in _GRAY_16:
             check_image_size(self.width, self.height)
             return Pixels(self._two_bytes().astype(np.uint16), self.encoding)
-        return Pixels(self.decoded(), 'mono8')
+        return Pixels(self.decoded(levels), 'mono8')
 
     def _from_bayer(self, levels: GrayLevels) -> Gray:
         if self.height < 3 or self.width < 3:
@@ -172,8 +172,8 @@ class CompressedImage:
             return (GrayLevels() if levels is None else levels).gray(image)
         return np.asarray(image, dtype=np.uint8)
 
-    def pixels(self) -> Pixels:
-        """The image in colour or gray, 8 or 16 bits, as it was encoded."""
+    def pixels(self, levels: GrayLevels | None = None) -> Pixels:
+        """The image in colour or gray, 8 or 16 bits, as it was encoded, whatever its levels."""
         # Nor is it turned upright here.
         image = self._decoded(cv2.IMREAD_UNCHANGED)
         channels = 1 if image.ndim == 2 else image.shape[2]
