@@ -27,13 +27,16 @@ def draw(command: str, rows: Sequence[Row], combined: Sequence[Combined], path: 
     _PICTURES[command](left, right, rows, {one.figure: one for one in combined})
     left.set_yticks(range(len(rows)), [_name(row) for row in rows])
     left.set_ylim(len(rows) - 0.4, -0.6)
+    legend = {}
     for axes in (left, right):
         axes.grid(axis='x', color='0.9')
         axes.set_axisbelow(True)
-        handles, _ = axes.get_legend_handles_labels()
-        if handles:
-            axes.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=4, fontsize='small',
-                        frameon=False)
+        handles, labels = axes.get_legend_handles_labels()
+        legend |= dict(zip(labels, handles, strict=True))
+    # Above both, over the room of a title.
+    left.set_title(' ', pad=9.0)
+    left.legend(legend.values(), legend.keys(), loc='lower left', bbox_to_anchor=(0.0, 1.0),
+                ncols=5, fontsize='small', frameon=False).set_in_layout(False)
     save_picture(figure, path)
 
 
@@ -53,6 +56,7 @@ def _calibrate(left: Axes, right: Axes, rows: Sequence[Row],
     for axes, figure, label in ((left, 'readout_time_s', 'read-out time [ms]'),
                                 (right, 'time_offset_s', 'time offset of row 0 [ms]')):
         axes.set_xlabel(label)
+        axes.locator_params(axis='x', nbins=6)
         mean = combined.get(figure)
         if mean is not None:
             axes.axvline(_MS * mean.mean, color=_BLUE, linewidth=1.0)
@@ -77,12 +81,11 @@ def _group(row: Row, figure: str, mean: Combined | None) -> str:
 
 
 def _replay(left: Axes, right: Axes, rows: Sequence[Row], _: Mapping[str, Combined]) -> None:
-    for y, row in enumerate(rows):
-        if row.figures:
-            answered, total = row.figures['answered'], row.figures['pairs']
-            left.barh(y, answered, color=_BLUE, label='pairs with a pose' if not y else None)
-            left.barh(y, total - answered, left=answered, color=_GRAY,
-                      label='without' if not y else None)
+    answered = [row.figures.get('answered', 0) for row in rows]
+    without = [row.figures.get('pairs', 0) - count
+               for row, count in zip(rows, answered, strict=True)]
+    left.barh(range(len(rows)), answered, color=_BLUE, label='pairs with a pose')
+    left.barh(range(len(rows)), without, left=answered, color=_GRAY, label='pairs without')
     left.set_xlabel('pairs')
     if not any(row.figures.get('pairs_with_truth') for row in rows):
         _seconds(right, rows)
