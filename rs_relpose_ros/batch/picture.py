@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -27,7 +28,7 @@ def draw(command: str, rows: Sequence[Row], combined: Sequence[Combined], path: 
     _PICTURES[command](left, right, rows, {one.figure: one for one in combined})
     left.set_yticks(range(len(rows)), [_name(row) for row in rows])
     left.set_ylim(len(rows) - 0.4, -0.6)
-    legend = {}
+    legend: dict[str, Any] = {}
     for axes in (left, right):
         axes.grid(axis='x', color='0.9')
         axes.set_axisbelow(True)
