@@ -118,10 +118,10 @@ def _jumps(folder: Path) -> list[int]:
     if not (folder / 'manifest.json').is_file():
         return []
     found = read_object(folder / 'manifest.json').get('pose_jumps')
-    jumps = found.get('jumps', found.get('list')) if isinstance(found, Mapping) else found
-    if not isinstance(jumps, list):
-        return []
-    stamps = [jump.get('timestamp_ns') for jump in jumps if isinstance(jump, Mapping)]
+    # Beside the list, whose name is not documented, are counts and thresholds.
+    jumps = [jump for values in (found.values() if isinstance(found, Mapping) else [found])
+             if isinstance(values, list) for jump in values if isinstance(jump, Mapping)]
+    stamps = [jump.get('timestamp_ns') for jump in jumps]
     return [stamp for stamp in stamps if isinstance(stamp, int)]
 
 
