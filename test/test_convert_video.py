@@ -17,6 +17,7 @@ from rs_relpose_ros.cli import main
 from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.convert.telemetry import read_telemetry
 from rs_relpose_ros.convert.video import START_NS
+from rs_relpose_ros.convert.video_frames import Video
 from rs_relpose_ros.messages.incoming import (
     image_from_message,
     imu_sample_from_message,
@@ -284,9 +285,10 @@ def test_gopro_turns_as_its_images(recordings):
     times = np.array([sample.stamp_ns for sample in gyro]) * 1e-9
     yaw = np.array([sample.angular_velocity[1] for sample in gyro])
     turned = np.concatenate([[0.0], np.cumsum(yaw[1:] * np.diff(times))])
-    video, shifts, before = cv2.VideoCapture(str(path)), [], None
-    for _ in range(362):
-        gray = cv2.cvtColor(video.read()[1], cv2.COLOR_BGR2GRAY)[:235]   # above the horizon
+    video, shifts, before = Video(path), [], None
+    for number in range(len(video)):
+        data = np.frombuffer(video.jpeg(number), dtype=np.uint8)
+        gray = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)[:235]   # above the horizon
         if before is not None:
             points = cv2.goodFeaturesToTrack(before, 200, 0.005, 8)
             moved, found, _ = cv2.calcOpticalFlowPyrLK(before, gray, points, None)
