@@ -143,9 +143,10 @@ def calibration(readout: float, observable: bool = True, yaw: float = 0.0) -> di
 
 
 def test_calibrations_of_one_camera():
-    combined = {one.figure: one for one in combine(
+    one_camera = combine(
         {'a': calibration(0.0300, yaw=0.01), 'b': calibration(0.0302, yaw=0.012),
-         'c': calibration(0.0301, yaw=0.011), 'd': calibration(0.9, observable=False, yaw=0.011)})}
+         'c': calibration(0.0301, yaw=0.011), 'd': calibration(0.9, observable=False, yaw=0.011)})
+    combined = {one.figure: one for one in one_camera.figures}
     assert combined['readout_time_s'].mean == pytest.approx(0.0301)
     assert combined['readout_time_s'].bags == ('a', 'b', 'c')
     assert combined['time_offset_s'].degrees_of_freedom == 3
@@ -153,6 +154,8 @@ def test_calibrations_of_one_camera():
     # 1 mrad to both sides of the mean.
     assert combined['rotation_z_rad'].chi2 == pytest.approx(2.0, rel=1e-3)
     assert combined['rotation_x_rad'].chi2 == pytest.approx(0.0, abs=1e-9)
+    np.testing.assert_allclose(one_camera.quat_cam_imu_xyzw,
+                               [0.0, 0.0, np.sin(0.0055), np.cos(0.0055)], atol=1e-9)
 
 
 # --- on clusters
@@ -353,7 +356,8 @@ def test_summary_of_calibrations(client, tmp_path):
     asked = Request('calibrate', tuple(str(tmp_path / name) for name in names), '', (), VERSION)
     result = run_batch(client, asked, tmp_path / 'out', work_of_calibrations)
     summary = json.loads((tmp_path / 'out' / 'summary.json').read_text())
-    readout = next(one for one in summary['combined'] if one['figure'] == 'readout_time_s')
+    readout = next(one for one in summary['combined']['figures']
+                   if one['figure'] == 'readout_time_s')
     assert readout['outliers'] == ['wrong'] and readout['degrees_of_freedom'] == 2
     rows = rows_of(tmp_path / 'out')
     assert float(rows['wrong']['readout_time_s']) == 0.024

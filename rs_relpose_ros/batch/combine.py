@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -52,8 +52,19 @@ def weighted_mean(figure: str, bags: Sequence[str], values: ArrayLike,
                     tuple(bag for i, bag in enumerate(bags) if i not in kept))
 
 
-def combine(calibrations: Mapping[str, Mapping[str, Any]]) -> list[Combined]:
-    """Each figure over the bags, by name, in which it is observable; one bag at least."""
+@dataclass(frozen=True, slots=True)
+class CombinedCalibration:
+    """The figures that are observable in one bag at least, and the rotation v_cam = R(q) v_imu.
+
+    The figures ``rotation_x_rad``, y and z are rotation vectors from it, about the camera's axes.
+    """
+
+    figures: tuple[Combined, ...] = ()
+    quat_cam_imu_xyzw: tuple[float, ...] | None = None
+
+
+def combine(calibrations: Mapping[str, Mapping[str, Any]]) -> CombinedCalibration:
+    """Calibrations by the names of their bags as one; of each figure where it is observable."""
     combined = []
     for figure in CALIBRATED:
         found = {bag: calibrated(figure, mapping) for bag, mapping in calibrations.items()}
@@ -61,20 +72,20 @@ def combine(calibrations: Mapping[str, Mapping[str, Any]]) -> list[Combined]:
         if good:
             values, sigmas = ([one[part] for one in good.values()] for part in ('value', 'sigma'))
             combined.append(weighted_mean(figure, list(good), values, sigmas))
-    return combined + _rotation({bag: mapping for bag, mapping in calibrations.items()
-                                 if mapping['rotation_from_axis_map_rad']['observable']})
-
-
-def _rotation(calibrations: Mapping[str, Mapping[str, Any]]) -> list[Combined]:
-    """Rotation vector [rad] from the mean rotation, about each axis of the camera."""
-    if not calibrations:
-        return []
-    rotations = Rotation.from_quat([mapping['quat_cam_imu_xyzw']
-                                    for mapping in calibrations.values()])
-    vectors = (rotations * rotations.mean().inv()).as_rotvec()
-    sigmas = np.array([mapping['rotation_sigma_rad'] for mapping in calibrations.values()])
-    return [weighted_mean(f'rotation_{axis}_rad', list(calibrations), vectors[:, i], sigmas[:, i])
-            for i, axis in enumerate('xyz')]
+    turned = {bag: mapping for bag, mapping in calibrations.items()
+              if mapping['rotation_from_axis_map_rad']['observable']}
+    if not turned:
+        return CombinedCalibration(tuple(combined))
+    rotations = Rotation.from_quat([mapping['quat_cam_imu_xyzw'] for mapping in turned.values()])
+    near = rotations.mean()
+    vectors = (rotations * near.inv()).as_rotvec()
+    about = np.array([mapping['rotation_sigma_rad'] for mapping in turned.values()])
+    of_axes = [weighted_mean(f'rotation_{axis}_rad', list(turned), vectors[:, i], about[:, i])
+               for i, axis in enumerate('xyz')]
+    mean = Rotation.from_rotvec([one.mean for one in of_axes]) * near
+    return CombinedCalibration(
+        (*combined, *(replace(one, mean=0.0) for one in of_axes)),
+        tuple(float(value) for value in mean.as_quat()))
 
 
 def _distance(x: np.ndarray, s: np.ndarray, one: int, others: list[int]) -> float:

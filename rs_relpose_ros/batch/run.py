@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rs_relpose_ros.batch.cluster import ask_a_worker, run_jobs
-from rs_relpose_ros.batch.combine import combine, Combined
+from rs_relpose_ros.batch.combine import combine, CombinedCalibration
 from rs_relpose_ros.batch.figures import RESULT_FILES
 from rs_relpose_ros.batch.job import Bag, Job, look_at, Outcome, State, unique_names
 from rs_relpose_ros.batch.picture import draw, PICTURE_FILE
@@ -36,7 +36,7 @@ class BatchOutcome:
     """All bags, in their order, and their calibrations as one."""
 
     rows: tuple[Row, ...]
-    combined: tuple[Combined, ...]
+    combined: CombinedCalibration
     taken_over: int   # bags whose results were there
 
     @property
@@ -77,9 +77,9 @@ def run_batch(client: Any, request: Request, folder: Path, work: Callable[[Job],
     rows = _rows(jobs, outcomes)
     store.write_table(rows)
     combined = _combined(request.command, jobs, outcomes)
-    result = BatchOutcome(tuple(rows), tuple(combined), taken_over)
+    result = BatchOutcome(tuple(rows), combined, taken_over)
     _write_summary(folder / SUMMARY_FILE, request, result)
-    draw(request.command, rows, combined, folder / PICTURE_FILE)
+    draw(request.command, rows, combined.figures, folder / PICTURE_FILE)
     return result
 
 
@@ -87,9 +87,10 @@ def _rows(jobs: Sequence[Job], outcomes: dict[str, Outcome]) -> list[Row]:
     return [row_of(job, outcomes[job.name]) for job in jobs if job.name in outcomes]
 
 
-def _combined(command: str, jobs: Sequence[Job], outcomes: dict[str, Outcome]) -> list[Combined]:
+def _combined(command: str, jobs: Sequence[Job],
+              outcomes: dict[str, Outcome]) -> CombinedCalibration:
     if command != 'calibrate':
-        return []
+        return CombinedCalibration()
     name = RESULT_FILES[command]
     return combine({job.name: json.loads(outcomes[job.name].files[name]) for job in jobs
                     if name in outcomes[job.name].files})
@@ -100,5 +101,5 @@ def _write_summary(path: Path, request: Request, result: BatchOutcome) -> None:
         'command': request.command, 'options': list(request.options),
         'version': request.version, 'bags': len(result.rows),
         'states': {state.value: result.states[state] for state in State},
-        'combined': [asdict(one) for one in result.combined]}
+        'combined': asdict(result.combined)}
     path.write_text(json.dumps(summary, indent=1) + '\n', encoding='utf-8')

@@ -15,6 +15,7 @@ import time
 import cv2
 
 from rs_relpose_ros.batch.cluster import ask_a_worker, open_cluster
+from rs_relpose_ros.batch.combine import Combined
 from rs_relpose_ros.batch.figures import RESULT_FILES
 from rs_relpose_ros.batch.job import Job, Outcome, State
 from rs_relpose_ros.batch.picture import PICTURE_FILE
@@ -110,18 +111,22 @@ def report(result: BatchOutcome, folder: Path) -> list[str]:
               for row in told[:_MOST_LINES]]
     if len(told) > _MOST_LINES:
         lines.append(f'... and {len(told) - _MOST_LINES} more in {RESULTS_FILE}')
-    for one in result.combined:
-        text = (f'{one.figure}: {one.mean:.6g} +- {one.sigma:.2g}, of '
-                f'{one.degrees_of_freedom + 1} bags')
-        if one.degrees_of_freedom:
-            reduced = one.chi2 / one.degrees_of_freedom
-            text += f', chi2 {one.chi2:.3g} of {one.degrees_of_freedom} degrees of freedom'
-            text += f' (sigma times {math.sqrt(reduced):.2g})' if reduced > 1.0 else ''
-        text += f'; outliers: {", ".join(one.outliers)}' if one.outliers else ''
-        lines.append(text)
+    lines += [_combined_line(one) for one in result.combined.figures if len(one.bags) > 1]
+    if result.combined.quat_cam_imu_xyzw is not None:
+        numbers = ', '.join(f'{value:.6f}' for value in result.combined.quat_cam_imu_xyzw)
+        lines.append(f'quat_cam_imu_xyzw: [{numbers}], which the rotations are from')
     lines.append(f'in {folder}: {RESULTS_FILE}, {SUMMARY_FILE}, {PICTURE_FILE}, and a folder for '
                  'each bag')
     return lines
+
+
+def _combined_line(one: Combined) -> str:
+    """A figure of one camera from several bags."""
+    reduced = one.chi2 / max(one.degrees_of_freedom, 1)
+    return (f'{one.figure}: {one.mean:.6g} +- {one.sigma:.2g}, of {one.degrees_of_freedom + 1} '
+            f'bags, chi2 {one.chi2:.3g} of {one.degrees_of_freedom} degrees of freedom'
+            + (f' (sigma times {math.sqrt(reduced):.2g})' if reduced > 1.0 else '')
+            + (f'; outliers: {", ".join(one.outliers)}' if one.outliers else ''))
 
 
 def _request(args: argparse.Namespace) -> Request:
