@@ -85,7 +85,7 @@ def combine(calibrations: Mapping[str, Mapping[str, Any]]) -> CombinedCalibratio
     mean = Rotation.from_rotvec([one.mean for one in of_axes]) * near
     return CombinedCalibration(
         (*combined, *(replace(one, mean=0.0) for one in of_axes)),
-        tuple(float(value) for value in mean.as_quat()))
+        tuple(float(value) for value in mean.as_quat(canonical=True)))
 
 
 def _distance(x: np.ndarray, s: np.ndarray, one: int, others: list[int]) -> float:

@@ -114,7 +114,7 @@ def report(result: BatchOutcome, folder: Path) -> list[str]:
     lines += [_combined_line(one) for one in result.combined.figures if len(one.bags) > 1]
     if result.combined.quat_cam_imu_xyzw is not None:
         numbers = ', '.join(f'{value:.6f}' for value in result.combined.quat_cam_imu_xyzw)
-        lines.append(f'quat_cam_imu_xyzw: [{numbers}], which the rotations are from')
+        lines.append(f'quat_cam_imu_xyzw: [{numbers}]')
     lines.append(f'in {folder}: {RESULTS_FILE}, {SUMMARY_FILE}, {PICTURE_FILE}, and a folder for '
                  'each bag')
     return lines
