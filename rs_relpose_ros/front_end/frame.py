@@ -8,10 +8,11 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.config.parameters import Parameters
+from rs_relpose_ros.config.parameters import Parameters, SensorConfig
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
+from rs_relpose_ros.geometry.timing import ImageClock
 from rs_relpose_ros.images.encoded import EncodedImage
 
 
@@ -90,3 +91,10 @@ def sensor_camera(intrinsics: Intrinsics, parameters: Parameters) -> RollingShut
                                 'delay in seconds (0 for a global shutter)')
     return replace(intrinsics.global_shutter_camera(), readout_time=sensor.readout_time,
                    readout_direction=sensor.readout_direction, reference_row=sensor.stamp_row)
+
+
+def image_clock(camera: RollingShutterCamera, sensor: SensorConfig) -> ImageClock:
+    """Clock of the images of a `sensor_camera`, as told."""
+    return ImageClock(
+        camera, sensor.time_offset, sensor.stamp_exposure, sensor.exposure_time,
+        sensor.time_offset_per_interval, sensor.time_offset_reference_interval)
