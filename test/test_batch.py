@@ -25,6 +25,8 @@ from rs_relpose_ros.batch.store import Store
 from rs_relpose_ros.cli import batch, main
 
 pytest.importorskip('distributed', reason='needs the extra batch')
+# Clusters start, and a first run compiles kernels.
+pytestmark = pytest.mark.timeout(300)
 
 VERSION = batch.package_version()
 
