@@ -139,7 +139,8 @@ MAY_IMPORT = {
     'calibrate': CORE | {'messages', 'bags'},
     'check': CORE | {'front_end', 'health', 'messages', 'bags', 'calibrate'},
     'convert': BASE | {'images', 'imu', 'messages', 'bags'},
-    'cli': BASE | {'bags', 'replay', 'calibrate', 'check', 'convert', 'global_shutter'},
+    'batch': set(),
+    'cli': BASE | {'bags', 'replay', 'calibrate', 'check', 'convert', 'global_shutter', 'batch'},
 }
 # The laboratory uses all of the product, and nothing of the product imports it.
 MAY_IMPORT_IN_THE_LABORATORY = {
