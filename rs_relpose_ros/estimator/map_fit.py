@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel, linked_kernel
 from rs_relpose_ros.estimator import sampson
-from rs_relpose_ros.estimator.priors import add_priors, Priors, with_log_scale
+from rs_relpose_ros.estimator.priors import add_priors, Priors, unknowns, with_log_scale
 from rs_relpose_ros.estimator.state import moved, PARAMETERS, SCALE, TwoViewState
 from rs_relpose_ros.geometry.vectors import copy_matrix, copy_vector
 from rs_relpose_ros.solvers.linear_algebra import cholesky, newton_step
@@ -60,12 +60,6 @@ def linearised(matches: FitMatches, state: TwoViewState) -> DataTerm:
         for j in range(PARAMETERS):
             hessian[i, j] *= weight
     return DataTerm(hessian, gradient, squares * weight)
-
-
-@kernel
-def unknowns(priors: Priors) -> int:
-    """Number of unknowns: those of a state, and the velocities' scale where it is one."""
-    return PARAMETERS + 1 if priors.velocity.weight > 0.0 else PARAMETERS
 
 
 @kernel

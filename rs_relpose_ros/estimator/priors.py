@@ -102,6 +102,12 @@ def isotropic(sigma: float, rate: float) -> VelocityPrior:
     return VelocityPrior(rate, np.zeros(6), np.eye(6), log_scale, log_scale, 0.0, 0.0)
 
 
+@kernel
+def unknowns(priors: Priors) -> int:
+    """Number of unknowns: those of a state, and the velocities' scale where it is one."""
+    return PARAMETERS + 1 if priors.velocity.weight > 0.0 else PARAMETERS
+
+
 @linked_kernel
 def _add_gravity(state: TwoViewState, priors: Priors, hessian: Array, gradient: Array) -> float:
     """``r = g x k`` of the two directions in frame 1; each is off by as much as one frame's."""
@@ -223,4 +229,5 @@ def add_priors(state: TwoViewState, priors: Priors, hessian: Array, gradient: Ar
 @kernel
 def prior_cost(state: TwoViewState, priors: Priors) -> float:
     """The priors' part of the cost."""
-    return add_priors(state, priors, np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS))
+    n = unknowns(priors)
+    return add_priors(state, priors, np.zeros((n, n)), np.zeros(n))

@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from rs_relpose_ros.compiled import kernel, linked_kernel
 from rs_relpose_ros.estimator.information import inverse, log_determinant
 from rs_relpose_ros.estimator.inliers import count_behind, Flags, Matches, within
-from rs_relpose_ros.estimator.map_fit import DataTerm, fit, FitMatches, linearised, unknowns
+from rs_relpose_ros.estimator.map_fit import DataTerm, fit, FitMatches, linearised
 from rs_relpose_ros.estimator.priors import (
     add_priors,
     add_velocities,
     Priors,
+    unknowns,
     VelocityPrior,
     with_velocity,
 )
