@@ -25,7 +25,7 @@ from rs_relpose_ros.messages.incoming import stamp_ns
 from rs_relpose_ros.replay.truth import TrueTrajectory
 
 HEADER = ('reference_stamp_ns,stamp_ns,tx,ty,tz,qx,qy,qz,qw,sigma_t1,sigma_t2,sigma_rx,sigma_ry,'
-          'sigma_rz,inliers,matches,model,status')
+          'sigma_rz,inliers,matches,model,status,baseline_m,baseline_log_sigma')
 START_NS = 1_700_000_000_000_000_000
 CAMERA = RollingShutterCamera(width=160, height=120, fx=120.0, fy=120.0, cx=79.5, cy=59.5,
                               readout_time=0.02)

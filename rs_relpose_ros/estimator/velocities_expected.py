@@ -43,7 +43,7 @@ def velocities_expected(problem: TwoViewProblem, motion: str, interval: float | 
                         inertial: InertialMotion | None) -> tuple[VelocityPrior, Scales]:
     """Prior of the velocities at the middle rows, and the grid of their scales."""
     if interval is None:
-        log_scales = -np.log(GRID)
+        log_scales: Array = -np.log(GRID)
         return isotropic(1.0, 0.0), Scales(log_scales, SMALL_IS_LIKELIER * log_scales)
     carrier = MOTIONS[motion]
     if inertial is None:
@@ -84,4 +84,5 @@ def _of_carrier(carrier: CarrierMotion, interval: float) -> Array:
     instants = (np.arange(parts) + 0.5) * interval / parts
     to_both = np.vstack([interval - instants, np.ones(parts)]) * interval / parts
     correlation = np.exp(-np.abs(instants[:, None] - instants) / CORRELATION_TIME)
-    return np.kron(carrier.acceleration**2 * to_both @ correlation @ to_both.T, np.eye(3))
+    covariance: Array = carrier.acceleration**2 * to_both @ correlation @ to_both.T
+    return np.kron(covariance, np.eye(3))
