@@ -31,10 +31,10 @@ def some_priors(rng, state, **weights):
     # Near the state: the turn from the gyro's rotation is a small one.
     down = state.R.T @ np.array([0.6, 0.0, 0.8])
     near = Rotation.from_rotvec([0.01, -0.02, 0.015]).as_matrix()
-    root = rng.normal(size=(6, 6))
+    root = np.sqrt(weights.get('velocity', 0.0)) * rng.normal(size=(6, 6))
     velocity = VelocityPrior(
-        rate=2.0, offset=rng.normal(size=6), information=weights.get('velocity', 0.0) * root @ root.T,
-        log_scale=0.4, centre=-0.3, weight=weights.get('scale', 0.0), freedom=1.7)
+        rate=2.0, offset=rng.normal(size=6), information=root @ root.T, log_scale=0.4,
+        centre=-0.3, weight=weights.get('scale', 0.0), freedom=1.7)
     values = {'gravity_weight': 0.0, 'gravity_row_time': 0.03, 'rate_weight': 0.0, **{
         k: v for k, v in weights.items() if k not in ('rotation', 'velocity', 'scale')}}
     return Priors(np.array([0.59, 0.02, 0.81]), down, rotation=near @ state.R,

@@ -39,7 +39,11 @@ from rs_relpose_ros.estimator.spread import (
 )
 from rs_relpose_ros.estimator.state import hypothesis_state, signed, TwoViewState
 from rs_relpose_ros.estimator.uncertainty import local_covariance, pair_state
-from rs_relpose_ros.estimator.velocities_expected import ONE_SCALE, velocities_expected
+from rs_relpose_ros.estimator.velocities_expected import (
+    AT_ZERO,
+    TIMELESS,
+    velocities_expected,
+)
 from rs_relpose_ros.estimator.velocity_prior import fit_with_evidence, Noise, Refined
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.inertial import InertialMotion
@@ -236,8 +240,8 @@ class Estimation:
         model = self.mode.model
         free = model.velocities or (model.derotated and config.refinement == 'map')
         if config.refinement == 'map':
-            priors, scales = self.priors, ONE_SCALE
-            if free:
+            priors, scales = self.priors, TIMELESS if free else AT_ZERO
+            if free and self.interval is not None:
                 velocity, scales = velocities_expected(self.problem, config.motion, self.interval,
                                                        self.inertial)
                 priors = with_velocity(priors, velocity)

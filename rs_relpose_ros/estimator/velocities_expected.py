@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.config.estimator import CarrierMotion, MOTIONS
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.estimator.priors import isotropic, PINNED, VelocityPrior
+from rs_relpose_ros.estimator.priors import PINNED, VelocityPrior
 from rs_relpose_ros.estimator.problem import TwoViewProblem
-from rs_relpose_ros.estimator.velocity_prior import GRID, Scales, SMALL_IS_LIKELIER
+from rs_relpose_ros.estimator.velocity_prior import Scales
 from rs_relpose_ros.geometry.inertial import InertialMotion
 
 Array = NDArray[np.float64]
@@ -35,16 +35,29 @@ SCALES = 4
 # Of the prior of each, as a share of the distance to the next one.
 WIDTH = 0.7
 
+# Without a time between the frames: prior sigmas [baselines per second], and the exponent of their
+# prior as its inverse. Where the data cannot tell (sideways motion, cameras at rest), a wide prior
+# would turn noise into velocity and degrees of translation.
+GRID = np.array([0.003, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
+SMALL_IS_LIKELIER = 0.5
+TIMELESS = Scales(np.asarray(-np.log(GRID)), np.asarray(-SMALL_IS_LIKELIER * np.log(GRID)))
 # Velocities that are held at zero.
-ONE_SCALE = Scales(np.array([0.5 * math.log(PINNED)]), np.zeros(1))
+AT_ZERO = Scales(np.array([0.5 * math.log(PINNED)]), np.zeros(1))
 
 
-def velocities_expected(problem: TwoViewProblem, motion: str, interval: float | None,
+def velocities_expected(problem: TwoViewProblem, motion: str, interval: float,
                         inertial: InertialMotion | None) -> tuple[VelocityPrior, Scales]:
-    """Prior of the velocities at the middle rows, and the grid of their scales."""
-    if interval is None:
-        log_scales: Array = -np.log(GRID)
-        return isotropic(1.0, 0.0), Scales(log_scales, SMALL_IS_LIKELIER * log_scales)
+    """Prior of the velocities at the middle rows, and the grid of their scales.
+
+    Parameters
+    ----------
+    motion : str
+        Of `MOTIONS`: what carries the camera.
+    interval : float
+        Between the frames [s].
+    inertial : InertialMotion or None
+        Between their reference rows.
+    """
     carrier = MOTIONS[motion]
     if inertial is None:
         expected, covariance = np.zeros(6), _of_carrier(carrier, interval)
@@ -54,7 +67,8 @@ def velocities_expected(problem: TwoViewProblem, motion: str, interval: float | 
     to_velocities = np.kron(np.array([[1.0 / interval, 0.0], [1.0 / interval, -1.0]]), np.eye(3))
     covariance = to_velocities @ covariance @ to_velocities.T + ROW_VELOCITY_SIGMA**2 * np.eye(6)
     step = math.log(carrier.fast / carrier.slow) / SCALES
-    centres = math.log(interval * carrier.slow) + step * (0.5 + np.arange(SCALES))
+    centres = np.array([math.log(interval * carrier.slow) + step * (0.5 + k)
+                        for k in range(SCALES)])
     prior = VelocityPrior(1.0 / interval, to_velocities @ expected,
                           np.ascontiguousarray(np.linalg.inv(covariance)),
                           float(centres[SCALES // 2]), 0.0, (WIDTH * step) ** -2, 0.0)
@@ -85,4 +99,4 @@ def _of_carrier(carrier: CarrierMotion, interval: float) -> Array:
     to_both = np.vstack([interval - instants, np.ones(parts)]) * interval / parts
     correlation = np.exp(-np.abs(instants[:, None] - instants) / CORRELATION_TIME)
     covariance: Array = carrier.acceleration**2 * to_both @ correlation @ to_both.T
-    return np.kron(covariance, np.eye(3))
+    return np.asarray(np.kron(covariance, np.eye(3)))

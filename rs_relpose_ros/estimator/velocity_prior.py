@@ -32,11 +32,6 @@ from rs_relpose_ros.geometry.vectors import copy_matrix, copy_vector
 
 Array = NDArray[np.float64]
 
-# Prior sigmas where nothing is known of the time between the frames [baselines per second].
-GRID = np.array([0.003, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
-# Exponent of the prior of the sigma, as its inverse: where the data cannot tell (sideways motion,
-# cameras at rest), a wide prior would turn noise into velocity and degrees of translation.
-SMALL_IS_LIKELIER = 0.5
 # Matches of more noise than the rest: how many times as much, and their share to begin with.
 WORSE = 3.0
 FIRST_SHARE = 0.1
