@@ -70,7 +70,7 @@ class EstimatorConfig:
         live=True)
     motion: str = setting(
         'hand_held', 'what carries the camera: how fast it goes and accelerates, where images and '
-        'accelerometer do not tell', choices=tuple(MOTIONS), live=True)
+        'accelerometer do not tell', choices=tuple(MOTIONS))
 
     def __post_init__(self) -> None:
         check_settings(self)

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel, linked_kernel
 from rs_relpose_ros.estimator.state import (
+    D1,
     DW1,
     DW2,
     PARAMETERS,
@@ -158,35 +159,33 @@ def _add_rotation(state: TwoViewState, priors: Priors, hessian: Array, gradient:
 def add_velocities(state: TwoViewState, prior: VelocityPrior, hessian: Array,
                    gradient: Array) -> float:
     """``u^T W u`` of both velocities; t moves in its tangent plane."""
-    b, c = math.exp(prior.log_scale), prior.rate
+    b, c, W = math.exp(prior.log_scale), prior.rate, prior.information
     basis = tangent_basis(state.t)
-    # du by the tangent, by d_1 and d_2, and by log b
-    jac, u = np.zeros((6, 9)), np.empty(6)
+    # du by the tangent's two steps and by log b; by (d_1, d_2) it is b.
+    jac, u = np.empty((6, 3)), np.empty(6)
     for i in range(6):
         axis = i % 3
         d = state.d1[axis] if i < 3 else state.d2[axis]
         jac[i, 0], jac[i, 1] = -b * c * basis[axis, 0], -b * c * basis[axis, 1]
-        jac[i, 2 + i] = b
-        jac[i, 8] = b * (d - c * state.t[axis])
-        u[i] = jac[i, 8] + prior.offset[i]
-    n, cost = 9 if len(gradient) > SCALE else 8, 0.0
-    weighted = np.zeros((6, 9))
+        jac[i, 2] = b * (d - c * state.t[axis])
+        u[i] = jac[i, 2] + prior.offset[i]
+    columns, cost = 3 if len(gradient) > SCALE else 2, 0.0
     for i in range(6):
-        product = 0.0
+        product, weighted = 0.0, np.zeros(3)
         for k in range(6):
-            w = prior.information[i, k]
-            product += w * u[k]
-            for a in range(n):
-                weighted[i, a] += w * jac[k, a]
+            product += W[i, k] * u[k]
+            hessian[D1 + i, D1 + k] += b * b * W[i, k]
+            for a in range(columns):
+                weighted[a] += W[i, k] * jac[k, a]
         cost += u[i] * product
-    for a in range(n):
-        row = TANGENT + a if a < 8 else SCALE
-        for i in range(6):
-            gradient[row] += weighted[i, a] * u[i]
-        for e in range(n):
-            column = TANGENT + e if e < 8 else SCALE
-            for i in range(6):
-                hessian[row, column] += jac[i, a] * weighted[i, e]
+        gradient[D1 + i] += b * product
+        for a in range(columns):
+            row = TANGENT + a if a < 2 else SCALE
+            gradient[row] += jac[i, a] * product
+            hessian[row, D1 + i] += b * weighted[a]
+            hessian[D1 + i, row] += b * weighted[a]
+            for e in range(columns):
+                hessian[row, TANGENT + e if e < 2 else SCALE] += jac[i, a] * weighted[e]
     return cost
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,4 +112,7 @@ def _widened(pose: RelativePose, shift: Array) -> RelativePose:
     """The pose with a shift (6,) that it may have in its covariance."""
     if not shift.any():
         return pose
-    return replace(pose, covariance=pose.covariance + np.outer(shift, shift))
+    # What the shift does to the baseline is not known: it is not told.
+    return replace(pose, covariance=pose.covariance + np.outer(shift, shift), baseline=math.nan,
+                   baseline_log_sigma=math.nan, baseline_reason='baseline not known: a figure '
+                   'that was told is suspect (see health)' if pose else '')
