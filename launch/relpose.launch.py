@@ -8,10 +8,16 @@
 
 from launch import Action, LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch.substitutions import (
+    EnvironmentVariable,
+    LaunchConfiguration,
+    PathJoinSubstitution,
+)
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
+# Where Fast DDS looks for a profile; one that the user has set stays.
+PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 ARGUMENTS = {
     'namespace': ('', 'namespace of the node'),
     'name': ('relpose_node', 'name of the node'),
@@ -25,8 +31,9 @@ ARGUMENTS = {
         PathJoinSubstitution([FindPackageShare('rs_relpose_ros'), 'config', 'relpose.yaml']),
         'parameter file; readout_time and quat_cam_imu_xyzw have no default'),
     'fastdds_profile': (
-        '', ('Fast DDS profile, for images above 512 KB: config/fastdds.xml of this package; the '
-             'driver needs the same')),
+        EnvironmentVariable(PROFILE, default_value=PathJoinSubstitution(
+            [FindPackageShare('rs_relpose_ros'), 'config', 'fastdds.xml'])),
+        'Fast DDS profile of the node, for images above 512 KB; the driver needs it, too'),
     'use_sim_time': ('false', 'clock of log lines and diagnostics; estimates go by stamps alone'),
 }
 
@@ -38,8 +45,8 @@ def start_node(context: LaunchContext) -> list[Action]:
     overrides = {name: argument[name] for name in ('image_transport', 'use_sim_time')
                  if argument[name].perform(context)}
     profile = argument['fastdds_profile']
-    environment = [SetEnvironmentVariable('FASTRTPS_DEFAULT_PROFILES_FILE', profile)]
-    return [*(environment if profile.perform(context) else []), Node(
+    environment = [SetEnvironmentVariable(PROFILE, profile)] if profile.perform(context) else []
+    return [*environment, Node(
         package='rs_relpose_ros', executable='relpose_node', name=argument['name'],
         namespace=argument['namespace'], output='screen',
         parameters=[argument['params_file'], overrides],

@@ -32,10 +32,10 @@ STILL = Cell(speed=0.0, rate=0.0, pixel_noise=1e-2, gravity_noise=1e-3, gyro_noi
              outliers=0.2)
 
 
-def trial(seed, rotation, oracle_rotation, nees=5.0):
+def trial(seed, rotation, oracle_rotation, nees=5.0, mixture=NO_POSE):
     error = NO_POSE if rotation is None else PoseError(rotation, 2.0 * rotation, nees)
     return Trial('forward-base', 'paper', 1.0, seed, 'OK', error,
-                 PoseError(oracle_rotation, oracle_rotation, 5.0), 0.003)
+                 PoseError(oracle_rotation, oracle_rotation, 5.0), mixture, 0.003)
 
 
 def test_cells_are_selected_by_pattern():
@@ -56,6 +56,16 @@ def test_ratios_are_of_medians_and_percentiles():
     assert statistics.lost == 0
     assert statistics.gross == (3.0 * errors > 2.0).sum()
     assert statistics.duration == pytest.approx(3.0)
+
+
+def test_the_oracle_without_labels_is_compared_where_it_was_asked():
+    name = "ratio of 90th percentiles of translation to the mixture oracle's, largest of a cell"
+    asked = cell_statistics([trial(k, 0.3, 0.1, mixture=PoseError(0.2, 0.4)) for k in range(5)])
+    others = cell_statistics([trial(k, 0.3, 0.1) for k in range(5)])
+    assert asked.mixture_ratio.p90 == pytest.approx(1.5)
+    for cells, expected in (([others], 0.0), ([others, asked], 1.5)):
+        figures = {name: figure for name, figure, _ in summary(cells)}
+        assert figures[name] == pytest.approx(expected)
 
 
 def test_a_lost_pose_is_an_infinite_error_and_has_no_nees():
@@ -82,7 +92,7 @@ def test_consistency_tells_right_from_overconfident(overconfidence):
 def run(tmp_path_factory):
     """Two problems of a cell, told right and double sigmas; the folder keeps the oracle."""
     folder = tmp_path_factory.mktemp('oracle')
-    asked = AccuracyRun(('sideways-base',), ('gaussian',), (1.0, 2.0), trials=2)
+    asked = AccuracyRun(('sideways-outliers-50',), ('gaussian',), (1.0, 2.0), trials=2)
     counts = []
     trials = run_accuracy(asked, OracleCache(folder), on_trials=counts.append)
     assert sum(counts) == asked.estimates == len(trials) == 4
@@ -97,8 +107,11 @@ def test_the_oracle_is_kept(run, monkeypatch):
     def forbidden(*args):
         raise AssertionError('asked again')
     monkeypatch.setattr(accuracy, 'oracle_estimate', forbidden)
+    monkeypatch.setattr(accuracy, 'mixture_estimate', forbidden)
     again = run_accuracy(asked, OracleCache(folder))
-    assert [(t.error, t.oracle) for t in again] == [(t.error, t.oracle) for t in trials]
+    assert ([(t.error, t.oracle, t.mixture) for t in again]
+            == [(t.error, t.oracle, t.mixture) for t in trials])
+    assert all(0.0 < t.mixture.translation < 20.0 for t in trials)
 
 
 def test_plot_of_accuracy_shows_the_statistics(run, tmp_path):
@@ -111,17 +124,18 @@ def test_plot_of_accuracy_shows_the_statistics(run, tmp_path):
                                          'nees.mean'), strict=True):
         shown = [line.get_xdata()[0] for line in axis.lines if line.get_marker() == 'o']
         assert shown == [attrgetter(value)(cell) for cell in cells]
-    assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == ['sideways-base']
+    assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == [
+        'sideways-outliers-50']
 
 
 def test_command_writes_tables_and_a_plot(run, tmp_path, capsys):
     _, oracle, trials = run
-    assert main(['benchmark', 'accuracy', '--trials', '2', '--cells', 'sideways-base', '--noise',
-                 'gaussian', '--cache', str(oracle), '--output', str(tmp_path)]) == 0
+    assert main(['benchmark', 'accuracy', '--trials', '2', '--cells', 'sideways-outliers-50',
+                 '--noise', 'gaussian', '--cache', str(oracle), '--output', str(tmp_path)]) == 0
     report = (tmp_path / 'accuracy.md').read_text()
     assert report in capsys.readouterr().out
     statistics = cell_statistics([t for t in trials if t.sigma_factor == 1.0])
-    assert f'| sideways-base | {statistics.rotation.text(3)} |' in report
+    assert f'| sideways-outliers-50 | {statistics.rotation.text(3)} |' in report
     with (tmp_path / 'trials.csv').open() as file:
         assert [float(row['error_rotation']) for row in csv.DictReader(file)] == [
             t.error.rotation for t in trials if t.sigma_factor == 1.0]

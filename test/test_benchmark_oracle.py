@@ -9,31 +9,38 @@ import pytest
 from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_lab.experiments import oracle, problems
-from rs_relpose_lab.experiments.accuracy import OracleCache
+from rs_relpose_lab.experiments import mixture_oracle, oracle, problems
+from rs_relpose_lab.experiments.accuracy import Best, OracleCache
+from rs_relpose_lab.experiments.mixture_oracle import (
+    depth_classes,
+    mixture_estimate,
+    mixture_of,
+)
 from rs_relpose_lab.experiments.oracle import Objective, oracle_estimate, start_at
 from rs_relpose_lab.experiments.problems import Cell, CELLS, make_problem
-from rs_relpose_lab.experiments.scoring import pose_error, PoseError
+from rs_relpose_lab.experiments.scoring import NO_POSE, pose_error, PoseError
 from rs_relpose_lab.simulation import rows
 
 NO_NOISE = {'pixel_noise': 0.0, 'gravity_noise': 0.0, 'gyro_noise': 0.0, 'outliers': 0.0}
 SIGMAS = 0.5, np.radians(0.2), np.radians(0.1)
 
 
-@pytest.mark.parametrize('module', [oracle, problems, rows])
+@pytest.mark.parametrize('module', [oracle, mixture_oracle, problems, rows])
 def test_it_uses_nothing_of_the_package(module):
     tree = ast.parse(Path(module.__file__).read_text(encoding='utf-8'))
     imported = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import)
                 for alias in node.names}
     imported |= {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
     assert {name for name in imported if name.startswith('rs_relpose')} <= {
-        'rs_relpose_lab.experiments.problems', 'rs_relpose_lab.simulation.rows'}
+        'rs_relpose_lab.experiments.problems', 'rs_relpose_lab.experiments.oracle',
+        'rs_relpose_lab.simulation.rows'}
 
 
 @pytest.mark.parametrize('cell', ['forward-base', 'sideways-v10-w3', 'forward-v0-w3'])
 def test_jacobian_equals_finite_differences(cell):
     problem = make_problem(CELLS[cell], 1)
-    objective = Objective(problem, *SIGMAS, start_at(problem.R, problem.t, problem.gravity1))
+    objective = Objective(problem, *SIGMAS, start_at(problem.R, problem.t, problem.gravity1),
+                          (~problem.is_outlier).astype(float))
     rng = np.random.default_rng(0)
     x = objective.truth()
     x += 0.01 * rng.normal(size=len(x))
@@ -48,7 +55,8 @@ def test_jacobian_equals_finite_differences(cell):
 def test_the_simulated_camera_obeys_its_model(cell):
     # Points projected by brute force, each at its own row's instant, lie on the constraint.
     problem = make_problem(replace(CELLS[cell], **NO_NOISE), 2)
-    objective = Objective(problem, *SIGMAS, start_at(problem.R, problem.t, problem.gravity1))
+    objective = Objective(problem, *SIGMAS, start_at(problem.R, problem.t, problem.gravity1),
+                          (~problem.is_outlier).astype(float))
     residuals = objective.residuals(objective.truth()[:, None])[:, 0]
     # First those of the matches; those of the priors follow.
     assert np.abs(SIGMAS[0] * residuals[:len(problem.points1)]).max() < 1e-6
@@ -82,6 +90,45 @@ def test_its_covariance_describes_its_errors():
         nees.append(pose_error(best.R, best.t, problem.R, problem.t, best.covariance).nees)
     # The mean of 30 chi-square(5) is 5 +- 0.58.
     assert np.mean(nees) == pytest.approx(5.0, abs=1.8)
+
+
+def test_depths_are_those_of_the_points():
+    problem = make_problem(replace(CELLS['sideways-v10-w3'], **NO_NOISE), 2)
+    objective = Objective(problem, *SIGMAS, start_at(problem.R, problem.t, problem.gravity1),
+                          np.ones(len(problem.points1)))
+    depths = objective.depths(objective.truth())
+    # The second camera stands R^T (X - b) from each point X, rows of another instant included.
+    assert depths.min() > 1.0
+    flipped = replace(problem, t=-problem.t, v1=-problem.v1, v2=-problem.v2)
+    behind = replace(objective, problem=flipped,
+                     start=start_at(problem.R, -problem.t, problem.gravity1))
+    np.testing.assert_allclose(behind.depths(behind.truth()), -depths, rtol=1e-9)
+    assert (depth_classes(-depths) == 0).all()
+    assert depth_classes(depths).min() > 0
+
+
+def test_the_mixture_oracle_knows_no_labels_and_tells_them_nearly():
+    cell = CELLS['forward-outliers-60']
+    problem = make_problem(cell, 5, 'gaussian')
+    mixture = mixture_of(cell, 5, SIGMAS[0])
+    blind = replace(problem, is_outlier=np.zeros(300, dtype=bool))
+    found = mixture_estimate(problem, mixture, *SIGMAS)
+    again = mixture_estimate(blind, mixture, *SIGMAS)
+    np.testing.assert_array_equal(found.R, again.R)
+    np.testing.assert_array_equal(found.t, again.t)
+    objective = Objective(problem, *SIGMAS, start_at(problem.R, problem.t, problem.gravity1),
+                          np.ones(300))
+    x = objective.truth()
+    true = mixture.is_true(objective.errors(x[:, None], np.ones(300, dtype=bool))[:, 0],
+                           objective.depths(x), SIGMAS[0])
+    assert true[~problem.is_outlier].mean() > 0.95
+    assert true[problem.is_outlier].mean() < 0.05
+    # As many are believed as are true.
+    assert true.sum() == pytest.approx(120, abs=6)
+    best = oracle_estimate(problem, *SIGMAS)
+    error = pose_error(found.R, found.t, best.R, best.t)
+    assert error.translation < 1.0
+    assert error.rotation < 0.05
 
 
 @pytest.mark.parametrize('name', CELLS)
@@ -119,9 +166,9 @@ def test_error_in_sigmas_is_that_of_the_told_covariance():
 
 def test_kept_errors_come_back_for_their_own_cell_only(tmp_path):
     cache = OracleCache(tmp_path)
-    cache.add(Cell(), 'paper', {3: PoseError(0.1, 0.2, 4.0)})
-    cache.add(Cell(), 'paper', {1: PoseError(0.3, 0.4, 5.0)})
-    assert cache.load(Cell(), 'paper') == {1: PoseError(0.3, 0.4, 5.0),
-                                           3: PoseError(0.1, 0.2, 4.0)}
+    first, second = (Best(PoseError(0.1 * k, 0.2, 4.0), NO_POSE) for k in (1, 2))
+    cache.add(Cell(), 'paper', {3: first})
+    cache.add(Cell(), 'paper', {1: second})
+    assert str(cache.load(Cell(), 'paper')) == str({1: second, 3: first})
     assert cache.load(Cell(), 'gaussian') == {}
     assert cache.load(Cell(speed=2.0), 'paper') == {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import py_compile
+import re
 from xml.etree import ElementTree
 
 from conftest import ROOT
@@ -14,6 +15,7 @@ from rs_relpose_lab.live.processes import node_process, Process
 from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.config.template import parameter_template
+from rs_relpose_ros.node import node as node_module
 
 CONFIG = ROOT / 'config'
 LAUNCH_FILE = ROOT / 'launch' / 'relpose.launch.py'
@@ -40,6 +42,16 @@ def test_template_holds_every_parameter_at_its_default():
 
 
 @pytest.mark.live
+def test_help_tells_the_legal_values_of_every_kind(capsys):
+    with pytest.raises(SystemExit):
+        node_module.main(['--help'])
+    shown = capsys.readouterr().out
+    assert re.search(r'^  track_time_offset: .*\. true or false; default False', shown, re.M)
+    assert re.search(r'^  stamps_file: .*\. text; default', shown, re.M)
+    for name, _, declared in Parameters.declarations():
+        assert f'  {name}: {declared.description}' in shown
+
+
 def test_node_takes_the_template(ros_domain_id):
     """Rcl's own YAML parser makes of it what ours does."""
     with node_process(CONFIG / 'relpose.yaml') as node:
@@ -90,6 +102,16 @@ def test_launch_file_remaps_what_the_node_subscribes_to():
     assert ast.literal_eval(keywords['executable']) == 'relpose_node'
     remapped = [ast.literal_eval(pair.elts[0]) for pair in keywords['remappings'].elts]
     assert remapped == ['image', 'camera_info', 'imu', 'accel']
+
+
+def test_launch_file_uses_the_profile_unless_the_user_has_one():
+    tree = ast.parse(LAUNCH_FILE.read_text(encoding='utf-8'))
+    [default] = [call for call in ast.walk(tree) if isinstance(call, ast.Call)
+                 and isinstance(call.func, ast.Name) and call.func.id == 'EnvironmentVariable']
+    assert ast.unparse(default.args[0]) == 'PROFILE'
+    [path] = [keyword.value for keyword in default.keywords if keyword.arg == 'default_value']
+    assert "'config', 'fastdds.xml'" in ast.unparse(path)
+    assert (CONFIG / 'fastdds.xml').is_file()
 
 
 def test_launch_file_describes_its_arguments():

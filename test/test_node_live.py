@@ -162,6 +162,7 @@ def told(message: DiagnosticArray) -> tuple[int, dict[str, str]]:
 def test_diagnostics_tell_what_happened(run):
     values = diagnostic_values(run.diagnostics[-1])
     assert run.diagnostics[-1].status[0].name == '/relpose_node: relative pose'
+    assert run.diagnostics[-1].status[0].hardware_id == '/camera/image_raw/compressed'
     refused = sum(int(value) for key, value in values.items() if key.startswith('frames_refused_'))
     assert int(values['frames_received']) == 180 == int(values['frames_processed']) + refused
     assert int(values['frames_processed']) == len(run.stamps)

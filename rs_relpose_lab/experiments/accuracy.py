@@ -9,17 +9,22 @@ import hashlib
 import json
 from pathlib import Path
 import time
+from typing import NamedTuple
 
 import numpy as np
 
-from rs_relpose_lab.experiments import oracle, problems
+from rs_relpose_lab.experiments import mixture_oracle, oracle, problems
 from rs_relpose_lab.experiments.methods import as_pair, METHODS, prepared
-from rs_relpose_lab.experiments.oracle import oracle_estimate
+from rs_relpose_lab.experiments.mixture_oracle import mixture_estimate, mixture_of
+from rs_relpose_lab.experiments.oracle import oracle_estimate, OracleEstimate
 from rs_relpose_lab.experiments.problems import Cell, CELLS, make_problem, Noise, TwoViewProblem
-from rs_relpose_lab.experiments.scoring import pose_error, PoseError
+from rs_relpose_lab.experiments.scoring import NO_POSE, pose_error, PoseError
 from rs_relpose_lab.experiments.workers import in_processes
 from rs_relpose_lab.simulation import rows
 from rs_relpose_ros import RelativePose, warm_up
+
+# Share of false matches from which on who knows the labels knows much more than anybody can.
+MANY_OUTLIERS = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +32,8 @@ class Trial:
     """One problem, estimated.
 
     `sigma_factor`: told sigmas by the true ones; `error`, `oracle`: of estimator and oracle;
-    `duration`: of the whole estimate [s].
+    `mixture`: of the oracle without labels, where there are many outliers; `duration`: of the
+    whole estimate [s].
     """
 
     cell: str
@@ -37,7 +43,15 @@ class Trial:
     status: str
     error: PoseError
     oracle: PoseError
+    mixture: PoseError
     duration: float
+
+
+class Best(NamedTuple):
+    """Errors of the oracle, and of the one without labels (infinite where it was not asked)."""
+
+    oracle: PoseError
+    mixture: PoseError
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +77,7 @@ class _Task:
     cell: str
     noise: Noise
     seeds: tuple[int, ...]
-    known: dict[int, PoseError]
+    known: dict[int, Best]
 
 
 def run_accuracy(run: AccuracyRun, cache: OracleCache, jobs: int = 1,
@@ -82,7 +96,8 @@ def run_accuracy(run: AccuracyRun, cache: OracleCache, jobs: int = 1,
     for task, done in zip(tasks, in_processes(_run, tasks, jobs, warm_up), strict=True):
         trials += done
         cache.add(CELLS[task.cell], task.noise,
-                  {trial.seed: trial.oracle for trial in done if trial.seed not in task.known})
+                  {trial.seed: Best(trial.oracle, trial.mixture) for trial in done
+                   if trial.seed not in task.known})
         on_trials(len(done))
     return trials
 
@@ -93,7 +108,7 @@ def _run(task: _Task) -> list[Trial]:
     trials = []
     for seed in task.seeds:
         problem = make_problem(cell, seed, task.noise)
-        best = task.known.get(seed) or _oracle_error(cell, problem)
+        best = task.known.get(seed) or _best(cell, problem, seed)
         for factor in task.run.sigma_factors:
             pair = as_pair(problem, cell, factor)
             call = prepared(method, pair, seed)
@@ -102,14 +117,21 @@ def _run(task: _Task) -> list[Trial]:
             duration = time.perf_counter() - started
             assert isinstance(pose, RelativePose)
             trials.append(Trial(task.cell, task.noise, factor, seed, pose.status.value,
-                                pair.error(pose), best, duration))
+                                pair.error(pose), *best, duration))
     return trials
 
 
-def _oracle_error(cell: Cell, problem: TwoViewProblem) -> PoseError:
-    best = oracle_estimate(problem, cell.pixel_noise, float(np.radians(cell.gravity_noise)),
-                           float(np.radians(cell.gyro_noise)))
-    return pose_error(best.R, best.t, problem.R, problem.t, best.covariance)
+def _best(cell: Cell, problem: TwoViewProblem, seed: int) -> Best:
+    def error(best: OracleEstimate) -> PoseError:
+        return pose_error(best.R, best.t, problem.R, problem.t, best.covariance)
+
+    sigmas = (cell.pixel_noise, float(np.radians(cell.gravity_noise)),
+              float(np.radians(cell.gyro_noise)))
+    mixture = NO_POSE
+    if cell.outliers >= MANY_OUTLIERS:
+        mixture = error(mixture_estimate(
+            problem, mixture_of(cell, seed, cell.pixel_noise), *sigmas))
+    return Best(error(oracle_estimate(problem, *sigmas)), mixture)
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,15 +144,16 @@ class OracleCache:
 
     folder: Path
 
-    def load(self, cell: Cell, noise: Noise) -> dict[int, PoseError]:
-        """Errors of the oracle by seed."""
+    def load(self, cell: Cell, noise: Noise) -> dict[int, Best]:
+        """Errors of the oracles by seed."""
         path = self._path(cell, noise)
         if not path.is_file():
             return {}
         stored = json.loads(path.read_text())
-        return {int(seed): PoseError(*error) for seed, error in stored.items()}
+        return {int(seed): Best(*(PoseError(*error) for error in errors))
+                for seed, errors in stored.items()}
 
-    def add(self, cell: Cell, noise: Noise, errors: dict[int, PoseError]) -> None:
+    def add(self, cell: Cell, noise: Noise, errors: dict[int, Best]) -> None:
         """Keep errors by seed, beside those that are kept already."""
         path = self._path(cell, noise)
         if not errors:
@@ -140,8 +163,8 @@ class OracleCache:
         # Replaced as a whole, so that a run that is stopped leaves no half of a file.
         new = path.with_suffix('.new')
         new.write_text(json.dumps({
-            seed: (error.rotation, error.translation, error.nees)
-            for seed, error in sorted(merged.items())}))
+            seed: [(error.rotation, error.translation, error.nees) for error in best]
+            for seed, best in sorted(merged.items())}))
         new.replace(path)
 
     def _path(self, cell: Cell, noise: Noise) -> Path:
@@ -151,5 +174,6 @@ class OracleCache:
 
 @functools.cache
 def _source() -> bytes:
-    """Of generator and oracle, as they were when first asked for."""
-    return b''.join(Path(str(module.__file__)).read_bytes() for module in (rows, problems, oracle))
+    """Of generator and oracles, as they were when first asked for."""
+    return b''.join(Path(str(module.__file__)).read_bytes()
+                    for module in (rows, problems, oracle, mixture_oracle))

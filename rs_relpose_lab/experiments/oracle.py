@@ -1,9 +1,10 @@
 """What the data allow: the maximum-a-posteriori estimate of somebody who knows the answer.
 
 The oracle knows which matches are true, every noise figure and how fast the cameras are, and
-starts at the truth. It is written with NumPy and SciPy alone and shares nothing with the
-estimator: not the code, not the parameters (gravity is an unknown of its own, velocities are in
-each camera's own frame), not the derivatives (complex steps).
+starts at the truth. (One that does not know which are true: `mixture_oracle`.) It is written with
+NumPy and SciPy alone and shares nothing with the estimator: not the code, not the parameters
+(gravity is an unknown of its own, velocities are in each camera's own frame), not the derivatives
+(complex steps).
 
 For a match at pixels ``(u_1, v_1), (u_2, v_2)``, row times ``tau_i = v_i line_delay``::
 
@@ -74,7 +75,8 @@ class Objective:
     """Residuals, of which the oracle minimises the sum of squares, over a step x from `start`.
 
     `pixel_sigma` [px] per coordinate, `gravity_sigma` [rad] per axis of one frame's direction,
-    `gyro_sigma` [rad/s] per axis of one frame.
+    `gyro_sigma` [rad/s] per axis of one frame. `weights` (N,) of the matches; those of weight 0
+    take no part.
     """
 
     problem: TwoViewProblem
@@ -82,6 +84,7 @@ class Objective:
     gravity_sigma: float
     gyro_sigma: float
     start: Start
+    weights: Array
 
     @property
     def velocity_spread(self) -> float:
@@ -102,22 +105,46 @@ class Objective:
     def residuals(self, x: Values) -> Values:
         """Residuals (M, K) in sigmas at each column of x (P, K)."""
         problem, spread = self.problem, self.velocity_spread
-        use = ~problem.is_outlier
-        turned, direction, gravity = pose_at(self.start, x)
-        gyro = x[_GYRO]
-        velocity = x[_VELOCITY] if spread > 0.0 else np.zeros_like(gyro)
-        sampson = _sampson(
-            problem.points1[use], problem.points2[use], turned, direction,
-            problem.measured_rate1[:, None] + gyro[:3],
-            problem.measured_rate2[:, None] + gyro[3:], velocity[:3], velocity[3:])
+        use = self.weights > 0.0
+        turned, _, gravity = pose_at(self.start, x)
         gravity2 = np.einsum('jik,jk->ik', turned, gravity)
-        parts = [sampson / self.pixel_sigma,
+        gyro = x[_GYRO]
+        parts = [np.sqrt(self.weights[use])[:, None] * self.errors(x, use) / self.pixel_sigma,
                  _tangent(problem.measured_gravity1).T @ gravity / self.gravity_sigma,
                  _tangent(problem.measured_gravity2).T @ gravity2 / self.gravity_sigma,
                  gyro / self.gyro_sigma]
         if spread > 0.0:
-            parts.append(velocity / spread)
+            parts.append(x[_VELOCITY] / spread)
         return np.concatenate(parts)
+
+    def errors(self, x: Values, use: NDArray[np.bool_]) -> Values:
+        """Signed Sampson errors (K, C) [px] of K matches in `use` (N,), at each column of x."""
+        problem = self.problem
+        turned, direction, _ = pose_at(self.start, x)
+        return _sampson(problem.points1[use], problem.points2[use], turned, direction,
+                        *self._motions(x))
+
+    def depths(self, x: Array) -> Array:
+        """Depths (N, 2) [baselines] along both derotated rays, normalised to 1 on the axis."""
+        problem = self.problem
+        turned, direction, _ = pose_at(self.start, x[:, None])
+        w1, w2, v1, v2 = self._motions(x[:, None])
+        (f1, _, _), tau1 = _derotated(problem.points1, w1)
+        (f2, _, _), tau2 = _derotated(problem.points2, w2)
+        f1, h = f1[:, 0], np.einsum('ij,jn->in', turned[:, :, 0], f2[:, 0])
+        # X = a f_1 = b + c h, in the least-squares sense.
+        b = direction + tau2 * (turned[:, :, 0] @ v2) - tau1 * v1
+        normal = _cross(f1, h)
+        square = _dot(normal, normal)
+        return np.stack([_dot(_cross(b, h), normal), _dot(_cross(b, f1), normal)]).T / square[
+            :, None]
+
+    def _motions(self, x: Values) -> tuple[Values, Values, Values, Values]:
+        """Angular, then linear velocities (3, C) of both frames at each column of x."""
+        problem, gyro = self.problem, x[_GYRO]
+        velocity = x[_VELOCITY] if self.velocity_spread > 0.0 else np.zeros_like(gyro)
+        return (problem.measured_rate1[:, None] + gyro[:3],
+                problem.measured_rate2[:, None] + gyro[3:], velocity[:3], velocity[3:])
 
     def jacobian(self, x: Array) -> Array:
         """Derivatives (M, P) at x (P,), exact to the last digits: no difference is formed."""
@@ -130,14 +157,23 @@ def oracle_estimate(problem: TwoViewProblem, pixel_sigma: float, gravity_sigma: 
     """The oracle's estimate of a problem; `start`: pose to start from instead of the truth."""
     R, t = (problem.R, problem.t) if start is None else start
     objective = Objective(problem, pixel_sigma, gravity_sigma, gyro_sigma,
-                          start_at(R, t, problem.gravity1))
-    found = least_squares(lambda x: objective.residuals(x[:, None])[:, 0], objective.truth(),
-                          jac=objective.jacobian, method='lm', x_scale='jac', xtol=1e-12,
-                          ftol=1e-12, gtol=1e-12)
-    turned, direction, gravity = pose_at(objective.start, found.x[:, None])
+                          start_at(R, t, problem.gravity1), (~problem.is_outlier).astype(float))
+    return estimate_at(objective, minimum(objective, objective.truth()))
+
+
+def minimum(objective: Objective, start: Array) -> Array:
+    """The unknowns (P,) of the least cost that is reached from `start` (P,)."""
+    return np.asarray(least_squares(
+        lambda x: objective.residuals(x[:, None])[:, 0], start, jac=objective.jacobian,
+        method='lm', x_scale='jac', xtol=1e-12, ftol=1e-12, gtol=1e-12).x)
+
+
+def estimate_at(objective: Objective, x: Array) -> OracleEstimate:
+    """Pose and covariance at an optimum x (P,)."""
+    turned, direction, gravity = pose_at(objective.start, x[:, None])
     # Once more about the optimum, where the unknowns of the pose are a turn and a tangent of it.
     optimum = start_at(turned[:, :, 0], direction[:, 0], gravity[:, 0])
-    x = found.x.copy()
+    x = x.copy()
     x[_POSE], x[_GRAVITY] = 0.0, 0.0
     slopes = replace(objective, start=optimum).jacobian(x)
     pose = np.linalg.inv(slopes.T @ slopes)[_POSE, _POSE]

@@ -13,6 +13,9 @@ from typing import Any
 
 from rs_relpose_ros.errors import InputError
 
+# Legal values of kinds that have no limits, in words.
+ANY_VALUE = {bool: 'true or false', str: 'text'}
+
 
 @dataclass(frozen=True, slots=True)
 class Declared:
@@ -32,6 +35,8 @@ class Declared:
         """The legal values in words."""
         if self.choices:
             return 'one of ' + ', '.join(self.choices)
+        if self.kind in ANY_VALUE:
+            return ANY_VALUE[self.kind]
         text = 'finite'
         if self.low > -math.inf or self.high < math.inf:
             text = f'in [{self.low:g}, {self.high:g}]'

@@ -8,12 +8,13 @@ from __future__ import annotations
 from pathlib import Path
 import sys
 
-from rs_relpose_ros.config.declarations import Declared
+from rs_relpose_ros.config.declarations import ANY_VALUE, Declared
 from rs_relpose_ros.config.parameter_file import comment, yaml_text
 from rs_relpose_ros.config.parameters import Parameters
 
 _HEAD = """\
-# Parameters of relpose_node and of `rs_relpose replay --params`, each at its default.
+# Parameters of relpose_node, global_shutter_node and `--params` of the commands, each at its
+# default.
 # Written by `python -m rs_relpose_ros.config.template config/relpose.yaml`; copy it and
 # change the copy. Those without a value have no default: the node says when it needs one.
 # [live] can be changed while the node runs (`ros2 param set`).
@@ -37,7 +38,7 @@ def parameter_template() -> str:
 
 def _meaning(declared: Declared) -> str:
     text = declared.description
-    if declared.kind is not bool and declared.legal != 'finite':
+    if declared.legal not in ('finite', *ANY_VALUE.values()):
         text += f': {declared.legal}'
     return f'{text} [live]' if declared.live else text
 
