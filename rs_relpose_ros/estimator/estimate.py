@@ -62,7 +62,9 @@ EXPLAINED = 0.5
 RAYS = (0, 9)
 # Noise of |f_1 - R f_2| is 1.67 sigma in the median (Rayleigh, two images).
 ROTATION_ONLY_SIGMAS = 2.5
-# Largest 1 sigma of the logarithm of a baseline: beyond it, the baseline is not told.
+# Least chi-square of the acceleration (6 degrees of freedom; 99 % of pure noise lie below) and
+# largest 1 sigma of the logarithm of a baseline: beyond it, the baseline is not told.
+LEAST_ACCELERATION = 16.8
 MOST_LOG_SIGMA = 1.0
 # Points whose root mean square distance from a line is below so many thresholds lie on it.
 DEGENERATE_THRESHOLDS = 2.0
@@ -165,6 +167,8 @@ class Estimation:
                                config.pixel_sigma / problem.focal)
         self.priors = _priors(problem, mode, config, interval)
         self.interval, self.inertial = interval, inertial
+        # How far the measured acceleration is from none: chi-square of six degrees of freedom.
+        self.inertial_chi2 = 0.0
         self.iterations = 0
         self.deadline = (time.perf_counter() + config.time_limit if config.time_limit > 0.0
                          else math.inf)
@@ -245,6 +249,7 @@ class Estimation:
                 velocity, scales = velocities_expected(self.problem, config.motion, self.interval,
                                                        self.inertial)
                 priors = with_velocity(priors, velocity)
+                self.inertial_chi2 = velocity.offset @ velocity.information @ velocity.offset
             return fit_with_evidence(matches, state, priors,
                                      Noise(config.pixel_sigma, config.threshold), scales,
                                      self._gyro_error())
@@ -256,8 +261,9 @@ class Estimation:
         covariance = local_covariance(
             FitMatches(matches.observations, inliers.astype(float), config.pixel_sigma), state,
             self.priors)
-        return Refined(state, inliers, self.priors.velocity.log_scale, config.pixel_sigma,
-                       covariance)
+        prior = self.priors.velocity
+        return Refined(state, inliers, prior.log_scale, math.exp(-prior.log_scale),
+                       config.pixel_sigma, covariance)
 
     def _gyro_error(self) -> Array:
         """Covariance (3, 3) of the gyro's rotation by errors s of the stamps, in frame 1.
@@ -356,7 +362,7 @@ class Estimation:
             linear_velocity2=pose.v2, angular_velocity1=pose.w1, angular_velocity2=pose.w2,
             inliers=refined.inliers, covariance=pose.covariance[:6, :6],
             velocity_covariance=pose.covariance[np.ix_(v2w2, v2w2)], model=self.mode.model.name,
-            velocity_sigma=float(np.exp(-refined.log_scale)),
+            velocity_sigma=refined.velocity_sigma,
             baseline=baseline, baseline_log_sigma=baseline_sigma, baseline_reason=reason,
             iterations=self.iterations,
             residual_rms=float(np.sqrt(np.mean(r**2))))
@@ -373,6 +379,9 @@ class Estimation:
             return math.nan, math.nan, ('baseline not known: no acceleration between the frames '
                                         'is given (inertial)')
         sigma = math.sqrt(max(pose.covariance[18, 18], 0.0))
+        if self.inertial_chi2 < LEAST_ACCELERATION:
+            return math.nan, math.nan, ('baseline not known: the acceleration between the frames '
+                                        'is within its own errors')
         if not (self.mode.model.derotated and sigma <= MOST_LOG_SIGMA):
             return math.nan, math.nan, ('baseline not known: velocities that the images show '
                                         'and the acceleration leave it open')

@@ -17,6 +17,7 @@ from rs_relpose_ros.compiled import kernel, linked_kernel
 from rs_relpose_ros.estimator import sampson
 from rs_relpose_ros.estimator.information import inverse
 from rs_relpose_ros.estimator.map_fit import FitMatches, linearised, normal_equations
+from rs_relpose_ros.estimator.noise import FITTED
 from rs_relpose_ros.estimator.priors import Priors
 from rs_relpose_ros.estimator.problem import PairState, TwoViewProblem
 from rs_relpose_ros.estimator.state import DW1, PARAMETERS, SCALE, THETA, TwoViewState
@@ -31,8 +32,6 @@ REGIONS = (4, 3)
 # The Hessian's covariance of the gradient counts as so many regions beside those of the image: few
 # regions alone would make a noisy one.
 HESSIAN_REGIONS = 8
-# Parameters that residuals lose to the fit, as a rule: pose, and what is observable beyond it.
-FITTED = 11
 # The told sigmas of the gyro count as one degree of freedom beside those of its disagreement.
 TOLD_FREEDOM = 1.0
 # Where the gyro alone decides, it cannot disagree: this share of its variance keeps 0 / 0 defined.

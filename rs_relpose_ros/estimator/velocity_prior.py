@@ -1,8 +1,10 @@
-"""The joint fit with the velocity prior chosen by the data: evidence over a grid of sigmas.
+"""The joint fit with the scale b of the velocity prior chosen by the data: evidence over a grid.
 
-How fast the camera moves is not known in advance. A wide prior lets the velocities soak up noise
-where they are zero (the normal case: they are then not even observable), a narrow one biases the
-pose where they are large. The Laplace evidence ``-cost/2 - logdet(H)/2 - 6 log s_d`` weighs them.
+How fast the camera moves is not known in advance. A wide prior (small b) lets the velocities soak
+up noise where they are zero (the normal case: they are then not even observable), a narrow one
+biases the pose where they are large. The Laplace evidence ``-cost/2 - logdet(H)/2 + 6 log b``
+weighs them. Where the time between the frames is known, b is the baseline: an unknown of each fit,
+whose prior is a mixture over the grid.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from rs_relpose_ros.compiled import kernel, linked_kernel
 from rs_relpose_ros.estimator.information import inverse, log_determinant
 from rs_relpose_ros.estimator.inliers import count_behind, Flags, Matches, within
 from rs_relpose_ros.estimator.map_fit import DataTerm, fit, FitMatches, linearised
+from rs_relpose_ros.estimator.noise import noise_mixture
 from rs_relpose_ros.estimator.priors import (
     add_priors,
     add_velocities,
@@ -32,13 +35,6 @@ from rs_relpose_ros.geometry.vectors import copy_matrix, copy_vector
 
 Array = NDArray[np.float64]
 
-# Matches of more noise than the rest: how many times as much, and their share to begin with.
-WORSE = 3.0
-FIRST_SHARE = 0.1
-# What is told of the noise counts as so many matches; that all are good, as so many.
-TOLD_MATCHES = 10.0
-LIKELY_GOOD = 20.0
-MIXTURE_ROUNDS = 6
 ROUNDS = 3
 ITERATIONS = 6
 # On the inliers of the last round, from each prior's own optimum on nearly the same ones.
@@ -72,51 +68,17 @@ class Refined(NamedTuple):
     """A refined state, and what it rests on.
 
     `inliers` (N,): the matches that the last fits used. `log_scale`: log b of the velocities, of
-    the most evidence, or the mean where it is unknown. `sigma`: noise of a match that the fits
-    used [px]. `covariance` (n, n): of the local parameters, within the fits and between them.
+    the most evidence, or the mean where it is unknown. `velocity_sigma`: of their prior [baselines
+    per second]. `sigma`: noise of a match that the fits used [px]. `covariance` (n, n): of the
+    local parameters, within the fits and between them.
     """
 
     state: TwoViewState
     inliers: Flags
     log_scale: float
+    velocity_sigma: float
     sigma: float
     covariance: Array
-
-
-@kernel
-def noise_mixture(r: Array, use: Flags, told: float) -> tuple[Array, float]:
-    """Weights (N,) of the matches in `use` and the noise [px] of good ones, by their residuals.
-
-    Some tracks are worse than others: a share h has `WORSE` times the noise of the rest. Both are
-    found by expectation maximisation; a match weighs as much as the mean of its inverse variance.
-    The told sigma counts as ten matches.
-    """
-    weights = np.zeros(len(r))
-    count, squares = 0, 0.0
-    for i in range(len(r)):
-        if use[i]:
-            count += 1
-            squares += r[i] * r[i]
-            weights[i] = 1.0
-    freedom = TOLD_MATCHES + max(count - 11, 0)
-    variance = (TOLD_MATCHES * told * told + squares) / freedom
-    share = FIRST_SHARE
-    for _ in range(MIXTURE_ROUNDS):
-        squares, worse = 0.0, 0.0
-        for i in range(len(r)):
-            if use[i]:
-                r2 = r[i] * r[i] / variance
-                if not r2 < 700.0:
-                    r2 = 700.0
-                ratio = (share / (1.0 - share) / WORSE
-                         * math.exp(0.5 * r2 * (1.0 - 1.0 / (WORSE * WORSE))))
-                p = ratio / (1.0 + ratio)
-                worse += p
-                weights[i] = 1.0 - p * (1.0 - 1.0 / (WORSE * WORSE))
-                squares += weights[i] * r[i] * r[i]
-        variance = (TOLD_MATCHES * told * told + squares) / freedom
-        share = (worse + 1.0) / (count + LIKELY_GOOD)
-    return weights, math.sqrt(variance)
 
 
 @kernel
@@ -223,6 +185,12 @@ def _candidate(matches: Matches, used: FitMatches, start: TwoViewState, data: Da
     return state, log_scale, data, hessian, evidence
 
 
+@kernel
+def velocity_sigma(prior: VelocityPrior, log_scale: float) -> float:
+    """Prior sigma of the velocities [baselines per second], root mean square over the six."""
+    return math.sqrt(np.trace(inverse(prior.information)) / 6.0) * math.exp(-log_scale)
+
+
 @linked_kernel
 def _average(matches: Matches, used: FitMatches, start: TwoViewState, steps: Array, likely: Flags,
              priors: Priors, scales: Scales, threshold: float, gyro_error: Array) -> Refined:
@@ -276,5 +244,6 @@ def _average(matches: Matches, used: FitMatches, start: TwoViewState, steps: Arr
     log_scale = scales.centres[best]
     if n > SCALE:
         log_scale = steps[best, SCALE] + mean[SCALE]
-    return Refined(moved(origin, mean), used.weights > 0.0, log_scale, used.sigma,
+    return Refined(moved(origin, mean), used.weights > 0.0, log_scale,
+                   velocity_sigma(priors.velocity, log_scale), used.sigma,
                    as_much_wider(believed, fitted, shown) + spread)
