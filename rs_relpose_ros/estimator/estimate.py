@@ -93,12 +93,16 @@ def estimate_relative_pose(
         Of its error dtheta in camera 1 [rad^2]: ``R_true = Exp(dtheta) relative_rotation``. Both
         or neither.
     interval : float, optional
-        Seconds between the two reference instants.
+        Seconds between the two reference instants: velocities are then about those of a carrier
+        (`EstimatorConfig.motion`).
     config : EstimatorConfig, optional
     rng : int or numpy.random.Generator
         Equal input and state give an equal result, bit by bit.
     quality : (N,) array_like, optional
         Higher is better: the order in which matches are sampled.
+    inertial : InertialMotion, optional
+        Preintegrated acceleration between the two reference instants: velocities and baseline in
+        metres follow from it. `interval` must be its duration, or None.
 
     Returns
     -------
@@ -114,8 +118,8 @@ def estimate_relative_pose(
     -----
     Design: hypotheses from derotated rays (gyro rotation and 2 points, angular 3- and 5-point),
     multi-scale MSAC, local optimisation of the uniform model on a shrinking threshold, joint MAP
-    fit with the velocity prior chosen by its evidence, sandwich covariance over image regions; see
-    `docs/estimator.md`.
+    fit with the scale of the velocities chosen by its evidence (with `inertial`: the baseline),
+    sandwich covariance over image regions; see `docs/estimator.md`.
 
     Examples
     --------
@@ -249,7 +253,8 @@ class Estimation:
                 velocity, scales = velocities_expected(self.problem, config.motion, self.interval,
                                                        self.inertial)
                 priors = with_velocity(priors, velocity)
-                self.inertial_chi2 = velocity.offset @ velocity.information @ velocity.offset
+                self.inertial_chi2 = float(
+                    velocity.offset @ velocity.information @ velocity.offset)
             return fit_with_evidence(matches, state, priors,
                                      Noise(config.pixel_sigma, config.threshold), scales,
                                      self._gyro_error())
