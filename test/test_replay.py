@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.bags.writer import BagWriter
@@ -138,6 +138,44 @@ def test_errors_agree_with_an_independent_calculation(replayed, bundled_bag):
     assert summary['rotation_median_deg'] == pytest.approx(np.median(rotation_errors), abs=1e-4)
     assert summary['translation_p90_deg'] == pytest.approx(
         np.percentile(translation_errors, 90), abs=0.05)
+
+
+def test_baselines_agree_with_the_truth(replayed):
+    true = {row['stamp_ns']: float(row['baseline_m']) for row in rows_of(replayed / 'errors.csv')}
+    rows = rows_of(replayed / 'relative_poses.csv')
+    known = [row for row in rows if row['baseline_m']]
+    assert all(row['status'] == 'OK' for row in known)
+    assert len(known) >= 15
+    errors = np.array([np.log(float(row['baseline_m']) / true[row['stamp_ns']]) for row in known])
+    sigmas = np.array([float(row['baseline_log_sigma']) for row in known])
+    assert np.median(np.abs(errors)) < 0.2
+    assert (np.abs(errors) < 3.0 * sigmas).all()
+
+
+def test_poses_between_the_middle_rows(replayed, bundled_bag, parameters_file, tmp_path, capsys):
+    assert main(['replay', str(bundled_bag), '--params', parameters_file, '--set',
+                 'pose_row=middle', '--out', str(tmp_path)]) == 0
+    capsys.readouterr()
+    at_stamps, at_middle = (rows_of(folder / 'relative_poses.csv')
+                            for folder in (replayed, tmp_path))
+    assert len(at_stamps) == len(at_middle)
+    for first, middle in zip(at_stamps, at_middle, strict=True):
+        for name in ('reference_stamp_ns', 'stamp_ns'):   # half of 30 ms, 479 of 480 rows
+            assert int(middle[name]) - int(first[name]) == 14_968_750
+    times, positions, rotations = truth_of(bundled_bag)
+    rotations = Slerp(times, rotations)
+    errors = []
+    for row in at_middle:
+        if row['status'] == 'OK':
+            seconds = [(int(row[name]) - START_NS) / 1e9
+                       for name in ('reference_stamp_ns', 'stamp_ns')]
+            p1, p2 = (np.array([np.interp(t, times, axis) for axis in positions.T])
+                      for t in seconds)
+            t_true = rotations(seconds[0]).inv().apply(p2 - p1)
+            t = np.array([float(row[name]) for name in ('tx', 'ty', 'tz')])
+            errors.append(np.degrees(np.arccos(np.clip(
+                t @ t_true / np.linalg.norm(t_true), -1.0, 1.0))))
+    assert np.median(errors) < 0.4 and np.quantile(errors, 0.9) < 0.8
 
 
 def test_summary_agrees_with_the_table(replayed, bundled_bag):

@@ -23,6 +23,8 @@ from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.camera import READOUT_DIRECTIONS, REFERENCE_ROWS
 from rs_relpose_ros.geometry.timing import STAMP_EXPOSURES
 
+POSE_ROWS = ('stamp', 'middle')
+
 
 @dataclass(frozen=True, slots=True)
 class SensorConfig:
@@ -34,7 +36,11 @@ class SensorConfig:
     readout_direction: str = setting(
         'down', 'whether row 0 is read first (down) or last (up)', choices=READOUT_DIRECTIONS)
     stamp_row: str = setting(
-        'first', 'row that the image stamp marks; poses relate these rows', choices=REFERENCE_ROWS)
+        'first', 'row that the image stamp marks', choices=REFERENCE_ROWS)
+    pose_row: str = setting(
+        'stamp', 'rows that poses relate, and whose instants their stamps are: those of the image '
+        'stamps, or the middle ones, between which the translation is known better',
+        choices=POSE_ROWS)
     stamp_exposure: str = setting(
         'middle', 'instant of that exposure which the stamp marks', choices=STAMP_EXPOSURES)
     exposure_time: float = setting(

@@ -83,10 +83,20 @@ def check_size(image: NDArray[Any], intrinsics: Intrinsics) -> None:
 
 
 def sensor_camera(intrinsics: Intrinsics, parameters: Parameters) -> RollingShutterCamera:
-    """Camera model of the full sensor; published pixels map to it by `Intrinsics.to_sensor`."""
+    """Camera model of the full sensor, about the row that poses relate.
+
+    Published pixels map to it by `Intrinsics.to_sensor`.
+    """
     sensor = parameters.sensor
     if sensor.readout_time is None:
         raise MissingInputError('parameter readout_time is not set: give image height times line '
                                 'delay in seconds (0 for a global shutter)')
+    row = 'middle' if sensor.pose_row == 'middle' else sensor.stamp_row
     return replace(intrinsics.global_shutter_camera(), readout_time=sensor.readout_time,
-                   readout_direction=sensor.readout_direction, reference_row=sensor.stamp_row)
+                   readout_direction=sensor.readout_direction, reference_row=row)
+
+
+def pose_row_delay(camera: RollingShutterCamera, parameters: Parameters) -> float:
+    """From the stamped row to the one that poses relate [s]: the camera's reference row."""
+    stamped = replace(camera, reference_row=parameters.sensor.stamp_row)
+    return float(stamped.row_times(camera.reference_row_index))

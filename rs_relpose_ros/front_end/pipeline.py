@@ -13,13 +13,13 @@ from rs_relpose_ros.errors import MissingInputError
 from rs_relpose_ros.estimator.estimate import estimate_relative_pose
 from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.front_end.derotated_rays import DerotatedRays, median_parallax, Sensor
-from rs_relpose_ros.front_end.frame import Frame, sensor_camera
+from rs_relpose_ros.front_end.frame import Frame, pose_row_delay, sensor_camera
 from rs_relpose_ros.front_end.pair import closes_pair, PairResult, SinceKeyframe
 from rs_relpose_ros.front_end.stamp_scatter import StampScatter
 from rs_relpose_ros.geometry.inertial import InertialMotion
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import aligning_rotation, log_so3
-from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between
+from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, to_nanoseconds
 from rs_relpose_ros.health.deviation import BIAS, DEVIATIONS, OFFSET, READOUT
 from rs_relpose_ros.health.judge import Told
 from rs_relpose_ros.health.monitor import HealthMonitor, withheld
@@ -296,8 +296,9 @@ class Pipeline:
         pose = self._judged(pose, matches, reference, view, sensor, parameters)
         rays1, rays2 = self._derotate(matches, reference.imu.motion, view.imu.motion, sensor)
         seen = self._health.latest
+        later_ns = to_nanoseconds(pose_row_delay(sensor.camera, parameters))
         return PairResult(
-            reference_stamp_ns=stamp1_ns, stamp_ns=stamp2_ns,
+            reference_stamp_ns=stamp1_ns + later_ns, stamp_ns=stamp2_ns + later_ns,
             reference_ns1=reference.imu.reference_ns, reference_ns2=view.imu.reference_ns,
             frame_id=view.frame.frame_id, interval=_interval(reference, view), pose=pose,
             matches=matches, row_times1=rays1.row_times, row_times2=rays2.row_times,
