@@ -122,6 +122,11 @@ class RelativePose:
             baseline_log_sigma=float('nan'), baseline_reason='',
             velocity_covariance=velocity_covariance)
 
+    def without_baseline(self, reason: str) -> RelativePose:
+        """The same with a baseline that is not known, and why."""
+        return replace(self, baseline=float('nan'), baseline_log_sigma=float('nan'),
+                       baseline_reason=reason)
+
     def inverse(self) -> RelativePose:
         """Pose of camera 1 in camera 2, covariance and velocities exchanged accordingly."""
         R_inv = self.R.T

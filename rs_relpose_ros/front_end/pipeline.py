@@ -292,11 +292,11 @@ class Pipeline:
             inertial=None if isinstance(inertial, str) else inertial,
             rng=np.random.default_rng([parameters.pair.seed, stamp1_ns, stamp2_ns]))
         if isinstance(inertial, str):
-            pose = replace(pose, baseline_reason=f'baseline not known: {inertial}')
+            pose = pose.without_baseline(f'baseline not known: {inertial}')
         pose = self._judged(pose, matches, reference, view, sensor, parameters)
         rays1, rays2 = self._derotate(matches, reference.imu.motion, view.imu.motion, sensor)
         seen = self._health.latest
-        later_ns = to_nanoseconds(pose_row_delay(sensor.camera, parameters))
+        later_ns = to_nanoseconds(pose_row_delay(sensor.camera, parameters.sensor))
         return PairResult(
             reference_stamp_ns=stamp1_ns + later_ns, stamp_ns=stamp2_ns + later_ns,
             reference_ns1=reference.imu.reference_ns, reference_ns2=view.imu.reference_ns,

@@ -60,7 +60,7 @@ class Unroller:
         if parameters.global_shutter.stamp_clock == 'camera':
             reference_ns = frame.stamp_ns + to_nanoseconds(
                 exposure_shift(sensor.stamp_exposure, sensor.exposure_time)
-                + pose_row_delay(middle.sensor.camera, parameters))
+                + pose_row_delay(middle.sensor.camera, sensor))
         return GlobalShutterFrame(
             reference_ns + to_nanoseconds(middle.delay), frame, middle.map(imu.motion),
             parameters.global_shutter.border, imu.applied_offset_ns)
