@@ -18,16 +18,18 @@ if TYPE_CHECKING:
     from rs_relpose_ros.estimator.result import RelativePose, Status
     from rs_relpose_ros.estimator.warm_up import warm_up
     from rs_relpose_ros.geometry.camera import RollingShutterCamera
+    from rs_relpose_ros.geometry.inertial import InertialMotion
     from rs_relpose_ros.geometry.motion import FrameMotion
     from rs_relpose_ros.messages.pose_chain import PoseChain
     from rs_relpose_ros.messages.published_pair import PairSynchronizer
 
-__all__ = ['EstimatorConfig', 'FrameMotion', 'InputError', 'MissingInputError',
+__all__ = ['EstimatorConfig', 'FrameMotion', 'InertialMotion', 'InputError', 'MissingInputError',
            'PairSynchronizer', 'PoseChain', 'RelativePose', 'RollingShutterCamera',
            'RsRelposeError', 'Status', 'estimate_relative_pose', 'warm_up']
 
 _HOMES = {
     'EstimatorConfig': 'config.estimator', 'FrameMotion': 'geometry.motion',
+    'InertialMotion': 'geometry.inertial',
     'InputError': 'errors', 'MissingInputError': 'errors',
     'PairSynchronizer': 'messages.published_pair', 'PoseChain': 'messages.pose_chain',
     'RelativePose': 'estimator.result',

@@ -127,7 +127,7 @@ BESIDE: dict[str, dict[str, Any]] = {
     # Many samples are needed: the hypotheses of a solver without priors, few of which fit.
     'confidence': {'solver': 'uniform_9pt', 'threshold': 0.2},
     # So far off that the health calls it wrong.
-    'withhold_when_wrong': {'time_offset': 0.04}}
+    'withhold_when_wrong': {'time_offset': 0.03}}
 # Shows in what the node publishes.
 OF_THE_NODE = {'publish_debug_image'}
 FRAMES = 60

@@ -585,7 +585,8 @@ FAST = [
           pairs=14),
     wrong('bias', 'gyro_bias', 'gyro_bias=[0.06,0,0]', 'track_gyro_bias=false', seen=0.010885,
           tolerance=5e-4, pairs=8),
-    wrong('axes cycled', 'axes', changes=[imu_with(CYCLED)], pairs=20),
+    # No pose comes before it is told: each pair is LOW_PARALLAX.
+    wrong('axes cycled', 'axes', changes=[imu_with(CYCLED)], pairs=26),
     wrong('axes by 3 deg', 'axes', changes=[imu_with(TURNED.as_matrix())],
           seen=math.degrees(TURNED.magnitude()), tolerance=0.1, pairs=14),
     wrong('gyro 0.95', 'gyro_scale', changes=[imu_with(gyro=1.0 / 0.95)], seen=0.95,

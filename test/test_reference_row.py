@@ -1,6 +1,7 @@
 """Moving a pose between reference rows, and inverting it: against motion written out in full."""
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.estimator.problem import PairState, to_reference_row
@@ -12,7 +13,7 @@ def make_state(rng, covariance=None):
     return PairState(
         Rotation.from_rotvec(rng.normal(size=3) * 0.3).as_matrix(), t / np.linalg.norm(t),
         rng.normal(size=3), rng.normal(size=3), rng.normal(size=3), rng.normal(size=3),
-        np.zeros((18, 18)) if covariance is None else covariance)
+        rng.normal(), np.zeros((19, 19)) if covariance is None else covariance)
 
 
 def turns(state, delay):
@@ -39,12 +40,13 @@ def test_pose_between_later_rows():
     np.testing.assert_allclose(result.t, baseline / scale, atol=1e-12)
     np.testing.assert_allclose(result.v1, later1.T @ R1 @ state.v1 / scale, atol=1e-12)
     np.testing.assert_allclose(result.v2, later2.T @ R2 @ state.v2 / scale, atol=1e-12)
+    assert result.log_baseline == pytest.approx(state.log_baseline + np.log(scale), abs=1e-12)
 
 
 def test_there_and_back():
     state = make_state(np.random.default_rng(1))
     back = moved(moved(state, 0.015), -0.015)
-    for name in ('R', 't', 'v1', 'v2'):
+    for name in ('R', 't', 'v1', 'v2', 'log_baseline'):
         np.testing.assert_allclose(getattr(back, name), getattr(state, name), atol=1e-12)
 
 
@@ -52,18 +54,19 @@ def test_covariance_follows_the_move():
     """First-order covariance against samples: perturb, move, measure."""
     rng = np.random.default_rng(2)
     state, delay = make_state(rng), 0.03
-    factor = 1e-5 * rng.normal(size=(18, 18))
+    factor = 1e-5 * rng.normal(size=(19, 19))
     projector = np.eye(3) - np.outer(state.t, state.t)
     factor[:3] = projector @ factor[:3]
     result = to_reference_row(
-        PairState(state.R, state.t, state.v1, state.v2, state.w1, state.w2, factor @ factor.T),
+        PairState(state.R, state.t, state.v1, state.v2, state.w1, state.w2, state.log_baseline,
+                  factor @ factor.T),
         delay, *turns(state, delay))
     errors = []
     for _ in range(4000):
-        e = factor @ rng.normal(size=18)
+        e = factor @ rng.normal(size=19)
         true = PairState(Rotation.from_rotvec(e[3:6]).as_matrix() @ state.R, state.t + e[0:3],
                          state.v1 + e[6:9], state.v2 + e[9:12], state.w1 + e[12:15],
-                         state.w2 + e[15:18], np.zeros((18, 18)))
+                         state.w2 + e[15:18], state.log_baseline + e[18], np.zeros((19, 19)))
         # The rates' errors turn the rows from the left, as the gyro corrections do.
         turn1, turn2 = turns(state, delay)
         turn1 = Rotation.from_rotvec(delay * e[12:15]).as_matrix() @ turn1
@@ -71,9 +74,11 @@ def test_covariance_follows_the_move():
         true = to_reference_row(true, delay, turn1, turn2)
         errors.append(np.concatenate([
             true.t - result.t, Rotation.from_matrix(true.R @ result.R.T).as_rotvec(),
-            true.v1 - result.v1, true.v2 - result.v2]))
+            true.v1 - result.v1, true.v2 - result.v2,
+            [true.log_baseline - result.log_baseline]]))
     sampled = np.cov(np.array(errors).T)
-    expected = result.covariance[:12, :12]
+    kept = [*range(12), 18]
+    expected = result.covariance[np.ix_(kept, kept)]
     sigma = np.sqrt(np.diag(expected))
     # 4000 samples: correlations to about 0.02, one sigma.
     np.testing.assert_allclose(sampled / np.outer(sigma, sigma),

@@ -23,6 +23,8 @@ from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.camera import READOUT_DIRECTIONS, REFERENCE_ROWS
 from rs_relpose_ros.geometry.timing import STAMP_EXPOSURES
 
+POSE_ROWS = ('stamp', 'middle')
+
 
 @dataclass(frozen=True, slots=True)
 class SensorConfig:
@@ -34,7 +36,11 @@ class SensorConfig:
     readout_direction: str = setting(
         'down', 'whether row 0 is read first (down) or last (up)', choices=READOUT_DIRECTIONS)
     stamp_row: str = setting(
-        'first', 'row that the image stamp marks; poses relate these rows', choices=REFERENCE_ROWS)
+        'first', 'row that the image stamp marks', choices=REFERENCE_ROWS)
+    pose_row: str = setting(
+        'stamp', 'rows that poses relate, and whose instants their stamps are: those of the image '
+        'stamps, or the middle ones, between which the translation is known better',
+        choices=POSE_ROWS)
     stamp_exposure: str = setting(
         'middle', 'instant of that exposure which the stamp marks', choices=STAMP_EXPOSURES)
     exposure_time: float = setting(
@@ -95,6 +101,9 @@ class PairConfig:
         True, 'gyro between the frames as rotation prior and hypothesis (else it only derotates '
         'rows)')
     use_gravity: bool = setting(True, 'gravity as prior and for the 3- and 9-point solvers')
+    use_accelerometer: bool = setting(
+        True, 'accelerometer between the frames for velocities and baseline (else it is asked for '
+        'gravity alone)')
     withhold_when_wrong: bool = setting(
         True, 'publish no pose while a figure that was told is seen to be wrong (see health in '
         '/diagnostics)', live=True)

@@ -87,17 +87,28 @@ def check_size(image: NDArray[Any], intrinsics: Intrinsics) -> None:
 
 
 def sensor_camera(intrinsics: Intrinsics, parameters: Parameters) -> RollingShutterCamera:
-    """Camera model of the full sensor; published pixels map to it by `Intrinsics.to_sensor`."""
+    """Camera model of the full sensor, about the row that poses relate.
+
+    Published pixels map to it by `Intrinsics.to_sensor`.
+    """
     sensor = parameters.sensor
     if sensor.readout_time is None:
         raise MissingInputError('parameter readout_time is not set: give image height times line '
                                 'delay in seconds (0 for a global shutter)')
+    row = 'middle' if sensor.pose_row == 'middle' else sensor.stamp_row
     return replace(intrinsics.global_shutter_camera(), readout_time=sensor.readout_time,
-                   readout_direction=sensor.readout_direction, reference_row=sensor.stamp_row)
+                   readout_direction=sensor.readout_direction, reference_row=row)
+
+
+def pose_row_delay(camera: RollingShutterCamera, sensor: SensorConfig) -> float:
+    """From the stamped row to the one that poses relate [s]: the camera's reference row."""
+    stamped = replace(camera, reference_row=sensor.stamp_row)
+    return float(stamped.row_times(camera.reference_row_index))
 
 
 def image_clock(camera: RollingShutterCamera, sensor: SensorConfig) -> ImageClock:
-    """Clock of the images of a `sensor_camera`, as told."""
+    """Clock of the images of a `sensor_camera`, as told; of the row that poses relate."""
     return ImageClock(
-        camera, sensor.time_offset, sensor.stamp_exposure, sensor.exposure_time,
-        sensor.time_offset_per_interval, sensor.time_offset_reference_interval)
+        camera, sensor.time_offset + pose_row_delay(camera, sensor), sensor.stamp_exposure,
+        sensor.exposure_time, sensor.time_offset_per_interval,
+        sensor.time_offset_reference_interval)

@@ -41,9 +41,11 @@ def closes_pair(since: SinceKeyframe, config: KeyframeConfig) -> bool:
 class PairResult:
     """Estimate of one keyframe pair with the matches that it was made from."""
 
-    reference_stamp_ns: int   # header stamps of the reference keyframe and of the current image
+    # Of the reference keyframe's and the current image's pose rows, on the camera's clock: their
+    # header stamps, or those of their middle rows (`pose_row`).
+    reference_stamp_ns: int
     stamp_ns: int
-    reference_ns1: int   # instants of the two stamped rows on the IMU clock
+    reference_ns1: int   # the same instants on the IMU clock
     reference_ns2: int
     frame_id: str   # of the current image
     interval: float   # [s] between the two reference instants

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.front_end.derotated_rays import Sensor
-from rs_relpose_ros.front_end.frame import Frame, sensor_camera
+from rs_relpose_ros.front_end.frame import Frame, pose_row_delay, sensor_camera
 from rs_relpose_ros.front_end.front_end import FrameLoop
 from rs_relpose_ros.front_end.pipeline import Pipeline
 from rs_relpose_ros.geometry.timing import exposure_shift, to_nanoseconds
@@ -59,7 +59,8 @@ class Unroller:
         reference_ns = imu.reference_ns
         if parameters.global_shutter.stamp_clock == 'camera':
             reference_ns = frame.stamp_ns + to_nanoseconds(
-                exposure_shift(sensor.stamp_exposure, sensor.exposure_time))
+                exposure_shift(sensor.stamp_exposure, sensor.exposure_time)
+                + pose_row_delay(middle.sensor.camera, sensor))
         return GlobalShutterFrame(
             reference_ns + to_nanoseconds(middle.delay), frame, middle.map(imu.motion),
             parameters.global_shutter.border, imu.applied_offset_ns)

@@ -83,7 +83,11 @@ class HealthMonitor:
         doubt = np.outer(shift, shift)
         if self.calibration.pairs <= _FIRST_PAIRS:
             doubt += by_deviation @ self.calibration.covariance @ by_deviation.T
-        return replace(pose, covariance=pose.covariance + doubt) if doubt.any() else pose
+        if doubt.any():
+            pose = replace(pose, covariance=pose.covariance + doubt)
+        # What a figure that is off does to the baseline is not known.
+        return pose.without_baseline('baseline not known: a figure that was told is suspect '
+                                     '(see health)') if shift.any() and pose else pose
 
     def _deviation(self) -> Array:
         """(11,) from what is in force, of all causes."""
