@@ -26,7 +26,7 @@ from rs_relpose_ros import (
     Status,
 )
 from rs_relpose_ros.estimator.map_fit import FitMatches
-from rs_relpose_ros.estimator.priors import Priors
+from rs_relpose_ros.estimator.priors import isotropic, Priors
 from rs_relpose_ros.estimator.problem import build_problem
 from rs_relpose_ros.estimator.state import TwoViewState
 from rs_relpose_ros.estimator.uncertainty import local_covariance
@@ -151,8 +151,8 @@ def hessian_covariance(pose, scene, camera):
                          pose.angular_velocity1 - scene.measured_rate1,
                          R @ (pose.angular_velocity2 - scene.measured_rate2))
     priors = Priors(scene.measured_gravity1, scene.measured_gravity2, TOLD.gravity_sigma**-2, 0.0,
-                    TOLD.gyro_sigma**-2, pose.velocity_sigma**-2, 0.0, np.eye(3),
-                    np.zeros((3, 3)))
+                    TOLD.gyro_sigma**-2, np.eye(3), np.zeros((3, 3)),
+                    isotropic(pose.velocity_sigma, 0.0))
     matches = FitMatches(problem.observations, pose.inliers, pose.residual_rms)
     return local_covariance(matches, state, priors)[:3, :3]
 

@@ -11,8 +11,14 @@ from rs_relpose_ros import (
     RollingShutterCamera,
 )
 from rs_relpose_ros.estimator import map_fit
-from rs_relpose_ros.estimator.priors import prior_cost, Priors
-from rs_relpose_ros.estimator.state import moved, PARAMETERS, TwoViewState
+from rs_relpose_ros.estimator.priors import (
+    prior_cost,
+    Priors,
+    unknowns,
+    VelocityPrior,
+    with_log_scale,
+)
+from rs_relpose_ros.estimator.state import moved, PARAMETERS, SCALE, TwoViewState
 
 
 def some_state(rng, rate):
@@ -25,29 +31,39 @@ def some_priors(rng, state, **weights):
     # Near the state: the turn from the gyro's rotation is a small one.
     down = state.R.T @ np.array([0.6, 0.0, 0.8])
     near = Rotation.from_rotvec([0.01, -0.02, 0.015]).as_matrix()
-    values = {'gravity_weight': 0.0, 'gravity_row_time': 0.03, 'rate_weight': 0.0,
-              'velocity_weight': 0.0, 'velocity_rate': 2.0, **weights}
+    root = rng.normal(size=(6, 6))
+    velocity = VelocityPrior(
+        rate=2.0, offset=rng.normal(size=6), information=weights.get('velocity', 0.0) * root @ root.T,
+        log_scale=0.4, centre=-0.3, weight=weights.get('scale', 0.0), freedom=1.7)
+    values = {'gravity_weight': 0.0, 'gravity_row_time': 0.03, 'rate_weight': 0.0, **{
+        k: v for k, v in weights.items() if k not in ('rotation', 'velocity', 'scale')}}
     return Priors(np.array([0.59, 0.02, 0.81]), down, rotation=near @ state.R,
                   rotation_information=np.diag([3.0, 4.0, 5.0]) * weights.get('rotation', 0.0),
-                  **{k: v for k, v in values.items() if k != 'rotation'})
+                  velocity=velocity, **values)
 
 
 @pytest.mark.parametrize('weights', [{'gravity_weight': 7.0}, {'rate_weight': 3.0},
-                                     {'velocity_weight': 2.0}, {'rotation': 1.0}])
+                                     {'velocity': 2.0}, {'velocity': 2.0, 'scale': 3.0},
+                                     {'rotation': 1.0}])
 def test_gradient_of_each_prior(weights):
     rng = np.random.default_rng(1)
     # The rates' part of gravity neglects what corrections do to each other: exact about zero.
     state = some_state(rng, 0.0 if 'gravity_weight' in weights else 0.1)
     priors = some_priors(rng, state, **weights)
-    n = PARAMETERS
-    nothing = map_fit.DataTerm(np.zeros((n, n)), np.zeros(n), 0.0)
+    n = unknowns(priors)
+    assert n == PARAMETERS + ('scale' in weights)
+    nothing = map_fit.DataTerm(np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS), 0.0)
     _, gradient, cost = map_fit.normal_equations(nothing, state, priors)
     assert cost == pytest.approx(prior_cost(state, priors))
     assert cost > 0.0
     step = 1e-5
+
+    def cost_after(change):
+        scale = priors.velocity.log_scale + (change[SCALE] if n > SCALE else 0.0)
+        return prior_cost(moved(state, change), with_log_scale(priors, scale))
+
     for k in range(n):
-        ahead, behind = (prior_cost(moved(state, sign * step * np.eye(n)[k]), priors)
-                         for sign in (1.0, -1.0))
+        ahead, behind = (cost_after(sign * step * np.eye(n)[k]) for sign in (1.0, -1.0))
         # Half the gradient of a sum of squares. Log has a Jacobian that the fit takes for one.
         tolerance = 0.03 if 'rotation' in weights else 1e-6
         assert (ahead - behind) / (4 * step) == pytest.approx(

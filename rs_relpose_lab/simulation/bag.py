@@ -106,6 +106,7 @@ def right_parameters(simulation: Simulation) -> dict[str, Any]:
         'stamp_exposure': 'middle',
         'time_offset': config.time_offset,
         'quat_cam_imu_xyzw': config.quat_cam_imu_xyzw,
+        'imu_position': config.lever_arm,
         'gyro_bias': tuple(round(float(value), 6) for value in simulation.calibrated_gyro_bias),
     }
 

@@ -11,7 +11,7 @@ from rs_relpose_ros.check.inertial import Inertial
 from rs_relpose_ros.check.judge_images import stamp_finding
 from rs_relpose_ros.check.scan import Scan
 from rs_relpose_ros.config.parameters import Parameters
-from rs_relpose_ros.imu.gravity import STANDARD_GRAVITY
+from rs_relpose_ros.geometry.vectors import STANDARD_GRAVITY
 from rs_relpose_ros.messages.sensor_feed import Role
 
 _SLOW = 80.0

@@ -3,11 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from rs_relpose_ros.config.declarations import check_settings, setting
 from rs_relpose_ros.solvers.table import SOLVERS
 
 SOLVER_CHOICES = ('auto', *SOLVERS)
+
+
+class CarrierMotion(NamedTuple):
+    """Speeds that a carrier reaches, from and to [m/s]; its acceleration, rms per axis [m/s^2]."""
+
+    slow: float
+    fast: float
+    acceleration: float
+
+
+MOTIONS = {
+    'hand_held': CarrierMotion(0.1, 3.0, 1.5),
+    'vehicle': CarrierMotion(0.5, 40.0, 1.5),
+    'drone': CarrierMotion(0.2, 15.0, 3.0),
+}
 REFINEMENTS = ('map', 'alternating', 'none')
 
 
@@ -52,6 +68,9 @@ class EstimatorConfig:
         10.0, 'largest 1 sigma of the direction of translation (root of the trace of its '
         'covariance); beyond it a pair has a rotation but no pose', 'deg', low=0.01, high=180.0,
         live=True)
+    motion: str = setting(
+        'hand_held', 'what carries the camera: how fast it goes and accelerates, where images and '
+        'accelerometer do not tell', choices=tuple(MOTIONS), live=True)
 
     def __post_init__(self) -> None:
         check_settings(self)

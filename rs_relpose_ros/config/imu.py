@@ -20,6 +20,16 @@ class ImuConfig:
         2e-4, 'white noise of the gyro', 'rad/s/sqrt(Hz)', low=1e-7, high=0.1)
     gyro_bias_sigma: float = setting(
         3e-3, 'uncertainty of gyro_bias, 1 sigma per axis', 'rad/s', low=0.0, high=1.0)
+    accel_noise_density: float = setting(
+        3e-3, 'white noise of the accelerometer', 'm/s^2/sqrt(Hz)', low=1e-6, high=10.0)
+    accel_bias_sigma: float = setting(
+        0.1, 'bias of the accelerometer beyond what gravity takes in, 1 sigma per axis', 'm/s^2',
+        low=0.0, high=10.0)
+    imu_position: tuple[float, ...] = setting(
+        (0.0, 0.0, 0.0), 'position of the IMU in the camera frame', 'm', low=-5.0, high=5.0,
+        length=3)
+    imu_position_sigma: float = setting(
+        0.03, 'uncertainty of imu_position, 1 sigma per axis', 'm', low=0.0, high=5.0)
     track_gyro_bias: bool = setting(
         True, 'take the gyro bias anew whenever the IMU stands still (within 4 gyro_bias_sigma)')
     use_imu_orientation: bool = setting(

@@ -94,6 +94,9 @@ class PairConfig:
         True, 'gyro between the frames as rotation prior and hypothesis (else it only derotates '
         'rows)')
     use_gravity: bool = setting(True, 'gravity as prior and for the 3- and 9-point solvers')
+    use_accelerometer: bool = setting(
+        True, 'accelerometer between the frames for velocities and baseline (else it is asked for '
+        'gravity alone)')
     withhold_when_wrong: bool = setting(
         True, 'publish no pose while a figure that was told is seen to be wrong (see health in '
         '/diagnostics)', live=True)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry.inertial import InertialMotion
 
 Array = NDArray[np.float64]
 
@@ -64,9 +67,14 @@ def checked_rotation(rotation: ArrayLike | None, covariance: ArrayLike | None,
     return R, C
 
 
-def checked_interval(interval: float | None) -> float | None:
-    """Seconds between the frames, or None."""
+def checked_interval(interval: float | None, inertial: InertialMotion | None) -> float | None:
+    """Seconds between the frames, told or by the IMU's motion; None where neither is given."""
     if interval is not None and not 1e-6 <= interval <= 1e6:
         raise InputError('interval must be a positive number of seconds in [1e-6, 1e6] or None, '
                          f'got {interval}')
-    return interval
+    if inertial is None:
+        return interval
+    if interval is not None and not math.isclose(interval, inertial.duration, abs_tol=1e-6):
+        raise InputError('interval must equal the duration of inertial, '
+                         f'got {interval:.9g} and {inertial.duration:.9g} s')
+    return inertial.duration

@@ -22,7 +22,7 @@ from rs_relpose_ros.estimator.information import inverse
 from rs_relpose_ros.estimator.inliers import cheirality_sign, Flags, Matches, select_inliers
 from rs_relpose_ros.estimator.local_optimisation import optimise
 from rs_relpose_ros.estimator.map_fit import FitMatches
-from rs_relpose_ros.estimator.priors import PINNED, Priors, with_velocity_sigma
+from rs_relpose_ros.estimator.priors import isotropic, PINNED, Priors, with_velocity
 from rs_relpose_ros.estimator.problem import (
     build_problem,
     PairState,
@@ -39,14 +39,10 @@ from rs_relpose_ros.estimator.spread import (
 )
 from rs_relpose_ros.estimator.state import hypothesis_state, signed, TwoViewState
 from rs_relpose_ros.estimator.uncertainty import local_covariance, pair_state
-from rs_relpose_ros.estimator.velocity_prior import (
-    fit_with_evidence,
-    GRID,
-    LEAST_VELOCITY_CHANGE,
-    Noise,
-    Refined,
-)
+from rs_relpose_ros.estimator.velocities_expected import ONE_SCALE, velocities_expected
+from rs_relpose_ros.estimator.velocity_prior import fit_with_evidence, Noise, Refined
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.inertial import InertialMotion
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import aligning_rotation, exp_so3
 from rs_relpose_ros.solvers.solver import Solutions
@@ -62,6 +58,8 @@ EXPLAINED = 0.5
 RAYS = (0, 9)
 # Noise of |f_1 - R f_2| is 1.67 sigma in the median (Rayleigh, two images).
 ROTATION_ONLY_SIGMAS = 2.5
+# Largest 1 sigma of the logarithm of a baseline: beyond it, the baseline is not told.
+MOST_LOG_SIGMA = 1.0
 # Points whose root mean square distance from a line is below so many thresholds lie on it.
 DEGENERATE_THRESHOLDS = 2.0
 
@@ -71,7 +69,8 @@ def estimate_relative_pose(
         motion2: FrameMotion, relative_rotation: ArrayLike | None = None,
         relative_rotation_covariance: ArrayLike | None = None, interval: float | None = None,
         config: EstimatorConfig | None = None, rng: int | np.random.Generator = 0, *,
-        quality: ArrayLike | None = None) -> RelativePose:
+        quality: ArrayLike | None = None,
+        inertial: InertialMotion | None = None) -> RelativePose:
     """Relative pose of two rolling-shutter frames from matches, gyro and gravity.
 
     Parameters
@@ -126,7 +125,7 @@ def estimate_relative_pose(
     points1, points2, order = checked_matches(points1, points2, quality)
     rotation, rotation_covariance = checked_rotation(
         relative_rotation, relative_rotation_covariance)
-    interval = checked_interval(interval)
+    interval = checked_interval(interval, inertial)
     mode = MODES[config.solver]
     if mode.needs_gravity and (motion1.gravity is None or motion2.gravity is None):
         raise InputError(f'solver {config.solver!r} needs gravity in both frames; use auto, '
@@ -134,7 +133,7 @@ def estimate_relative_pose(
     problem = build_problem(points1, points2, camera, motion1, motion2, rotation,
                             rotation_covariance, mode.model.derotated)
     seed = np.array([np.random.default_rng(rng).integers(2**63)], dtype=np.uint64)
-    pose = Estimation(problem, mode, config, order, seed, interval).run()
+    pose = Estimation(problem, mode, config, order, seed, interval, inertial).run()
     object.__setattr__(pose, 'duration', time.perf_counter() - started)
     return pose
 
@@ -154,14 +153,14 @@ class Estimation:
 
     def __init__(self, problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig,
                  order: NDArray[np.int64], seed: NDArray[np.uint64],
-                 interval: float | None) -> None:
+                 interval: float | None, inertial: InertialMotion | None = None) -> None:
         self.problem, self.mode, self.config = problem, mode, config
         self.order = order[problem.valid[order]]
         self.seed = seed
         self.matches = Matches(problem.observations, problem.valid,
                                config.pixel_sigma / problem.focal)
         self.priors = _priors(problem, mode, config, interval)
-        self.interval = interval
+        self.interval, self.inertial = interval, inertial
         self.iterations = 0
         self.deadline = (time.perf_counter() + config.time_limit if config.time_limit > 0.0
                          else math.inf)
@@ -196,7 +195,8 @@ class Estimation:
         if turned is not None:
             return turned
         # 5. Covariance at the optimum, then from the middle to the reference row.
-        at_middle = pair_state(self.problem, refined.state, refined.covariance)
+        at_middle = pair_state(self.problem, refined.state, refined.log_scale,
+                               refined.covariance)
         pose = to_reference_row(at_middle, self.problem.reference_row_time,
                                 *self._turns_to_reference_row(refined.state))
         return self._result(pose, refined)
@@ -210,15 +210,13 @@ class Estimation:
         return drawn.hypotheses
 
     def _best(self, hypotheses: Solutions) -> TwoViewState | None:
-        config, model = self.config, self.mode.model
+        config = self.config
         if not len(hypotheses.R):
             return None
         if config.refinement != 'map':
             # The paper's way: the best hypothesis as it is.
             return self._in_front(hypothesis_state(hypotheses.R[0], hypotheses.x[0]))
-        priors = with_velocity_sigma(self.priors, SAMPLING_VELOCITY_SIGMA) \
-            if model.velocities or model.derotated else self.priors
-        state, found = optimise(self.matches, hypotheses, priors, config.pixel_sigma,
+        state, found = optimise(self.matches, hypotheses, self.priors, config.pixel_sigma,
                                 config.threshold)
         return state if found else None
 
@@ -238,22 +236,23 @@ class Estimation:
         model = self.mode.model
         free = model.velocities or (model.derotated and config.refinement == 'map')
         if config.refinement == 'map':
-            grid = GRID if free else np.array([1.0 / np.sqrt(PINNED)])
-            if free and self.interval is not None:
-                grid = GRID[GRID >= LEAST_VELOCITY_CHANGE]
-            return fit_with_evidence(matches, state, self.priors,
-                                     Noise(config.pixel_sigma, config.threshold), grid,
+            priors, scales = self.priors, ONE_SCALE
+            if free:
+                velocity, scales = velocities_expected(self.problem, config.motion, self.interval,
+                                                       self.inertial)
+                priors = with_velocity(priors, velocity)
+            return fit_with_evidence(matches, state, priors,
+                                     Noise(config.pixel_sigma, config.threshold), scales,
                                      self._gyro_error())
         inliers = select_inliers(matches, state, config.threshold)
         if config.refinement == 'alternating' and inliers.sum() >= 12:
             state = self._in_front(refine_alternating(
                 matches.observations, inliers, state, config.pixel_sigma, free))
             inliers = select_inliers(matches, state, config.threshold)
-        velocity_sigma = SAMPLING_VELOCITY_SIGMA if free else 1.0 / np.sqrt(PINNED)
         covariance = local_covariance(
-            FitMatches(matches.observations, inliers, config.pixel_sigma), state,
-            with_velocity_sigma(self.priors, velocity_sigma))
-        return Refined(state, inliers, velocity_sigma, config.pixel_sigma, covariance)
+            FitMatches(matches.observations, inliers, config.pixel_sigma), state, self.priors)
+        return Refined(state, inliers, self.priors.velocity.log_scale, config.pixel_sigma,
+                       covariance)
 
     def _gyro_error(self) -> Array:
         """Covariance (3, 3) of the gyro's rotation by errors s of the stamps, in frame 1.
@@ -346,12 +345,15 @@ class Estimation:
         sigma = np.degrees(np.sqrt(max(np.trace(pose.covariance[:3, :3]), 0.0)))
         r = residuals(self.problem.observations, refined.state)[refined.inliers]
         v2w2 = np.r_[9:12, 15:18]
+        baseline, baseline_sigma, reason = self._baseline(pose)
         result = RelativePose(
             status=Status.OK, R=pose.R, t=pose.t, linear_velocity1=pose.v1,
             linear_velocity2=pose.v2, angular_velocity1=pose.w1, angular_velocity2=pose.w2,
             inliers=refined.inliers, covariance=pose.covariance[:6, :6],
             velocity_covariance=pose.covariance[np.ix_(v2w2, v2w2)], model=self.mode.model.name,
-            velocity_sigma=refined.velocity_sigma, iterations=self.iterations,
+            velocity_sigma=float(np.exp(-refined.log_scale)),
+            baseline=baseline, baseline_log_sigma=baseline_sigma, baseline_reason=reason,
+            iterations=self.iterations,
             residual_rms=float(np.sqrt(np.mean(r**2))))
         limit = self.config.max_translation_sigma
         if sigma <= limit:
@@ -359,6 +361,17 @@ class Estimation:
         return result.without_translation(
             Status.LOW_PARALLAX, f'the direction of translation is uncertain by {sigma:.3g} deg '
             f'(1 sigma), more than max_translation_sigma = {limit:g} deg')
+
+    def _baseline(self, pose: PairState) -> tuple[float, float, str]:
+        """Baseline [m] and 1 sigma of its logarithm; or NaN twice, and why."""
+        if self.inertial is None:
+            return math.nan, math.nan, ('baseline not known: no acceleration between the frames '
+                                        'is given (inertial)')
+        sigma = math.sqrt(max(pose.covariance[18, 18], 0.0))
+        if not (self.mode.model.derotated and sigma <= MOST_LOG_SIGMA):
+            return math.nan, math.nan, ('baseline not known: velocities that the images show '
+                                        'and the acceleration leave it open')
+        return math.exp(pose.log_baseline), sigma, ''
 
     def _failure(self, status: Status, reason: str) -> RelativePose:
         return RelativePose(status=status, reason=reason, model=self.mode.model.name,
@@ -379,7 +392,7 @@ def _priors(problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig,
     return Priors(
         unit1, unit2, config.gravity_sigma**-2 if known else 0.0,
         problem.reference_row_time, config.gyro_sigma**-2 if mode.model.derotated else PINNED,
-        SAMPLING_VELOCITY_SIGMA**-2 if free else PINNED,
-        1.0 / interval if free and interval is not None else 0.0,
         np.ascontiguousarray(rotation),
-        np.ascontiguousarray(information) if information is not None else np.zeros((3, 3)))
+        np.ascontiguousarray(information) if information is not None else np.zeros((3, 3)),
+        isotropic(SAMPLING_VELOCITY_SIGMA if free else PINNED**-0.5,
+                  1.0 / interval if free and interval is not None else 0.0))

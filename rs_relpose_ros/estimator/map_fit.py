@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel, linked_kernel
 from rs_relpose_ros.estimator import sampson
-from rs_relpose_ros.estimator.priors import add_priors, Priors
-from rs_relpose_ros.estimator.state import moved, PARAMETERS, TwoViewState
-from rs_relpose_ros.geometry.vectors import copy_matrix
+from rs_relpose_ros.estimator.priors import add_priors, Priors, unknowns, with_log_scale
+from rs_relpose_ros.estimator.state import moved, PARAMETERS, SCALE, TwoViewState
+from rs_relpose_ros.geometry.vectors import copy_matrix, copy_vector
 from rs_relpose_ros.solvers.linear_algebra import cholesky, newton_step
 
 Array = NDArray[np.float64]
@@ -65,16 +65,19 @@ def linearised(matches: FitMatches, state: TwoViewState) -> DataTerm:
 @kernel
 def normal_equations(data: DataTerm, state: TwoViewState,
                      priors: Priors) -> tuple[Array, Array, float]:
-    """Hessian (17, 17), half gradient (17,) and cost of the whole objective at `state`."""
-    hessian, gradient = data.hessian.copy(), data.gradient.copy()
+    """Hessian (n, n), half gradient (n,) and cost of the whole objective at `state`."""
+    n = unknowns(priors)
+    hessian, gradient = np.zeros((n, n)), np.zeros(n)
+    copy_vector(data.gradient, gradient)
+    copy_matrix(data.hessian, hessian)
     cost = data.cost + add_priors(state, priors, hessian, gradient)
     return hessian, gradient, cost
 
 
 @linked_kernel
 def fit(matches: FitMatches, start: TwoViewState, data: DataTerm, priors: Priors,
-        iterations: int) -> tuple[TwoViewState, DataTerm, float, Array]:
-    """Levenberg-Marquardt from `start`.
+        iterations: int) -> tuple[TwoViewState, float, DataTerm, float, Array]:
+    """Levenberg-Marquardt from `start` and the scale of `priors`.
 
     Parameters
     ----------
@@ -84,21 +87,23 @@ def fit(matches: FitMatches, start: TwoViewState, data: DataTerm, priors: Priors
     Returns
     -------
     state : TwoViewState
+    log_scale : float
+        Of the velocities.
     data : DataTerm
         About that state.
     cost : float
         Of the whole objective.
-    hessian : (17, 17) ndarray
+    hessian : (n, n) ndarray
         Of the whole objective.
     """
-    state = start
+    state, n = start, unknowns(priors)
     damping = FIRST_DAMPING
     hessian, gradient, cost = normal_equations(data, state, priors)
-    damped = np.empty((PARAMETERS, PARAMETERS))
-    factor = np.zeros((PARAMETERS, PARAMETERS))
+    damped = np.empty((n, n))
+    factor = np.zeros((n, n))
     for _ in range(iterations):
         copy_matrix(hessian, damped)
-        for i in range(PARAMETERS):
+        for i in range(n):
             damped[i, i] += damping * hessian[i, i] + 1e-12
         if not cholesky(damped, factor):
             damping = max(damping * 10.0, 1e-6)
@@ -108,23 +113,26 @@ def fit(matches: FitMatches, start: TwoViewState, data: DataTerm, priors: Priors
         step = newton_step(factor, gradient)
         # What the step promises to gain (Newton's decrement): too little to look at it.
         gain = 0.0
-        for i in range(PARAMETERS):
+        for i in range(n):
             gain -= gradient[i] * step[i]
-        if gain < LEAST_GAIN * (1.0 + cost):
+        if gain < LEAST_GAIN * (1.0 + abs(cost)):
             break
-        candidate = moved(state, step)
+        candidate, candidate_priors = moved(state, step), priors
+        if n > SCALE:
+            candidate_priors = with_log_scale(priors, priors.velocity.log_scale + step[SCALE])
         # Most steps are taken: their derivatives cost little more than the residuals alone.
         next_data = linearised(matches, candidate)
-        next_hessian, next_gradient, next_cost = normal_equations(next_data, candidate, priors)
+        next_hessian, next_gradient, next_cost = normal_equations(next_data, candidate,
+                                                                  candidate_priors)
         if next_cost <= cost:
-            state, data = candidate, next_data
+            state, data, priors = candidate, next_data, candidate_priors
             hessian, gradient, cost = next_hessian, next_gradient, next_cost
             damping = max(damping * 0.1, 1e-9)
         else:
             damping *= 10.0
             if not damping < 1e8:
                 break
-    return state, data, cost, hessian
+    return state, priors.velocity.log_scale, data, cost, hessian
 
 
 @linked_kernel

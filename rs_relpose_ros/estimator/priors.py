@@ -2,19 +2,26 @@
 
 Over the state of `state` (docs/estimator.md, step 5)::
 
-    |g x k|^2 / (2 s_g^2)  +  (|dw_1|^2 + |dw_2|^2) / s_w^2
-        +  (|d_1 - c t|^2 + |d_2 - c t|^2) / s_d^2  +  theta^T Lambda theta
+    |g x k|^2 / (2 s_g^2)  +  (|dw_1|^2 + |dw_2|^2) / s_w^2  +  theta^T Lambda theta
+        +  u^T W u,    u = b (d - c t) + a,   d = (d_1, d_2)
 
 with ``theta = Log(R R_gyro^T)``, and ``g = Exp(T dw_1) g_1``, ``k = Exp(T dw_2) R g_2``: gravity
 was measured T after the middle row, and the error of the rate is in what turned it from there.
-``c`` is 1 / interval where the time between the frames is known (constant velocity), else 0.
 
-Each function adds its term to the normal equations, Hessian (17, 17) and half gradient (17,), and
-to the cost.
+u are the velocities against what is expected of them, in the units in which their scale b is the
+length of the baseline. Where the time between the frames is known, ``c`` is its inverse, b is in
+metres, and a (6,) is what the preintegrated acceleration says of the velocities (`velocity_prior`;
+0 without accelerometer), W the inverse of its covariance. Where it is not, ``c = 0, a = 0, W = I``
+and 1 / b is the prior sigma of the velocities [baselines per second].
+
+Each function adds its term to the normal equations, Hessian (n, n) and half gradient (n,), and to
+the cost. n is 17, or 18 where ``log b`` is unknown, too: ``-2 g log b + (log b - m)^2 / s^2`` then
+is part of the cost, g being the number of velocities that the matches know (`velocity_prior`).
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -22,11 +29,10 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel, linked_kernel
 from rs_relpose_ros.estimator.state import (
-    D1,
-    D2,
     DW1,
     DW2,
     PARAMETERS,
+    SCALE,
     TANGENT,
     THETA,
     TwoViewState,
@@ -41,6 +47,22 @@ Array = NDArray[np.float64]
 PINNED = 1e14
 
 
+class VelocityPrior(NamedTuple):
+    """What is known of the linear velocities: c, a (6,) and W (6, 6) of ``u = b (d - c t) + a``.
+
+    `log_scale` is ``log b``, as it is now. Where it is unknown: mean `centre` and inverse variance
+    `weight` of its prior (0 where it is known), `freedom`: g, as above.
+    """
+
+    rate: float
+    offset: Array
+    information: Array
+    log_scale: float
+    centre: float
+    weight: float
+    freedom: float
+
+
 class Priors(NamedTuple):
     """Weights are inverse variances; 0 where nothing is known. All at the middle row.
 
@@ -52,18 +74,38 @@ class Priors(NamedTuple):
     gravity_weight: float
     gravity_row_time: float
     rate_weight: float
-    velocity_weight: float
-    velocity_rate: float
     rotation: Array
     rotation_information: Array
+    velocity: VelocityPrior
 
 
 @kernel
-def with_velocity_sigma(priors: Priors, sigma: float) -> Priors:
-    """The priors with another sigma of the linear velocities [baselines per second]."""
+def with_velocity(priors: Priors, velocity: VelocityPrior) -> Priors:
+    """The priors with another one of the linear velocities."""
     return Priors(priors.gravity1, priors.gravity2, priors.gravity_weight,
-                  priors.gravity_row_time, priors.rate_weight, 1.0 / (sigma * sigma),
-                  priors.velocity_rate, priors.rotation, priors.rotation_information)
+                  priors.gravity_row_time, priors.rate_weight, priors.rotation,
+                  priors.rotation_information, velocity)
+
+
+@kernel
+def with_log_scale(priors: Priors, log_scale: float) -> Priors:
+    """The priors about another ``log b``."""
+    prior = priors.velocity
+    return with_velocity(priors, VelocityPrior(
+        prior.rate, prior.offset, prior.information, log_scale, prior.centre, prior.weight,
+        prior.freedom))
+
+
+def isotropic(sigma: float, rate: float) -> VelocityPrior:
+    """Velocities (d_1, d_2) each of `rate` t, with `sigma` per axis [baselines per second]."""
+    log_scale = -math.log(sigma)
+    return VelocityPrior(rate, np.zeros(6), np.eye(6), log_scale, log_scale, 0.0, 0.0)
+
+
+@kernel
+def unknowns(priors: Priors) -> int:
+    """Number of unknowns: those of a state, and the velocities' scale where it is one."""
+    return PARAMETERS + 1 if priors.velocity.weight > 0.0 else PARAMETERS
 
 
 @linked_kernel
@@ -112,28 +154,50 @@ def _add_rotation(state: TwoViewState, priors: Priors, hessian: Array, gradient:
     return cost
 
 
-@kernel
-def _add_velocities(state: TwoViewState, priors: Priors, hessian: Array, gradient: Array,
-                    cost: float) -> float:
-    """``w |d_k - c t|^2`` of both velocities, added to `cost`; t moves in its tangent plane."""
-    w, c = priors.velocity_weight, priors.velocity_rate
+@linked_kernel
+def add_velocities(state: TwoViewState, prior: VelocityPrior, hessian: Array,
+                   gradient: Array) -> float:
+    """``u^T W u`` of both velocities; t moves in its tangent plane."""
+    b, c = math.exp(prior.log_scale), prior.rate
     basis = tangent_basis(state.t)
-    for i in range(3):
-        e1, e2 = state.d1[i] - c * state.t[i], state.d2[i] - c * state.t[i]
-        cost += w * (e1 * e1 + e2 * e2)
-        gradient[D1 + i] += w * e1
-        gradient[D2 + i] += w * e2
-        for first in (D1, D2):
-            hessian[first + i, first + i] += w
-        for j in range(2):
-            mixed = -c * w * basis[i, j]
-            gradient[TANGENT + j] += mixed * (e1 + e2)
-            for first in (D1, D2):
-                hessian[TANGENT + j, first + i] += mixed
-                hessian[first + i, TANGENT + j] += mixed
-    for j in range(2):
-        hessian[TANGENT + j, TANGENT + j] += 2.0 * c * c * w
+    # du by the tangent, by d_1 and d_2, and by log b
+    jac, u = np.zeros((6, 9)), np.empty(6)
+    for i in range(6):
+        axis = i % 3
+        d = state.d1[axis] if i < 3 else state.d2[axis]
+        jac[i, 0], jac[i, 1] = -b * c * basis[axis, 0], -b * c * basis[axis, 1]
+        jac[i, 2 + i] = b
+        jac[i, 8] = b * (d - c * state.t[axis])
+        u[i] = jac[i, 8] + prior.offset[i]
+    n, cost = 9 if len(gradient) > SCALE else 8, 0.0
+    weighted = np.zeros((6, 9))
+    for i in range(6):
+        product = 0.0
+        for k in range(6):
+            w = prior.information[i, k]
+            product += w * u[k]
+            for a in range(n):
+                weighted[i, a] += w * jac[k, a]
+        cost += u[i] * product
+    for a in range(n):
+        row = TANGENT + a if a < 8 else SCALE
+        for i in range(6):
+            gradient[row] += weighted[i, a] * u[i]
+        for e in range(n):
+            column = TANGENT + e if e < 8 else SCALE
+            for i in range(6):
+                hessian[row, column] += jac[i, a] * weighted[i, e]
     return cost
+
+
+@kernel
+def _add_scale(prior: VelocityPrior, hessian: Array, gradient: Array, cost: float) -> float:
+    """``-2 g log b + (log b - m)^2 / s^2``, added to `cost`."""
+    away = prior.log_scale - prior.centre
+    # Of the velocities that the matches know, half the log-evidence curves by as much again.
+    hessian[SCALE, SCALE] += prior.weight + prior.freedom
+    gradient[SCALE] += prior.weight * away - prior.freedom
+    return cost + prior.weight * away * away - 2.0 * prior.freedom * prior.log_scale
 
 
 @kernel
@@ -156,11 +220,14 @@ def add_priors(state: TwoViewState, priors: Priors, hessian: Array, gradient: Ar
     if priors.gravity_weight > 0.0:
         cost += _add_gravity(state, priors, hessian, gradient)
     cost = _add_rotation(state, priors, hessian, gradient, cost)
-    cost = _add_velocities(state, priors, hessian, gradient, cost)
+    cost += add_velocities(state, priors.velocity, hessian, gradient)
+    if len(gradient) > SCALE:
+        cost = _add_scale(priors.velocity, hessian, gradient, cost)
     return _add_rates(state, priors, hessian, gradient, cost)
 
 
 @kernel
 def prior_cost(state: TwoViewState, priors: Priors) -> float:
     """The priors' part of the cost."""
-    return add_priors(state, priors, np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS))
+    n = unknowns(priors)
+    return add_priors(state, priors, np.zeros((n, n)), np.zeros(n))

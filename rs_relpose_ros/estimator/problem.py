@@ -139,8 +139,8 @@ def _checked_columns(observations: Array) -> tuple[NDArray[np.bool_], Array]:
 class PairState:
     """A pose between two rows with its covariance; velocities each in its own camera's frame.
 
-    ``covariance`` (18, 18) is of ``(dt, dtheta, dv_1, dv_2, dw_1, dw_2)``: dt and dtheta in
-    camera 1 as in `RelativePose`, velocities in their own frames.
+    ``covariance`` (19, 19) is of ``(dt, dtheta, dv_1, dv_2, dw_1, dw_2, dlog b)``: dt, dtheta in
+    camera 1 as in `RelativePose`, velocities in their own frames, b the length of the baseline.
     """
 
     R: Array
@@ -149,6 +149,7 @@ class PairState:
     v2: Array
     w1: Array
     w2: Array
+    log_baseline: float
     covariance: Array
 
 
@@ -172,11 +173,11 @@ def to_reference_row(state: PairState, delay: float, turn1: Array, turn2: Array)
     v1, v2 = e1.T @ state.v1 / scale, e2.T @ state.v2 / scale
 
     eye = np.eye(3)
-    jacobian = np.zeros((18, 18))
+    jacobian = np.zeros((19, 19))
     TT, TH, V1, V2, W1, W2 = (slice(3 * k, 3 * k + 3) for k in range(6))
     # t_true = t + dt, R_true = Exp(th) R: baseline' = E1^T (dt - D dv1 + D R dv2 - D [R v2]x th
     #   + D [baseline]x dw1), for rate errors that turn E_i into Exp(D dw_i) E_i.
-    by = np.zeros((3, 18))
+    by = np.zeros((3, 19))
     by[:, TT] = eye
     by[:, V1] = -delay * eye
     by[:, V2] = delay * state.R
@@ -197,5 +198,8 @@ def to_reference_row(state: PairState, delay: float, turn1: Array, turn2: Array)
     jacobian[V2, W2] += delay * skew(v2) @ e2.T
     jacobian[W1, W1] = eye
     jacobian[W2, W2] = eye
-    return PairState(R, t, v1, v2, state.w1, state.w2, jacobian @ state.covariance @ jacobian.T)
+    jacobian[18] = along
+    jacobian[18, 18] += 1.0
+    return PairState(R, t, v1, v2, state.w1, state.w2, state.log_baseline + math.log(scale),
+                     jacobian @ state.covariance @ jacobian.T)
 

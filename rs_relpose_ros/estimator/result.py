@@ -60,6 +60,8 @@ class RelativePose:
         Length of the translation [m]; NaN where it is not known: images and gyro do not tell it.
     baseline_log_sigma : float
         1 sigma of its logarithm.
+    baseline_reason : str
+        Why the baseline is not known; empty where it is, and without a pose.
     velocity_sigma : float
         Prior sigma of the linear velocities that was used [baselines per second].
     iterations : int
@@ -84,6 +86,7 @@ class RelativePose:
     model: str = ''
     baseline: float = float('nan')
     baseline_log_sigma: float = float('nan')
+    baseline_reason: str = ''
     velocity_sigma: float = float('nan')
     iterations: int = 0
     residual_rms: float = float('nan')
@@ -98,6 +101,16 @@ class RelativePose:
         """Whether `R` and its covariance are known; of every pose they are."""
         return bool(np.isfinite(self.R).all())
 
+    @property
+    def metric_velocity1(self) -> Array:
+        """`linear_velocity1` (3,) in m/s; NaN where the baseline is not known."""
+        return self.baseline * self.linear_velocity1
+
+    @property
+    def metric_velocity2(self) -> Array:
+        """`linear_velocity2` (3,) in m/s; NaN where the baseline is not known."""
+        return self.baseline * self.linear_velocity2
+
     def without_translation(self, status: Status, reason: str) -> RelativePose:
         """The same with the rotation alone, and why."""
         covariance, velocity_covariance = self.covariance.copy(), self.velocity_covariance.copy()
@@ -105,7 +118,8 @@ class RelativePose:
             matrix[:3] = matrix[:, :3] = np.nan
         return replace(
             self, status=status, reason=reason, t=_nan(3), linear_velocity1=_nan(3),
-            linear_velocity2=_nan(3), covariance=covariance,
+            linear_velocity2=_nan(3), covariance=covariance, baseline=float('nan'),
+            baseline_log_sigma=float('nan'), baseline_reason='',
             velocity_covariance=velocity_covariance)
 
     def inverse(self) -> RelativePose:
@@ -124,7 +138,8 @@ class RelativePose:
             status=self.status, reason=self.reason, R=R_inv, t=-R_inv @ self.t,
             linear_velocity1=self.linear_velocity2, linear_velocity2=self.linear_velocity1,
             angular_velocity1=self.angular_velocity2, angular_velocity2=self.angular_velocity1,
-            inliers=self.inliers, covariance=covariance,
+            inliers=self.inliers, covariance=covariance, baseline=self.baseline,
+            baseline_log_sigma=self.baseline_log_sigma, baseline_reason=self.baseline_reason,
             model=self.model, velocity_sigma=self.velocity_sigma, iterations=self.iterations,
             residual_rms=self.residual_rms, duration=self.duration)
 

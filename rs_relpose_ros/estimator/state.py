@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 # Where each unknown's local parameters begin: a turn on the left of R, two steps of t in its
 # tangent plane, and four vectors.
 PARAMETERS = 17
+# Beyond those, where it is unknown: the logarithm of the velocities' scale (`priors`).
+SCALE = 17
 THETA, TANGENT, D1, D2, DW1, DW2 = 0, 3, 5, 8, 11, 14
 
 

@@ -19,9 +19,9 @@ from rs_relpose_ros.estimator.information import inverse
 from rs_relpose_ros.estimator.map_fit import FitMatches, linearised, normal_equations
 from rs_relpose_ros.estimator.priors import Priors
 from rs_relpose_ros.estimator.problem import PairState, TwoViewProblem
-from rs_relpose_ros.estimator.state import DW1, PARAMETERS, THETA, TwoViewState
+from rs_relpose_ros.estimator.state import DW1, PARAMETERS, SCALE, THETA, TwoViewState
 from rs_relpose_ros.geometry.so3 import log_so3, skew
-from rs_relpose_ros.geometry.vectors import tangent_basis
+from rs_relpose_ros.geometry.vectors import copy_matrix, tangent_basis
 from rs_relpose_ros.solvers.linear_algebra import cholesky, newton_step
 
 Array = NDArray[np.float64]
@@ -59,7 +59,7 @@ def score_covariance(matches: FitMatches, state: TwoViewState, data_hessian: Arr
     `gyro_error` (3, 3): covariance of errors of the gyro's rotation that its prior does not know.
     """
     surprise = gyro_surprise(state, priors, inverse(hessian))
-    excess = np.zeros((PARAMETERS, PARAMETERS))
+    excess = np.zeros(hessian.shape)
     information = priors.rotation_information
     rotation = (surprise - 1.0) * information + information @ gyro_error @ information
     for i in range(3):
@@ -114,23 +114,28 @@ def _of_matches(matches: FitMatches, state: TwoViewState, data_hessian: Array,
     """
     regions = _regions(matches)
     weight = 1.0 / (matches.sigma * matches.sigma)
-    total = np.zeros((PARAMETERS, PARAMETERS))
-    factor = np.zeros((PARAMETERS, PARAMETERS))
+    n = len(hessian)
+    total, rest, factor = np.zeros((n, n)), np.empty((n, n)), np.zeros((n, n))
+    score = np.zeros(n)
     filled, cost = 0, 0.0
     for g in range(REGIONS[0] * REGIONS[1]):
         use = regions == g
         if not use.any():
             continue
         filled += 1
-        own, score, squares = sampson.normal_equations(matches.observations, use, state)
-        score *= weight
+        own, gradient, squares = sampson.normal_equations(matches.observations, use, state)
         cost += weight * squares
+        copy_matrix(hessian, rest)
+        for i in range(PARAMETERS):
+            score[i] = weight * gradient[i]
+            for j in range(PARAMETERS):
+                rest[i, j] -= weight * own[i, j]
         adjusted = score
-        if cholesky(hessian - weight * own, factor):
+        if cholesky(rest, factor):
             # (I - H_g H^-1)^-1 s = H (H - H_g)^-1 s
             adjusted = 0.5 * (score - hessian @ newton_step(factor, score))
-        for i in range(PARAMETERS):
-            for j in range(PARAMETERS):
+        for i in range(n):
+            for j in range(n):
                 total[i, j] += adjusted[i] * adjusted[j]
     # Noise as the residuals have it, without what was told: (units of sigma)^2.
     variance = (1.0 + cost) / (1.0 + max(matches.use.sum() - FITTED, 0))
@@ -197,16 +202,19 @@ def local_covariance(matches: FitMatches, state: TwoViewState, priors: Priors) -
     return np.asarray(local + np.outer(step, step))
 
 
-def pair_state(problem: TwoViewProblem, state: TwoViewState, local: Array) -> PairState:
+def pair_state(problem: TwoViewProblem, state: TwoViewState, log_scale: float,
+               local: Array) -> PairState:
     """The state in each camera's own frame, with its covariance.
 
     Parameters
     ----------
-    local : (17, 17) ndarray
+    log_scale : float
+        Of the velocities: the logarithm of the baseline where that is a figure in metres.
+    local : (n, n) ndarray
         Covariance of the state's local parameters ``(theta, tangent, d_1, d_2, dw_1, dw_2)``,
-        which are in frame 1.
+        which are in frame 1, and of `log_scale` where it is unknown.
     """
-    jacobian = np.zeros((18, 17))
+    jacobian = np.zeros((19, len(local)))
     jacobian[0:3, 3:5] = tangent_basis(state.t)
     jacobian[3:6, 0:3] = np.eye(3)
     jacobian[6:9, 5:8] = np.eye(3)
@@ -215,7 +223,9 @@ def pair_state(problem: TwoViewProblem, state: TwoViewState, local: Array) -> Pa
     jacobian[9:12, 0:3] = state.R.T @ skew(state.d2)
     jacobian[12:15, 11:14] = np.eye(3)
     jacobian[15:18, 14:17] = state.R.T
+    if len(local) > SCALE:
+        jacobian[18, SCALE] = 1.0
     w1 = problem.motion1.angular_velocity + state.dw1
     w2 = problem.motion2.angular_velocity + state.R.T @ state.dw2
-    return PairState(state.R, state.t, state.d1, state.R.T @ state.d2, w1, w2,
+    return PairState(state.R, state.t, state.d1, state.R.T @ state.d2, w1, w2, log_scale,
                      jacobian @ local @ jacobian.T)

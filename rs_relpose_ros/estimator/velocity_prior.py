@@ -17,19 +17,23 @@ from rs_relpose_ros.compiled import kernel, linked_kernel
 from rs_relpose_ros.estimator.information import inverse, log_determinant
 from rs_relpose_ros.estimator.inliers import count_behind, Flags, Matches, within
 from rs_relpose_ros.estimator.map_fit import DataTerm, fit, FitMatches, linearised
-from rs_relpose_ros.estimator.priors import Priors, with_velocity_sigma
+from rs_relpose_ros.estimator.priors import (
+    add_priors,
+    add_velocities,
+    Priors,
+    unknowns,
+    VelocityPrior,
+    with_velocity,
+)
 from rs_relpose_ros.estimator.sampson import residuals
-from rs_relpose_ros.estimator.state import moved, PARAMETERS, step_between, TwoViewState
+from rs_relpose_ros.estimator.state import moved, PARAMETERS, SCALE, step_between, TwoViewState
 from rs_relpose_ros.estimator.uncertainty import as_much_wider, sandwich, score_covariance
 from rs_relpose_ros.geometry.vectors import copy_matrix, copy_vector
 
 Array = NDArray[np.float64]
 
-# Units of |t| per second.
+# Prior sigmas where nothing is known of the time between the frames [baselines per second].
 GRID = np.array([0.003, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
-# With a known interval the prior is about constant velocity; hand-held cameras and robots change
-# their velocity by at least this share of it per second, however little one pair shows of that.
-LEAST_VELOCITY_CHANGE = 0.3
 # Exponent of the prior of the sigma, as its inverse: where the data cannot tell (sideways motion,
 # cameras at rest), a wide prior would turn noise into velocity and degrees of translation.
 SMALL_IS_LIKELIER = 0.5
@@ -45,6 +49,16 @@ WIDEST = 2.0
 LEAST_EVIDENCE = 6.0
 
 
+class Scales(NamedTuple):
+    """Grid of scales of the velocities (`priors`): ``log b`` of each, or the mean of its prior.
+
+    `log_weights`: logarithms of their prior probabilities, up to a constant.
+    """
+
+    centres: Array
+    log_weights: Array
+
+
 class Noise(NamedTuple):
     """What is told of the noise: `sigma` and inlier `threshold` [px] of a match."""
 
@@ -55,14 +69,14 @@ class Noise(NamedTuple):
 class Refined(NamedTuple):
     """A refined state, and what it rests on.
 
-    `inliers` (N,): the matches that the last fits used. `velocity_sigma`: the prior sigma of the
-    most evidence [baselines per second]. `sigma`: noise of a match that the fits used [px].
-    `covariance` (17, 17): of the local parameters, within the fits and between them.
+    `inliers` (N,): the matches that the last fits used. `log_scale`: log b of the velocities, of
+    the most evidence, or the mean where it is unknown. `sigma`: noise of a match that the fits
+    used [px]. `covariance` (n, n): of the local parameters, within the fits and between them.
     """
 
     state: TwoViewState
     inliers: Flags
-    velocity_sigma: float
+    log_scale: float
     sigma: float
     covariance: Array
 
@@ -77,37 +91,40 @@ def noise_sigma(observations_cost: float, count: int, told: float) -> float:
 
 @kernel
 def fit_with_evidence(matches: Matches, start: TwoViewState, priors: Priors, noise: Noise,
-                      grid: Array, gyro_error: Array) -> Refined:
-    """Select inliers and fit repeatedly; average over the velocity priors at the end.
+                      scales: Scales, gyro_error: Array) -> Refined:
+    """Select inliers and fit repeatedly; average over the scales of the velocities at the end.
 
-    `grid` (K,) holds the prior sigmas of the velocities; the state is the mean over them, weighted
-    by their evidence. `gyro_error` (3, 3) is that of `score_covariance`.
+    The state is the mean over the scales, weighted by their evidence. `gyro_error` (3, 3) is that
+    of `score_covariance`.
     """
-    size = grid.shape[0]
+    size, n = len(scales.centres), unknowns(priors)
     state = start
     used = _selected(matches, state, noise.threshold, noise.sigma)
-    # Optimum of each prior as a step from `start`, and its evidence in its last round.
-    steps = np.zeros((size, PARAMETERS))
+    # Optimum of each scale as a step from `start` and a log b, and its evidence in its last round.
+    steps = np.zeros((size, n))
     lacking = np.zeros(size)
     evidences = np.full(size, -math.inf)
-    # The prior that `start` comes from, or the one next to it.
-    best = int(np.argmin(np.abs(np.log(grid * math.sqrt(priors.velocity_weight)))))
+    # The scale that `start` comes from, or the one next to it.
+    best = int(np.argmin(np.abs(scales.centres - priors.velocity.log_scale)))
     for turn in range(ROUNDS):
         low, high = 0, size
         if turn > 0:   # the choice moves little once the inliers stand
             low, high = max(best - 1, 0), min(best + 2, size)
-        # From the best prior down and from it up, each fit from its neighbour's optimum.
+        # From the best scale down and from it up, each fit from its neighbour's optimum.
         data = linearised(used, state)
         upwards, upwards_data = state, data
         for turned in range(high - low):
             k = best - turned if turned <= best - low else low + turned
             if k == best + 1:
                 state, data = upwards, upwards_data
-            state, data, _, evidences[k] = _candidate(
-                matches, used, state, data, priors, grid[k], noise.threshold, ITERATIONS)
+            state, log_scale, data, _, evidences[k] = _candidate(
+                matches, used, state, data, priors, scales, k, scales.centres[k],
+                noise.threshold, ITERATIONS)
             if k == best:
                 upwards, upwards_data = state, data
             copy_vector(step_between(start, state), steps[k])
+            if n > SCALE:
+                steps[k, SCALE] = log_scale
         best = low + int(np.argmax(evidences[low:high]))
         for k in range(low, high):
             lacking[k] = evidences[best] - evidences[k]
@@ -116,9 +133,8 @@ def fit_with_evidence(matches: Matches, start: TwoViewState, priors: Priors, noi
         used = _selected(matches, state, _reach(noise.threshold, used.sigma), noise.sigma)
         if (used.use == chosen_from).all():
             break
-    state, covariance, best = _average(matches, used, start, steps, lacking < LEAST_EVIDENCE,
-                                       priors, grid, noise.threshold, gyro_error)
-    return Refined(state, used.use, grid[best], used.sigma, covariance)
+    return _average(matches, used, start, steps, lacking < LEAST_EVIDENCE, priors, scales,
+                    noise.threshold, gyro_error)
 
 
 @kernel
@@ -141,41 +157,68 @@ def _selected(matches: Matches, state: TwoViewState, threshold: float,
                       noise_sigma(squares, inliers.sum(), told_sigma))
 
 
+@kernel
+def _known_velocities(data: DataTerm, state: TwoViewState, priors: Priors) -> float:
+    """How many of the six velocities the matches know, of those that their prior knows, too.
+
+    ``g = 6 - tr(C V)``, V being the prior's part of the Hessian whose inverse is C (MacKay,
+    Neural Computation 4, 1992): ``log b`` gains ``6 - tr(C V)`` in the logarithm of the evidence.
+    """
+    hessian, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
+    of_prior, ignored = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
+    add_priors(state, priors, hessian, gradient)
+    add_velocities(state, priors.velocity, of_prior, ignored)
+    for i in range(PARAMETERS):
+        for j in range(PARAMETERS):
+            hessian[i, j] += data.hessian[i, j]
+    return min(max(6.0 - (inverse(hessian) * of_prior).sum(), 0.0), 6.0)
+
+
 @linked_kernel
 def _candidate(matches: Matches, used: FitMatches, start: TwoViewState, data: DataTerm,
-               priors: Priors, velocity_sigma: float, threshold: float,
-               iterations: int) -> tuple[TwoViewState, DataTerm, Array, float]:
-    """Fit with one velocity prior: state, its data term and Hessian, and its log-evidence."""
-    state, data, cost, hessian = fit(
-        used, start, data, with_velocity_sigma(priors, velocity_sigma), iterations)
+               priors: Priors, scales: Scales, k: int, log_scale: float, threshold: float,
+               iterations: int) -> tuple[TwoViewState, float, DataTerm, Array, float]:
+    """Fit about scale k, from `log_scale`: state, log b, data term, Hessian and log-evidence."""
+    told = priors.velocity
+    velocity = VelocityPrior(told.rate, told.offset, told.information, log_scale,
+                             scales.centres[k], told.weight, 0.0)
+    priors = with_velocity(priors, velocity)
+    if told.weight > 0.0:
+        priors = with_velocity(priors, VelocityPrior(
+            told.rate, told.offset, told.information, log_scale, scales.centres[k], told.weight,
+            _known_velocities(data, start, priors)))
+    state, log_scale, data, cost, hessian = fit(used, start, data, priors, iterations)
+    cost += 2.0 * priors.velocity.freedom * log_scale
     # Velocities that carry the camera past its own baseline within a frame explain any residual,
     # with points behind the cameras: those count as outliers.
     cost += count_behind(matches, used.use, state) * (threshold / used.sigma) ** 2
-    evidence = (-0.5 * cost - 0.5 * log_determinant(hessian)
-                - (6.0 + SMALL_IS_LIKELIER) * math.log(velocity_sigma))
-    return state, data, hessian, evidence
+    evidence = (-0.5 * cost - 0.5 * log_determinant(hessian) + 6.0 * log_scale
+                + scales.log_weights[k])
+    return state, log_scale, data, hessian, evidence
 
 
 @linked_kernel
 def _average(matches: Matches, used: FitMatches, start: TwoViewState, steps: Array, likely: Flags,
-             priors: Priors, grid: Array, threshold: float,
-             gyro_error: Array) -> tuple[TwoViewState, Array, int]:
-    """Mean state, its covariance (17, 17), and the number of the prior of the most evidence.
+             priors: Priors, scales: Scales, threshold: float, gyro_error: Array) -> Refined:
+    """Mean state over the scales, its covariance, and the scale of the most evidence.
 
-    Where the data cannot tell which prior is right, one of them alone would be overconfident. The
-    fits go on from `steps` (K, 17) from `start`, for the `likely` (K,) priors.
+    Where the data cannot tell which scale is right, one of them alone would be overconfident. The
+    fits go on from `steps` (K, n) from `start`, for the `likely` (K,) scales.
     """
-    size = grid.shape[0]
+    size, n = steps.shape
     evidences = np.full(size, -math.inf)
-    hessians = np.zeros((size, PARAMETERS, PARAMETERS))
-    of_data = np.zeros((size, PARAMETERS, PARAMETERS))
+    hessians = np.zeros((size, n, n))
+    of_data = np.zeros((size, n, n))
     for k in range(size):
         if likely[k]:
             own = moved(start, steps[k])
-            state, data, hessian, evidences[k] = _candidate(
-                matches, used, own, linearised(used, own), priors, grid[k], threshold,
-                LAST_ITERATIONS)
+            log_scale = steps[k, SCALE] if n > SCALE else scales.centres[k]
+            state, log_scale, data, hessian, evidences[k] = _candidate(
+                matches, used, own, linearised(used, own), priors, scales, k, log_scale,
+                threshold, LAST_ITERATIONS)
             copy_vector(step_between(start, state), steps[k])
+            if n > SCALE:
+                steps[k, SCALE] = log_scale
             copy_matrix(hessian, hessians[k])
             copy_matrix(data.hessian, of_data[k])
     best = int(np.argmax(evidences))
@@ -184,22 +227,28 @@ def _average(matches: Matches, used: FitMatches, start: TwoViewState, steps: Arr
     scores = score_covariance(used, origin, of_data[best], hessians[best], priors, gyro_error)
     weights = np.exp(evidences - evidences[best])
     weights /= weights.sum()
-    mean = np.zeros(PARAMETERS)
-    away = np.zeros((size, PARAMETERS))
+    mean = np.zeros(n)
+    away = np.zeros((size, n))
     for k in range(size):
         if likely[k]:
             copy_vector(step_between(origin, moved(start, steps[k])), away[k])
+            if n > SCALE:
+                away[k, SCALE] = steps[k, SCALE] - steps[best, SCALE]
             mean += weights[k] * away[k]
-    believed = np.zeros((PARAMETERS, PARAMETERS))
-    spread = np.zeros((PARAMETERS, PARAMETERS))
+    believed = np.zeros((n, n))
+    spread = np.zeros((n, n))
     for k in range(size):
         if likely[k]:
             rest, fitted = away[k] - mean, inverse(hessians[k])
-            for i in range(PARAMETERS):
-                for j in range(PARAMETERS):
+            for i in range(n):
+                for j in range(n):
                     believed[i, j] += weights[k] * fitted[i, j]
                     spread[i, j] += weights[k] * rest[i] * rest[j]
     # The errors are those that the best one shows: another's misfit is no noise to it.
     fitted = inverse(hessians[best])
     shown = sandwich(hessians[best], of_data[best], fitted, scores)
-    return moved(origin, mean), as_much_wider(believed, fitted, shown) + spread, best
+    log_scale = scales.centres[best]
+    if n > SCALE:
+        log_scale = steps[best, SCALE] + mean[SCALE]
+    return Refined(moved(origin, mean), used.use, log_scale, used.sigma,
+                   as_much_wider(believed, fitted, shown) + spread)

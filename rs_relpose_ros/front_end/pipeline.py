@@ -16,6 +16,7 @@ from rs_relpose_ros.front_end.derotated_rays import DerotatedRays, median_parall
 from rs_relpose_ros.front_end.frame import Frame, sensor_camera
 from rs_relpose_ros.front_end.pair import closes_pair, PairResult, SinceKeyframe
 from rs_relpose_ros.front_end.stamp_scatter import StampScatter
+from rs_relpose_ros.geometry.inertial import InertialMotion
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import aligning_rotation, log_so3
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between
@@ -25,8 +26,10 @@ from rs_relpose_ros.health.monitor import HealthMonitor, withheld
 from rs_relpose_ros.health.pair_information import PairEvidence
 from rs_relpose_ros.health.tracked import Applied, Tracked
 from rs_relpose_ros.health.turning import rotation_of_rays
+from rs_relpose_ros.imu.forces import ForceSegment
 from rs_relpose_ros.imu.frame_imu import FrameImu, GyroSegment
 from rs_relpose_ros.imu.integration import integrate_rotation, turn_sensitivity
+from rs_relpose_ros.imu.preintegration import inertial_motion
 from rs_relpose_ros.tracking.matches import Matches
 from rs_relpose_ros.tracking.tracker import make_tracker, Tracker
 
@@ -107,6 +110,7 @@ class Pipeline:
         self._previous: _View | None = None
         self._frames = 0   # since the reference keyframe
         self._gyro: _GyroTurn | None = None
+        self._forces: ForceSegment | str = ''   # since the reference, or why they are not known
         self._reference_rays: DerotatedRays | None = None
         self._current_rays: DerotatedRays | None = None
         self._turn = _Turn.none()
@@ -152,6 +156,7 @@ class Pipeline:
             seconds_between(self._previous.frame.stamp_ns, frame.stamp_ns))
         self._previous = view
         self._gyro = self._turn_with(imu.since_previous, parameters)
+        self._forces = self._forces_with(imu)
         rays1, rays2 = self._derotate(matches, self._reference.imu.motion, imu.motion, sensor)
         since = SinceKeyframe(self._parallax(rays1, rays2, sensor),
                               _interval(self._reference, view), self._frames,
@@ -226,6 +231,27 @@ class Pipeline:
         return _GyroTurn(*integrate_rotation(segment.stamps_ns, segment.angular_velocities,
                                              parameters.imu, segment.bias_sigma), segment)
 
+    def _forces_with(self, imu: FrameImu) -> ForceSegment | str:
+        """Specific force since the reference, continued by a frame; why not, once a part lacks."""
+        if isinstance(imu.force, str):
+            return imu.force
+        if self._frames == 1:
+            return imu.force.since_previous
+        before = self._forces
+        return before if isinstance(before, str) else before.joined(imu.force.since_previous)
+
+    def _inertial(self, reference: _View, view: _View,
+                  parameters: Parameters) -> InertialMotion | str:
+        """What the accelerometer says of the pair, or why it says nothing."""
+        if not parameters.pair.use_accelerometer:
+            return 'use_accelerometer is false'
+        if self._gyro is None:
+            return 'the gyro has a gap'
+        if isinstance(self._forces, str):
+            return self._forces
+        return inertial_motion(self._gyro.segment, self._forces, reference.imu, view.imu,
+                               parameters.imu)
+
     def _derotate(self, matches: Matches, motion1: FrameMotion, motion2: FrameMotion,
                   sensor: Sensor) -> tuple[DerotatedRays, DerotatedRays]:
         """Rays of matches in the reference and in the current image, which are kept."""
@@ -252,6 +278,7 @@ class Pipeline:
         matches, gyro = self._tracker.refined_matches(), self._gyro
         told = gyro if parameters.pair.use_gyro_rotation else None
         gravity = _gravity_prior(reference.imu, view.imu, parameters)
+        inertial = self._inertial(reference, view, parameters)
         pose = estimate_relative_pose(
             sensor.intrinsics.to_sensor(matches.points1),
             sensor.intrinsics.to_sensor(matches.points2),
@@ -262,7 +289,10 @@ class Pipeline:
             config=replace(parameters.estimator, gravity_sigma=gravity.sigma, stamp_sigma=max(
                 parameters.estimator.stamp_sigma, self._stamps.sigma)),
             quality=matches.quality,
+            inertial=None if isinstance(inertial, str) else inertial,
             rng=np.random.default_rng([parameters.pair.seed, stamp1_ns, stamp2_ns]))
+        if isinstance(inertial, str):
+            pose = replace(pose, baseline_reason=f'baseline not known: {inertial}')
         pose = self._judged(pose, matches, reference, view, sensor, parameters)
         rays1, rays2 = self._derotate(matches, reference.imu.motion, view.imu.motion, sensor)
         seen = self._health.latest

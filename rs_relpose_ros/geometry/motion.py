@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3, multiply
-from rs_relpose_ros.geometry.vectors import copy_matrix, copy_vector
+from rs_relpose_ros.geometry.vectors import checked_vector, copy_matrix, copy_vector
 
 Array = NDArray[np.float64]
 
@@ -51,12 +51,12 @@ class FrameMotion:
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name)))
         object.__setattr__(self, 'angular_velocity',
-                           _vector3('angular_velocity', self.angular_velocity))
+                           checked_vector('angular_velocity', self.angular_velocity))
         if not np.abs(self.angular_velocity).max() <= _LARGEST_RATE:
             raise InputError(f'angular_velocity must be within {_LARGEST_RATE:g} rad/s, '
                              f'got {self.angular_velocity.tolist()}')
         if self.gravity is not None:
-            gravity = _vector3('gravity', self.gravity)
+            gravity = checked_vector('gravity', self.gravity)
             if not 1e-6 < np.abs(gravity).max() < 1e6:
                 raise InputError(
                     'gravity must have a direction (or be None where it is not known) and a '
@@ -174,10 +174,3 @@ def rotations_between(knot_times: Array, knot_rotations: Array, times: Array,
         turn = exp_so3(fraction * steps[k])
         multiply(knot_rotations[k], turn, out[i])
     return out, covered
-
-
-def _vector3(name: str, value: ArrayLike) -> Array:
-    vector = np.array(value, dtype=np.float64)
-    if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise InputError(f'{name} must be 3 finite numbers, got {value!r}')
-    return vector

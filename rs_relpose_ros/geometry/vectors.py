@@ -10,12 +10,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from rs_relpose_ros.compiled import kernel, small_kernel
+from rs_relpose_ros.errors import InputError
 
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
+
+# [m/s^2]
+STANDARD_GRAVITY = 9.80665
 
 
 @small_kernel
@@ -84,3 +88,11 @@ def tangent_basis(t: Array) -> Array:
     basis[0, 0], basis[1, 0], basis[2, 0] = u[0] / length, u[1] / length, u[2] / length
     basis[0, 1], basis[1, 1], basis[2, 1] = cross(t, basis[:, 0])
     return basis
+
+
+def checked_vector(name: str, value: ArrayLike) -> Array:
+    """An argument as a vector (3,); InputError, naming it, unless it is 3 finite numbers."""
+    vector = np.array(value, dtype=np.float64)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise InputError(f'{name} must be 3 finite numbers, got {value!r}')
+    return vector

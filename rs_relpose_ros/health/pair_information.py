@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.estimator.information import inverse
 from rs_relpose_ros.estimator.map_fit import FitMatches, stepped
-from rs_relpose_ros.estimator.priors import add_priors, Priors
+from rs_relpose_ros.estimator.priors import add_priors, isotropic, Priors
 from rs_relpose_ros.estimator.problem import build_problem, TwoViewProblem
 from rs_relpose_ros.estimator.sampson import jacobian, residuals
 from rs_relpose_ros.estimator.state import D1, PARAMETERS, TANGENT, THETA, TwoViewState
@@ -113,8 +113,9 @@ def pair_information(pair: PairEvidence, in_force: Array, about: Array) -> PairI
     if at.any():
         rotation = exp_so3(by_deviation @ at) @ rotation
         observations = rows.displaced(observations, at)
-    priors = Priors(np.zeros(3), np.zeros(3), 0.0, 0.0, pair.gyro_sigma**-2, _VELOCITY_SIGMA**-2,
-                    1.0 / pair.interval, np.ascontiguousarray(rotation), information)
+    priors = Priors(np.zeros(3), np.zeros(3), 0.0, 0.0, pair.gyro_sigma**-2,
+                    np.ascontiguousarray(rotation), information,
+                    isotropic(_VELOCITY_SIGMA, 1.0 / pair.interval))
     if at.any():
         every = np.ones(len(observations), dtype=np.bool_)
         r = np.abs(residuals(observations, state))

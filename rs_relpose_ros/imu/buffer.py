@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from enum import Enum
 import math
 
@@ -110,7 +111,10 @@ class ImuBuffer:
 
     def coverage(self, start_ns: int, end_ns: int) -> Coverage:
         """Whether the gyro covers [start_ns, end_ns] without a gap."""
-        stamps = self._gyro.stamps
+        return self._covered(self._gyro, start_ns, end_ns)
+
+    def _covered(self, series: Series, start_ns: int, end_ns: int) -> Coverage:
+        stamps = series.stamps
         if len(stamps) == 0:
             return Coverage.NOT_YET
         if start_ns < stamps[0]:
@@ -136,6 +140,24 @@ class ImuBuffer:
                              f'{self.coverage(start_ns, end_ns).value}')
         stamps_ns, rates = self._gyro.between(start_ns, end_ns)
         return stamps_ns, rates - self.bias(end_ns).value
+
+    def specific_force(self, start_ns: int,
+                       end_ns: int) -> tuple[NDArray[np.int64], Array] | None:
+        """Accelerometer over an interval, its borders interpolated; None where it has a gap there.
+
+        Stamps (K,) and specific forces (K, 3) [m/s^2] in the IMU frame.
+        """
+        if self._covered(self._force, start_ns, end_ns) is not Coverage.AVAILABLE:
+            return None
+        return self._force.between(start_ns, end_ns)
+
+    def recent_forces(self, until_ns: int) -> Array:
+        """Specific forces (K, 3) [m/s^2] of the last seconds up to an instant, IMU frame."""
+        stamps = self._force.stamps
+        # Half of the history: how much more is left depends on when it is asked for.
+        window = slice(int(np.searchsorted(stamps, until_ns - self._keep_ns // 2)),
+                       int(np.searchsorted(stamps, until_ns, side='right')))
+        return self._force.values[window]
 
     def bias(self, at_ns: int) -> GyroBias:
         """Bias of the gyro at an instant, from samples up to it; ask in the order of time."""
@@ -194,8 +216,8 @@ class ImuBuffer:
         if self.coverage(start_ns, end_ns) is not Coverage.AVAILABLE:
             return None
         turn, _ = self.rotation(start_ns, end_ns)
-        return GravityEstimate((turn.T if from_ns < to_ns else turn) @ estimate.direction,
-                               estimate.sigma)
+        return replace(estimate, direction=(turn.T if from_ns < to_ns else turn)
+                       @ estimate.direction)
 
     def _run_filters(self, until_ns: int) -> None:
         """Filter the samples up to an instant that were not filtered yet."""

@@ -1,4 +1,4 @@
-"""What the IMU says for one frame: motion during its read-out, and the turn since the last one."""
+"""What the IMU says for one frame: motion during its read-out, and since the last one."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.timing import seconds_between
 from rs_relpose_ros.imu.buffer import Coverage, ImuBuffer
+from rs_relpose_ros.imu.forces import force_fault, ForceSegment, FrameForce
 
 Array = NDArray[np.float64]
 
@@ -47,6 +48,7 @@ class FrameImu:
     # Since the previous frame's reference instant; None for the first frame or after a gap.
     since_previous: GyroSegment | None
     applied_offset_ns: int = 0   # tracked time offset in these instants, beyond the parameter's
+    force: FrameForce | str = 'there is no accelerometer'   # or why there is none
 
 
 def frame_imu(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_cam_imu: Array,
@@ -78,4 +80,27 @@ def frame_imu(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_
         bias = buffer.bias(reference_ns)
         since_previous = GyroSegment(stamps_ns, rates @ R_cam_imu.T, R_cam_imu @ bias.value,
                                      bias.sigma)
-    return FrameImu(motion, gravity_sigma, reference_ns, since_previous)
+    return FrameImu(motion, gravity_sigma, reference_ns, since_previous,
+                    force=_frame_force(buffer, span_ns, reference_ns, R_cam_imu, motion,
+                                       previous_reference_ns))
+
+
+def _frame_force(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_cam_imu: Array,
+                 motion: FrameMotion, previous_reference_ns: int | None) -> FrameForce | str:
+    """The accelerometer's share of a frame, or why it has none."""
+    first_ns = span_ns[0] if previous_reference_ns is None else previous_reference_ns
+    fault = force_fault(buffer.recent_forces(span_ns[1]))
+    if fault:
+        return fault
+    within = buffer.specific_force(*span_ns)
+    before = buffer.specific_force(min(first_ns, reference_ns), reference_ns)
+    gravity = buffer.gravity(span_ns[1])
+    if within is None or before is None or gravity is None:
+        return 'the accelerometer has a gap'
+    stamps_ns, forces = within
+    seconds = (stamps_ns - reference_ns) * 1e-9
+    turned = np.einsum('kij,kj->ki', motion.rotations(seconds), forces @ R_cam_imu.T)
+    steps = np.diff(seconds, append=seconds[-1]) + np.diff(seconds, prepend=seconds[0])
+    mean = turned[0] if len(turned) == 1 else steps @ turned / steps.sum()
+    return FrameForce(mean, gravity.length, gravity.length_sigma,
+                      ForceSegment(before[0], before[1] @ R_cam_imu.T))

@@ -13,7 +13,7 @@ that in length is known to hold acceleration and gets less weight.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from typing import NamedTuple
 
@@ -24,12 +24,18 @@ from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.config.imu import ImuConfig
 from rs_relpose_ros.geometry.so3 import exp_so3
 from rs_relpose_ros.geometry.timing import to_nanoseconds
-from rs_relpose_ros.geometry.vectors import cross, dot, norm, rotated
+from rs_relpose_ros.geometry.vectors import cross, dot, norm, rotated, STANDARD_GRAVITY
 from rs_relpose_ros.imu.bias import BIAS_MEMORY
 
 Array = NDArray[np.float64]
 
-STANDARD_GRAVITY = 9.80665
+# Error of an accelerometer's reading of gravity, scale and bias [m/s^2].
+LENGTH_SIGMA = 0.3
+# Acceleration along gravity that lasts as long as the correlation time [m/s^2]: of a velocity that
+# is bounded, so less than that of any moment.
+_LENGTH_NOISE = 0.3
+# Growth of the variance of the length [m^2/s^5]: temperature.
+_LENGTH_GROWTH = 2e-5
 MEAN_WINDOW_NS = 100_000_000
 # Correlation time of hand-held acceleration [s]: samples within it count as one measurement.
 _CORRELATION_TIME = 0.2
@@ -43,10 +49,16 @@ _OWN_GATE = 4.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GravityEstimate:
-    """Direction (3,) of free fall, unit, IMU frame; `sigma` [rad] per axis."""
+    """Direction (3,) of free fall, unit, IMU frame; `sigma` [rad] per axis.
+
+    `length` [m/s^2]: of the specific force at rest as this accelerometer reads it, with its 1
+    sigma: scale and bias along gravity are part of it.
+    """
 
     direction: Array
     sigma: float
+    length: float = STANDARD_GRAVITY
+    length_sigma: float = LENGTH_SIGMA
 
 
 class _Noise(NamedTuple):
@@ -64,6 +76,7 @@ class _State(NamedTuple):
     bias: Array   # (3,) b [rad/s]
     covariance: Array   # (6, 6) P, of (d, e)
     residual: Array   # (3,) mean of f / |f| - u over about the last second
+    length: Array   # (2,) of the specific force at rest [m/s^2], and its variance
 
 
 class GravityFilter:
@@ -78,7 +91,8 @@ class GravityFilter:
                    + config.gyro_noise_density**2)
         self._noise = _Noise(config.gravity_acceleration_sigma**2, turning,
                              config.gyro_bias_sigma**2 / BIAS_MEMORY)
-        self._state = _State(np.zeros(3), np.zeros(3), np.zeros((6, 6)), np.zeros(3))
+        self._state = _State(np.zeros(3), np.zeros(3), np.zeros((6, 6)), np.zeros(3),
+                             np.array([STANDARD_GRAVITY, LENGTH_SIGMA**2]))
         self._state.covariance[3:, 3:] = config.gyro_bias_sigma**2 * np.eye(3)
         # Of the last sample taken in: None while the direction is unknown.
         self.stamp_ns: int | None = None
@@ -110,7 +124,9 @@ class GravityFilter:
         variance = 0.5 * float(np.trace(spread) - up @ spread @ up)
         dragged = (float(np.linalg.norm(self._state.residual))
                    * min(_LASTING / self._config.gravity_time_constant, 1.0))
-        return GravityEstimate(-up, math.sqrt(variance + dragged * dragged))
+        length, length_variance = self._state.length
+        return GravityEstimate(-up, math.sqrt(variance + dragged * dragged), float(length),
+                               math.sqrt(length_variance))
 
     def _begin(self, k: int, stamps_ns: NDArray[np.int64], rates: Array, forces: Array) -> int:
         """Start from the first specific force at or after sample `k`; the index after it.
@@ -122,7 +138,7 @@ class GravityFilter:
             return len(stamps_ns)
         first = k + int(usable[0])
         length = float(np.linalg.norm(forces[first]))
-        up, _, covariance, residual = self._state
+        up, _, covariance, residual, _ = self._state
         up[:], residual[:] = forces[first] / length, 0.0
         covariance[:3, 3:] = covariance[3:, :3] = 0.0
         covariance[:3, :3] = _direction_variance(length, self._noise.acceleration) * np.eye(3)
@@ -194,8 +210,12 @@ def _correct(state: _State, noise: _Noise, force: Array, dt: float) -> None:
     (d, e) = K (f / |f| - u)        P <- P - K H P
     u <- Exp(d) u        b <- b + e
     """
-    up, bias, P, residual = state
+    up, bias, P, residual, at_rest = state
     length = norm(force)
+    at_rest[1] += _LENGTH_GROWTH * dt
+    gain = at_rest[1] / (at_rest[1] + _LENGTH_NOISE**2 * max(_CORRELATION_TIME / dt, 1.0))
+    at_rest[0] += gain * (dot(up, force) - at_rest[0])
+    at_rest[1] *= 1.0 - gain
     # Samples closer than the correlation time share one measurement's weight.
     variance = (_direction_variance(length, noise.acceleration)
                 * max(_CORRELATION_TIME / dt, 1.0))
@@ -300,9 +320,10 @@ def agreed_gravity(own: GravityEstimate | None,
     """
     if own is None:
         return measured
-    own = GravityEstimate(own.direction, max(own.sigma, _LEAST_OWN_SIGMA))
+    own = replace(own, sigma=max(own.sigma, _LEAST_OWN_SIGMA))
     if measured is None:
         return own
+    own = replace(own, length=measured.length, length_sigma=measured.length_sigma)
     apart = math.atan2(float(np.linalg.norm(np.cross(own.direction, measured.direction))),
                        float(own.direction @ measured.direction))
     return own if apart <= _OWN_GATE * math.hypot(own.sigma, measured.sigma) else measured

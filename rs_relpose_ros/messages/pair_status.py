@@ -47,6 +47,10 @@ PAIR_VALUES = (
     *(_figure(figure) for figure in PAIR_FIGURES),
     PairValue('baseline_m', lambda pair: number(pair.pose.baseline)),
     PairValue('baseline_log_sigma', lambda pair: number(pair.pose.baseline_log_sigma)),
+    PairValue('baseline_reason', lambda pair: pair.pose.baseline_reason),
+    # Of the current camera in its own frame.
+    PairValue('linear_velocity_m_s', lambda pair: numbers(
+        pair.pose.metric_velocity2 if math.isfinite(pair.pose.baseline) else None)),
     # Instants of the two stamped rows on the IMU's clock.
     PairValue('reference_imu_ns', lambda pair: str(pair.reference_ns1)),
     PairValue('current_imu_ns', lambda pair: str(pair.reference_ns2)),

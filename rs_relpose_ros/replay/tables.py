@@ -22,7 +22,8 @@ Array = NDArray[np.float64]
 
 RELATIVE_POSE_COLUMNS = (
     'reference_stamp_ns', 'stamp_ns', 'tx', 'ty', 'tz', 'qx', 'qy', 'qz', 'qw', 'sigma_t1',
-    'sigma_t2', 'sigma_rx', 'sigma_ry', 'sigma_rz', 'inliers', 'matches', 'model', 'status')
+    'sigma_t2', 'sigma_rx', 'sigma_ry', 'sigma_rz', 'inliers', 'matches', 'model', 'status',
+    'baseline_m', 'baseline_log_sigma')
 
 ERROR_COLUMNS = (
     'reference_stamp_ns', 'stamp_ns', 'interval_s', 'baseline_m', 'rotation_deg',
@@ -100,7 +101,7 @@ def relative_pose_cells(record: PairRecord) -> list[str]:
     pose, matches = record.pose, str(record.figures['matches'])
     stamps = [str(record.reference_stamp_ns), str(record.stamp_ns)]
     if not pose.rotation_known:
-        return [*stamps, *[''] * 13, matches, '', pose.status.value]
+        return [*stamps, *[''] * 13, matches, '', pose.status.value, '', '']
     # As it is published: of the whole, or of the rotation alone.
     covariance, known = np.full((6, 6), math.nan), slice(0 if pose else 3, 6)
     published = published_covariance(pose.covariance[known, known])
@@ -108,7 +109,7 @@ def relative_pose_cells(record: PairRecord) -> list[str]:
     figures = [*pose.t, *quat_xyzw(pose.R), *translation_sigmas(covariance),
                *rotation_sigmas(covariance)]
     return [*stamps, *map(number, figures), str(record.figures['inliers']), matches, pose.model,
-            pose.status.value]
+            pose.status.value, number(pose.baseline), number(pose.baseline_log_sigma)]
 
 
 def error_cells(record: PairRecord) -> list[str]:
