@@ -28,12 +28,13 @@ def compile_kernels(folder: str) -> None:
     paths = [path for path in os.environ.get('PYTHONPATH', '').split(os.pathsep)
              if path and not (Path(path) / 'sitecustomize.py').exists()]
     environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(paths)}
-    filled = subprocess.run([sys.executable, '-m', f'{NAME}.front_end.warm_up'], cwd=folder,
-                            env=environment, stderr=subprocess.PIPE, text=True, check=False)
-    if filled.returncode:
-        reason = (filled.stderr.splitlines() or ['no reason given'])[-1]
-        logging.getLogger(NAME).warning(
-            'kernels will be compiled by the first start of the node: %s', reason)
+    for module in ('front_end', 'global_shutter'):
+        filled = subprocess.run([sys.executable, '-m', f'{NAME}.{module}.warm_up'], cwd=folder,
+                                env=environment, stderr=subprocess.PIPE, text=True, check=False)
+        if filled.returncode:
+            reason = (filled.stderr.splitlines() or ['no reason given'])[-1]
+            logging.getLogger(NAME).warning(
+                'kernels will be compiled by the first start of the node: %s', reason)
 
 
 class BuildWithKernels(build_py):
@@ -80,6 +81,7 @@ setup(
     entry_points={
         'console_scripts': [
             'relpose_node = rs_relpose_ros.node.start:main',
+            'global_shutter_node = rs_relpose_ros.global_shutter.start:main',
             'rs_relpose = rs_relpose_ros.cli.main:main',
         ],
     },

@@ -39,14 +39,14 @@ def front_end_with(error: Exception, monkeypatch: pytest.MonkeyPatch, *,
                    offline: bool) -> FrontEnd:
     """Three frames are ready, and the tracking of the second one fails."""
     front_end = FrontEnd(Parameters.from_mapping(SENSOR), offline=offline)
-    process = front_end._pipeline.process
+    process = front_end._processor.process
 
     def failing(frame: Frame, *others: Any) -> PairResult | None:
         if frame.stamp_ns == 100 * MS:
             raise error
         return process(frame, *others)
 
-    monkeypatch.setattr(front_end._pipeline, 'process', failing)
+    monkeypatch.setattr(front_end._processor, 'process', failing)
     for ms in range(0, 300, 5):
         front_end.sequencer.add_imu(ImuSample(ms * MS, (0.0, 0.1, 0.0), (0.0, -9.81, 0.0)))
     rng = np.random.default_rng(0)
@@ -177,8 +177,8 @@ def pairs_of_run(recorded: list[Any], parameters: Parameters,
     pairs = 0
     for outcome in outcomes(recorded, front_end):
         assert isinstance(outcome, FrameProcessed)
-        if outcome.pair is not None:
-            yield figures(outcome.pair)
+        if outcome.result is not None:
+            yield figures(outcome.result)
             pairs += 1
             if pairs == CHANGE_AFTER:
                 front_end.parameters = changed
@@ -220,8 +220,8 @@ def test_poses_that_were_withheld_appear(recorded, parameters):
 
 def test_publishing_of_debug_images_can_be_switched_while_running(recorded, parameters):
     front_end = FrontEnd(parameters, offline=True, keep_images=True)
-    pair = next(o.pair for o in outcomes(recorded, front_end)
-                if isinstance(o, FrameProcessed) and o.pair is not None)
+    pair = next(o.result for o in outcomes(recorded, front_end)
+                if isinstance(o, FrameProcessed) and o.result is not None)
     publishers: defaultdict[str, Any] = defaultdict(MagicMock)
     publishers['~/debug_image'].get_subscription_count.return_value = 1
     node = MagicMock()

@@ -689,7 +689,7 @@ def test_live_and_replay_agree_while_figures_are_applied(bundled_bag):
         time.sleep(0.05)
     assert worker.stop(30.0)
     assert not any(isinstance(event, FrameFailed) for event in events)
-    live = [frame.pair for frame in processed() if frame.pair is not None]
+    live = [frame.result for frame in processed() if frame.result is not None]
     assert live[-1].applied.time_offset < -0.005
     assert live[-1].applied.readout_time > 0.001
     again, _ = replayed(bundled_bag, *settings, pairs=len(live), stamps=frozenset(

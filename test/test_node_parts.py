@@ -16,7 +16,8 @@ from rs_relpose_ros.front_end.sequencer import Refusal, SequencerCounts
 from rs_relpose_ros.health.findings import Finding, Health, HealthState
 from rs_relpose_ros.health.tracked import Applied, Tracked
 from rs_relpose_ros.node.cause_log import CauseLog
-from rs_relpose_ros.node.diagnostics import ERROR, Inputs, OK, Statistics, WARN
+from rs_relpose_ros.node.diagnostics import Statistics
+from rs_relpose_ros.node.frame_statistics import ERROR, Inputs, OK, WARN
 from rs_relpose_ros.node.health_log import HealthLog
 from rs_relpose_ros.tracking.matches import Matches
 

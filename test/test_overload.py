@@ -64,7 +64,7 @@ class HeldFrontEnd(FrontEnd):
 
     def __init__(self, parameters: Parameters, **options: Any) -> None:
         super().__init__(parameters, **options)
-        self._pipeline = HeldPipeline(parameters)
+        self._processor = HeldPipeline(parameters)
 
 
 @pytest.fixture
@@ -97,7 +97,7 @@ def test_the_oldest_frame_goes_and_the_latest_wait(held):
     def done() -> list[FrameProcessed]:
         return [event for event in events if isinstance(event, FrameProcessed)]
 
-    worker = Worker(front_end, events.append)
+    worker = Worker(front_end, lambda: None, events.append)
     worker.start()
     try:
         samples = 0
@@ -165,7 +165,7 @@ def test_a_busy_worker_costs_the_node_no_imu(held, module_ros_domain_id):
     try:
         spin_until(lambda: all(p.get_subscription_count() for p in publishers.values()),
                    'discovery')
-        sequencer = node._front_end.sequencer
+        sequencer = node._loop.sequencer
         publishers[CameraInfo].publish(build.camera_info(
             build.rclpy_types, width=WIDTH, height=HEIGHT,
             k=(60.0, 0.0, 32.0, 0.0, 60.0, 24.0, 0.0, 0.0, 1.0)))

@@ -133,12 +133,13 @@ MAY_IMPORT = {
     'front_end': CORE | {'health'},
     'messages': CORE | {'front_end', 'health'},
     'bags': {'geometry'},
-    'node': BASE | {'front_end', 'health', 'messages'},
+    'node': BASE | {'images', 'front_end', 'health', 'messages'},
+    'global_shutter': BASE | {'images', 'imu', 'health', 'front_end', 'messages', 'bags', 'node'},
     'replay': CORE | {'front_end', 'health', 'messages', 'bags'},
     'calibrate': CORE | {'messages', 'bags'},
     'check': CORE | {'front_end', 'health', 'messages', 'bags', 'calibrate'},
     'convert': BASE | {'images', 'imu', 'messages', 'bags'},
-    'cli': BASE | {'bags', 'replay', 'calibrate', 'check', 'convert'},
+    'cli': BASE | {'bags', 'replay', 'calibrate', 'check', 'convert', 'global_shutter'},
 }
 # The laboratory uses all of the product, and nothing of the product imports it.
 MAY_IMPORT_IN_THE_LABORATORY = {
@@ -196,7 +197,8 @@ def test_core_imports_neither_ros_nor_rosbags():
 
 
 @pytest.mark.parametrize(('library', 'folders'), [
-    (ROS, {f'{NAME}/node', f'{LABORATORY}/live'}), (re.compile('rosbags$'), {f'{NAME}/bags'})])
+    (ROS, {f'{NAME}/node', f'{NAME}/global_shutter', f'{LABORATORY}/live'}),
+    (re.compile('rosbags$'), {f'{NAME}/bags'})])
 def test_library_is_imported_in_its_folders_only(library, folders):
     users = {path for path in MODULES.values()
              if any(library.match(name.partition('.')[0]) for name in imports(path))}

@@ -38,8 +38,8 @@ with open_bag(sys.argv[1]) as bag:
     for role, item in intake.feed.messages(bag, topics):
         intake.receive(role, item.message)
         while isinstance(outcome := front_end.step(), FrameProcessed):
-            if outcome.pair is not None:
-                statuses.add(outcome.pair.pose.status.value)
+            if outcome.result is not None:
+                statuses.add(outcome.result.pose.status.value)
 after = kernels()
 print(json.dumps([sorted(statuses), [k for k in after if after[k] != before[k]],
                   sum(before.values())]))

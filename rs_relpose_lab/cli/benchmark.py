@@ -344,6 +344,43 @@ def _run_trust(args: argparse.Namespace) -> int:
     return _tell(report, args.output)
 
 
+def _global_shutter_arguments(parser: argparse.ArgumentParser) -> None:
+    _number(parser, '--walks', 6, 'walks of 2 s on which the map is compared with the truth')
+    _number(parser, '--bags', 6, "rendered bags for OpenCV's 5-point")
+    parser.add_argument('--recording', nargs=3, type=Path, action='append', default=[],
+                        metavar=('BAG', 'PARAMETERS', 'PAIRS'),
+                        help='a recording, its parameter file and a table of true pairs '
+                        '(pseudo_truth.csv); may be given several times')
+
+
+def _run_global_shutter(args: argparse.Namespace) -> int:
+    from rs_relpose_lab.experiments.global_shutter import frame_times, SIZES, write_report
+    from rs_relpose_lab.experiments.unrolled_map import map_cases, map_errors
+    from rs_relpose_lab.experiments.unrolled_poses import (
+        bag_configurations,
+        five_point_on_bag,
+        five_point_on_recording,
+    )
+
+    _check_at_least(0, args, 'walks', 'bags')
+    args.output.mkdir(parents=True, exist_ok=True)
+    speeds = [frame_times(*size) for size in SIZES]
+    cases = map_cases(args.walks, args.seed)
+    configs = bag_configurations(args.bags, args.seed)
+    with progress_bar(len(cases) + len(configs) + len(args.recording), 'recording') as bar:
+        maps, bags = [], []
+        for case in cases:
+            maps.append(map_errors(*case))
+            bar.update()
+        for bag, parameters, pairs in args.recording:
+            bags += five_point_on_recording(bag, parameters, pairs, args.output)
+            bar.update()
+        for config in configs:
+            bags.append(five_point_on_bag(config, args.output / f'seed_{config.seed}'))
+            bar.update()
+    return _tell(write_report(args.output, maps, bags, speeds), args.output)
+
+
 def _stretches_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('bags', nargs='+', type=Path, metavar='BAG',
                         help='recordings of one camera with one IMU')
@@ -415,6 +452,13 @@ BENCHMARKS = {
         '(NEES by degrees of freedom: 1 where it is right), over the pairs of rendered bags of '
         'walks, and over the true pairs of recordings, short and long ones.',
         _consistency_arguments, _run_consistency, 'consistency', first_seed=401, seed_of='bag'),
+    'global-shutter': Benchmark(
+        "images turned to their middle row: against the truth, and OpenCV's 5-point on them",
+        'Where the map of `rs_relpose unroll` takes pixels from, against a renderer that shares '
+        "no code with it, over swings and walks; errors of OpenCV's 5-point on rendered bags and "
+        'on recordings, as they were read and turned; processor time of a frame.',
+        _global_shutter_arguments, _run_global_shutter, 'global_shutter', first_seed=8101,
+        seed_of='recording'),
     'calibration': Benchmark(
         '`rs_relpose calibrate` on simulated tracks, against the truth',
         'Errors, sigmas and verdicts of the calibration over many simulated recordings of 300 '

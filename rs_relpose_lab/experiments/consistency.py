@@ -130,17 +130,17 @@ def read_true_pairs(path: Path) -> list[TruePair]:
 
 def on_recording(path: Path, parameter_file: Path, truth: Path) -> Iterator[PairConsistency]:
     """The true pairs of a recording, each from a replay of its own frames alone."""
-    parameters, stamps = read_parameters(parameter_file), _image_stamps(path)
+    parameters, stamps = read_parameters(parameter_file), image_stamps(path)
     for true in read_true_pairs(truth):
         frames = frozenset(s for s in stamps if true.stamp1_ns <= s <= true.stamp2_ns)
-        result = _pair_of(path, parameters, frames)
+        result = pair_of(path, parameters, frames)
         if result is not None and result.pose and (
                 result.reference_stamp_ns, result.stamp_ns) == true[:2]:
             yield pair_consistency(path.name, path.name, result.interval, result.pose, true.R,
                                    true.t, true.translation_sigma)
 
 
-def _image_stamps(path: Path) -> list[int]:
+def image_stamps(path: Path) -> list[int]:
     """Stamps of all images of a bag [ns]."""
     images: list[PublishedImage] = []
     feed = SensorFeed({Role.IMAGE: images.append})
@@ -150,7 +150,7 @@ def _image_stamps(path: Path) -> list[int]:
     return [image.stamp_ns for image in images]
 
 
-def _pair_of(path: Path, parameters: Parameters, stamps: frozenset[int]) -> PairResult | None:
+def pair_of(path: Path, parameters: Parameters, stamps: frozenset[int]) -> PairResult | None:
     """The pair of the first and the last of some frames; None where tracks or gyro are lost."""
     keyframes = replace(parameters.keyframes, min_keyframe_parallax=1000.0,
                         max_keyframe_interval=60.0, min_tracked_fraction=0.0,

@@ -211,8 +211,8 @@ def run(recording: Recording, told: Told, until: float = math.inf,
 
 def _closed(front_end: FrontEnd) -> Iterator[tuple[PairResult, float]]:
     while (outcome := front_end.step()) is not None:
-        if isinstance(outcome, FrameProcessed) and outcome.pair is not None:
-            yield outcome.pair, outcome.seconds
+        if isinstance(outcome, FrameProcessed) and outcome.result is not None:
+            yield outcome.result, outcome.seconds
 
 
 def judged(recording: Recording, pair: PairResult, seconds: float) -> JudgedPair:

@@ -8,7 +8,8 @@ import functools
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rosbags.interfaces import Connection, ConnectionExtRosbag2, QosReliability
+from rosbags.convert.converter import LATCH
+from rosbags.interfaces import Connection, ConnectionExtRosbag2, Qos, QosReliability
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.typesys import get_typestore, Stores
@@ -40,6 +41,15 @@ class RawMessage(NamedTuple):
     msgtype: str
     bag_time_ns: int
     data: bytes
+
+
+class TopicOrigin(NamedTuple):
+    """What a bag tells of a topic besides its name and type; empty where it tells nothing."""
+
+    definition: str   # of the message type
+    type_hash: str
+    serialization: str
+    qos: tuple[Qos, ...]   # as its publishers offered
 
 
 @functools.cache
@@ -95,6 +105,20 @@ class Bag:
             return 'best effort'
         return 'reliable' if QosReliability.RELIABLE in offered else ''
 
+    def origin(self, topic: Topic) -> TopicOrigin:
+        """What is to be written along where a topic of this bag is copied, as of ROS 2."""
+        connection = next(c for c in self._reader.connections
+                          if (c.topic, c.msgtype) == (topic.name, topic.msgtype))
+        if not isinstance(connection.ext, ConnectionExtRosbag2):
+            return TopicOrigin('', '', 'cdr', tuple(LATCH) if connection.ext.latching else ())
+        return TopicOrigin(connection.msgdef.data, connection.digest,
+                           connection.ext.serialization_format,
+                           tuple(connection.ext.offered_qos_profiles))
+
+    def can_be_copied(self, topic: Topic) -> bool:
+        """Whether `raw_messages` can read it: from ROS 1 what ROS 2 has, too."""
+        return self._is_ros2 or topic.msgtype in _types(of_ros2=True).fielddefs
+
     def find_topics(self, options: TopicOptions | None = None, *,
                     needs_camera_info: bool = True) -> SensorTopics:
         """The sensors' topics; see `TopicFinder.find`."""
@@ -129,6 +153,14 @@ class Bag:
                 with self._decoding(connection):
                     data = bytes(typestore.ros1_to_cdr(data, connection.msgtype))
             yield RawMessage(connection.topic, connection.msgtype, bag_time_ns, data)
+
+    def read(self, raw: RawMessage) -> Any:
+        """The message of ROS 2 that `raw_messages` gave; InputError where it is none."""
+        connection = next(c for c in self._reader.connections
+                          if (c.topic, c.msgtype) == (raw.topic, raw.msgtype))
+        self._check_type(connection)
+        with self._decoding(connection):
+            return _types(of_ros2=True).deserialize_cdr(raw.data, raw.msgtype)
 
     def _raw(self, topics: Sequence[Topic]) -> Iterator[tuple[Connection, int, bytes]]:
         chosen = {(topic.name, topic.msgtype) for topic in topics}

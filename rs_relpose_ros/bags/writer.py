@@ -13,9 +13,14 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 
+from rs_relpose_ros.bags.reader import RawMessage, TopicOrigin
+from rs_relpose_ros.bags.topics import Topic
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.timing import NANOSECONDS
+
+# Where a bag tells no hash of a type that is not known here: players go by its name.
+_UNKNOWN_HASH = f'RIHS01_{64 * "0"}'
 
 
 class BagWriter:
@@ -32,6 +37,7 @@ class BagWriter:
         self._typestore = get_typestore(Stores.ROS2_JAZZY)
         self._writer = Writer(self.path, version=9, storage_plugin=StoragePlugin.MCAP)
         self._connections: dict[str, Connection] = {}
+        self._copied: dict[tuple[str, str], Connection] = {}
 
     def __enter__(self) -> Self:
         # Asked again: the path may have come into being since.
@@ -81,6 +87,22 @@ class BagWriter:
                              f'it cannot carry {msgtype} as well')
         self._writer.write(
             connection, bag_time_ns, self._typestore.serialize_cdr(message, msgtype))
+
+    def announce(self, topic: Topic, origin: TopicOrigin) -> None:
+        """Announce a topic whose messages are copied, or written anew at the same quality."""
+        known = topic.msgtype in self._typestore.fielddefs
+        definition = {} if known and not origin.definition else {
+            'msgdef': origin.definition, 'rihs01': origin.type_hash or _UNKNOWN_HASH}
+        connection = self._writer.add_connection(
+            topic.name, topic.msgtype, typestore=self._typestore,
+            serialization_format=origin.serialization, offered_qos_profiles=origin.qos,
+            **definition)
+        self._copied[topic.name, topic.msgtype] = connection
+        self._connections.setdefault(topic.name, connection)
+
+    def copy(self, raw: RawMessage) -> None:
+        """Append a message of an announced topic as it is."""
+        self._writer.write(self._copied[raw.topic, raw.msgtype], raw.bag_time_ns, raw.data)
 
     # -- messages from plain data ------------------------------------------------------------
 

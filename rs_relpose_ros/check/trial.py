@@ -102,8 +102,8 @@ class Trial:
                 self.reasons.add(str(outcome.error))
             else:
                 self.frames += 1
-                if outcome.pair is not None:
-                    self._take_pair(outcome.pair)
+                if outcome.result is not None:
+                    self._take_pair(outcome.result)
 
     def _take_pair(self, pair: PairResult) -> None:
         self.matches.append(len(pair.matches))

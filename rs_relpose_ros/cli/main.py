@@ -32,6 +32,8 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
                  'run the experiments of the paper: tables and box plots'),
     'replay': ('rs_relpose_ros.cli.replay',
                'estimate relative poses from a bag: CSV, summary and pictures'),
+    'unroll': ('rs_relpose_ros.cli.unroll',
+               'turn the images of a bag as if they came from a global shutter'),
     'simulate': ('rs_relpose_lab.cli.simulate',
                  'render rolling-shutter images and IMU of a known motion into a bag'),
 }

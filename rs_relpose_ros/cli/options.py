@@ -10,6 +10,8 @@ import sys
 from tqdm import tqdm
 
 from rs_relpose_ros.bags.topics import TopicOptions
+from rs_relpose_ros.config.parameters import Parameters
+from rs_relpose_ros.errors import MissingInputError
 
 # Role of a topic -> what it holds.
 _ROLES = {
@@ -48,6 +50,23 @@ def topic_options(args: argparse.Namespace) -> TopicOptions:
     """Topics that `add_topic_arguments` declared, as given."""
     return TopicOptions(**{name.removesuffix('_topic'): value for name, value in vars(args).items()
                            if name.endswith('_topic')})
+
+
+def need_sensor_parameters(parameters: Parameters, args: argparse.Namespace) -> None:
+    """Raise MissingInputError where one is missing that no message tells, and say how to give it.
+
+    `args` have `bag` and what `add_parameter_arguments` declares.
+    """
+    missing = parameters.sensor.missing()
+    if not missing:
+        return
+    beside = args.bag.resolve().with_name(f'{bag_name(args.bag)}.yaml')
+    if args.params is None and beside.is_file():
+        raise MissingInputError(f'parameter {" and ".join(missing)} must be given; use '
+                                f'--params {beside}, which lies beside the bag')
+    raise MissingInputError(
+        f'parameter {" and ".join(missing)} must be given, by --params FILE or --set '
+        f'{missing[0]}=...: see config/relpose.yaml')
 
 
 def bag_name(bag: Path) -> str:

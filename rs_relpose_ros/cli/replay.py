@@ -14,12 +14,12 @@ from rs_relpose_ros.cli.options import (
     add_parameter_arguments,
     add_topic_arguments,
     bag_name,
+    need_sensor_parameters,
     package_version,
     progress_bar,
     topic_options,
 )
 from rs_relpose_ros.config.parameter_file import read_parameters
-from rs_relpose_ros.errors import MissingInputError
 from rs_relpose_ros.replay.outputs import replay_into, ReplayOutcome, SUMMARY_FILE
 from rs_relpose_ros.replay.run import read_stamps
 from rs_relpose_ros.replay.summary import write_summary
@@ -64,11 +64,7 @@ def run(args: argparse.Namespace) -> int:
     with open_bag(args.bag) as bag:
         topics = bag.find_topics(topic_options(args),
                                  needs_camera_info=not parameters.intrinsics.given)
-        missing = parameters.sensor.missing()
-        beside = args.bag.resolve().with_name(f'{name}.yaml')
-        if missing and args.params is None and beside.is_file():
-            raise MissingInputError(f'parameter {" and ".join(missing)} must be given; use '
-                                    f'--params {beside}, which lies beside the bag')
+        need_sensor_parameters(parameters, args)
         with progress_bar(topics.image.count, 'image', name) as bar:
             outcome = replay_into(folder, bag, topics, parameters, stamps=stamps,
                                   pictures=not args.no_pictures, with_bag=args.with_bag,

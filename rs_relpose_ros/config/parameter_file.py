@@ -34,15 +34,16 @@ class SourcedValue:
     source: str
 
 
-def read_parameters(path: Path | str | None, assignments: Sequence[str] = ()) -> Parameters:
+def read_parameters(path: Path | str | None, assignments: Sequence[str] = (),
+                    node: str = _NODE) -> Parameters:
     """Parameters at their defaults, then from a file, then from ``NAME=VALUE`` assignments.
 
-    The file is as ``ros2 run --params-file`` takes it, the values of assignments are in YAML, such
-    as ``gyro_bias=[0.01, 0, 0]``.
+    The file is as ``ros2 run --params-file`` takes it for `node`, the values of assignments are in
+    YAML, such as ``gyro_bias=[0.01, 0, 0]``.
     """
     parameters = Parameters()
     if path is not None:
-        values = _values(Path(path))
+        values = _values(Path(path), node)
         try:
             parameters = parameters.updated(_converted(values))
         except InputError as error:
@@ -98,8 +99,8 @@ def yaml_text(value: Any) -> str:
     return text.replace('e', '.0e') if 'e' in text and '.' not in text else text
 
 
-def _values(path: Path) -> dict[str, Any]:
-    """Flat values of a parameter file that are meant for the node."""
+def _values(path: Path, wanted: str) -> dict[str, Any]:
+    """Flat values of a parameter file that are meant for the node `wanted`."""
     if not path.is_file():
         raise MissingInputError(f'there is no parameter file {path}')
     if path.stat().st_size > _MAX_BYTES:
@@ -117,7 +118,7 @@ def _values(path: Path) -> dict[str, Any]:
                          '"ros__parameters:"')
     values: dict[str, Any] = {}
     for node in document:
-        if node in ('/**', _NODE) or str(node).endswith(f'/{_NODE}'):
+        if node in ('/**', wanted) or str(node).endswith(f'/{wanted}'):
             section = document[node]
             inner = section.get('ros__parameters') if isinstance(section, dict) else None
             if not isinstance(inner, dict):
@@ -126,8 +127,8 @@ def _values(path: Path) -> dict[str, Any]:
             values |= {str(name): value for name, value in inner.items()
                        if name not in _ROS_OWN and not str(name).startswith('qos_overrides')}
     if not values:
-        raise InputError(f'{path} has no parameters for {_NODE}: they must stand below "/**:" or '
-                         f'"{_NODE}:" and "ros__parameters:"')
+        raise InputError(f'{path} has no parameters for {wanted}: they must stand below "/**:" '
+                         f'or "{wanted}:" and "ros__parameters:"')
     return values
 
 

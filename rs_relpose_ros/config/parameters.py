@@ -1,4 +1,4 @@
-"""Every parameter of the node and of the replay, flat by name, from the declared settings."""
+"""Every parameter of the nodes and of the replay, flat by name, from the declared settings."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.config.declarations import check_settings, Declared, declared, setting
 from rs_relpose_ros.config.estimator import EstimatorConfig
+from rs_relpose_ros.config.global_shutter import GlobalShutterConfig
 from rs_relpose_ros.config.imu import ImuConfig
 from rs_relpose_ros.config.intrinsics import IntrinsicsConfig
 from rs_relpose_ros.config.keyframes import KeyframeConfig
@@ -131,6 +132,7 @@ class Parameters:
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     imu: ImuConfig = field(default_factory=ImuConfig)
     estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
+    global_shutter: GlobalShutterConfig = field(default_factory=GlobalShutterConfig)
 
     @staticmethod
     def declarations() -> Iterator[tuple[str, Any, Declared]]:

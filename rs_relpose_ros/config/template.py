@@ -13,7 +13,8 @@ from rs_relpose_ros.config.parameter_file import comment, yaml_text
 from rs_relpose_ros.config.parameters import Parameters
 
 _HEAD = """\
-# Parameters of relpose_node and of `rs_relpose replay --params`, each at its default.
+# Parameters of relpose_node, global_shutter_node and `--params` of the commands, each at its
+# default.
 # Written by `python -m rs_relpose_ros.config.template config/relpose.yaml`; copy it and
 # change the copy. Those without a value have no default: the node says when it needs one.
 # [live] can be changed while the node runs (`ros2 param set`).

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,29 @@ from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.images.encoded import EncodedImage
+
+
+class Waiting(Protocol):
+    """What the sequencer needs of a frame while it waits for its IMU."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """Of the header."""
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Those in force."""
+
+
+Decoded = TypeVar('Decoded', bound=Waiting)
+DecodedCo = TypeVar('DecodedCo', bound=Waiting, covariant=True)
+
+
+class Decodable(Waiting, Protocol[DecodedCo]):
+    """A frame that is decoded only when its turn has come."""
+
+    def decoded(self) -> DecodedCo:
+        """The frame with its image; raises InputError where it cannot be decoded."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,12 +51,7 @@ class Frame:
         if self.image.dtype != np.uint8 or self.image.ndim != 2:
             raise InputError('image must be (H, W) of uint8, '
                              f'got {self.image.shape} of {self.image.dtype}')
-        expected = (self.intrinsics.image_height, self.intrinsics.image_width)
-        if self.image.shape != expected:
-            raise InputError(
-                f'image is {self.image.shape[1]}x{self.image.shape[0]}, but its CameraInfo tells '
-                f'{expected[1]}x{expected[0]}: publish a CameraInfo of the same size (region of '
-                'interest and binning included)')
+        check_size(self.image, self.intrinsics)
 
     def decoded(self) -> Frame:
         """This frame; as in `EncodedFrame`."""
@@ -51,6 +70,16 @@ class EncodedFrame:
     def decoded(self) -> Frame:
         """The frame with its image; raises InputError where it cannot be decoded."""
         return Frame(self.stamp_ns, self.image.decoded(), self.frame_id, self.intrinsics)
+
+
+def check_size(image: NDArray[Any], intrinsics: Intrinsics) -> None:
+    """Raise InputError where an image (H, W, ...) is not of the size that the intrinsics tell."""
+    height, width = image.shape[:2]
+    expected = intrinsics.image_height, intrinsics.image_width
+    if (height, width) != expected:
+        raise InputError(
+            f'image is {width}x{height}, but its CameraInfo tells {expected[1]}x{expected[0]}: '
+            'publish a CameraInfo of the same size (region of interest and binning included)')
 
 
 def sensor_camera(intrinsics: Intrinsics, parameters: Parameters) -> RollingShutterCamera:

@@ -13,10 +13,11 @@ from dataclasses import dataclass, fields, replace
 from enum import Enum
 import threading
 import time
+from typing import Generic
 
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.front_end.frame import EncodedFrame, Frame, sensor_camera
+from rs_relpose_ros.front_end.frame import Decodable, Decoded, sensor_camera
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.geometry.timing import (
     FrameIntervals,
@@ -66,10 +67,10 @@ class Refusal(str, Enum):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ReadyFrame:
+class ReadyFrame(Generic[Decoded]):
     """A decoded frame with its IMU; both instants are on the monotonic clock, 0 offline."""
 
-    frame: Frame
+    frame: Decoded
     imu: FrameImu
     restart: bool   # time jumped since the frame before: tracks belong to another time
     ready_ns: int   # arrival of the image or of the IMU sample behind its last row: the later
@@ -100,10 +101,10 @@ class SequencerCounts:
 
 
 @dataclass(slots=True, eq=False)
-class _Waiting:
+class _Waiting(Generic[Decoded]):
     """A frame that waits for the IMU or for the worker."""
 
-    frame: Frame | EncodedFrame
+    frame: Decodable[Decoded]
     start_ns: int   # first, last and stamped row on the IMU clock, without a tracked offset
     end_ns: int
     reference_ns: int
@@ -132,7 +133,7 @@ class _StepsBack:
         return True
 
 
-class Sequencer:
+class Sequencer(Generic[Decoded]):
     """Thread-safe meeting point of frames and IMU samples; its states: ``docs/architecture.md``.
 
     Offline every frame is kept until the IMU covers it or the input is closed. Take what is ready
@@ -154,7 +155,7 @@ class Sequencer:
         self._closed = False
         self._buffer = ImuBuffer(parameters.imu)
         self._samples_back = _StepsBack(_BACK_SAMPLES)
-        self._waiting: deque[_Waiting] = deque()
+        self._waiting: deque[_Waiting[Decoded]] = deque()
         self._refusals: deque[FrameRefused] = deque(maxlen=None if offline else _REFUSALS_KEPT)
         self._frames_back = _StepsBack(_BACK_FRAMES)
         self._intrinsics: Intrinsics | None = None
@@ -192,7 +193,7 @@ class Sequencer:
                 self._count['imu_gaps'] += stamp_ns - before_ns > self._max_gap_ns
             self._sort_out()
 
-    def add_frame(self, frame: Frame | EncodedFrame) -> None:
+    def add_frame(self, frame: Decodable[Decoded]) -> None:
         """Take a frame into the mailbox, or refuse it for its stamp."""
         with self._changed:
             self._count['frames'] += 1
@@ -247,7 +248,7 @@ class Sequencer:
         with self._changed:
             self._offset_ns, self._margin_ns = applied.time_offset_ns, applied.margin_ns
 
-    def take(self, timeout: float = 0.0) -> ReadyFrame | FrameRefused | None:
+    def take(self, timeout: float = 0.0) -> ReadyFrame[Decoded] | FrameRefused | None:
         """The next frame in the order of stamps, or a refusal, or None after `timeout` seconds.
 
         The image is decoded outside of the lock.
@@ -283,7 +284,7 @@ class Sequencer:
 
     # -- waiting (all below are called under the lock, but for `_await_head`) ------------------
 
-    def _await_head(self, timeout: float) -> _Waiting | FrameRefused | None:
+    def _await_head(self, timeout: float) -> _Waiting[Decoded] | FrameRefused | None:
         """The oldest frame as soon as it is ready or refused; None after `timeout` seconds."""
         with self._changed:
             # Offline nothing comes while one waits.
@@ -296,7 +297,7 @@ class Sequencer:
                 until_ns = min(deadline_ns, self._overdue_ns()) if self._waiting else deadline_ns
                 self._changed.wait(max(until_ns - now_ns, 0) / NANOSECONDS)
 
-    def _decided_head(self) -> _Waiting | FrameRefused | None:
+    def _decided_head(self) -> _Waiting[Decoded] | FrameRefused | None:
         """The oldest refusal, or the oldest frame if it is ready or must be refused."""
         if self._refusals:
             return self._refusals.popleft()
@@ -362,7 +363,7 @@ class Sequencer:
             self._intrinsics = intrinsics
         return self._image_clock
 
-    def _span(self, waiting: _Waiting) -> tuple[int, int]:
+    def _span(self, waiting: _Waiting[Decoded]) -> tuple[int, int]:
         """Instants of its first and last row, with offset and read-out tracked by now."""
         return (waiting.start_ns + self._offset_ns - self._margin_ns,
                 waiting.end_ns + self._offset_ns + self._margin_ns)
@@ -376,10 +377,10 @@ class Sequencer:
         return (force_ns is None or force_ns >= end_ns
                 or gyro_ns - force_ns > _ACCELEROMETER_STALE_NS)
 
-    def _coverage(self, waiting: _Waiting) -> Coverage:
+    def _coverage(self, waiting: _Waiting[Decoded]) -> Coverage:
         return self._buffer.coverage(*self._span(waiting))
 
-    def _imu_of(self, taken: _Waiting) -> FrameImu:
+    def _imu_of(self, taken: _Waiting[Decoded]) -> FrameImu:
         """The IMU's share of a frame, with the turn since the frame that was taken before."""
         reference_ns = taken.reference_ns + self._offset_ns
         previous_ns = self._previous_reference_ns

@@ -15,6 +15,7 @@ from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.distortion.inverse import project_points, undistort_points
 from rs_relpose_ros.geometry.distortion.models import DISTORTION_MODELS, DistortionModel
 from rs_relpose_ros.geometry.rays import rays_with_jacobian
+from rs_relpose_ros.geometry.turning import project_turning
 
 REFERENCE_ROWS = ('first', 'middle', 'last')
 READOUT_DIRECTIONS = ('down', 'up')
@@ -147,6 +148,19 @@ class RollingShutterCamera:
         distort, _ = self._lens.addresses
         normalized = project_points(points, distort, self._lens.padded(self.distortion))
         return normalized * (self.fx, self.fy) + (self.cx, self.cy)
+
+    def project_turning(self, rays: NDArray[np.float64], rows: NDArray[np.float64],
+                        rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Raw pixels (N, 2) of rays (N, 3) seen while the camera turns; NaN where nowhere.
+
+        `rotations` (K, 3, 3) take from the frame of the rays to the camera's at K rows spread
+        evenly from the first to the last one; `rows` (N,) are first guesses. Each ray is seen by
+        the row that it is projected to.
+        """
+        distort, _ = self._lens.addresses
+        return project_turning(rays, rows, rotations, self.height,
+                               (self.fx, self.fy, self.cx, self.cy), distort,
+                               self._lens.padded(self.distortion))
 
     def unproject(self, points: ArrayLike) -> NDArray[np.float64]:
         """Unit rays (N, 3) in the camera frame of raw pixels (N, 2).

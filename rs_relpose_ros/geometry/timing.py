@@ -32,6 +32,11 @@ def to_nanoseconds(seconds: float) -> int:
     return round(seconds * NANOSECONDS)
 
 
+def exposure_shift(stamp_exposure: str, exposure_time: float) -> float:
+    """From the stamp to the middle of the stamped row's exposure [s]; of `STAMP_EXPOSURES`."""
+    return {'start': 0.5, 'middle': 0.0, 'end': -0.5}[stamp_exposure] * exposure_time
+
+
 @dataclass(frozen=True, slots=True)
 class ImageClock:
     """Where an image's rows lie on the IMU clock.
@@ -69,8 +74,7 @@ class ImageClock:
 
         `interval_ns`: T of the frame; None where it is not known, T_ref then.
         """
-        shift = {'start': 0.5, 'middle': 0.0, 'end': -0.5}[self.stamp_exposure]
-        offset = self.time_offset + shift * self.exposure_time
+        offset = self.time_offset + exposure_shift(self.stamp_exposure, self.exposure_time)
         if interval_ns is not None:
             offset += self.offset_per_interval * (
                 interval_ns / NANOSECONDS - self.reference_interval)

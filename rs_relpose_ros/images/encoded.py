@@ -1,4 +1,4 @@
-"""An image as it was published, and the gray image that it is decoded to.
+"""An image as it was published, and the gray or colour image that it is decoded to.
 
 Nothing of an image is trusted: sizes are checked before memory is taken, and whatever cannot be
 used raises `InputError` with one sentence.
@@ -7,13 +7,14 @@ used raises `InputError` with one sentence.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.images.headers import encoded_image_size
+from rs_relpose_ros.images.headers import encoded_image_size, is_png
 
 Bytes = NDArray[np.uint8]
 Gray = NDArray[np.uint8]
@@ -45,8 +46,19 @@ _PLANAR_YUV = ('nv21', 'nv12', 'nv24')
 # One byte a pixel, row by row, from the first byte on: the gray image itself.
 _GRAY = ('mono8', '8UC1', *_PLANAR_YUV)
 
+# Names of the pixels of a PNG or JPEG file, by their type and number of channels.
+_ENCODED = {('uint8', 1): 'mono8', ('uint8', 3): 'bgr8', ('uint8', 4): 'bgra8',
+            ('uint16', 1): 'mono16', ('uint16', 3): 'bgr16', ('uint16', 4): 'bgra16'}
+
 ENCODINGS = ('mono8', '8UC1', 'mono16', *_COLOR, *(f'{name}8' for name in _BAYER),
              *(f'{name}16' for name in _BAYER), *_PACKED_YUV, *_PLANAR_YUV)
+
+
+class Pixels(NamedTuple):
+    """An image (H, W) or (H, W, C), and what sensor_msgs/Image calls its encoding."""
+
+    values: NDArray[Any]
+    encoding: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,6 +97,18 @@ class RawImage:
         raise InputError(f'image encoding {encoding[:40]!r} is not known; '
                          f'publish one of {", ".join(ENCODINGS)}')
 
+    def pixels(self) -> Pixels:
+        """The image in its own encoding; in mono8 where that is Bayer or YUV."""
+        if self.encoding in _COLOR:
+            check_image_size(self.width, self.height)
+            channels, _ = _COLOR[self.encoding]
+            rows = np.ascontiguousarray(self._rows(self.width * channels))
+            return Pixels(rows.reshape(self.height, self.width, channels), self.encoding)
+        if self.encoding == 'mono16':
+            check_image_size(self.width, self.height)
+            return Pixels(self._two_bytes().astype(np.uint16), self.encoding)
+        return Pixels(self.decoded(), 'mono8')
+
     def _from_bayer(self) -> Gray:
         if self.height < 3 or self.width < 3:
             raise InputError(
@@ -96,9 +120,12 @@ class RawImage:
 
     def _high_bytes(self) -> Gray:
         """The upper byte of pixels of 16 bits."""
+        return (self._two_bytes() >> 8).astype(np.uint8)
+
+    def _two_bytes(self) -> NDArray[np.uint16]:
+        """Pixels of 16 bits, in the byte order of the message."""
         order = '>u2' if self.is_bigendian else '<u2'
-        pixels = np.ascontiguousarray(self._rows(2 * self.width)).view(order)
-        return (pixels >> 8).astype(np.uint8)
+        return np.ascontiguousarray(self._rows(2 * self.width)).view(order)
 
     def _rows(self, row_bytes: int) -> Bytes:
         """View (height, row_bytes) of the data, padding left out."""
@@ -127,20 +154,39 @@ class CompressedImage:
         """Width and height [px] as its header tells; not checked yet."""
         return encoded_image_size(self.data)
 
+    @property
+    def is_png(self) -> bool:
+        """Whether it is a PNG file, which loses nothing."""
+        return is_png(self.data)
+
     def decoded(self) -> Gray:
         """Gray image (H, W)."""
+        # Not turned upright: rows must stay in the order in which the sensor reads them.
+        image = self._decoded(cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+        return np.asarray(image, dtype=np.uint8)
+
+    def pixels(self) -> Pixels:
+        """The image in colour or gray, 8 or 16 bits, as it was encoded."""
+        # Nor is it turned upright here.
+        image = self._decoded(cv2.IMREAD_UNCHANGED)
+        channels = 1 if image.ndim == 2 else image.shape[2]
+        encoding = _ENCODED.get((image.dtype.name, channels))
+        if encoding is None:
+            raise InputError(f'compressed image has {channels} channels of {image.dtype.name}: '
+                             f'publish one of {", ".join(_ENCODED.values())}')
+        return Pixels(image, encoding)
+
+    def _decoded(self, flags: int) -> NDArray[Any]:
         width, height = self.size
         check_image_size(width, height)
-        # Not turned upright: rows must stay in the order in which the sensor reads them.
-        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
         try:
             image = cv2.imdecode(self.data, flags)
         except cv2.error:
             image = None
-        if image is None or image.shape != (height, width):
+        if image is None or image.shape[:2] != (height, width):
             raise InputError(
                 f'compressed image of {len(self.data)} bytes cannot be decoded: it is corrupt')
-        return np.asarray(image, dtype=np.uint8)
+        return np.asarray(image)
 
 
 EncodedImage = RawImage | CompressedImage

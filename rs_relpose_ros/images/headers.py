@@ -27,6 +27,11 @@ def encoded_image_size(data: NDArray[np.uint8]) -> tuple[int, int]:
     raise InputError(f'compressed image of {len(data)} bytes is neither JPEG nor PNG')
 
 
+def is_png(data: NDArray[np.uint8]) -> bool:
+    """Whether it begins as a PNG does."""
+    return data[:len(_PNG_SIGNATURE)].tobytes() == _PNG_SIGNATURE
+
+
 def _png_size(start: bytes, data: NDArray[np.uint8]) -> tuple[int, int]:
     if len(start) < 24 or start[12:16] != b'IHDR' or b'IEND' not in data[-_PADDING:].tobytes():
         raise InputError(f'PNG image of {len(data)} bytes is truncated or corrupt')

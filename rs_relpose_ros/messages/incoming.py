@@ -87,7 +87,7 @@ def intrinsics_from_info(msg: Any) -> Intrinsics:
 
     MissingInputError where it has none.
     """
-    k = [float(value) for value in _field(msg, 'k')]
+    k = [float(value) for value in info_field(msg, 'k')]
     if len(k) == 9 and k[0] == 0.0:
         raise MissingInputError(
             'the camera is uncalibrated (k[0] of its CameraInfo is 0): calibrate it and let its '
@@ -95,7 +95,7 @@ def intrinsics_from_info(msg: Any) -> Intrinsics:
     pinhole = pinhole_of_matrix('k of CameraInfo', k)
     width, height = int(msg.width), int(msg.height)
     check_image_size(width, height)
-    coefficients = _field(msg, 'd')
+    coefficients = info_field(msg, 'd')
     if len(coefficients) > 64:
         raise InputError(f'd of CameraInfo has {len(coefficients)} coefficients')
     # 0 in these fields means "not set": no binning, and the full sensor.
@@ -111,8 +111,8 @@ def intrinsics_from_info(msg: Any) -> Intrinsics:
         image_width=roi_width // binning_x, image_height=roi_height // binning_y)
 
 
-def _field(msg: Any, name: str) -> Any:
-    """A field that ROS 1 writes in capitals."""
+def info_field(msg: Any, name: str) -> Any:
+    """A field of a CameraInfo that ROS 1 writes in capitals."""
     return getattr(msg, name) if hasattr(msg, name) else getattr(msg, name.upper())
 
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 from rs_relpose_ros.config.intrinsics import IntrinsicsConfig
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
-from rs_relpose_ros.front_end.frame import EncodedFrame
+from rs_relpose_ros.front_end.frame import Decodable, EncodedFrame
 from rs_relpose_ros.front_end.sequencer import Refusal, Sequencer
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
+from rs_relpose_ros.images.encoded import EncodedImage
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.messages.hanging import HangingCamera, HangingGyro
 from rs_relpose_ros.messages.incoming import PublishedImage
@@ -24,17 +26,21 @@ class Intake:
 
     An image goes with the CameraInfo that came last, or, where that is uncalibrated or none came
     with the first images, with the intrinsics that are `told` by parameters. `stuck_gyro_time` [s]
-    is the parameter of that name; 0 believes every gyro. Not thread-safe: one thread feeds it.
+    is the parameter of that name; 0 believes every gyro. `frame` makes what the sequencer gets of
+    stamp [ns], image, frame_id and intrinsics. Not thread-safe: one thread feeds it.
     """
 
-    def __init__(self, sequencer: Sequencer, stuck_gyro_time: float = 0.0,
-                 told: IntrinsicsConfig | None = None) -> None:
+    def __init__(self, sequencer: Sequencer[Any], stuck_gyro_time: float = 0.0,
+                 told: IntrinsicsConfig | None = None,
+                 frame: Callable[[int, EncodedImage, str, Intrinsics], Decodable[Any]]
+                 = EncodedFrame) -> None:
         self.feed = SensorFeed({
             Role.IMU: self._add_imu, Role.ACCEL: sequencer.add_imu,
             Role.CAMERA_INFO: self._add_intrinsics, Role.IMAGE: self._add_image})
-        self._sequencer = sequencer
+        self._sequencer, self._frame = sequencer, frame
         # Those in force.
         self.intrinsics: Intrinsics | None = None
+        self._camera_info: Any = None
         self._told = told if told is not None and told.given else None
         # Whether images go with what is told.
         self._use_told = False
@@ -63,6 +69,12 @@ class Intake:
                 self._use_told = False
                 self.release_held()
             raise
+        if role is Role.CAMERA_INFO:
+            self._camera_info = message
+
+    def camera_info_of(self, intrinsics: Intrinsics) -> Any:
+        """The CameraInfo in force; None where it does not tell these intrinsics."""
+        return None if self._use_told or intrinsics != self.intrinsics else self._camera_info
 
     def release_held(self) -> None:
         """Let no image wait for a CameraInfo any longer."""
@@ -118,7 +130,7 @@ class Intake:
             self._sequencer.refuse(image.stamp_ns, Refusal.BAD_IMAGE, problem)
             return
         self._sequencer.add_frame(
-            EncodedFrame(image.stamp_ns, image.image, image.frame_id, intrinsics))
+            self._frame(image.stamp_ns, image.image, image.frame_id, intrinsics))
 
     def _refuse_without_intrinsics(self, image: PublishedImage) -> None:
         self._sequencer.refuse(

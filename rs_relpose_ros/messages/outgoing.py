@@ -9,16 +9,21 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+import sys
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.front_end.pair import PairResult
+from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.health.findings import HealthState
+from rs_relpose_ros.images.encoded import Pixels
+from rs_relpose_ros.messages.incoming import info_field
 from rs_relpose_ros.messages.pair_status import PAIR_VALUES, TOPICS_KEY
 
 MessageTypes = Callable[[str], Any]
@@ -43,6 +48,11 @@ PAIR_TOPICS = {
 }
 # Those of a pair with a pose only.
 POSE_TOPICS = ('relative_pose', 'reference', 'velocity', 'matches')
+
+# Of images that are turned; as image_transport's default.
+_JPEG_QUALITY = 95
+# Fields of sensor_msgs/RegionOfInterest with numbers.
+_REGION = ('x_offset', 'y_offset', 'height', 'width')
 
 # Least eigenvalue of a published covariance, as a share of the largest: that of a matrix of rank 5
 # is then not below 0 by rounding.
@@ -164,14 +174,57 @@ def pose_stamped_message(stamp_ns: int, frame_id: str, R: NDArray[np.float64],
         header=header(stamp_ns, frame_id, types), pose=_pose(R, position, types))
 
 
-def color_image_message(stamp_ns: int, frame_id: str, pixels: NDArray[np.uint8],
-                        types: MessageTypes) -> Any:
-    """sensor_msgs/Image, bgr8, of (H, W, 3) pixels."""
+def image_message(stamp_ns: int, frame_id: str, pixels: Pixels, types: MessageTypes) -> Any:
+    """sensor_msgs/Image."""
+    values = np.ascontiguousarray(pixels.values)
     message_type = types('sensor_msgs/msg/Image')
     return message_type(
-        header=header(stamp_ns, frame_id, types), height=pixels.shape[0], width=pixels.shape[1],
-        encoding='bgr8', is_bigendian=0, step=3 * pixels.shape[1],
-        data=_byte_data(pixels, message_type))
+        header=header(stamp_ns, frame_id, types), height=values.shape[0], width=values.shape[1],
+        encoding=pixels.encoding, is_bigendian=int(sys.byteorder == 'big'),
+        step=values[0].nbytes, data=_byte_data(values, message_type))
+
+
+def compressed_image_message(stamp_ns: int, frame_id: str, pixels: Pixels, *, png: bool,
+                             types: MessageTypes) -> Any:
+    """sensor_msgs/CompressedImage: a JPEG, or a PNG, which alone takes 16 bits."""
+    values, name = pixels
+    if name.startswith('rgb'):
+        values = cv2.cvtColor(values, cv2.COLOR_RGBA2BGRA if name == 'rgba8'
+                              else cv2.COLOR_RGB2BGR)
+    kind = 'png' if png or values.dtype != np.uint8 else 'jpeg'
+    _, data = cv2.imencode(f'.{kind}', values, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+                           if kind == 'jpeg' else [])
+    # As image_transport writes it.
+    text = f'{name}; {kind} compressed {"" if values.ndim == 2 else f"bgr{8 * values.itemsize}"}'
+    message_type = types('sensor_msgs/msg/CompressedImage')
+    return message_type(header=header(stamp_ns, frame_id, types), format=text,
+                        data=_byte_data(data, message_type))
+
+
+def camera_info_message(stamp_ns: int, frame_id: str, intrinsics: Intrinsics, published: Any,
+                        types: MessageTypes) -> Any:
+    """sensor_msgs/CameraInfo of intrinsics; all but the stamp as `published`, where that is given.
+
+    `published`: the CameraInfo that they are from, of ROS 1 or 2; None where parameters told them.
+    """
+    if published is None:
+        told = intrinsics.global_shutter_camera()
+        p = np.zeros((3, 4))
+        p[:, :3] = told.camera_matrix
+        arrays = {'d': intrinsics.distortion, 'k': told.camera_matrix.ravel(),
+                  'r': np.eye(3).ravel(), 'p': p.ravel()}
+        model, binning, region = intrinsics.distortion_model, (0, 0), dict.fromkeys(_REGION, 0)
+    else:
+        arrays = {name: info_field(published, name) for name in 'dkrp'}
+        model = published.distortion_model
+        binning = int(published.binning_x), int(published.binning_y)
+        region = {name: int(getattr(published.roi, name)) for name in _REGION}
+        region['do_rectify'] = bool(published.roi.do_rectify)
+    return types('sensor_msgs/msg/CameraInfo')(
+        header=header(stamp_ns, frame_id, types), height=intrinsics.height, width=intrinsics.width,
+        distortion_model=model, binning_x=binning[0], binning_y=binning[1],
+        roi=types('sensor_msgs/msg/RegionOfInterest')(**{'do_rectify': False, **region}),
+        **{name: np.array(values, dtype=np.float64) for name, values in arrays.items()})
 
 
 def inlier_records(result: PairResult) -> NDArray[np.void]:

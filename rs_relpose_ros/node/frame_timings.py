@@ -8,6 +8,7 @@ from typing import TextIO
 
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.front_end.front_end import FrameProcessed
+from rs_relpose_ros.front_end.pair import PairResult
 
 COLUMNS = ('stamp_ns', 'ready_ns', 'taken_ns', 'done_ns', 'cpu_ns', 'outcome')
 
@@ -37,10 +38,10 @@ class FrameTimings:
         """What the thread did until now belongs to no frame."""
         self._spent_ns = time.thread_time_ns()
 
-    def add(self, frame: FrameProcessed) -> None:
+    def add(self, frame: FrameProcessed[PairResult]) -> None:
         """Write a frame; call it right after its result was published."""
         done_ns, spent_ns = time.monotonic_ns(), time.thread_time_ns()
-        outcome = 'none' if frame.pair is None else frame.pair.pose.status.value
+        outcome = 'none' if frame.result is None else frame.result.pose.status.value
         self._file.write(f'{frame.stamp_ns},{frame.ready_ns},{frame.taken_ns},{done_ns},'
                          f'{spent_ns - self._spent_ns},{outcome}\n')
         self._spent_ns = spent_ns

@@ -16,7 +16,7 @@ from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.messages.intake import Intake
 from rs_relpose_ros.messages.sensor_feed import PARTS, Role
-from rs_relpose_ros.node.diagnostics import Inputs, SILENCE
+from rs_relpose_ros.node.frame_statistics import Inputs, SILENCE
 from rs_relpose_ros.node.message_types import message_class
 from rs_relpose_ros.node.polled import PolledSubscription, WhenChanged
 

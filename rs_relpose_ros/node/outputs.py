@@ -20,7 +20,8 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_ros.config.parameters import PairConfig
 from rs_relpose_ros.errors import MissingInputError
 from rs_relpose_ros.front_end.pair import PairResult
-from rs_relpose_ros.messages.outgoing import color_image_message, pair_messages, PAIR_TOPICS
+from rs_relpose_ros.images.encoded import Pixels
+from rs_relpose_ros.messages.outgoing import image_message, pair_messages, PAIR_TOPICS
 from rs_relpose_ros.node.debug_image import draw_debug_image
 from rs_relpose_ros.node.message_types import message_class
 
@@ -50,8 +51,9 @@ class PairPublishers:
     def publish_picture(self, result: PairResult, config: PairConfig) -> None:
         """Publish ~/debug_image of any pair, where somebody looks at it."""
         if config.publish_debug_image and self._debug_image.get_subscription_count():
-            self._debug_image.publish(color_image_message(
-                result.stamp_ns, result.frame_id, draw_debug_image(result), message_class))
+            self._debug_image.publish(image_message(
+                result.stamp_ns, result.frame_id, Pixels(draw_debug_image(result), 'bgr8'),
+                message_class))
 
 
 def _transform_broadcaster(node: Node) -> Any:

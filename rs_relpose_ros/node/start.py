@@ -1,4 +1,4 @@
-"""Entry of the console script: a signal ends the node quietly even while it still imports.
+"""Entry of the console scripts: a signal ends the node quietly even while it still imports.
 
 Imports nothing heavy itself. Before rclpy runs, SIGINT would end the process with a traceback and
 SIGTERM with a signal's exit code.
@@ -6,6 +6,7 @@ SIGTERM with a signal's exit code.
 
 from __future__ import annotations
 
+import importlib
 import os
 import signal
 import sys
@@ -17,11 +18,16 @@ _started = False
 
 
 def main() -> NoReturn:
-    """Run the node, and end the process with its exit code."""
+    """Run relpose_node, and end the process with its exit code."""
+    start('rs_relpose_ros.node.node')
+
+
+def start(module: str) -> NoReturn:
+    """Run the node whose `main` is in `module`, and end the process with its exit code."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _on_signal)
-    from rs_relpose_ros.node.node import leave
-    from rs_relpose_ros.node.node import main as run
+    from rs_relpose_ros.node.run import leave
+    run = importlib.import_module(module).main
     leave(run(on_started=_on_started))
 
 

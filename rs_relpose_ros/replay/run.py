@@ -136,9 +136,9 @@ class Replay:
                 self._not_used(str(outcome.error))
             else:
                 self.counts.processing_seconds += outcome.seconds
-                if outcome.pair is not None:
+                if outcome.result is not None:
                     self.counts.pairs += 1
-                    yield ReplayedPair(outcome.pair, self.counts.last_ns)
+                    yield ReplayedPair(outcome.result, self.counts.last_ns)
 
     def _not_used(self, reason: str) -> None:
         if self.reasons.add(reason):
