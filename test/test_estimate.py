@@ -153,7 +153,7 @@ def hessian_covariance(pose, scene, camera):
     priors = Priors(scene.measured_gravity1, scene.measured_gravity2, TOLD.gravity_sigma**-2, 0.0,
                     TOLD.gyro_sigma**-2, np.eye(3), np.zeros((3, 3)),
                     isotropic(pose.velocity_sigma, 0.0))
-    matches = FitMatches(problem.observations, pose.inliers, pose.residual_rms)
+    matches = FitMatches(problem.observations, pose.inliers.astype(float), pose.residual_rms)
     return local_covariance(matches, state, priors)[:3, :3]
 
 

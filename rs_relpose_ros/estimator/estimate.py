@@ -250,7 +250,8 @@ class Estimation:
                 matches.observations, inliers, state, config.pixel_sigma, free))
             inliers = select_inliers(matches, state, config.threshold)
         covariance = local_covariance(
-            FitMatches(matches.observations, inliers, config.pixel_sigma), state, self.priors)
+            FitMatches(matches.observations, inliers.astype(float), config.pixel_sigma), state,
+            self.priors)
         return Refined(state, inliers, self.priors.velocity.log_scale, config.pixel_sigma,
                        covariance)
 

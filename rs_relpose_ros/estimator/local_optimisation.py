@@ -85,7 +85,8 @@ def optimise(matches: Matches, hypotheses: Solutions, priors: Priors, sigma: flo
                 continue
             costs[k] = (_truncated_cost(r[k], matches.valid, bound, noise)
                         + prior_cost(states[k], priors))
-            state = stepped(FitMatches(matches.observations, use, noise), states[k], priors, STEPS)
+            state = stepped(FitMatches(matches.observations, use.astype(np.float64), noise),
+                            states[k], priors, STEPS)
             errors = residuals(matches.observations, state)
             cost = (_truncated_cost(errors, matches.valid, bound, noise)
                     + prior_cost(state, priors))

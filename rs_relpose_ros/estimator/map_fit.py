@@ -28,13 +28,13 @@ LEAST_GAIN = 1e-7
 
 
 class FitMatches(NamedTuple):
-    """The matches that a fit uses: `use` (N,) of the rows `observations` (N, 20).
+    """The matches that a fit uses: `weights` (N,), 0 to 1, of the rows `observations` (N, 20).
 
-    `sigma`: their noise [px].
+    `sigma`: noise [px] of a match of weight 1.
     """
 
     observations: Array
-    use: NDArray[np.bool_]
+    weights: Array
     sigma: float
 
 
@@ -53,7 +53,7 @@ class DataTerm(NamedTuple):
 def linearised(matches: FitMatches, state: TwoViewState) -> DataTerm:
     """Hessian (17, 17), half gradient (17,) and cost of the matches about `state`."""
     hessian, gradient, squares = sampson.normal_equations(
-        matches.observations, matches.use, state)
+        matches.observations, matches.weights, state)
     weight = 1.0 / (matches.sigma * matches.sigma)
     for i in range(PARAMETERS):
         gradient[i] *= weight

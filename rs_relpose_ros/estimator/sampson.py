@@ -78,22 +78,23 @@ def _turned(turns, tau, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @linked_kernel
-def _gather(observations: Array, use: NDArray[np.bool_], first: int,
-            block: Array) -> tuple[int, int]:
-    """Fill `block` (20, BLOCK) with the matches in `use` from number `first` on.
+def _gather(observations: Array, weights: Array, first: int, block: Array) -> tuple[int, int]:
+    """Fill `block` (21, BLOCK) with the matches that have a weight, from number `first` on.
 
-    Returns the number from which to go on, and how many matches there are. The rest of the block
-    is zero: such a match has no residual and no derivative.
+    The last row is for the roots of their weights. Returns the number from which to go on, and how
+    many matches there are. The rest of the block is zero: such a match has no residual and no
+    derivative.
     """
     count = 0
     while first < observations.shape[0] and count < BLOCK:
-        if use[first]:
+        if weights[first] > 0.0:
             for k in range(20):
                 block[k, count] = observations[first, k]
+            block[20, count] = math.sqrt(weights[first])
             count += 1
         first += 1
     for i in range(count, BLOCK):
-        for k in range(20):
+        for k in range(21):
             block[k, i] = 0.0
     return first, count
 
@@ -136,7 +137,10 @@ def _residual(o, i, baselines, turns1, turns2):  # type: ignore[no-untyped-def]
 
 @inlined_kernel
 def _linearise(o, baselines, turns1, turns2, basis, rows):  # type: ignore[no-untyped-def]
-    """Derivatives and residuals of a block: `rows` (18, BLOCK), the residual last."""
+    """Derivatives and residuals of a block, times the roots of the weights.
+
+    `rows` (18, BLOCK): the residual last.
+    """
     for i in range(BLOCK):
         r, (bx, by, bz), (fx, fy, fz), (hx, hy, hz), (px, py, pz), (jx, jy, jz) = _residual(
             o, i, baselines, turns1, turns2)
@@ -153,6 +157,10 @@ def _linearise(o, baselines, turns1, turns2, basis, rows):  # type: ignore[no-un
         # by a turn of the first rays: one of all three vectors, b too, would change nothing
         mx, my, mz = _cross(bx, by, bz, nx, ny, nz)
         wx, wy, wz = -rx - mx, -ry - my, -rz - mz
+        # All of a row is linear in one of n, r and w, or is the residual.
+        root = o[20, i]
+        r, rx, ry, rz = root * r, root * rx, root * ry, root * rz
+        nx, ny, nz, wx, wy, wz = root * nx, root * ny, root * nz, root * wx, root * wy, root * wz
         tau1, tau2 = o[18, i], o[19, i]
         rows[0, i], rows[1, i], rows[2, i] = rx, ry, rz
         rows[3, i] = nx * basis[0, 0] + ny * basis[1, 0] + nz * basis[2, 0]
@@ -170,8 +178,8 @@ def residuals(observations: Array, state: TwoViewState) -> Array:
     n = observations.shape[0]
     baselines = _baselines(state)
     turns1, turns2 = _turns(state.dw1, np.eye(3)), _turns(state.dw2, state.R)
-    block, errors = np.empty((20, BLOCK)), np.empty(BLOCK)
-    everything = np.ones(n, dtype=np.bool_)
+    block, errors = np.empty((21, BLOCK)), np.empty(BLOCK)
+    everything = np.ones(n)
     out = np.empty(n)
     first = 0
     while first < n:
@@ -190,8 +198,8 @@ def jacobian(observations: Array, state: TwoViewState) -> Array:
     baselines = _baselines(state)
     turns1, turns2 = _turns(state.dw1, np.eye(3)), _turns(state.dw2, state.R)
     basis = tangent_basis(state.t)
-    block, rows = np.empty((20, BLOCK)), np.empty((PARAMETERS + 1, BLOCK))
-    everything = np.ones(n, dtype=np.bool_)
+    block, rows = np.empty((21, BLOCK)), np.empty((PARAMETERS + 1, BLOCK))
+    everything = np.ones(n)
     out = np.empty((n, PARAMETERS))
     first = 0
     while first < n:
@@ -203,20 +211,20 @@ def jacobian(observations: Array, state: TwoViewState) -> Array:
 
 
 @linked_kernel
-def normal_equations(observations: Array, use: NDArray[np.bool_],
+def normal_equations(observations: Array, weights: Array,
                      state: TwoViewState) -> tuple[Array, Array, float]:
-    """``J^T J`` (17, 17), ``J^T r`` (17,) and sum of squares over the matches in `use`."""
+    """``J^T W J`` (17, 17), ``J^T W r`` (17,) and ``r^T W r`` with the weights (N,) of matches."""
     baselines = _baselines(state)
     turns1, turns2 = _turns(state.dw1, np.eye(3)), _turns(state.dw2, state.R)
     basis = tangent_basis(state.t)
-    block, rows = np.empty((20, BLOCK)), np.empty((PARAMETERS + 1, BLOCK))
+    block, rows = np.empty((21, BLOCK)), np.empty((PARAMETERS + 1, BLOCK))
     # The residual as the last column of J: one product holds all three results. By BLAS, whose
     # sums are in one order whoever calls; a block is too small for it to start threads.
     gram = np.zeros((PARAMETERS + 1, PARAMETERS + 1))
     product = np.empty((PARAMETERS + 1, PARAMETERS + 1))
     first = 0
     while first < observations.shape[0]:
-        first, _ = _gather(observations, use, first, block)
+        first, _ = _gather(observations, weights, first, block)
         _linearise(block, baselines, turns1, turns2, basis, rows)
         np.dot(rows, rows.T, product)
         gram += product

@@ -123,7 +123,8 @@ def _of_matches(matches: FitMatches, state: TwoViewState, data_hessian: Array,
         if not use.any():
             continue
         filled += 1
-        own, gradient, squares = sampson.normal_equations(matches.observations, use, state)
+        own, gradient, squares = sampson.normal_equations(
+            matches.observations, use * matches.weights, state)
         cost += weight * squares
         copy_matrix(hessian, rest)
         for i in range(PARAMETERS):
@@ -138,7 +139,7 @@ def _of_matches(matches: FitMatches, state: TwoViewState, data_hessian: Array,
             for j in range(n):
                 total[i, j] += adjusted[i] * adjusted[j]
     # Noise as the residuals have it, without what was told: (units of sigma)^2.
-    variance = (1.0 + cost) / (1.0 + max(matches.use.sum() - FITTED, 0))
+    variance = (1.0 + cost) / (1.0 + max(matches.weights.sum() - FITTED, 0.0))
     share = filled / (filled + HESSIAN_REGIONS)
     return share * total + (1.0 - share) * variance * data_hessian
 
@@ -146,16 +147,16 @@ def _of_matches(matches: FitMatches, state: TwoViewState, data_hessian: Array,
 @kernel
 def _regions(matches: FitMatches) -> NDArray[np.int64]:
     """Number of each match's region (N,), by its first ray; -1 for those that are not used."""
-    n = len(matches.use)
+    n = len(matches.weights)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for i in range(n):
-        if matches.use[i]:
+        if matches.weights[i] > 0.0:
             for k in range(2):
                 low[k] = min(low[k], matches.observations[i, k])
                 high[k] = max(high[k], matches.observations[i, k])
     regions = np.full(n, -1)
     for i in range(n):
-        if matches.use[i]:
+        if matches.weights[i] > 0.0:
             number = 0
             for k in range(2):
                 share = (matches.observations[i, k] - low[k]) / max(high[k] - low[k], 1e-12)

@@ -37,6 +37,13 @@ GRID = np.array([0.003, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
 # Exponent of the prior of the sigma, as its inverse: where the data cannot tell (sideways motion,
 # cameras at rest), a wide prior would turn noise into velocity and degrees of translation.
 SMALL_IS_LIKELIER = 0.5
+# Matches of more noise than the rest: how many times as much, and their share to begin with.
+WORSE = 3.0
+FIRST_SHARE = 0.1
+# What is told of the noise counts as so many matches; that all are good, as so many.
+TOLD_MATCHES = 10.0
+LIKELY_GOOD = 20.0
+MIXTURE_ROUNDS = 6
 ROUNDS = 3
 ITERATIONS = 6
 # On the inliers of the last round, from each prior's own optimum on nearly the same ones.
@@ -82,11 +89,39 @@ class Refined(NamedTuple):
 
 
 @kernel
-def noise_sigma(observations_cost: float, count: int, told: float) -> float:
-    """Noise of a match [px] from the residuals, with the told sigma as ten matches' worth."""
-    told_weight = 10.0
-    return math.sqrt((told_weight * told * told + observations_cost)
-                     / (told_weight + max(count - 11, 0)))
+def noise_mixture(r: Array, use: Flags, told: float) -> tuple[Array, float]:
+    """Weights (N,) of the matches in `use` and the noise [px] of good ones, by their residuals.
+
+    Some tracks are worse than others: a share h has `WORSE` times the noise of the rest. Both are
+    found by expectation maximisation; a match weighs as much as the mean of its inverse variance.
+    The told sigma counts as ten matches.
+    """
+    weights = np.zeros(len(r))
+    count, squares = 0, 0.0
+    for i in range(len(r)):
+        if use[i]:
+            count += 1
+            squares += r[i] * r[i]
+            weights[i] = 1.0
+    freedom = TOLD_MATCHES + max(count - 11, 0)
+    variance = (TOLD_MATCHES * told * told + squares) / freedom
+    share = FIRST_SHARE
+    for _ in range(MIXTURE_ROUNDS):
+        squares, worse = 0.0, 0.0
+        for i in range(len(r)):
+            if use[i]:
+                r2 = r[i] * r[i] / variance
+                if not r2 < 700.0:
+                    r2 = 700.0
+                ratio = (share / (1.0 - share) / WORSE
+                         * math.exp(0.5 * r2 * (1.0 - 1.0 / (WORSE * WORSE))))
+                p = ratio / (1.0 + ratio)
+                worse += p
+                weights[i] = 1.0 - p * (1.0 - 1.0 / (WORSE * WORSE))
+                squares += weights[i] * r[i] * r[i]
+        variance = (TOLD_MATCHES * told * told + squares) / freedom
+        share = (worse + 1.0) / (count + LIKELY_GOOD)
+    return weights, math.sqrt(variance)
 
 
 @kernel
@@ -129,9 +164,9 @@ def fit_with_evidence(matches: Matches, start: TwoViewState, priors: Priors, noi
         for k in range(low, high):
             lacking[k] = evidences[best] - evidences[k]
         state = moved(start, steps[best])
-        chosen_from = used.use
+        chosen_from = used.weights > 0.0
         used = _selected(matches, state, _reach(noise.threshold, used.sigma), noise.sigma)
-        if (used.use == chosen_from).all():
+        if ((used.weights > 0.0) == chosen_from).all():
             break
     return _average(matches, used, start, steps, lacking < LEAST_EVIDENCE, priors, scales,
                     noise.threshold, gyro_error)
@@ -149,12 +184,8 @@ def _selected(matches: Matches, state: TwoViewState, threshold: float,
     """Inliers of a state, with their noise."""
     r = residuals(matches.observations, state)
     inliers = within(r, matches, state, threshold)
-    squares = 0.0
-    for i in range(len(r)):
-        if inliers[i]:
-            squares += r[i] * r[i]
-    return FitMatches(matches.observations, inliers,
-                      noise_sigma(squares, inliers.sum(), told_sigma))
+    weights, sigma = noise_mixture(r, inliers, told_sigma)
+    return FitMatches(matches.observations, weights, sigma)
 
 
 @kernel
@@ -191,7 +222,7 @@ def _candidate(matches: Matches, used: FitMatches, start: TwoViewState, data: Da
     cost += 2.0 * priors.velocity.freedom * log_scale
     # Velocities that carry the camera past its own baseline within a frame explain any residual,
     # with points behind the cameras: those count as outliers.
-    cost += count_behind(matches, used.use, state) * (threshold / used.sigma) ** 2
+    cost += count_behind(matches, used.weights > 0.0, state) * (threshold / used.sigma) ** 2
     evidence = (-0.5 * cost - 0.5 * log_determinant(hessian) + 6.0 * log_scale
                 + scales.log_weights[k])
     return state, log_scale, data, hessian, evidence
@@ -250,5 +281,5 @@ def _average(matches: Matches, used: FitMatches, start: TwoViewState, steps: Arr
     log_scale = scales.centres[best]
     if n > SCALE:
         log_scale = steps[best, SCALE] + mean[SCALE]
-    return Refined(moved(origin, mean), used.use, log_scale, used.sigma,
+    return Refined(moved(origin, mean), used.weights > 0.0, log_scale, used.sigma,
                    as_much_wider(believed, fitted, shown) + spread)

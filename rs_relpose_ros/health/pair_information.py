@@ -117,9 +117,8 @@ def pair_information(pair: PairEvidence, in_force: Array, about: Array) -> PairI
                     np.ascontiguousarray(rotation), information,
                     isotropic(_VELOCITY_SIGMA, 1.0 / pair.interval))
     if at.any():
-        every = np.ones(len(observations), dtype=np.bool_)
         r = np.abs(residuals(observations, state))
-        state = stepped(FitMatches(observations, every & (r < 4.0 * np.median(r)),
+        state = stepped(FitMatches(observations, (r < 4.0 * np.median(r)).astype(float),
                                    _noise(r)), state, priors, _STEPS_ANEW)
     r = residuals(observations, state)
     sigma = _noise(r)
