@@ -18,6 +18,11 @@ from rs_relpose_ros.estimator.arguments import (
 )
 from rs_relpose_ros.estimator.consensus import SCALES
 from rs_relpose_ros.estimator.hypotheses import draw_hypotheses, MODES, SolverMode
+from rs_relpose_ros.estimator.image_information import (
+    image_information,
+    ImageInformation,
+    rotation_information,
+)
 from rs_relpose_ros.estimator.information import inverse
 from rs_relpose_ros.estimator.inliers import cheirality_sign, Flags, Matches, select_inliers
 from rs_relpose_ros.estimator.local_optimisation import optimise
@@ -40,11 +45,11 @@ from rs_relpose_ros.estimator.spread import (
 from rs_relpose_ros.estimator.state import hypothesis_state, signed, TwoViewState
 from rs_relpose_ros.estimator.uncertainty import local_covariance, pair_state
 from rs_relpose_ros.estimator.velocities_expected import ONE_SCALE, velocities_expected
-from rs_relpose_ros.estimator.velocity_prior import fit_with_evidence, Noise, Refined
+from rs_relpose_ros.estimator.velocity_prior import fit_with_evidence, Noise, noise_mixture, Refined
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.inertial import InertialMotion
 from rs_relpose_ros.geometry.motion import FrameMotion
-from rs_relpose_ros.geometry.so3 import aligning_rotation, exp_so3
+from rs_relpose_ros.geometry.so3 import aligning_rotation, exp_so3, log_so3
 from rs_relpose_ros.solvers.solver import Solutions
 
 Array = NDArray[np.float64]
@@ -326,6 +331,9 @@ class Estimation:
         return RelativePose(
             status=Status.PURE_ROTATION if turned_only else Status.LOW_PARALLAX, reason=reason,
             R=turn1.T @ R @ turn2, covariance=covariance, inliers=inliers,
+            images=rotation_information(
+                information, self.priors.rotation_information,
+                log_so3(R @ self.priors.rotation.T), turn1),
             angular_velocity1=problem.motion1.angular_velocity,
             angular_velocity2=problem.motion2.angular_velocity,
             velocity_covariance=velocity_covariance, model='angular',
@@ -354,7 +362,7 @@ class Estimation:
             velocity_covariance=pose.covariance[np.ix_(v2w2, v2w2)], model=self.mode.model.name,
             velocity_sigma=float(np.exp(-refined.log_scale)),
             baseline=baseline, baseline_log_sigma=baseline_sigma, baseline_reason=reason,
-            iterations=self.iterations,
+            images=self._images(refined), iterations=self.iterations,
             residual_rms=float(np.sqrt(np.mean(r**2))))
         limit = self.config.max_translation_sigma
         if sigma <= limit:
@@ -362,6 +370,17 @@ class Estimation:
         return result.without_translation(
             Status.LOW_PARALLAX, f'the direction of translation is uncertain by {sigma:.3g} deg '
             f'(1 sigma), more than max_translation_sigma = {limit:g} deg')
+
+    def _images(self, refined: Refined) -> ImageInformation | None:
+        """What the images alone say; None of models that are not fitted to all unknowns."""
+        if not self.mode.model.derotated:
+            return None
+        state, problem = refined.state, self.problem
+        weights, sigma = noise_mixture(residuals(problem.observations, state), refined.inliers,
+                                       self.config.pixel_sigma)
+        return image_information(
+            FitMatches(problem.observations, weights, sigma), state, self.priors,
+            problem.reference_row_time, self._turns_to_reference_row(state)[0])
 
     def _baseline(self, pose: PairState) -> tuple[float, float, str]:
         """Baseline [m] and 1 sigma of its logarithm; or NaN twice, and why."""

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.estimator.image_information import ImageInformation
 from rs_relpose_ros.front_end.pair import PAIR_FIGURES, PairFigure, PairResult
 
 Array = NDArray[np.float64]
@@ -38,6 +39,13 @@ def _figure(figure: PairFigure) -> PairValue:
     return PairValue(figure.name, lambda pair: number(figure.of(pair)))
 
 
+def _of_images(pair: PairResult, part: Callable[[ImageInformation], Array]) -> str:
+    images = pair.pose.images
+    if images is None or not np.isfinite(values := part(images)).all():
+        return ''
+    return numbers(values)
+
+
 # In the order in which they are shown. `TOPICS_KEY` follows: it tells what else was published.
 PAIR_VALUES = (
     PairValue('reference_stamp_ns', lambda pair: str(pair.reference_stamp_ns)),
@@ -55,10 +63,17 @@ PAIR_VALUES = (
     PairValue('reference_imu_ns', lambda pair: str(pair.reference_ns1)),
     PairValue('current_imu_ns', lambda pair: str(pair.reference_ns2)),
     PairValue('gyro_bias_rad_s', lambda pair: numbers(pair.gyro_bias)),
+    # Of the images alone: estimator.image_information.
+    PairValue('image_velocities', lambda pair: _of_images(pair, lambda images: images.velocities)),
+    PairValue('image_gradient', lambda pair: _of_images(pair, lambda images: images.gradient)),
+    PairValue('image_information', lambda pair: _of_images(
+        pair, lambda images: images.information[np.triu_indices(len(images.gradient))])),
     PairValue('health', lambda pair: pair.health.state.value),
     PairValue('health_findings', lambda pair: pair.health.text),
 )
 TOPICS_KEY = 'topics'
+# Of the longest list of numbers, 66 of them.
+_MOST_CHARACTERS = 2000
 
 
 class PairStatus:
@@ -94,10 +109,15 @@ class PairStatus:
             raise InputError(f'{key} of ~/pairs must be three numbers, got {text[:60]!r}')
         return np.array(values)
 
+    def reals(self, key: str) -> Array:
+        """Numbers (N,); none where they are empty."""
+        text = self.text(key)
+        return np.array(self._reals(key, text, _MOST_CHARACTERS) if text else [])
+
     @staticmethod
-    def _reals(key: str, text: str) -> list[float]:
+    def _reals(key: str, text: str, most: int = 200) -> list[float]:
         try:
-            values = [float(word) for word in text[:200].split()]
+            values = [float(word) for word in text[:most].split()]
         except ValueError:
             values = []
         if not values or not all(map(math.isfinite, values)):
