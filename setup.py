@@ -75,13 +75,14 @@ setup(
     # Run-time dependencies are rosdep keys in package.xml and, for pip, requirements/base.txt.
     # Named here, pip would lay its own OpenCV and NumPy over those of a ROS machine.
     install_requires=['setuptools'],
-    extras_require={'test': ['pytest']},
+    extras_require={'test': ['pytest'], 'odometry': ['gtsam>=4.3,<4.4']},
     zip_safe=False,
     cmdclass={'build_py': BuildWithKernels, 'develop': DevelopWithKernels},
     entry_points={
         'console_scripts': [
             'relpose_node = rs_relpose_ros.node.start:main',
             'global_shutter_node = rs_relpose_ros.global_shutter.start:main',
+            'odometry_node = rs_relpose_ros.odometry.start:main',
             'rs_relpose = rs_relpose_ros.cli.main:main',
         ],
     },

@@ -138,8 +138,11 @@ MAY_IMPORT = {
     'replay': CORE | {'front_end', 'health', 'messages', 'bags'},
     'calibrate': CORE | {'messages', 'bags'},
     'check': CORE | {'front_end', 'health', 'messages', 'bags', 'calibrate'},
+    'odometry': BASE | {'estimator', 'imu', 'health', 'front_end', 'messages', 'bags', 'replay',
+                        'node'},
     'convert': BASE | {'images', 'imu', 'messages', 'bags'},
-    'cli': BASE | {'bags', 'replay', 'calibrate', 'check', 'convert', 'global_shutter'},
+    'cli': BASE | {'bags', 'replay', 'calibrate', 'check', 'convert', 'global_shutter',
+                   'odometry'},
 }
 # The laboratory uses all of the product, and nothing of the product imports it.
 MAY_IMPORT_IN_THE_LABORATORY = {

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.config.imu import ImuConfig
 from rs_relpose_ros.config.odometry import OdometryConfig
+from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.geometry.so3 import skew
 from rs_relpose_ros.odometry.interval import ImuInterval
 from rs_relpose_ros.odometry.measurement import PairMeasurement
@@ -35,6 +36,10 @@ STANDARD_GRAVITY = 9.80665   # [m/s^2]
 _STANDING = 0.005
 # Integration error of the samples, as a noise density of the position [m/sqrt(s)].
 _INTEGRATION = 1e-4
+
+
+class GraphError(RsRelposeError):
+    """The graph cannot be solved."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -264,7 +269,10 @@ class KeyframeGraph:
 
     def _update(self, factors: Any, values: Any, seconds: float) -> None:
         stamps = dict.fromkeys(list(values.keys()), seconds)
-        self._smoother.update(factors, values, stamps)
+        try:
+            self._smoother.update(factors, values, stamps)
+        except RuntimeError as error:   # of gtsam, of several lines
+            raise GraphError('the graph cannot be solved: ' + str(error).strip().partition('\n')[0]) from error
         self._seconds = seconds
         self._read()
         if self._record is not None:

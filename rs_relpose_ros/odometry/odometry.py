@@ -18,7 +18,9 @@ from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.geometry.so3 import skew
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.samples import ImuSample
+from rs_relpose_ros.messages.hanging import HangingGyro
 from rs_relpose_ros.odometry.graph import (
+    GraphError,
     KeyframeGraph,
     KeyframeState,
     STANDARD_GRAVITY,
@@ -33,14 +35,17 @@ Array = NDArray[np.float64]
 
 # Time that a message may be late by.
 _LATE_NS = 100_000_000
+# Samples that are older by more than this come from a clock that was set back.
+_JUMP_NS = 1_000_000_000
 # Samples of which gravity is taken at a start [s].
 _GRAVITY_WINDOW = 1.0
 # 1 sigma of that direction where the body moves [rad]; of heading and place, which are chosen.
 _MOVING_TILT, _CHOSEN = 0.1, 1e-4
 # 1 sigma of the velocity at a start in motion [m/s], per axis: nothing is known of it.
 _ANY_VELOCITY = 3.0
-# Largest 1 sigma of the logarithm of the baseline of a pair that starts a graph.
-_START_LOG_SIGMA = 0.7
+# Largest 1 sigma of the logarithm of a baseline that starts a graph, and the speed that is tried
+# where none is known [m/s]: pairs of a global shutter have no baseline.
+_START_LOG_SIGMA, _GUESSED_SPEED = 0.7, 1.0
 # Chi squared per degree of freedom of a pair that contradicts, and of a start that went wrong.
 _CONTRADICTING, _WRONG_START = 4.0, 3.0
 # A start that takes longer is begun anew [s].
@@ -110,6 +115,7 @@ class OdometryEstimator:
         R, lever = parameters.sensor.R_cam_imu, np.array(parameters.imu.imu_position)
         self._mounting = Mounting(R, -R.T @ lever)
         self._samples = ImuHistory(parameters.imu.max_imu_gap)
+        self._gyro = HangingGyro(parameters.imu.stuck_gyro_time)
         self._keep = keep
         self._waiting: dict[int, PairMeasurement] = {}
         self._run: _Run | None = None
@@ -123,8 +129,14 @@ class OdometryEstimator:
         self._sentences: list[str] = []
 
     def add_imu(self, sample: ImuSample) -> None:
-        """Take in a sample."""
-        self._samples.add(sample)
+        """Take in a sample; InputError where a gyro hangs."""
+        newest = self._samples.newest_ns
+        if newest is not None and sample.stamp_ns < newest - _JUMP_NS:
+            self._end('the clock of the IMU was set back')
+            self._samples = ImuHistory(self._imu.max_imu_gap)
+            self._waiting, self._last_ns = {}, None
+        if not self._gyro.repeats(sample):
+            self._samples.add(sample)
 
     def add_pair(self, pair: PairMeasurement) -> None:
         """Take in a pair."""
@@ -148,7 +160,11 @@ class OdometryEstimator:
                 break
             del self._waiting[pair.current_ns]
             self._last_ns = pair.current_ns
-            found = self._process(pair)
+            try:
+                found = self._process(pair)
+            except GraphError as error:
+                found = None
+                self._end(str(error))
             if found is not None:
                 out.append(found)
             self._samples.prune(pair.current_ns - to_nanoseconds(
@@ -259,8 +275,10 @@ class OdometryEstimator:
         if pair.images is None or interval is None:
             return None
         at_rest = pair.turned_only and interval.at_rest
-        if not at_rest and not pair.baseline_log_sigma < _START_LOG_SIGMA:
+        if not at_rest and not np.isfinite(pair.t).all():
             return None
+        moving = (pair.metric_velocity if pair.baseline_log_sigma < _START_LOG_SIGMA
+                  else _GUESSED_SPEED * pair.t)
         bias = np.where(np.isfinite(pair.gyro_bias), pair.gyro_bias, self._imu.gyro_bias)
         rate = interval.rates[0] - bias
         if at_rest or before is None or before.duration < interval.duration:
@@ -271,7 +289,7 @@ class OdometryEstimator:
         R = self._levelled(force)
         C, c = self._mounting
         velocity = np.zeros(3) if at_rest else R @ (
-            C.T @ pair.metric_velocity - np.cross(rate, c))
+            C.T @ moving - np.cross(rate, c))
         tilt = (self._imu.accel_bias_sigma / STANDARD_GRAVITY if at_rest else _MOVING_TILT)
         # About the world's z, as the axes of the body lie, heading is chosen.
         turn = R.T @ np.diag([tilt, tilt, _CHOSEN]) @ R
