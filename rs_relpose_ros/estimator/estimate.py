@@ -332,8 +332,8 @@ class Estimation:
             status=Status.PURE_ROTATION if turned_only else Status.LOW_PARALLAX, reason=reason,
             R=turn1.T @ R @ turn2, covariance=covariance, inliers=inliers,
             images=rotation_information(
-                information, self.priors.rotation_information,
-                log_so3(R @ self.priors.rotation.T), turn1),
+                R, information, self.priors.rotation_information,
+                log_so3(R @ self.priors.rotation.T), -problem.reference_row_time),
             angular_velocity1=problem.motion1.angular_velocity,
             angular_velocity2=problem.motion2.angular_velocity,
             velocity_covariance=velocity_covariance, model='angular',
@@ -380,7 +380,7 @@ class Estimation:
                                        self.config.pixel_sigma)
         return image_information(
             FitMatches(problem.observations, weights, sigma), state, self.priors,
-            problem.reference_row_time, self._turns_to_reference_row(state)[0])
+            -problem.reference_row_time)
 
     def _baseline(self, pose: PairState) -> tuple[float, float, str]:
         """Baseline [m] and 1 sigma of its logarithm; or NaN twice, and why."""

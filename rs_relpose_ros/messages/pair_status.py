@@ -8,9 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.estimator.image_information import ImageInformation
+from rs_relpose_ros.estimator.image_information import ImageInformation, POSE, ROTATION
 from rs_relpose_ros.front_end.pair import PAIR_FIGURES, PairFigure, PairResult
 
 Array = NDArray[np.float64]
@@ -63,7 +64,12 @@ PAIR_VALUES = (
     PairValue('reference_imu_ns', lambda pair: str(pair.reference_ns1)),
     PairValue('current_imu_ns', lambda pair: str(pair.reference_ns2)),
     PairValue('gyro_bias_rad_s', lambda pair: numbers(pair.gyro_bias)),
-    # Of the images alone: estimator.image_information.
+    # What the images alone say, without the priors of the IMU: `ImageInformation`.
+    PairValue('image_row_s', lambda pair: _of_images(
+        pair, lambda images: np.array([images.row_time]))),
+    PairValue('image_rotation_xyzw', lambda pair: _of_images(
+        pair, lambda images: Rotation.from_matrix(images.R).as_quat())),
+    PairValue('image_direction', lambda pair: _of_images(pair, lambda images: images.t)),
     PairValue('image_velocities', lambda pair: _of_images(pair, lambda images: images.velocities)),
     PairValue('image_gradient', lambda pair: _of_images(pair, lambda images: images.gradient)),
     PairValue('image_information', lambda pair: _of_images(
@@ -74,6 +80,8 @@ PAIR_VALUES = (
 TOPICS_KEY = 'topics'
 # Of the longest list of numbers, 66 of them.
 _MOST_CHARACTERS = 2000
+# Largest deviation from 1 of the length of directions and quaternions.
+_UNIT = 1e-3
 
 
 class PairStatus:
@@ -87,6 +95,29 @@ class PairStatus:
         if key not in self._values:
             raise InputError(f'~/pairs must have the key {key}')
         return self._values[key]
+
+    def images(self) -> ImageInformation | None:
+        """What the images alone say; None where nothing is told."""
+        gradient = self.reals('image_gradient')
+        size = len(gradient)
+        if size == 0:
+            return None
+        upper, rows = self.reals('image_information'), np.triu_indices(size)
+        turn, t, velocities = (self.reals(f'image_{name}') for name in (
+            'rotation_xyzw', 'direction', 'velocities'))
+        row_time = self.real('image_row_s')
+        if not ((size == POSE and len(t) == 3 and len(velocities) == 6
+                 and abs(np.linalg.norm(t) - 1.0) < _UNIT or size == ROTATION)
+                and len(upper) == len(rows[0]) and abs(row_time) < 1.0
+                and len(turn) == 4 and abs(np.linalg.norm(turn) - 1.0) < _UNIT):
+            raise InputError(f'image_information of ~/pairs and the keys beside it must be of '
+                             f'{POSE} or {ROTATION} unknowns, got {size}')
+        H = np.zeros((size, size))
+        H[rows] = H.T[rows] = upper
+        if size == ROTATION:
+            t, velocities = np.full(3, math.nan), np.full(6, math.nan)
+        return ImageInformation(row_time, Rotation.from_quat(turn).as_matrix(), t, velocities, H,
+                                gradient)
 
     def nanoseconds(self, key: str) -> int:
         """An instant [ns]."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.estimator.image_information import ImageInformation, POSE, ROTATION
+from rs_relpose_ros.estimator.image_information import ImageInformation
 from rs_relpose_ros.messages.incoming import stamp_ns, time_ns
 from rs_relpose_ros.messages.outgoing import (
     MATCH_DTYPE,
@@ -60,7 +60,7 @@ class PublishedPair:
     baseline: float   # [m]
     baseline_log_sigma: float   # 1 sigma of its logarithm
     gyro_bias: Array   # (3,) [rad/s] that was removed, in the axes of the IMU
-    images: ImageInformation | None   # what the images alone say, about R and t
+    images: ImageInformation | None   # what the images alone say
     health: str   # of what was told of camera and IMU, as of `HealthState`
     matches: NDArray[np.void]   # (N,), of MATCH_DTYPE
 
@@ -169,7 +169,7 @@ def published_pair(messages: PairMessages) -> PublishedPair:
         velocity_covariance=velocity_covariance, baseline=status.real('baseline_m'),
         baseline_log_sigma=status.real('baseline_log_sigma'),
         gyro_bias=status.vector('gyro_bias_rad_s'),
-        images=_images(status, R, t), health=status.text('health'), matches=matches)
+        images=status.images(), health=status.text('health'), matches=matches)
 
 
 def pair_status(pairs: Any) -> PairStatus:
@@ -177,27 +177,6 @@ def pair_status(pairs: Any) -> PairStatus:
     if len(pairs.status) != 1:
         raise InputError(f'~/pairs must have one status, got {len(pairs.status)}')
     return PairStatus({str(item.key): str(item.value) for item in pairs.status[0].values})
-
-
-def _images(status: PairStatus, R: Array, t: Array) -> ImageInformation | None:
-    """What the images alone say; None where nothing is told, or not about what."""
-    gradient = status.reals('image_gradient')
-    size = len(gradient)
-    known = {0: False, ROTATION: np.isfinite(R).all(), POSE: np.isfinite(t).all()}
-    if size not in known:
-        raise InputError(f'image_gradient of ~/pairs must have {POSE} or {ROTATION} numbers, or '
-                         f'none, got {size}')
-    if not known[size]:
-        return None
-    upper, rows = status.reals('image_information'), np.triu_indices(size)
-    velocities = status.reals('image_velocities')
-    if len(upper) != len(rows[0]) or len(velocities) != (6 if size == POSE else 0):
-        raise InputError(f'image_information and image_velocities of ~/pairs must have '
-                         f'{len(rows[0])} and {6 if size == POSE else 0} numbers, got '
-                         f'{len(upper)} and {len(velocities)}')
-    H = np.zeros((size, size))
-    H[rows] = H.T[rows] = upper
-    return ImageInformation(H, gradient, velocities if size == POSE else np.full(6, np.nan))
 
 
 def _topics(status: PairStatus) -> frozenset[str]:

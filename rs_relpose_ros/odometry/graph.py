@@ -226,9 +226,9 @@ class KeyframeGraph:
             return None
         mounting = self._mounting
         root, offset = square_root(images.information, images.gradient)
-        n, R = root.shape[1], pair.R
+        n, R = root.shape[1], images.R
         # Of a rotation alone, the rest of the deviations is not asked for.
-        t, velocities = (pair.t, images.velocities) if n > 3 else (
+        t, velocities = (images.t, images.velocities) if pair.has_direction else (
             np.array([0.0, 0.0, 1.0]), np.zeros(6))
         bias = self._bias.gyroscope()
         rates = self._rates[i] - bias, self._rates[j] - bias

@@ -37,6 +37,9 @@ Array = NDArray[np.float64]
 _LATE_NS = 100_000_000
 # Samples that are older by more than this come from a clock that was set back.
 _JUMP_NS = 1_000_000_000
+# Instants that are nearer than this are those of one keyframe: a read-out time that is tracked
+# moves the middle row.
+_SAME_NS = 1_000_000
 # Samples of which gravity is taken at a start [s].
 _GRAVITY_WINDOW = 1.0
 # 1 sigma of that direction where the body moves [rad]; of heading and place, which are chosen.
@@ -122,6 +125,7 @@ class OdometryEstimator:
         self._left: _Run | None = None   # a run that ended: where the path goes on
         self._runs: list[_Run] = []
         self._last_ns: int | None = None
+        self._row_ns = 0   # from the stamped to the middle row
         self.state = State.STARTING
         self.starts: list[Started] = []
         # Of pairs and runs, by what became of them.
@@ -141,6 +145,10 @@ class OdometryEstimator:
     def add_pair(self, pair: PairMeasurement) -> None:
         """Take in a pair."""
         self.counts['pairs'] += 1
+        if pair.images is not None:
+            self._row_ns = to_nanoseconds(pair.images.row_time)
+        # Keyframes are at the middle rows, also where a pair says nothing.
+        pair = pair.later(self._row_ns)
         if self._last_ns is not None and pair.current_ns <= self._last_ns:
             self.counts['late'] += 1
             return
@@ -203,7 +211,7 @@ class OdometryEstimator:
             return False
         if newest >= pair.current_ns + _LATE_NS:
             return True
-        return (self._run is not None and pair.reference_ns == self._run.newest_ns
+        return (self._run is not None and abs(pair.reference_ns - self._run.newest_ns) < _SAME_NS
                 and self._samples.complete(pair.reference_ns, pair.current_ns))
 
     def _process(self, pair: PairMeasurement) -> Odometry | None:
@@ -220,7 +228,7 @@ class OdometryEstimator:
             run = self._run = self._begun(pair)
         if run is None:
             return None
-        interval = self._samples.between(pair.reference_ns, pair.current_ns)
+        interval = self._samples.between(run.newest_ns, pair.current_ns)
         if interval is None:
             self._end('the IMU has a gap')
             return None
@@ -243,7 +251,7 @@ class OdometryEstimator:
     def _continued(self, pair: PairMeasurement) -> _Run | None:
         """The run with a keyframe at the pair's reference; None where there is none."""
         run = self._run
-        if run is None or run.newest_ns == pair.reference_ns:
+        if run is None or abs(run.newest_ns - pair.reference_ns) < _SAME_NS:
             return run
         if pair.reference_ns < run.newest_ns:
             self._end('pairs overlap')
@@ -275,10 +283,11 @@ class OdometryEstimator:
         if pair.images is None or interval is None:
             return None
         at_rest = pair.turned_only and interval.at_rest
-        if not at_rest and not np.isfinite(pair.t).all():
+        if not at_rest and not pair.has_direction:
             return None
-        moving = (pair.metric_velocity if pair.baseline_log_sigma < _START_LOG_SIGMA
-                  else _GUESSED_SPEED * pair.t)
+        moving = (pair.baseline * pair.images.velocities[:3]
+                  if pair.baseline_log_sigma < _START_LOG_SIGMA
+                  else _GUESSED_SPEED * pair.images.t)
         bias = np.where(np.isfinite(pair.gyro_bias), pair.gyro_bias, self._imu.gyro_bias)
         rate = interval.rates[0] - bias
         if at_rest or before is None or before.duration < interval.duration:
