@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     """Odometry of a bag; 1 where it did not start."""
     need_gtsam()
     from rs_relpose_ros.odometry.offline import LIVE_FILE, odometry_into, PICTURE, SMOOTHED_FILE
-    parameters = read_parameters(args.params, args.set, node='odometry_node')
+    parameters = read_parameters(args.params, args.set)
     name = bag_name(args.bag)
     folder = args.out or Path(f'{name}_odometry')
     with open_bag(args.bag) as bag:

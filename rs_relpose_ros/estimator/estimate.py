@@ -45,7 +45,12 @@ from rs_relpose_ros.estimator.spread import (
 from rs_relpose_ros.estimator.state import hypothesis_state, signed, TwoViewState
 from rs_relpose_ros.estimator.uncertainty import local_covariance, pair_state
 from rs_relpose_ros.estimator.velocities_expected import ONE_SCALE, velocities_expected
-from rs_relpose_ros.estimator.velocity_prior import fit_with_evidence, Noise, noise_mixture, Refined
+from rs_relpose_ros.estimator.velocity_prior import (
+    fit_with_evidence,
+    Noise,
+    noise_mixture,
+    Refined,
+)
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.inertial import InertialMotion
 from rs_relpose_ros.geometry.motion import FrameMotion

@@ -64,7 +64,8 @@ class RelativePose:
     baseline_reason : str
         Why the baseline is not known; empty where it is, and without a pose.
     images : ImageInformation or None
-        What the images alone say of it, without the priors of the IMU; None where nothing is known.
+        What the images alone say of it, without the priors of the IMU; None where they say
+        nothing.
     velocity_sigma : float
         Prior sigma of the linear velocities that was used [baselines per second].
     iterations : int

@@ -106,10 +106,11 @@ class PairStatus:
         turn, t, velocities = (self.reals(f'image_{name}') for name in (
             'rotation_xyzw', 'direction', 'velocities'))
         row_time = self.real('image_row_s')
-        if not ((size == POSE and len(t) == 3 and len(velocities) == 6
-                 and abs(np.linalg.norm(t) - 1.0) < _UNIT or size == ROTATION)
+        whole = (len(t) == 3 and len(velocities) == 6
+                 and abs(float(np.linalg.norm(t)) - 1.0) < _UNIT)
+        if not ((size == ROTATION or (size == POSE and whole))
                 and len(upper) == len(rows[0]) and abs(row_time) < 1.0
-                and len(turn) == 4 and abs(np.linalg.norm(turn) - 1.0) < _UNIT):
+                and len(turn) == 4 and abs(float(np.linalg.norm(turn)) - 1.0) < _UNIT):
             raise InputError(f'image_information of ~/pairs and the keys beside it must be of '
                              f'{POSE} or {ROTATION} unknowns, got {size}')
         H = np.zeros((size, size))

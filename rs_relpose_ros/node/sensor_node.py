@@ -11,7 +11,6 @@ from typing import Any, ClassVar
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
-from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from rs_relpose_ros.config.parameters import Parameters
@@ -28,6 +27,7 @@ from rs_relpose_ros.node.inputs import SensorInputs
 from rs_relpose_ros.node.message_types import message_class
 from rs_relpose_ros.node.outputs import SHUT_DOWN
 from rs_relpose_ros.node.params import NodeParameters, unknown_overrides, unknown_qos_overrides
+from rs_relpose_ros.node.stoppable import StoppableNode
 from rs_relpose_ros.node.worker import Event, WarmedUp, Worker
 
 # Time [s] that the worker gets to end: a frame takes less, compiling takes longer.
@@ -36,7 +36,7 @@ _JOIN_TIMEOUT = 0.4
 _TELL_COMPILING = 4.0
 
 
-class SensorNode(Node):
+class SensorNode(StoppableNode):
     """A node that works on the frames of a camera with an IMU; its states: docs/architecture.md.
 
     Callbacks convert little and hand over; one worker thread does the rest. An illegal parameter

@@ -272,7 +272,8 @@ class KeyframeGraph:
         try:
             self._smoother.update(factors, values, stamps)
         except RuntimeError as error:   # of gtsam, of several lines
-            raise GraphError('the graph cannot be solved: ' + str(error).strip().partition('\n')[0]) from error
+            first_line = str(error).strip().partition('\n')[0]
+            raise GraphError(f'the graph cannot be solved: {first_line}') from error
         self._seconds = seconds
         self._read()
         if self._record is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 import math
 from pathlib import Path
@@ -25,6 +26,9 @@ from rs_relpose_ros.picture_files import save_picture
 from rs_relpose_ros.replay.run import read_truth, Replay
 
 Array = NDArray[np.float64]
+
+# Trajectory, its name, and its places as aligned and true (N, 3), where the truth is known.
+_Drawn = tuple[Sequence[Odometry], str, tuple[Array, Array] | None]
 
 LIVE_FILE, SMOOTHED_FILE, PICTURE = 'trajectory.tum', 'trajectory_smoothed.tum', 'path.png'
 
@@ -73,7 +77,7 @@ def odometry_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Para
         'lost': estimator.counts['lost'],
         'starts': [asdict(started) for started in estimator.starts], 'health': health,
         'length_m': _length(live)}
-    drawn = [(live, 'live', None), (smoothed, 'smoothed', None)]
+    drawn: list[_Drawn] = [(live, 'live', None), (smoothed, 'smoothed', None)]
     for name, trajectory, at in (('live', live, 0), ('smoothed', smoothed, 1)):
         errors = None if truth is None else trajectory_errors(trajectory, truth)
         figures[name] = None
@@ -102,10 +106,8 @@ def _samples(bag: Bag, topics: SensorTopics) -> list[tuple[int, ImuSample]]:
 
 
 def _add(estimator: OdometryEstimator, sample: ImuSample) -> None:
-    try:
+    with suppress(InputError):   # a gyro that hangs: the replay counts and tells it
         estimator.add_imu(sample)
-    except InputError:
-        pass   # a gyro that hangs: the replay counts and tells it
 
 
 def _length(trajectory: Sequence[Odometry]) -> float:
@@ -113,7 +115,7 @@ def _length(trajectory: Sequence[Odometry]) -> float:
     return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
 
 
-def _draw(drawn: Sequence[tuple[Sequence[Odometry], str, Any]], path: Path) -> None:
+def _draw(drawn: Sequence[_Drawn], path: Path) -> None:
     """The path from above and its height, beside the truth where it is known."""
     figure = Figure(figsize=(11.0, 5.5), dpi=110, layout='constrained')
     above, height = figure.subplots(1, 2)
