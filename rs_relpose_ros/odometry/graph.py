@@ -236,7 +236,7 @@ class KeyframeGraph:
         def error(factor: Any, values: Any, jacobians: Any) -> Array:
             keys = factor.keys()
             first, second = (BodyState(
-                values.atPose3(keys[k]).rotation().matrix(),
+                np.ascontiguousarray(values.atPose3(keys[k]).rotation().matrix()),
                 values.atPose3(keys[k]).translation(), values.atVector(keys[k + 1]), rate)
                 for k, rate in ((0, rates[0]), (2, rates[1])))
             e, by = deviations(first, second, mounting, R, t, velocities)

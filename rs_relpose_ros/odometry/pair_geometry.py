@@ -16,7 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.geometry.so3 import log_so3, skew
+from rs_relpose_ros.compiled import kernel
+from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.vectors import tangent_basis
 
 Array = NDArray[np.float64]
@@ -44,44 +45,52 @@ class BodyState(NamedTuple):
     rate: Array
 
 
+@kernel
+def _skew(v: Array) -> Array:
+    """``_skew(a) @ b = a x b``."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+@kernel
 def deviations(first: BodyState, second: BodyState, mounting: Mounting, R: Array, t: Array,
                velocities: Array) -> tuple[Array, Array]:
     """Deviations (11,) of a measured pair, and their derivatives (11, 18).
 
     By small turns and steps of the first body (in its axes), a change of its velocity (in the
-    world), and the same of the second.
+    world), and the same of the second. All arrays are contiguous.
     """
-    C, c = mounting
-    R1 = first.R @ C.T
-    R12 = R1.T @ second.R @ C.T
-    q = R1.T @ (second.position + second.R @ c - first.position - first.R @ c)
-    b = max(float(np.linalg.norm(q)), _LEAST_BASELINE)
+    C, c = mounting.R, mounting.position
+    arm = _skew(c)
+    back = C @ first.R.T
+    R12 = back @ second.R @ C.T
+    R12C = R12 @ C
+    q = back @ (second.position + second.R @ c - first.position - first.R @ c)
+    b = max(np.linalg.norm(q), _LEAST_BASELINE)
     u = q / b
-    arm1, arm2 = np.cross(first.rate, c), np.cross(second.rate, c)
-    w1 = R1.T @ (first.velocity + first.R @ arm1)
-    w2 = R1.T @ (second.velocity + second.R @ arm2)
-    R12C, RT = R12 @ C, R1.T
-    dq = np.hstack([skew(q) @ C + C @ skew(c), -C, np.zeros((3, 3)),
-                    -R12C @ skew(c), R12C, np.zeros((3, 3))])
-    by = np.zeros((11, 18))
+    dq = np.zeros((3, 18))
+    dq[:, 0:3], dq[:, 3:6] = _skew(q) @ C + C @ arm, -C
+    dq[:, 9:12], dq[:, 12:15] = -R12C @ arm, R12C
+    db = u @ dq
+    e, by = np.empty(11), np.zeros((11, 18))
+    e[0:3] = log_so3(R12 @ R.T)
     by[0:3, 0:3], by[0:3, 9:12] = -C, R12C
-    B, along = tangent_basis(t), float(t @ u)
+    B, along = tangent_basis(t), t @ u
     # Behind the measured direction it has no tangent: the sine instead.
     along = along if along > 0.1 else 1.0
-    du = (dq - np.outer(u, u @ dq)) / b
-    s = B.T @ u / along
-    by[3:5] = (B.T @ du - np.outer(s, t @ du)) / along
-    db = u @ dq
-    e = np.empty(11)
-    e[0:3], e[3:5] = log_so3(np.ascontiguousarray(R12 @ R.T)), s
-    for k, (w, own) in enumerate(((w1, 0), (w2, 9))):
-        rows = slice(5 + 3 * k, 8 + 3 * k)
+    du = (dq - np.outer(u, db)) / b
+    e[3:5] = B.T @ u / along
+    by[3:5] = (B.T @ du - np.outer(e[3:5], t @ du)) / along
+    for k in range(2):
+        body = first if k == 0 else second
+        # The camera's place turns with the body.
+        swing = _skew(body.rate) @ c
+        w = back @ (body.velocity + body.R @ swing)
+        own, rows = 9 * k, slice(5 + 3 * k, 8 + 3 * k)
         e[rows] = w / b - velocities[3 * k:3 * k + 3]
-        by[rows, 0:3] = skew(w) @ C
-        by[rows, own:own + 3] -= (C @ skew(arm1)) if k == 0 else (R12C @ skew(arm2))
-        by[rows, own + 6:own + 9] = RT
-        by[rows] /= b
-        by[rows] -= np.outer(w / b, db) / b
+        by[rows, 0:3] += _skew(w) @ C
+        by[rows, own:own + 3] -= (C if k == 0 else R12C) @ _skew(swing)
+        by[rows, own + 6:own + 9] = back
+        by[rows] = (by[rows] - np.outer(w / b, db)) / b
     return e, by
 
 
