@@ -28,7 +28,7 @@ def compile_kernels(folder: str) -> None:
     paths = [path for path in os.environ.get('PYTHONPATH', '').split(os.pathsep)
              if path and not (Path(path) / 'sitecustomize.py').exists()]
     environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(paths)}
-    for module in ('front_end', 'global_shutter'):
+    for module in ('front_end', 'global_shutter', 'odometry'):
         filled = subprocess.run([sys.executable, '-m', f'{NAME}.{module}.warm_up'], cwd=folder,
                                 env=environment, stderr=subprocess.PIPE, text=True, check=False)
         if filled.returncode:

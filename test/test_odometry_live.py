@@ -44,6 +44,9 @@ def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag):
         relpose.wait_for('ready')
         node.wait_for('ready')
         graph.wait_for_publisher('/odometry_node/odometry')
+        # The one of this test, and the node's, which must not miss the first pair.
+        wait_until(lambda: graph.node.count_subscribers('/relpose_node/pairs') == 2,
+                   'the subscriptions', node)
         with player_process(bundled_bag) as playing:
             assert playing.wait() == 0
         wait_until(lambda: paths and len(paths[-1].poses) > 15, 'a path', node)

@@ -200,7 +200,8 @@ def test_core_imports_neither_ros_nor_rosbags():
 
 
 @pytest.mark.parametrize(('library', 'folders'), [
-    (ROS, {f'{NAME}/node', f'{NAME}/global_shutter', f'{LABORATORY}/live'}),
+    (ROS, {f'{NAME}/node', f'{NAME}/global_shutter', f'{NAME}/odometry', f'{LABORATORY}/live'}),
+    (re.compile('gtsam$'), {f'{NAME}/odometry'}),
     (re.compile('rosbags$'), {f'{NAME}/bags'})])
 def test_library_is_imported_in_its_folders_only(library, folders):
     users = {path for path in MODULES.values()

@@ -34,6 +34,8 @@ Array = NDArray[np.float64]
 STANDARD_GRAVITY = 9.80665   # [m/s^2]
 # 1 sigma of the velocity of a body that stands [m/s], per axis.
 _STANDING = 0.005
+# 1 sigma of heading and place of a start, which are chosen [rad, m].
+_CHOSEN = 1e-4
 # Integration error of the samples, as a noise density of the position [m/sqrt(s)].
 _INTEGRATION = 1e-4
 
@@ -44,16 +46,13 @@ class GraphError(RsRelposeError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Start:
-    """State of the first keyframe, with 1 sigma of each part.
-
-    `pose_sigmas` (6,): of a small turn in the axes of the body [rad], and of the position [m].
-    """
+    """State of the first keyframe, with 1 sigma of what is not chosen: place and heading are."""
 
     R: Array
     position: Array
     velocity: Array
     gyro_bias: Array
-    pose_sigmas: Array
+    tilt_sigma: float   # [rad] per axis
     velocity_sigma: float
     gyro_bias_sigma: float
 
@@ -108,9 +107,12 @@ class KeyframeGraph:
         params = gtsam.LevenbergMarquardtParams()
         params.setMaxIterations(10)
         params.setRelativeErrorTol(1e-4)
+        # Bias walks are known to 1e-5, a velocity or a place to metres: too much for Cholesky.
+        params.setLinearSolverType('MULTIFRONTAL_QR')
+        self._params = params
         self._smoother = gtsam.BatchFixedLagSmoother(config.smoothing_lag, params)
         self._record = Record() if keep else None
-        self._rates = [rate]   # of the body at each keyframe, as measured
+        self._rate = rate   # of the body at the newest keyframe, as measured
         self._count = 1   # of keyframes
         self._seconds = 0.0   # of the newest
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -119,7 +121,11 @@ class KeyframeGraph:
         values.insert(X(0), pose)
         values.insert(V(0), start.velocity)
         values.insert(B(0), bias)
-        factors.addPriorPose3(X(0), pose, _diagonal(start.pose_sigmas))
+        # Turns and steps are in the axes of the body.
+        covariance = _CHOSEN**2 * np.eye(6)
+        covariance[:3, :3] = start.R.T @ np.diag(
+            np.square([start.tilt_sigma] * 2 + [_CHOSEN])) @ start.R
+        factors.addPriorPose3(X(0), pose, gtsam.noiseModel.Gaussian.Covariance(covariance))
         factors.addPriorVector(V(0), start.velocity, _diagonal([start.velocity_sigma] * 3))
         factors.addPriorConstantBias(B(0), bias, _diagonal(
             [imu.accel_bias_sigma] * 3 + [start.gyro_bias_sigma] * 3))
@@ -158,7 +164,7 @@ class KeyframeGraph:
         i, j = self._count - 1, self._count
         pim = preintegrated(interval, self._bias, self._imu, self._config)
         state = self._predicted(pim)
-        self._rates.append(interval.rates[-1])
+        rates, self._rate = (self._rate, interval.rates[-1]), interval.rates[-1]
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         values.insert(X(j), state.pose())
         values.insert(V(j), state.velocity())
@@ -166,7 +172,7 @@ class KeyframeGraph:
         factors.add(gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), pim))
         of_pair = None
         if pair is not None:
-            of_pair = self._pair_factor(i, j, pair)
+            of_pair = self._pair_factor(i, j, pair, rates)
             if of_pair is not None:
                 factors.add(of_pair)
             if pair.turned_only:
@@ -209,7 +215,8 @@ class KeyframeGraph:
         """All keyframes since the start, each with what came after it; needs `keep`."""
         assert self._record is not None
         factors = _compact(self._record.factors)
-        values = gtsam.LevenbergMarquardtOptimizer(factors, self._record.values).optimize()
+        values = gtsam.LevenbergMarquardtOptimizer(
+            factors, self._record.values, self._params).optimize()
         marginals = gtsam.Marginals(factors, values)
         return [_state(values, marginals, k) for k in range(self._count)]
 
@@ -220,7 +227,8 @@ class KeyframeGraph:
                                self._values.atVector(V(self._count - 1)))
         return pim.predict(state, self._bias)
 
-    def _pair_factor(self, i: int, j: int, pair: PairMeasurement) -> Any:
+    def _pair_factor(self, i: int, j: int, pair: PairMeasurement,
+                     measured: tuple[Array, Array]) -> Any:
         images = pair.images
         if images is None:
             return None
@@ -231,7 +239,7 @@ class KeyframeGraph:
         t, velocities = (images.t, images.velocities) if pair.has_direction else (
             np.array([0.0, 0.0, 1.0]), np.zeros(6))
         bias = self._bias.gyroscope()
-        rates = self._rates[i] - bias, self._rates[j] - bias
+        rates = measured[0] - bias, measured[1] - bias
 
         def error(factor: Any, values: Any, jacobians: Any) -> Array:
             keys = factor.keys()
@@ -269,13 +277,13 @@ class KeyframeGraph:
 
     def _update(self, factors: Any, values: Any, seconds: float) -> None:
         stamps = dict.fromkeys(list(values.keys()), seconds)
+        self._seconds = seconds
         try:
             self._smoother.update(factors, values, stamps)
+            self._read()
         except RuntimeError as error:   # of gtsam, of several lines
             first_line = str(error).strip().partition('\n')[0]
             raise GraphError(f'the graph cannot be solved: {first_line}') from error
-        self._seconds = seconds
-        self._read()
         if self._record is not None:
             self._record.factors.push_back(factors)
 

@@ -31,6 +31,7 @@ from rs_relpose_ros.node.stoppable import StoppableNode
 from rs_relpose_ros.odometry.library import need_gtsam
 from rs_relpose_ros.odometry.measurement import PairMeasurement
 from rs_relpose_ros.odometry.outgoing import odometry_message, path_message, transform_message
+from rs_relpose_ros.odometry.warm_up import warm_up_odometry
 
 NAME = 'odometry_node'
 
@@ -57,6 +58,7 @@ class OdometryNode(StoppableNode):
         super().__init__(NAME)
         need_gtsam()
         from rs_relpose_ros.odometry.odometry import OdometryEstimator
+        warm_up_odometry()
         logger = self.get_logger()
         self._info = CauseLog(lambda text: logger.info(text))
         self._warn = CauseLog(lambda text: logger.warning(text))

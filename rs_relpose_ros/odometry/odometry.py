@@ -10,12 +10,13 @@ from collections import Counter
 from dataclasses import dataclass
 from enum import Enum
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.config.parameters import Parameters
-from rs_relpose_ros.geometry.so3 import skew
+from rs_relpose_ros.geometry.so3 import exp_so3, skew
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.messages.hanging import HangingGyro
@@ -42,8 +43,8 @@ _JUMP_NS = 1_000_000_000
 _SAME_NS = 1_000_000
 # Samples of which gravity is taken at a start [s].
 _GRAVITY_WINDOW = 1.0
-# 1 sigma of that direction where the body moves [rad]; of heading and place, which are chosen.
-_MOVING_TILT, _CHOSEN = 0.1, 1e-4
+# 1 sigma of that direction where the body moves [rad].
+_MOVING_TILT = 0.1
 # 1 sigma of the velocity at a start in motion [m/s], per axis: nothing is known of it.
 _ANY_VELOCITY = 3.0
 # Largest 1 sigma of the logarithm of a baseline that starts a graph, and the speed that is tried
@@ -51,6 +52,8 @@ _ANY_VELOCITY = 3.0
 _START_LOG_SIGMA, _GUESSED_SPEED = 0.7, 1.0
 # Chi squared per degree of freedom of a pair that contradicts, and of a start that went wrong.
 _CONTRADICTING, _WRONG_START = 4.0, 3.0
+# Longest time over which the IMU carries a path that was lost [s].
+_LONGEST_CARRIED = 10.0
 # A start that takes longer is begun anew [s].
 _LONGEST_START = 4.0
 # Pairs that tell the scale of a start in motion, at least.
@@ -91,11 +94,21 @@ class Started:
     scale_sigma: float   # relative
 
 
+class _Left(NamedTuple):
+    """Where a path goes on: rotation of the body (None: of any heading), position [m], sigmas."""
+
+    R: Array | None
+    position: Array
+    heading_sigma: float
+    position_sigma: float
+
+
 @dataclass(slots=True, eq=False)
 class _Run:
     """A graph since its start."""
 
     graph: KeyframeGraph
+    left: _Left   # where the path before it ended
     at_rest: bool
     first_ns: int
     newest_ns: int   # of the newest keyframe
@@ -105,6 +118,7 @@ class _Run:
     interval: ImuInterval   # up to the newest keyframe
     pairs: int = 0
     published: bool = False
+    path: int = 0   # number of starts before
 
 
 class OdometryEstimator:
@@ -190,15 +204,15 @@ class OdometryEstimator:
         if interval is None:
             return None
         stamp_ns, at_ns = run.stamps[-1]
-        return self._told(run.graph.carried(interval), interval.rates[-1],
-                          stamp_ns + imu_ns - at_ns, imu_ns, run.frame_id)
+        return self._told(run, run.graph.carried(interval), interval.rates[-1],
+                          stamp_ns + imu_ns - at_ns, imu_ns)
 
     def smoothed(self) -> list[Odometry]:
         """All keyframes, each with all that came before and after it; needs `keep`."""
         out = []
         for run in self._runs:
             states = run.graph.smoothed()
-            out += [self._told(state, np.full(3, math.nan), *stamps, run.frame_id)
+            out += [self._told(run, state, np.full(3, math.nan), *stamps)
                     for state, stamps in zip(states, run.stamps, strict=True)]
         return out
 
@@ -245,8 +259,8 @@ class OdometryEstimator:
             return None
         if not run.published and not self._known(run):
             return None
-        return self._told(run.graph.newest, interval.rates[-1], pair.stamp_ns, pair.current_ns,
-                          pair.frame_id)
+        return self._told(run, run.graph.newest, interval.rates[-1], pair.stamp_ns,
+                          pair.current_ns)
 
     def _continued(self, pair: PairMeasurement) -> _Run | None:
         """The run with a keyframe at the pair's reference; None where there is none."""
@@ -295,41 +309,34 @@ class OdometryEstimator:
             force = _mean_force_at_start(interval, bias)
         else:
             force = before.mean_force(bias)
-        R = self._levelled(force)
+        left = self._left_at(pair.reference_ns)
+        R = _levelled(force, left)
         C, c = self._mounting
-        velocity = np.zeros(3) if at_rest else R @ (
-            C.T @ moving - np.cross(rate, c))
-        tilt = (self._imu.accel_bias_sigma / STANDARD_GRAVITY if at_rest else _MOVING_TILT)
-        # About the world's z, as the axes of the body lie, heading is chosen.
-        turn = R.T @ np.diag([tilt, tilt, _CHOSEN]) @ R
-        position, sigmas = np.zeros(3), np.full(6, _CHOSEN)
-        if self._left is not None:
-            newest = self._left.graph.newest
-            position = newest.position
-            sigmas[3:] = math.sqrt(float(np.trace(newest.pose_covariance[3:, 3:])) / 3.0)
-        sigmas[:3] = np.sqrt(np.diag(turn @ turn))
-        start = Start(R, position, velocity, bias, sigmas,
+        velocity = np.zeros(3) if at_rest else R @ (C.T @ moving - np.cross(rate, c))
+        tilt = self._imu.accel_bias_sigma / STANDARD_GRAVITY if at_rest else _MOVING_TILT
+        start = Start(R, left.position, velocity, bias, tilt,
                       0.01 if at_rest else _ANY_VELOCITY, self._imu.gyro_bias_sigma)
         graph = KeyframeGraph(start, interval.rates[0], self._mounting, self._imu, self._config,
                               keep=self._keep)
         offset = pair.current_ns - pair.stamp_ns
-        return _Run(graph, at_rest, pair.reference_ns, pair.reference_ns, pair.reference_ns,
+        return _Run(graph, left, at_rest, pair.reference_ns, pair.reference_ns, pair.reference_ns,
                     [(pair.reference_ns - offset, pair.reference_ns)], pair.frame_id, interval)
 
-    def _levelled(self, force: Array) -> Array:
-        """Rotation (3, 3) from the body to the world, by the force of standing still."""
-        up = force / np.linalg.norm(force)
-        # The least turn that takes it upwards.
-        axis = np.cross(up, [0.0, 0.0, 1.0])
-        cosine = up[2]
-        R = (np.eye(3) + skew(axis) + skew(axis) @ skew(axis) / (1.0 + cosine)
-             if cosine > -0.999 else np.diag([1.0, -1.0, -1.0]))
-        if self._left is not None:
-            M = self._left.graph.newest.R @ R.T
-            psi = math.atan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1])
-            R = np.array([[math.cos(psi), -math.sin(psi), 0.0],
-                          [math.sin(psi), math.cos(psi), 0.0], [0.0, 0.0, 1.0]]) @ R
-        return np.asarray(R)
+    def _left_at(self, imu_ns: int) -> _Left:
+        """Where the path goes on at an instant: where it ended, carried on by the IMU."""
+        run = self._left
+        if run is None:
+            return _Left(None, np.zeros(3), 0.0, 0.0)
+        seconds, newest = seconds_between(run.newest_ns, imu_ns), run.graph.newest
+        interval = self._samples.between(run.newest_ns, imu_ns)
+        if interval is None or not seconds <= _LONGEST_CARRIED:
+            speed = float(np.linalg.norm(newest.velocity))
+            return _Left(newest.R, newest.position, math.pi, 1.0 + speed * abs(seconds))
+        state = run.graph.carried(interval)
+        up, covariance = state.R[2], state.pose_covariance
+        drift = 0.5 * self._imu.accel_bias_sigma * seconds**2
+        return _Left(state.R, state.position, math.sqrt(float(up @ covariance[:3, :3] @ up)),
+                     math.hypot(drift, math.sqrt(float(np.trace(covariance[3:, 3:])) / 3.0)))
 
     def _known(self, run: _Run) -> bool:
         """Whether the scale of a run that starts is known by now."""
@@ -344,7 +351,9 @@ class OdometryEstimator:
                 run.published = True
                 self.state = State.TRACKING
                 self.starts.append(Started(run.at_rest, run.newest_ns, seconds, sigma))
-                self._runs.append(run)
+                run.path = len(self.starts) - 1
+                if self._keep:
+                    self._runs.append(run)
                 self._sentences.append(
                     f'started {"at rest" if run.at_rest else "in motion"} after {seconds:.1f} s: '
                     f'the scale is known to {100.0 * sigma:.1f} %')
@@ -363,8 +372,8 @@ class OdometryEstimator:
 
     # -- results -----------------------------------------------------------------------------
 
-    def _told(self, state: KeyframeState, rate: Array, stamp_ns: int, imu_ns: int,
-              frame_id: str) -> Odometry:
+    def _told(self, run: _Run, state: KeyframeState, rate: Array, stamp_ns: int,
+              imu_ns: int) -> Odometry:
         C, c = self._mounting
         rate = rate - state.gyro_bias
         # The camera's place turns with the body: dp = R (step - c x turn), in the world.
@@ -375,10 +384,29 @@ class OdometryEstimator:
         velocity = np.zeros((6, 6))
         velocity[:3, :3] = R.T @ state.velocity_covariance @ R
         velocity[3:, 3:] = self._imu.gyro_noise_density**2 * 100.0 * np.eye(3)
+        # A start that goes on from an earlier path has its place and heading from there.
+        position, up = state.position + state.R @ c, np.array([0.0, 0.0, 1.0])
+        by_heading = run.left.heading_sigma * np.concatenate([
+            np.cross(up, position - run.left.position), up])
+        covariance = to_world @ state.pose_covariance @ to_world.T + np.outer(
+            by_heading, by_heading)
+        covariance[:3, :3] += run.left.position_sigma**2 * np.eye(3)
         return Odometry(
-            stamp_ns, imu_ns, frame_id, len(self._runs) - 1, R, state.position + state.R @ c,
-            to_world @ state.pose_covariance @ to_world.T,
+            stamp_ns, imu_ns, run.frame_id, run.path, R, position, covariance,
             R.T @ (state.velocity + state.R @ np.cross(rate, c)), C @ rate, velocity)
+
+
+def _levelled(force: Array, left: _Left) -> Array:
+    """Rotation (3, 3) from the body to the world, by the force of standing still."""
+    up = force / np.linalg.norm(force)
+    # The least turn that takes it upwards, then one about z to the heading that was left.
+    turn = skew(np.cross(up, [0.0, 0.0, 1.0]))
+    R = (np.eye(3) + turn + turn @ turn / (1.0 + up[2]) if up[2] > -0.999
+         else np.diag([1.0, -1.0, -1.0]))
+    if left.R is not None:
+        M = left.R @ R.T
+        R = exp_so3(np.array([0.0, 0.0, math.atan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1])])) @ R
+    return np.asarray(R)
 
 
 def _mean_force_at_start(interval: ImuInterval, bias: Array) -> Array:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.geometry.so3 import log_so3
-from rs_relpose_ros.geometry.vectors import tangent_basis
+from rs_relpose_ros.geometry.vectors import norm, tangent_basis
 
 Array = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ def deviations(first: BodyState, second: BodyState, mounting: Mounting, R: Array
     R12 = back @ second.R @ C.T
     R12C = R12 @ C
     q = back @ (second.position + second.R @ c - first.position - first.R @ c)
-    b = max(np.linalg.norm(q), _LEAST_BASELINE)
+    b = max(norm(q), _LEAST_BASELINE)
     u = q / b
     dq = np.zeros((3, 18))
     dq[:, 0:3], dq[:, 3:6] = _skew(q) @ C + C @ arm, -C
