@@ -63,7 +63,6 @@ PAIR_VALUES = (
     # Instants of the two stamped rows on the IMU's clock.
     PairValue('reference_imu_ns', lambda pair: str(pair.reference_ns1)),
     PairValue('current_imu_ns', lambda pair: str(pair.reference_ns2)),
-    PairValue('gyro_bias_rad_s', lambda pair: numbers(pair.gyro_bias)),
     # What the images alone say, without the priors of the IMU: `ImageInformation`.
     PairValue('image_row_s', lambda pair: _of_images(
         pair, lambda images: np.array([images.row_time]))),
@@ -74,6 +73,7 @@ PAIR_VALUES = (
     PairValue('image_gradient', lambda pair: _of_images(pair, lambda images: images.gradient)),
     PairValue('image_information', lambda pair: _of_images(
         pair, lambda images: images.information[np.triu_indices(len(images.gradient))])),
+    PairValue('gyro_bias_rad_s', lambda pair: numbers(pair.gyro_bias)),
     PairValue('health', lambda pair: pair.health.state.value),
     PairValue('health_findings', lambda pair: pair.health.text),
 )
