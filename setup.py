@@ -75,7 +75,12 @@ setup(
     # Run-time dependencies are rosdep keys in package.xml and, for pip, requirements/base.txt.
     # Named here, pip would lay its own OpenCV and NumPy over those of a ROS machine.
     install_requires=['setuptools'],
-    extras_require={'test': ['pytest'], 'odometry': ['gtsam>=4.3,<4.4']},
+    extras_require={
+        'test': ['pytest'],
+        'odometry': ['gtsam>=4.3,<4.4'],
+        'video': ['av>=13,<19', 'telemetry-parser>=0.3,<0.4'],
+        'batch': ['dask[distributed]>=2024.5'],
+    },
     zip_safe=False,
     cmdclass={'build_py': BuildWithKernels, 'develop': DevelopWithKernels},
     entry_points={

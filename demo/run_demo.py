@@ -24,6 +24,10 @@ from rs_relpose_lab.experiments.comparison import (
     score_of_replay,
     score_table,
 )
+from rs_relpose_lab.experiments.unrolled_poses import (
+    draw_before_and_after,
+    five_point_when_turned,
+)
 from rs_relpose_lab.live.live_run import LiveRun, run_live
 from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.errors import RsRelposeError
@@ -44,11 +48,14 @@ def compare(live: LiveRun) -> list[str]:
         '...')
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context('spawn')) as pool:
         paper = [pool.submit(score_of_paper, name) for name in PAPER_ALGORITHMS]
+        turned = pool.submit(five_point_when_turned, BAG, read_parameters(PARAMETERS), OUT)
         replayed = compare_live(live.table, live.stamps, BAG, PARAMETERS, OUT, pictures=True)
         opencv = replayed.opencv_scores()
         scores = [replayed.node, score_of_records('the same, replayed', replayed.records),
-                  *(future.result() for future in paper), *opencv]
-    return [*score_table(scores), '', *remarks(replayed, opencv)]
+                  *(future.result() for future in paper), *opencv, turned.result()]
+    shift = draw_before_and_after(BAG, read_parameters(PARAMETERS), OUT / 'global_shutter.png')
+    return [*score_table(scores), '', *remarks(replayed, opencv),
+            f'images turned by the gyro to their middle row: pixels move by up to {shift:.1f} px']
 
 
 def score_of_paper(name: str) -> Score:
@@ -91,8 +98,8 @@ def main() -> int:
     print('\n'.join(lines))
     print()
     print('pictures and tables:')
-    for name in ('matches.png', 'errors.png', 'residuals.png', 'rotation.png', POSES_FILE,
-                 'live.csv'):
+    for name in ('matches.png', 'errors.png', 'residuals.png', 'rotation.png',
+                 'global_shutter.png', POSES_FILE, 'live.csv'):
         print(f'  {(OUT / name).relative_to(ROOT)}')
     return 0
 

@@ -1,4 +1,4 @@
-"""Start relpose_node beside a camera driver.
+"""Start relpose_node, or another node of the package, beside a camera driver.
 
 ::
 
@@ -8,13 +8,20 @@
 
 from launch import Action, LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch.substitutions import (
+    EnvironmentVariable,
+    LaunchConfiguration,
+    PathJoinSubstitution,
+)
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
+# Where Fast DDS looks for a profile; one that the user has set stays.
+PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 ARGUMENTS = {
     'namespace': ('', 'namespace of the node'),
-    'name': ('relpose_node', 'name of the node'),
+    'executable': ('relpose_node', 'node to start: relpose_node or global_shutter_node'),
+    'name': (LaunchConfiguration('executable'), 'name of the node'),
     'camera_namespace': ('/camera', 'namespace of the camera driver'),
     'image': ('image_raw', 'raw image topic, within camera_namespace unless absolute'),
     'camera_info': ('camera_info', 'CameraInfo topic, likewise'),
@@ -25,8 +32,9 @@ ARGUMENTS = {
         PathJoinSubstitution([FindPackageShare('rs_relpose_ros'), 'config', 'relpose.yaml']),
         'parameter file; readout_time and quat_cam_imu_xyzw have no default'),
     'fastdds_profile': (
-        '', ('Fast DDS profile, for images above 512 KB: config/fastdds.xml of this package; the '
-             'driver needs the same')),
+        EnvironmentVariable(PROFILE, default_value=PathJoinSubstitution(
+            [FindPackageShare('rs_relpose_ros'), 'config', 'fastdds.xml'])),
+        'Fast DDS profile of the node, for images above 512 KB; the driver needs it, too'),
     'use_sim_time': ('false', 'clock of log lines and diagnostics; estimates go by stamps alone'),
 }
 
@@ -38,9 +46,9 @@ def start_node(context: LaunchContext) -> list[Action]:
     overrides = {name: argument[name] for name in ('image_transport', 'use_sim_time')
                  if argument[name].perform(context)}
     profile = argument['fastdds_profile']
-    environment = [SetEnvironmentVariable('FASTRTPS_DEFAULT_PROFILES_FILE', profile)]
-    return [*(environment if profile.perform(context) else []), Node(
-        package='rs_relpose_ros', executable='relpose_node', name=argument['name'],
+    environment = [SetEnvironmentVariable(PROFILE, profile)] if profile.perform(context) else []
+    return [*environment, Node(
+        package='rs_relpose_ros', executable=argument['executable'], name=argument['name'],
         namespace=argument['namespace'], output='screen',
         parameters=[argument['params_file'], overrides],
         remappings=[

@@ -6,6 +6,8 @@ import csv
 from functools import lru_cache
 
 import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.experiments.calibration_stretches import (
     calibrated_parts,
@@ -15,16 +17,26 @@ from rs_relpose_lab.experiments.calibration_stretches import (
 )
 from rs_relpose_lab.experiments.calibration_tracks import drawn, record, Recorded
 from rs_relpose_ros.calibrate.bag_streams import CalibrationInput
-from rs_relpose_ros.calibrate.coplanarity import BIAS, EXPOSURE, FOCAL, GLOBAL, READOUT, SLOPE
+from rs_relpose_ros.calibrate.coplanarity import (
+    BIAS,
+    EXPOSURE,
+    FOCAL,
+    GLOBAL,
+    OFFSET,
+    READOUT,
+    ROTATION,
+    SLOPE,
+)
 from rs_relpose_ros.calibrate.fit import Fit, fit, initial, with_bends
 from rs_relpose_ros.calibrate.gyro_path import blur, GyroSeries
 from rs_relpose_ros.calibrate.judgement import judged
 from rs_relpose_ros.calibrate.observations import Observations
 from rs_relpose_ros.calibrate.report import parameter_file
-from rs_relpose_ros.calibrate.result import CostCurve
+from rs_relpose_ros.calibrate.result import CalibrationResult, CostCurve
 from rs_relpose_ros.calibrate.tracks import Tracks
 from rs_relpose_ros.calibrate.uncertainty import ModelErrors, widened
 from rs_relpose_ros.config.calibration import CalibrationConfig
+from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
 
@@ -123,20 +135,55 @@ def test_exposure_is_found():
     assert abs(found[READOUT] - recorded().truth.readout_time) < 4.0 * sigma[READOUT]
 
 
-def test_read_out_beyond_the_interval_is_not_observable():
+def judged_at(readout: float, sigma: float) -> tuple[CalibrationResult, Fit, Observations]:
+    """Result where the fit has this read-out time, its offset by -0.5 correlated with it."""
     final, data = fitted(recorded().tracks, recorded().gyro, free_of(EXPOSURE))
-    beyond = final.unknowns.parameters.copy()
-    beyond[READOUT] = data.interval + 5e-4
-    covariance = final.covariance.copy()
-    covariance[READOUT, READOUT] = 1e-6
-    final = Fit(final.problem, final.unknowns._replace(parameters=beyond), final.weights,
+    parameters, covariance = final.unknowns.parameters.copy(), final.covariance.copy()
+    parameters[READOUT] = readout
+    covariance[READOUT], covariance[:, READOUT] = 0.0, 0.0
+    covariance[READOUT, READOUT] = sigma**2
+    covariance[READOUT, OFFSET] = covariance[OFFSET, READOUT] = -0.5 * sigma**2
+    covariance[READOUT, ROTATION] = covariance[ROTATION, READOUT] = 0.1 * sigma**2
+    final = Fit(final.problem, final.unknowns._replace(parameters=parameters), final.weights,
                 covariance, final.information, True)
     curve = CostCurve(np.linspace(-0.03, 0.03, 3), np.zeros(3))
-    result = judged(data, final, free_of(EXPOSURE), curve, CalibrationConfig())
-    assert result.readout_time.sigma < 1.5e-3 and not result.readout_time.observable
-    assert 'no camera can do' in result.readout_time.remark
+    return judged(data, final, free_of(EXPOSURE), curve, CalibrationConfig()), final, data
+
+
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+def test_the_interval_between_frames_bounds_the_read_out(sign):
+    """Against draws from the normal distribution of which those beyond the bound are left out."""
+    interval, sigma = Observations.of(
+        recorded().tracks, recorded().gyro, camera_of(recorded())).interval, 1e-3
+    result, final, _ = judged_at(sign * (interval + 5e-4), sigma)
+    drawn_at = final.unknowns.parameters[READOUT] + sigma * np.random.default_rng(
+        5).standard_normal(1_000_000)
+    mean = float(drawn_at[np.abs(drawn_at) <= interval].mean())
+    readout, moved = result.readout_time, mean - final.unknowns.parameters[READOUT]
+    assert readout.observable and abs(readout.value) < interval
+    assert readout.value == pytest.approx(mean, abs=5e-6)
+    assert readout.sigma == pytest.approx(sigma, rel=1e-6)
+    # What goes with it follows: the middle row, and so the first one; the axes.
+    middle = final.unknowns.parameters[OFFSET] - 0.5 * moved
+    first = 0.5 * (recorded().truth.height - 1) / recorded().truth.height
+    assert result.time_offset.value == pytest.approx(middle - first * mean, abs=1e-5)
+    turn = Rotation.from_matrix(result.R_cam_imu.T @ final.unknowns.R_imu_cam.T).as_rotvec()
+    np.testing.assert_allclose(turn, [0.1 * moved, 0.0, 0.0], atol=1e-6)
+    assert any(f'{1e3 * interval:.1f} ms between frames' in text for text in result.warnings)
     text = parameter_file(result, 'A test.', camera=camera_of(recorded()), compressed=False)
-    assert 'readout_time:' not in text.replace('readout_time (', '')
+    assert f'readout_time: {abs(readout.value):.6f}'.rstrip('0') in text
+
+
+def test_the_interval_does_not_touch_a_read_out_far_below():
+    result, final, _ = judged_at(0.02, 1e-3)
+    assert result.readout_time.value == pytest.approx(0.02, abs=1e-12)
+    np.testing.assert_allclose(result.R_cam_imu, final.unknowns.R_imu_cam.T, atol=1e-12)
+    assert result.warnings == ()
+
+
+def test_a_read_out_for_certain_beyond_the_interval_is_refused():
+    with pytest.raises(InputError, match='which no camera can do'):
+        judged_at(0.037, 1e-3)
 
 
 # -- parts of a recording ----------------------------------------------------------------------

@@ -284,7 +284,7 @@ def unchanged(message):
     """A message as it is."""
 
 
-def rewritten(source, path, change, seconds=6.0):
+def rewritten(source, path, change, seconds=4.0):
     """The first seconds of a bag with its messages changed in place."""
     with open_bag(source) as bag, BagWriter(path) as out:
         topics = bag.find_topics()
@@ -323,7 +323,7 @@ WRONG = {
     'read-out zero': ({'readout_time': 0.0}, 'readout_time', 0.03, 0.006),
     'read-out upwards': ({'readout_direction': 'up'}, 'readout_direction', -0.03, 0.006),
     'clock': ({'time_offset': 0.02}, 'time_offset', 0.0, 0.003),
-    'axes': ({'quat_cam_imu_xyzw': (0.0, 0.0, 0.0, 1.0)}, 'axes', 120.0, 25.0),
+    'axes': ({'quat_cam_imu_xyzw': (0.0, 0.0, 0.0, 1.0)}, 'axes', 120.0, 1.0),
 }
 
 
@@ -416,54 +416,46 @@ def converted(recordings, tmp_path_factory):
     return path
 
 
-# READMEs of the recordings, whose figures come from other software; of the second RealSense one
-# its own offset. Three gaps of up to 0.3 s; no accelerometer, and no bias known; little light.
+# Parameters of the converter; what may be warned of. Three gaps of up to 0.3 s; no accelerometer,
+# and no bias known; little light.
 REAL = {
-    'realsense_rgb_rs': ({}, {'image rate'}),
-    'realsense_rgb_rs_b': ({'time_offset': -0.064}, {'image rate'}),
-    'xiaomi_cc9_rs': ({}, {'gravity', 'gyro_bias'}),
+    'realsense_rgb_rs': {'image rate'},
+    'realsense_rgb_rs_b': {'image rate'},
+    'xiaomi_cc9_rs': {'gravity', 'gyro_bias'},
 }
 
 
 @pytest.mark.recordings
 @pytest.mark.parametrize('name', REAL)
 def test_recordings_of_real_cameras(converted, name):
-    path, (changes, warned) = converted(name), REAL[name]
-    findings, report = checked(path, read_parameters(f'{path}.yaml').updated(changes))
+    path = converted(name)
+    findings, report = checked(path, read_parameters(f'{path}.yaml'))
     assert not report.failed
-    assert {f.name for f in report.findings if f.verdict is W} <= warned
+    assert {f.name for f in report.findings if f.verdict is W} <= REAL[name]
     assert findings['axes'].verdict in (Verdict.OK, Verdict.UNKNOWN)
+    if 'realsense' in name:
+        # Automatic exposure: stamps of varying interval are no times of arrival.
+        assert findings['image stamps'].verdict is Verdict.OK
+    if name == 'realsense_rgb_rs_b':
+        assert 'automatic exposure' in findings['image stamps'].text
+        assert 'time_offset_per_interval' in findings['image stamps'].remedy
 
 
 @pytest.mark.recordings
-@pytest.mark.parametrize('changes, name', [
-    ({'time_offset': -0.031}, 'time_offset'),
-    ({'quat_cam_imu_xyzw': (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))}, 'axes'),
-    ({'quat_cam_imu_xyzw': (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))}, 'axes')])
-def test_gross_errors_in_a_recording_in_little_light(converted, changes, name):
+@pytest.mark.parametrize('changes, name, seen, tolerance', [
+    ({'time_offset': -0.0305}, 'time_offset', -0.0635, 6e-3),
+    ({'time_offset': -0.0965}, 'time_offset', -0.0635, 6e-3),
+    ({'quat_cam_imu_xyzw': (0.0, 0.0, -math.sqrt(0.5), math.sqrt(0.5))}, 'axes', 90.0, 2.0)])
+def test_gross_errors_in_a_recording_in_little_light(converted, changes, name, seen, tolerance):
+    """Too far off for the pairs to tell: they are measured anew, and nothing else is blamed."""
     path = converted('realsense_rgb_rs_b')
-    told = read_parameters(f'{path}.yaml').updated({'time_offset': -0.064} | changes)
-    findings, _ = checked(path, told)
-    assert findings[name].verdict is F, findings[name]
-
-
-@pytest.mark.recordings
-def test_an_offset_too_far_off_to_be_seen_is_not_called_ok(converted):
-    """The other way by 33 ms: few pairs agree with the gyro, which is told instead."""
-    path = converted('realsense_rgb_rs_b')
-    findings, _ = checked(path, read_parameters(f'{path}.yaml').updated({'time_offset': -0.097}))
-    assert findings['time_offset'].verdict in (F, Verdict.UNKNOWN), findings['time_offset']
-    assert findings['pairs'].verdict is W or (
-        findings['time_offset'].verdict is F)
-
-
-@pytest.mark.recordings
-def test_stamps_under_automatic_exposure_are_no_times_of_arrival(converted):
-    path = converted('realsense_rgb_rs_b')
-    findings, _ = checked(path, Parameters.from_mapping(GIVEN))
-    assert 'automatic exposure' in findings['image stamps'].text
-    assert findings['image stamps'].verdict is Verdict.OK
-    assert 'time_offset_per_interval' in findings['image stamps'].remedy
+    findings, report = checked(path, read_parameters(f'{path}.yaml').updated(changes))
+    assert [f.name for f in report.findings if f.verdict is F] == [name], findings[name]
+    assert findings[name].figures['seen'] == pytest.approx(seen, abs=tolerance)
+    if name == 'axes':
+        # What is advised is within 2 deg of the file of the recording, the identity nearly.
+        advised = re.search(r'quat_cam_imu_xyzw: \[(.*?)\]', findings[name].text)[1]
+        assert abs(float(advised.split(',')[3])) > math.cos(math.radians(1.0))
 
 
 # -- containers, options, output -------------------------------------------------------------

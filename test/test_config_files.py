@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from importlib.metadata import distribution
 import py_compile
 import re
 from xml.etree import ElementTree
@@ -99,15 +100,42 @@ def test_launch_file_remaps_what_the_node_subscribes_to():
               and isinstance(call.func, ast.Name) and call.func.id == 'Node']
     keywords = {keyword.arg: keyword.value for keyword in node.keywords}
     assert ast.literal_eval(keywords['package']) == 'rs_relpose_ros'
-    assert ast.literal_eval(keywords['executable']) == 'relpose_node'
+    assert ast.unparse(keywords['executable']) == "argument['executable']"
+    assert "'executable': ('relpose_node'," in LAUNCH_FILE.read_text(encoding='utf-8')
     remapped = [ast.literal_eval(pair.elts[0]) for pair in keywords['remappings'].elts]
     assert remapped == ['image', 'camera_info', 'imu', 'accel']
 
 
-def test_launch_file_describes_its_arguments():
+def test_launch_file_uses_the_profile_unless_the_user_has_one():
+    tree = ast.parse(LAUNCH_FILE.read_text(encoding='utf-8'))
+    [default] = [call for call in ast.walk(tree) if isinstance(call, ast.Call)
+                 and isinstance(call.func, ast.Name) and call.func.id == 'EnvironmentVariable']
+    assert ast.unparse(default.args[0]) == 'PROFILE'
+    [path] = [keyword.value for keyword in default.keywords if keyword.arg == 'default_value']
+    assert "'config', 'fastdds.xml'" in ast.unparse(path)
+    assert (CONFIG / 'fastdds.xml').is_file()
+
+
+@pytest.mark.parametrize(('name', 'nodes'), [
+    ('global_shutter', ['global_shutter_node']),
+    ('relpose_and_global_shutter', ['relpose_node', 'global_shutter_node'])])
+def test_launch_files_of_other_nodes_include_that_of_relpose_node(name, nodes):
+    path = ROOT / 'launch' / f'{name}.launch.py'
+    py_compile.compile(str(path), doraise=True, cfile=None)
+    texts = [node.value for node in ast.walk(ast.parse(path.read_text(encoding='utf-8')))
+             if isinstance(node, ast.Constant)]
+    assert LAUNCH_FILE.name in texts
+    scripts = {entry.name for entry in distribution('rs_relpose_ros').entry_points}
+    for node in nodes:
+        assert node in texts
+        assert node in scripts
+
+
+@pytest.mark.parametrize('path', sorted((ROOT / 'launch').glob('*.py')), ids=lambda p: p.stem)
+def test_launch_file_describes_its_arguments(path):
     pytest.importorskip('launch_ros', reason='launch is not in the wheels, only on ROS machines')
     names: dict[str, object] = {}
-    exec(compile(LAUNCH_FILE.read_text(encoding='utf-8'), str(LAUNCH_FILE), 'exec'), names)  # noqa: S102
+    exec(compile(path.read_text(encoding='utf-8'), str(path), 'exec'), names)  # noqa: S102
     description = names['generate_launch_description']()
     described = {argument.name for argument in description.get_launch_arguments()}
     assert {'camera_namespace', 'params_file', 'fastdds_profile'} <= described

@@ -20,6 +20,7 @@ from rs_relpose_ros.config.parameter_file import (
     write_parameters,
 )
 from rs_relpose_ros.convert import xiaomi
+from rs_relpose_ros.convert.sources import DATASETS
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.messages.incoming import (
     image_from_message,
@@ -276,9 +277,9 @@ def test_paths_that_cannot_be_used(tmp_path, capsys):
 # --- parameter files
 
 
-@pytest.mark.parametrize('dataset', convert.DATASETS)
+@pytest.mark.parametrize('dataset', DATASETS)
 def test_parameter_file_is_what_the_command_writes(tmp_path, dataset):
-    source = convert.DATASETS[dataset]
+    source = DATASETS[dataset]
     file = ROOT / 'config' / f'{dataset}.yaml'
     assert file.read_text() == parameter_text(source.TITLE, source.PARAMETERS)
     parameters = read_parameters(file)

@@ -237,6 +237,8 @@ def test_pairs_leave_the_window_and_a_stamp_further_back_starts_anew():
     recursion.add(22_500 * MS, pair, NONE, NONE)
     assert recursion.solved().pairs == 3
     recursion.add(10_000 * MS, pair, NONE, NONE)
+    assert recursion.solved().pairs == 1
+    recursion.clear()
     assert recursion.solved() is NOTHING_SEEN
     np.testing.assert_array_equal(NOTHING_SEEN.sigma, PRIOR_SIGMA)
 
@@ -267,11 +269,11 @@ def test_older_pairs_are_linearised_anew_once_a_figure_is_off():
 # -- turns of images and gyro --------------------------------------------------------------------
 
 
-def turns(Q, scale=1.0, size=0.05, count=40, seed=0):
-    """Images turn by `scale` times Q times what the gyro says."""
+def turns(Q, scale=1.0, size=0.05, count=40, seed=0, weights=(1.0, 1.0, 1.0)):
+    """Images turn by `scale` times Q times what the gyro says, about axes by `weights`."""
     rng, sums = np.random.default_rng(seed), TurnSums()
     for k in range(count):
-        by_gyro = size * rng.normal(size=3)
+        by_gyro = size * rng.normal(size=3) * weights
         sums.add(100 * MS * k, scale * np.asarray(Q) @ by_gyro + 1e-3 * rng.normal(size=3),
                  by_gyro)
     return sums
@@ -350,6 +352,31 @@ def test_one_cause_is_not_shared_with_a_figure_that_is_alike():
     assert found[0].shift == pytest.approx(2.0, rel=0.01)   # 20 sigmas
 
 
+def test_a_figure_that_fits_as_well_is_named_too():
+    c = deviation(offset=0.01)
+    told = Told(PARAMETERS.sensor, CAMERA, np.zeros(3), 0.003, NONE)
+    seen = calibration(c, SIGMA, 0.999)
+    explained = causes(seen, [EFFECT], NONE)
+    assert [cause.figure.name for cause in explained] == ['time_offset']
+    health = judged(seen, explained, None, told)
+    assert {fault.figure for fault in health.faults} == {'time_offset', 'readout_time'}
+    assert all('both fit as well' in fault.sentence for fault in health.faults)
+    # Where another explains much less, one is named.
+    seen = calibration(c, SIGMA, 0.8)
+    health = judged(seen, causes(seen, [EFFECT], NONE), None, told)
+    assert [fault.figure for fault in health.faults] == ['time_offset']
+
+
+@pytest.mark.parametrize('size, rows', [(-0.015, 'middle'), (-0.03, 'last'), (-0.02, None)])
+def test_an_offset_that_another_stamped_row_makes(size, rows):
+    told = Told(PARAMETERS.sensor, CAMERA, np.zeros(3), 0.003, NONE)
+    seen = calibration(deviation(offset=size), SIGMA)
+    faults = judged(seen, causes(seen, [EFFECT], NONE), None, told).faults
+    assert {fault.figure for fault in faults} == {'time_offset'} | ({'stamp_row'} if rows
+                                                                    else set())
+    assert rows is None or f'set stamp_row: {rows}' in faults[-1].sentence
+
+
 def test_two_causes_are_both_found_and_solved_together():
     c = deviation(offset=0.01, readout=-0.008)
     found = causes(calibration(c, SIGMA, 0.6), [EFFECT], NONE)
@@ -378,6 +405,24 @@ def test_a_figure_is_off_by_what_it_does_to_the_pose(size, state):
     if state is not HealthState.OK:
         assert health.faults == (finding,)
         assert f'set time_offset: {0.004 + size:.4f}' in finding.sentence
+
+
+def test_axes_are_wrong_though_most_turning_is_about_their_axis():
+    """Half a turn about the vertical leaves the yaw of a vehicle as it is."""
+    told = Told(PARAMETERS.sensor, CAMERA, np.zeros(3), 0.003, NONE)
+    turned = turns(np.diag([-1.0, 1.0, -1.0]), weights=[0.15, 1.0, 0.15]).compared()
+    assert turned.left_as_told < 0.3
+    assert 'axes' in {fault.figure for fault in judged(NOTHING_SEEN, [], turned, told).faults}
+
+
+def test_images_that_stand_still_while_the_gyro_turns():
+    told = Told(PARAMETERS.sensor, CAMERA, np.zeros(3), 0.003, NONE)
+    sums = TurnSums()
+    for k in range(40):
+        sums.add(100 * MS * k, np.zeros(3), np.array([0.0, 0.08, 0.01]))
+    health = judged(NOTHING_SEEN, [], sums.compared(), told)
+    assert {fault.figure for fault in health.faults} == {'image_geometry', 'time_offset'}
+    assert all(finding.state is not HealthState.OK for finding in health.findings)
 
 
 def test_wrong_axes_leave_the_other_figures_unjudged():
@@ -532,7 +577,7 @@ FAST = [
     wrong('offset', 'time_offset', 'time_offset=0.01', seen=0.0, tolerance=2e-4,
           stamps_late=0.01),
     wrong('late', 'time_offset', changes=[imu_with(late=0.03)], seen=0.03, tolerance=1e-3,
-          pairs=14),
+          pairs=26),   # far from what is told a pair is not linear: some more settle it
     wrong('readout twice', 'readout_time', 'readout_time=0.06', seen=0.03, tolerance=1e-3,
           pairs=12),
     wrong('no readout', 'readout_time', 'readout_time=0.0', seen=0.03, tolerance=1e-3, pairs=14),
@@ -626,8 +671,14 @@ def test_told_right_poses_are_as_without_health(bundled_bag, told_right, monkeyp
     assert len(without) == len(told_right)
     for a, b in zip(without, told_right, strict=True):
         assert (a.pose.status, a.pose.reason) == (b.pose.status, b.pose.reason)
-        for name in ('R', 't', 'covariance'):
+        for name in ('R', 't'):
             assert np.array_equal(getattr(a.pose, name), getattr(b.pose, name), equal_nan=True)
+    for k, (a, b) in enumerate(zip(without, told_right, strict=True)):
+        # Of the first three pairs nothing that was told has been seen yet.
+        if k >= 3:
+            assert np.array_equal(a.pose.covariance, b.pose.covariance, equal_nan=True)
+        elif a.pose:
+            assert np.trace(b.pose.covariance[3:, 3:]) > 4.0 * np.trace(a.pose.covariance[3:, 3:])
 
 
 # -- figures that are applied, on the bundled bag ------------------------------------------------
@@ -661,7 +712,7 @@ def test_live_and_replay_agree_while_figures_are_applied(bundled_bag):
     front_end = FrontEnd(read_parameters(bundled_bag.with_name('hand_held.yaml'), settings))
     sequencer = front_end.sequencer
     events = []
-    worker = Worker(front_end, events.append)
+    worker = Worker(front_end, lambda: None, events.append)
 
     def processed():
         return [event for event in events if isinstance(event, FrameProcessed)]

@@ -18,9 +18,12 @@ from rs_relpose_ros.config.intrinsics import IntrinsicsConfig
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.estimator.result import RelativePose, Status
+from rs_relpose_ros.front_end.frame import EncodedFrame
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.front_end.sequencer import FrameRefused, ReadyFrame, Refusal, Sequencer
+from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.health.findings import Finding, Health, HealthState
+from rs_relpose_ros.images.gray_levels import GrayLevels
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.messages import incoming, outgoing
 from rs_relpose_ros.messages.hanging import HangingCamera, HangingGyro
@@ -75,12 +78,70 @@ def test_mono8_is_passed_on(types, rgb, padding, end):
 
 
 @pytest.mark.parametrize(('order', 'is_bigendian'), [('<u2', 0), ('>u2', 1)])
-def test_mono16_honours_byte_order(types, order, is_bigendian):
-    values = np.arange(0, 65536, 977, dtype=np.uint16)[:60].reshape(6, 10)
+@pytest.mark.parametrize('encoding', ['mono16', '16UC1'])
+def test_16_bits_honour_byte_order(types, order, is_bigendian, encoding):
+    values = np.arange(0, 60000, 25, dtype=np.uint16).reshape(40, 60)
     data, step = padded(values.astype(order), 2)
     gray = decoded(
-        build.image(types, 10, 6, 'mono16', data, step=step, is_bigendian=is_bigendian))
-    np.testing.assert_array_equal(gray, values // 256)
+        build.image(types, 60, 40, encoding, data, step=step, is_bigendian=is_bigendian))
+    slope, offset = np.polyfit(values.ravel(), gray.ravel(), 1)
+    assert 170 < gray.max() - gray.min() <= 255
+    np.testing.assert_allclose(gray, slope * values + offset, atol=1.5)
+
+
+def texture(low: float, high: float) -> np.ndarray:
+    return np.random.default_rng(3).uniform(low, high, (120, 160)).astype(np.uint16)
+
+
+@pytest.mark.parametrize(('low', 'high'), [
+    (0, 1023), (0, 4095), (100, 16383), (0, 65535), (29_800, 30_400)])
+def test_16_bits_are_shown_as_their_content_fills_them(low, high):
+    gray = GrayLevels().gray(texture(low, high))
+    assert 120 < int(gray.max()) - int(gray.min()) <= 255
+    # Little of it is cut off.
+    assert np.isin(gray, (0, 255)).mean() < 0.02
+
+
+def test_a_png_of_16_bits_is_shown_alike(types):
+    pixels = texture(0, 4095)
+    data = cv2.imencode('.png', pixels)[1].tobytes()
+    message = build.compressed(types, data)
+    np.testing.assert_array_equal(decoded(message), GrayLevels().gray(pixels))
+
+
+def test_what_is_dark_stays_dark():
+    assert GrayLevels().gray(texture(0, 20)).max() <= 25
+
+
+def test_the_range_stays_while_the_content_fits_and_follows_it_otherwise():
+    levels, pixels = GrayLevels(), texture(1000, 3000)
+    first = levels.gray(pixels)
+    # Automatic exposure, a little darker: the same range, so the image is darker, too.
+    darker = levels.gray((pixels * 0.9).astype(np.uint16))
+    assert first.mean() - darker.mean() > 10
+    np.testing.assert_array_equal(levels.gray(pixels), first)
+    # Ten times as bright: black and white are chosen anew, and back again.
+    bright = levels.gray(pixels * 10)
+    assert bright.mean() == pytest.approx(first.mean(), abs=3)
+    np.testing.assert_array_equal(levels.gray(pixels), first)
+
+
+def test_frames_of_a_camera_share_the_range(types):
+    levels = GrayLevels()
+    intrinsics = Intrinsics(width=160, height=120, fx=100.0, fy=100.0, cx=79.5, cy=59.5,
+                            image_width=160, image_height=120)
+    first, second = (EncodedFrame(k, incoming.image_from_message(build.image(
+        types, 160, 120, 'mono16', texture(0, high).astype('<u2').tobytes(), step=320)).image,
+        '', intrinsics, levels).decoded().image for k, high in enumerate((4000, 3000)))
+    assert second.mean() < first.mean() - 20
+
+
+@pytest.mark.parametrize('encoding', ['nv12', 'nv21', 'i420'])
+def test_planar_yuv_begins_with_its_luma(types, rgb, encoding):
+    luma = np.ascontiguousarray(rgb[:6, :, 0])
+    data = luma.tobytes() + bytes(30)
+    np.testing.assert_array_equal(decoded(build.image(types, 10, 6, encoding, data, step=10)),
+                                  luma)
 
 
 @pytest.mark.parametrize(('encoding', 'luma_first'), [
@@ -103,7 +164,10 @@ def test_bayer_knows_its_colors(types, pattern, bits):
     raw = mosaic if bits == 8 else mosaic.astype('<u2') * 256
     gray = decoded(build.image(
         types, 10, 8, f'bayer_{pattern}{bits}', raw.tobytes(), step=10 * bits // 8))
-    np.testing.assert_allclose(gray[2:-2, 2:-2], WEIGHTS @ [200, 100, 50], atol=1.0)
+    luma = WEIGHTS @ [200, 100, 50]
+    # Of 16 bits, black and white are a quarter of the range beyond the content.
+    expected = luma if bits == 8 else (luma - 12.5) * 255 / 225
+    np.testing.assert_allclose(gray[2:-2, 2:-2], expected, atol=1.5)
 
 
 @pytest.mark.parametrize(('change', 'sentence'), [
@@ -425,20 +489,25 @@ def test_published_covariances_have_no_negative_eigenvalue():
 
 def test_matches_are_the_inliers(types):
     result = pair()
-    cloud = outgoing.matches_message(result, types)
-    names = ['id', 'u1', 'v1', 'u2', 'v2', 'tau1', 'tau2', 'x1', 'y1', 'z1', 'x2', 'y2', 'z2']
+    cloud = outgoing.pair_messages(result, types).matches
+    assert cloud.header.frame_id == 'camera_reference'
+    assert cloud.is_dense
+    names = ['id', 'u1', 'v1', 'u2', 'v2', 'tau1', 'tau2', 'x1', 'y1', 'z1', 'x2', 'y2', 'z2',
+             'x', 'y', 'z', 'u1_gs', 'v1_gs', 'u2_gs', 'v2_gs']
     assert [field.name for field in cloud.fields] == names
-    assert [field.datatype for field in cloud.fields] == [6] + [7] * 12
+    assert [field.datatype for field in cloud.fields] == [6] + [7] * 19
     count = int(result.pose.inliers.sum())
     assert 0 < count < len(result.pose.inliers)
     assert (cloud.height, cloud.width) == (1, count)
     assert len(cloud.data) == cloud.row_step == count * cloud.point_step
     raw = bytes(cloud.data)
     for row, index in enumerate(np.flatnonzero(result.pose.inliers)):
-        record = struct.unpack_from('<I12f', raw, row * cloud.point_step)
+        record = struct.unpack_from('<I19f', raw, row * cloud.point_step)
         expected = [result.matches.track_ids[index], *result.matches.points1[index],
                     *result.matches.points2[index], result.row_times1[index],
-                    result.row_times2[index], *result.rays1[index], *result.rays2[index]]
+                    result.row_times2[index], *result.rays1[index], *result.rays2[index],
+                    *result.landmarks.points[index], *result.landmarks.pixels1[index],
+                    *result.landmarks.pixels2[index]]
         np.testing.assert_allclose(record, expected, rtol=1e-6)
 
 

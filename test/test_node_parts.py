@@ -19,6 +19,7 @@ from rs_relpose_ros.node.cause_log import CauseLog
 from rs_relpose_ros.node.diagnostics import Statistics
 from rs_relpose_ros.node.frame_statistics import ERROR, Inputs, OK, WARN
 from rs_relpose_ros.node.health_log import HealthLog
+from rs_relpose_ros.node.silence import LostImages, Silence, why_no_image, why_nothing
 from rs_relpose_ros.tracking.matches import Matches
 
 SECOND = 10**9
@@ -117,6 +118,70 @@ def test_health_is_told_once_a_figure_and_when_it_is_well_again(clock):
     clock.now = 31
     log(wrong, withhold=True)
     assert lines[4][1].endswith('(1 more since the last such line)')
+
+
+# -- silence ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(('published', 'remedy'), [
+    (['/camera/image/compressed', '/b'],
+     'only /camera/image/compressed is published: set image_transport:=compressed'),
+    (['/b', '/a'], 'these topics with images have publishers: /a, /b; remap image'),
+    ([], 'no topic with images has a publisher'),
+    (['/camera/image'], 'it has a publisher: does its quality of service match'),
+])
+def test_why_no_image_comes(published, remedy):
+    reason = why_no_image('/camera/image', published)
+    assert reason.text.startswith('no image on /camera/image for 5 s; ')
+    assert remedy in reason.text
+
+
+def test_the_other_transport_is_told_in_both_directions():
+    assert 'image_transport:=raw' in why_no_image('/image/compressed', ['/image']).text
+
+
+def test_why_nothing_comes_out():
+    refused = {Refusal.IMU_GAP: 100, Refusal.NO_IMU: 30}
+    reason = why_nothing(Silence(5.0, 150, refused, 'PURE_ROTATION: it stands'))
+    assert '130 of 150 images were refused, 100 of them as imu_gap' in reason.text
+    # Most images are used, and their pairs have no pose.
+    standing = why_nothing(Silence(5.0, 150, {Refusal.IMU_GAP: 20}, 'PURE_ROTATION: 0.1 px'))
+    assert 'PURE_ROTATION: 0.1 px' in standing.text
+    # The numbers of a reason change, its kind does not.
+    assert standing.kind == why_nothing(Silence(6.0, 180, {}, 'PURE_ROTATION: 0.2 px')).kind
+    assert standing.kind != reason.kind
+    assert 'no pair of keyframes' in why_nothing(Silence(5.0, 150, {}, '')).text
+
+
+def test_silence_is_counted_from_the_last_result(clock):
+    def silence(images: int, **refused: int) -> Silence:
+        return statistics.report(inputs(images), counts(**refused), problem='',
+                                 missing=()).silence
+
+    statistics = Statistics(clock)
+    clock.now = 60 * SECOND   # kernels were compiled
+    statistics.start()
+    clock.now = 63 * SECOND
+    assert silence(90, no_imu=10) == Silence(3.0, 90, {Refusal.NO_IMU: 10})
+    statistics.add_pair(pair(), clock.now)
+    assert silence(90, no_imu=10).seconds == 0.0
+    statistics.add_pair(pair(Status.LOW_PARALLAX, 'it stands'), clock.now)
+    clock.now = 65 * SECOND
+    assert silence(150, no_imu=12) == Silence(2.0, 60, {Refusal.NO_IMU: 2},
+                                              'LOW_PARALLAX: it stands')
+
+
+@pytest.mark.parametrize(('rate', 'size', 'told'), [
+    (9, 921_600, True), (29, 921_600, False), (9, 300_000, False), (0, 921_600, False)])
+def test_images_that_are_lost_on_the_way_are_told(rate, size, told):
+    lost = LostImages()
+    for second in range(5):
+        assert lost.add(rate * second, 30 * second, size) == ''
+    text = lost.add(rate * 5, 150, size)
+    assert bool(text) == told
+    if told:
+        assert text.startswith('9 images a second of 0.9 MB come, and 30 CameraInfo')
+        assert 'config/fastdds.xml' in text and 'ros2 launch' in text
 
 
 # -- diagnostics -----------------------------------------------------------------------------

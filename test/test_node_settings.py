@@ -20,9 +20,9 @@ import numpy as np
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterDescriptor, ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, SetParameters
-from rclpy.qos import ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from scipy.spatial.transform import Rotation
-from sensor_msgs.msg import CameraInfo, Image, Imu
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 from std_srvs.srv import Trigger
 
 from rs_relpose_lab.live.graph import diagnostic_values, Graph
@@ -71,7 +71,9 @@ def running(module_ros_domain_id: int, bundled_bag: Path) -> Iterator[Running]:
                   for topic in RELIABLE}
     with Graph() as graph, node_process(
             BUNDLED_PARAMETERS, remap=BAG_TOPICS,
-            parameters={'image_transport': 'raw', UNKNOWN_OVERRIDE: 3, **parameters}) as node:
+            parameters={'image_transport': 'raw', UNKNOWN_OVERRIDE: 3,
+                        'qos_overrides./imu/data_raw.subscription.durability': 'volatile',
+                        **parameters}) as node:
         diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
         node.wait_for('ready')
         publishers = {kind: graph.publisher(kind, topic, best_effort=topic not in RELIABLE)
@@ -87,8 +89,10 @@ def running(module_ros_domain_id: int, bundled_bag: Path) -> Iterator[Running]:
 
 def test_quality_of_service_can_be_overridden_topic_by_topic(running):
     for topic in [*BAG_TOPICS.values(), '/accel']:
-        [info] = wait_until(
-            lambda topic=topic: running.graph.node.get_subscriptions_info_by_topic(topic), topic)
+        # Of CameraInfo there is another one, for what was latched.
+        [info] = wait_until(lambda topic=topic: [
+            info for info in running.graph.node.get_subscriptions_info_by_topic(topic)
+            if info.qos_profile.durability is DurabilityPolicy.VOLATILE], topic)
         assert info.qos_profile.reliability is (
             ReliabilityPolicy.RELIABLE if topic in RELIABLE else ReliabilityPolicy.BEST_EFFORT)
     assert 'there is no parameter' not in running.node.output
@@ -218,6 +222,34 @@ def test_a_camera_without_camera_info_gives_poses(ros_domain_id, bundled_bag):
         values = diagnostic_values(diagnostics[-1])
         assert 'no CameraInfo' not in node.output
     assert values['frames_refused_no_calibration'] == '0'
+
+
+def test_a_late_node_gets_a_latched_camera_info_and_says_why_no_image_comes(
+        ros_domain_id, bundled_bag):
+    messages = read_messages(bundled_bag, 1.5)
+    info = next(message for _, message in messages if isinstance(message, CameraInfo))
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    with Graph() as graph:
+        driver = graph.node.create_publisher(CameraInfo, BAG_TOPICS['camera_info'], latched)
+        driver.publish(info)
+        graph.node.create_publisher(CompressedImage, BAG_TOPICS['image'] + '/compressed', 1)
+        poses = graph.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
+        with node_process(BUNDLED_PARAMETERS, remap=BAG_TOPICS,
+                          parameters={'image_transport': 'raw'}) as node:
+            node.wait_for('ready')
+            image = BAG_TOPICS['image']
+            node.wait_for(f'not estimating: no image on {image} for 5 s; only '
+                          f'{image}/compressed is published: set image_transport:=compressed')
+            publishers = {kind: graph.publisher(kind, topic) for kind, topic in
+                          zip((Image, CameraInfo, Imu), BAG_TOPICS.values(), strict=True)
+                          if kind is not CameraInfo}
+            publish_in_time((publishers[type(message)], bag_time_ns, message)
+                            for bag_time_ns, message in messages if type(message) in publishers)
+            wait_until(lambda: len(poses) >= 3, 'three poses', node)
+            assert 'no CameraInfo' not in node.output
+            # Told once. Of the drivers' other durability nothing is said.
+            assert node.output.count(f'no image on {image}') == 1
+            assert 'incompatible' not in node.output
 
 
 def test_what_is_told_wrong_is_seen_and_poses_are_withheld(ros_domain_id, bundled_bag):

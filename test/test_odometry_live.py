@@ -36,7 +36,7 @@ def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag):
     with Graph() as graph, \
             node_process(BUNDLED_PARAMETERS, remap=BAG_TOPICS) as relpose, \
             node_process(BUNDLED_PARAMETERS, remap=imu,
-                         module='rs_relpose_ros.odometry.start') as node:
+                         folder='odometry') as node:
         received = graph.listen(OdometryMessage, '/odometry_node/odometry')
         paths = graph.listen(PathMessage, '/odometry_node/path')
         pairs = graph.listen(DiagnosticArray, '/relpose_node/pairs')

@@ -141,7 +141,8 @@ MAY_IMPORT = {
     'odometry': BASE | {'estimator', 'imu', 'health', 'front_end', 'messages', 'bags', 'replay',
                         'node'},
     'convert': BASE | {'images', 'imu', 'messages', 'bags'},
-    'cli': BASE | {'bags', 'replay', 'calibrate', 'check', 'convert', 'global_shutter',
+    'batch': set(),
+    'cli': BASE | {'bags', 'replay', 'calibrate', 'check', 'convert', 'global_shutter', 'batch',
                    'odometry'},
 }
 # The laboratory uses all of the product, and nothing of the product imports it.
@@ -230,15 +231,17 @@ def test_the_library_does_not_print_or_exit():
 # --- commands
 
 
-@pytest.mark.parametrize('script', ['relpose_node', 'rs_relpose'])
+@pytest.mark.parametrize('script', [
+    'relpose_node', 'global_shutter_node', 'odometry_node', 'rs_relpose'])
 def test_console_script_resolves(script):
     entries = {entry.name: entry for entry in distribution(NAME).entry_points
                if entry.group == 'console_scripts'}
     assert callable(entries[script].load())
 
 
-def test_node_describes_itself():
-    ended = run(sys.executable, '-m', f'{NAME}.node.node', '--help')
+@pytest.mark.parametrize('folder', ['node', 'global_shutter'])
+def test_node_describes_itself(folder):
+    ended = run(sys.executable, '-m', f'{NAME}.{folder}.node', '--help')
     assert ended.returncode == 0, ended.stderr
     assert 'readout_time' in ended.stdout
     assert ended.stderr == ''

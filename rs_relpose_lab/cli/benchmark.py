@@ -347,6 +347,8 @@ def _run_trust(args: argparse.Namespace) -> int:
 def _global_shutter_arguments(parser: argparse.ArgumentParser) -> None:
     _number(parser, '--walks', 6, 'walks of 2 s on which the map is compared with the truth')
     _number(parser, '--bags', 6, "rendered bags for OpenCV's 5-point")
+    parser.add_argument('--live', action='store_true', help='also play the first bag to '
+                        'global_shutter_node and relpose_node side by side; needs ROS')
     parser.add_argument('--recording', nargs=3, type=Path, action='append', default=[],
                         metavar=('BAG', 'PARAMETERS', 'PAIRS'),
                         help='a recording, its parameter file and a table of true pairs '
@@ -362,7 +364,10 @@ def _run_global_shutter(args: argparse.Namespace) -> int:
         five_point_on_recording,
     )
 
-    _check_at_least(0, args, 'walks', 'bags')
+    _check_at_least(int(args.live), args, 'bags')
+    _check_at_least(0, args, 'walks')
+    if args.live:
+        _need_ros('beside')
     args.output.mkdir(parents=True, exist_ok=True)
     speeds = [frame_times(*size) for size in SIZES]
     cases = map_cases(args.walks, args.seed)
@@ -378,7 +383,13 @@ def _run_global_shutter(args: argparse.Namespace) -> int:
         for config in configs:
             bags.append(five_point_on_bag(config, args.output / f'seed_{config.seed}'))
             bar.update()
-    return _tell(write_report(args.output, maps, bags, speeds), args.output)
+    beside = []
+    if args.live:
+        from rs_relpose_lab.live.beside import run_beside
+        folder = args.output / f'seed_{args.seed}'
+        beside = run_beside(folder / 'bag', folder / 'bag.yaml', folder,
+                            _shipped('fastdds.xml').resolve())
+    return _tell(write_report(args.output, maps, bags, speeds, beside), args.output)
 
 
 def _stretches_arguments(parser: argparse.ArgumentParser) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 import statistics
 import time
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -22,6 +23,9 @@ from rs_relpose_ros.global_shutter.frames import EncodedColorFrame
 from rs_relpose_ros.global_shutter.unroller import unrolling_loop
 from rs_relpose_ros.images.encoded import RawImage
 from rs_relpose_ros.imu.samples import ImuSample
+
+if TYPE_CHECKING:   # what is measured without ROS needs none
+    from rs_relpose_lab.live.beside import Beside
 
 SIZES = ((640, 480), (1280, 720))
 
@@ -71,7 +75,7 @@ def frame_times(width: int, height: int) -> Speed:
 
 
 def write_report(folder: Path, maps: Sequence[MapErrors], bags: Sequence[FivePoint],
-                 speeds: Sequence[Speed]) -> str:
+                 speeds: Sequence[Speed], beside: Sequence[Beside] = ()) -> str:
     """Write the figures (CSV) and the report (Markdown), and return the latter."""
     folder.mkdir(parents=True, exist_ok=True)
     parts = []
@@ -87,20 +91,29 @@ def write_report(folder: Path, maps: Sequence[MapErrors], bags: Sequence[FivePoi
         write_csv(folder / 'five_point.csv', bags)
         rows = [(b.name, f'{b.readout_ms:.0f}', f'{b.raw_rotation:.3f}',
                  f'{b.raw_translation:.2f}', f'{b.turned_rotation:.3f}',
-                 f'{b.turned_translation:.2f}', f'{b.raw_rotation / b.turned_rotation:.1f}',
-                 f'{b.raw_translation / b.turned_translation:.1f}') for b in bags]
-        ratios = [[getattr(b, f'raw_{what}') / getattr(b, f'turned_{what}') for b in bags]
-                  for what in ('rotation', 'translation')]
+                 f'{b.turned_translation:.2f}', f'{b.rotation_ratio:.1f}',
+                 f'{b.translation_ratio:.1f}') for b in bags]
         parts.append("OpenCV's 5-point, median errors [deg]\n\n" + markdown_table(
             ('recording', 'read-out [ms]', 'raw: R', 't', 'turned: R', 't', 'ratio of R',
-             'of t'), rows) + '\nMedian of the ratios: rotation '
-            f'{statistics.median(ratios[0]):.1f}, translation '
-            f'{statistics.median(ratios[1]):.1f}\n')
+             'of t'), rows))
+        walks = [b for b in bags if b.simulated]
+        if walks:
+            parts.append('Median of the ratios of the simulated ones: rotation '
+                         f'{statistics.median(b.rotation_ratio for b in walks):.1f}, translation '
+                         f'{statistics.median(b.translation_ratio for b in walks):.1f}\n')
     if speeds:
         write_csv(folder / 'speed.csv', speeds)
         parts.append('Processor time of a frame [ms]\n\n' + markdown_table(
             ('size', *(field.name for field in fields(Speed)[2:])),
             [(f'{s.width}x{s.height} mono8', f'{s.median:.1f}', f'{s.p90:.1f}') for s in speeds]))
+    if beside:
+        write_csv(folder / 'beside.csv', beside)
+        parts.append('Both nodes at once, raw mono8 at 30 Hz\n\n' + markdown_table(
+            ('node', 'frames', 'dropped', 'frame [ms]', 'latency 50 % [ms]', '99 %',
+             'processor [%]'),
+            [(b.node, f'{b.received}', f'{b.refused}', f'{b.frame_time_p50:.1f}',
+              f'{b.latency_p50:.1f}', f'{b.latency_p99:.1f}', f'{b.cpu_percent:.0f}')
+             for b in beside]))
     text = '\n'.join(parts)
     (folder / 'global_shutter.md').write_text(text, encoding='utf-8')
     return text

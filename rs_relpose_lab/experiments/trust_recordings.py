@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +24,9 @@ from rs_relpose_ros.bags.layout import IMAGE_DELAY
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.config.parameters import Parameters
-from rs_relpose_ros.convert import realsense, xiaomi
-from rs_relpose_ros.convert.recording import ImageFile
+from rs_relpose_ros.convert import phone_tables, realsense, xiaomi
+from rs_relpose_ros.convert.recording import by_stamp
 from rs_relpose_ros.convert.recording import Recording as RecordedFiles
-from rs_relpose_ros.convert.tables import read_rows
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.front_end.frame import sensor_camera
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
@@ -48,19 +48,9 @@ _PHONE_CAMERA = RollingShutterCamera(width=640, height=480, fx=500.0, fy=500.0, 
 
 
 def _phone(folder: Path) -> RecordedFiles:
-    """Gyro and accelerometer have a table each."""
-    def rows(name: str) -> list[Any]:
-        return list(read_rows(folder / name, columns=4 if name != 'frames.csv' else 3,
-                              separator=','))[1:]
-
-    samples = [ImuSample(row.nanoseconds(0), (row.real(1), row.real(2), row.real(3)), None)
-               for row in rows('gyro.csv')]
-    samples += [ImuSample(row.nanoseconds(0), None, (row.real(1), row.real(2), row.real(3)))
-                for row in rows('accel.csv')]
-    images = tuple(ImageFile(row.nanoseconds(1), folder / row.words[2])
-                   for row in rows('frames.csv'))
-    return RecordedFiles(_PHONE_CAMERA, images, 'jpeg',
-                         tuple(sorted(samples, key=lambda sample: sample.stamp_ns)))
+    """Gyro and accelerometer, which have a table each, in one series."""
+    found = phone_tables.read_conversion(folder).recording
+    return replace(found, camera=_PHONE_CAMERA, imu=by_stamp(found.imu + found.accel), accel=())
 
 
 def _told_by(module: Any) -> dict[str, Any]:
@@ -91,12 +81,14 @@ def real_recording(folder: Path) -> Recording:
     """A real recording; what is right of it is as far as known."""
     read, right = REAL[folder.name]
     files, values = read(folder), right()
+    if files.camera is None:
+        raise MissingInputError(f'{folder} has no calibration of its camera')
 
     def image(number: int) -> Gray:
-        path = files.images[number].path
-        found = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        data = np.frombuffer(files.images[number].encoded(), dtype=np.uint8)
+        found = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
         if found is None:
-            raise MissingInputError(f'{path} is no image')
+            raise MissingInputError(f'{files.images[number].name} is no image')
         return np.asarray(found, dtype=np.uint8)
 
     return _recording(Source(folder.name, RECORDING), values, intrinsics_of(files.camera),

@@ -216,6 +216,7 @@ ROWS: Mapping[str, Row] = {
     'imu-xy-negated': Row(('axes',), GROSS, _axes_turned(lambda rng: _HALF_TURN)),
     'imu-cycled': Row(('axes',), GROSS, _axes_turned(lambda rng: _CYCLE)),
     'gyro-degrees': Row(('gyro_unit',), GROSS, _arrives(_gyro_times(math.degrees(1.0)))),
+    'gyro-57th': Row(('gyro_unit',), GROSS, _arrives(_gyro_times(1.0 / math.degrees(1.0)))),
     'K-1.3': Row(('focal_length',), GROSS, _focal_length(1.3),
                  lambda told, rng: Injected('focal_length', np.array([0.3]))),
     'K-1.05': Row(('focal_length',), GROSS, _focal_length(1.05),

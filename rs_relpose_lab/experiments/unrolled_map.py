@@ -34,6 +34,9 @@ Array = NDArray[np.float64]
 
 # Pixels from one compared point to the next.
 _SPACING = 20.0
+# IMU that comes before a frame is asked for, beyond its last row [s]: a tracked time offset may
+# need it.
+_AHEAD = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +92,7 @@ def turned_frames(simulation: Simulation, parameters: Parameters, *,
     black = np.zeros((config.height, config.width), dtype=np.uint8)
     for index in range(config.frame_count):
         until = int(np.searchsorted(imu.stamps_ns, simulation.reference_ns(index)
-                                    + to_nanoseconds(camera.row_time_span[1]))) + 1
+                                    + to_nanoseconds(camera.row_time_span[1] + _AHEAD)))
         for k in range(fed, until):
             loop.sequencer.add_imu(ImuSample(
                 int(imu.stamps_ns[k]), tuple(imu.angular_velocities[k].tolist()),

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+import shutil
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,11 +30,15 @@ from rs_relpose_ros.config.imu import ImuConfig
 from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.front_end.frame import sensor_camera
+from rs_relpose_ros.front_end.front_end import FrameProcessed
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
+from rs_relpose_ros.global_shutter.frames import color_frames, GlobalShutterFrame
 from rs_relpose_ros.global_shutter.unroll import unroll
+from rs_relpose_ros.global_shutter.unroller import unrolling_loop
 from rs_relpose_ros.imu.buffer import Coverage, ImuBuffer
 from rs_relpose_ros.imu.samples import ImuSample
+from rs_relpose_ros.messages.intake import Intake
 from rs_relpose_ros.messages.sensor_feed import Role, SensorFeed
 from rs_relpose_ros.replay.run import read_truth, Replay
 
@@ -56,6 +62,17 @@ class FivePoint:
     turned_pairs: int
     turned_rotation: float
     turned_translation: float
+    simulated: bool = False
+
+    @property
+    def rotation_ratio(self) -> float:
+        """Of the raw images to the turned ones."""
+        return self.raw_rotation / self.turned_rotation
+
+    @property
+    def translation_ratio(self) -> float:
+        """Of the raw images to the turned ones."""
+        return self.raw_translation / self.turned_translation
 
 
 def five_point_on_bag(config: SimulationConfig, folder: Path) -> FivePoint:
@@ -65,11 +82,12 @@ def five_point_on_bag(config: SimulationConfig, folder: Path) -> FivePoint:
     if not turned.exists():
         with open_bag(path) as bag:
             unroll(bag, bag.find_topics(), parameters, turned)
-    raw = _five_point(path, parameters)
-    corrected = _five_point(turned, as_global_shutter(parameters))
+    raw = five_point(path, parameters)
+    corrected = five_point(turned, as_global_shutter(parameters))
     return FivePoint(f'{config.scene} {config.seed}', 1e3 * config.readout_time,
                      raw.answered, raw.rotation[0], raw.translation[0],
-                     corrected.answered, corrected.rotation[0], corrected.translation[0])
+                     corrected.answered, corrected.rotation[0], corrected.translation[0],
+                     simulated=True)
 
 
 def as_global_shutter(parameters: Parameters) -> Parameters:
@@ -78,7 +96,7 @@ def as_global_shutter(parameters: Parameters) -> Parameters:
                                'time_offset_per_interval': 0.0, 'stamp_exposure': 'middle'})
 
 
-def _five_point(path: Path, parameters: Parameters) -> Score:
+def five_point(path: Path, parameters: Parameters) -> Score:
     """The better of OpenCV's estimators over the pairs of a bag that the pipeline answers."""
     with open_bag(path) as bag:
         topics = bag.find_topics()
@@ -93,6 +111,36 @@ def _five_point(path: Path, parameters: Parameters) -> Score:
         assert replay.intrinsics is not None
     return min((best_opencv_score(estimator, pairs, replay.intrinsics, truth)
                 for estimator in OPENCV_ESTIMATORS), key=lambda found: found.rotation[0])
+
+
+def five_point_when_turned(path: Path, parameters: Parameters, folder: Path) -> Score:
+    """Score of OpenCV on the turned images of a bag, which is written into `folder` anew."""
+    turned = folder / f'{path.name}_turned'
+    shutil.rmtree(turned, ignore_errors=True)
+    with open_bag(path) as bag:
+        unroll(bag, bag.find_topics(), parameters, turned)
+    return replace(five_point(turned, as_global_shutter(parameters)),
+                   name='OpenCV 5-point, images turned')
+
+
+def frames_of_bag(path: Path, parameters: Parameters) -> Iterator[GlobalShutterFrame]:
+    """The turned frames of a bag."""
+    loop = unrolling_loop(parameters, offline=True)
+    intake = Intake(loop.sequencer, parameters.imu.stuck_gyro_time, parameters.intrinsics,
+                    color_frames())
+    with open_bag(path) as bag:
+        for role, message in intake.feed.messages(bag, bag.find_topics()):
+            intake.receive(role, message.message)
+            while (outcome := loop.step()) is not None:
+                if isinstance(outcome, FrameProcessed) and outcome.result is not None:
+                    yield outcome.result
+
+
+def draw_before_and_after(path: Path, parameters: Parameters, picture: Path) -> float:
+    """Draw the frame of a bag that is moved most, as read and turned; its shift [px]."""
+    frame = max(frames_of_bag(path, parameters), key=lambda found: found.map.shift)
+    cv2.imwrite(str(picture), np.hstack([frame.frame.pixels.values, frame.image().values]))
+    return frame.map.shift
 
 
 def bag_configurations(bags: int, first_seed: int) -> list[SimulationConfig]:

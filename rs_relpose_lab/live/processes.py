@@ -111,14 +111,18 @@ class Process:
 
 def node_process(parameter_file: Path | None = None, *, remap: Mapping[str, str] | None = None,
                  parameters: Mapping[str, object] | None = None, log: Path | None = None,
-                 module: str = 'rs_relpose_ros.node.start') -> Process:
-    """Start a node, `relpose_node` by default; `remap` takes topics, ``__ns`` and ``__node``."""
+                 folder: str = 'node') -> Process:
+    """Start `relpose_node`; `remap` takes topics, ``__ns`` and ``__node``.
+
+    `folder`: of the package, whose `start` is to be run instead: ``'global_shutter'`` or
+    ``'odometry'``.
+    """
     words = [] if parameter_file is None else ['--params-file', str(parameter_file)]
     for name, value in (parameters or {}).items():
         words += ['-p', f'{name}:={value}']
     for source, target in (remap or {}).items():
         words += ['-r', f'{source}:={target}']
-    return Process('-m', module, '--ros-args', *words, log=log)
+    return Process('-m', f'rs_relpose_ros.{folder}.start', '--ros-args', *words, log=log)
 
 
 def player_process(bag: Path, *options: str, log: Path | None = None) -> Process:

@@ -6,6 +6,9 @@ COMPRESSED_TOPIC = '/camera/image_raw/compressed'
 RAW_TOPIC = '/camera/image_raw'
 CAMERA_INFO_TOPIC = '/camera/camera_info'
 IMU_TOPIC = '/imu/data_raw'
+# Gyro and accelerometer of phones, which stamp them apart.
+GYRO_TOPIC = '/imu/gyro'
+ACCEL_TOPIC = '/imu/accel'
 GROUND_TRUTH_TOPIC = '/ground_truth/pose'
 
 CAMERA_FRAME = 'camera_optical_frame'

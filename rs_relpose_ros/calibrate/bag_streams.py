@@ -15,6 +15,7 @@ from rs_relpose_ros.config.tracking import TrackingConfig
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
+from rs_relpose_ros.images.gray_levels import GrayLevels
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.messages.incoming import PublishedImage
 from rs_relpose_ros.messages.sensor_feed import Role, SensorFeed
@@ -70,6 +71,7 @@ class _Reader:
         self._uncalibrated = topics.camera_info is None
         self._size: tuple[int, int] | None = None
         self._gyro: dict[int, tuple[float, float, float]] = {}
+        self._levels = GrayLevels()
         self._unused: dict[str, int] = {}
 
     def take(self, role: Role, message: BagMessage) -> None:
@@ -97,7 +99,7 @@ class _Reader:
         last = self._follower.last_stamp_ns
         if last is not None and published.stamp_ns <= last:
             raise InputError('the stamp of an image is not later than that of the one before')
-        image = published.image.decoded()
+        image = published.image.decoded(self._levels)
         self._follower.add(published.stamp_ns, image)
         self._size = image.shape[1], image.shape[0]
 

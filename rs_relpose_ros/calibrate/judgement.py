@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import truncnorm
 
 from rs_relpose_ros.calibrate.axis_maps import nearest_axis_map
 from rs_relpose_ros.calibrate.coplanarity import (
@@ -17,8 +18,9 @@ from rs_relpose_ros.calibrate.coplanarity import (
     READOUT,
     ROTATION,
     SLOPE,
+    Unknowns,
 )
-from rs_relpose_ros.calibrate.fit import Fit
+from rs_relpose_ros.calibrate.fit import Fit, LOCAL, stepped
 from rs_relpose_ros.calibrate.observations import Observations
 from rs_relpose_ros.calibrate.result import AXES, CalibrationResult, CostCurve, Estimate
 from rs_relpose_ros.calibrate.stamps import Varying
@@ -56,17 +58,10 @@ def judged(data: Observations, final: Fit, free: NDArray[np.bool_], curve: CostC
     tracker[SLOPE] = config.exposure_slope_sigma
     tracker[FOCAL] = _LEAST_FOCAL_SIGMA
     covariance = final.covariance + np.diag(np.where(free, tracker, 0.0)**2)
-    parameters, R_cam_imu = final.unknowns.parameters, final.unknowns.R_imu_cam.T
+    bounded, beyond = _bounded(final.unknowns, covariance, data.interval)
+    parameters, R_cam_imu = bounded.parameters, bounded.R_imu_cam.T
     rates, one_axis = _excitation(data, parameters[BIAS:BIAS + 3], R_cam_imu, config)
     sigmas = np.sqrt(np.diag(covariance))
-    readout, readout_sigma = parameters[READOUT], sigmas[READOUT]
-    if abs(readout) - 3.0 * readout_sigma > data.interval:
-        raise InputError(
-            f'the read-out time comes out as {1e3 * abs(readout):.1f} +- '
-            f'{1e3 * readout_sigma:.1f} ms, longer than the interval of '
-            f'{1e3 * data.interval:.1f} ms between frames, which no camera can do: stamps or '
-            'frames are not what they seem (frames dropped and stamped anew, images cropped, '
-            'scaled or rotated)')
     # Row 0 is read this share of the read-out before the middle row.
     to_first = np.zeros(GLOBAL)
     to_first[OFFSET], to_first[READOUT] = 1.0, -0.5 * (data.camera.height - 1) / data.camera.height
@@ -82,15 +77,12 @@ def judged(data: Observations, final: Fit, free: NDArray[np.bool_], curve: CostC
         factor = math.exp(parameters[FOCAL])
         focal = _estimate(factor, factor * sigmas[FOCAL], factor * config.max_focal_sigma,
                           one_axis)
-    beyond = '' if abs(readout) <= data.interval else (
-        f'beyond the {1e3 * data.interval:.1f} ms between frames, which no camera can do: record '
-        'longer, and turn faster about all three axes')
     if free[SLOPE]:
         slope = _estimate(parameters[SLOPE], sigmas[SLOPE], _MOST_SLOPE_SIGMA)
     jitters = data.stamps.varying is Varying.JITTER
     unsettled = '' if final.converged else 'the fit had not settled when it was stopped'
     return CalibrationResult(
-        readout_time=_estimate(readout, readout_sigma, config.max_readout_sigma, beyond),
+        readout_time=_estimate(parameters[READOUT], sigmas[READOUT], config.max_readout_sigma),
         time_offset=_estimate(float(to_first @ parameters),
                               math.sqrt(to_first @ covariance @ to_first),
                               config.max_offset_sigma),
@@ -105,7 +97,30 @@ def judged(data: Observations, final: Fit, free: NDArray[np.bool_], curve: CostC
         inlier_ratio=float((final.weights > 0.25).mean()),
         frames=len(data.tracks), pairs=final.problem.pairs, matches=int(final.problem.begin[-1]),
         frame_interval=data.interval,
-        warnings=tuple(filter(None, (unsettled, one_axis, _UNCLEAR[data.stamps.varying]))))
+        warnings=tuple(filter(None, (unsettled, one_axis, beyond, _UNCLEAR[data.stamps.varying]))))
+
+
+def _bounded(unknowns: Unknowns, covariance: Array, interval: float) -> tuple[Unknowns, str]:
+    """The calibration with its read-out within an interval between frames, and a note.
+
+    No camera reads longer than that. The read-out is the mean of its normal distribution between
+    these bounds, and the others follow by their covariance with it. Sigmas stay: what comes out
+    beyond the bound has errors of which the bound says nothing.
+    """
+    readout, sigma = float(unknowns.parameters[READOUT]), math.sqrt(covariance[READOUT, READOUT])
+    found = f'the read-out time comes out as {1e3 * abs(readout):.1f} +- {1e3 * sigma:.1f} ms'
+    if abs(readout) - 3.0 * sigma > interval:
+        raise InputError(
+            f'{found}, longer than the interval of {1e3 * interval:.1f} ms between frames, which '
+            'no camera can do: stamps or frames are not what they seem (frames dropped and '
+            'stamped anew, images cropped, scaled or rotated)')
+    mean = float(truncnorm.mean(*((np.array([-interval, interval]) - readout) / sigma),
+                                loc=readout, scale=sigma))
+    step = covariance[:, READOUT] * ((mean - readout) / sigma**2)
+    note = '' if abs(readout) <= interval else (
+        f'{found}, but is at most the {1e3 * interval:.1f} ms between frames: all figures are for '
+        f'{1e3 * abs(mean):.1f} ms, the mean below that')
+    return stepped(unknowns, step, np.zeros((len(unknowns.direction), LOCAL))), note
 
 
 def _estimate(value: float, sigma: float, limit: float, obstacle: str = '') -> Estimate:

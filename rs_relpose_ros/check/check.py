@@ -8,7 +8,7 @@ from rs_relpose_ros.bags.reader import Bag
 from rs_relpose_ros.bags.topics import SensorTopics, Topic, TopicOptions
 from rs_relpose_ros.calibrate.axis_maps import axes_text, nearest_axis_map
 from rs_relpose_ros.check import judge_images, judge_imu, judge_together
-from rs_relpose_ros.check.completion import completed, Completion
+from rs_relpose_ros.check.completion import completed, Completion, remeasured
 from rs_relpose_ros.check.findings import CheckReport, FAILURE, Finding, Verdict, WARNING
 from rs_relpose_ros.check.scan import Chosen, Scan
 from rs_relpose_ros.check.trial import middle_of, Trial
@@ -47,9 +47,9 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters,
               on_message: Callable[[], object] = lambda: None) -> CheckReport:
     """Read the chosen topics of an open bag, and judge them and the node's parameters.
 
-    Once, or, where read-out or axes are not told, twice: they are looked for first. `on_message`
-    is called after each message of the last reading, and after each image of the first one, for a
-    progress bar.
+    A second time where read-out or axes are not told, to look for them first, or where the trial
+    of what was told goes wrong, to measure it. `on_message` is called after each message of the
+    reading in between, and after each image of the first one, for a progress bar.
 
     Raises
     ------
@@ -58,11 +58,10 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters,
     """
     images = chosen.image.count if chosen.image else 0
     seen = Scan(images, parameters.intrinsics, no_camera_info=chosen.camera_info is None)
-    completion, trial = Completion(parameters, None, ''), None
+    completion, trial, topics = Completion(parameters, None, ''), None, None
     if chosen.image is not None and chosen.imu is not None:
-        completion = completed(
-            bag, SensorTopics(chosen.image, chosen.camera_info, chosen.imu, chosen.accel, None),
-            parameters, middle_of(images), on_message)
+        topics = SensorTopics(chosen.image, chosen.camera_info, chosen.imu, chosen.accel, None)
+        completion = completed(bag, topics, parameters, middle_of(images), on_message)
         if not completion.parameters.sensor.missing():
             trial = Trial(images, completion.parameters)
     for role, message in seen.feed.messages(bag, chosen):
@@ -78,7 +77,9 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters,
             seen, chosen.image, bag.reliability(chosen.image), parameters)
     if chosen.imu is not None:
         findings += judge_imu.findings(seen, bag.reliability(chosen.imu), parameters)
-    if chosen.image is not None and chosen.imu is not None:
+    if topics is not None:
+        if trial is not None and trial.is_lost and completion.found is None:
+            completion = remeasured(bag, topics, completion, middle_of(images))
         findings += judge_together.findings(seen, trial, completion, parameters)
     return CheckReport(str(bag.path), tuple(findings))
 

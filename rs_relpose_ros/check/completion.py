@@ -1,9 +1,9 @@
-"""What was not told of camera and IMU, found by the calibration of a part of the recording."""
+"""What was not told of camera and IMU, or too far off, by the calibration of a part."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from rs_relpose_ros.bags.reader import Bag
@@ -22,8 +22,27 @@ class Completion:
     """Parameters with what was found in place of what was not told."""
 
     parameters: Parameters
-    found: CalibrationResult | None   # None where nothing was missing, or could be found
+    found: CalibrationResult | None   # None where none was wanted, or could be made
     problem: str   # why something is still missing; empty where nothing is
+
+
+def measured(bag: Bag, topics: SensorTopics, parameters: Parameters, images: range,
+             on_image: Callable[[], object] = lambda: None) -> CalibrationResult:
+    """Calibration from nothing of some `images`, by their number in the bag.
+
+    `on_image` is called after each image of the bag, for a progress bar.
+
+    Raises
+    ------
+    InputError
+        They cannot be used for it.
+    """
+    tracking = parameters.tracking
+    recording = read_recording(bag, topics, TrackingConfig(
+        detector=tracking.detector, feature_rows=tracking.feature_rows), images=images,
+        on_image=on_image)
+    return calibrate(recording.tracks, recording.gyro, recording.camera,
+                     focal_known=recording.focal_known, config=TRACKED_IN_IMAGES)
 
 
 def completed(bag: Bag, topics: SensorTopics, parameters: Parameters, images: range,
@@ -32,15 +51,11 @@ def completed(bag: Bag, topics: SensorTopics, parameters: Parameters, images: ra
 
     `on_image` is called after each image of the bag, for a progress bar.
     """
-    missing, tracking = parameters.sensor.missing(), parameters.tracking
+    missing = parameters.sensor.missing()
     if not missing:
         return Completion(parameters, None, '')
     try:
-        recording = read_recording(bag, topics, TrackingConfig(
-            detector=tracking.detector, feature_rows=tracking.feature_rows), images=images,
-            on_image=on_image)
-        found = calibrate(recording.tracks, recording.gyro, recording.camera,
-                          focal_known=recording.focal_known, config=TRACKED_IN_IMAGES)
+        found = measured(bag, topics, parameters, images, on_image)
     except InputError as error:
         return Completion(parameters, None, str(error))
     readout, problem = found.readout_time, ''
@@ -55,3 +70,12 @@ def completed(bag: Bag, topics: SensorTopics, parameters: Parameters, images: ra
         elif name in missing:
             problem = problem or estimate.remark
     return Completion(parameters.updated(values), found, problem)
+
+
+def remeasured(bag: Bag, topics: SensorTopics, completion: Completion,
+               images: range) -> Completion:
+    """The same with the calibration of `images` from nothing; without, where they give none."""
+    try:
+        return replace(completion, found=measured(bag, topics, completion.parameters, images))
+    except InputError:
+        return completion

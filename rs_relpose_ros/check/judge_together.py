@@ -20,9 +20,11 @@ from rs_relpose_ros.check.findings import (
     Verdict,
     WARNING,
 )
+from rs_relpose_ros.check.remeasured import contradicted
 from rs_relpose_ros.check.scan import Scan
-from rs_relpose_ros.check.trial import Trial
+from rs_relpose_ros.check.trial import MOST_POSED, Trial
 from rs_relpose_ros.config.parameters import Parameters
+from rs_relpose_ros.front_end.frame import sensor_camera
 from rs_relpose_ros.health.findings import Finding as Seen
 from rs_relpose_ros.health.findings import Health, HealthState, NOT_JUDGED
 from rs_relpose_ros.health.judge import FIGURES
@@ -31,8 +33,6 @@ from rs_relpose_ros.health.judge import FIGURES
 _SAME_CLOCK = 0.5
 # Matches of a pair in the median that give no estimate, and that are few.
 _NO_MATCHES, _FEW_MATCHES = 15, 30
-# Share of the pairs that have a pose where the camera moves and the figures are right.
-_MOST_POSED = 0.7
 # Read-out that is taken for example where none is known [s].
 _EXAMPLE_READOUT = 0.030
 # Displacement below the noise of matches, and one that spoils a global-shutter pose [px].
@@ -45,6 +45,8 @@ _LIMITS = {figure.name: _GROSS * figure.observable for figure in FIGURES}
 _VERDICTS = {HealthState.OK: Verdict.OK, HealthState.UNKNOWN: UNKNOWN,
              HealthState.SUSPECT: WARNING, HealthState.WRONG: FAILURE}
 _MEASURE = 'have it measured with "rs_relpose calibrate"'
+# Figures of the read-out, of which one is said.
+_READOUT = frozenset(('readout_time', 'readout_direction'))
 # Figures by the parameters that tell them.
 _TOLD_BY = {'quat_cam_imu_xyzw': 'axes', 'readout_time': 'readout_time'}
 
@@ -55,10 +57,10 @@ def findings(seen: Scan, trial: Trial | None, completion: Completion,
 
     `trial` is None where `completion` could not find what `parameters` do not tell.
     """
-    health = NOT_JUDGED if trial is None else trial.health
+    health = NOT_JUDGED if trial is None else _remeasured(trial, seen, completion)
     found = [_overlap(seen, parameters)]
     if trial is not None:
-        found += [_pairs(trial), _texture(trial, health)]
+        found += [_pairs(trial, health), _texture(trial, health)]
     why = completion.problem if trial is None else 'too few pairs of images were estimated'
     missing = {_TOLD_BY[name] for name in parameters.sensor.missing()}
     found += [_not_told(name, completion, seen) for name in sorted(missing)]
@@ -92,7 +94,7 @@ def _overlap(seen: Scan, parameters: Parameters) -> Finding:
              'the delays differ: see that both stamp the instant of measuring'))
 
 
-def _pairs(trial: Trial) -> Finding:
+def _pairs(trial: Trial, health: Health) -> Finding:
     """What the front end makes of the recording."""
     pairs, posed = len(trial.matches), trial.poses
     figures = {'images': trial.frames, 'pairs': pairs, 'poses': posed}
@@ -101,7 +103,9 @@ def _pairs(trial: Trial) -> Finding:
     return judged(
         'pairs', f'{pairs} pairs in {trial.frames} images, {posed} with a pose', figures,
         Case(not posed, UNKNOWN, '', f': {why}'),
-        Case(posed < _MOST_POSED * pairs, WARNING, 'move more, beside turning; where the camera '
+        Case(posed < MOST_POSED * pairs and health.state is HealthState.WRONG, WARNING,
+             'set right what is wrong, below', f'; without: {why}'),
+        Case(posed < MOST_POSED * pairs, WARNING, 'move more, beside turning; where the camera '
              'does, a figure is too far off to be seen: have all measured with "rs_relpose '
              'calibrate"', f'; without: {why}'))
 
@@ -126,6 +130,27 @@ def _texture(trial: Trial, health: Health) -> Finding:
 # -- figures that are told -------------------------------------------------------------------
 
 
+def _remeasured(trial: Trial, seen: Scan, completion: Completion) -> Health:
+    """What the trial found; where it got lost, what a calibration from nothing contradicts."""
+    found, health = completion.found, trial.health
+    units = any(fault.figure == 'gyro_unit' for fault in health.faults)
+    if found is None or seen.intrinsics is None or units or not trial.is_lost:
+        return health
+    wrong = contradicted(found, completion.parameters.sensor,
+                         sensor_camera(seen.intrinsics, completion.parameters))
+    if not wrong:
+        return health
+    named = {finding.figure for finding in wrong}
+    if not named.isdisjoint(_READOUT):
+        named |= _READOUT
+    judged_by_pair = {figure.name for figure in FIGURES}
+    why = f'not judged while {wrong[0].figure} is wrong'
+    return Health((*wrong, *(
+        replace(finding, observable=False, told=None, seen=None, sigma=None,
+                state=HealthState.UNKNOWN, sentence=why) if finding.figure in judged_by_pair
+        else finding for finding in health.findings if finding.figure not in named)))
+
+
 def _figures(health: Health, why: str) -> Iterator[Finding]:
     """Each figure, by the trial; `why` none is known where there is none."""
     for seen in health.findings:
@@ -133,7 +158,7 @@ def _figures(health: Health, why: str) -> Iterator[Finding]:
         yield Finding(
             seen.figure, _VERDICTS[state], seen.sentence,
             _MEASURE if state is not seen.state is HealthState.OK else
-            'then check again: a figure that is far off hides others, and is not seen to its sigma'
+            'then check again: a figure that is far off hides others'
             if state is HealthState.WRONG else '', replace(seen, state=state).as_json())
     if not health.findings:
         for figure in FIGURES:

@@ -10,19 +10,24 @@ from rs_relpose_ros.front_end.front_end import FrameFailed, FrontEnd
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.front_end.sequencer import FrameRefused
 from rs_relpose_ros.geometry.timing import to_nanoseconds
-from rs_relpose_ros.health.findings import Health, NOT_JUDGED, worst_of
+from rs_relpose_ros.health.findings import Health, HealthState, NOT_JUDGED, worst_of
 from rs_relpose_ros.messages.causes import CauseCounts
 from rs_relpose_ros.messages.incoming import stamp_ns
 from rs_relpose_ros.messages.intake import Intake
 from rs_relpose_ros.messages.sensor_feed import Role
 
-# Parts of consecutive images, evenly over the recording: three times 20 s at 30 Hz.
-_PARTS, _PART_IMAGES = 3, 600
+# Parts of consecutive images, evenly over the recording: three times 10 s at 30 Hz; and images
+# that a calibration takes.
+_PARTS, _PART_IMAGES, _CALIBRATED_IMAGES = 3, 300, 600
 # A part is judged by its last pair, and by those so long after its first one: fewer pairs are
 # soon mistaken.
 _SETTLED_NS = to_nanoseconds(10.0)
 # Pairs so far apart are of two parts.
 _APART_NS = to_nanoseconds(3.0)
+# Share of the pairs that have a pose where the camera moves and the figures are right.
+MOST_POSED = 0.7
+# Figures of which the trial sees that they are far off, but not by how much.
+_FAR_OFF = frozenset(('axes', 'time_offset', 'image_geometry'))
 # Images that wait for the gyro at most: where the clocks differ it never comes.
 _MOST_WAITING = 64
 
@@ -36,9 +41,9 @@ def _part_of(images: int, part: int) -> range:
 
 
 def middle_of(images: int) -> range:
-    """Indices of as many images as a part has, in the middle of the recording."""
-    first = max(images - _PART_IMAGES, 0) // 2
-    return range(first, first + min(images, _PART_IMAGES))
+    """Indices of the images, in the middle of the recording, that a calibration takes."""
+    first = max(images - _CALIBRATED_IMAGES, 0) // 2
+    return range(first, first + min(images, _CALIBRATED_IMAGES))
 
 
 class Trial:
@@ -82,6 +87,15 @@ class Trial:
     def health(self) -> Health:
         """Of each figure the worst that a part shows."""
         return self._before if self._last is None else worst_of(self._before, self._last.health)
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether a figure may be too far off for the trial to see by how much."""
+        if not self.matches:
+            return False
+        wrong = {fault.figure for fault in self.health.faults
+                 if fault.state is HealthState.WRONG}
+        return bool(wrong & _FAR_OFF) or self.poses < MOST_POSED * len(self.matches)
 
     def _wants(self, message: BagMessage) -> bool:
         """Count an image; whether it belongs to a part."""

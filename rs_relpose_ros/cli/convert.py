@@ -1,4 +1,4 @@
-"""``rs_relpose convert``: a public recording as a bag."""
+"""``rs_relpose convert``: a recording of a camera or phone as a bag."""
 
 from __future__ import annotations
 
@@ -8,44 +8,48 @@ from pathlib import Path
 from rs_relpose_ros.bags.writer import refuse_existing
 from rs_relpose_ros.cli.options import progress_bar
 from rs_relpose_ros.config.parameter_file import write_parameters
-from rs_relpose_ros.convert import realsense, xiaomi
-from rs_relpose_ros.convert.recording import Recording, write_bag
-from rs_relpose_ros.errors import MissingInputError
+from rs_relpose_ros.convert.recording import write_bag
+from rs_relpose_ros.convert.sources import SOURCES
 
-HELP = ('Turn a public recording into a rosbag2 directory (MCAP) with the topics '
-        '/camera/image_raw/compressed, /camera/camera_info and /imu/data_raw, and write '
-        'OUT_BAG.yaml beside it: the parameters of relpose_node, each with its source. Stamps and '
-        'JPEG images stay as recorded; the IMU keeps its own axes. realsense_rgb_rs: colour '
-        'camera, gyro and accelerometer of a RealSense, from github.com/Zoltan3057/DM-VIO-dataset '
-        '(imu.txt, frames.csv, camera.txt, images/). xiaomi_cc9_rs: phone with gyro, from '
-        'github.com/lhaippp/gyro-video-stabilization (gyro.txt, framestamp.txt, images/).')
-
-
-# Source -> module: how its recordings are read, and what the node must know of them.
-DATASETS = {'realsense_rgb_rs': realsense, 'xiaomi_cc9_rs': xiaomi}
+HELP = ('Turn a recording into a rosbag2 directory (MCAP) with /camera/image_raw/compressed, '
+        '/imu/data_raw (or /imu/gyro and /imu/accel, where they are stamped apart), '
+        '/camera/camera_info where the camera is calibrated, and /ground_truth/pose where poses '
+        'came with it; and write OUT_BAG.yaml beside it: the parameters of relpose_node, each '
+        'with its source. Stamps and JPEG images stay as recorded. "rs_relpose convert SOURCE '
+        '--help" describes a source.')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument('dataset', choices=DATASETS, help='source of the recording')
-    parser.add_argument('folder', metavar='FOLDER', type=Path, help='folder of the recording')
-    parser.add_argument('out_bag', metavar='OUT_BAG', type=Path,
-                        help='bag directory to create; OUT_BAG.yaml is written beside it')
+    sources = parser.add_subparsers(dest='source', metavar='SOURCE', required=True)
+    for name, source in SOURCES.items():
+        one = sources.add_parser(name, help=source.help, description=source.help)
+        one.add_argument('path', metavar=source.path, type=Path, help='the recording')
+        one.add_argument('out_bag', metavar='OUT_BAG', type=Path,
+                         help='bag directory to create; OUT_BAG.yaml is written beside it')
+        if source.takes_lens_profile:
+            one.add_argument(
+                '--lens-profile', metavar='PATH', type=Path,
+                help="Gyroflow's profile of the camera's mode (JSON), or a folder of them, such "
+                'as a checkout of github.com/gyroflow/lens_profiles: calibration of the lens, and '
+                'a guess of the read-out time where the file does not tell it')
+        one.set_defaults(lens_profile=None)
 
 
 def run(args: argparse.Namespace) -> int:
     """Write the bag and its parameter file."""
-    dataset = DATASETS[args.dataset]
-    folder: Path = args.folder
     parameters = args.out_bag.with_name(args.out_bag.name + '.yaml')
-    if not folder.is_dir():
-        raise MissingInputError(f'there is no folder {folder}')
     refuse_existing(args.out_bag, parameters)
-    recording: Recording = dataset.read_recording(folder)
+    conversion = SOURCES[args.source].conversion(args.path, args.lens_profile)
+    recording = conversion.recording
     with progress_bar(len(recording.images), 'image', args.out_bag.name) as bar:
         write_bag(recording, args.out_bag, on_image=bar.update)
-    write_parameters(parameters, dataset.TITLE, dataset.PARAMETERS)
+    write_parameters(parameters, conversion.title, conversion.parameters)
     size = sum(file.stat().st_size for file in args.out_bag.iterdir())
-    print(f'{args.out_bag}: {len(recording.images)} images, {len(recording.cropped_imu())} IMU '
-          f'samples, {size / 1e6:.1f} MB; parameters of the node: {parameters}')
+    samples = len(recording.cropped_imu()) + len(recording.cropped_accel())
+    print(f'{args.out_bag}: {len(recording.images)} images, {samples} IMU samples'
+          + (f', {len(recording.truth)} true poses' if recording.truth else '')
+          + f', {size / 1e6:.1f} MB; parameters of the node: {parameters}')
+    if 'readout_time' not in {value.name for value in conversion.parameters}:
+        print(f'the read-out time is not known: rs_relpose calibrate {args.out_bag}')
     return 0

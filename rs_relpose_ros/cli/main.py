@@ -20,6 +20,8 @@ PROGRAM = 'rs_relpose'
 # overview does not wait for OpenCV and Numba. Those of the laboratory, another package, are found
 # by name, so that the product does not depend on it.
 COMMANDS: Mapping[str, tuple[str, str]] = {
+    'batch': ('rs_relpose_ros.cli.batch',
+              'check, calibrate or replay over many bags, on Dask'),
     'benchmark': ('rs_relpose_lab.cli.benchmark',
                   'measure accuracy and speed of the estimator: tables and plots'),
     'check': ('rs_relpose_ros.cli.check',
@@ -27,7 +29,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     'calibrate': ('rs_relpose_ros.cli.calibrate',
                   'read-out time, time offset, axes and gyro bias from a bag, without a target'),
     'convert': ('rs_relpose_ros.cli.convert',
-                'turn a public recording into a rosbag2 bag and its parameter file'),
+                'turn a recording of a camera or phone into a bag and its parameter file'),
     'evaluate': ('rs_relpose_lab.cli.evaluate',
                  'run the experiments of the paper: tables and box plots'),
     'odometry': ('rs_relpose_ros.cli.odometry',

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from rs_relpose_ros.config.parameter_file import SourcedValue
 from rs_relpose_ros.convert.recording import ImageFile, ordered_samples, Recording
-from rs_relpose_ros.convert.tables import read_rows, Row
+from rs_relpose_ros.convert.tables import file_inside, read_rows, Row
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.imu.samples import ImuSample
@@ -88,13 +88,5 @@ def _read_frames(folder: Path) -> tuple[ImageFile, ...]:
     stamp, file = rows[0].words.index('stamp_ns'), rows[0].words.index('file')
     if len(rows) == 1:
         raise MissingInputError(f'{folder / "frames.csv"} lists no image')
-    return tuple(ImageFile(row.nanoseconds(stamp), _inside(folder, row, file))
+    return tuple(ImageFile(row.nanoseconds(stamp), file_inside(folder, row, file))
                  for row in rows[1:])
-
-
-def _inside(folder: Path, row: Row, column: int) -> Path:
-    """A file that a table names; a table from elsewhere must not reach other folders."""
-    name = Path(row.words[column])
-    if name.is_absolute() or '..' in name.parts:
-        raise row.error(f'{str(name)[:80]!r} lies outside of the recording')
-    return folder / name

@@ -83,7 +83,16 @@ def build_problem(points1: Array, points2: Array, camera: RollingShutterCamera,
         # A floor far below any gyro keeps the information finite.
         information = np.linalg.inv(covariance + 1e-14 * np.eye(3))
         information = 0.5 * (information + information.T)
-    observations = np.empty((len(points1), 20))
+    observations = observed(points1, points2, camera, motion1, motion2, derotate)
+    valid, points = _checked_columns(observations)
+    return TwoViewProblem(observations, points, valid, 0.5 * (camera.fx + camera.fy), motion1,
+                          motion2, -delay, rotation, information)
+
+
+def observed(points1: Array, points2: Array, camera: RollingShutterCamera, motion1: FrameMotion,
+             motion2: FrameMotion, derotate: bool = True) -> Array:
+    """Observations (N, 20) of matched pixels (N, 2); motions at the middle row."""
+    delay, observations = middle_row_delay(camera), np.empty((len(points1), 20))
     for k, (points, motion) in enumerate(((points1, motion1), (points2, motion2))):
         rays, jacobian = camera.unproject_with_jacobian(points)
         tau = camera.row_times(points[:, 1]) - delay
@@ -93,9 +102,7 @@ def build_problem(points1: Array, points2: Array, camera: RollingShutterCamera,
         observations[:, 18 + k] = tau
         _derotate(rays, jacobian, np.ascontiguousarray(turns), camera.line_delay * rate,
                   observations[:, 9 * k:9 * k + 9])
-    valid, points = _checked_columns(observations)
-    return TwoViewProblem(observations, points, valid, 0.5 * (camera.fx + camera.fy), motion1,
-                          motion2, -delay, rotation, information)
+    return observations
 
 
 @kernel

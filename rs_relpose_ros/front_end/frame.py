@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.config.parameters import Parameters
+from rs_relpose_ros.config.parameters import Parameters, SensorConfig
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
+from rs_relpose_ros.geometry.timing import ImageClock
 from rs_relpose_ros.images.encoded import EncodedImage
+from rs_relpose_ros.images.gray_levels import GrayLevels
 
 
 class Waiting(Protocol):
@@ -66,10 +68,12 @@ class EncodedFrame:
     image: EncodedImage
     frame_id: str
     intrinsics: Intrinsics
+    levels: GrayLevels = field(default_factory=GrayLevels)   # of the camera's images so far
 
     def decoded(self) -> Frame:
         """The frame with its image; raises InputError where it cannot be decoded."""
-        return Frame(self.stamp_ns, self.image.decoded(), self.frame_id, self.intrinsics)
+        return Frame(self.stamp_ns, self.image.decoded(self.levels), self.frame_id,
+                     self.intrinsics)
 
 
 def check_size(image: NDArray[Any], intrinsics: Intrinsics) -> None:
@@ -90,3 +94,10 @@ def sensor_camera(intrinsics: Intrinsics, parameters: Parameters) -> RollingShut
                                 'delay in seconds (0 for a global shutter)')
     return replace(intrinsics.global_shutter_camera(), readout_time=sensor.readout_time,
                    readout_direction=sensor.readout_direction, reference_row=sensor.stamp_row)
+
+
+def image_clock(camera: RollingShutterCamera, sensor: SensorConfig) -> ImageClock:
+    """Clock of the images of a `sensor_camera`, as told."""
+    return ImageClock(
+        camera, sensor.time_offset, sensor.stamp_exposure, sensor.exposure_time,
+        sensor.time_offset_per_interval, sensor.time_offset_reference_interval)

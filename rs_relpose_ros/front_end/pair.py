@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.config.keyframes import KeyframeConfig
 from rs_relpose_ros.estimator.result import RelativePose
+from rs_relpose_ros.front_end.landmarks import Landmarks
 from rs_relpose_ros.health.findings import Health, NOT_JUDGED
 from rs_relpose_ros.health.tracked import Applied, NOTHING_APPLIED, Tracked
 from rs_relpose_ros.tracking.matches import Matches
@@ -53,6 +54,7 @@ class PairResult:
     rays1: Array   # (N, 3) unit, turned by the gyro to the stamped row
     rays2: Array
     parallax: float   # [px] median after derotation
+    landmarks: Landmarks | None = None   # of the matches; None without a pose
     gyro_rotation: Array | None = None   # (3, 3) R_1^T R_2 integrated from the gyro
     # (3,) [rad] rotation by the images alone against the gyro's; None without either
     images_against_gyro: Array | None = None

@@ -14,6 +14,7 @@ from rs_relpose_ros.estimator.estimate import estimate_relative_pose
 from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.front_end.derotated_rays import DerotatedRays, median_parallax, Sensor
 from rs_relpose_ros.front_end.frame import Frame, sensor_camera
+from rs_relpose_ros.front_end.landmarks import landmarks
 from rs_relpose_ros.front_end.pair import closes_pair, PairResult, SinceKeyframe
 from rs_relpose_ros.front_end.stamp_scatter import StampScatter
 from rs_relpose_ros.geometry.inertial import InertialMotion
@@ -302,6 +303,7 @@ class Pipeline:
             frame_id=view.frame.frame_id, interval=_interval(reference, view), pose=pose,
             matches=matches, row_times1=rays1.row_times, row_times2=rays2.row_times,
             rays1=rays1.rays, rays2=rays2.rays, parallax=self._parallax(rays1, rays2, sensor),
+            landmarks=landmarks(pose, rays1, rays2, sensor) if pose else None,
             gyro_rotation=None if gyro is None else gyro.rotation,
             images_against_gyro=None if seen is None else seen.images_against_gyro,
             health=self._health.health, tracked=self._seen, applied=self._applied,

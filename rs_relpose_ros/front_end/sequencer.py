@@ -17,7 +17,7 @@ from typing import Generic
 
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.front_end.frame import Decodable, Decoded, sensor_camera
+from rs_relpose_ros.front_end.frame import Decodable, Decoded, image_clock, sensor_camera
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.geometry.timing import (
     FrameIntervals,
@@ -355,11 +355,8 @@ class Sequencer(Generic[Decoded]):
 
     def _clock_of(self, intrinsics: Intrinsics) -> ImageClock:
         if self._image_clock is None or intrinsics != self._intrinsics:
-            sensor = self._parameters.sensor
-            self._image_clock = ImageClock(
-                sensor_camera(intrinsics, self._parameters), sensor.time_offset,
-                sensor.stamp_exposure, sensor.exposure_time, sensor.time_offset_per_interval,
-                sensor.time_offset_reference_interval)
+            self._image_clock = image_clock(
+                sensor_camera(intrinsics, self._parameters), self._parameters.sensor)
             self._intrinsics = intrinsics
         return self._image_clock
 

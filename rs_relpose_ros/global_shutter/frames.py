@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
 
 import cv2
 import numpy as np
@@ -11,9 +13,8 @@ from rs_relpose_ros.front_end.frame import check_size, Frame
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.global_shutter.row_map import RowMap
 from rs_relpose_ros.images.encoded import CompressedImage, EncodedImage, Pixels
+from rs_relpose_ros.images.gray_levels import GrayLevels
 
-# Both coordinates are in one map.
-_NO_MAP = np.empty(0, dtype=np.float32)
 _BORDERS = {'replicate': cv2.BORDER_REPLICATE, 'black': cv2.BORDER_CONSTANT}
 
 
@@ -26,13 +27,15 @@ class ColorFrame:
     frame_id: str
     intrinsics: Intrinsics
     encoded: EncodedImage
+    levels: GrayLevels   # of the camera's images so far
 
     def __post_init__(self) -> None:
         check_size(self.pixels.values, self.intrinsics)
 
     def gray(self) -> Frame:
         """The frame as relpose_node gets it, bit by bit."""
-        return Frame(self.stamp_ns, self.encoded.decoded(), self.frame_id, self.intrinsics)
+        return Frame(self.stamp_ns, self.encoded.decoded(self.levels), self.frame_id,
+                     self.intrinsics)
 
     @property
     def is_png(self) -> bool:
@@ -48,11 +51,17 @@ class EncodedColorFrame:
     image: EncodedImage
     frame_id: str
     intrinsics: Intrinsics
+    levels: GrayLevels = field(default_factory=GrayLevels)
 
     def decoded(self) -> ColorFrame:
         """The frame with its image; raises InputError where it cannot be decoded."""
-        return ColorFrame(self.stamp_ns, self.image.pixels(), self.frame_id, self.intrinsics,
-                          self.image)
+        return ColorFrame(self.stamp_ns, self.image.pixels(self.levels), self.frame_id,
+                          self.intrinsics, self.image, self.levels)
+
+
+def color_frames() -> Callable[[int, EncodedImage, str, Intrinsics], EncodedColorFrame]:
+    """What makes the frames of one camera, for `Intake`."""
+    return partial(EncodedColorFrame, levels=GrayLevels())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,7 +79,9 @@ class GlobalShutterFrame:
         values, border = self.frame.pixels.values, _BORDERS[self.border]
         complete, turned = self.map.complete, np.empty_like(values)
         for rows, sources in self.map.bands():
-            turned[rows] = cv2.remap(values, sources, _NO_MAP, cv2.INTER_LINEAR, borderMode=border)
+            # None, as the types forbid: OpenCV 5 takes an empty second map for one.
+            turned[rows] = cv2.remap(values, sources, None,  # type: ignore[call-overload]
+                                     cv2.INTER_LINEAR, borderMode=border)
             if not complete:
                 turned[rows][np.isnan(sources[..., 0])] = 0
         return Pixels(turned, self.frame.pixels.encoding)

@@ -13,8 +13,8 @@ from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.front_end.front_end import FrameLoop, FrameProcessed
 from rs_relpose_ros.front_end.sequencer import Sequencer
 from rs_relpose_ros.global_shutter.frames import (
+    color_frames,
     ColorFrame,
-    EncodedColorFrame,
     GlobalShutterFrame,
 )
 from rs_relpose_ros.global_shutter.unroller import unrolling_loop
@@ -100,7 +100,7 @@ class GlobalShutterNode(SensorNode):
 
     def _make_intake(self, parameters: Parameters, sequencer: Sequencer[Any]) -> Intake:
         return Intake(sequencer, parameters.imu.stuck_gyro_time, parameters.intrinsics,
-                      EncodedColorFrame)
+                      color_frames())
 
     def _warm_up(self) -> None:
         warm_up_unroller(self._settings.current)
@@ -143,22 +143,27 @@ class GlobalShutterNode(SensorNode):
         """Tell once of images of the same driver, whose stamps stay on the camera's clock."""
         assert self._inputs is not None
         own = next(iter(self._inputs.topics.values()))
-        drivers = {(info.node_namespace, info.node_name)
-                   for info in self.get_publishers_info_by_topic(own)}
+        drivers = self._publishing_nodes(own)
         if not drivers:
             return
         self.destroy_timer(self._sibling_timer)
         base = own.removesuffix('/compressed')
+        # Transports of the same image lie below it.
         others = sorted(
-            name for namespace, node in drivers for name, types in
-            self.get_publisher_names_and_types_by_node(node, namespace)
-            # Transports of the same image lie below it.
-            if set(types) & set(_IMAGE_TYPES) and not f'{name}/'.startswith(f'{base}/'))
+            name for name, types in self.get_topic_names_and_types()
+            if set(types) & set(_IMAGE_TYPES) and not f'{name}/'.startswith(f'{base}/')
+            and drivers & self._publishing_nodes(name))
         if others:
             self._warn(
                 f'{", ".join(others)} of the same driver keep stamps on the clock of the camera, '
                 "while those of the turned images are on the IMU's: set stamp_clock: camera "
                 'where they are used together (depth, stereo)')
+
+    def _publishing_nodes(self, topic: str) -> set[tuple[str, str]]:
+        """Namespaces and names of who publishes a topic, as far as they are known by now."""
+        return {(info.node_namespace, info.node_name)
+                for info in self.get_publishers_info_by_topic(topic)
+                if info.node_namespace.startswith('/')}
 
 
 def main(arguments: Sequence[str] | None = None,

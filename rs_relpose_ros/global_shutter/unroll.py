@@ -22,7 +22,7 @@ from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.front_end.front_end import FrameFailed
 from rs_relpose_ros.front_end.sequencer import FrameRefused
-from rs_relpose_ros.global_shutter.frames import EncodedColorFrame, GlobalShutterFrame
+from rs_relpose_ros.global_shutter.frames import color_frames, GlobalShutterFrame
 from rs_relpose_ros.global_shutter.unroller import unrolling_loop
 from rs_relpose_ros.messages.causes import CauseCounts
 from rs_relpose_ros.messages.incoming import stamp_ns
@@ -105,7 +105,7 @@ class _Unrolling:
         self._stamp_clock = parameters.global_shutter.stamp_clock
         self._loop = unrolling_loop(parameters, offline=True)
         self._intake = Intake(self._loop.sequencer, parameters.imu.stuck_gyro_time,
-                              parameters.intrinsics, EncodedColorFrame)
+                              parameters.intrinsics, color_frames())
         self._places: deque[_Place] = deque()
         # Places of images and of their CameraInfos, by stamp, whose write is not known yet.
         self._images: dict[int, deque[_Place]] = {}

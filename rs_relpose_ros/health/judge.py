@@ -7,7 +7,7 @@ sigma of a pose that is told right, *wrong* where it moves the pose out of its c
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.config.parameters import SensorConfig
-from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.camera import REFERENCE_ROWS, RollingShutterCamera
 from rs_relpose_ros.geometry.so3 import exp_so3
 from rs_relpose_ros.health.deviation import (
     AXES,
@@ -38,21 +38,25 @@ Array = NDArray[np.float64]
 _CERTAIN = 4.0
 # Shift of the pose in its own sigmas (Mahalanobis) that matters, and that leaves its covariance.
 _MATTERS, _OUTSIDE = 1.0, 3.0
-# Shares of the images' turning that the gyro as told, and at best, leaves unexplained, beyond
-# which its axes are wrong: translation alone leaves some, turned axes nearly all.
-_UNEXPLAINED_AS_TOLD, _EXPLAINED_AT_BEST, _BETTER = 0.7, 0.5, 0.4
+# Axes are wrong where the best rotation leaves less than this share of the images' turning, is
+# larger than the recursive calibration reaches [rad], and leaves so much less unexplained [rad]
+# than the axes as told; half of what it leaves itself counts as chance.
+_EXPLAINED_AT_BEST, _LARGE_TURN, _BETTER = 0.5, 1.0, 0.15
 # Images over gyro beyond which only another unit explains the scale (deg/s: 0.017).
 _UNIT_FACTOR = 5.0
-# Turning [rad] of both after which they must agree, and the share that they then must explain.
+# Turning of the gyro [rad] after which images must agree, and the share that they then must
+# explain.
 _LONG_TURN, _INDEPENDENT = 2.0, 0.85
 # Rotations within this [rad] of half a turn about an axis of the image also are flipped images.
-_HALF_TURN = 0.35
+_HALF_TURN = 0.6
 # Quantile of the pairs' shifts that says whether a deviation matters: quiet ones hide it.
 _SEEN_IN = 0.9
 # Sigmas of a figure that was told with one, within which it is as told.
 _AS_TOLD = 3.0
 # Figures that are asked for at most: traces of a gross one need some, too.
 _MOST_CAUSES = 4
+# Chi-square by which a second figure may explain less, and still fits as well.
+_AS_GOOD = 4.0
 # Part of the told distortion that rectified images have at most.
 _LITTLE_OF = 0.25
 # Deviations that move the pose by less than this share of the largest one's shift are not judged:
@@ -114,6 +118,7 @@ class Cause(NamedTuple):
     # most, and in those claimed, in the median.
     shift: float
     claimed_shift: float
+    rival: Cause | None = None   # that explains the pairs as well, instead
 
     def matters(self, told: Told) -> bool:
         """Whether it moves the pose by its sigma, beyond what was told with a sigma."""
@@ -127,33 +132,48 @@ def causes(seen: Calibration, effects: list[Effect], in_force: Array) -> list[Ca
     All figures at once would share a deviation of one among each other where few pairs tell them
     apart. A figure alone gains ``b_k^T S_kk^-1 b_k`` in chi-square; the one that gains most is
     taken for the cause, and the others are asked about what it leaves. Where that is not certain,
-    a figure is a cause that is certain beside all others.
+    a figure is a cause that is certain beside all others. One that explains as much as a single
+    cause is its rival.
     """
     if not seen.pairs:
         return []
     found: list[tuple[Figure, float]] = []
+    rival: tuple[Figure, float] | None = None
     together = sigma = np.zeros(DEVIATIONS)
     taken = np.zeros(DEVIATIONS, dtype=bool)
     while len(found) < _MOST_CAUSES:
         left = seen.b - seen.S @ (in_force + together)
-        asked = [figure for figure in FIGURES if not taken[figure.part].any()]
-        figure, certainty = max(((figure, _alone(figure, seen, left, taken)) for figure in asked),
-                                key=lambda item: item[1])
+        alone = sorted(((figure, _alone(figure, seen, left, taken)) for figure in FIGURES
+                        if not taken[figure.part].any()), key=lambda item: -item[1])
+        figure, certainty = alone[0]
         if certainty < _CERTAIN:
             figure, certainty = max(
-                ((figure, _beside_all(figure, seen, in_force)) for figure in asked),
+                ((figure, _beside_all(figure, seen, in_force)) for figure, _ in alone),
                 key=lambda item: item[1])
+        elif not found and certainty**2 - alone[1][1]**2 < _AS_GOOD:
+            rival = alone[1]
         if certainty < _CERTAIN:
             break
         found.append((figure, certainty))
         taken[figure.part] = True
-        # All causes so far together.
-        covariance = np.linalg.inv(seen.S[np.ix_(taken, taken)])
-        together, sigma = np.zeros(DEVIATIONS), np.zeros(DEVIATIONS)
-        together[taken] = covariance @ (seen.b - seen.S @ in_force)[taken]
-        sigma[taken] = np.sqrt(seen.misfit * np.diag(covariance))
-    return [_cause(figure, together, sigma, certainty, effects)
-            for figure, certainty in found]
+        together, sigma = _solved(seen, taken, in_force)
+    explained = [_cause(figure, together, sigma, certainty, effects)
+                 for figure, certainty in found]
+    if rival is not None and len(found) == 1:
+        instead = np.zeros(DEVIATIONS, dtype=bool)
+        instead[rival[0].part] = True
+        explained[0] = explained[0]._replace(rival=_cause(
+            rival[0], *_solved(seen, instead, in_force), rival[1], effects))
+    return explained
+
+
+def _solved(seen: Calibration, taken: NDArray[np.bool_], in_force: Array) -> tuple[Array, Array]:
+    """Deviations (11,) from what is in force where only those `taken` are off; 1 sigma each."""
+    together, sigma = np.zeros(DEVIATIONS), np.zeros(DEVIATIONS)
+    covariance = np.linalg.inv(seen.S[np.ix_(taken, taken)])
+    together[taken] = covariance @ (seen.b - seen.S @ in_force)[taken]
+    sigma[taken] = np.sqrt(seen.misfit * np.diag(covariance))
+    return together, sigma
 
 
 def _beside_all(figure: Figure, seen: Calibration, in_force: Array) -> float:
@@ -196,10 +216,13 @@ def judged(seen: Calibration, explained: list[Cause], turned: TurnComparison | N
     largest = max((cause.shift for cause in explained), default=0.0)
     faults = {cause.figure.name: cause for cause in explained
               if cause.matters(told) and cause.shift > _TRACE * largest}
+    faults |= {cause.rival.figure.name: cause.rival for cause in faults.values()
+               if cause.rival is not None}
+    rivals = ' or '.join(faults) if any(cause.rival for cause in faults.values()) else ''
     found: list[Finding] = []
     for figure in FIGURES:
         if figure.name in faults:
-            found += _fault_of(faults[figure.name], told)
+            found += _fault_of(faults[figure.name], told, rivals)
         elif float(seen.sigma[figure.part].max()) > figure.observable:
             found.append(_unknown(figure, 'this motion does not show it, or too few pairs came'))
         elif faults:
@@ -219,8 +242,8 @@ def _length(shifts: list[Array], quantile: float) -> float:
 # -- figures one by one ----------------------------------------------------------------------
 
 
-def _fault_of(cause: Cause, told: Told) -> Iterator[Finding]:
-    """Findings on a figure that is off by enough to matter."""
+def _fault_of(cause: Cause, told: Told, rivals: str) -> Iterator[Finding]:
+    """Findings on a figure that is off by enough to matter; `rivals`: that fit as well, if any."""
     figure = cause.figure
     sure = cause.claimed_shift * (1.0 - 2.0 / cause.certainty)
     state = HealthState.WRONG if sure > _OUTSIDE else HealthState.SUSPECT
@@ -233,11 +256,25 @@ def _fault_of(cause: Cause, told: Told) -> Iterator[Finding]:
         return
     yield Finding(figure.name, described.told, described.seen, described.sigma, figure.unit, True,
                   state, f'{described.text} (moves the pose by {cause.shift:.1f} of its sigmas): '
-                  f'{_remedy(figure, cause.deviation[figure.part], described, told)}')
+                  f'{_remedy(figure, cause.deviation[figure.part], described, told)}'
+                  + (f' ({rivals}: both fit as well)' if rivals else ''))
+    if figure.name == 'time_offset':
+        yield from _another_row(cause, state, told)
     if figure.name == 'distortion' and described.told and (
             abs(described.seen) < _LITTLE_OF * abs(described.told)):
         yield _fault('image_geometry', state, 'the images have hardly any distortion left: are '
                      'they rectified? subscribe to the raw ones, whose rows have one instant each')
+
+
+def _another_row(cause: Cause, state: HealthState, told: Told) -> Iterator[Finding]:
+    """Another stamped row, where it makes the same offset."""
+    camera, deviation = told.camera, cause.deviation[OFFSET]
+    for name in REFERENCE_ROWS:
+        row = replace(camera, reference_row=name).reference_row_index
+        makes = (camera.reference_row_index - row) * camera.line_delay
+        if name != camera.reference_row and abs(deviation - makes) < 2.0 * cause.sigma[OFFSET]:
+            yield _fault('stamp_row', state, f'or the stamps mark the {name} row, which makes the '
+                         f'same offset: set stamp_row: {name}')
 
 
 class _Described(NamedTuple):
@@ -330,10 +367,11 @@ def _gross(turned: TurnComparison | None, told: Told) -> Iterator[Finding]:
             yield _fault('gyro_unit', wrong, f'images turn {turned.scale:.3g} times as far as the '
                          'gyro: it must be in rad/s, which is pi / 180 = 0.0175 times deg/s',
                          1.0, turned.scale)
-        if (turned.left_as_told > _UNEXPLAINED_AS_TOLD
-                and turned.left_as_told - explained > _BETTER):
+        better = (turned.left_as_told - 1.5 * explained) * turned.by_images
+        mirrored = turned.left_mirrored < turned.left_at_best
+        if better > _BETTER and (mirrored or turned.angle > _LARGE_TURN):
             yield from _turned_axes(turned, told)
-    elif min(turned.by_images, turned.by_gyro) > _LONG_TURN and explained > _INDEPENDENT:
+    elif turned.by_gyro > _LONG_TURN and explained > _INDEPENDENT:
         text = ('images and gyro turn independently of each other: is it the IMU of this camera, '
                 'do both stamp by one clock, is electronic stabilisation off?')
         yield _fault('image_geometry', wrong, text)
@@ -342,7 +380,7 @@ def _gross(turned: TurnComparison | None, told: Told) -> Iterator[Finding]:
 
 def _turned_axes(turned: TurnComparison, told: Told) -> Iterator[Finding]:
     wrong = HealthState.WRONG
-    if turned.left_mirrored < turned.left_at_best - 0.5 * _BETTER:
+    if turned.left_mirrored < 0.5 * turned.left_at_best:
         yield _fault('axes', wrong, 'the axes of the gyro are left-handed: one of them has the '
                      'wrong sign')
         return

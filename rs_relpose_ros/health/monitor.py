@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 
 # Latest pairs with a pose over which the effect of a deviation is taken.
 _EFFECTS = 30
+# Pairs of a start whose poses get the covariance of all that may be told wrong: nothing that was
+# told has been seen to be true yet.
+_FIRST_PAIRS = 3
 # Deviations about which a pair is linearised at most: lens and read-out must stay possible.
 _LARGEST = np.array([0.5] * 3 + [0.06, 0.1] + [0.2] * 3 + [0.3, 0.45, 0.6])
 
@@ -75,7 +78,12 @@ class HealthMonitor:
         if pose:
             self._effects.append(_effect(information, pose))
         self._causes = causes(self.calibration, list(self._effects), told.in_force)
-        return _widened(pose, information.pose_by_deviation @ self._deviation())
+        by_deviation = information.pose_by_deviation
+        shift = by_deviation @ self._deviation()
+        doubt = np.outer(shift, shift)
+        if self.calibration.pairs <= _FIRST_PAIRS:
+            doubt += by_deviation @ self.calibration.covariance @ by_deviation.T
+        return replace(pose, covariance=pose.covariance + doubt) if doubt.any() else pose
 
     def _deviation(self) -> Array:
         """(11,) from what is in force, of all causes."""
@@ -106,9 +114,3 @@ def _effect(information: PairInformation, pose: RelativePose) -> Effect:
     return Effect(information.shift_by_deviation, np.asarray(
         np.linalg.solve(claimed, information.pose_by_deviation)))
 
-
-def _widened(pose: RelativePose, shift: Array) -> RelativePose:
-    """The pose with a shift (6,) that it may have in its covariance."""
-    if not shift.any():
-        return pose
-    return replace(pose, covariance=pose.covariance + np.outer(shift, shift))

@@ -23,7 +23,7 @@ from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.estimator.information import inverse
 from rs_relpose_ros.estimator.map_fit import FitMatches, stepped
 from rs_relpose_ros.estimator.priors import add_priors, isotropic, Priors
-from rs_relpose_ros.estimator.problem import build_problem, TwoViewProblem
+from rs_relpose_ros.estimator.problem import build_problem, observed, TwoViewProblem
 from rs_relpose_ros.estimator.sampson import jacobian, residuals
 from rs_relpose_ros.estimator.state import D1, PARAMETERS, TANGENT, THETA, TwoViewState
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
@@ -125,7 +125,7 @@ def pair_information(pair: PairEvidence, in_force: Array, about: Array) -> PairI
     weights = 1.0 / (1.0 + (r / (_CAUCHY_SIGMAS * sigma)) ** 2) / sigma**2
     J_x = jacobian(observations, state)
     J_c = np.hstack([rows.derivatives(observations, state, r),
-                     _by_lens(pair, rows, keep, at, state, r)])
+                     _by_lens(pair, problem, rows, keep, at, state, r)])
     # The gyro's rotation: theta = Log(R R_gyro^T), which R_gyro turned by D c makes smaller.
     D = by_deviation
     theta = log_so3(np.ascontiguousarray(state.R @ rotation.T))
@@ -205,6 +205,8 @@ def _pose_by_deviation(problem: TwoViewProblem, state: TwoViewState, moved: Arra
 
 def _lens(camera: RollingShutterCamera, focal: float, distortion: float) -> RollingShutterCamera:
     """The camera with deviations of FOCAL and DISTORTION."""
+    if not (focal or distortion):
+        return camera
     coefficients = list(camera.distortion) or [0.0] * 4
     coefficients[0] += distortion
     return replace(camera, fx=camera.fx / (1.0 + focal), fy=camera.fy / (1.0 + focal),
@@ -222,19 +224,18 @@ def _gyro(pair: PairEvidence) -> Array:
     return turn
 
 
-def _by_lens(pair: PairEvidence, rows: _Rows, keep: NDArray[np.bool_], at: Array,
-             state: TwoViewState, r: Array) -> Array:
+def _by_lens(pair: PairEvidence, problem: TwoViewProblem, rows: _Rows, keep: NDArray[np.bool_],
+             at: Array, state: TwoViewState, r: Array) -> Array:
     """Derivatives (N, 2) of the residuals by FOCAL and by DISTORTION.
 
     Rays and their derivatives by the pixel change together, as they must: a residual in pixels
     whose rays alone shrink would fit noise the better the longer the focal length.
     """
-    columns = []
+    columns, points1, points2 = [], pair.points1[keep], pair.points2[keep]
     for focal, distortion in ((_STEP, 0.0), (0.0, _STEP)):
-        problem = build_problem(
-            pair.points1[keep], pair.points2[keep], _lens(pair.camera, focal, distortion),
-            pair.motion1, pair.motion2, None, None)
-        observations = problem.observations
+        observations = observed(
+            points1, points2, _lens(pair.camera, focal, distortion), problem.motion1,
+            problem.motion2)
         if at.any():
             observations = rows.displaced(observations, at)
         columns.append((residuals(observations, state) - r) / _STEP)

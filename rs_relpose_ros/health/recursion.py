@@ -30,10 +30,10 @@ _WINDOW_NS = to_nanoseconds(20.0)
 _MOST_PAIRS = 100
 # Older pairs that are linearised anew with each new one, once a figure is found off.
 _ANEW = 3
-# Fewer pairs give no covariance. Sigmas of n pairs are widened by (n + 6) / n: few scores scatter
-# less than they should. Share of a pair's sigma that is alike in all pairs, and no mean makes
-# smaller: blur, the tracker's bias, a lens that the model does not fit.
-_LEAST_PAIRS, _UNSEEN_PAIRS, _SHARED = 3, 6, 0.25
+# Sigmas of n pairs are widened by (n + 6) / n: few scores scatter less than they should. Share of
+# a pair's sigma that is alike in all pairs, and no mean makes smaller: blur, the tracker's bias, a
+# lens that the model does not fit.
+_UNSEEN_PAIRS, _SHARED = 6, 0.25
 # Deviations before the first pair, 1 sigma: rad, s, s, rad/s, -, -, -.
 PRIOR_SIGMA = np.array([0.2] * 3 + [0.05, 0.03] + [0.1] * 3 + [0.2, 0.3, 0.5])
 
@@ -110,7 +110,7 @@ class Recursion:
     def solved(self) -> Calibration:
         """What the pairs show together."""
         n = len(self._pairs)
-        if n < _LEAST_PAIRS:
+        if not n:
             return NOTHING_SEEN
         S = np.array([pair.information.S for pair in self._pairs])
         b = np.array([pair.information.b for pair in self._pairs])

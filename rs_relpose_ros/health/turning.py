@@ -15,6 +15,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.geometry.order import median
 from rs_relpose_ros.geometry.so3 import aligning_rotation, log_so3
 from rs_relpose_ros.geometry.timing import to_nanoseconds
 
@@ -35,13 +36,13 @@ def rotation_of_rays(rays1: Array, rays2: Array) -> Array | None:
     Translation is not modelled: rays that move most count least (Cauchy weights about the
     median). None where there are too few rays.
     """
-    finite = np.isfinite(rays1).all(axis=1) & np.isfinite(rays2).all(axis=1)
+    finite = np.isfinite(rays1 + rays2).all(axis=1)
     if np.count_nonzero(finite) < _LEAST_RAYS:
         return None
     first, second = rays1[finite], rays2[finite]
-    R = aligning_rotation(first.T @ second)
-    off = np.sum((first - second @ R.T) ** 2, axis=1)
-    weights = 1.0 / (1.0 + off / max(float(np.median(off)), 1e-12))
+    off = first - second @ aligning_rotation(first.T @ second).T
+    squares = np.einsum('ni,ni->n', off, off)
+    weights = 1.0 / (1.0 + squares / max(median(squares.copy()), 1e-12))
     return log_so3(aligning_rotation((first.T * weights) @ second))
 
 
@@ -93,13 +94,13 @@ class TurnSums:
         phi = np.array([turn for _, _, turn in self._turns])
         by_images = float(np.linalg.norm(theta, axis=1).sum())
         by_gyro = float(np.linalg.norm(phi, axis=1).sum())
-        if by_images < _LEAST_TURN or by_gyro < 1e-3 * _LEAST_TURN:
+        if max(by_images, by_gyro) < _LEAST_TURN or by_gyro < 1e-3 * _LEAST_TURN:
             return None
         M, power, gyro = theta.T @ phi, float((theta**2).sum()), float((phi**2).sum())
 
         def left(trace: float) -> float:
             # min over s of sum |theta - s Q phi|^2 / sum |theta|^2; a negative scale is worse
-            return 1.0 - trace * abs(trace) / (power * gyro)
+            return 1.0 - trace * abs(trace) / max(power * gyro, 1e-30)
 
         U, singular, Vt = np.linalg.svd(M)
         handed = math.copysign(1.0, float(np.linalg.det(U @ Vt)))

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.images.gray_levels import GrayLevels
 from rs_relpose_ros.images.headers import encoded_image_size, is_png
 
 Bytes = NDArray[np.uint8]
@@ -42,7 +43,7 @@ _BAYER = {
 # Packed YUV 4:2:2 -> which of two successive bytes is the luma.
 _PACKED_YUV = {'yuv422_yuy2': 0, 'yuyv': 0, 'yuv422': 1, 'uyvy': 1}
 # Planar YUV begins with the whole luma plane.
-_PLANAR_YUV = ('nv21', 'nv12', 'nv24')
+_PLANAR_YUV = ('nv21', 'nv12', 'nv24', 'i420', 'yuv420')
 # One byte a pixel, row by row, from the first byte on: the gray image itself.
 _GRAY = ('mono8', '8UC1', *_PLANAR_YUV)
 
@@ -50,7 +51,10 @@ _GRAY = ('mono8', '8UC1', *_PLANAR_YUV)
 _ENCODED = {('uint8', 1): 'mono8', ('uint8', 3): 'bgr8', ('uint8', 4): 'bgra8',
             ('uint16', 1): 'mono16', ('uint16', 3): 'bgr16', ('uint16', 4): 'bgra16'}
 
-ENCODINGS = ('mono8', '8UC1', 'mono16', *_COLOR, *(f'{name}8' for name in _BAYER),
+# Two bytes a pixel, of which a camera may fill some bits only.
+_GRAY_16 = ('mono16', '16UC1')
+
+ENCODINGS = ('mono8', '8UC1', *_GRAY_16, *_COLOR, *(f'{name}8' for name in _BAYER),
              *(f'{name}16' for name in _BAYER), *_PACKED_YUV, *_PLANAR_YUV)
 
 
@@ -77,14 +81,18 @@ class RawImage:
         """Width and height [px] as told; not checked yet."""
         return self.width, self.height
 
-    def decoded(self) -> Gray:
-        """Gray image (H, W); of a mono8 image without padding a view of `data`."""
+    def decoded(self, levels: GrayLevels | None = None) -> Gray:
+        """Gray image (H, W); of a mono8 image without padding a view of `data`.
+
+        `levels`: of the images before, for pixels of 16 bits; without it an image is by itself.
+        """
+        levels = GrayLevels() if levels is None else levels
         height, width, encoding = self.height, self.width, self.encoding
         check_image_size(width, height)
         if encoding in _GRAY:
             return np.ascontiguousarray(self._rows(width))
-        if encoding == 'mono16':
-            return self._high_bytes()
+        if encoding in _GRAY_16:
+            return levels.gray(self._two_bytes())
         if encoding in _COLOR:
             channels, conversion = _COLOR[encoding]
             pixels = np.ascontiguousarray(self._rows(width * channels))
@@ -93,34 +101,30 @@ class RawImage:
         if encoding in _PACKED_YUV:
             return np.ascontiguousarray(self._rows(2 * width)[:, _PACKED_YUV[encoding]::2])
         if encoding in ENCODINGS:
-            return self._from_bayer()
+            return self._from_bayer(levels)
         raise InputError(f'image encoding {encoding[:40]!r} is not known; '
                          f'publish one of {", ".join(ENCODINGS)}')
 
-    def pixels(self) -> Pixels:
-        """The image in its own encoding; in mono8 where that is Bayer or YUV."""
+    def pixels(self, levels: GrayLevels | None = None) -> Pixels:
+        """The image in its own encoding; in mono8, as `decoded`, where that is Bayer or YUV."""
         if self.encoding in _COLOR:
             check_image_size(self.width, self.height)
             channels, _ = _COLOR[self.encoding]
             rows = np.ascontiguousarray(self._rows(self.width * channels))
             return Pixels(rows.reshape(self.height, self.width, channels), self.encoding)
-        if self.encoding == 'mono16':
+        if self.encoding in _GRAY_16:
             check_image_size(self.width, self.height)
             return Pixels(self._two_bytes().astype(np.uint16), self.encoding)
-        return Pixels(self.decoded(), 'mono8')
+        return Pixels(self.decoded(levels), 'mono8')
 
-    def _from_bayer(self) -> Gray:
+    def _from_bayer(self, levels: GrayLevels) -> Gray:
         if self.height < 3 or self.width < 3:
             raise InputError(
                 f'a Bayer image must be at least 3x3, got {self.width}x{self.height}')
         pattern = self.encoding.removesuffix('16').removesuffix('8')
-        mosaic = (self._high_bytes() if self.encoding.endswith('16')
+        mosaic = (levels.gray(self._two_bytes()) if self.encoding.endswith('16')
                   else np.ascontiguousarray(self._rows(self.width)))
         return np.asarray(cv2.cvtColor(mosaic, _BAYER[pattern]), dtype=np.uint8)
-
-    def _high_bytes(self) -> Gray:
-        """The upper byte of pixels of 16 bits."""
-        return (self._two_bytes() >> 8).astype(np.uint8)
 
     def _two_bytes(self) -> NDArray[np.uint16]:
         """Pixels of 16 bits, in the byte order of the message."""
@@ -159,14 +163,17 @@ class CompressedImage:
         """Whether it is a PNG file, which loses nothing."""
         return is_png(self.data)
 
-    def decoded(self) -> Gray:
-        """Gray image (H, W)."""
+    def decoded(self, levels: GrayLevels | None = None) -> Gray:
+        """Gray image (H, W); `levels` as of `RawImage.decoded`."""
         # Not turned upright: rows must stay in the order in which the sensor reads them.
-        image = self._decoded(cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+        image = self._decoded(cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+                              | cv2.IMREAD_ANYDEPTH)
+        if image.dtype == np.uint16:
+            return (GrayLevels() if levels is None else levels).gray(image)
         return np.asarray(image, dtype=np.uint8)
 
-    def pixels(self) -> Pixels:
-        """The image in colour or gray, 8 or 16 bits, as it was encoded."""
+    def pixels(self, levels: GrayLevels | None = None) -> Pixels:
+        """The image in colour or gray, 8 or 16 bits, as it was encoded, whatever its levels."""
         # Nor is it turned upright here.
         image = self._decoded(cv2.IMREAD_UNCHANGED)
         channels = 1 if image.ndim == 2 else image.shape[2]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from rs_relpose_ros.config.intrinsics import IntrinsicsConfig
@@ -12,6 +13,7 @@ from rs_relpose_ros.front_end.frame import Decodable, EncodedFrame
 from rs_relpose_ros.front_end.sequencer import Refusal, Sequencer
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.images.encoded import EncodedImage
+from rs_relpose_ros.images.gray_levels import GrayLevels
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.messages.hanging import HangingCamera, HangingGyro
 from rs_relpose_ros.messages.incoming import PublishedImage
@@ -32,12 +34,13 @@ class Intake:
 
     def __init__(self, sequencer: Sequencer[Any], stuck_gyro_time: float = 0.0,
                  told: IntrinsicsConfig | None = None,
-                 frame: Callable[[int, EncodedImage, str, Intrinsics], Decodable[Any]]
-                 = EncodedFrame) -> None:
+                 frame: Callable[[int, EncodedImage, str, Intrinsics], Decodable[Any]] | None
+                 = None) -> None:
         self.feed = SensorFeed({
             Role.IMU: self._add_imu, Role.ACCEL: sequencer.add_imu,
             Role.CAMERA_INFO: self._add_intrinsics, Role.IMAGE: self._add_image})
-        self._sequencer, self._frame = sequencer, frame
+        self._sequencer = sequencer
+        self._frame = partial(EncodedFrame, levels=GrayLevels()) if frame is None else frame
         # Those in force.
         self.intrinsics: Intrinsics | None = None
         self._camera_info: Any = None

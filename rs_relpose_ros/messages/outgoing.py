@@ -31,7 +31,8 @@ MessageTypes = Callable[[str], Any]
 _UINT32, _FLOAT32 = 6, 7   # sensor_msgs/PointField
 
 MATCH_DTYPE = np.dtype([('id', '<u4')] + [(name, '<f4') for name in (
-    'u1', 'v1', 'u2', 'v2', 'tau1', 'tau2', 'x1', 'y1', 'z1', 'x2', 'y2', 'z2')])
+    'u1', 'v1', 'u2', 'v2', 'tau1', 'tau2', 'x1', 'y1', 'z1', 'x2', 'y2', 'z2', 'x', 'y', 'z',
+    'u1_gs', 'v1_gs', 'u2_gs', 'v2_gs')])
 # Name, offset and type of each, for sensor_msgs/PointField.
 MATCH_FIELDS = tuple(
     (name, int(offset), _UINT32 if name == 'id' else _FLOAT32)
@@ -121,7 +122,7 @@ def _pose_messages(result: PairResult, in_reference: Any, types: MessageTypes) -
         'velocity': types('geometry_msgs/msg/TwistWithCovarianceStamped')(
             header=in_camera, twist=types('geometry_msgs/msg/TwistWithCovariance')(
                 twist=twist, covariance=published_covariance(pose.velocity_covariance))),
-        'matches': matches_message(result, types)}
+        'matches': matches_message(result, in_reference, types)}
 
 
 def _rotation_message(pose: RelativePose, in_reference: Any, types: MessageTypes) -> Any:
@@ -150,10 +151,12 @@ def _pair_status_message(result: PairResult, others: Sequence[str], types: Messa
         [*values, (TOPICS_KEY, ' '.join(others))], types), types)
 
 
-def matches_message(result: PairResult, types: MessageTypes) -> Any:
+def matches_message(result: PairResult, in_reference: Any, types: MessageTypes) -> Any:
     """sensor_msgs/PointCloud2 of the inliers, fields as in `MATCH_DTYPE`.
 
-    Pixels of the published images, row times [s] against the stamped row, rays turned to it.
+    Pixels of the published images, row times [s] against the stamped row, rays turned to it, the
+    landmark in the frame of the header, which is the reference camera [baselines], and pixels as
+    global shutters would see it at the stamped rows' instants.
     """
     points = inlier_records(result)
     field_type = types('sensor_msgs/msg/PointField')
@@ -161,10 +164,10 @@ def matches_message(result: PairResult, types: MessageTypes) -> Any:
               for name, offset, datatype in MATCH_FIELDS]
     message_type = types('sensor_msgs/msg/PointCloud2')
     return message_type(
-        header=header(result.stamp_ns, result.frame_id, types), height=1, width=len(points),
+        header=in_reference, height=1, width=len(points),
         fields=fields, is_bigendian=False, point_step=MATCH_DTYPE.itemsize,
         row_step=MATCH_DTYPE.itemsize * len(points), data=_byte_data(points, message_type),
-        is_dense=True)
+        is_dense=not np.isnan(points['x']).any())
 
 
 def pose_stamped_message(stamp_ns: int, frame_id: str, R: NDArray[np.float64],
@@ -229,13 +232,15 @@ def camera_info_message(stamp_ns: int, frame_id: str, intrinsics: Intrinsics, pu
 
 def inlier_records(result: PairResult) -> NDArray[np.void]:
     """Inlier matches (N,) as records of `MATCH_DTYPE`."""
-    inliers = result.pose.inliers
+    inliers, found = result.pose.inliers, result.landmarks
+    assert found is not None, 'only pairs with a pose have inliers to publish'
     records = np.empty(int(np.count_nonzero(inliers)), dtype=MATCH_DTYPE)
     records['id'] = result.matches.track_ids[inliers]
     for names, values in (
             ('u1 v1', result.matches.points1), ('u2 v2', result.matches.points2),
             ('tau1', result.row_times1[:, None]), ('tau2', result.row_times2[:, None]),
-            ('x1 y1 z1', result.rays1), ('x2 y2 z2', result.rays2)):
+            ('x1 y1 z1', result.rays1), ('x2 y2 z2', result.rays2), ('x y z', found.points),
+            ('u1_gs v1_gs', found.pixels1), ('u2_gs v2_gs', found.pixels2)):
         for column, name in enumerate(names.split()):
             records[name] = values[inliers, column]
     return records

@@ -28,6 +28,8 @@ from rs_relpose_ros.messages.pair_status import PairStatus, TOPICS_KEY
 
 Array = NDArray[np.float64]
 
+# Fields of the landmark of a match.
+LANDMARK = ('x', 'y', 'z')
 # Largest deviation from 1 of the length of directions, quaternions and rays.
 _UNIT_TOLERANCE = 1e-3
 
@@ -39,8 +41,9 @@ class PublishedPair:
     Pose of the current camera in the reference camera, ``X1 = R X2 + t``, with the covariance of
     ``(dt, dtheta)``: ``t_true = t + dt`` and ``R_true = Exp(dtheta) R``, in camera 1. `matches`
     are the inliers: track ``id``, pixels ``u1 v1 u2 v2``, row times ``tau1 tau2`` [s], rays
-    ``x1 y1 z1 x2 y2 z2`` turned to the stamped row. What is not known is NaN, and there are no
-    matches without a pose.
+    ``x1 y1 z1 x2 y2 z2`` turned to the stamped row, landmarks ``x y z`` in the reference camera
+    [baselines], pixels ``u1_gs v1_gs u2_gs v2_gs`` as global shutters would see them at the
+    stamped rows' instants. What is not known is NaN, and there are no matches without a pose.
     """
 
     reference_stamp_ns: int   # header stamp of the reference keyframe
@@ -206,7 +209,10 @@ def match_records(cloud: Any) -> NDArray[np.void]:
         raise InputError(f'~/matches has {len(data)} bytes of data, but {int(cloud.width)}x'
                          f'{int(cloud.height)} points need {count * MATCH_DTYPE.itemsize}')
     records = data.view(MATCH_DTYPE)
-    if not all(np.isfinite(records[name]).all() for name in MATCH_DTYPE.names or ()):
+    # Of a match without a landmark x, y and z are NaN.
+    far = np.isnan(records['x']) & np.isnan(records['y']) & np.isnan(records['z'])
+    if not all((np.isfinite(records[name]) | (far & (name in LANDMARK))).all()
+               for name in MATCH_DTYPE.names or ()):
         raise InputError('~/matches must be finite')
     for view in '12':
         rays = np.stack([records[axis + view].astype(np.float64) for axis in 'xyz'])

@@ -12,6 +12,7 @@ import numpy as np
 
 from rs_relpose_ros.front_end.sequencer import Refusal, SequencerCounts
 from rs_relpose_ros.geometry.timing import NANOSECONDS
+from rs_relpose_ros.node.silence import Silence
 
 OK, WARN, ERROR = 0, 1, 2
 
@@ -29,6 +30,7 @@ class Report:
     level: int
     text: str
     values: tuple[tuple[str, str], ...]
+    silence: Silence   # ends with a result
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +64,13 @@ class FrameStatistics:
         self._refused: Counter[Refusal] = Counter()
         self._frame_times: deque[float] = deque(maxlen=_RECENT_FRAMES)
         self._busy_ns = 0
+        self._results = self._results_told = 0
+        self.start()
+
+    def start(self) -> None:
+        """Sensors can be heard from now on: what is silent is so from here."""
+        with self._lock:
+            self._silent_since = (self._clock(), self._counted.images, self._refused)
 
     def add_frame(self, taken_ns: int) -> None:
         """Count a frame that was `taken_ns` (monotonic clock); call it when all is done for it."""
@@ -96,6 +105,7 @@ class FrameStatistics:
             level, text = self._judge(problem, dropped.total(), dropped[Refusal.OVERLOAD])
             state = self.idle if problem else {
                 OK: 'ok', WARN: 'degraded', ERROR: self.wrong}[level]
+            silence = self._silence(now_ns, inputs.images, refused)
             latency, frame_time = _milliseconds(self._latencies), _milliseconds(self._frame_times)
             values = [
                 ('state', state),
@@ -116,7 +126,15 @@ class FrameStatistics:
                 ('worker_busy_percent', f'{100.0 * busy:.0f}'),
                 *self._last_values(),
             ]
-        return Report(level, text, tuple(values))
+        return Report(level, text, tuple(values), silence)
+
+    def _silence(self, now_ns: int, images: int, refused: Counter[Refusal]) -> Silence:
+        if self._results > self._results_told:
+            self._results_told = self._results
+            self._silent_since = (now_ns, images, refused)
+        since_ns, images_before, refused_before = self._silent_since
+        return Silence((now_ns - since_ns) / NANOSECONDS, images - images_before,
+                       refused - refused_before, self._last_failure)
 
     def _judge(self, problem: str, dropped: int, overload: int) -> tuple[int, str]:
         if problem:
@@ -133,6 +151,7 @@ class FrameStatistics:
 
     def _published(self, ready_ns: int) -> None:
         """Take the latency of a result, all for which had come by `ready_ns`; under the lock."""
+        self._results += 1
         self._latencies.append((self._clock() - ready_ns) / NANOSECONDS)
 
     # -- of a node's results (called under the lock) -------------------------------------------

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import array
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 import sys
 from typing import Any
 
@@ -20,6 +21,7 @@ from rclpy.parameter import Parameter
 from rs_relpose_ros.config.declarations import Declared
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.node.outputs import SHUT_DOWN
 
 # Prefix of the parameters by which rclpy overrides the QoS of a topic.
 _QOS = 'qos_overrides.'
@@ -73,6 +75,17 @@ def unknown_overrides(node: Node) -> list[str]:
             except InputError as error:
                 sentences.append(str(error))
     return sentences
+
+
+@contextmanager
+def legal_qos() -> Iterator[None]:
+    """Where topics are opened: a QoS override that is not legal raises InputError."""
+    try:
+        yield
+    except SHUT_DOWN:
+        raise
+    except (ParameterException, RuntimeError) as error:
+        raise InputError(f'a QoS override is not legal: {error}') from error
 
 
 def unknown_qos_overrides(node: Node) -> list[str]:

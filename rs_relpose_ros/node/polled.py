@@ -13,7 +13,6 @@ from typing import Any
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import deserialize_message
 
 # Most messages that are taken at once, so that other callbacks get their turn.
@@ -25,17 +24,18 @@ _STAMPED = 12
 class PolledSubscription:
     """A subscription that is read by `drain`, and wakes the executor only while it is urgent.
 
-    `receive` gets each message, its bytes where `raw`; `urgent` is asked before the executor
-    waits. The depth of `qos` must hold what comes between two calls of `drain`.
+    `receive` gets each message, its bytes where `raw` is among the `options`, which are those of
+    ``create_subscription``; `urgent` is asked before the executor waits. The depth of `qos` must
+    hold what comes between two calls of `drain`.
     """
 
     def __init__(self, node: Node, msgtype: type, topic: str, qos: QoSProfile,
-                 receive: Callable[[Any], None], urgent: Callable[[], bool], *,
-                 raw: bool = False) -> None:
+                 receive: Callable[[Any], None], urgent: Callable[[], bool],
+                 **options: Any) -> None:
         self._receive = receive
         self._subscription = node.create_subscription(
             msgtype, topic, self._on_message, qos, callback_group=_WhileUrgent(urgent),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(), raw=raw)
+            **options)
 
     def drain(self) -> None:
         """Receive all that has come."""

@@ -10,23 +10,34 @@ from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import ParameterException
 from std_srvs.srv import Trigger
 
 from rs_relpose_ros.config.parameters import Parameters
-from rs_relpose_ros.errors import InputError, RsRelposeError
+from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.front_end.front_end import FrameFailed, FrameLoop, FrameProcessed
 from rs_relpose_ros.front_end.sequencer import FrameRefused, Refusal, Sequencer
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.messages.intake import Intake
 from rs_relpose_ros.messages.outgoing import diagnostics_message, status_message
-from rs_relpose_ros.messages.sensor_feed import Role
+from rs_relpose_ros.messages.sensor_feed import PARTS, Role
 from rs_relpose_ros.node.cause_log import CauseLog
 from rs_relpose_ros.node.frame_statistics import FrameStatistics, Inputs, SILENCE
 from rs_relpose_ros.node.inputs import SensorInputs
 from rs_relpose_ros.node.message_types import message_class
-from rs_relpose_ros.node.outputs import SHUT_DOWN
-from rs_relpose_ros.node.params import NodeParameters, unknown_overrides, unknown_qos_overrides
+from rs_relpose_ros.node.params import (
+    legal_qos,
+    NodeParameters,
+    unknown_overrides,
+    unknown_qos_overrides,
+)
+from rs_relpose_ros.node.silence import (
+    LostImages,
+    PATIENCE,
+    Reason,
+    Silence,
+    why_no_image,
+    why_nothing,
+)
 from rs_relpose_ros.node.stoppable import StoppableNode
 from rs_relpose_ros.node.worker import Event, WarmedUp, Worker
 
@@ -62,9 +73,11 @@ class SensorNode(StoppableNode):
         self._inputs: SensorInputs | None = None
         self._worker: Worker | None = None
         self._warm = threading.Event()
+        self._lost_images, self._told_silence = LostImages(), ''
         # For diagnostics and time-outs, which must run although /clock may stand still.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._open_outputs(self._settings.current)
+        with legal_qos():
+            self._open_outputs(self._settings.current)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_service(Trigger, '~/reset', self._reset)
         self._cannot_start = self._why_it_cannot_start()
@@ -131,20 +144,17 @@ class SensorNode(StoppableNode):
             return
         self.destroy_timer(self._warm_timer)
         assert self._loop is not None
-        try:
+        with legal_qos():
             inputs = SensorInputs(
                 self, self._intake, self._loop.sequencer.waits_for_imu,
                 self._settings.current.pair.image_transport, self._error, self._steady)
-        except SHUT_DOWN:
-            raise
-        except (ParameterException, RuntimeError) as error:
-            raise InputError(f'a QoS override is not legal: {error}') from error
         for sentence in unknown_qos_overrides(self):
             self._warn(sentence)
         # Objects that exist by now live to the end: the garbage collector need not scan them.
         gc.collect()
         gc.freeze()
         self._inputs = inputs
+        self._frame_statistics.start()
         self._on_ready(inputs)
         image, camera_info, imu, _ = inputs.topics.values()
         self.get_logger().info(f'ready: {image}, {camera_info} and {imu}')
@@ -216,6 +226,35 @@ class SensorNode(StoppableNode):
             self._image_topic(), report.values, message_class)
         self._diagnostics.publish(diagnostics_message(
             self.get_clock().now().nanoseconds, status, message_class))
+        if self._inputs is not None:
+            self._tell_silence(self._inputs, report.silence, problem)
+            totals = self._inputs.totals()
+            lost = self._lost_images.add(
+                totals.images, totals.camera_infos, self._inputs.image_bytes)
+            if lost:
+                self._warn(lost)
+
+    def _tell_silence(self, inputs: SensorInputs, silence: Silence, problem: str) -> None:
+        """Say why nothing comes out, once as long as it stays the same."""
+        if silence.seconds < PATIENCE:
+            self._told_silence = ''
+        elif inputs.silent(Role.IMAGE, PATIENCE):
+            self._tell_reason(why_no_image(self._image_topic(), self._topics_with_images()))
+        elif not problem:   # which has a line of its own
+            self._tell_reason(why_nothing(silence))
+
+    def _tell_reason(self, reason: Reason) -> None:
+        if reason.kind != self._told_silence:
+            self._told_silence = reason.kind
+            self._warn(f'{self._frame_statistics.idle}: {reason.text}')
+
+    def _topics_with_images(self) -> list[str]:
+        """Those that others publish."""
+        own = f'{self.get_fully_qualified_name()}/'
+        images = set(PARTS[Role.IMAGE].msgtypes)
+        return [name for name, types in self.get_topic_names_and_types()
+                if images.intersection(types) and not name.startswith(own)
+                and self.count_publishers(name)]
 
     def _image_topic(self) -> str:
         """The subscribed one, with its transport, once there is one."""

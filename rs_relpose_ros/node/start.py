@@ -14,6 +14,9 @@ import threading
 from types import FrameType
 from typing import NoReturn
 
+# Time [s] for rclpy to end its contexts.
+_GRACE = 0.3
+
 _started = False
 
 
@@ -41,9 +44,12 @@ def _on_signal(number: int, frame: FrameType | None) -> None:
     if not _started:
         # Nothing was begun that would need an end.
         os._exit(0)
-    # rclpy has ended its contexts by now, but for one that was made at this very moment. In a
-    # thread, since this one may hold a lock that it needs.
-    threading.Thread(target=sys.modules['rclpy'].try_shutdown, daemon=True).start()
+    # A thread of rclpy's own ends its contexts, but for one that is made at this very moment. Not
+    # at once: two threads that end one context can crash the process. In a thread, since this one
+    # may hold a lock that it needs.
+    late = threading.Timer(_GRACE, sys.modules['rclpy'].try_shutdown)
+    late.daemon = True
+    late.start()
 
 
 if __name__ == '__main__':

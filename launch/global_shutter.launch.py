@@ -1,0 +1,22 @@
+"""Start global_shutter_node beside a camera driver.
+
+::
+
+    ros2 launch rs_relpose_ros global_shutter.launch.py camera_namespace:=/camera \
+        imu:=/imu/data_raw params_file:=my_camera.yaml
+
+Its arguments are those of relpose.launch.py.
+"""
+
+from launch import LaunchDescription
+from launch.actions import IncludeLaunchDescription
+from launch.substitutions import PathJoinSubstitution
+from launch_ros.substitutions import FindPackageShare
+
+
+def generate_launch_description() -> LaunchDescription:
+    """The launch file of relpose_node, with the other node."""
+    return LaunchDescription([IncludeLaunchDescription(
+        PathJoinSubstitution([FindPackageShare('rs_relpose_ros'), 'launch', 'relpose.launch.py']),
+        launch_arguments={'executable': 'global_shutter_node',
+                          'name': 'global_shutter_node'}.items())])

@@ -1,0 +1,406 @@
+"""Many bags on real Dask clusters of processes, all on the loopback interface."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import csv
+import json
+import os
+from pathlib import Path
+import shutil
+import signal
+import sys
+import threading
+import time
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from rs_relpose_ros.batch.combine import combine, weighted_mean
+from rs_relpose_ros.batch.job import Bag, Job, look_at, Outcome, State, unique_names
+from rs_relpose_ros.batch.run import Request, run_batch
+from rs_relpose_ros.batch.store import Store
+from rs_relpose_ros.cli import batch, main
+
+pytest.importorskip('distributed', reason='needs the extra batch')
+# Clusters start, and a first run compiles kernels.
+pytestmark = pytest.mark.timeout(300)
+
+VERSION = batch.package_version()
+
+
+def job_for(name: str, command: str = 'check', **changes: object) -> Job:
+    values = {'bag': Bag(f'/bags/{name}', 5, 7, 'a: 1\n'), 'parameters': 'a: 1\n',
+              'options': ('--set', 'seed=1'), 'version': '1'}
+    return Job(command=command, name=name, **{**values, **changes})
+
+
+# --- which bags, and which of them are done
+
+
+def make_bag(path: Path, size: int = 10) -> Path:
+    path.mkdir(parents=True)
+    (path / 'metadata.yaml').write_text('x')
+    (path / 'data.mcap').write_bytes(b'x' * size)
+    return path
+
+
+def test_bags_of_paths_and_globs(tmp_path):
+    for name in ('b', 'a'):
+        make_bag(tmp_path / name, size=10)
+        (tmp_path / f'{name}.yaml').write_text(f'# {name}\n')
+    (tmp_path / 'other').mkdir()
+    (tmp_path / 'old.bag').write_bytes(b'12345')
+    found = look_at([str(tmp_path / 'b'), str(tmp_path / '*'), str(tmp_path / 'absent')])
+    assert [Path(bag.path).name for bag in found] == ['b', 'a', 'old.bag', 'absent']
+    assert [bag.size for bag in found] == [11, 11, 5, -1]
+    assert [bag.parameters for bag in found] == ['# b\n', '# a\n', '', '']
+    os.utime(tmp_path / 'a' / 'data.mcap', ns=(1, 4_000_000_000_000_000_000))
+    assert look_at([str(tmp_path / 'a')])[0].changed_ns == 4_000_000_000_000_000_000
+
+
+def test_relative_globs(tmp_path, monkeypatch):
+    make_bag(tmp_path / 'x' / 'one')
+    monkeypatch.chdir(tmp_path)
+    assert [bag.path for bag in look_at(['x/*'])] == ['x/one']
+
+
+@pytest.mark.parametrize('paths, names', [
+    (['/a/x', '/a/y.bag'], ['x', 'y']),
+    (['/a/x', '/b/x', '/b/y'], ['a__x', 'b__x', 'y']),
+    (['/c/a/x', '/d/a/x'], ['c__a__x', 'd__a__x']),
+    (['./x', 'x'], ['x_0', 'x_1'])])
+def test_names_of_results_differ(paths, names):
+    assert unique_names(paths) == names
+
+
+@pytest.mark.parametrize('changes', [
+    {'bag': Bag('/bags/a', 6, 7, 'a: 1\n')}, {'bag': Bag('/bags/a', 5, 8, 'a: 1\n')},
+    {'parameters': 'a: 2\n'}, {'options': ()}, {'version': '2'}, {'command': 'replay'}])
+def test_result_is_taken_over_only_if_nothing_changed(tmp_path, changes):
+    store = Store(tmp_path)
+    outcome = Outcome(State.DONE, '', 1.5, {'check.json': b'{}', 'in/it.txt': b'text'})
+    store.add(job_for('a'), outcome)
+    assert Store(tmp_path).done(job_for('a')) == outcome
+    assert store.done(Job(**{**{field: getattr(job_for('a'), field) for field in Job.__slots__},
+                             **changes})) is None
+    assert store.done(job_for('b')) is None
+
+
+@pytest.mark.parametrize('state, lasts', [
+    (State.DONE, True), (State.FINDINGS, True), (State.REFUSED, True), (State.FAILED, False),
+    (State.LOST, False)])
+def test_what_may_end_better_is_run_again(tmp_path, state, lasts):
+    store = Store(tmp_path)
+    store.add(job_for('a'), Outcome(state, 'because', 1.0, {}))
+    assert (store.done(job_for('a')) is not None) is lasts
+
+
+def test_damaged_result_is_run_again(tmp_path):
+    store = Store(tmp_path)
+    store.add(job_for('a'), Outcome(State.DONE, '', 1.0, {'check.json': b'{}'}))
+    (tmp_path / 'a' / 'check.json').unlink()
+    assert store.done(job_for('a')) is None
+    (tmp_path / 'a' / 'job.json').write_text('{')
+    assert store.done(job_for('a')) is None
+
+
+# --- calibrations as one
+
+
+def test_weighted_mean_of_a_book():
+    """Bevington, Data Reduction, section 4.1: weights 1 / sigma^2."""
+    combined = weighted_mean('x', ['a', 'b'], [10.0, 13.0], [1.0, 2.0])
+    assert combined.mean == pytest.approx(10.6)
+    assert combined.chi2 == pytest.approx(0.36 + 1.44)
+    # 1 / (1 + 1/4), times the scatter of one degree of freedom.
+    assert combined.sigma == pytest.approx(np.sqrt(0.8 * 1.8))
+    assert weighted_mean('x', ['a', 'b'], [10.0, 10.5], [1.0, 2.0]).sigma == pytest.approx(
+        np.sqrt(0.8))
+
+
+def test_outliers_do_not_spoil_the_mean():
+    names = list('abcdef')
+    combined = weighted_mean('x', names, [1.0, 1.1, 0.9, 5.0, 1.0, -3.0], [0.1] * 6)
+    assert combined.outliers == ('d', 'f')
+    assert combined.mean == pytest.approx(1.0)
+    assert combined.degrees_of_freedom == 3
+    # Of two that disagree, neither is known to be wrong: the sigma tells it.
+    assert weighted_mean('x', ['a', 'b'], [1.0, 2.0], [0.1, 0.1]).outliers == ()
+    assert weighted_mean('x', ['a', 'b'], [1.0, 2.0], [0.1, 0.1]).sigma == pytest.approx(0.5)
+
+
+def calibration(readout: float, observable: bool = True, yaw: float = 0.0) -> dict:
+    def figure(value: float, seen: bool = True) -> dict:
+        return {'value': value, 'sigma': 0.0002, 'observable': seen, 'remark': 'turn more'}
+    return {
+        'shutter': 'rolling', 'readout_time_s': figure(readout, observable),
+        'time_offset_s': figure(-0.01), 'focal_px': None,
+        'gyro_bias_rad_per_s': [figure(0.001 * k) for k in range(3)],
+        'quat_cam_imu_xyzw': [0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)],
+        'rotation_sigma_rad': [0.001] * 3, 'rotation_from_axis_map_rad': figure(0.0),
+        'frames': 100, 'pixel_sigma': 0.1}
+
+
+def test_calibrations_of_one_camera():
+    one_camera = combine(
+        {'a': calibration(0.0300, yaw=0.01), 'b': calibration(0.0302, yaw=0.012),
+         'c': calibration(0.0301, yaw=0.011), 'd': calibration(0.9, observable=False, yaw=0.011)})
+    combined = {one.figure: one for one in one_camera.figures}
+    assert combined['readout_time_s'].mean == pytest.approx(0.0301)
+    assert combined['readout_time_s'].bags == ('a', 'b', 'c')
+    assert combined['time_offset_s'].degrees_of_freedom == 3
+    assert 'focal_px' not in combined
+    # 1 mrad to both sides of the mean.
+    assert combined['rotation_z_rad'].chi2 == pytest.approx(2.0, rel=1e-3)
+    assert combined['rotation_x_rad'].chi2 == pytest.approx(0.0, abs=1e-9)
+    np.testing.assert_allclose(one_camera.quat_cam_imu_xyzw,
+                               [0.0, 0.0, np.sin(0.0055), np.cos(0.0055)], atol=1e-9)
+
+
+# --- on clusters
+
+
+def rows_of(folder: Path) -> dict[str, dict[str, str]]:
+    with (folder / 'results.csv').open(newline='') as file:
+        return {row['name']: row for row in csv.DictReader(file)}
+
+
+def copy_bag(bag: Path, path: Path) -> Path:
+    path.parent.mkdir(exist_ok=True)
+    shutil.copytree(bag, path)
+    shutil.copy(bag.with_name(f'{bag.name}.yaml'), path.with_name(f'{path.name}.yaml'))
+    return path
+
+
+def damage(bag: Path) -> None:
+    file = next(bag.glob('*.mcap'))
+    file.write_bytes(file.read_bytes()[:300_000])
+
+
+@pytest.fixture(scope='module')
+def bags(tmp_path_factory, bundled_bag) -> Path:
+    """Two whole bags with a damaged one between."""
+    folder = tmp_path_factory.mktemp('bags')
+    for name in ('first', 'second', 'third'):
+        copy_bag(bundled_bag, folder / name)
+    damage(folder / 'second')
+    return folder
+
+
+@pytest.fixture(scope='module')
+def client() -> Iterator[Any]:
+    """Of a cluster of two processes; those that a test kills are replaced."""
+    with batch.open_cluster(None, 2) as client:
+        yield client
+
+
+@pytest.fixture(scope='module')
+def single(tmp_path_factory, bags) -> Path:
+    """What a single replay of the first bag writes."""
+    out = tmp_path_factory.mktemp('single')
+    assert main.main(['replay', str(bags / 'first'), '--params', str(bags / 'first.yaml'),
+                      '--out', str(out), '--no-pictures']) == 0
+    return out
+
+
+@pytest.fixture(scope='module')
+def replayed(tmp_path_factory, bags) -> Path:
+    """The three bags on two processes."""
+    out = tmp_path_factory.mktemp('batch')
+    code = main.main(['batch', 'replay', f'{bags}/*', '--out', str(out), '--workers', '2',
+                      '--options=--no-pictures'])
+    assert code == 1   # one is damaged
+    return out
+
+
+def test_results_are_those_of_single_runs(replayed, single):
+    for name in ('relative_poses.csv', 'errors.csv'):
+        expected = (single / name).read_bytes()
+        assert len(expected) > 1000
+        assert (replayed / 'first' / name).read_bytes() == expected
+        assert (replayed / 'third' / name).read_bytes() == expected
+    summary = json.loads((single / 'summary.json').read_text())
+    row = rows_of(replayed)['first']
+    assert row['state'] == 'done' and row['message'] == ''
+    assert int(row['pairs']) == summary['pairs']['total']
+    assert int(row['answered']) == summary['pairs']['answered']
+    assert float(row['rotation_median_deg']) == summary['errors_against_truth'][
+        'rotation_median_deg']
+    assert float(row['seconds']) > 0.5
+
+
+def test_damaged_bag_among_good_ones(replayed, bags):
+    rows = rows_of(replayed)
+    assert list(rows) == ['first', 'second', 'third']
+    assert rows['second']['state'] == 'refused'
+    assert 'truncated' in rows['second']['message'] and rows['second']['pairs'] == ''
+    summary = json.loads((replayed / 'summary.json').read_text())
+    assert summary['states'] == {'done': 2, 'findings': 0, 'refused': 1, 'failed': 0, 'lost': 0}
+    picture = cv2.imread(str(replayed / 'overview.png'))
+    assert picture.shape[1] > 800 and (picture < 128).any()
+
+
+def test_only_what_changed_is_run_again(replayed, bags, tmp_path, capsys):
+    out = tmp_path / 'out'
+    shutil.copytree(replayed, out)
+    before = {path: path.stat().st_mtime_ns for path in out.glob('*/job.json')}
+    damage(bags / 'third')
+    try:
+        assert main.main(['batch', 'replay', f'{bags}/*', '--out', str(out), '--workers', '1',
+                          '--options=--no-pictures']) == 1
+    finally:
+        shutil.copytree(bags / 'first', bags / 'third', dirs_exist_ok=True)
+    printed = capsys.readouterr().out
+    assert '3 bags: 1 done, 2 refused; 2 of them from an earlier run' in printed
+    changed = {path.parent.name for path, stamp in before.items()
+               if path.stat().st_mtime_ns != stamp}
+    assert changed == {'third'}
+    assert rows_of(out)['third']['state'] == 'refused'
+    assert not (out / 'third' / 'relative_poses.csv').exists()
+
+
+def test_check_on_a_running_cluster(client, bags, tmp_path, capsys):
+    options = ['--out', str(tmp_path), '--scheduler', client.scheduler.address]
+    assert main.main(['batch', 'check', str(bags / 'first'), *options, '--workers', '2']) == 2
+    assert 'a running cluster has its own' in capsys.readouterr().err
+    assert main.main(['batch', 'check', str(bags / 'first'), str(bags / 'absent'), *options,
+                      '--params', str(bags / 'first.yaml'), '--set', 'time_offset=0.03']) == 1
+    rows = rows_of(tmp_path)
+    assert rows['first']['state'] == 'findings' and 'time_offset' in rows['first']['message']
+    assert int(rows['first']['failure']) >= 1
+    assert rows['absent']['state'] == 'refused' and 'there is no bag' in rows['absent']['message']
+    assert (tmp_path / 'overview.png').is_file()
+
+
+# Work for clusters; the folder for marks is in the job's options.
+
+
+def die_in_mid_bag(job: Job) -> Outcome:
+    """Do the job as always, but the first worker is killed while it does."""
+    mark = Path(job.options[-1]) / f'{job.name}.died'
+    if job.name == 'mortal' and not mark.exists():
+        mark.touch()
+        threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGKILL)).start()
+    return batch.run_job(Job(job.command, job.bag, job.name, job.parameters, ('--no-pictures',),
+                             job.version))
+
+
+def die_always(job: Job) -> Outcome:
+    """The mortal one kills each worker; the others take their time."""
+    if job.name == 'mortal':
+        os.kill(os.getpid(), signal.SIGKILL)
+    time.sleep(0.5)
+    if job.name == 'faulty':
+        raise ZeroDivisionError('no such number')
+    return Outcome(State.DONE, '', 0.5, {})
+
+
+def threads(job: Job) -> Outcome:
+    outcome = batch.run_job(job)
+    told = f'{os.environ["OMP_NUM_THREADS"]} {cv2.getNumThreads()} {os.getpid()}'
+    return Outcome(outcome.state, told, outcome.seconds, {})
+
+
+def request(folder: Path, *names: str, options: tuple[str, ...] = ()) -> Request:
+    return Request('replay', tuple(str(folder / name) for name in names), None, options, VERSION)
+
+
+def test_worker_that_dies_in_mid_bag_is_replaced(client, bags, single, tmp_path):
+    copy_bag(bags / 'first', tmp_path / 'in' / 'mortal')
+    result = run_batch(client, request(tmp_path / 'in', 'mortal', options=(str(tmp_path),)),
+                       tmp_path / 'out', die_in_mid_bag)
+    assert (tmp_path / 'mortal.died').exists()
+    assert [row.state for row in result.rows] == [State.DONE]
+    assert (tmp_path / 'out' / 'mortal' / 'relative_poses.csv').read_bytes() == (
+        single / 'relative_poses.csv').read_bytes()
+
+
+def test_bag_that_kills_every_worker(client, tmp_path):
+    for name in ('a', 'mortal', 'b', 'faulty', 'c'):
+        make_bag(tmp_path / name)
+    asked = request(tmp_path, 'a', 'mortal', 'b', 'faulty', 'c')
+    result = run_batch(client, asked, tmp_path / 'out', die_always)
+    assert {row.name: row.state for row in result.rows} == {
+        'a': State.DONE, 'mortal': State.LOST, 'b': State.DONE, 'faulty': State.FAILED,
+        'c': State.DONE}
+    rows = rows_of(tmp_path / 'out')
+    assert 'workers died over this bag' in rows['mortal']['message']
+    assert rows['faulty']['message'] == 'ZeroDivisionError: no such number'
+
+
+def test_each_worker_is_a_process_of_one_thread(client, tmp_path):
+    for name in ('a', 'b'):
+        make_bag(tmp_path / name)
+    client.wait_for_workers(2, timeout=60)
+    assert set(client.nthreads().values()) == {1} and len(client.nthreads()) == 2
+    assert all('//127.0.0.1:' in address for address in client.nthreads())
+    result = run_batch(client, request(tmp_path, 'a', 'b'), tmp_path / 'out', threads)
+    told = [row.message.split() for row in result.rows]
+    assert [words[:2] for words in told] == [['1', '1']] * 2
+    assert os.getpid() not in {int(words[2]) for words in told}
+
+
+def work_of_calibrations(job: Job) -> Outcome:
+    """What `calibrate` writes, by the bag's name."""
+    readout = {'cam1': 0.0300, 'cam2': 0.0301, 'wrong': 0.024}.get(job.name, 0.0302)
+    data = calibration(readout, observable=job.name != 'still5')
+    return Outcome(State.DONE if job.name != 'still5' else State.FINDINGS, '', 1.0,
+                   {'calibration.json': json.dumps(data).encode()})
+
+
+def test_summary_of_calibrations(client, tmp_path):
+    names = ('cam1', 'cam2', 'wrong', 'cam4', 'still5')
+    for name in names:
+        make_bag(tmp_path / name)
+    asked = Request('calibrate', tuple(str(tmp_path / name) for name in names), '', (), VERSION)
+    result = run_batch(client, asked, tmp_path / 'out', work_of_calibrations)
+    summary = json.loads((tmp_path / 'out' / 'summary.json').read_text())
+    readout = next(one for one in summary['combined']['figures']
+                   if one['figure'] == 'readout_time_s')
+    assert readout['outliers'] == ['wrong'] and readout['degrees_of_freedom'] == 2
+    rows = rows_of(tmp_path / 'out')
+    assert float(rows['wrong']['readout_time_s']) == 0.024
+    assert rows['still5']['message'] == 'readout_time_s is not observable: turn more'
+    lines = batch.report(result, tmp_path / 'out')
+    assert any(line.startswith('readout_time_s: 0.03') and line.endswith('outliers: wrong')
+               for line in lines)
+
+
+# --- what is refused
+
+
+@pytest.mark.parametrize('words, told', [
+    (['replay', 'x', '--workers', '0'], '--workers must be at least 1'),
+    (['replay', 'x', '--params', 'absent.yaml'], 'there is no parameter file'),
+    (['replay', 'x', '--set', 'colour=1'], 'colour'),
+    (['calibrate', 'x', '--set', 'seed=1'], 'calibrate takes no parameters'),
+    (['replay', 'x', '--options=--colour'], '--options: --colour are no options of replay'),
+    (['replay', 'x', '--options=--out=y'], '--options must not have --out=y'),
+    (['replay', 'x', '--scheduler', 'tcp://127.0.0.1:1'], 'no Dask scheduler answers')])
+def test_bad_usage(tmp_path, capsys, monkeypatch, words, told):
+    monkeypatch.setattr('rs_relpose_ros.batch.cluster._TIMEOUT', 1.0)
+    assert main.main(['batch', *words, '--out', str(tmp_path / 'out')]) == 2
+    assert told in capsys.readouterr().err
+    assert not (tmp_path / 'out').exists()
+
+
+def test_no_bag_at_all(tmp_path, capsys):
+    assert main.main(['batch', 'check', str(tmp_path / '*'), '--out', str(tmp_path / 'out'),
+                      '--workers', '1']) == 2
+    assert 'the workers find no bag at' in capsys.readouterr().err
+
+
+def test_dask_that_is_not_installed(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'dask', None)
+    assert main.main(['batch', 'check', 'x', '--out', str(tmp_path / 'out')]) == 2
+    assert "pip install 'dask[distributed]'" in capsys.readouterr().err
+
+
+def test_workers_of_another_version(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(batch, 'ask_a_worker', lambda client, function: '9.9.9')
+    assert main.main(['batch', 'check', 'x', '--out', str(tmp_path / 'out'),
+                      '--workers', '1']) == 2
+    assert 'the workers have version 9.9.9' in capsys.readouterr().err
