@@ -28,7 +28,7 @@ def compile_kernels(folder: str) -> None:
     paths = [path for path in os.environ.get('PYTHONPATH', '').split(os.pathsep)
              if path and not (Path(path) / 'sitecustomize.py').exists()]
     environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(paths)}
-    for module in ('front_end', 'global_shutter'):
+    for module in ('front_end', 'global_shutter', 'odometry'):
         filled = subprocess.run([sys.executable, '-m', f'{NAME}.{module}.warm_up'], cwd=folder,
                                 env=environment, stderr=subprocess.PIPE, text=True, check=False)
         if filled.returncode:
@@ -77,6 +77,7 @@ setup(
     install_requires=['setuptools'],
     extras_require={
         'test': ['pytest'],
+        'odometry': ['gtsam>=4.3,<4.4'],
         'video': ['av>=13,<19', 'telemetry-parser>=0.3,<0.4'],
         'batch': ['dask[distributed]>=2024.5'],
     },
@@ -86,6 +87,7 @@ setup(
         'console_scripts': [
             'relpose_node = rs_relpose_ros.node.start:main',
             'global_shutter_node = rs_relpose_ros.global_shutter.start:main',
+            'odometry_node = rs_relpose_ros.odometry.start:main',
             'rs_relpose = rs_relpose_ros.cli.main:main',
         ],
     },

@@ -138,9 +138,12 @@ MAY_IMPORT = {
     'replay': CORE | {'front_end', 'health', 'messages', 'bags'},
     'calibrate': CORE | {'messages', 'bags'},
     'check': CORE | {'front_end', 'health', 'messages', 'bags', 'calibrate'},
+    'odometry': BASE | {'estimator', 'imu', 'health', 'front_end', 'messages', 'bags', 'replay',
+                        'node'},
     'convert': BASE | {'images', 'imu', 'messages', 'bags'},
     'batch': set(),
-    'cli': BASE | {'bags', 'replay', 'calibrate', 'check', 'convert', 'global_shutter', 'batch'},
+    'cli': BASE | {'bags', 'replay', 'calibrate', 'check', 'convert', 'global_shutter', 'batch',
+                   'odometry'},
 }
 # The laboratory uses all of the product, and nothing of the product imports it.
 MAY_IMPORT_IN_THE_LABORATORY = {
@@ -198,7 +201,8 @@ def test_core_imports_neither_ros_nor_rosbags():
 
 
 @pytest.mark.parametrize(('library', 'folders'), [
-    (ROS, {f'{NAME}/node', f'{NAME}/global_shutter', f'{LABORATORY}/live'}),
+    (ROS, {f'{NAME}/node', f'{NAME}/global_shutter', f'{NAME}/odometry', f'{LABORATORY}/live'}),
+    (re.compile('gtsam$'), {f'{NAME}/odometry'}),
     (re.compile('rosbags$'), {f'{NAME}/bags'})])
 def test_library_is_imported_in_its_folders_only(library, folders):
     users = {path for path in MODULES.values()
@@ -227,7 +231,8 @@ def test_the_library_does_not_print_or_exit():
 # --- commands
 
 
-@pytest.mark.parametrize('script', ['relpose_node', 'global_shutter_node', 'rs_relpose'])
+@pytest.mark.parametrize('script', [
+    'relpose_node', 'global_shutter_node', 'odometry_node', 'rs_relpose'])
 def test_console_script_resolves(script):
     entries = {entry.name: entry for entry in distribution(NAME).entry_points
                if entry.group == 'console_scripts'}

@@ -16,6 +16,7 @@ import pytest
 from simulated_pairs import simulated_flight
 
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.estimator.image_information import ImageInformation
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.messages.outgoing import (
@@ -76,6 +77,22 @@ def test_what_was_published_is_read_back(pairs, results):
         np.testing.assert_array_equal(pair.linear_velocity, result.pose.linear_velocity2)
         np.testing.assert_array_equal(pair.angular_velocity, result.pose.angular_velocity2)
         np.testing.assert_array_equal(pair.matches, inlier_records(result))
+
+
+@pytest.mark.parametrize('types', [build.rclpy_types, build.rosbags_types])
+@pytest.mark.parametrize('rotation_alone', [False, True])
+def test_what_the_images_alone_say_is_read_back(results, types, rotation_alone):
+    rng, pose = np.random.default_rng(0), results[0].pose
+    root = rng.normal(size=(11, 11))
+    images = ImageInformation(0.015, pose.R, pose.t, rng.normal(size=6), root.T @ root,
+                              rng.normal(size=11))
+    if rotation_alone:
+        images = images.of_rotation()
+    result = replace(results[0], pose=replace(pose, images=images))
+    read = published_pair(pair_messages(result, types)).images
+    for name in ('row_time', 't', 'velocities', 'information', 'gradient'):
+        np.testing.assert_array_equal(getattr(read, name), getattr(images, name))
+    np.testing.assert_allclose(read.R, images.R, atol=1e-15)
 
 
 @pytest.mark.parametrize('types', [build.rclpy_types, build.rosbags_types])
@@ -243,6 +260,8 @@ def test_a_malformed_cloud_is_refused(pairs, path, value, sentence):
     ('pairs', 'status.0.values.-4.value', '0.1 0.2', 'gyro_bias_rad_s .* three numbers'),
     ('pairs', 'status.0.values.-4.value', '0.1 0.2 inf', 'gyro_bias_rad_s .* finite'),
     ('pairs', 'status.0.values.-4.value', ' ', 'gyro_bias_rad_s .* finite'),
+    ('pairs', 'status.0.values.-6.value', '0.1 0.2', 'image_information .* unknowns'),
+    ('pairs', 'status.0.values.-6.value', '0.1 0.2 inf', 'image_gradient .* finite'),
     ('pairs', 'status.0.values.-1.value', 'matches', 'must name all others'),
     ('pairs', 'status.0.values.-1.value', 'relative_rotation', 'tells of pairs relative_rotation'),
 ])

@@ -114,7 +114,8 @@ def node_process(parameter_file: Path | None = None, *, remap: Mapping[str, str]
                  folder: str = 'node') -> Process:
     """Start `relpose_node`; `remap` takes topics, ``__ns`` and ``__node``.
 
-    `folder`: of the package, whose `start` is to be run instead: ``'global_shutter'``.
+    `folder`: of the package, whose `start` is to be run instead: ``'global_shutter'`` or
+    ``'odometry'``.
     """
     words = [] if parameter_file is None else ['--params-file', str(parameter_file)]
     for name, value in (parameters or {}).items():

@@ -32,6 +32,8 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
                 'turn a recording of a camera or phone into a bag and its parameter file'),
     'evaluate': ('rs_relpose_lab.cli.evaluate',
                  'run the experiments of the paper: tables and box plots'),
+    'odometry': ('rs_relpose_ros.cli.odometry',
+                 'a metric path from a bag: relative poses and IMU in one graph'),
     'replay': ('rs_relpose_ros.cli.replay',
                'estimate relative poses from a bag: CSV, summary and pictures'),
     'unroll': ('rs_relpose_ros.cli.unroll',

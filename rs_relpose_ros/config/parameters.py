@@ -18,6 +18,7 @@ from rs_relpose_ros.config.global_shutter import GlobalShutterConfig
 from rs_relpose_ros.config.imu import ImuConfig
 from rs_relpose_ros.config.intrinsics import IntrinsicsConfig
 from rs_relpose_ros.config.keyframes import KeyframeConfig
+from rs_relpose_ros.config.odometry import OdometryConfig
 from rs_relpose_ros.config.tracking import TrackingConfig
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.camera import READOUT_DIRECTIONS, REFERENCE_ROWS
@@ -139,6 +140,7 @@ class Parameters:
     imu: ImuConfig = field(default_factory=ImuConfig)
     estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
     global_shutter: GlobalShutterConfig = field(default_factory=GlobalShutterConfig)
+    odometry: OdometryConfig = field(default_factory=OdometryConfig)
 
     @staticmethod
     def declarations() -> Iterator[tuple[str, Any, Declared]]:

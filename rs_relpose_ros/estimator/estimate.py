@@ -18,10 +18,16 @@ from rs_relpose_ros.estimator.arguments import (
 )
 from rs_relpose_ros.estimator.consensus import SCALES
 from rs_relpose_ros.estimator.hypotheses import draw_hypotheses, MODES, SolverMode
+from rs_relpose_ros.estimator.image_information import (
+    image_information,
+    ImageInformation,
+    rotation_information,
+)
 from rs_relpose_ros.estimator.information import inverse
 from rs_relpose_ros.estimator.inliers import cheirality_sign, Flags, Matches, select_inliers
 from rs_relpose_ros.estimator.local_optimisation import optimise
 from rs_relpose_ros.estimator.map_fit import FitMatches
+from rs_relpose_ros.estimator.noise import noise_mixture
 from rs_relpose_ros.estimator.priors import isotropic, PINNED, Priors, with_velocity
 from rs_relpose_ros.estimator.problem import (
     build_problem,
@@ -48,7 +54,7 @@ from rs_relpose_ros.estimator.velocity_prior import fit_with_evidence, Noise, Re
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.inertial import InertialMotion
 from rs_relpose_ros.geometry.motion import FrameMotion
-from rs_relpose_ros.geometry.so3 import aligning_rotation, exp_so3
+from rs_relpose_ros.geometry.so3 import aligning_rotation, exp_so3, log_so3
 from rs_relpose_ros.solvers.solver import Solutions
 
 Array = NDArray[np.float64]
@@ -341,6 +347,9 @@ class Estimation:
         return RelativePose(
             status=Status.PURE_ROTATION if turned_only else Status.LOW_PARALLAX, reason=reason,
             R=turn1.T @ R @ turn2, covariance=covariance, inliers=inliers,
+            images=rotation_information(
+                R, information, self.priors.rotation_information,
+                log_so3(R @ self.priors.rotation.T), -problem.reference_row_time),
             angular_velocity1=problem.motion1.angular_velocity,
             angular_velocity2=problem.motion2.angular_velocity,
             velocity_covariance=velocity_covariance, model='angular',
@@ -369,7 +378,7 @@ class Estimation:
             velocity_covariance=pose.covariance[np.ix_(v2w2, v2w2)], model=self.mode.model.name,
             velocity_sigma=refined.velocity_sigma,
             baseline=baseline, baseline_log_sigma=baseline_sigma, baseline_reason=reason,
-            iterations=self.iterations,
+            images=self._images(refined), iterations=self.iterations,
             residual_rms=float(np.sqrt(np.mean(r**2))))
         limit = self.config.max_translation_sigma
         if sigma <= limit:
@@ -377,6 +386,17 @@ class Estimation:
         return result.without_translation(
             Status.LOW_PARALLAX, f'the direction of translation is uncertain by {sigma:.3g} deg '
             f'(1 sigma), more than max_translation_sigma = {limit:g} deg')
+
+    def _images(self, refined: Refined) -> ImageInformation | None:
+        """What the images alone say; None of models that are not fitted to all unknowns."""
+        if not self.mode.model.derotated:
+            return None
+        state, problem = refined.state, self.problem
+        weights, sigma = noise_mixture(residuals(problem.observations, state), refined.inliers,
+                                       self.config.pixel_sigma)
+        return image_information(
+            FitMatches(problem.observations, weights, sigma), state, self.priors,
+            -problem.reference_row_time)
 
     def _baseline(self, pose: PairState) -> tuple[float, float, str]:
         """Baseline [m] and 1 sigma of its logarithm; or NaN twice, and why."""

@@ -8,6 +8,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.estimator.image_information import ImageInformation
 from rs_relpose_ros.geometry.so3 import skew
 
 Array = NDArray[np.float64]
@@ -62,6 +63,9 @@ class RelativePose:
         1 sigma of its logarithm.
     baseline_reason : str
         Why the baseline is not known; empty where it is, and without a pose.
+    images : ImageInformation or None
+        What the images alone say of it, without the priors of the IMU; None where they say
+        nothing.
     velocity_sigma : float
         Prior sigma of the linear velocities that was used [baselines per second].
     iterations : int
@@ -87,6 +91,7 @@ class RelativePose:
     baseline: float = float('nan')
     baseline_log_sigma: float = float('nan')
     baseline_reason: str = ''
+    images: ImageInformation | None = None
     velocity_sigma: float = float('nan')
     iterations: int = 0
     residual_rms: float = float('nan')
@@ -120,6 +125,7 @@ class RelativePose:
             self, status=status, reason=reason, t=_nan(3), linear_velocity1=_nan(3),
             linear_velocity2=_nan(3), covariance=covariance, baseline=float('nan'),
             baseline_log_sigma=float('nan'), baseline_reason='',
+            images=None if self.images is None else self.images.of_rotation(),
             velocity_covariance=velocity_covariance)
 
     def without_baseline(self, reason: str) -> RelativePose:

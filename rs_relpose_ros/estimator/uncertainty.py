@@ -67,7 +67,7 @@ def score_covariance(matches: FitMatches, state: TwoViewState, data_hessian: Arr
     for i in range(DW1, PARAMETERS):
         excess[i, i] = (surprise - 1.0) * priors.rate_weight
     # Where gyro and images disagree, either may be wrong.
-    of_matches = _of_matches(matches, state, data_hessian, hessian)
+    of_matches = score_of_matches(matches, state, data_hessian, hessian)
     return ScoreCovariance(max(surprise, 1.0) * of_matches, excess)
 
 
@@ -99,7 +99,7 @@ def as_much_wider(covariance: Array, believed: Array, shown: Array) -> Array:
 
 
 @kernel
-def _of_matches(matches: FitMatches, state: TwoViewState, data_hessian: Array,
+def score_of_matches(matches: FitMatches, state: TwoViewState, data_hessian: Array,
                 hessian: Array) -> Array:
     """Covariance of the matches' gradient, by image regions g and by the Hessian.
 

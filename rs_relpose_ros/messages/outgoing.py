@@ -295,6 +295,11 @@ def _pose(R: NDArray[np.float64], position: NDArray[np.float64], types: MessageT
         orientation=_geometry('Quaternion', quat_xyzw(R), types))
 
 
+def vector_message(values: NDArray[np.float64], types: MessageTypes) -> Any:
+    """geometry_msgs/Vector3."""
+    return _geometry('Vector3', values, types)
+
+
 def _geometry(name: str, values: NDArray[np.float64], types: MessageTypes) -> Any:
     """geometry_msgs message with the fields x, y, z and, of a quaternion, w."""
     fields = dict(zip('xyzw', map(float, values), strict=False))

@@ -8,8 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.estimator.image_information import ImageInformation, POSE, ROTATION
 from rs_relpose_ros.front_end.pair import PAIR_FIGURES, PairFigure, PairResult
 
 Array = NDArray[np.float64]
@@ -38,6 +40,13 @@ def _figure(figure: PairFigure) -> PairValue:
     return PairValue(figure.name, lambda pair: number(figure.of(pair)))
 
 
+def _of_images(pair: PairResult, part: Callable[[ImageInformation], Array]) -> str:
+    images = pair.pose.images
+    if images is None or not np.isfinite(values := part(images)).all():
+        return ''
+    return numbers(values)
+
+
 # In the order in which they are shown. `TOPICS_KEY` follows: it tells what else was published.
 PAIR_VALUES = (
     PairValue('reference_stamp_ns', lambda pair: str(pair.reference_stamp_ns)),
@@ -54,11 +63,25 @@ PAIR_VALUES = (
     # Instants of the two stamped rows on the IMU's clock.
     PairValue('reference_imu_ns', lambda pair: str(pair.reference_ns1)),
     PairValue('current_imu_ns', lambda pair: str(pair.reference_ns2)),
+    # What the images alone say, without the priors of the IMU: `ImageInformation`.
+    PairValue('image_row_s', lambda pair: _of_images(
+        pair, lambda images: np.array([images.row_time]))),
+    PairValue('image_rotation_xyzw', lambda pair: _of_images(
+        pair, lambda images: Rotation.from_matrix(images.R).as_quat())),
+    PairValue('image_direction', lambda pair: _of_images(pair, lambda images: images.t)),
+    PairValue('image_velocities', lambda pair: _of_images(pair, lambda images: images.velocities)),
+    PairValue('image_gradient', lambda pair: _of_images(pair, lambda images: images.gradient)),
+    PairValue('image_information', lambda pair: _of_images(
+        pair, lambda images: images.information[np.triu_indices(len(images.gradient))])),
     PairValue('gyro_bias_rad_s', lambda pair: numbers(pair.gyro_bias)),
     PairValue('health', lambda pair: pair.health.state.value),
     PairValue('health_findings', lambda pair: pair.health.text),
 )
 TOPICS_KEY = 'topics'
+# Of the longest list of numbers, 66 of them.
+_MOST_CHARACTERS = 2000
+# Largest deviation from 1 of the length of directions and quaternions.
+_UNIT = 1e-3
 
 
 class PairStatus:
@@ -72,6 +95,30 @@ class PairStatus:
         if key not in self._values:
             raise InputError(f'~/pairs must have the key {key}')
         return self._values[key]
+
+    def images(self) -> ImageInformation | None:
+        """What the images alone say; None where nothing is told."""
+        gradient = self.reals('image_gradient')
+        size = len(gradient)
+        if size == 0:
+            return None
+        upper, rows = self.reals('image_information'), np.triu_indices(size)
+        turn, t, velocities = (self.reals(f'image_{name}') for name in (
+            'rotation_xyzw', 'direction', 'velocities'))
+        row_time = self.real('image_row_s')
+        whole = (len(t) == 3 and len(velocities) == 6
+                 and abs(float(np.linalg.norm(t)) - 1.0) < _UNIT)
+        if not ((size == ROTATION or (size == POSE and whole))
+                and len(upper) == len(rows[0]) and abs(row_time) < 1.0
+                and len(turn) == 4 and abs(float(np.linalg.norm(turn)) - 1.0) < _UNIT):
+            raise InputError(f'image_information of ~/pairs and the keys beside it must be of '
+                             f'{POSE} or {ROTATION} unknowns, got {size}')
+        H = np.zeros((size, size))
+        H[rows] = H.T[rows] = upper
+        if size == ROTATION:
+            t, velocities = np.full(3, math.nan), np.full(6, math.nan)
+        return ImageInformation(row_time, Rotation.from_quat(turn).as_matrix(), t, velocities, H,
+                                gradient)
 
     def nanoseconds(self, key: str) -> int:
         """An instant [ns]."""
@@ -94,10 +141,15 @@ class PairStatus:
             raise InputError(f'{key} of ~/pairs must be three numbers, got {text[:60]!r}')
         return np.array(values)
 
+    def reals(self, key: str) -> Array:
+        """Numbers (N,); none where they are empty."""
+        text = self.text(key)
+        return np.array(self._reals(key, text, _MOST_CHARACTERS) if text else [])
+
     @staticmethod
-    def _reals(key: str, text: str) -> list[float]:
+    def _reals(key: str, text: str, most: int = 200) -> list[float]:
         try:
-            values = [float(word) for word in text[:200].split()]
+            values = [float(word) for word in text[:most].split()]
         except ValueError:
             values = []
         if not values or not all(map(math.isfinite, values)):

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.estimator.image_information import ImageInformation
 from rs_relpose_ros.messages.incoming import stamp_ns, time_ns
 from rs_relpose_ros.messages.outgoing import (
     MATCH_DTYPE,
@@ -62,6 +63,7 @@ class PublishedPair:
     baseline: float   # [m]
     baseline_log_sigma: float   # 1 sigma of its logarithm
     gyro_bias: Array   # (3,) [rad/s] that was removed, in the axes of the IMU
+    images: ImageInformation | None   # what the images alone say
     health: str   # of what was told of camera and IMU, as of `HealthState`
     matches: NDArray[np.void]   # (N,), of MATCH_DTYPE
 
@@ -169,7 +171,8 @@ def published_pair(messages: PairMessages) -> PublishedPair:
         covariance=covariance, linear_velocity=linear_velocity, angular_velocity=angular_velocity,
         velocity_covariance=velocity_covariance, baseline=status.real('baseline_m'),
         baseline_log_sigma=status.real('baseline_log_sigma'),
-        gyro_bias=status.vector('gyro_bias_rad_s'), health=status.text('health'), matches=matches)
+        gyro_bias=status.vector('gyro_bias_rad_s'),
+        images=status.images(), health=status.text('health'), matches=matches)
 
 
 def pair_status(pairs: Any) -> PairStatus:

@@ -17,10 +17,10 @@ from rclpy.utilities import remove_ros_args
 
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import RsRelposeError
-from rs_relpose_ros.node.sensor_node import SensorNode
+from rs_relpose_ros.node.stoppable import StoppableNode
 
 
-def run_node(make: Callable[[], SensorNode], name: str, description: str,
+def run_node(make: Callable[[], StoppableNode], name: str, description: str,
              arguments: Sequence[str] | None = None,
              on_started: Callable[[], object] = lambda: None) -> int:
     """Run a node; its exit code: 0 after SIGINT or SIGTERM, 2 for an illegal parameter.
@@ -38,7 +38,7 @@ def run_node(make: Callable[[], SensorNode], name: str, description: str,
     _help(name, description).parse_args(own[1:])
     rclpy.init(args=list(given))
     on_started()
-    node: SensorNode | None = None
+    node: StoppableNode | None = None
     try:
         node = make()
         rclpy.spin(node)
@@ -67,7 +67,7 @@ def _help(name: str, description: str) -> argparse.ArgumentParser:
         epilog='\n'.join(lines))
 
 
-def _finish(node: SensorNode | None) -> None:
+def _finish(node: StoppableNode | None) -> None:
     """End the node; signals are ignored from here on, as Ctrl-C comes twice under ros2 launch."""
     _ignore_signals()
     if node is not None:

@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from rs_relpose_ros.config.parameters import Parameters
@@ -39,6 +38,7 @@ from rs_relpose_ros.node.silence import (
     why_no_image,
     why_nothing,
 )
+from rs_relpose_ros.node.stoppable import StoppableNode
 from rs_relpose_ros.node.worker import Event, WarmedUp, Worker
 
 # Time [s] that the worker gets to end: a frame takes less, compiling takes longer.
@@ -47,7 +47,7 @@ _JOIN_TIMEOUT = 0.4
 _TELL_COMPILING = 4.0
 
 
-class SensorNode(Node):
+class SensorNode(StoppableNode):
     """A node that works on the frames of a camera with an IMU; its states: docs/architecture.md.
 
     Callbacks convert little and hand over; one worker thread does the rest. An illegal parameter

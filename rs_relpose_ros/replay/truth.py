@@ -67,6 +67,10 @@ class TrueTrajectory:
         return after > 0 and bool(
             self._stamps[after] - self._stamps[after - 1] <= _MAX_GAP_NS)
 
+    def position(self, at_ns: int) -> Array:
+        """Position (3,) [m] at an instant that the poses cover."""
+        return np.asarray(self._position((at_ns - self._stamps[0]) / NANOSECONDS))
+
     def relative_pose(self, ns1: int, ns2: int) -> tuple[Array, Array] | None:
         """R (3, 3) and t (3,) [m] with ``X1 = R X2 + t``; None where the truth does not reach."""
         if not (self.covers(ns1) and self.covers(ns2)):

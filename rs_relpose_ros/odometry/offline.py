@@ -1,0 +1,142 @@
+"""Metric odometry of a bag: replay's pairs and the bag's IMU, as a live node would get them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+import math
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.bags.reader import Bag
+from rs_relpose_ros.bags.topics import SensorTopics
+from rs_relpose_ros.config.parameters import Parameters
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.imu.samples import ImuSample
+from rs_relpose_ros.messages.sensor_feed import Role, SensorFeed
+from rs_relpose_ros.odometry.measurement import PairMeasurement
+from rs_relpose_ros.odometry.odometry import Odometry, OdometryEstimator
+from rs_relpose_ros.odometry.trajectory import trajectory_errors, write_tum
+from rs_relpose_ros.picture_files import save_picture
+from rs_relpose_ros.replay.run import read_truth, Replay
+
+Array = NDArray[np.float64]
+
+# Trajectory, its name, and its places as aligned and true (N, 3), where the truth is known.
+_Drawn = tuple[Sequence[Odometry], str, tuple[Array, Array] | None]
+
+LIVE_FILE, SMOOTHED_FILE, PICTURE = 'trajectory.tum', 'trajectory_smoothed.tum', 'path.png'
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OdometryOutcome:
+    """What came of a bag; `figures`: as in summary.json, without provenance."""
+
+    live: list[Odometry]
+    smoothed: list[Odometry]
+    figures: dict[str, Any]
+    sentences: list[str]
+
+
+def odometry_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parameters, *,
+                  on_image: Callable[[], object] = lambda: None) -> OdometryOutcome:
+    """Run a bag, and write trajectories and a picture into `folder`, which is made as needed.
+
+    Files of an earlier run are replaced.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f'cannot make the folder {folder}: {error.strerror}') from error
+    estimator = OdometryEstimator(parameters, keep=True)
+    replay = Replay(bag, topics, parameters, on_image=on_image)
+    samples = _samples(bag, topics)
+    live, sentences, given, health = [], [], 0, 'unknown'
+    for pair in replay.pairs():
+        while given < len(samples) and samples[given][0] <= pair.bag_time_ns:
+            _add(estimator, samples[given][1])
+            given += 1
+        estimator.add_pair(PairMeasurement.of_result(pair.result))
+        live += estimator.take()
+        sentences += estimator.sentences()
+        health = pair.result.health.state.value
+    for _, sample in samples[given:]:
+        _add(estimator, sample)
+    live += estimator.take(end=True)
+    sentences += estimator.sentences()
+    smoothed = estimator.smoothed()
+    truth = read_truth(bag, topics)
+    figures: dict[str, Any] = {
+        'keyframes': len(live), 'pairs': {name: estimator.counts[name] for name in (
+            'pairs', 'contradicting', 'late', 'told wrong')},
+        'lost': estimator.counts['lost'],
+        'starts': [asdict(started) for started in estimator.starts], 'health': health,
+        'length_m': _length(live)}
+    drawn: list[_Drawn] = [(live, 'live', None), (smoothed, 'smoothed', None)]
+    for name, trajectory, at in (('live', live, 0), ('smoothed', smoothed, 1)):
+        errors = None if truth is None else trajectory_errors(trajectory, truth)
+        figures[name] = None
+        if errors is not None:
+            figures[name] = {key: value if math.isfinite(value) else None
+                             for key, value in asdict(errors[0]).items()}
+            drawn[at] = (trajectory, name, errors[1:])
+    write_tum(folder / LIVE_FILE, live)
+    write_tum(folder / SMOOTHED_FILE, smoothed)
+    _draw(drawn, folder / PICTURE)
+    return OdometryOutcome(live, smoothed, figures, sentences)
+
+
+def _samples(bag: Bag, topics: SensorTopics) -> list[tuple[int, ImuSample]]:
+    """IMU samples of a bag with their bag times, in bag order."""
+    read: list[ImuSample] = []
+    feed = SensorFeed({Role.IMU: read.append, Role.ACCEL: read.append})
+    out = []
+    for role, message in feed.messages(bag, topics):
+        try:
+            feed.receive(role, message.message)
+        except InputError:
+            continue   # the replay counts and tells it
+        out.append((message.bag_time_ns, read.pop()))
+    return out
+
+
+def _add(estimator: OdometryEstimator, sample: ImuSample) -> None:
+    with suppress(InputError):   # a gyro that hangs: the replay counts and tells it
+        estimator.add_imu(sample)
+
+
+def _length(trajectory: Sequence[Odometry]) -> float:
+    places = np.array([pose.position for pose in trajectory]).reshape(-1, 3)
+    return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+
+
+def _draw(drawn: Sequence[_Drawn], path: Path) -> None:
+    """The path from above and its height, beside the truth where it is known."""
+    figure = Figure(figsize=(11.0, 5.5), dpi=110, layout='constrained')
+    above, height = figure.subplots(1, 2)
+    for (trajectory, name, against), colour in zip(drawn, ('#E69F00', '#0072B2'), strict=True):
+        if not trajectory:
+            continue
+        places = np.array([pose.position for pose in trajectory])
+        seconds = np.array([(pose.imu_ns - trajectory[0].imu_ns) * 1e-9 for pose in trajectory])
+        if against is not None:
+            places, true = against
+            seconds = seconds[:len(places)]
+            if name == 'live':
+                above.plot(true[:, 0], true[:, 1], color='black', lw=2.5, label='truth')
+                height.plot(seconds, true[:, 2], color='black', lw=2.5, label='truth')
+        above.plot(places[:, 0], places[:, 1], color=colour, lw=1.2, label=name)
+        height.plot(seconds, places[:, 2], color=colour, lw=1.2, label=name)
+    above.set_aspect('equal', 'datalim')
+    above.set(title='path from above', xlabel='x [m]', ylabel='y [m]')
+    height.set(title='height', xlabel='time [s]', ylabel='z [m]')
+    for axes in (above, height):
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend()
+        axes.grid(alpha=0.3)
+    save_picture(figure, path)
