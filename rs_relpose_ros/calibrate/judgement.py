@@ -83,6 +83,7 @@ def judged(data: Observations, final: Fit, free: NDArray[np.bool_], curve: CostC
     unsettled = '' if final.converged else 'the fit had not settled when it was stopped'
     return CalibrationResult(
         readout_time=_estimate(parameters[READOUT], sigmas[READOUT], config.max_readout_sigma),
+        fitted_readout=float(final.unknowns.parameters[READOUT]),
         time_offset=_estimate(float(to_first @ parameters),
                               math.sqrt(to_first @ covariance @ to_first),
                               config.max_offset_sigma),

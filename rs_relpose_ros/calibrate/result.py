@@ -44,6 +44,7 @@ class CalibrationResult:
     """
 
     readout_time: Estimate                  # signed [s]
+    fitted_readout: float                   # without its bound, the interval between frames [s]
     time_offset: Estimate                   # of row 0 [s], at the median interval between frames
     R_cam_imu: Array                        # (3, 3) v_cam = R_cam_imu v_imu
     rotation_sigma: Array                   # (3,) 1 sigma about the camera's axes [rad]
@@ -92,10 +93,10 @@ class CalibrationResult:
     def shutter(self) -> str:
         """'rolling', 'global' or 'unsure'.
 
-        Rolling: the read-out time is 5 sigma and 1 ms from zero; global: it is within 3 sigma or
-        1 ms of zero, and known to a millisecond.
+        Rolling: the read-out time as fitted is 5 sigma and 1 ms from zero; global: it is within
+        3 sigma or 1 ms of zero, and known to a millisecond.
         """
-        value, sigma = abs(self.readout_time.value), self.readout_time.sigma
+        value, sigma = abs(self.fitted_readout), self.readout_time.sigma
         if value > max(5.0 * sigma, 1e-3):
             return 'rolling'
         return 'global' if sigma < 1e-3 and value < max(3.0 * sigma, 1e-3) else 'unsure'
