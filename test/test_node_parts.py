@@ -150,7 +150,7 @@ def test_why_nothing_comes_out():
     # The numbers of a reason change, its kind does not.
     assert standing.kind == why_nothing(Silence(6.0, 180, {}, 'PURE_ROTATION: 0.2 px')).kind
     assert standing.kind != reason.kind
-    assert 'no pair of keyframes' in why_nothing(Silence(5.0, 150, {}, '')).text
+    assert 'nothing came of 150 images' in why_nothing(Silence(5.0, 150, {}, '')).text
 
 
 def test_silence_is_counted_from_the_last_result(clock):

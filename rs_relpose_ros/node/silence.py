@@ -67,8 +67,8 @@ def why_nothing(silence: Silence) -> Reason:
             f'{silence.refused[cause]} of them as {cause.value}'))
     if silence.failure:
         return Reason(silence.failure.partition(':')[0],
-                      f'no pose for {PATIENCE:g} s; the last reason: {silence.failure}')
-    return Reason('no pair', f'no pair of keyframes for {PATIENCE:g} s')
+                      f'nothing for {PATIENCE:g} s; the last reason: {silence.failure}')
+    return Reason('nothing', f'nothing came of {silence.images} images in {PATIENCE:g} s')
 
 
 class LostImages:
