@@ -103,8 +103,8 @@ class PairConfig:
         'rows)')
     use_gravity: bool = setting(True, 'gravity as prior and for the 3- and 9-point solvers')
     use_accelerometer: bool = setting(
-        True, 'accelerometer between the frames for velocities and baseline (else it is asked for '
-        'gravity alone)')
+        True, 'accelerometer between the frames for velocities and baseline, with '
+        'use_gyro_rotation (else it is asked for gravity alone)')
     withhold_when_wrong: bool = setting(
         True, 'publish no pose while a figure that was told is seen to be wrong (see health in '
         '/diagnostics)', live=True)

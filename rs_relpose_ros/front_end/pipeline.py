@@ -246,6 +246,9 @@ class Pipeline:
         """What the accelerometer says of the pair, or why it says nothing."""
         if not parameters.pair.use_accelerometer:
             return 'use_accelerometer is false'
+        if not parameters.pair.use_gyro_rotation:
+            # The gyro turns what the accelerometer feels.
+            return 'use_gyro_rotation is false'
         if self._gyro is None:
             return 'the gyro has a gap'
         if isinstance(self._forces, str):
