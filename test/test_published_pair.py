@@ -5,6 +5,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable, Iterator
 import copy
+import csv
 from dataclasses import fields, replace
 import itertools
 from typing import Any
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 from simulated_pairs import simulated_flight
 
+from rs_relpose_lab.live.live_run import Recorder
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.image_information import ImageInformation
 from rs_relpose_ros.estimator.result import RelativePose, Status
@@ -58,6 +60,26 @@ def without_rotation(result: PairResult) -> PairResult:
 
 def test_topics_are_the_messages():
     assert set(PAIR_TOPICS) == {field.name for field in fields(PairMessages)}
+
+
+def test_the_table_of_a_live_run_is_that_of_the_replay(results, tmp_path):
+    class Topics:
+        def listen(self, _: type, topic: str) -> list[Any]:
+            return [getattr(messages, topic.rpartition('/')[2]) for messages in published]
+
+        def wait_for_publisher(self, *_: Any) -> None:
+            pass
+
+    published = [pair_messages(result, build.rclpy_types) for result in results]
+    path = tmp_path / 'live.csv'
+    assert Recorder(Topics(), None).write(path) == len(results)
+    with path.open(encoding='ascii') as file:
+        rows = list(csv.DictReader(file))
+    for row, result in zip(rows, results, strict=True):
+        assert (row['stamp_ns'], row['status']) == (str(result.stamp_ns), 'OK')
+        assert float(row['tx']) == result.pose.t[0]
+        assert row['baseline_m'] == ('' if np.isnan(result.pose.baseline)
+                                     else repr(result.pose.baseline))
 
 
 def test_what_was_published_is_read_back(pairs, results):

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from rs_relpose_lab.live.graph import Graph, private_domain
+from rs_relpose_lab.live.graph import diagnostic_values, Graph, private_domain
 from rs_relpose_lab.live.processes import (
     LiveRunError,
     node_process,
@@ -85,17 +85,19 @@ class Recorder:
         Pairs without a pose are left out, and the cells of the number of matches and the model
         stay empty.
         """
-        poses, references, matches = (
+        poses, references, matches, pairs = (
             {stamp_ns(msg.header): msg for msg in self._received[name]}
-            for name in ('relative_pose', 'reference', 'matches'))
+            for name in ('relative_pose', 'reference', 'matches', 'pairs'))
         with table_writer(path, RELATIVE_POSE_COLUMNS) as write:
             for stamp, pose in sorted(poses.items()):
                 reference = references.get(stamp)
                 cloud = matches.get(stamp)
+                told = diagnostic_values(pairs[stamp]) if stamp in pairs else {}
                 write([
                     '' if reference is None else str(time_ns(reference.time_ref)), str(stamp),
                     *map(number, _pose_figures(pose)), '' if cloud is None else str(cloud.width),
-                    '', '', Status.OK.value])
+                    '', '', Status.OK.value,
+                    *(told.get(name, '') for name in ('baseline_m', 'baseline_log_sigma'))])
         return len(poses)
 
 
