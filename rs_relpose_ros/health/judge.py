@@ -53,6 +53,8 @@ _HALF_TURN = 0.6
 _SEEN_IN = 0.9
 # Sigmas of a figure that was told with one, within which it is as told.
 _AS_TOLD = 3.0
+# Gain in chi-square beyond which there is no doubt.
+_LARGEST_GAIN = 100.0
 # Figures that are asked for at most: traces of a gross one need some, too.
 _MOST_CAUSES = 4
 # Chi-square by which a second figure may explain less, and still fits as well.
@@ -165,6 +167,29 @@ def causes(seen: Calibration, effects: list[Effect], in_force: Array) -> list[Ca
         explained[0] = explained[0]._replace(rival=_cause(
             rival[0], *_solved(seen, instead, in_force), rival[1], effects))
     return explained
+
+
+def undetermined(seen: Calibration, in_force: Array) -> Array:
+    """Second moment (11, 11) of the deviations, averaged over which figure is off, if any.
+
+    Before the first pair each one is as likely to be off, by its prior P, as none. Pairs where
+    told and seen agree lower these odds as they lower the figure's sigma, others raise them
+    (Bayesian model averaging; Hoeting et al., Statistical Science 1999)::
+
+        odds_k = (|Sigma_k| / |P_k|)^1/2 exp(b_k^T Sigma_k b_k / 2),  Sigma_k = (S_kk + P_k^-1)^-1
+    """
+    odds, moment = 0.0, np.zeros((DEVIATIONS, DEVIATIONS))
+    S, left = seen.S / seen.scatter, (seen.b - seen.S @ in_force) / seen.scatter
+    for figure in FIGURES:
+        part = figure.part
+        covariance = np.linalg.inv(S[part, part] + np.diag(PRIOR_SIGMA[part] ** -2.0))
+        deviation = covariance @ left[part]
+        gain = min(float(left[part] @ deviation), _LARGEST_GAIN)
+        of_figure = math.exp(0.5 * gain) * math.sqrt(float(np.linalg.det(covariance))) / float(
+            np.prod(PRIOR_SIGMA[part]))
+        moment[part, part] = of_figure * (covariance + np.outer(deviation, deviation))
+        odds += of_figure
+    return moment / (1.0 + odds)
 
 
 def _solved(seen: Calibration, taken: NDArray[np.bool_], in_force: Array) -> tuple[Array, Array]:

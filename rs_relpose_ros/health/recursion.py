@@ -46,7 +46,8 @@ class Calibration:
     covariance: Array   # (11, 11)
     S: Array   # (11, 11) and (11,): sums of the pairs, without a prior
     b: Array
-    misfit: float   # variance of the scores over that by S: 1 where residuals are independent
+    scatter: float   # variance of the scores over that by S: 1 where residuals are independent
+    misfit: float   # the same with what all pairs share
     pairs: int
 
     @property
@@ -56,7 +57,7 @@ class Calibration:
 
 
 NOTHING_SEEN = Calibration(np.zeros(DEVIATIONS), np.diag(PRIOR_SIGMA**2),
-                           np.zeros((DEVIATIONS, DEVIATIONS)), np.zeros(DEVIATIONS), 1.0, 0)
+                           np.zeros((DEVIATIONS, DEVIATIONS)), np.zeros(DEVIATIONS), 1.0, 1.0, 0)
 
 
 class _Entry(NamedTuple):
@@ -122,7 +123,7 @@ class Recursion:
         scores = b - S @ c
         sandwich = inverse @ (scores.T @ scores) @ inverse
         ratios = np.maximum(np.diag(sandwich) / np.diag(inverse), 1.0) * (
-            1.0 + _SHARED**2 * n) * ((n + _UNSEEN_PAIRS) / n) ** 2
-        wider = np.sqrt(ratios)
-        return Calibration(c, inverse * np.outer(wider, wider), S.sum(axis=0), b.sum(axis=0),
-                           float(np.median(ratios)), n)
+            (n + _UNSEEN_PAIRS) / n) ** 2
+        shared, scatter = 1.0 + _SHARED**2 * n, float(np.median(ratios))
+        return Calibration(c, shared * inverse * np.sqrt(np.outer(ratios, ratios)), S.sum(axis=0),
+                           b.sum(axis=0), scatter, shared * scatter, n)
