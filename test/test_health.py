@@ -197,20 +197,6 @@ def test_too_few_matches_say_nothing():
                             NONE, NONE) is None
 
 
-def test_a_pair_without_a_translation_is_linearised_at_a_fit():
-    """A turn on the spot, told right: about a made-up translation it would blame the lens."""
-    scene = Scene.drawn()
-    turning = RotationSpline(np.arange(-1.0, 6.0, 0.4), Rotation.from_rotvec(
-        np.outer(np.arange(-1.0, 6.0, 0.4), [0.02, 0.4, 0.05])))
-    pair = evidence(replace(scene, turning=turning, velocity=np.array([2e-3, 0.0, 0.0])), 0.4, 0.9,
-                    NONE)
-    noise = 0.1 * np.random.default_rng(3).normal(size=pair.points2.shape)
-    seen = pair_information(replace(pair, points2=pair.points2 + noise, t=np.full(3, np.nan)),
-                            NONE, NONE)
-    assert 0.0 < seen.S[FOCAL, FOCAL] ** -0.5 < 0.01   # it does show the focal length
-    assert abs(seen.b[FOCAL]) < 4.0 * np.sqrt(seen.S[FOCAL, FOCAL])
-
-
 def test_the_images_rotation_does_not_follow_the_gyro():
     """Half a degree of the gyro's rotation is seen as that, though the pose has it as a prior."""
     pair = evidence(Scene.drawn(), 0.4, 0.7, NONE)
@@ -704,12 +690,12 @@ def test_told_right_poses_are_as_without_health(bundled_bag, told_right, monkeyp
         assert (a.pose.status, a.pose.reason) == (b.pose.status, b.pose.reason)
         for name in ('R', 't'):
             assert np.array_equal(getattr(a.pose, name), getattr(b.pose, name), equal_nan=True)
-    # Of the first pairs nothing that was told has been seen yet; later it is.
+    # Of the first pair nothing that was told has been seen yet; later it is.
     wider = [np.trace(b.pose.covariance[3:, 3:]) / np.trace(a.pose.covariance[3:, 3:])
              for a, b in zip(without, told_right, strict=True) if a.pose]
     assert min(wider) >= 1.0
-    assert min(wider[:3]) > 4.0
-    assert max(wider[10:]) < 1.3
+    assert wider[0] > 4.0
+    assert max(wider[10:]) < 1.1
 
 
 @pytest.mark.parametrize('c', [deviation(focal=-0.03), deviation(readout=0.004)],

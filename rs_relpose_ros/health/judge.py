@@ -29,7 +29,7 @@ from rs_relpose_ros.health.deviation import (
     SCALE,
 )
 from rs_relpose_ros.health.findings import Finding, Health, HealthState
-from rs_relpose_ros.health.recursion import Calibration, PRIOR_SIGMA
+from rs_relpose_ros.health.recursion import Calibration, PRIOR_INFORMATION, PRIOR_SIGMA
 from rs_relpose_ros.health.turning import TurnComparison
 
 Array = NDArray[np.float64]
@@ -108,6 +108,10 @@ FIGURES = (
     Figure('distortion', slice(DISTORTION, DISTORTION + 1), 0.05, ''),
 )
 
+# Deviations of each figure, and the determinant of their prior.
+_PRIORS = tuple((figure.part, float(np.prod(PRIOR_SIGMA[figure.part] ** 2.0)))
+                for figure in FIGURES)
+
 
 class Cause(NamedTuple):
     """A figure whose deviation explains what the pairs show."""
@@ -179,15 +183,19 @@ def undetermined(seen: Calibration, in_force: Array) -> Array:
         odds_k = (|Sigma_k| / |P_k|)^1/2 exp(b_k^T Sigma_k b_k / 2),  Sigma_k = (S_kk + P_k^-1)^-1
     """
     odds, moment = 0.0, np.zeros((DEVIATIONS, DEVIATIONS))
-    S, left = seen.S / seen.scatter, (seen.b - seen.S @ in_force) / seen.scatter
-    for figure in FIGURES:
-        part = figure.part
-        covariance = np.linalg.inv(S[part, part] + np.diag(PRIOR_SIGMA[part] ** -2.0))
+    posterior = seen.S / seen.scatter + PRIOR_INFORMATION
+    left = (seen.b - seen.S @ in_force) / seen.scatter
+    for part, largest in _PRIORS:
+        if part.stop - part.start == 1:
+            covariance = 1.0 / posterior[part, part]
+            determinant = float(covariance[0, 0])
+        else:
+            covariance = np.linalg.inv(posterior[part, part])
+            determinant = float(np.linalg.det(covariance))
         deviation = covariance @ left[part]
         gain = min(float(left[part] @ deviation), _LARGEST_GAIN)
-        of_figure = math.exp(0.5 * gain) * math.sqrt(float(np.linalg.det(covariance))) / float(
-            np.prod(PRIOR_SIGMA[part]))
-        moment[part, part] = of_figure * (covariance + np.outer(deviation, deviation))
+        of_figure = math.sqrt(determinant / largest) * math.exp(0.5 * gain)
+        moment[part, part] = of_figure * (covariance + deviation[:, None] * deviation)
         odds += of_figure
     return moment / (1.0 + odds)
 
@@ -210,11 +218,12 @@ def _beside_all(figure: Figure, seen: Calibration, in_force: Array) -> float:
 def _alone(figure: Figure, seen: Calibration, left: Array, taken: NDArray[np.bool_]) -> float:
     """Sigmas by which a figure is off when, beside those that are taken, it is off alone."""
     part = figure.part
-    S = seen.S[part, part] + np.diag(PRIOR_SIGMA[part] ** -2.0)
+    S = seen.S[part, part] + PRIOR_INFORMATION[part, part]
     if taken.any():
         cross = seen.S[part][:, taken]
         S = S - cross @ np.linalg.solve(seen.S[np.ix_(taken, taken)], cross.T)
-    gain = float(left[part] @ np.linalg.solve(S, left[part])) / seen.misfit
+    of_part = left[part] / S[0] if len(S) == 1 else np.linalg.solve(S, left[part])
+    gain = float(left[part] @ of_part) / seen.misfit
     # A vector gains more by chance.
     return math.sqrt(max(gain - 2.0 * (part.stop - part.start - 1), 0.0))
 

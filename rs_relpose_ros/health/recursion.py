@@ -36,6 +36,7 @@ _ANEW = 3
 _UNSEEN_PAIRS, _SHARED = 6, 0.25
 # Deviations before the first pair, 1 sigma: rad, s, s, rad/s, -, -, -.
 PRIOR_SIGMA = np.array([0.2] * 3 + [0.05, 0.03] + [0.1] * 3 + [0.2, 0.3, 0.5])
+PRIOR_INFORMATION = np.diag(PRIOR_SIGMA**-2.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
