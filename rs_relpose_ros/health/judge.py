@@ -186,12 +186,8 @@ def undetermined(seen: Calibration, in_force: Array) -> Array:
     posterior = seen.S / seen.scatter + PRIOR_INFORMATION
     left = (seen.b - seen.S @ in_force) / seen.scatter
     for part, largest in _PRIORS:
-        if part.stop - part.start == 1:
-            covariance = 1.0 / posterior[part, part]
-            determinant = float(covariance[0, 0])
-        else:
-            covariance = np.linalg.inv(posterior[part, part])
-            determinant = float(np.linalg.det(covariance))
+        covariance: Array = np.linalg.inv(posterior[part, part])
+        determinant = float(np.linalg.det(covariance))
         deviation = covariance @ left[part]
         gain = min(float(left[part] @ deviation), _LARGEST_GAIN)
         of_figure = math.sqrt(determinant / largest) * math.exp(0.5 * gain)
@@ -402,8 +398,7 @@ def _gross(turned: TurnComparison | None, told: Told) -> Iterator[Finding]:
                          'gyro: it must be in rad/s, which is pi / 180 = 0.0175 times deg/s',
                          1.0, turned.scale)
         better = (turned.left_as_told - 1.5 * explained) * turned.by_images
-        mirrored = turned.left_mirrored < turned.left_at_best
-        if better > _BETTER and (mirrored or turned.angle > _LARGE_TURN):
+        if better > _BETTER and (turned.is_left_handed or turned.angle > _LARGE_TURN):
             yield from _turned_axes(turned, told)
     elif turned.by_gyro > _LONG_TURN and explained > _INDEPENDENT:
         text = ('images and gyro turn independently of each other: is it the IMU of this camera, '
@@ -414,9 +409,14 @@ def _gross(turned: TurnComparison | None, told: Told) -> Iterator[Finding]:
 
 def _turned_axes(turned: TurnComparison, told: Told) -> Iterator[Finding]:
     wrong = HealthState.WRONG
-    if turned.left_mirrored < 0.5 * turned.left_at_best:
-        yield _fault('axes', wrong, 'the axes of the gyro are left-handed: one of them has the '
-                     'wrong sign')
+    if turned.is_left_handed:
+        # In the IMU's own axes one sign is all that is wrong, as a rule.
+        R_cam_imu = told.sensor.R_cam_imu
+        signs = np.diag(R_cam_imu.T @ turned.reflection @ R_cam_imu)
+        axis = 'xyz'[int(np.argmin(signs))] if sorted(signs)[1] > 0.7 > -0.7 > min(signs) else ''
+        yield _fault('axes', wrong, 'the axes of the gyro are left-handed: ' + (
+            f'its {axis} has' if axis else 'one or all of them have') + ' the wrong sign, which '
+            'no quat_cam_imu_xyzw sets right: correct the driver')
         return
     angle, Q = turned.angle, turned.rotation
     xyzw = _listed(Rotation.from_matrix(Q @ told.sensor.R_cam_imu).as_quat(), 3)

@@ -29,6 +29,8 @@ _WINDOW_NS = to_nanoseconds(8.0)
 _MOST_TURNS = 160
 # Turns, and turning [rad, their sum], that a comparison needs.
 _LEAST_TURNS, _LEAST_TURN = 5, 0.15
+# Logarithm of a ratio of likelihoods that is certain, errors of neighbours being alike.
+_LOG_LIKELIHOOD = 20.0
 # Images over gyro from which on what the gyro says may be its bias for the most part.
 _MOSTLY_BIAS = 5.0
 
@@ -61,9 +63,21 @@ class TurnComparison:
     left_at_best: float   # `rotation`
     left_mirrored: float   # the best reflection: a gyro whose axes are left-handed
     rotation: Array   # (3, 3) Q: the true gyro is Q times the told one
+    reflection: Array   # (3, 3) the best one
     scale: float   # images over gyro, after `rotation`
     by_images: float   # [rad] turning, summed
     by_gyro: float
+    turns: int
+
+    @property
+    def is_left_handed(self) -> bool:
+        """Whether a reflection explains the images better than any rotation, for certain.
+
+        By the ratio of the likelihoods, with normal errors of a variance that nobody knows; three
+        components a turn. Where all turns are about two axes both explain the same.
+        """
+        ratio = self.left_at_best / max(self.left_mirrored, 1e-9)
+        return 1.5 * self.turns * math.log(max(ratio, 1.0)) > _LOG_LIKELIHOOD
 
     @property
     def angle(self) -> float:
@@ -124,7 +138,8 @@ class TurnSums:
         return TurnComparison(
             left(float(np.trace(M))), left(trace),
             left(float(singular[0] + singular[1] - handed * singular[2])), rotation,
-            trace / gyro, by_images, by_gyro)
+            np.ascontiguousarray((U * (1.0, 1.0, -handed)) @ Vt), trace / gyro, by_images,
+            by_gyro, len(self._turns))
 
 
 def _unsteady(turns: Array, intervals: Array) -> Array:
