@@ -38,10 +38,8 @@ Array = NDArray[np.float64]
 _CERTAIN = 4.0
 # Shift of the pose in its own sigmas (Mahalanobis) that matters, and that leaves its covariance.
 _MATTERS, _OUTSIDE = 1.0, 3.0
-# Axes are wrong where the best rotation leaves less than this share of the images' turning, is
-# larger than the recursive calibration reaches [rad], and leaves so much less unexplained [rad]
-# than the axes as told; half of what it leaves itself counts as chance.
-_EXPLAINED_AT_BEST, _LARGE_TURN, _BETTER = 0.5, 1.0, 0.15
+# Axes and unit are said to be wrong where this leaves less than this share of the images' turning.
+_EXPLAINED_AT_BEST = 0.5
 # Images over gyro beyond which only another unit explains the scale (deg/s: 0.017).
 _UNIT_FACTOR = 5.0
 # Turning of the gyro [rad] after which images must agree, and the share that they then must
@@ -186,7 +184,7 @@ def undetermined(seen: Calibration, in_force: Array) -> Array:
     posterior = seen.S / seen.scatter + PRIOR_INFORMATION
     left = (seen.b - seen.S @ in_force) / seen.scatter
     for part, largest in _PRIORS:
-        covariance: Array = np.linalg.inv(posterior[part, part])
+        covariance = np.linalg.inv(posterior[part, part])
         determinant = float(np.linalg.det(covariance))
         deviation = covariance @ left[part]
         gain = min(float(left[part] @ deviation), _LARGEST_GAIN)
@@ -397,8 +395,7 @@ def _gross(turned: TurnComparison | None, told: Told) -> Iterator[Finding]:
             yield _fault('gyro_unit', wrong, f'images turn {turned.scale:.3g} times as far as the '
                          'gyro: it must be in rad/s, which is pi / 180 = 0.0175 times deg/s',
                          1.0, turned.scale)
-        better = (turned.left_as_told - 1.5 * explained) * turned.by_images
-        if better > _BETTER and (turned.is_left_handed or turned.angle > _LARGE_TURN):
+        if turned.is_left_handed or turned.is_turned:
             yield from _turned_axes(turned, told)
     elif turned.by_gyro > _LONG_TURN and explained > _INDEPENDENT:
         text = ('images and gyro turn independently of each other: is it the IMU of this camera, '

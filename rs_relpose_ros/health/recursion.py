@@ -28,8 +28,9 @@ Array = NDArray[np.float64]
 # Pairs that count: those of the last seconds, at most so many.
 _WINDOW_NS = to_nanoseconds(20.0)
 _MOST_PAIRS = 100
-# Older pairs that are linearised anew with each new one, once a figure is found off.
-_ANEW = 3
+# Older pairs that are linearised anew with each new one, once a figure is found off, and distance
+# in sigmas of the prior within which that changes nothing.
+_ANEW, _NEAR = 3, 0.02
 # Sigmas of n pairs are widened by (n + 6) / n: few scores scatter less than they should. Share of
 # a pair's sigma that is alike in all pairs, and no mean makes smaller: blur, the tracker's bias, a
 # lens that the model does not fit.
@@ -102,8 +103,11 @@ class Recursion:
         return information
 
     def _linearise_anew(self, about: Array) -> None:
-        apart = [float(np.linalg.norm((pair.about - about) / PRIOR_SIGMA)) for pair in self._pairs]
+        apart = np.linalg.norm(
+            (np.array([pair.about for pair in self._pairs]) - about) / PRIOR_SIGMA, axis=1)
         for k in np.argsort(apart, kind='stable')[::-1][:_ANEW]:
+            if apart[k] < _NEAR:
+                break
             pair = self._pairs[k]
             information = pair_information(pair.evidence, pair.in_force, about)
             if information is not None:

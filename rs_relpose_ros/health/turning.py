@@ -29,6 +29,8 @@ _WINDOW_NS = to_nanoseconds(8.0)
 _MOST_TURNS = 160
 # Turns, and turning [rad, their sum], that a comparison needs.
 _LEAST_TURNS, _LEAST_TURN = 5, 0.15
+# Rotation of axes [rad] that the recursive calibration does not reach.
+_LARGE_TURN = 1.0
 # Logarithm of a ratio of likelihoods that is certain, errors of neighbours being alike.
 _LOG_LIKELIHOOD = 20.0
 # Images over gyro from which on what the gyro says may be its bias for the most part.
@@ -70,14 +72,26 @@ class TurnComparison:
     turns: int
 
     @property
+    def is_turned(self) -> bool:
+        """Whether the axes are another way round: `rotation` is large, and better for certain."""
+        return self.angle > _LARGE_TURN and self._certain(self.left_as_told, self.left_at_best)
+
+    @property
     def is_left_handed(self) -> bool:
         """Whether a reflection explains the images better than any rotation, for certain.
 
-        By the ratio of the likelihoods, with normal errors of a variance that nobody knows; three
-        components a turn. Where all turns are about two axes both explain the same.
+        Where all turns are about two axes both explain the same.
         """
-        ratio = self.left_at_best / max(self.left_mirrored, 1e-9)
-        return 1.5 * self.turns * math.log(max(ratio, 1.0)) > _LOG_LIKELIHOOD
+        return self._certain(self.left_at_best, self.left_mirrored)
+
+    def _certain(self, left: float, left_instead: float) -> bool:
+        """Whether the second of two explanations is better.
+
+        By the ratio of their likelihoods, with normal errors of a variance that nobody knows; each
+        turn has three components.
+        """
+        ratio = max(left, 1e-9) / max(left_instead, 1e-9)
+        return 1.5 * self.turns * math.log(ratio) > _LOG_LIKELIHOOD
 
     @property
     def angle(self) -> float:
