@@ -360,7 +360,7 @@ def calibration(c, sigma, coupled=0.0):
     correlation[OFFSET, READOUT] = correlation[READOUT, OFFSET] = coupled
     S = correlation / np.outer(sigma, sigma)
     covariance = np.linalg.inv(S + np.diag(PRIOR_SIGMA**-2.0))
-    return Calibration(np.asarray(c), covariance, S, S @ c, 1.0, 1.0, 20)
+    return Calibration(np.asarray(c), covariance, covariance, S, S @ c, 1.0, 1.0, 20)
 
 
 SIGMA = np.array([1e-3] * 3 + [5e-4, 1e-3] + [1e-3] * 3 + [5e-3, 5e-3, 0.01])

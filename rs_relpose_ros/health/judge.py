@@ -172,15 +172,15 @@ def causes(seen: Calibration, effects: list[Effect], in_force: Array) -> list[Ca
 
 
 def undetermined(seen: Calibration, in_force: Array) -> Array:
-    """Second moment (11, 11) of the deviations, averaged over which figure is off, if any.
+    """Second moment (11, 11) of what may be off, by the odds that anything is.
 
-    Before the first pair each one is as likely to be off, by its prior P, as none. Pairs where
-    told and seen agree lower these odds as they lower the figure's sigma, others raise them
-    (Bayesian model averaging; Hoeting et al., Statistical Science 1999)::
+    Before the first pair these are even, and each figure as likely. Pairs where told and seen
+    agree lower a figure's odds as they lower its sigma, against its prior P; others raise them
+    (Bayes factor; Kass and Raftery, JASA 1995)::
 
         odds_k = (|Sigma_k| / |P_k|)^1/2 exp(b_k^T Sigma_k b_k / 2),  Sigma_k = (S_kk + P_k^-1)^-1
     """
-    odds, moment = 0.0, np.zeros((DEVIATIONS, DEVIATIONS))
+    odds = 0.0
     posterior = seen.S / seen.scatter + PRIOR_INFORMATION
     left = (seen.b - seen.S @ in_force) / seen.scatter
     for part, largest in _PRIORS:
@@ -188,10 +188,9 @@ def undetermined(seen: Calibration, in_force: Array) -> Array:
         determinant = float(np.linalg.det(covariance))
         deviation = covariance @ left[part]
         gain = min(float(left[part] @ deviation), _LARGEST_GAIN)
-        of_figure = math.sqrt(determinant / largest) * math.exp(0.5 * gain)
-        moment[part, part] = of_figure * (covariance + deviation[:, None] * deviation)
-        odds += of_figure
-    return moment / (1.0 + odds)
+        odds += math.sqrt(determinant / largest) * math.exp(0.5 * gain) / len(FIGURES)
+    off = seen.c - in_force
+    return (seen.undetermined + off[:, None] * off) * odds / (1.0 + odds)
 
 
 def _solved(seen: Calibration, taken: NDArray[np.bool_], in_force: Array) -> tuple[Array, Array]:

@@ -46,6 +46,7 @@ class Calibration:
 
     c: Array   # (11,)
     covariance: Array   # (11, 11)
+    undetermined: Array   # (11, 11) the same as if pairs shared no error: what more of them end
     S: Array   # (11, 11) and (11,): sums of the pairs, without a prior
     b: Array
     scatter: float   # variance of the scores over that by S: 1 where residuals are independent
@@ -58,7 +59,7 @@ class Calibration:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
-NOTHING_SEEN = Calibration(np.zeros(DEVIATIONS), np.diag(PRIOR_SIGMA**2),
+NOTHING_SEEN = Calibration(np.zeros(DEVIATIONS), np.diag(PRIOR_SIGMA**2), np.diag(PRIOR_SIGMA**2),
                            np.zeros((DEVIATIONS, DEVIATIONS)), np.zeros(DEVIATIONS), 1.0, 1.0, 0)
 
 
@@ -130,5 +131,6 @@ class Recursion:
         ratios = np.maximum(np.diag(sandwich) / np.diag(inverse), 1.0) * (
             (n + _UNSEEN_PAIRS) / n) ** 2
         shared, scatter = 1.0 + _SHARED**2 * n, float(np.median(ratios))
-        return Calibration(c, shared * inverse * np.sqrt(np.outer(ratios, ratios)), S.sum(axis=0),
-                           b.sum(axis=0), scatter, shared * scatter, n)
+        undetermined = inverse * np.sqrt(np.outer(ratios, ratios))
+        return Calibration(c, shared * undetermined, undetermined, S.sum(axis=0), b.sum(axis=0),
+                           scatter, shared * scatter, n)
