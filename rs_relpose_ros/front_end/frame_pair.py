@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rs_relpose_ros.config.imu import ImuConfig
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.estimator.estimate import estimate_relative_pose
-from rs_relpose_ros.estimator.result import RelativePose
+from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.front_end.derotated_rays import DerotatedRays, median_parallax, Sensor
 from rs_relpose_ros.front_end.frame import Frame, pose_row_delay
 from rs_relpose_ros.front_end.landmarks import landmarks
@@ -24,6 +24,7 @@ from rs_relpose_ros.geometry.inertial import InertialMotion
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import aligning_rotation
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
+from rs_relpose_ros.images.gray_levels import is_dark
 from rs_relpose_ros.imu.forces import ForceSegment
 from rs_relpose_ros.imu.frame_imu import FrameImu, GyroSegment
 from rs_relpose_ros.imu.integration import integrate_rotation
@@ -34,6 +35,7 @@ Array = NDArray[np.float64]
 
 # Largest 1 sigma of the gravity direction that the estimator takes [rad].
 _LARGEST_GRAVITY_SIGMA = 1.5
+_LACK_OF_MATCHES = (Status.TOO_FEW_MATCHES, Status.NO_CONSENSUS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,6 +116,8 @@ def estimate_pair(first: View, second: View, matches: Matches, sensor: Sensor,
                                    second.frame.stamp_ns]))
     if isinstance(inertial, str):
         pose = pose.without_baseline(f'baseline not known: {inertial}')
+    if pose.status in _LACK_OF_MATCHES and is_dark(second.frame.image):
+        pose = replace(pose, reason=f'the image is dark: {pose.reason}')
     return pose
 
 
