@@ -33,6 +33,7 @@ from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.replay.outputs import POSES_FILE
+from rs_relpose_ros.replay.pictures import draw_errors
 
 ROOT = Path(__file__).resolve().parent.parent
 BAG = ROOT / 'bags' / 'hand_held'
@@ -53,6 +54,7 @@ def compare(live: LiveRun) -> list[str]:
         opencv = replayed.opencv_scores()
         scores = [replayed.node, score_of_records('the same, replayed', replayed.records),
                   *(future.result() for future in paper), *opencv, turned.result()]
+    draw_errors(replayed.records, OUT / 'errors.png', {s.name: s.errors for s in opencv})
     shift = draw_before_and_after(BAG, read_parameters(PARAMETERS), OUT / 'global_shutter.png')
     return [*score_table(scores), '', *remarks(replayed, opencv),
             f'images turned by the gyro to their middle row: pixels move by up to {shift:.1f} px']
