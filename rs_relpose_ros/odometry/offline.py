@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 import math
@@ -17,6 +17,7 @@ from rs_relpose_ros.bags.reader import Bag
 from rs_relpose_ros.bags.topics import SensorTopics
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.health.findings import HealthState
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.messages.sensor_feed import Role, SensorFeed
 from rs_relpose_ros.odometry.measurement import PairMeasurement
@@ -55,27 +56,23 @@ def odometry_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Para
         raise InputError(f'cannot make the folder {folder}: {error.strerror}') from error
     estimator = OdometryEstimator(parameters, keep=True)
     replay = Replay(bag, topics, parameters, on_image=on_image)
-    samples = _samples(bag, topics)
-    live, sentences, given, health = [], [], 0, 'unknown'
-    for pair in replay.pairs():
-        while given < len(samples) and samples[given][0] <= pair.bag_time_ns:
-            _add(estimator, samples[given][1])
-            given += 1
-        estimator.add_pair(PairMeasurement.of_result(pair.result))
-        live += estimator.take()
-        sentences += estimator.sentences()
-        health = pair.result.health.state.value
-    for _, sample in samples[given:]:
-        _add(estimator, sample)
-    live += estimator.take(end=True)
-    sentences += estimator.sentences()
+    health = HealthState.UNKNOWN
+
+    def pairs() -> Iterator[tuple[int, PairMeasurement]]:
+        nonlocal health
+        for pair in replay.pairs():
+            health = pair.result.health.state
+            yield pair.bag_time_ns, PairMeasurement.of_result(pair.result)
+
+    live = follow(estimator, pairs(), _samples(bag, topics))
+    sentences = estimator.sentences()
     smoothed = estimator.smoothed()
     truth = read_truth(bag, topics)
     figures: dict[str, Any] = {
         'keyframes': len(live), 'pairs': {name: estimator.counts[name] for name in (
             'pairs', 'contradicting', 'late', 'told wrong')},
         'lost': estimator.counts['lost'],
-        'starts': [asdict(started) for started in estimator.starts], 'health': health,
+        'starts': [asdict(started) for started in estimator.starts], 'health': health.value,
         'length_m': _length(live)}
     drawn: list[_Drawn] = [(live, 'live', None), (smoothed, 'smoothed', None)]
     for name, trajectory, at in (('live', live, 0), ('smoothed', smoothed, 1)):
@@ -89,6 +86,21 @@ def odometry_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Para
     write_tum(folder / SMOOTHED_FILE, smoothed)
     _draw(drawn, folder / PICTURE)
     return OdometryOutcome(live, smoothed, figures, sentences)
+
+
+def follow(estimator: OdometryEstimator, pairs: Iterable[tuple[int, PairMeasurement]],
+           samples: Sequence[tuple[int, ImuSample]]) -> list[Odometry]:
+    """Keyframes that come of pairs and samples, both with their times of arrival [ns]."""
+    live, given = [], 0
+    for arrives_ns, pair in pairs:
+        while given < len(samples) and samples[given][0] <= arrives_ns:
+            _add(estimator, samples[given][1])
+            given += 1
+        estimator.add_pair(pair)
+        live += estimator.take()
+    for _, sample in samples[given:]:
+        _add(estimator, sample)
+    return live + estimator.take(end=True)
 
 
 def _samples(bag: Bag, topics: SensorTopics) -> list[tuple[int, ImuSample]]:
