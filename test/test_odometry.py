@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 import math
 
 import numpy as np
@@ -20,13 +21,14 @@ from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.odometry import library
 from rs_relpose_ros.odometry.measurement import PairMeasurement
 from rs_relpose_ros.odometry.odometry import OdometryEstimator, State
+from rs_relpose_ros.odometry.offline import draw_paths, Drawn
 from rs_relpose_ros.odometry.pair_geometry import (
     BodyState,
     deviations,
     Mounting,
     square_root,
 )
-from rs_relpose_ros.odometry.trajectory import trajectory_errors, write_tum
+from rs_relpose_ros.odometry.trajectory import against_truth, write_tum
 from rs_relpose_ros.replay.truth import TrueTrajectory
 
 START_NS = 1_700_000_000_000_000_000
@@ -46,7 +48,13 @@ PARAMETERS = Parameters.from_mapping({
 class Walk:
     pairs: list[PairMeasurement]
     samples: list[ImuSample]
-    truth: TrueTrajectory
+    stamps: np.ndarray   # [ns] of the truth, with positions and quaternions
+    positions: np.ndarray
+    quats: np.ndarray
+
+    @cached_property
+    def truth(self) -> TrueTrajectory:
+        return TrueTrajectory(self.stamps, self.positions, self.quats)
 
 
 def walk(plan: str, seconds: float, seed: int = 1, imu_rate: float = 200.0) -> Walk:
@@ -85,8 +93,8 @@ def walk(plan: str, seconds: float, seed: int = 1, imu_rate: float = 200.0) -> W
         pairs.append(PairMeasurement(
             stamp2, stamp1, stamp2, 'camera', status, images,
             baseline * math.exp(0.2 * rng.standard_normal()), 0.2, np.array(GYRO_BIAS), False))
-    return Walk(pairs, samples, TrueTrajectory(
-        stamps, states.position, Rotation.from_matrix(states.R_world_cam).as_quat()))
+    return Walk(pairs, samples, stamps, states.position,
+                Rotation.from_matrix(states.R_world_cam).as_quat())
 
 
 @pytest.fixture(scope='module')
@@ -167,8 +175,8 @@ def test_square_root_leaves_out_what_is_not_observed():
 def test_path_is_metric(walked):
     estimator, out = run(walked)
     assert len(out) > 0.9 * len(walked.pairs)
-    live, _, _ = trajectory_errors(out, walked.truth)
-    smoothed, _, _ = trajectory_errors(estimator.smoothed(), walked.truth)
+    live = against_truth(out, walked.truth).errors
+    smoothed = against_truth(estimator.smoothed(), walked.truth).errors
     assert live.length_m > 10.0
     assert live.ate_m < 0.05
     assert smoothed.ate_m < 0.035
@@ -185,7 +193,7 @@ def test_covariance_holds():
     for seed in range(3):
         given = walk('walk:6', 6.0, seed=seed)
         _, out = run(given)
-        _, moved, true = trajectory_errors(out, given.truth)
+        _, _, moved, true = against_truth(out, given.truth)
         for keyframe, error in zip(out[5:], (moved - true)[5:], strict=True):
             # The alignment takes a part of the error away.
             nees.append(error @ error / np.trace(keyframe.pose_covariance[:3, :3]))
@@ -201,7 +209,7 @@ def test_start_at_rest_is_at_once_and_says_so():
     standing = [keyframe for keyframe in out if keyframe.imu_ns < START_NS + 1.8 * SECOND]
     assert len(standing) > 5
     assert np.linalg.norm(positions(standing) - standing[0].position, axis=1).max() < 0.01
-    assert trajectory_errors(out, given.truth)[0].ate_m < 0.05
+    assert against_truth(out, given.truth).errors.ate_m < 0.05
 
 
 def test_nothing_is_told_before_the_scale_is_known():
@@ -261,7 +269,7 @@ def test_contradicting_pair_is_left_out(walked):
              for k, pair in enumerate(walked.pairs)]
     estimator, out = run(walked, pairs=pairs)
     assert estimator.counts['contradicting'] == 1
-    assert trajectory_errors(out, walked.truth)[0].ate_m < 0.05
+    assert against_truth(out, walked.truth).errors.ate_m < 0.05
 
 
 def test_camera_that_stops_for_a_second_is_bridged(walked):
@@ -271,7 +279,7 @@ def test_camera_that_stops_for_a_second_is_bridged(walked):
     estimator, out = run(walked, pairs=pairs)
     assert estimator.counts['lost'] == 0
     assert len(estimator.starts) == 1
-    assert trajectory_errors(out, walked.truth)[0].ate_m < 0.1
+    assert against_truth(out, walked.truth).errors.ate_m < 0.1
 
 
 def test_camera_that_stops_for_longer_is_lost_and_the_path_goes_on(walked):
@@ -287,7 +295,7 @@ def test_camera_that_stops_for_longer_is_lost_and_the_path_goes_on(walked):
     assert np.trace(after[0].pose_covariance[:3, :3]) > np.trace(
         before[-1].pose_covariance[:3, :3])
     for part in (before, after):
-        assert trajectory_errors(part, walked.truth)[0].ate_m < 0.05
+        assert against_truth(part, walked.truth).errors.ate_m < 0.05
     # It goes on where the IMU led it meanwhile, as well as its covariance says.
     _, t = walked.truth.relative_pose(before[-1].imu_ns, after[0].imu_ns)
     error = before[-1].R.T @ (after[0].position - before[-1].position) - t
@@ -385,6 +393,30 @@ def test_without_gtsam_one_line_says_how_to_get_it(monkeypatch):
 
 
 # --- files
+
+
+def test_the_picture_has_one_time_and_all_of_the_truth(walked, tmp_path):
+    """A live path starts later than the smoothed one, and the truth may end before both."""
+    estimator, out = run(walked)
+    smoothed = estimator.smoothed()
+    ends_ns = START_NS + 9 * SECOND
+    known = [at for at in walked.stamps.tolist() if at < ends_ns]
+    truth = TrueTrajectory(known, walked.positions[:len(known)], walked.quats[:len(known)])
+    compared = {name: against_truth(path, truth)
+                for name, path in (('live', out), ('smoothed', smoothed))}
+    figure = draw_paths({name: Drawn(*found[1:]) for name, found in compared.items()},
+                        tmp_path / 'path.png')
+    lines = {line.get_label(): line for line in figure.axes[1].get_lines()}
+    assert list(lines) == ['truth', 'live', 'smoothed']
+    first_ns = smoothed[0].imu_ns
+    assert out[0].imu_ns > first_ns + SECOND // 5
+    for name, path in (('live', out), ('smoothed', smoothed), ('truth', smoothed)):
+        at = [keyframe.imu_ns for keyframe in path if keyframe.imu_ns < ends_ns]
+        np.testing.assert_allclose(lines[name].get_xdata(), [(ns - first_ns) / SECOND
+                                                             for ns in at], atol=1e-9)
+        # Wherever they are drawn, they are near the truth of that time.
+        true = np.array([walked.truth.position(ns)[2] for ns in at])
+        np.testing.assert_allclose(lines[name].get_ydata(), true, atol=0.05)
 
 
 def test_tum_files_are_exact_to_the_nanosecond(walked, tmp_path):

@@ -26,7 +26,7 @@ from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.odometry.measurement import PairMeasurement
 from rs_relpose_ros.odometry.odometry import Odometry, OdometryEstimator
 from rs_relpose_ros.odometry.offline import follow
-from rs_relpose_ros.odometry.trajectory import aligned, trajectory_errors, TrajectoryErrors
+from rs_relpose_ros.odometry.trajectory import against_truth, aligned, TrajectoryErrors
 from rs_relpose_ros.odometry.warm_up import warm_up_odometry
 from rs_relpose_ros.replay.truth import TrueTrajectory
 
@@ -101,14 +101,14 @@ def on_recording(recording: Recording, truth: TrueTrajectory) -> PathFigures:
     live = follow(estimator, pairs, samples)
     processor = time.thread_time() - started
     smoothed = estimator.smoothed()
-    errors = [trajectory_errors(path, truth) for path in (live, smoothed)]
-    if errors[0] is None or errors[1] is None:
+    compared = [against_truth(path, truth) for path in (live, smoothed)]
+    if compared[0] is None or compared[1] is None:
         raise ValueError(f'{recording.source.name}: odometry did not start')
     first = estimator.starts[0]
     return PathFigures(
         recording.source.name, 1e3 * recording.camera.readout_time, recording.seconds,
         len(pairs), estimator.counts['contradicting'], estimator.counts['lost'], first.at_rest,
-        first.seconds, errors[0][0], errors[1][0], step_nees(estimator, truth),
+        first.seconds, compared[0].errors, compared[1].errors, step_nees(estimator, truth),
         live_nees(live, smoothed[0], truth), drift(live, truth),
         100.0 * processor / recording.seconds)
 
