@@ -1,4 +1,4 @@
-"""Metric odometry on simulated walks and on EuRoC's corners, against the truth.
+"""`rs_relpose benchmark odometry`: simulated walks and EuRoC's corners, against the truth.
 
 Tracks without images go through the whole front end; its pairs and the samples through the graph.
 """
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_lab.experiments.odometry_euroc import read_euroc
 from rs_relpose_lab.experiments.tables import markdown_table, write_csv
 from rs_relpose_lab.experiments.trust_runs import Recording, run, simulated, Source, TRACKS
 from rs_relpose_lab.experiments.trust_tracks import TrackNoise
@@ -22,10 +23,11 @@ from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.scene import SCENES
 from rs_relpose_ros.bags.layout import IMU_DELAY
 from rs_relpose_ros.config.parameters import Parameters
+from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.odometry.measurement import PairMeasurement
 from rs_relpose_ros.odometry.odometry import Odometry, OdometryEstimator
-from rs_relpose_ros.odometry.offline import follow
+from rs_relpose_ros.odometry.offline import draw_paths, Drawn, follow
 from rs_relpose_ros.odometry.trajectory import against_truth, aligned, TrajectoryErrors
 from rs_relpose_ros.odometry.warm_up import warm_up_odometry
 from rs_relpose_ros.replay.truth import TrueTrajectory
@@ -44,9 +46,9 @@ class PathFigures:
 
     `start`: seconds from the first pair to the first keyframe that is told. `step_nees`: mean of
     the smoothed steps between keyframes, `live_nees`: median of the live positions against the
-    start, both in units of their covariances, by degrees of freedom. `drift`: error of the end
-    after the first 5 s are aligned, by the length of the path [%]. `processor`: of one core, by
-    the graph alone [%].
+    start, both in units of their covariances, by degrees of freedom; NaN where the truth has
+    errors of its own. `drift`: error of the end after the first 5 s are aligned, by the length of
+    the path [%]. `processor`: of one core, by the graph alone, without messages [%].
     """
 
     name: str
@@ -65,9 +67,12 @@ class PathFigures:
     processor: float
 
 
-def walks(count: int, first_seed: int, seconds: float, *, readout: float | None = None,
+def walks(count: int, first_seed: int, seconds: float = SHORT, *, readout: float | None = None,
           plan: str = '') -> list[SimulationConfig]:
-    """Recordings of hand-held walks; scenes take turns, read-outs are spread from 12 to 35 ms."""
+    """Recordings of hand-held walks; scenes take turns, read-outs are spread from 12 to 35 ms.
+
+    Without a `plan`, they stand and turn in place now and then.
+    """
     return [SimulationConfig(
         seed=first_seed + k, scene=SCENES[k % len(SCENES)], duration=seconds, plan=plan,
         readout_time=round(0.012 + 0.023 * k / max(count - 1, 1), 4) if readout is None
@@ -86,8 +91,15 @@ def on_walk(config: SimulationConfig) -> PathFigures:
     return on_recording(recording, truth)
 
 
-def on_recording(recording: Recording, truth: TrueTrajectory) -> PathFigures:
-    """Odometry of a recording's pairs and samples; the truth's world has z upwards."""
+def on_euroc(folder: Path, picture: Path) -> PathFigures:
+    """Odometry of EuRoC's corners, and a picture of the path."""
+    recording, truth = read_euroc(folder)
+    return on_recording(recording, truth, exact=False, picture=picture)
+
+
+def on_recording(recording: Recording, truth: TrueTrajectory, *, exact: bool = True,
+                 picture: Path | None = None) -> PathFigures:
+    """Odometry of a recording's pairs and samples; `exact`: whether the truth is."""
     parameters = Parameters.from_mapping(recording.told.values)
     arrives = {arrival.stamp_ns: arrival.arrives_ns for arrival in recording.arrivals}
     # All of them before the first: the time of the front end is none of odometry's.
@@ -101,15 +113,20 @@ def on_recording(recording: Recording, truth: TrueTrajectory) -> PathFigures:
     live = follow(estimator, pairs, samples)
     processor = time.thread_time() - started
     smoothed = estimator.smoothed()
-    compared = [against_truth(path, truth) for path in (live, smoothed)]
-    if compared[0] is None or compared[1] is None:
-        raise ValueError(f'{recording.source.name}: odometry did not start')
+    compared = [found for path in (live, smoothed)
+                if (found := against_truth(path, truth)) is not None]
+    if len(compared) < 2:
+        raise InputError(f'{recording.source.name}: odometry did not start')
+    if picture is not None:
+        draw_paths({name: Drawn(*found[1:]) for name, found in zip(
+            ('live', 'smoothed'), compared, strict=True)}, picture)
     first = estimator.starts[0]
     return PathFigures(
         recording.source.name, 1e3 * recording.camera.readout_time, recording.seconds,
         len(pairs), estimator.counts['contradicting'], estimator.counts['lost'], first.at_rest,
-        first.seconds, compared[0].errors, compared[1].errors, step_nees(estimator, truth),
-        live_nees(live, smoothed[0], truth), drift(live, truth),
+        first.seconds, compared[0].errors, compared[1].errors,
+        step_nees(estimator, truth) if exact else math.nan,
+        live_nees(live, smoothed[0], truth) if exact else math.nan, drift(live, truth),
         100.0 * processor / recording.seconds)
 
 
@@ -125,16 +142,14 @@ def step_nees(estimator: OdometryEstimator, truth: TrueTrajectory) -> float:
 
 
 def live_nees(live: Sequence[Odometry], first: Odometry, truth: TrueTrajectory) -> float:
-    """The same of live positions against the start, which has chosen place and heading; median."""
+    """The same of live positions against the `first` one, smoothed, which is that of the truth."""
     if not truth.covers(first.imu_ns):
         return math.nan
     turn = first.R @ truth.rotation(first.imu_ns).T
-    heading = Rotation.from_euler('z', math.atan2(
-        turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])).as_matrix()
     found = []
     for pose in live:
         if truth.covers(pose.imu_ns):
-            error = pose.position - first.position - heading @ (
+            error = pose.position - first.position - turn @ (
                 truth.position(pose.imu_ns) - truth.position(first.imu_ns))
             found.append(error @ np.linalg.solve(pose.pose_covariance[:3, :3], error) / 3.0)
     return float(np.median(found))
@@ -161,12 +176,16 @@ def write_report(folder: Path, paths: Sequence[PathFigures]) -> str:
          'drift [%]', 'core [%]', 'left out'),
         [(f'{p.name}, {p.seconds:.0f} s', f'{p.readout_ms:.1f}', f'{p.live.length_m:.1f}',
           f'{p.start:.1f}' + (' at rest' if p.at_rest else ''), *_errors(p.live),
-          *_errors(p.smoothed), f'{p.step_nees:.2f}', f'{p.live_nees:.2f}', f'{p.drift:.3f}',
+          *_errors(p.smoothed), _known(p.step_nees), _known(p.live_nees), f'{p.drift:.3f}',
           f'{p.processor:.1f}',
           f'{p.contradicting} of {p.pairs}' + (f', lost {p.lost} times' if p.lost else ''))
          for p in paths])
     (folder / 'odometry.md').write_text(text, encoding='utf-8')
     return text
+
+
+def _known(value: float) -> str:
+    return '-' if math.isnan(value) else f'{value:.2f}'
 
 
 def _errors(errors: TrajectoryErrors) -> tuple[str, str, str]:

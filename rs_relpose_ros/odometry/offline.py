@@ -54,7 +54,7 @@ class Drawn(NamedTuple):
     truth: Array | None = None
 
 
-def odometry_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parameters, *,
+def odometry_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parameters,
                   on_image: Callable[[], object] = lambda: None) -> OdometryOutcome:
     """Run a bag, and write trajectories and a picture into `folder`, which is made as needed.
 
