@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import gtsam
 from gtsam.symbol_shorthand import B, V, X
@@ -68,6 +68,13 @@ class KeyframeState:
     accel_bias: Array
     pose_covariance: Array   # (6, 6) of (turn, step), both in the axes of the body
     velocity_covariance: Array   # (3, 3) in the world
+
+
+class Step(NamedTuple):
+    """From one keyframe's camera to the next one's, in the axes of the former."""
+
+    translation: Array   # (3,) [m]
+    covariance: Array   # (3, 3)
 
 
 @dataclass(slots=True, eq=False)
@@ -213,14 +220,36 @@ class KeyframeGraph:
 
     def smoothed(self) -> list[KeyframeState]:
         """All keyframes since the start, each with what came after it; needs `keep`."""
+        values, marginals = self._smoothed()
+        return [_state(values, marginals, k) for k in range(self._count)]
+
+    def smoothed_steps(self) -> list[Step]:
+        """Of the same keyframes, each against the one before: for evaluations."""
+        values, marginals = self._smoothed()
+        C, c = self._mounting
+        steps, arm = [], skew(c)
+        for i in range(self._count - 1):
+            first, second = (values.atPose3(X(k)) for k in (i, i + 1))
+            R1, R2 = first.rotation().matrix(), second.rotation().matrix()
+            way = R1.T @ (second.translation() - first.translation() + R2 @ c) - c
+            back = R1.T @ R2
+            # Of turns and steps of both bodies, each in its axes.
+            by = np.hstack([skew(way) + arm, -np.eye(3), -back @ arm, back])
+            both = marginals.jointMarginalCovariance([X(i), X(i + 1)])
+            covariance = np.block([[both.at(X(a), X(b)) for b in (i, i + 1)]
+                                   for a in (i, i + 1)])
+            steps.append(Step(C @ way, C @ by @ covariance @ by.T @ C.T))
+        return steps
+
+    # -- inside ------------------------------------------------------------------------------
+
+    def _smoothed(self) -> tuple[Any, Any]:
+        """Values and marginals of all that was recorded."""
         assert self._record is not None
         factors = _compact(self._record.factors)
         values = gtsam.LevenbergMarquardtOptimizer(
             factors, self._record.values, self._params).optimize()
-        marginals = gtsam.Marginals(factors, values)
-        return [_state(values, marginals, k) for k in range(self._count)]
-
-    # -- inside ------------------------------------------------------------------------------
+        return values, gtsam.Marginals(factors, values)
 
     def _predicted(self, pim: Any) -> Any:
         state = gtsam.NavState(self._values.atPose3(X(self._count - 1)),

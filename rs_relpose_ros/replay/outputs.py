@@ -29,8 +29,9 @@ from rs_relpose_ros.replay.tables import (
     table_writer,
 )
 from rs_relpose_ros.replay.truth import TrueTrajectory
+from rs_relpose_ros.result_files import SUMMARY_FILE
 
-POSES_FILE, ERRORS_FILE, SUMMARY_FILE = 'relative_poses.csv', 'errors.csv', 'summary.json'
+POSES_FILE, ERRORS_FILE = 'relative_poses.csv', 'errors.csv'
 BAG_FOLDER = 'relpose_bag'
 _PICTURES = ('matches.png', 'errors.png', 'residuals.png', 'rotation.png')
 
