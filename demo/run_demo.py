@@ -34,6 +34,7 @@ from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.replay.outputs import POSES_FILE
+from rs_relpose_ros.replay.pictures import draw_errors
 
 ROOT = Path(__file__).resolve().parent.parent
 BAG = ROOT / 'bags' / 'hand_held'
@@ -57,6 +58,7 @@ def compare(live: LiveRun) -> list[str]:
         shift = draw_before_and_after(BAG, read_parameters(PARAMETERS), OUT / BEFORE_AND_AFTER)
         scores = [replayed.node, score_of_records('the same, replayed', replayed.records),
                   *(future.result() for future in paper), *opencv, turned.result()]
+        draw_errors(replayed.records, OUT / 'errors.png', {s.name: s.errors for s in opencv})
         turning = f'images turned to their middle row: pixels move by up to {shift:.1f} px'
         return [*score_table(scores), '', *remarks(replayed, opencv), turning, path.result()]
 
