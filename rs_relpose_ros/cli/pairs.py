@@ -7,10 +7,8 @@ from collections import Counter
 from pathlib import Path
 
 from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.cli.bag_run import add_run_arguments
 from rs_relpose_ros.cli.options import (
-    add_bag_argument,
-    add_parameter_arguments,
-    add_topic_arguments,
     bag_name,
     need_sensor_parameters,
     progress_bar,
@@ -38,14 +36,9 @@ _NO_POSE = 1
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    add_bag_argument(parser)
+    add_run_arguments(parser, 'pairs')
     parser.add_argument('--list', metavar='FILE', type=Path, required=True,
                         help='the pairs (CSV): stamps of their images [ns]')
-    add_parameter_arguments(parser)
-    parser.add_argument('--out', metavar='DIR', type=Path,
-                        help='directory of the tables (default: BAGNAME_pairs in the current '
-                        'one); those of an earlier run are replaced')
-    add_topic_arguments(parser, 'image', 'camera_info', 'imu', 'accel', 'truth')
 
 
 def run(args: argparse.Namespace) -> int:
