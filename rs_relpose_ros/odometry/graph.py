@@ -40,6 +40,10 @@ _CHOSEN = 1e-4
 _INTEGRATION = 1e-4
 
 
+# Columns of a pair's derivatives: pose and velocity of the first body, of the second one.
+_BLOCKS = (slice(0, 6), slice(6, 9), slice(9, 15), slice(15, 18))
+
+
 class GraphError(RsRelposeError):
     """The graph cannot be solved."""
 
@@ -271,17 +275,13 @@ class KeyframeGraph:
         rates = measured[0] - bias, measured[1] - bias
 
         def error(factor: Any, values: Any, jacobians: Any) -> Array:
-            keys = factor.keys()
-            first, second = (BodyState(
-                np.ascontiguousarray(values.atPose3(keys[k]).rotation().matrix()),
-                values.atPose3(keys[k]).translation(), values.atVector(keys[k + 1]), rate)
-                for k, rate in ((0, rates[0]), (2, rates[1])))
-            e, by = deviations(first, second, mounting, R, t, velocities)
+            x1, v1, x2, v2 = factor.keys()
+            e, by = deviations(_body(values, x1, v1, rates[0]), _body(values, x2, v2, rates[1]),
+                               mounting, R, t, velocities)
             if jacobians is not None:
-                whole = root @ by[:n]
-                for block, columns in enumerate((slice(0, 6), slice(6, 9), slice(9, 15),
-                                                 slice(15, 18))):
-                    jacobians[block] = np.asfortranarray(whole[:, columns])
+                whole = (by[:n].T @ root.T).T   # in Fortran's order, as gtsam wants its blocks
+                for block, columns in enumerate(_BLOCKS):
+                    jacobians[block] = whole[:, columns]
             return np.asarray(root @ e[:n] + offset)
 
         return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(offset)),
@@ -324,6 +324,11 @@ class KeyframeGraph:
             _compact(self._smoother.getFactors()), self._values), newest)
         if self._record is not None:
             self._record.values.insert_or_assign(self._values)
+
+
+def _body(values: Any, pose_key: int, velocity_key: int, rate: Array) -> BodyState:
+    pose = values.atPose3(pose_key).matrix()
+    return BodyState(pose[:3, :3].copy(), pose[:3, 3], values.atVector(velocity_key), rate)
 
 
 def _pair_slots(graph: Any, i: int, j: int) -> list[int]:

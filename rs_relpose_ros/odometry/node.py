@@ -27,6 +27,7 @@ from rs_relpose_ros.node.cause_log import CauseLog
 from rs_relpose_ros.node.inputs import best_effort
 from rs_relpose_ros.node.message_types import message_class
 from rs_relpose_ros.node.params import legal_qos, NodeParameters, unknown_overrides
+from rs_relpose_ros.node.polled import PolledSubscription
 from rs_relpose_ros.node.run import leave, run_node
 from rs_relpose_ros.node.stoppable import StoppableNode
 from rs_relpose_ros.odometry.library import need_gtsam
@@ -39,6 +40,8 @@ NAME = 'odometry_node'
 # Topic of the pairs, below the node's namespace.
 _PAIRS = 'relpose_node/pairs'
 _IMU_DEPTH, _DEPTH = 2000, 50
+# Rate at which the IMU is read where nothing is published between keyframes [Hz].
+_LEAST_RATE = 10.0
 # Keyframes of ~/path, the newest ones; a rate at which it can be drawn [s].
 _PATH_LENGTH, _PATH_PERIOD = 3000, 1.0
 # Reports (one a second) without a message after which a topic counts as silent.
@@ -72,13 +75,16 @@ class OdometryNode(StoppableNode):
         parameters = self._settings.current
         self._config: OdometryConfig = parameters.odometry
         self._estimator = OdometryEstimator(parameters)
-        self._last_ns = 0   # of the newest published instant, on the IMU's clock
+        # Newest sample and newest published instant, on the IMU's clock.
+        self._newest_ns = self._last_ns = 0
         self._path: deque[Any] = deque(maxlen=_PATH_LENGTH)
         self._transforms = _broadcaster(self) if self._config.publish_odometry_tf else None
         with legal_qos():
             self._open_topics()
         self.create_service(Trigger, '~/reset', self._reset)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(1.0 / (self._config.odometry_rate or _LEAST_RATE), self._carry_on,
+                          clock=steady)
         self.create_timer(_PATH_PERIOD, self._publish_path, clock=steady)
         self.create_timer(1.0, self._report, clock=steady)
         self._info(f'ready: {" and ".join(self._silent)}')
@@ -96,11 +102,11 @@ class OdometryNode(StoppableNode):
         self.create_subscription(
             message_class('diagnostic_msgs/msg/DiagnosticArray'), _PAIRS, self._on_pair,
             QoSProfile(depth=_DEPTH), qos_overriding_options=overridable())
-        for role in (Role.IMU, Role.ACCEL):
-            self.create_subscription(
-                message_class(PARTS[role].msgtypes[0]), role.value,
-                partial(self._on_sample, role), best_effort(_IMU_DEPTH),
-                qos_overriding_options=overridable())
+        # Read as often as odometry is published: an IMU would wake the process for each sample.
+        self._sensors = [PolledSubscription(
+            self, message_class(PARTS[role].msgtypes[0]), role.value, best_effort(_IMU_DEPTH),
+            partial(self._on_sample, role), lambda: False, qos_overriding_options=overridable())
+            for role in (Role.IMU, Role.ACCEL)]
         self._pairs, self._imu = map(self.resolve_topic_name, (_PAIRS, Role.IMU.value))
         # Reports since the last message, by topic.
         self._silent = {self._pairs: 0, self._imu: 0}
@@ -123,7 +129,7 @@ class OdometryNode(StoppableNode):
         except RsRelposeError as error:
             self._warn(str(error))
             return
-        self._take()
+        self._read_sensors()
 
     def _on_sample(self, role: Role, message: Any) -> None:
         if role is Role.IMU:
@@ -134,14 +140,20 @@ class OdometryNode(StoppableNode):
         except InputError as error:
             self._warn(str(error))
             return
-        self._take()
-        if role is Role.IMU and self._config.odometry_rate > 0.0 and not (
-                0 <= sample.stamp_ns - self._last_ns < NANOSECONDS / self._config.odometry_rate):
-            carried = self._estimator.carried(sample.stamp_ns)
+        if role is Role.IMU:
+            self._newest_ns = sample.stamp_ns
+
+    def _carry_on(self) -> None:
+        """Publish where the IMU has led the newest keyframe."""
+        self._read_sensors()
+        if self._config.odometry_rate > 0.0 and self._newest_ns != self._last_ns:
+            carried = self._estimator.carried(self._newest_ns)
             if carried is not None:
                 self._publish(carried)
 
-    def _take(self) -> None:
+    def _read_sensors(self) -> None:
+        for subscription in self._sensors:
+            subscription.drain()
         for keyframe in self._estimator.take():
             self._publish(keyframe)
             self._path.append(pose_stamped_message(

@@ -149,6 +149,11 @@ class OdometryEstimator:
         self.counts: Counter[str] = Counter()
         self._sentences: list[str] = []
 
+    @property
+    def waiting(self) -> bool:
+        """Whether a pair waits for samples."""
+        return bool(self._waiting)
+
     def add_imu(self, sample: ImuSample) -> None:
         """Take in a sample; InputError where a gyro hangs."""
         newest = self._samples.newest_ns

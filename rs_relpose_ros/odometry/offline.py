@@ -110,7 +110,10 @@ def follow(estimator: OdometryEstimator, pairs: Iterable[tuple[int, PairMeasurem
         estimator.add_pair(pair)
         live += estimator.take()
     for _, sample in samples[given:]:
+        if not estimator.waiting:
+            break   # that the camera ended before the IMU is no loss
         _add(estimator, sample)
+        live += estimator.take()
     return live + estimator.take(end=True)
 
 
