@@ -16,7 +16,8 @@ pip := $(bin)/python -m pip --quiet --quiet --disable-pip-version-check
 
 # What a run imports is byte-compiled by the set-up, or else the first run would do it, and every run
 # where PYTHONDONTWRITEBYTECODE is set. pip would do it for all 6,000 modules of the environment.
-first_run := rs_relpose_ros.node.node, rs_relpose_ros.global_shutter.node, rs_relpose_ros.cli.replay, rs_relpose_lab.live.player, \
+first_run := rs_relpose_ros.node.node, rs_relpose_ros.global_shutter.node, rs_relpose_ros.cli.replay, \
+    rs_relpose_ros.odometry.offline, rs_relpose_lab.live.player, \
     rs_relpose_lab.live.live_run, rs_relpose_lab.experiments.comparison
 
 # The environment brings its own ROS; one that a sourced setup.bash offers must not mix with it.

@@ -29,38 +29,53 @@ from rs_relpose_lab.experiments.unrolled_poses import (
     five_point_when_turned,
 )
 from rs_relpose_lab.live.live_run import LiveRun, run_live
+from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.replay.outputs import POSES_FILE
+from rs_relpose_ros.replay.pictures import draw_errors
 
 ROOT = Path(__file__).resolve().parent.parent
 BAG = ROOT / 'bags' / 'hand_held'
 PARAMETERS = ROOT / 'bags' / 'hand_held.yaml'
 OUT = ROOT / 'demo_out'
+BEFORE_AND_AFTER, PATH = 'global_shutter.png', 'path.png'
 
 STARTED = time.monotonic()
 
 
 def compare(live: LiveRun) -> list[str]:
     """Replay the bag with all methods, side by side; the lines to print."""
-    say("replaying it offline: the pipeline of the node, the paper's algorithms, OpenCV's 5-point "
-        '...')
+    say("replaying it offline: the node's pipeline, the paper's algorithms, OpenCV's 5-point, a "
+        'metric path ...')
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context('spawn')) as pool:
         paper = [pool.submit(score_of_paper, name) for name in PAPER_ALGORITHMS]
         turned = pool.submit(five_point_when_turned, BAG, read_parameters(PARAMETERS), OUT)
+        path = pool.submit(metric_path)
         replayed = compare_live(live.table, live.stamps, BAG, PARAMETERS, OUT, pictures=True)
         opencv = replayed.opencv_scores()
+        shift = draw_before_and_after(BAG, read_parameters(PARAMETERS), OUT / BEFORE_AND_AFTER)
         scores = [replayed.node, score_of_records('the same, replayed', replayed.records),
                   *(future.result() for future in paper), *opencv, turned.result()]
-    shift = draw_before_and_after(BAG, read_parameters(PARAMETERS), OUT / 'global_shutter.png')
-    return [*score_table(scores), '', *remarks(replayed, opencv),
-            f'images turned by the gyro to their middle row: pixels move by up to {shift:.1f} px']
+        draw_errors(replayed.records, OUT / 'errors.png', {s.name: s.errors for s in opencv})
+        turning = f'images turned to their middle row: pixels move by up to {shift:.1f} px'
+        return [*score_table(scores), '', *remarks(replayed, opencv), turning, path.result()]
 
 
 def score_of_paper(name: str) -> Score:
     """One of `PAPER_ALGORITHMS` over the whole bag."""
     return score_of_replay(name, BAG, read_parameters(PARAMETERS).updated(PAPER_ALGORITHMS[name]))
+
+
+def metric_path() -> str:
+    """Odometry of the bag; the line to print."""
+    from rs_relpose_ros.odometry.offline import odometry_into
+    with open_bag(BAG) as bag:
+        found = odometry_into(OUT, bag, bag.find_topics(), read_parameters(PARAMETERS))
+    errors = found.figures['live']
+    return (f'metric path from pairs and IMU: {100.0 * errors["ate_m"]:.1f} cm off (rms) over '
+            f'{errors["length_m"]:.1f} m, scale {100.0 * errors["scale_error"]:+.2f} %')
 
 
 def remarks(replayed: LiveComparison, opencv: list[Score]) -> list[str]:
@@ -99,7 +114,7 @@ def main() -> int:
     print()
     print('pictures and tables:')
     for name in ('matches.png', 'errors.png', 'residuals.png', 'rotation.png',
-                 'global_shutter.png', POSES_FILE, 'live.csv'):
+                 BEFORE_AND_AFTER, PATH, 'trajectory.tum', POSES_FILE, 'live.csv'):
         print(f'  {(OUT / name).relative_to(ROOT)}')
     return 0
 

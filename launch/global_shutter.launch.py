@@ -18,5 +18,4 @@ def generate_launch_description() -> LaunchDescription:
     """The launch file of relpose_node, with the other node."""
     return LaunchDescription([IncludeLaunchDescription(
         PathJoinSubstitution([FindPackageShare('rs_relpose_ros'), 'launch', 'relpose.launch.py']),
-        launch_arguments={'executable': 'global_shutter_node',
-                          'name': 'global_shutter_node'}.items())])
+        launch_arguments={'executable': 'global_shutter_node'}.items())])

@@ -1,4 +1,4 @@
-"""Start relpose_node, or another node of the package, beside a camera driver.
+"""Start relpose_node, or other nodes of the package, beside a camera driver.
 
 ::
 
@@ -20,8 +20,10 @@ from launch_ros.substitutions import FindPackageShare
 PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 ARGUMENTS = {
     'namespace': ('', 'namespace of the node'),
-    'executable': ('relpose_node', 'node to start: relpose_node or global_shutter_node'),
-    'name': (LaunchConfiguration('executable'), 'name of the node'),
+    'executable': (
+        'relpose_node',
+        'nodes to start, with commas between: relpose_node, global_shutter_node, odometry_node'),
+    'name': ('', 'name of a node that is started alone; empty: that of its executable'),
     'camera_namespace': ('/camera', 'namespace of the camera driver'),
     'image': ('image_raw', 'raw image topic, within camera_namespace unless absolute'),
     'camera_info': ('camera_info', 'CameraInfo topic, likewise'),
@@ -39,16 +41,17 @@ ARGUMENTS = {
 }
 
 
-def start_node(context: LaunchContext) -> list[Action]:
-    """The node, with the arguments that were given in place of the file's parameters."""
+def start_nodes(context: LaunchContext) -> list[Action]:
+    """The nodes, with the arguments that were given in place of the file's parameters."""
     argument = {name: LaunchConfiguration(name) for name in ARGUMENTS}
     camera = argument['camera_namespace']
     overrides = {name: argument[name] for name in ('image_transport', 'use_sim_time')
                  if argument[name].perform(context)}
     profile = argument['fastdds_profile']
     environment = [SetEnvironmentVariable(PROFILE, profile)] if profile.perform(context) else []
-    return [*environment, Node(
-        package='rs_relpose_ros', executable=argument['executable'], name=argument['name'],
+    name = argument['name'].perform(context)
+    return [*environment, *(Node(
+        package='rs_relpose_ros', executable=executable, name=name or executable,
         namespace=argument['namespace'], output='screen',
         parameters=[argument['params_file'], overrides],
         remappings=[
@@ -56,13 +59,14 @@ def start_node(context: LaunchContext) -> list[Action]:
             ('image', PathJoinSubstitution([camera, argument['image']])),
             ('camera_info', PathJoinSubstitution([camera, argument['camera_info']])),
             ('imu', argument['imu']),
-            ('accel', argument['accel'])])]
+            ('accel', argument['accel'])])
+        for executable in argument['executable'].perform(context).split(','))]
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Arguments and the node."""
+    """Arguments and nodes."""
     return LaunchDescription([
         *(DeclareLaunchArgument(name, default_value=default, description=description)
           for name, (default, description) in ARGUMENTS.items()),
-        OpaqueFunction(function=start_node),
+        OpaqueFunction(function=start_nodes),
     ])

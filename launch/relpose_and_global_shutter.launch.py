@@ -10,19 +10,13 @@ Its arguments are those of relpose.launch.py. Each node decodes compressed image
 """
 
 from launch import LaunchDescription
-from launch.actions import GroupAction, IncludeLaunchDescription
+from launch.actions import IncludeLaunchDescription
 from launch.substitutions import PathJoinSubstitution
 from launch_ros.substitutions import FindPackageShare
 
-NODES = ('relpose_node', 'global_shutter_node')
-
 
 def generate_launch_description() -> LaunchDescription:
-    """The launch file of relpose_node, once for each node."""
-    launch_file = PathJoinSubstitution(
-        [FindPackageShare('rs_relpose_ros'), 'launch', 'relpose.launch.py'])
-    return LaunchDescription([
-        # A group keeps the arguments of one from the other.
-        GroupAction([IncludeLaunchDescription(
-            launch_file, launch_arguments={'executable': node, 'name': node}.items())])
-        for node in NODES])
+    """The launch file of relpose_node, with both nodes."""
+    return LaunchDescription([IncludeLaunchDescription(
+        PathJoinSubstitution([FindPackageShare('rs_relpose_ros'), 'launch', 'relpose.launch.py']),
+        launch_arguments={'executable': 'relpose_node,global_shutter_node'}.items())])

@@ -92,13 +92,30 @@ def test_its_covariance_describes_its_errors():
     assert np.mean(nees) == pytest.approx(5.0, abs=1.8)
 
 
+def seen_from(points, rate, velocity):
+    """Of each pixel where the camera is at its row, and its ray, in the axes of the first row."""
+    times = points[:, 1] * problems.LINE_DELAY
+    rays = np.column_stack([(points[:, 0] - problems.CENTRE_U) / problems.FOCAL,
+                            (points[:, 1] - problems.CENTRE_V) / problems.FOCAL,
+                            np.ones(len(points))])
+    return times[:, None] * velocity, Rotation.from_rotvec(times[:, None] * rate).apply(rays)
+
+
 def test_depths_are_those_of_the_points():
     problem = make_problem(replace(CELLS['sideways-v10-w3'], **NO_NOISE), 2)
     objective = Objective(problem, *SIGMAS, start_at(problem.R, problem.t, problem.gravity1),
                           np.ones(len(problem.points1)))
     depths = objective.depths(objective.truth())
-    # The second camera stands R^T (X - b) from each point X, rows of another instant included.
-    assert depths.min() > 1.0
+    # Both rays of a match meet: tau_1 v_1 + a f_1 = t + tau_2 R v_2 + c R f_2, for (a, c).
+    origins, rays = zip(*(seen_from(points, w, v) for points, w, v in (
+        (problem.points1, problem.w1, problem.v1), (problem.points2, problem.w2, problem.v2))),
+        strict=True)
+    expected = np.array([
+        np.linalg.lstsq(np.column_stack([f1, -problem.R @ f2]),
+                        problem.t + problem.R @ o2 - o1, rcond=None)[0]
+        for o1, o2, f1, f2 in zip(*origins, *rays, strict=True)])
+    np.testing.assert_allclose(depths, expected, rtol=1e-6)
+    assert depths.min() > 0.0
     flipped = replace(problem, t=-problem.t, v1=-problem.v1, v2=-problem.v2)
     behind = replace(objective, problem=flipped,
                      start=start_at(problem.R, -problem.t, problem.gravity1))

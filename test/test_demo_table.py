@@ -25,6 +25,7 @@ from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
+from rs_relpose_ros.replay import pictures
 from rs_relpose_ros.replay.run import ReplayedPair
 from rs_relpose_ros.replay.tables import (
     pair_record,
@@ -119,6 +120,24 @@ def test_best_threshold_is_the_best(truth):
     threshold = min(medians, key=medians.__getitem__)
     assert best.name.endswith(f'{threshold:g} px')
     assert best.rotation[0] == pytest.approx(medians[threshold], abs=1e-6)
+
+
+def test_errors_are_drawn_beside_those_of_the_baselines(truth, tmp_path, monkeypatch):
+    figures = []
+    monkeypatch.setattr(pictures, 'save_picture', lambda figure, path: figures.append(figure))
+    pairs = [pair_of(0.5, 90, seed) for seed in range(3)]
+    opencv = best_opencv_score('RANSAC', pairs, CALIBRATION, truth)
+    assert len(opencv.errors) == len(pairs)
+    pictures.draw_errors([pair_record(pair.result, truth) for pair in pairs],
+                         tmp_path / 'errors.png', {opencv.name: opencv.errors})
+    [figure] = figures
+    figure.canvas.draw()
+    for axis, median in zip(figure.axes, (opencv.rotation[0], opencv.translation[0]),
+                            strict=True):
+        legend = [text.get_text() for text in axis.get_legend().get_texts()]
+        assert f'{opencv.name}:\nmedian {median:.2g} deg' in legend
+        ticks = [tick.get_text() for tick in axis.get_yticklabels()]
+        assert any(ticks) and all(float(tick) > 0.0 for tick in ticks if tick)
 
 
 def test_scores_of_a_table_and_of_its_records_agree(truth, tmp_path):

@@ -17,11 +17,13 @@ from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.result import Status
-from rs_relpose_ros.front_end.frame import Frame
+from rs_relpose_ros.front_end.frame import EncodedFrame, Frame
 from rs_relpose_ros.front_end.front_end import FrameFailed, FrameProcessed, FrontEnd, Outcome
 from rs_relpose_ros.front_end.pair import closes_pair, PairResult, SinceKeyframe
 from rs_relpose_ros.front_end.sequencer import FrameRefused
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
+from rs_relpose_ros.images.encoded import RawImage
+from rs_relpose_ros.images.gray_levels import GrayLevels
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.messages.intake import Intake
 from rs_relpose_ros.node.outputs import PairPublishers
@@ -54,6 +56,27 @@ def front_end_with(error: Exception, monkeypatch: pytest.MonkeyPatch, *,
         image = rng.integers(0, 256, (48, 64), dtype=np.uint8)
         front_end.sequencer.add_frame(Frame(ms * MS, image, 'camera', INTRINSICS))
     return front_end
+
+
+@pytest.mark.parametrize(('encoding', 'brightest', 'dark'), [
+    ('mono8', 12, True), ('mono16', 25, True), ('mono8', 0, True), ('mono8', 255, False)])
+def test_the_dark_is_called_dark(encoding, brightest, dark):
+    """Noise up to `brightest`: too few tracks; a black image is dark, and a bright one is not."""
+    front_end = FrontEnd(Parameters.from_mapping({**SENSOR, 'max_keyframe_frames': 1}),
+                         offline=True)
+    for ms in range(0, 300, 5):
+        front_end.sequencer.add_imu(ImuSample(ms * MS, (0.0, 0.1, 0.0), (0.0, -9.81, 0.0)))
+    rng, levels = np.random.default_rng(0), GrayLevels()
+    kind = np.dtype('u1' if encoding == 'mono8' else '<u2')
+    for ms in (50, 100):
+        noise = rng.integers(0, brightest + 1, (48, 64)).astype(kind)
+        image = RawImage(noise.view(np.uint8).ravel(), encoding, 64, 48, 64 * kind.itemsize, False)
+        front_end.sequencer.add_frame(EncodedFrame(ms * MS, image, 'camera', INTRINSICS, levels))
+    front_end.sequencer.close()
+    [pair] = [outcome.result for outcome in iter(front_end.step, None) if outcome.result]
+    assert pair.pose.status is Status.TOO_FEW_MATCHES
+    assert pair.pose.reason.startswith('the image is dark: ') is dark
+    assert 'usable matches' in pair.pose.reason
 
 
 @pytest.mark.parametrize('offline', [False, True])

@@ -492,22 +492,24 @@ def test_matches_are_the_inliers(types):
     cloud = outgoing.pair_messages(result, types).matches
     assert cloud.header.frame_id == 'camera_reference'
     assert cloud.is_dense
-    names = ['id', 'u1', 'v1', 'u2', 'v2', 'tau1', 'tau2', 'x1', 'y1', 'z1', 'x2', 'y2', 'z2',
-             'x', 'y', 'z', 'u1_gs', 'v1_gs', 'u2_gs', 'v2_gs']
+    names = ['u1', 'v1', 'u2', 'v2', 'tau1', 'tau2', 'x1', 'y1', 'z1', 'x2', 'y2', 'z2',
+             'x', 'y', 'z', 'u1_gs', 'v1_gs', 'u2_gs', 'v2_gs', 'id']
     assert [field.name for field in cloud.fields] == names
-    assert [field.datatype for field in cloud.fields] == [6] + [7] * 19
+    # Floats first: read_points_numpy of sensor_msgs_py asks that all fields that it reads have the
+    # type of the first, be that read or not.
+    assert [field.datatype for field in cloud.fields] == [7] * 19 + [6]
     count = int(result.pose.inliers.sum())
     assert 0 < count < len(result.pose.inliers)
     assert (cloud.height, cloud.width) == (1, count)
     assert len(cloud.data) == cloud.row_step == count * cloud.point_step
     raw = bytes(cloud.data)
     for row, index in enumerate(np.flatnonzero(result.pose.inliers)):
-        record = struct.unpack_from('<I19f', raw, row * cloud.point_step)
-        expected = [result.matches.track_ids[index], *result.matches.points1[index],
+        record = struct.unpack_from('<19fI', raw, row * cloud.point_step)
+        expected = [*result.matches.points1[index],
                     *result.matches.points2[index], result.row_times1[index],
                     result.row_times2[index], *result.rays1[index], *result.rays2[index],
                     *result.landmarks.points[index], *result.landmarks.pixels1[index],
-                    *result.landmarks.pixels2[index]]
+                    *result.landmarks.pixels2[index], result.matches.track_ids[index]]
         np.testing.assert_allclose(record, expected, rtol=1e-6)
 
 

@@ -231,8 +231,8 @@ def changed_records(name: str, change: Callable[[np.ndarray], object]) -> Callab
 
 
 @pytest.mark.parametrize(('path', 'value', 'sentence'), [
-    ('fields.3.name', 'intensity', 'must have the fields id u1 .* got id u1 v1 intensity'),
-    ('fields.1.name', 'v1', 'got id v1 v1'),
+    ('fields.3.name', 'intensity', 'must have the fields u1 v1 .* got u1 v1 u2 intensity'),
+    ('fields.0.name', 'v1', 'got v1 v1'),
     ('fields.1.datatype', 8, 'must have the fields'),
     ('fields.1.count', 2**32 - 1, 'must have the fields'),
     ('fields.1.offset', 2**32 - 1, 'must have the fields'),

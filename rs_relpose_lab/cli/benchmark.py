@@ -249,9 +249,14 @@ def _consistency_arguments(parser: argparse.ArgumentParser) -> None:
                         metavar=('BAG', 'PARAMETERS', 'PAIRS'),
                         help='a recording, its parameter file and a table of true pairs '
                         '(pseudo_truth.csv); may be given several times')
+    parser.add_argument('--chain', nargs=2, type=Path, action='append', default=[],
+                        metavar=('BAG', 'PARAMETERS'),
+                        help='a recording and its parameter file: whether baselines of successive '
+                        'pairs agree with the scale of their tracks; may be given several times')
 
 
 def _run_consistency(args: argparse.Namespace) -> int:
+    from rs_relpose_lab.experiments import baseline_chain
     from rs_relpose_lab.experiments.consistency import (
         configurations,
         on_recording,
@@ -261,20 +266,26 @@ def _run_consistency(args: argparse.Namespace) -> int:
     )
 
     _check_at_least(0, args, 'bags')
-    if not args.bags and not args.recording:
-        raise InputError('--bags 0 needs a --recording: there is nothing to measure')
+    if not args.bags and not args.recording and not args.chain:
+        raise InputError('--bags 0 needs a --recording or a --chain: there is nothing to measure')
     args.output.mkdir(parents=True, exist_ok=True)
     pairs: list[PairConsistency] = []
-    with progress_bar(args.bags + len(args.recording), 'bag') as bar:
+    found: list[baseline_chain.BaselineStep] = []
+    with progress_bar(args.bags + len(args.recording) + len(args.chain), 'bag') as bar:
+        for chain in args.chain:
+            found += baseline_chain.chain_of(*chain)
+            bar.update()
         for recording in args.recording:
             pairs += on_recording(*recording)
             bar.update()
         for config in configurations(args.bags, args.seed):
             pairs += on_simulated_bag(config, args.output / f'seed_{config.seed}')
             bar.update()
-    if not pairs:
-        raise InputError('no pair could be compared with the truth')
-    return _tell(write_report(args.output, pairs), args.output)
+    if not pairs and not found:
+        raise InputError('no pair could be compared with the truth, or with the pair before it')
+    reports = ([write_report(args.output, pairs)] if pairs else []) + (
+        [baseline_chain.write_report(args.output, found)] if found else [])
+    return _tell('\n'.join(reports), args.output)
 
 
 def _run_calibration(args: argparse.Namespace) -> int:
@@ -392,6 +403,50 @@ def _run_global_shutter(args: argparse.Namespace) -> int:
     return _tell(write_report(args.output, maps, bags, speeds, beside), args.output)
 
 
+def _odometry_arguments(parser: argparse.ArgumentParser) -> None:
+    _number(parser, '--walks', 10, 'walks of 30 s with standstills and pure rotations')
+    _number(parser, '--global-shutter', 4, 'the first ones of these, with a read-out of 0')
+    _number(parser, '--in-motion', 4, 'walks of 30 s that never stand')
+    _number(parser, '--long', 1, 'walks of 5 min, as the first ones')
+    parser.add_argument('--euroc', type=Path, metavar='FOLDER',
+                        help='also corners of a real recording, euroc_imu_april_corners')
+
+
+def _run_odometry(args: argparse.Namespace) -> int:
+    from rs_relpose_ros.odometry.library import need_gtsam
+    need_gtsam()
+    from rs_relpose_lab.experiments.odometry_walks import (
+        LONG,
+        on_euroc,
+        on_walk,
+        SHORT,
+        walks,
+        write_report,
+    )
+    from rs_relpose_lab.experiments.workers import in_processes
+
+    _check_at_least(0, args, 'walks', 'global_shutter', 'in_motion', 'long')
+    count, seed = args.walks, args.seed
+    asked = [*walks(count, seed), *walks(args.global_shutter, seed, readout=0.0),
+             *walks(args.in_motion, seed + 100, plan=f'walk:{SHORT:g}'),
+             *walks(args.long, seed + 200, LONG)]
+    if not asked and args.euroc is None:
+        raise InputError('there is nothing to measure: give --walks or --euroc')
+    args.output.mkdir(parents=True, exist_ok=True)
+    paths, report = [], ''
+    with progress_bar(len(asked) + (args.euroc is not None), 'recording') as bar:
+        if args.euroc is not None:
+            paths.append(on_euroc(args.euroc, args.output / 'euroc.png'))
+            report = write_report(args.output, paths)
+            bar.update()
+        for found in in_processes(on_walk, asked, args.jobs):
+            paths.append(found)
+            # A run that is stopped leaves what it has.
+            report = write_report(args.output, paths)
+            bar.update()
+    return _tell(report, args.output)
+
+
 def _stretches_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('bags', nargs='+', type=Path, metavar='BAG',
                         help='recordings of one camera with one IMU')
@@ -461,7 +516,8 @@ BENCHMARKS = {
         'whether covariances hold, on simulated bags and on recordings',
         'Squared errors of rotation and direction of translation in units of their covariance '
         '(NEES by degrees of freedom: 1 where it is right), over the pairs of rendered bags of '
-        'walks, and over the true pairs of recordings, short and long ones.',
+        'walks, and over the true pairs of recordings, short and long ones. With --chain: metric '
+        'baselines of successive pairs of a recording without truth.',
         _consistency_arguments, _run_consistency, 'consistency', first_seed=401, seed_of='bag'),
     'global-shutter': Benchmark(
         "images turned to their middle row: against the truth, and OpenCV's 5-point on them",
@@ -470,6 +526,12 @@ BENCHMARKS = {
         'on recordings, as they were read and turned; processor time of a frame.',
         _global_shutter_arguments, _run_global_shutter, 'global_shutter', first_seed=8101,
         seed_of='recording'),
+    'odometry': Benchmark(
+        'the metric path of `rs_relpose odometry`, against the truth',
+        'Walks (tracks without images, scenes by turns, read-outs of 12 to 35 ms) through the '
+        'whole front end and the graph: errors of the path, live and smoothed, of its scale, and '
+        'whether its covariances hold. Needs gtsam.', _odometry_arguments, _run_odometry,
+        'odometry', first_seed=7101, seed_of='walk', jobs='processes'),
     'calibration': Benchmark(
         '`rs_relpose calibrate` on simulated tracks, against the truth',
         'Errors, sigmas and verdicts of the calibration over many simulated recordings of 300 '

@@ -40,6 +40,7 @@ class Score:
     answered: int
     rotation: tuple[float, float]
     translation: tuple[float, float]
+    errors: tuple[PairErrors | None, ...] = ()   # of each pair; None without a pose
 
 
 def score(name: str, errors: Sequence[PairErrors | None], pairs: int | None = None) -> Score:
@@ -47,7 +48,7 @@ def score(name: str, errors: Sequence[PairErrors | None], pairs: int | None = No
     known = [error for error in errors if error is not None]
     return Score(name, len(errors) if pairs is None else pairs, len(known),
                  median_and_p90([e.rotation_error for e in known]),
-                 median_and_p90([e.translation_error for e in known]))
+                 median_and_p90([e.translation_error for e in known]), tuple(errors))
 
 
 def score_of_records(name: str, records: Sequence[PairRecord]) -> Score:

@@ -6,9 +6,11 @@ from collections.abc import Callable, Mapping
 import json
 from typing import Any
 
+from rs_relpose_ros.result_files import SUMMARY_FILE
+
 Figures = dict[str, Any]
 
-RESULT_FILES = {'check': 'check.json', 'calibrate': 'calibration.json', 'replay': 'summary.json'}
+RESULT_FILES = {'check': 'check.json', 'calibrate': 'calibration.json', 'replay': SUMMARY_FILE}
 _VERDICTS = ('ok', 'unknown', 'warning', 'failure')
 
 

@@ -16,8 +16,7 @@ from rs_relpose_ros.batch.job import Bag, Job, look_at, Outcome, State, unique_n
 from rs_relpose_ros.batch.picture import draw, PICTURE_FILE
 from rs_relpose_ros.batch.store import Row, row_of, Store
 from rs_relpose_ros.errors import MissingInputError
-
-SUMMARY_FILE = 'summary.json'
+from rs_relpose_ros.result_files import SUMMARY_FILE
 
 
 @dataclass(frozen=True, slots=True)

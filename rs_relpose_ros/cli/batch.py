@@ -19,12 +19,13 @@ from rs_relpose_ros.batch.combine import Combined
 from rs_relpose_ros.batch.figures import RESULT_FILES
 from rs_relpose_ros.batch.job import Job, Outcome, State
 from rs_relpose_ros.batch.picture import PICTURE_FILE
-from rs_relpose_ros.batch.run import BatchOutcome, Request, run_batch, SUMMARY_FILE
+from rs_relpose_ros.batch.run import BatchOutcome, Request, run_batch
 from rs_relpose_ros.batch.store import RESULTS_FILE
 from rs_relpose_ros.cli.main import load_command, make_parser
 from rs_relpose_ros.cli.options import add_parameter_arguments, package_version, progress_bar
 from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.errors import InputError, RsRelposeError
+from rs_relpose_ros.result_files import SUMMARY_FILE
 
 HELP = ('Run check, calibrate or replay over many bags: on processes of this machine, one thread '
         'each, or on a running Dask cluster (pip install "dask[distributed]"). Writes results.csv '

@@ -34,6 +34,8 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
                  'run the experiments of the paper: tables and box plots'),
     'odometry': ('rs_relpose_ros.cli.odometry',
                  'a metric path from a bag: relative poses and IMU in one graph'),
+    'pairs': ('rs_relpose_ros.cli.pairs',
+              'relative poses of chosen pairs of images, such as loop closures'),
     'replay': ('rs_relpose_ros.cli.replay',
                'estimate relative poses from a bag: CSV, summary and pictures'),
     'unroll': ('rs_relpose_ros.cli.unroll',

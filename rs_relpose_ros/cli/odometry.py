@@ -3,25 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import logging
-from pathlib import Path
-import sys
 from typing import Any
 
-from rs_relpose_ros.bags.reader import open_bag
-from rs_relpose_ros.cli.options import (
-    add_bag_argument,
-    add_parameter_arguments,
-    add_topic_arguments,
-    bag_name,
-    need_sensor_parameters,
-    package_version,
-    progress_bar,
-    topic_options,
-)
-from rs_relpose_ros.config.parameter_file import read_parameters
+from rs_relpose_ros.cli.bag_run import add_run_arguments, run_on_bag
 from rs_relpose_ros.odometry.library import need_gtsam
-from rs_relpose_ros.replay.summary import write_summary
+from rs_relpose_ros.result_files import SUMMARY_FILE
 
 HELP = (
     'Metric odometry from a bag: the relative poses of its keyframe pairs and its IMU in one '
@@ -30,37 +16,19 @@ HELP = (
     "came later), summary.json and a picture; with errors where the bag has the camera's true "
     'poses. The parameter imu_position should be told. Exit code 1: odometry did not start.')
 
-SUMMARY_FILE = 'summary.json'
 _NOT_STARTED = 1
-
-_logger = logging.getLogger(__name__)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    add_bag_argument(parser)
-    add_parameter_arguments(parser)
-    parser.add_argument('--out', metavar='DIR', type=Path,
-                        help='directory of the results (default: BAGNAME_odometry in the current '
-                        'one); those of an earlier run are replaced')
-    add_topic_arguments(parser, 'image', 'camera_info', 'imu', 'accel', 'truth')
+    add_run_arguments(parser, 'odometry')
 
 
 def run(args: argparse.Namespace) -> int:
     """Odometry of a bag; 1 where it did not start."""
     need_gtsam()
     from rs_relpose_ros.odometry.offline import LIVE_FILE, odometry_into, PICTURE, SMOOTHED_FILE
-    parameters = read_parameters(args.params, args.set)
-    name = bag_name(args.bag)
-    folder = args.out or Path(f'{name}_odometry')
-    with open_bag(args.bag) as bag:
-        topics = bag.find_topics(topic_options(args),
-                                 needs_camera_info=not parameters.intrinsics.given)
-        need_sensor_parameters(parameters, args)
-        with progress_bar(topics.image.count, 'image', name) as bar:
-            outcome = odometry_into(folder, bag, topics, parameters, on_image=bar.update)
-    write_summary(folder / SUMMARY_FILE, outcome.figures, bag=args.bag, topics=topics,
-                  parameters=parameters, command=sys.argv, package_version=package_version())
+    folder, outcome = run_on_bag(args, 'odometry', odometry_into)
     for sentence in outcome.sentences:
         print(sentence)
     figures = outcome.figures

@@ -5,24 +5,12 @@ from __future__ import annotations
 import argparse
 import logging
 from pathlib import Path
-import sys
 from typing import Any
 
-from rs_relpose_ros.bags.reader import open_bag
-from rs_relpose_ros.cli.options import (
-    add_bag_argument,
-    add_parameter_arguments,
-    add_topic_arguments,
-    bag_name,
-    need_sensor_parameters,
-    package_version,
-    progress_bar,
-    topic_options,
-)
-from rs_relpose_ros.config.parameter_file import read_parameters
-from rs_relpose_ros.replay.outputs import replay_into, ReplayOutcome, SUMMARY_FILE
+from rs_relpose_ros.cli.bag_run import add_run_arguments, errors_line, run_on_bag
+from rs_relpose_ros.replay.outputs import replay_into, ReplayOutcome
 from rs_relpose_ros.replay.run import read_stamps
-from rs_relpose_ros.replay.summary import write_summary
+from rs_relpose_ros.result_files import SUMMARY_FILE
 
 HELP = (
     'Estimate relative poses from a bag (rosbag2 with SQLite3 or MCAP, compressed or not, or ROS '
@@ -40,11 +28,7 @@ _logger = logging.getLogger(__name__)
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    add_bag_argument(parser)
-    add_parameter_arguments(parser)
-    parser.add_argument('--out', metavar='DIR', type=Path,
-                        help='directory of the results (default: BAGNAME_relpose in the current '
-                        'one); those of an earlier run are replaced')
+    add_run_arguments(parser, 'relpose')
     parser.add_argument('--stamps', metavar='FILE', type=Path,
                         help='use only the frames whose stamps [ns] are in FILE, one per line, as '
                         'the parameter stamps_file of a live node wrote them: the poses are then '
@@ -52,25 +36,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--no-pictures', action='store_true', help='tables and summary only')
     parser.add_argument('--bag', dest='with_bag', action='store_true',
                         help="write the node's topics as an MCAP bag, too")
-    add_topic_arguments(parser, 'image', 'camera_info', 'imu', 'accel', 'truth')
 
 
 def run(args: argparse.Namespace) -> int:
     """Replay a bag; 1 when no pair got a pose or what was told is wrong."""
-    parameters = read_parameters(args.params, args.set)
     stamps = None if args.stamps is None else read_stamps(args.stamps)
-    name = bag_name(args.bag)
-    folder = args.out or Path(f'{name}_relpose')
-    with open_bag(args.bag) as bag:
-        topics = bag.find_topics(topic_options(args),
-                                 needs_camera_info=not parameters.intrinsics.given)
-        need_sensor_parameters(parameters, args)
-        with progress_bar(topics.image.count, 'image', name) as bar:
-            outcome = replay_into(folder, bag, topics, parameters, stamps=stamps,
-                                  pictures=not args.no_pictures, with_bag=args.with_bag,
-                                  on_image=bar.update)
-    write_summary(folder / SUMMARY_FILE, outcome.figures, bag=args.bag, topics=topics,
-                  parameters=parameters, command=sys.argv, package_version=package_version())
+    folder, outcome = run_on_bag(
+        args, 'relpose', lambda folder, bag, topics, parameters, on_image: replay_into(
+            folder, bag, topics, parameters, stamps=stamps, pictures=not args.no_pictures,
+            with_bag=args.with_bag, on_image=on_image))
     for reason, count in outcome.figures['not_used'].items():
         _logger.warning('not used, %d times: %s', count, reason)
     for line in report(outcome, folder):
@@ -101,10 +75,7 @@ def report(outcome: ReplayOutcome, folder: Path) -> list[str]:
         lines += [f'no pose: {reason}' for reason in reasons[:5]]
     errors, medians = figures['errors_against_truth'], figures['medians']
     if errors:
-        lines.append(
-            f'against the truth (median, 90 %): rotation {errors["rotation_median_deg"]:.3g}, '
-            f'{errors["rotation_p90_deg"]:.3g} deg; direction of translation '
-            f'{errors["translation_median_deg"]:.3g}, {errors["translation_p90_deg"]:.3g} deg')
+        lines.append(errors_line(errors))
     if pairs['answered']:
         lines.append(
             f'medians: {_text(medians["inliers"], "inliers")}, residual '

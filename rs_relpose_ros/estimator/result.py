@@ -134,7 +134,10 @@ class RelativePose:
                        baseline_reason=reason)
 
     def inverse(self) -> RelativePose:
-        """Pose of camera 1 in camera 2, covariance and velocities exchanged accordingly."""
+        """Pose of camera 1 in camera 2, covariance and velocities exchanged accordingly.
+
+        Without `images`: their information is about this pose, in the axes of camera 1.
+        """
         R_inv = self.R.T
         # t' = -R^T t: dt' = -R^T (dt + t x dtheta); theta' = -R^T theta.
         tx = skew(self.t)

@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import MissingInputError
-from rs_relpose_ros.estimator.estimate import estimate_relative_pose
 from rs_relpose_ros.estimator.result import RelativePose
-from rs_relpose_ros.front_end.derotated_rays import DerotatedRays, median_parallax, Sensor
-from rs_relpose_ros.front_end.frame import Frame, pose_row_delay, sensor_camera
-from rs_relpose_ros.front_end.landmarks import landmarks
+from rs_relpose_ros.front_end.derotated_rays import DerotatedRays, Sensor
+from rs_relpose_ros.front_end.frame import Frame, sensor_camera
+from rs_relpose_ros.front_end.frame_pair import (
+    estimate_pair,
+    GyroTurn,
+    inertial_of,
+    interval_of,
+    pair_result,
+    parallax_of,
+    View,
+)
 from rs_relpose_ros.front_end.pair import closes_pair, PairResult, SinceKeyframe
 from rs_relpose_ros.front_end.stamp_scatter import StampScatter
-from rs_relpose_ros.geometry.inertial import InertialMotion
 from rs_relpose_ros.geometry.motion import FrameMotion
-from rs_relpose_ros.geometry.so3 import aligning_rotation, log_so3
-from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, to_nanoseconds
+from rs_relpose_ros.geometry.so3 import log_so3
+from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between
 from rs_relpose_ros.health.deviation import BIAS, DEVIATIONS, OFFSET, READOUT
 from rs_relpose_ros.health.judge import Told
 from rs_relpose_ros.health.monitor import HealthMonitor, withheld
@@ -30,7 +35,6 @@ from rs_relpose_ros.health.turning import rotation_of_rays
 from rs_relpose_ros.imu.forces import ForceSegment
 from rs_relpose_ros.imu.frame_imu import FrameImu, GyroSegment
 from rs_relpose_ros.imu.integration import integrate_rotation, turn_sensitivity
-from rs_relpose_ros.imu.preintegration import inertial_motion
 from rs_relpose_ros.tracking.matches import Matches
 from rs_relpose_ros.tracking.tracker import make_tracker, Tracker
 
@@ -38,25 +42,6 @@ Array = NDArray[np.float64]
 
 # Points of which the turning of the images is taken, of the longest tracks, and frames between.
 _TURN_POINTS, _TURN_FRAMES = 120, 3
-# Largest 1 sigma of the gravity direction that the estimator takes [rad].
-_LARGEST_GRAVITY_SIGMA = 1.5
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _View:
-    """A processed frame."""
-
-    frame: Frame
-    imu: FrameImu
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _GyroTurn:
-    """``R_1^T R_2`` since the reference by the gyro, its covariance, and what was integrated."""
-
-    rotation: Array
-    covariance: Array
-    segment: GyroSegment
 
 
 @dataclass(slots=True, eq=False)
@@ -77,14 +62,6 @@ class _Turn:
     def go_on(self, rotation: Array) -> None:
         """Count a frame that the gyro has turned by `rotation` since the one before."""
         self.by_gyro, self.frames = self.by_gyro @ rotation, self.frames + 1
-
-
-class _GravityPrior(NamedTuple):
-    """Motions of both frames, with gravity where it is used, and its sigma for the estimator."""
-
-    motion1: FrameMotion
-    motion2: FrameMotion
-    sigma: float
 
 
 class Pipeline:
@@ -108,10 +85,10 @@ class Pipeline:
         self._applied = Applied()
         self._sensor: Sensor | None = None
         self._readout = 0.0   # [s] that its camera has beyond the parameter
-        self._reference: _View | None = None
-        self._previous: _View | None = None
+        self._reference: View | None = None
+        self._previous: View | None = None
         self._frames = 0   # since the reference keyframe
-        self._gyro: _GyroTurn | None = None
+        self._gyro: GyroTurn | None = None
         self._forces: ForceSegment | str = ''   # since the reference, or why they are not known
         self._reference_rays: DerotatedRays | None = None
         self._current_rays: DerotatedRays | None = None
@@ -141,7 +118,7 @@ class Pipeline:
         """
         self.prepare()
         sensor = self._sensor_of(frame, parameters)
-        view = _View(frame, imu)
+        view = View(frame, imu)
         self._stamps.add(frame.stamp_ns)
         # Without the gyro tracks are not predicted, and wrong ones that agree by chance pass.
         if self._reference is None or self._previous is None or imu.since_previous is None:
@@ -160,8 +137,8 @@ class Pipeline:
         self._gyro = self._turn_with(imu.since_previous, parameters)
         self._forces = self._forces_with(imu)
         rays1, rays2 = self._derotate(matches, self._reference.imu.motion, imu.motion, sensor)
-        since = SinceKeyframe(self._parallax(rays1, rays2, sensor),
-                              _interval(self._reference, view), self._frames,
+        since = SinceKeyframe(parallax_of(rays1, rays2, self._gyro, sensor),
+                              interval_of(self._reference, view), self._frames,
                               self._tracker.tracked_fraction)
         closing = closes_pair(since, parameters.keyframes)
         # Where tracks are lost pairs close early, and few tracks outlive them.
@@ -199,7 +176,7 @@ class Pipeline:
             self._current_rays = None
         return self._sensor
 
-    def _restart_from(self, view: _View) -> None:
+    def _restart_from(self, view: View) -> None:
         self._reference = self._previous = view
         self._gyro = self._reference_rays = None
         self._frames = 0
@@ -224,14 +201,13 @@ class Pipeline:
         # f_2 = R^T f_1 for R = R_1^T R_2, in rows.
         return sensor.seen(rays @ rotation, row_times, current)
 
-    def _turn_with(self, segment: GyroSegment, parameters: Parameters) -> _GyroTurn | None:
+    def _turn_with(self, segment: GyroSegment, parameters: Parameters) -> GyroTurn | None:
         """Gyro since the reference, continued by a frame; None once a part was missing."""
         if self._frames > 1:
             if self._gyro is None:
                 return None
             segment = self._gyro.segment.joined(segment)
-        return _GyroTurn(*integrate_rotation(segment.stamps_ns, segment.angular_velocities,
-                                             parameters.imu, segment.bias_sigma), segment)
+        return GyroTurn.of(segment, parameters.imu)
 
     def _forces_with(self, imu: FrameImu) -> ForceSegment | str:
         """Specific force since the reference, continued by a frame; why not, once a part lacks."""
@@ -241,21 +217,6 @@ class Pipeline:
             return imu.force.since_previous
         before = self._forces
         return before if isinstance(before, str) else before.joined(imu.force.since_previous)
-
-    def _inertial(self, reference: _View, view: _View,
-                  parameters: Parameters) -> InertialMotion | str:
-        """What the accelerometer says of the pair, or why it says nothing."""
-        if not parameters.pair.use_accelerometer:
-            return 'use_accelerometer is false'
-        if not parameters.pair.use_gyro_rotation:
-            # The gyro turns what the accelerometer feels.
-            return 'use_gyro_rotation is false'
-        if self._gyro is None:
-            return 'the gyro has a gap'
-        if isinstance(self._forces, str):
-            return self._forces
-        return inertial_motion(self._gyro.segment, self._forces, reference.imu, view.imu,
-                               parameters.imu)
 
     def _derotate(self, matches: Matches, motion1: FrameMotion, motion2: FrameMotion,
                   sensor: Sensor) -> tuple[DerotatedRays, DerotatedRays]:
@@ -269,51 +230,22 @@ class Pipeline:
         self._reference_rays, self._current_rays = first, second
         return first, second
 
-    def _parallax(self, first: DerotatedRays, second: DerotatedRays, sensor: Sensor) -> float:
-        """Median parallax [px] of matched rays, beyond what the rotation explains."""
-        rotation = aligning_rotation(first.rays.T @ second.rays) if self._gyro is None else (
-            self._gyro.rotation)
-        return sensor.camera.fx * median_parallax(first.rays, second.rays, rotation)
-
     # -- one pair ----------------------------------------------------------------------------
 
-    def _close_pair(self, reference: _View, view: _View, sensor: Sensor,
+    def _close_pair(self, reference: View, view: View, sensor: Sensor,
                     parameters: Parameters) -> PairResult:
-        stamp1_ns, stamp2_ns = reference.frame.stamp_ns, view.frame.stamp_ns
         matches, gyro = self._tracker.refined_matches(), self._gyro
-        told = gyro if parameters.pair.use_gyro_rotation else None
-        gravity = _gravity_prior(reference.imu, view.imu, parameters)
-        inertial = self._inertial(reference, view, parameters)
-        pose = estimate_relative_pose(
-            sensor.intrinsics.to_sensor(matches.points1),
-            sensor.intrinsics.to_sensor(matches.points2),
-            sensor.camera, gravity.motion1, gravity.motion2,
-            relative_rotation=None if told is None else told.rotation,
-            relative_rotation_covariance=None if told is None else told.covariance,
-            interval=_interval(reference, view),
-            config=replace(parameters.estimator, gravity_sigma=gravity.sigma, stamp_sigma=max(
-                parameters.estimator.stamp_sigma, self._stamps.sigma)),
-            quality=matches.quality,
-            inertial=None if isinstance(inertial, str) else inertial,
-            rng=np.random.default_rng([parameters.pair.seed, stamp1_ns, stamp2_ns]))
-        if isinstance(inertial, str):
-            pose = pose.without_baseline(f'baseline not known: {inertial}')
+        inertial = inertial_of(reference, view, gyro, self._forces, parameters)
+        pose = estimate_pair(reference, view, matches, sensor, gyro, inertial, parameters,
+                             interval=interval_of(reference, view),
+                             stamp_sigma=self._stamps.sigma)
         pose = self._judged(pose, matches, reference, view, sensor, parameters)
         rays1, rays2 = self._derotate(matches, reference.imu.motion, view.imu.motion, sensor)
         seen = self._health.latest
-        later_ns = to_nanoseconds(pose_row_delay(sensor.camera, parameters.sensor))
-        return PairResult(
-            reference_stamp_ns=stamp1_ns + later_ns, stamp_ns=stamp2_ns + later_ns,
-            reference_ns1=reference.imu.reference_ns, reference_ns2=view.imu.reference_ns,
-            frame_id=view.frame.frame_id, interval=_interval(reference, view), pose=pose,
-            matches=matches, row_times1=rays1.row_times, row_times2=rays2.row_times,
-            rays1=rays1.rays, rays2=rays2.rays, parallax=self._parallax(rays1, rays2, sensor),
-            landmarks=landmarks(pose, rays1, rays2, sensor) if pose else None,
-            gyro_rotation=None if gyro is None else gyro.rotation,
+        return replace(
+            pair_result(reference, view, matches, rays1, rays2, pose, gyro, sensor, parameters),
             images_against_gyro=None if seen is None else seen.images_against_gyro,
             health=self._health.health, tracked=self._seen, applied=self._applied,
-            gyro_bias=None if gyro is None else (
-                parameters.sensor.R_cam_imu.T @ gyro.segment.bias),
             image1=reference.frame.image if self._keep_images else None,
             image2=view.frame.image if self._keep_images else None)
 
@@ -330,7 +262,7 @@ class Pipeline:
                                   log_so3(before.by_gyro))
         self._turn = _Turn(stamp_ns, ids, rays)
 
-    def _judged(self, pose: RelativePose, matches: Matches, reference: _View, view: _View,
+    def _judged(self, pose: RelativePose, matches: Matches, reference: View, view: View,
                 sensor: Sensor, parameters: Parameters) -> RelativePose:
         """The pose with a covariance that holds, or withheld; what is tracked moves on."""
         evidence = None
@@ -342,7 +274,7 @@ class Pipeline:
         self._applied = self._applied.moved(self._seen, parameters.sensor)
         return withheld(pose, self._health.health) if parameters.pair.withhold_when_wrong else pose
 
-    def _told(self, view: _View, sensor: Sensor, parameters: Parameters) -> Told:
+    def _told(self, view: View, sensor: Sensor, parameters: Parameters) -> Told:
         bias = np.array(parameters.imu.gyro_bias)
         in_force = np.zeros(DEVIATIONS)
         in_force[OFFSET] = view.imu.applied_offset_ns / NANOSECONDS
@@ -354,31 +286,14 @@ class Pipeline:
         return told
 
 
-def _evidence(pose: RelativePose, matches: Matches, reference: _View, view: _View, gyro: _GyroTurn,
+def _evidence(pose: RelativePose, matches: Matches, reference: View, view: View, gyro: GyroTurn,
               sensor: Sensor, parameters: Parameters) -> PairEvidence:
     """A pair as the recursive calibration needs it."""
     segment = gyro.segment
     return PairEvidence(
         sensor.intrinsics.to_sensor(matches.points1), sensor.intrinsics.to_sensor(matches.points2),
-        sensor.camera, reference.imu.motion, view.imu.motion, _interval(reference, view),
+        sensor.camera, reference.imu.motion, view.imu.motion, interval_of(reference, view),
         pose.R, pose.t, gyro.rotation, gyro.covariance, turn_sensitivity(
             segment.stamps_ns, segment.angular_velocities, parameters.imu),
         (segment.angular_velocities[0], segment.angular_velocities[-1]),
         parameters.sensor.R_cam_imu, parameters.estimator.gyro_sigma)
-
-
-def _interval(reference: _View, view: _View) -> float:
-    """Seconds between the stamped rows of two frames."""
-    return seconds_between(reference.imu.reference_ns, view.imu.reference_ns)
-
-
-def _gravity_prior(imu1: FrameImu, imu2: FrameImu, parameters: Parameters) -> _GravityPrior:
-    """Gravity as the estimator is to use it: of both frames, or of none."""
-    sigma1, sigma2 = imu1.gravity_sigma, imu2.gravity_sigma
-    told = parameters.estimator.gravity_sigma
-    if not parameters.pair.use_gravity or sigma1 is None or sigma2 is None:
-        return _GravityPrior(replace(imu1.motion, gravity=None),
-                             replace(imu2.motion, gravity=None), told)
-    # One sigma for both frames: that of the filter where it is larger than the parameter.
-    return _GravityPrior(imu1.motion, imu2.motion,
-                         min(max(told, sigma1, sigma2), _LARGEST_GRAVITY_SIGMA))

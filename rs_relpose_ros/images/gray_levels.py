@@ -1,4 +1,4 @@
-"""From pixels of 16 bits to gray: sensors fill 10, 12 or 14 of them, or a narrow band."""
+"""Brightness: pixels of 16 bits to gray (sensors fill 10, 12 or 14 bits), and what is dark."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ _MARGIN = 0.25
 _LEAST_FILLED = 0.3
 # A range is never narrower than gray has levels: noise of a dark image is not stretched.
 _LEAST_RANGE = 255.0
+
+# An image is dark where so many percent of its pixels are below this gray: noise, no contrast.
+_DARK_SHARE, _DARK_GRAY = 99.0, 32
 
 
 class GrayLevels:
@@ -38,3 +41,8 @@ class GrayLevels:
         scale = 255.0 / (self._high - self._low)
         return np.asarray(np.clip((pixels - np.float32(self._low)) * np.float32(scale), 0.0, 255.0)
                           .astype(np.uint8))
+
+
+def is_dark(image: NDArray[np.uint8]) -> bool:
+    """Whether hardly a pixel of a gray image (H, W) is bright: night, a covered lens."""
+    return bool(np.percentile(image[::_STRIDE, ::_STRIDE], _DARK_SHARE) < _DARK_GRAY)

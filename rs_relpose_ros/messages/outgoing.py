@@ -30,9 +30,11 @@ MessageTypes = Callable[[str], Any]
 
 _UINT32, _FLOAT32 = 6, 7   # sensor_msgs/PointField
 
-MATCH_DTYPE = np.dtype([('id', '<u4')] + [(name, '<f4') for name in (
+# The id comes last: `sensor_msgs_py.point_cloud2.read_points_numpy` reads only fields of the type
+# of the first.
+MATCH_DTYPE = np.dtype([(name, '<f4') for name in (
     'u1', 'v1', 'u2', 'v2', 'tau1', 'tau2', 'x1', 'y1', 'z1', 'x2', 'y2', 'z2', 'x', 'y', 'z',
-    'u1_gs', 'v1_gs', 'u2_gs', 'v2_gs')])
+    'u1_gs', 'v1_gs', 'u2_gs', 'v2_gs')] + [('id', '<u4')])
 # Name, offset and type of each, for sensor_msgs/PointField.
 MATCH_FIELDS = tuple(
     (name, int(offset), _UINT32 if name == 'id' else _FLOAT32)

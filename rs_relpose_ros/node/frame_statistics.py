@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -44,7 +45,7 @@ class Inputs:
     invalid: int = 0
 
 
-class FrameStatistics:
+class FrameStatistics(ABC):
     """Figures that every node has, thread-safe; a node adds those of its results.
 
     Tests give a `clock` of their own, monotonic [ns].
@@ -160,13 +161,13 @@ class FrameStatistics:
         """A sentence about a figure that was told and is wrong; empty for none."""
         return ''
 
+    @abstractmethod
     def _judge_results(self) -> tuple[int, str]:
         """Level and sentence where frames come and are used."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _values(self) -> tuple[tuple[str, str], ...]:
         """Figures of the results."""
-        raise NotImplementedError
 
     def _last_values(self) -> tuple[tuple[str, str], ...]:
         """Figures that are shown last."""

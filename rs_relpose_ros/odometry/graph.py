@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import gtsam
 from gtsam.symbol_shorthand import B, V, X
@@ -40,6 +40,10 @@ _CHOSEN = 1e-4
 _INTEGRATION = 1e-4
 
 
+# Columns of a pair's derivatives: pose and velocity of the first body, of the second one.
+_BLOCKS = (slice(0, 6), slice(6, 9), slice(9, 15), slice(15, 18))
+
+
 class GraphError(RsRelposeError):
     """The graph cannot be solved."""
 
@@ -68,6 +72,13 @@ class KeyframeState:
     accel_bias: Array
     pose_covariance: Array   # (6, 6) of (turn, step), both in the axes of the body
     velocity_covariance: Array   # (3, 3) in the world
+
+
+class Step(NamedTuple):
+    """From one keyframe's camera to the next one's, in the axes of the former."""
+
+    translation: Array   # (3,) [m]
+    covariance: Array   # (3, 3)
 
 
 @dataclass(slots=True, eq=False)
@@ -213,14 +224,36 @@ class KeyframeGraph:
 
     def smoothed(self) -> list[KeyframeState]:
         """All keyframes since the start, each with what came after it; needs `keep`."""
+        values, marginals = self._smoothed()
+        return [_state(values, marginals, k) for k in range(self._count)]
+
+    def smoothed_steps(self) -> list[Step]:
+        """Of the same keyframes, each against the one before: for evaluations."""
+        values, marginals = self._smoothed()
+        C, c = self._mounting
+        steps, arm = [], skew(c)
+        for i in range(self._count - 1):
+            first, second = (values.atPose3(X(k)) for k in (i, i + 1))
+            R1, R2 = first.rotation().matrix(), second.rotation().matrix()
+            way = R1.T @ (second.translation() - first.translation() + R2 @ c) - c
+            back = R1.T @ R2
+            # Of turns and steps of both bodies, each in its axes.
+            by = np.hstack([skew(way) + arm, -np.eye(3), -back @ arm, back])
+            both = marginals.jointMarginalCovariance([X(i), X(i + 1)])
+            covariance = np.block([[both.at(X(a), X(b)) for b in (i, i + 1)]
+                                   for a in (i, i + 1)])
+            steps.append(Step(C @ way, C @ by @ covariance @ by.T @ C.T))
+        return steps
+
+    # -- inside ------------------------------------------------------------------------------
+
+    def _smoothed(self) -> tuple[Any, Any]:
+        """Values and marginals of all that was recorded."""
         assert self._record is not None
         factors = _compact(self._record.factors)
         values = gtsam.LevenbergMarquardtOptimizer(
             factors, self._record.values, self._params).optimize()
-        marginals = gtsam.Marginals(factors, values)
-        return [_state(values, marginals, k) for k in range(self._count)]
-
-    # -- inside ------------------------------------------------------------------------------
+        return values, gtsam.Marginals(factors, values)
 
     def _predicted(self, pim: Any) -> Any:
         state = gtsam.NavState(self._values.atPose3(X(self._count - 1)),
@@ -242,17 +275,13 @@ class KeyframeGraph:
         rates = measured[0] - bias, measured[1] - bias
 
         def error(factor: Any, values: Any, jacobians: Any) -> Array:
-            keys = factor.keys()
-            first, second = (BodyState(
-                np.ascontiguousarray(values.atPose3(keys[k]).rotation().matrix()),
-                values.atPose3(keys[k]).translation(), values.atVector(keys[k + 1]), rate)
-                for k, rate in ((0, rates[0]), (2, rates[1])))
-            e, by = deviations(first, second, mounting, R, t, velocities)
+            x1, v1, x2, v2 = factor.keys()
+            e, by = deviations(_body(values, x1, v1, rates[0]), _body(values, x2, v2, rates[1]),
+                               mounting, R, t, velocities)
             if jacobians is not None:
-                whole = root @ by[:n]
-                for block, columns in enumerate((slice(0, 6), slice(6, 9), slice(9, 15),
-                                                 slice(15, 18))):
-                    jacobians[block] = np.asfortranarray(whole[:, columns])
+                whole = (by[:n].T @ root.T).T   # in Fortran's order, as gtsam wants its blocks
+                for block, columns in enumerate(_BLOCKS):
+                    jacobians[block] = whole[:, columns]
             return np.asarray(root @ e[:n] + offset)
 
         return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(offset)),
@@ -295,6 +324,11 @@ class KeyframeGraph:
             _compact(self._smoother.getFactors()), self._values), newest)
         if self._record is not None:
             self._record.values.insert_or_assign(self._values)
+
+
+def _body(values: Any, pose_key: int, velocity_key: int, rate: Array) -> BodyState:
+    pose = values.atPose3(pose_key).matrix()
+    return BodyState(pose[:3, :3].copy(), pose[:3, 3], values.atVector(velocity_key), rate)
 
 
 def _pair_slots(graph: Any, i: int, j: int) -> list[int]:

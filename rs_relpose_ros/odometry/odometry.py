@@ -26,6 +26,7 @@ from rs_relpose_ros.odometry.graph import (
     KeyframeState,
     STANDARD_GRAVITY,
     Start,
+    Step,
 )
 from rs_relpose_ros.odometry.imu_history import ImuHistory
 from rs_relpose_ros.odometry.interval import ImuInterval
@@ -36,6 +37,8 @@ Array = NDArray[np.float64]
 
 # Time that a message may be late by.
 _LATE_NS = 100_000_000
+# Time after `max_coast` until which a last pair may still come, and how many wait for the IMU.
+_LAST_PAIR_NS, _MOST_WAITING = 1_000_000_000, 100
 # Samples that are older by more than this come from a clock that was set back.
 _JUMP_NS = 1_000_000_000
 # Instants that are nearer than this are those of one keyframe: a read-out time that is tracked
@@ -146,6 +149,11 @@ class OdometryEstimator:
         self.counts: Counter[str] = Counter()
         self._sentences: list[str] = []
 
+    @property
+    def waiting(self) -> bool:
+        """Whether a pair waits for samples."""
+        return bool(self._waiting)
+
     def add_imu(self, sample: ImuSample) -> None:
         """Take in a sample; InputError where a gyro hangs."""
         newest = self._samples.newest_ns
@@ -155,6 +163,11 @@ class OdometryEstimator:
             self._waiting, self._last_ns = {}, None
         if not self._gyro.repeats(sample):
             self._samples.add(sample)
+        run = self._run
+        if run is not None and run.published and not self._waiting and (
+                sample.stamp_ns - run.seen_ns
+                > to_nanoseconds(self._config.max_coast) + _LAST_PAIR_NS):
+            self._end(f'no pair for {self._config.max_coast:g} s')
 
     def add_pair(self, pair: PairMeasurement) -> None:
         """Take in a pair."""
@@ -167,6 +180,14 @@ class OdometryEstimator:
             self.counts['late'] += 1
             return
         self._waiting[pair.current_ns] = pair
+        if len(self._waiting) > _MOST_WAITING:
+            del self._waiting[min(self._waiting)]
+            self.counts['without IMU'] += 1
+
+    def reset(self) -> None:
+        """Forget the path: the next start is at the origin, as the first one was."""
+        self._run = self._left = None
+        self._waiting, self.state = {}, State.STARTING
 
     def sentences(self) -> list[str]:
         """What happened since the last call, for the log."""
@@ -216,6 +237,12 @@ class OdometryEstimator:
                     for state, stamps in zip(states, run.stamps, strict=True)]
         return out
 
+    def smoothed_steps(self) -> list[tuple[int, int, Step]]:
+        """Steps between consecutive ones of these, with both instants on the IMU's clock."""
+        return [(start, end, step) for run in self._runs
+                for (_, start), (_, end), step in zip(
+                    run.stamps, run.stamps[1:], run.graph.smoothed_steps(), strict=False)]
+
     # -- pairs -------------------------------------------------------------------------------
 
     def _ready(self, pair: PairMeasurement) -> bool:
@@ -231,8 +258,7 @@ class OdometryEstimator:
     def _process(self, pair: PairMeasurement) -> Odometry | None:
         if pair.told_wrong:
             if self.state is not State.TOLD_WRONG:
-                self._end('what was told of camera or IMU is wrong: see the health of the pairs')
-                self.state = State.TOLD_WRONG
+                self._end('', State.TOLD_WRONG)
             self.counts['told wrong'] += 1
             return None
         if self.state is State.TOLD_WRONG:
@@ -329,14 +355,21 @@ class OdometryEstimator:
             return _Left(None, np.zeros(3), 0.0, 0.0)
         seconds, newest = seconds_between(run.newest_ns, imu_ns), run.graph.newest
         interval = self._samples.between(run.newest_ns, imu_ns)
+        # What was lost before is not known any better now.
+        earlier = run.left
+        variance = earlier.position_sigma**2 + earlier.heading_sigma**2 * float(
+            ((newest.position - earlier.position)[:2]**2).sum()) / 3.0
         if interval is None or not seconds <= _LONGEST_CARRIED:
             speed = float(np.linalg.norm(newest.velocity))
-            return _Left(newest.R, newest.position, math.pi, 1.0 + speed * abs(seconds))
+            return _Left(newest.R, newest.position, math.pi,
+                         math.hypot(1.0 + speed * abs(seconds), math.sqrt(variance)))
         state = run.graph.carried(interval)
         up, covariance = state.R[2], state.pose_covariance
         drift = 0.5 * self._imu.accel_bias_sigma * seconds**2
-        return _Left(state.R, state.position, math.sqrt(float(up @ covariance[:3, :3] @ up)),
-                     math.hypot(drift, math.sqrt(float(np.trace(covariance[3:, 3:])) / 3.0)))
+        variance += drift**2 + float(np.trace(covariance[3:, 3:])) / 3.0
+        heading = math.hypot(earlier.heading_sigma,
+                             math.sqrt(float(up @ covariance[:3, :3] @ up)))
+        return _Left(state.R, state.position, min(heading, math.pi), math.sqrt(variance))
 
     def _known(self, run: _Run) -> bool:
         """Whether the scale of a run that starts is known by now."""
@@ -362,13 +395,17 @@ class OdometryEstimator:
             self._run = None
         return False
 
-    def _end(self, reason: str) -> None:
+    def _end(self, reason: str, state: State = State.STARTING) -> None:
         """End the run; the next one goes on from its end."""
         if self._run is not None and self._run.published:
-            self._sentences.append(f'lost: {reason}; starting anew where it ended')
             self.counts['lost'] += 1
             self._left = self._run
-        self._run, self.state = None, State.STARTING
+            if reason:
+                self._sentences.append(f'lost: {reason}; starting anew where it ended')
+        if state is State.TOLD_WRONG:
+            self._sentences.append('stopped: what was told of camera or IMU is wrong: see the '
+                                   'health of the pairs')
+        self._run, self.state = None, state
 
     # -- results -----------------------------------------------------------------------------
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,15 @@ class TrajectoryErrors:
     scale_error: float   # scale of the similarity that fits best, less 1
     relative_translation_error_percent: float   # median over stretches of 1 m, of their length
     length_m: float   # of the true path
+
+
+class AgainstTruth(NamedTuple):
+    """Poses that the truth covers: positions (N, 3) as aligned and true, at instants [ns]."""
+
+    errors: TrajectoryErrors
+    imu_ns: Sequence[int]
+    positions: Array
+    truth: Array
 
 
 def write_tum(path: Path, trajectory: Sequence[Odometry]) -> None:
@@ -53,9 +63,8 @@ def aligned(positions: Array, truth: Array) -> tuple[Array, Array, float]:
     return R, true_mean - R @ mean, scale
 
 
-def trajectory_errors(trajectory: Sequence[Odometry], truth: TrueTrajectory,
-                      ) -> tuple[TrajectoryErrors, Array, Array] | None:
-    """Errors, and positions (N, 3) as aligned and true; None with fewer than 4 true poses."""
+def against_truth(trajectory: Sequence[Odometry], truth: TrueTrajectory) -> AgainstTruth | None:
+    """The poses that the truth covers, beside it; None where it covers fewer than 4."""
     covered = [pose for pose in trajectory if truth.covers(pose.imu_ns)]
     if len(covered) < 4:
         return None
@@ -73,7 +82,7 @@ def trajectory_errors(trajectory: Sequence[Odometry], truth: TrueTrajectory,
         if known is not None and covered[j].path == pose.path:
             told = pose.R.T @ (covered[j].position - pose.position)
             relative.append(float(np.linalg.norm(told - known[1])) / float(way[j] - way[i]))
-    return TrajectoryErrors(
+    errors = TrajectoryErrors(
         float(np.sqrt(((moved - true) ** 2).sum(axis=1).mean())), scale - 1.0,
-        100.0 * float(np.median(relative)) if relative else float('nan'), float(way[-1])), \
-        moved, true
+        100.0 * float(np.median(relative)) if relative else float('nan'), float(way[-1]))
+    return AgainstTruth(errors, [pose.imu_ns for pose in covered], moved, true)

@@ -5,7 +5,7 @@ Figures are drawn on a canvas of their own, so that nothing of matplotlib's glob
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from matplotlib.axes import Axes
@@ -13,6 +13,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullFormatter
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -22,7 +23,7 @@ from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.geometry.timing import seconds_between
 from rs_relpose_ros.picture_files import save_picture
 from rs_relpose_ros.replay.tables import PairRecord, rotation_sigmas, translation_sigmas
-from rs_relpose_ros.replay.truth import rotation_angle, TrueTrajectory
+from rs_relpose_ros.replay.truth import PairErrors, rotation_angle, TrueTrajectory
 
 Array = NDArray[np.float64]
 
@@ -62,24 +63,35 @@ def draw_matches(result: PairResult, path: Path) -> None:
     save_picture(figure, path)
 
 
-def draw_errors(records: Sequence[PairRecord], path: Path) -> None:
-    """Errors against the truth over time, with the sigmas that the estimates claim."""
+def draw_errors(records: Sequence[PairRecord], path: Path,
+                baselines: Mapping[str, Sequence[PairErrors | None]] | None = None) -> None:
+    """Errors against the truth over time, with the sigmas that the estimates claim.
+
+    `baselines`: errors of other methods, by their names, of the pairs that have a pose.
+    """
     figure, axes = _over_time(2, 'errors of the relative poses against the ground truth')
     start_ns = records[0].reference_ns1
     known = [(r, r.errors) for r in records if r.pose and r.errors is not None]
     begins, ends = _spans([r for r, _ in known], start_ns)
     # Of a 3-vector and of a 2-vector with these sigmas: the root of the mean square length.
-    series = (([e.rotation_error for _, e in known], rotation_sigmas, 'rotation error [deg]'),
-              ([e.translation_error for _, e in known], translation_sigmas,
-               'translation direction\nerror [deg]'))
-    for axis, (values, sigmas_of, label) in zip(axes, series, strict=True):
+    series = (('rotation_error', rotation_sigmas, 'rotation error [deg]'),
+              ('translation_error', translation_sigmas, 'translation direction\nerror [deg]'))
+    for axis, (name, sigmas_of, label) in zip(axes, series, strict=True):
         if known:
+            values = [getattr(e, name) for _, e in known]
             sigmas = [np.degrees(np.linalg.norm(sigmas_of(r.pose.covariance))) for r, _ in known]
             axis.hlines(sigmas, begins, ends, color=_ORANGE, linewidth=2.2,
                         label='1 sigma, as estimated')
             axis.plot(0.5 * (begins + ends), values, 'o', color=_BLUE, markersize=5, label='error')
             _median_line(axis, values, f'median error {np.median(values):.2g} deg')
+            for (method, errors), color, marker in zip(
+                    (baselines or {}).items(), (_RED, _GREEN), '+x', strict=False):
+                others = [np.nan if e is None else getattr(e, name) for e in errors]
+                axis.plot(0.5 * (begins + ends), others, marker, color=color, markersize=6,
+                          label=f'{method}:\nmedian {np.nanmedian(others):.2g} deg')
             axis.set_yscale('log')
+            axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
+            axis.yaxis.set_minor_formatter(NullFormatter())
         axis.set_ylabel(label)
         _shade_no_pose(axis, records, start_ns)
     _save_over_time(figure, axes, path)
@@ -140,6 +152,8 @@ def draw_rotation(records: Sequence[PairRecord], path: Path,
             below.plot(times, angles, 'o-', color=color, markersize=3, linewidth=1.4,
                        label=f'{name} against {against}')
     below.set_ylabel('difference, accumulated\n[deg]')
+    below.set_title('how far the chain has drifted: errors of pairs add up, as in any odometry',
+                    fontsize=9, loc='left')
     below.set_ylim(bottom=0.0)
     _shade_no_pose(below, [r for r in records if np.isnan(r.pose.R).any()], start_ns,
                    'no rotation: gyro instead')

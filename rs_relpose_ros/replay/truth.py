@@ -71,6 +71,10 @@ class TrueTrajectory:
         """Position (3,) [m] at an instant that the poses cover."""
         return np.asarray(self._position((at_ns - self._stamps[0]) / NANOSECONDS))
 
+    def rotation(self, at_ns: int) -> Array:
+        """R (3, 3) from the camera to the world, likewise."""
+        return np.asarray(self._rotation((at_ns - self._stamps[0]) / NANOSECONDS).as_matrix())
+
     def relative_pose(self, ns1: int, ns2: int) -> tuple[Array, Array] | None:
         """R (3, 3) and t (3,) [m] with ``X1 = R X2 + t``; None where the truth does not reach."""
         if not (self.covers(ns1) and self.covers(ns2)):

@@ -1,0 +1,281 @@
+"""Relative poses of chosen pairs: on the bundled bag, where a walk returns, and bad lists."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+import math
+from pathlib import Path
+import subprocess
+import sys
+
+from conftest import BUNDLED_PARAMETERS, ROOT
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_lab.simulation import simulate, SimulationConfig
+from rs_relpose_lab.simulation.bag import write_bag, write_parameters
+from rs_relpose_lab.simulation.trajectory import Trajectory
+from rs_relpose_ros.cli.main import main
+from rs_relpose_ros.config.parameter_file import read_parameters
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.front_end.chosen_pairs import estimate_wide_pair, view_frame
+from rs_relpose_ros.front_end.frame import Frame
+from rs_relpose_ros.geometry.intrinsics import Intrinsics
+from rs_relpose_ros.imu.buffer import ImuBuffer
+from rs_relpose_ros.imu.samples import ImuSample
+
+START_NS = 1_700_000_000_000_000_000
+COLUMNS = ('reference_stamp_ns,stamp_ns,tx,ty,tz,qx,qy,qz,qw,sigma_t1,sigma_t2,sigma_rx,sigma_ry,'
+           'sigma_rz,inliers,matches,model,status,baseline_m,baseline_log_sigma,reason')
+
+
+def stamp_of(frame: int, fps: float = 30.0) -> int:
+    """As the simulation stamps its frames."""
+    return START_NS + round(frame * 1e9 / fps)
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline='') as file:
+        return list(csv.DictReader(file))
+
+
+def run_pairs(bag: Path, parameters: Path, pairs: list[tuple[int, int]], folder: Path,
+              *options: str) -> tuple[int, list[dict[str, str]]]:
+    folder.mkdir(exist_ok=True)
+    listed = folder / 'pairs.csv'
+    listed.write_text('reference_stamp_ns,stamp_ns\n'
+                      + ''.join(f'{first},{second}\n' for first, second in pairs))
+    code = main(['pairs', str(bag), '--list', str(listed), '--params', str(parameters), '--out',
+                 str(folder / 'out'), *options])
+    return code, rows_of(folder / 'out' / 'relative_poses.csv')
+
+
+def assert_within_covariance(rows: list[dict[str, str]], errors: list[dict[str, str]]) -> None:
+    """No error is larger than three sigmas of all axes together."""
+    for row, error in zip(rows, errors, strict=True):
+        for name, sigmas in (('translation', ('t1', 't2')), ('rotation', ('rx', 'ry', 'rz'))):
+            sigma = math.hypot(*(float(row[f'sigma_{axis}']) for axis in sigmas))
+            assert float(error[f'{name}_error_deg']) < 3.0 * math.degrees(sigma)
+
+
+# -- the bundled bag, its list with everything that can be wrong -------------------------------
+
+# From 0.3 to 3.6 s apart, with parallax; not in the order of time.
+GOOD = [(45, 81), (0, 9), (0, 48), (9, 75), (115, 157), (0, 69)]
+BAD = {(stamp_of(9), stamp_of(0)): 'reference_stamp_ns must be before stamp_ns: exchange them',
+       (stamp_of(9), stamp_of(9)): 'give two different images',
+       (5, stamp_of(9)): 'has the stamp 5',
+       (stamp_of(9), stamp_of(9) + 1): f'has the stamp {stamp_of(9) + 1}'}
+
+
+@pytest.fixture(scope='module')
+def bundled(bundled_bag, tmp_path_factory):
+    """Exit code and rows of `GOOD`, `BAD` and `GOOD` again, and the errors."""
+    folder = tmp_path_factory.mktemp('pairs')
+    good = [(stamp_of(a), stamp_of(b)) for a, b in GOOD]
+    code, rows = run_pairs(bundled_bag, BUNDLED_PARAMETERS, [*good, *BAD, *good], folder)
+    return code, rows, rows_of(folder / 'out' / 'errors.csv'), folder
+
+
+def test_every_row_of_the_list_has_one_in_its_order(bundled):
+    code, rows, _, folder = bundled
+    assert code == 0
+    assert (folder / 'out' / 'relative_poses.csv').read_text().splitlines()[0] == COLUMNS
+    listed = rows_of(folder / 'pairs.csv')
+    assert [(row['reference_stamp_ns'], row['stamp_ns']) for row in rows] == [
+        (row['reference_stamp_ns'], row['stamp_ns']) for row in listed]
+    # Whatever else is in the list.
+    assert rows[:len(GOOD)] == rows[-len(GOOD):]
+
+
+def test_wide_pairs_agree_with_the_truth(bundled):
+    """Baselines of 0.6 to 4.2 m, over which no corner is followed."""
+    _, rows, errors, _ = bundled
+    assert [row['status'] for row in rows[:len(GOOD)]] == ['OK'] * len(GOOD)
+    assert all(row['reason'] == '' for row in rows[:len(GOOD)])
+    rotation, translation = (np.array([float(row[f'{name}_error_deg'])
+                                       for row in errors[:len(GOOD)]])
+                             for name in ('rotation', 'translation'))
+    print(f'R {rotation.round(3)}, t {translation.round(3)} deg')
+    assert np.median(rotation) < 0.1
+    assert rotation.max() < 0.2
+    assert np.median(translation) < 0.4
+    assert translation.max() < 1.0
+
+
+def test_errors_are_as_large_as_the_covariance_says(bundled):
+    _, rows, errors, _ = bundled
+    assert_within_covariance(rows[:len(GOOD)], errors[:len(GOOD)])
+
+
+def test_rows_that_cannot_be_estimated_say_why(bundled):
+    _, rows, _, _ = bundled
+    for row in rows[len(GOOD):-len(GOOD)]:
+        assert row['status'] == 'BAD_INPUT'
+        assert BAD[int(row['reference_stamp_ns']), int(row['stamp_ns'])] in row['reason']
+        assert row['tx'] == row['inliers'] == ''
+
+
+def test_no_imu_cover(bundled_bag, tmp_path):
+    """With a time offset of 0.2 s the last frame's gyro lies behind the end of the bag."""
+    pair = stamp_of(0), stamp_of(179)
+    code, rows = run_pairs(bundled_bag, BUNDLED_PARAMETERS, [pair], tmp_path, '--set',
+                           'time_offset=0.2')
+    assert code == 1
+    assert rows[0]['reason'].startswith(f'the image of {pair[1]} cannot be used: ')
+    assert 'the gyro ends before the last row' in rows[0]['reason']
+
+
+def test_too_few_matches(bundled_bag, tmp_path):
+    pair = stamp_of(0), stamp_of(9)
+    code, rows = run_pairs(bundled_bag, BUNDLED_PARAMETERS, [pair], tmp_path, '--set',
+                           'max_descriptors=8')
+    assert code == 1
+    assert rows[0]['status'] == 'TOO_FEW_MATCHES'
+    assert 'usable matches' in rows[0]['reason']
+
+
+@pytest.mark.parametrize(('text', 'said'), [
+    ('', 'must begin with a line of column names'),
+    ('1,2\n', 'reference_stamp_ns and stamp_ns is missing'),
+    ('reference_stamp_ns,stamp_ns\n', 'has no pairs'),
+    ('reference_stamp_ns,stamp_ns\n1,2\n1.7e18,3\n',
+     "line 3: reference_stamp_ns must be the stamp of an image, an integer [ns], got '1.7e18'"),
+    ('reference_stamp_ns,stamp_ns\n1\n', 'line 2: stamp_ns must be')])
+def test_list_that_is_none(text, said, bundled_bag, tmp_path, capsys):
+    listed = tmp_path / 'pairs.csv'
+    listed.write_text(text)
+    assert main(['pairs', str(bundled_bag), '--list', str(listed), '--params',
+                 str(BUNDLED_PARAMETERS), '--out', str(tmp_path / 'out')]) == 2
+    said_in = capsys.readouterr().err
+    assert said in said_in and said_in.count('\n') == 1
+    assert not (tmp_path / 'out').exists()
+
+
+# -- a walk that returns -----------------------------------------------------------------------
+
+FPS, SECONDS = 5.0, 6.0
+LAST = round(FPS * SECONDS) - 1
+
+
+def loop() -> Trajectory:
+    """Away, around and back, to 0.3 m beside the start, looking 10 deg to the side."""
+    spacing = 0.05
+    times = np.arange(-1.0, SECONDS + 1.0, spacing)
+    phase = np.clip(times / (LAST / FPS), 0.0, 1.0)
+    turn = 2.0 * np.pi * phase
+    positions = np.column_stack([
+        0.6 * (1.0 - np.cos(turn)) - 0.6 + 0.05 * phase, 0.5 * np.sin(turn) + 0.3 * phase,
+        1.6 + 0.04 * np.sin(11.0 * times)])
+    angles = np.column_stack([
+        0.5 * np.sin(turn) + math.radians(10.0) * phase + 0.02 * np.sin(7.0 * times),
+        0.05 * np.sin(5.0 * times), 0.04 * np.sin(3.0 * times)])
+    return Trajectory(positions, angles, float(times[0]), spacing)
+
+
+@pytest.fixture(scope='module')
+def returned(tmp_path_factory):
+    """Bag and parameters of the loop."""
+    folder = tmp_path_factory.mktemp('loop')
+    simulation = simulate(SimulationConfig(duration=SECONDS, fps=FPS, seed=11), trajectory=loop())
+    write_bag(simulation, folder / 'bag')
+    write_parameters(simulation, folder / 'bag.yaml')
+    return folder / 'bag', folder / 'bag.yaml', simulation
+
+
+def test_loop_is_closed(returned, tmp_path):
+    """Start and end of the walk, 5.8 s apart: the gyro between them is not in the history."""
+    bag, parameters, _ = returned
+    pairs = [(stamp_of(a, FPS), stamp_of(b, FPS)) for a, b in [(0, LAST), (1, LAST - 1),
+                                                               (2, LAST)]]
+    code, rows = run_pairs(bag, parameters, pairs, tmp_path)
+    assert code == 0
+    assert [row['status'] for row in rows] == ['OK'] * len(pairs)
+    assert_within_covariance(rows, errors := rows_of(tmp_path / 'out' / 'errors.csv'))
+    for error in errors:
+        print({name: error[name] for name in error if 'deg' in name or name == 'baseline_m'})
+        assert float(error['rotation_error_deg']) < 0.15
+        # Baselines of 0.1 to 0.3 m.
+        across = float(error['baseline_m']) * math.radians(float(error['translation_error_deg']))
+        assert across < 0.01
+
+
+def test_gyro_is_carried_over_the_frames_between(returned, tmp_path):
+    """With a frame between, the gyro reaches from the first to the last, and tells a rotation."""
+    bag, parameters, _ = returned
+    first, between, last = (stamp_of(k, FPS) for k in (0, 10, 20))
+    _, alone = run_pairs(bag, parameters, [(first, last)], tmp_path / 'a')
+    _, with_it = run_pairs(bag, parameters, [(first, between), (between, last), (first, last)],
+                           tmp_path / 'b')
+    assert float(with_it[2]['sigma_rz']) < 0.95 * float(alone[0]['sigma_rz'])
+
+
+# -- as a library ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope='module')
+def library(returned):
+    """Parameters, a buffer of the whole walk, and its first and last frame."""
+    _, parameter_file, simulation = returned
+    camera, series = simulation.camera, simulation.imu
+    parameters = read_parameters(parameter_file, ['imu_buffer_seconds=60'])
+    intrinsics = Intrinsics(
+        width=camera.width, height=camera.height, image_width=camera.width,
+        image_height=camera.height, fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy,
+        distortion_model=camera.distortion_model, distortion=camera.distortion)
+    imu = ImuBuffer(parameters.imu)
+    for stamp, rate, force in zip(series.stamps_ns, series.angular_velocities,
+                                  series.linear_accelerations, strict=True):
+        imu.add(ImuSample(int(stamp), tuple(rate), tuple(force)))
+    frames = [Frame(simulation.stamp_ns(k), simulation.image(k), 'camera', intrinsics)
+              for k in (0, LAST)]
+    return parameters, imu, frames
+
+
+def test_frames_and_an_imu_buffer(library, returned):
+    parameters, imu, frames = library
+    first = view_frame(frames[0], imu, parameters)
+    second = view_frame(frames[1], imu, parameters, since=first)
+    pose = estimate_wide_pair(first, second, parameters).pose
+    states = returned[2].states([first.imu.reference_ns, second.imu.reference_ns])
+    R1, R2 = states.R_world_cam
+    true = R1.T @ (states.position[1] - states.position[0])
+    assert np.linalg.norm(Rotation.from_matrix(pose.R.T @ R1.T @ R2).as_rotvec(True)) < 0.15
+    assert math.degrees(math.acos(pose.t @ true / np.linalg.norm(true))) < 2.0
+    # The buffer tells the turn between them, too, and it agrees with its covariance.
+    assert second.imu.since_previous is not None
+    with pytest.raises(InputError, match='must be later than the first: exchange them'):
+        estimate_wide_pair(second, first, parameters)
+
+
+def test_one_calibration_for_both_frames(library):
+    parameters, imu, (frame1, frame2) = library
+    first = view_frame(frame1, imu, parameters)
+    zoomed = replace(frame2, intrinsics=replace(frame2.intrinsics, fx=500.0))
+    with pytest.raises(InputError, match='intrinsics changed'):
+        estimate_wide_pair(first, view_frame(zoomed, imu, parameters), parameters)
+
+
+def test_frame_outside_of_the_buffer(library):
+    parameters, imu, frames = library
+    with pytest.raises(InputError, match='does not cover'):
+        view_frame(replace(frames[1], stamp_ns=frames[1].stamp_ns + 10**10), imu, parameters)
+
+
+def test_example(bundled_bag, bundled):
+    """The script of the documentation gives the pose of the command line."""
+    _, rows, _, _ = bundled
+    row = rows[3]
+    ended = subprocess.run(
+        [sys.executable, ROOT / 'docs' / 'examples' / 'loop_closure.py', bundled_bag,
+         BUNDLED_PARAMETERS, row['reference_stamp_ns'], row['stamp_ns']],
+        capture_output=True, text=True, timeout=140, check=False)
+    assert ended.returncode == 0, ended.stderr
+    printed = np.array([line.split() for line in ended.stdout.splitlines()], dtype=float)
+    R = Rotation.from_quat([float(row[f'q{axis}']) for axis in 'xyzw']).as_matrix()
+    # Its history of the gyro reaches over both frames, that of the command line does not.
+    np.testing.assert_allclose(printed[:, :3], R, atol=2e-3)
+    np.testing.assert_allclose(printed[:, 3], [float(row[f't{axis}']) for axis in 'xyz'],
+                               atol=1e-2)
