@@ -378,6 +378,19 @@ def test_messages_that_contradict_each_other(change, name, truth, tolerance, bun
     assert Verdict.OK not in {findings[figure.name].verdict for figure in FIGURES}
 
 
+def left_handed(message):
+    if hasattr(message, 'angular_velocity'):
+        message.angular_velocity.y *= -1.0
+
+
+def test_a_sign_of_the_gyro_that_no_rotation_sets_right(bundled_bag, parameters, tmp_path):
+    findings, report = checked(rewritten(bundled_bag, tmp_path / 'bag', left_handed, 6.0),
+                               parameters)
+    assert [f.name for f in report.findings if f.verdict is F] == ['axes']
+    assert 'its y has the wrong sign' in findings['axes'].text
+    assert 'set quat_cam_imu_xyzw' not in findings['axes'].text
+
+
 def test_a_gyro_of_another_body(bundled_bag, parameters, tmp_path):
     """Whatever is blamed: the recording fails, and figures that explain nothing are not ok."""
     findings, report = checked(rewritten(bundled_bag, tmp_path / 'bag', of_another_body),

@@ -1,12 +1,15 @@
 """The benchmark of covariances: its statistic, and the pairs of a recording."""
 
 import csv
+from dataclasses import replace
+import itertools
 
 from conftest import ROOT
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_lab.experiments.baseline_chain import steps
 from rs_relpose_lab.experiments.consistency import on_recording, pair_consistency, read_true_pairs
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.cli.main import main
@@ -78,3 +81,27 @@ def test_a_table_of_something_else_is_refused(tmp_path, capsys):
         read_true_pairs(table)
     assert main(['benchmark', 'consistency', '--bags', '0', '--output', str(tmp_path)]) == 2
     assert 'nothing to measure' in capsys.readouterr().err
+
+
+def test_baselines_agree_with_the_scale_of_their_tracks(bundled_bag):
+    """By the truth they do; one that is told half as large again does not."""
+    parameters = read_parameters(PARAMETERS)
+    with open_bag(bundled_bag) as bag:
+        topics = bag.find_topics()
+        truth = read_truth(bag, topics)
+        found = [pair.result for pair in itertools.islice(
+            Replay(bag, topics, parameters).pairs(), 6)]
+    pairs = []
+    for pair in found:
+        _, metric = truth.relative_pose(pair.reference_ns1, pair.reference_ns2)
+        pairs.append(replace(pair, pose=replace(
+            pair.pose, baseline=float(np.linalg.norm(metric)), baseline_log_sigma=0.05)))
+    right = list(steps('', pairs))
+    assert len(right) >= 3
+    assert max(abs(step.disagreement) for step in right) < 0.15
+    assert all(step.known for step in right)
+    wrong = replace(pairs[2], pose=replace(pairs[2].pose, baseline=1.5 * pairs[2].pose.baseline))
+    told = list(steps('', [*pairs[:2], wrong, *pairs[3:]]))
+    assert [step.disagreement - ours.disagreement for step, ours in zip(
+        told, right, strict=True)][1:3] == pytest.approx([np.log(1.5), -np.log(1.5)])
+    assert abs(told[1].sigmas) > 3.0

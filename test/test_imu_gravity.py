@@ -162,9 +162,9 @@ def test_sigma_is_honest_under_random_acceleration():
         estimate = buffer.gravity(end)
         normalised.append(np.radians(angle(estimate.direction, -UP)) / estimate.sigma)
     normalised = np.array(normalised)
-    # Rayleigh: median 1.18 sigma; a cautious sigma makes it less.
+    # Rayleigh: median 1.18 sigma; with the process noise that sets the gain it was 0.90.
     assert np.mean(normalised < 3.0) >= 0.95
-    assert 0.3 < np.median(normalised) < 1.8
+    assert 1.0 < np.median(normalised) < 1.8
 
 
 def test_gravity_is_causal():
@@ -255,3 +255,5 @@ def test_gravity_on_a_real_hand_held_imu(recordings):
     # Two axes: 95 % of a Rayleigh distribution lie within 2.45 sigma. And no sigma for show.
     assert np.mean(np.array(errors) < 2.45 * np.array(sigmas)) >= 0.95
     assert np.median(sigmas) < 2.5
+    # The process noise that shortens the filter's memory is no error: with it this is 0.18.
+    assert np.mean(np.square(errors) / np.square(sigmas)) / 2.0 > 0.3

@@ -198,6 +198,15 @@ ESTIMATES = {'readout_time': 0.03, 'quat_cam_imu_xyzw': '[0.0, 0.0, 0.0, 1.0]'}
 OVERRIDE = 'qos_overrides./image.subscription'
 
 
+def publish_all_but_camera_info(graph, messages):
+    """Images and IMU of a bag, at bag time."""
+    publishers = {kind: graph.publisher(kind, topic) for kind, topic in
+                  zip((Image, CameraInfo, Imu), BAG_TOPICS.values(), strict=True)
+                  if kind is not CameraInfo}
+    publish_in_time((publishers[type(message)], bag_time_ns, message)
+                    for bag_time_ns, message in messages if type(message) in publishers)
+
+
 def test_a_camera_without_camera_info_gives_poses(ros_domain_id, bundled_bag):
     """Its calibration stands in the parameters."""
     messages = read_messages(bundled_bag, 1.5)
@@ -210,11 +219,7 @@ def test_a_camera_without_camera_info_gives_poses(ros_domain_id, bundled_bag):
         diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
         node.wait_for('ready')
         graph.wait_for_publisher('/relpose_node/relative_pose')
-        publishers = {kind: graph.publisher(kind, topic) for kind, topic in
-                      zip((Image, CameraInfo, Imu), BAG_TOPICS.values(), strict=True)
-                      if kind is not CameraInfo}
-        publish_in_time((publishers[type(message)], bag_time_ns, message)
-                        for bag_time_ns, message in messages if type(message) in publishers)
+        publish_all_but_camera_info(graph, messages)
         wait_until(lambda: len(poses) >= 3, 'three poses', node)
         # The first images waited for a CameraInfo, and were used.
         count = len(diagnostics)
@@ -240,11 +245,7 @@ def test_a_late_node_gets_a_latched_camera_info_and_says_why_no_image_comes(
             image = BAG_TOPICS['image']
             node.wait_for(f'not estimating: no image on {image} for 5 s; only '
                           f'{image}/compressed is published: set image_transport:=compressed')
-            publishers = {kind: graph.publisher(kind, topic) for kind, topic in
-                          zip((Image, CameraInfo, Imu), BAG_TOPICS.values(), strict=True)
-                          if kind is not CameraInfo}
-            publish_in_time((publishers[type(message)], bag_time_ns, message)
-                            for bag_time_ns, message in messages if type(message) in publishers)
+            publish_all_but_camera_info(graph, messages)
             wait_until(lambda: len(poses) >= 3, 'three poses', node)
             assert 'no CameraInfo' not in node.output
             # Told once. Of the drivers' other durability nothing is said.

@@ -249,9 +249,14 @@ def _consistency_arguments(parser: argparse.ArgumentParser) -> None:
                         metavar=('BAG', 'PARAMETERS', 'PAIRS'),
                         help='a recording, its parameter file and a table of true pairs '
                         '(pseudo_truth.csv); may be given several times')
+    parser.add_argument('--chain', nargs=2, type=Path, action='append', default=[],
+                        metavar=('BAG', 'PARAMETERS'),
+                        help='a recording and its parameter file: whether baselines of successive '
+                        'pairs agree with the scale of their tracks; may be given several times')
 
 
 def _run_consistency(args: argparse.Namespace) -> int:
+    from rs_relpose_lab.experiments import baseline_chain
     from rs_relpose_lab.experiments.consistency import (
         configurations,
         on_recording,
@@ -261,20 +266,26 @@ def _run_consistency(args: argparse.Namespace) -> int:
     )
 
     _check_at_least(0, args, 'bags')
-    if not args.bags and not args.recording:
-        raise InputError('--bags 0 needs a --recording: there is nothing to measure')
+    if not args.bags and not args.recording and not args.chain:
+        raise InputError('--bags 0 needs a --recording or a --chain: there is nothing to measure')
     args.output.mkdir(parents=True, exist_ok=True)
     pairs: list[PairConsistency] = []
-    with progress_bar(args.bags + len(args.recording), 'bag') as bar:
+    found: list[baseline_chain.BaselineStep] = []
+    with progress_bar(args.bags + len(args.recording) + len(args.chain), 'bag') as bar:
+        for chain in args.chain:
+            found += baseline_chain.chain_of(*chain)
+            bar.update()
         for recording in args.recording:
             pairs += on_recording(*recording)
             bar.update()
         for config in configurations(args.bags, args.seed):
             pairs += on_simulated_bag(config, args.output / f'seed_{config.seed}')
             bar.update()
-    if not pairs:
-        raise InputError('no pair could be compared with the truth')
-    return _tell(write_report(args.output, pairs), args.output)
+    if not pairs and not found:
+        raise InputError('no pair could be compared with the truth, or with the pair before it')
+    reports = ([write_report(args.output, pairs)] if pairs else []) + (
+        [baseline_chain.write_report(args.output, found)] if found else [])
+    return _tell('\n'.join(reports), args.output)
 
 
 def _run_calibration(args: argparse.Namespace) -> int:
@@ -505,7 +516,8 @@ BENCHMARKS = {
         'whether covariances hold, on simulated bags and on recordings',
         'Squared errors of rotation and direction of translation in units of their covariance '
         '(NEES by degrees of freedom: 1 where it is right), over the pairs of rendered bags of '
-        'walks, and over the true pairs of recordings, short and long ones.',
+        'walks, and over the true pairs of recordings, short and long ones. With --chain: metric '
+        'baselines of successive pairs of a recording without truth.',
         _consistency_arguments, _run_consistency, 'consistency', first_seed=401, seed_of='bag'),
     'global-shutter': Benchmark(
         "images turned to their middle row: against the truth, and OpenCV's 5-point on them",

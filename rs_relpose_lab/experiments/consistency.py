@@ -145,7 +145,7 @@ def image_stamps(path: Path) -> list[int]:
     images: list[PublishedImage] = []
     feed = SensorFeed({Role.IMAGE: images.append})
     with open_bag(path) as bag:
-        for role, message in feed.messages(bag, bag.find_topics()):
+        for role, message in feed.messages(bag, bag.find_topics(needs_camera_info=False)):
             feed.receive(role, message.message)
     return [image.stamp_ns for image in images]
 
@@ -156,8 +156,8 @@ def pair_of(path: Path, parameters: Parameters, stamps: frozenset[int]) -> PairR
                         max_keyframe_interval=60.0, min_tracked_fraction=0.0,
                         max_keyframe_frames=len(stamps) - 1)
     with open_bag(path) as bag:
-        replay = Replay(bag, bag.find_topics(), replace(parameters, keyframes=keyframes),
-                        stamps=stamps)
+        topics = bag.find_topics(needs_camera_info=not parameters.intrinsics.given)
+        replay = Replay(bag, topics, replace(parameters, keyframes=keyframes), stamps=stamps)
         return next((pair.result for pair in replay.pairs()), None)
 
 

@@ -60,7 +60,8 @@ def _told_by(module: Any) -> dict[str, Any]:
 # Folder of a recording -> how it is read, and what is right of it.
 REAL: Mapping[str, tuple[Callable[[Path], RecordedFiles], Callable[[], Mapping[str, Any]]]] = {
     'realsense_rgb_rs': (realsense.read_recording, lambda: _told_by(realsense)),
-    'realsense_rgb_rs_b': (realsense.read_recording, lambda: _told_by(realsense)),
+    'realsense_rgb_rs_b': (realsense.read_recording,
+                           lambda: {**_told_by(realsense), 'time_offset': -0.064}),
     'xiaomi_cc9_rs': (xiaomi.read_recording, lambda: _told_by(xiaomi)),
     'android_phone_rs': (_phone, lambda: _PHONE),
 }

@@ -133,8 +133,10 @@ def _texture(trial: Trial, health: Health) -> Finding:
 def _remeasured(trial: Trial, seen: Scan, completion: Completion) -> Health:
     """What the trial found; where it got lost, what a calibration from nothing contradicts."""
     found, health = completion.found, trial.health
-    units = any(fault.figure == 'gyro_unit' for fault in health.faults)
-    if found is None or seen.intrinsics is None or units or not trial.is_lost:
+    # What no calibration finds: another unit, and axes of which no rotation is seen.
+    beyond = any(fault.figure == 'gyro_unit' or (fault.figure == 'axes' and fault.seen is None)
+                 for fault in health.faults)
+    if found is None or seen.intrinsics is None or beyond or not trial.is_lost:
         return health
     wrong = contradicted(found, completion.parameters.sensor,
                          sensor_camera(seen.intrinsics, completion.parameters))

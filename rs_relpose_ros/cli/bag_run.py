@@ -1,9 +1,9 @@
-"""What `replay` and `odometry` have in common: a bag through the front end, into a folder."""
+"""What `replay`, `pairs` and `odometry` have in common: a bag's results, into a folder."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 import sys
 from typing import Any, Protocol, TypeVar
@@ -63,3 +63,10 @@ def run_on_bag(args: argparse.Namespace, name: str, work: Work[Made]) -> tuple[P
     write_summary(folder / SUMMARY_FILE, results.figures, bag=args.bag, topics=topics,
                   parameters=parameters, command=sys.argv, package_version=package_version())
     return folder, results
+
+
+def errors_line(errors: Mapping[str, float]) -> str:
+    """Errors of pairs against the truth, as in summary.json, in a line."""
+    return (f'against the truth (median, 90 %): rotation {errors["rotation_median_deg"]:.3g}, '
+            f'{errors["rotation_p90_deg"]:.3g} deg; direction of translation '
+            f'{errors["translation_median_deg"]:.3g}, {errors["translation_p90_deg"]:.3g} deg')

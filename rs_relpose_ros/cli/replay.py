@@ -7,7 +7,7 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from rs_relpose_ros.cli.bag_run import add_run_arguments, run_on_bag
+from rs_relpose_ros.cli.bag_run import add_run_arguments, errors_line, run_on_bag
 from rs_relpose_ros.replay.outputs import replay_into, ReplayOutcome
 from rs_relpose_ros.replay.run import read_stamps
 from rs_relpose_ros.result_files import SUMMARY_FILE
@@ -75,10 +75,7 @@ def report(outcome: ReplayOutcome, folder: Path) -> list[str]:
         lines += [f'no pose: {reason}' for reason in reasons[:5]]
     errors, medians = figures['errors_against_truth'], figures['medians']
     if errors:
-        lines.append(
-            f'against the truth (median, 90 %): rotation {errors["rotation_median_deg"]:.3g}, '
-            f'{errors["rotation_p90_deg"]:.3g} deg; direction of translation '
-            f'{errors["translation_median_deg"]:.3g}, {errors["translation_p90_deg"]:.3g} deg')
+        lines.append(errors_line(errors))
     if pairs['answered']:
         lines.append(
             f'medians: {_text(medians["inliers"], "inliers")}, residual '

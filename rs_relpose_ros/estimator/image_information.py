@@ -17,10 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.compiled import linked_kernel
 from rs_relpose_ros.estimator.information import inverse
 from rs_relpose_ros.estimator.map_fit import FitMatches, linearised, normal_equations
 from rs_relpose_ros.estimator.priors import Priors
-from rs_relpose_ros.estimator.state import DW1, PARAMETERS, TwoViewState
+from rs_relpose_ros.estimator.state import DW1, DW2, PARAMETERS, TwoViewState
 from rs_relpose_ros.estimator.uncertainty import score_of_matches
 
 Array = NDArray[np.float64]
@@ -67,7 +68,7 @@ class ImageInformation:
         """The same of the rotation alone, whatever the rest is."""
         if len(self.gradient) == ROTATION:
             return self
-        H, g = _without(self.information, self.gradient, ROTATION)
+        H, g = _of_rotation(self.information, self.gradient)
         return ImageInformation(self.row_time, self.R, np.full(3, np.nan), np.full(6, np.nan),
                                 H, g)
 
@@ -75,19 +76,32 @@ class ImageInformation:
 def image_information(matches: FitMatches, state: TwoViewState, priors: Priors,
                       row_time: float) -> ImageInformation:
     """Of the matches that a fit used; of its `priors`, only the rates' are kept."""
-    data = linearised(matches, state)
-    H, g = data.hessian.copy(), data.gradient.copy()
-    rates = np.arange(DW1, PARAMETERS)
-    # As the errors are, by image regions, not as a Hessian believes them to be: H S^-1 H.
-    S = score_of_matches(matches, state, data.hessian, normal_equations(data, state, priors)[0])
-    H[rates, rates] += priors.rate_weight
-    S[rates, rates] += priors.rate_weight
-    g[rates] += priors.rate_weight * np.concatenate([state.dw1, state.dw2])
-    S[np.diag_indices(PARAMETERS)] += _RANK * np.trace(S)
-    weighted = H @ inverse(S)
-    H, g = _without(weighted @ H, weighted @ g, POSE)
+    H, g = _of_pose(matches, state, priors)
     return ImageInformation(row_time, state.R, state.t, np.concatenate([state.d1, state.d2]),
                             H, g)
+
+
+@linked_kernel
+def _of_pose(matches: FitMatches, state: TwoViewState, priors: Priors) -> tuple[Array, Array]:
+    """Information (11, 11) and gradient (11,) of the pose, the rates being what they are."""
+    data = linearised(matches, state)
+    H, g = data.hessian, data.gradient
+    # As the errors are, by image regions, not as a Hessian believes them to be: H S^-1 H.
+    S = score_of_matches(matches, state, H, normal_equations(data, state, priors)[0])
+    floor = _RANK * (np.trace(S) + 6.0 * priors.rate_weight)
+    for i in range(3):
+        g[DW1 + i] += priors.rate_weight * state.dw1[i]
+        g[DW2 + i] += priors.rate_weight * state.dw2[i]
+    for i in range(DW1, PARAMETERS):
+        H[i, i] += priors.rate_weight
+        S[i, i] += priors.rate_weight
+    for i in range(PARAMETERS):
+        S[i, i] += floor
+    weighted = H @ inverse(S)
+    H, g = weighted @ H, weighted @ g
+    gain = H[:POSE, POSE:].copy() @ inverse(H[POSE:, POSE:].copy())
+    reduced = H[:POSE, :POSE] - gain @ H[POSE:, :POSE].copy()
+    return 0.5 * (reduced + reduced.T), g[:POSE] - gain @ g[POSE:]
 
 
 def rotation_information(R: Array, information: Array, prior: Array, turn_from_gyro: Array,
@@ -97,11 +111,12 @@ def rotation_information(R: Array, information: Array, prior: Array, turn_from_g
                             information - prior, -(prior @ turn_from_gyro))
 
 
-def _without(H: Array, g: Array, keep: int) -> tuple[Array, Array]:
-    """Canonical form of the first `keep` unknowns, the others being whatever they are."""
+def _of_rotation(H: Array, g: Array) -> tuple[Array, Array]:
+    """Canonical form of a pose's rotation, the others being whatever they are."""
     # Scaled, so that what counts as not observed does not depend on units.
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(H)[keep:], np.finfo(float).tiny))
-    rest = np.linalg.pinv(H[keep:, keep:] * np.outer(scale, scale), rcond=_RANK, hermitian=True)
-    gain = H[:keep, keep:] @ (rest * np.outer(scale, scale))
-    reduced = H[:keep, :keep] - gain @ H[keep:, :keep]
-    return 0.5 * (reduced + reduced.T), g[:keep] - gain @ g[keep:]
+    k = ROTATION
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(H)[k:], np.finfo(float).tiny))
+    rest = np.linalg.pinv(H[k:, k:] * np.outer(scale, scale), rcond=_RANK, hermitian=True)
+    gain = H[:k, k:] @ (rest * np.outer(scale, scale))
+    reduced = H[:k, :k] - gain @ H[k:, :k]
+    return 0.5 * (reduced + reduced.T), g[:k] - gain @ g[k:]

@@ -48,6 +48,7 @@ _TURN_POINTS, _TURN_FRAMES = 120, 3
 class _Turn:
     """An image that later ones are compared with, and how the gyro has turned since."""
 
+    stamp_ns: int
     ids: NDArray[np.uint32]   # (N,) of tracks
     rays: Array   # (N, 3) as measured
     by_gyro: Array = field(default_factory=lambda: np.eye(3))
@@ -56,7 +57,7 @@ class _Turn:
     @classmethod
     def none(cls) -> _Turn:
         """No image yet: the next one is the first."""
-        return cls(np.zeros(0, dtype=np.uint32), np.zeros((0, 3)), frames=_TURN_FRAMES)
+        return cls(0, np.zeros(0, dtype=np.uint32), np.zeros((0, 3)), frames=_TURN_FRAMES)
 
     def go_on(self, rotation: Array) -> None:
         """Count a frame that the gyro has turned by `rotation` since the one before."""
@@ -257,8 +258,9 @@ class Pipeline:
         _, old, new = np.intersect1d(before.ids, ids, assume_unique=True, return_indices=True)
         turned = rotation_of_rays(before.rays[old], rays[new])
         if turned is not None:
-            self._health.add_turn(stamp_ns, turned, log_so3(before.by_gyro))
-        self._turn = _Turn(ids, rays)
+            self._health.add_turn(stamp_ns, seconds_between(before.stamp_ns, stamp_ns), turned,
+                                  log_so3(before.by_gyro))
+        self._turn = _Turn(stamp_ns, ids, rays)
 
     def _judged(self, pose: RelativePose, matches: Matches, reference: View, view: View,
                 sensor: Sensor, parameters: Parameters) -> RelativePose:

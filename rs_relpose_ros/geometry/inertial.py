@@ -74,8 +74,8 @@ class InertialMotion:
             object.__setattr__(self, name, vector)
         covariance = np.array(self.covariance, dtype=np.float64)
         if covariance.shape != (6, 6) or not np.abs(covariance).max() < _LARGEST**2 \
-                or not np.allclose(covariance, covariance.T, atol=1e-9) \
-                or np.linalg.eigvalsh(covariance).min() < -1e-9:
+                or np.abs(covariance - covariance.T).max() > 1e-9 \
+                or np.linalg.eigvalsh(covariance)[0] < -1e-9:
             raise InputError('covariance must be a (6, 6) covariance matrix of alpha [m] and beta '
                              f'[m/s], got {covariance.tolist()}')
         object.__setattr__(self, 'covariance', covariance)
@@ -99,7 +99,10 @@ class InertialMotion:
                  - delay * self.duration * a1)
         beta = self.beta + delay * change
         # An error of beta moves alpha with it.
-        jacobian = np.kron(np.array([[1.0, delay], [0.0, 1.0]]), turn.T)
+        jacobian = np.zeros((6, 6))
+        jacobian[:3, :3] = jacobian[3:, 3:] = turn.T
+        jacobian[:3, 3:] = delay * turn.T
+        covariance = jacobian @ self.covariance @ jacobian.T
         return replace(self, alpha=turn.T @ alpha, beta=turn.T @ beta,
-                       covariance=jacobian @ self.covariance @ jacobian.T,
+                       covariance=0.5 * (covariance + covariance.T),
                        acceleration1=turn.T @ a1, acceleration2=turn.T @ a2)

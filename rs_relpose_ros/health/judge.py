@@ -29,7 +29,7 @@ from rs_relpose_ros.health.deviation import (
     SCALE,
 )
 from rs_relpose_ros.health.findings import Finding, Health, HealthState
-from rs_relpose_ros.health.recursion import Calibration, PRIOR_SIGMA
+from rs_relpose_ros.health.recursion import Calibration, PRIOR_INFORMATION, PRIOR_SIGMA
 from rs_relpose_ros.health.turning import TurnComparison
 
 Array = NDArray[np.float64]
@@ -38,10 +38,8 @@ Array = NDArray[np.float64]
 _CERTAIN = 4.0
 # Shift of the pose in its own sigmas (Mahalanobis) that matters, and that leaves its covariance.
 _MATTERS, _OUTSIDE = 1.0, 3.0
-# Axes are wrong where the best rotation leaves less than this share of the images' turning, is
-# larger than the recursive calibration reaches [rad], and leaves so much less unexplained [rad]
-# than the axes as told; half of what it leaves itself counts as chance.
-_EXPLAINED_AT_BEST, _LARGE_TURN, _BETTER = 0.5, 1.0, 0.15
+# Axes and unit are said to be wrong where this leaves less than this share of the images' turning.
+_EXPLAINED_AT_BEST = 0.5
 # Images over gyro beyond which only another unit explains the scale (deg/s: 0.017).
 _UNIT_FACTOR = 5.0
 # Turning of the gyro [rad] after which images must agree, and the share that they then must
@@ -53,6 +51,8 @@ _HALF_TURN = 0.6
 _SEEN_IN = 0.9
 # Sigmas of a figure that was told with one, within which it is as told.
 _AS_TOLD = 3.0
+# Gain in chi-square beyond which there is no doubt.
+_LARGEST_GAIN = 100.0
 # Figures that are asked for at most: traces of a gross one need some, too.
 _MOST_CAUSES = 4
 # Chi-square by which a second figure may explain less, and still fits as well.
@@ -105,6 +105,10 @@ FIGURES = (
     Figure('focal_length', slice(FOCAL, FOCAL + 1), 0.04, 'px'),
     Figure('distortion', slice(DISTORTION, DISTORTION + 1), 0.05, ''),
 )
+
+# Deviations of each figure, and the determinant of their prior.
+_PRIORS = tuple((figure.part, float(np.prod(PRIOR_SIGMA[figure.part] ** 2.0)))
+                for figure in FIGURES)
 
 
 class Cause(NamedTuple):
@@ -167,6 +171,29 @@ def causes(seen: Calibration, effects: list[Effect], in_force: Array) -> list[Ca
     return explained
 
 
+def undetermined(seen: Calibration, in_force: Array) -> Array:
+    """Second moment (11, 11) of the deviations, averaged over which figure is off, if any.
+
+    Before the first pair each one is as likely to be off, by its prior P, as none. Pairs where
+    told and seen agree lower these odds as they lower the figure's sigma, others raise them
+    (Bayesian model averaging; Hoeting et al., Statistical Science 1999)::
+
+        odds_k = (|Sigma_k| / |P_k|)^1/2 exp(b_k^T Sigma_k b_k / 2),  Sigma_k = (S_kk + P_k^-1)^-1
+    """
+    odds, moment = 0.0, np.zeros((DEVIATIONS, DEVIATIONS))
+    posterior = seen.S / seen.scatter + PRIOR_INFORMATION
+    left = (seen.b - seen.S @ in_force) / seen.scatter
+    for part, largest in _PRIORS:
+        covariance = np.linalg.inv(posterior[part, part])
+        determinant = float(np.linalg.det(covariance))
+        deviation = covariance @ left[part]
+        gain = min(float(left[part] @ deviation), _LARGEST_GAIN)
+        of_figure = math.sqrt(determinant / largest) * math.exp(0.5 * gain)
+        moment[part, part] = of_figure * (covariance + deviation[:, None] * deviation)
+        odds += of_figure
+    return moment / (1.0 + odds)
+
+
 def _solved(seen: Calibration, taken: NDArray[np.bool_], in_force: Array) -> tuple[Array, Array]:
     """Deviations (11,) from what is in force where only those `taken` are off; 1 sigma each."""
     together, sigma = np.zeros(DEVIATIONS), np.zeros(DEVIATIONS)
@@ -185,11 +212,12 @@ def _beside_all(figure: Figure, seen: Calibration, in_force: Array) -> float:
 def _alone(figure: Figure, seen: Calibration, left: Array, taken: NDArray[np.bool_]) -> float:
     """Sigmas by which a figure is off when, beside those that are taken, it is off alone."""
     part = figure.part
-    S = seen.S[part, part] + np.diag(PRIOR_SIGMA[part] ** -2.0)
+    S = seen.S[part, part] + PRIOR_INFORMATION[part, part]
     if taken.any():
         cross = seen.S[part][:, taken]
         S = S - cross @ np.linalg.solve(seen.S[np.ix_(taken, taken)], cross.T)
-    gain = float(left[part] @ np.linalg.solve(S, left[part])) / seen.misfit
+    of_part = left[part] / S[0] if len(S) == 1 else np.linalg.solve(S, left[part])
+    gain = float(left[part] @ of_part) / seen.misfit
     # A vector gains more by chance.
     return math.sqrt(max(gain - 2.0 * (part.stop - part.start - 1), 0.0))
 
@@ -367,9 +395,7 @@ def _gross(turned: TurnComparison | None, told: Told) -> Iterator[Finding]:
             yield _fault('gyro_unit', wrong, f'images turn {turned.scale:.3g} times as far as the '
                          'gyro: it must be in rad/s, which is pi / 180 = 0.0175 times deg/s',
                          1.0, turned.scale)
-        better = (turned.left_as_told - 1.5 * explained) * turned.by_images
-        mirrored = turned.left_mirrored < turned.left_at_best
-        if better > _BETTER and (mirrored or turned.angle > _LARGE_TURN):
+        if turned.is_left_handed or turned.is_turned:
             yield from _turned_axes(turned, told)
     elif turned.by_gyro > _LONG_TURN and explained > _INDEPENDENT:
         text = ('images and gyro turn independently of each other: is it the IMU of this camera, '
@@ -380,9 +406,14 @@ def _gross(turned: TurnComparison | None, told: Told) -> Iterator[Finding]:
 
 def _turned_axes(turned: TurnComparison, told: Told) -> Iterator[Finding]:
     wrong = HealthState.WRONG
-    if turned.left_mirrored < 0.5 * turned.left_at_best:
-        yield _fault('axes', wrong, 'the axes of the gyro are left-handed: one of them has the '
-                     'wrong sign')
+    if turned.is_left_handed:
+        # In the IMU's own axes one sign is all that is wrong, as a rule.
+        R_cam_imu = told.sensor.R_cam_imu
+        signs = np.diag(R_cam_imu.T @ turned.reflection @ R_cam_imu)
+        axis = 'xyz'[int(np.argmin(signs))] if sorted(signs)[1] > 0.7 > -0.7 > min(signs) else ''
+        yield _fault('axes', wrong, 'the axes of the gyro are left-handed: ' + (
+            f'its {axis} has' if axis else 'one or all of them have') + ' the wrong sign, which '
+            'no quat_cam_imu_xyzw sets right: correct the driver')
         return
     angle, Q = turned.angle, turned.rotation
     xyzw = _listed(Rotation.from_matrix(Q @ told.sensor.R_cam_imu).as_quat(), 3)

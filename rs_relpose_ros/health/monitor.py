@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.health.deviation import DEVIATIONS
 from rs_relpose_ros.health.findings import Health, HealthState, NOT_JUDGED
-from rs_relpose_ros.health.judge import Cause, causes, Effect, judged, Told
+from rs_relpose_ros.health.judge import Cause, causes, Effect, judged, Told, undetermined
 from rs_relpose_ros.health.pair_information import PairEvidence, PairInformation
 from rs_relpose_ros.health.recursion import NOTHING_SEEN, Recursion
 from rs_relpose_ros.health.turning import TurnSums
@@ -20,9 +20,6 @@ Array = NDArray[np.float64]
 
 # Latest pairs with a pose over which the effect of a deviation is taken.
 _EFFECTS = 30
-# Pairs of a start whose poses get the covariance of all that may be told wrong: nothing that was
-# told has been seen to be true yet.
-_FIRST_PAIRS = 3
 # Deviations about which a pair is linearised at most: lens and read-out must stay possible.
 _LARGEST = np.array([0.5] * 3 + [0.06, 0.1] + [0.2] * 3 + [0.3, 0.45, 0.6])
 
@@ -47,9 +44,9 @@ class HealthMonitor:
         self._causes = []
         self.health, self.calibration = NOT_JUDGED, NOTHING_SEEN
 
-    def add_turn(self, stamp_ns: int, by_images: Array, by_gyro: Array) -> None:
-        """Take in the turns (3,) over some frames, by images alone and by gyro."""
-        self._turns.add(stamp_ns, by_images, by_gyro)
+    def add_turn(self, stamp_ns: int, interval: float, by_images: Array, by_gyro: Array) -> None:
+        """Take in the turns (3,) over some frames, `interval` [s], by images alone and by gyro."""
+        self._turns.add(stamp_ns, interval, by_images, by_gyro)
 
     def add_pair(self, stamp_ns: int, evidence: PairEvidence | None, pose: RelativePose,
                  told: Told) -> RelativePose:
@@ -80,11 +77,10 @@ class HealthMonitor:
         self._causes = causes(self.calibration, list(self._effects), told.in_force)
         by_deviation = information.pose_by_deviation
         shift = by_deviation @ self._deviation()
-        doubt = np.outer(shift, shift)
-        if self.calibration.pairs <= _FIRST_PAIRS:
-            doubt += by_deviation @ self.calibration.covariance @ by_deviation.T
-        if doubt.any():
-            pose = replace(pose, covariance=pose.covariance + doubt)
+        # What is off, and what the pairs so far have not yet shown to be as told.
+        doubt = np.outer(shift, shift) + (
+            by_deviation @ undetermined(self.calibration, told.in_force) @ by_deviation.T)
+        pose = replace(pose, covariance=pose.covariance + doubt)
         # What a figure that is off does to the baseline is not known.
         return pose.without_baseline('baseline not known: a figure that was told is suspect '
                                      '(see health)') if shift.any() and pose else pose

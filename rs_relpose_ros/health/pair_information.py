@@ -116,7 +116,8 @@ def pair_information(pair: PairEvidence, in_force: Array, about: Array) -> PairI
     priors = Priors(np.zeros(3), np.zeros(3), 0.0, 0.0, pair.gyro_sigma**-2,
                     np.ascontiguousarray(rotation), information,
                     isotropic(_VELOCITY_SIGMA, 1.0 / pair.interval))
-    if at.any():
+    # Without a translation there is no estimate about which a pair could be linearised.
+    if at.any() or not np.isfinite(pair.t).all():
         r = np.abs(residuals(observations, state))
         state = stepped(FitMatches(observations, (r < 4.0 * np.median(r)).astype(float),
                                    _noise(r)), state, priors, _STEPS_ANEW)

@@ -28,14 +28,16 @@ Array = NDArray[np.float64]
 # Pairs that count: those of the last seconds, at most so many.
 _WINDOW_NS = to_nanoseconds(20.0)
 _MOST_PAIRS = 100
-# Older pairs that are linearised anew with each new one, once a figure is found off.
-_ANEW = 3
+# Older pairs that are linearised anew with each new one, once a figure is found off, and distance
+# in sigmas of the prior within which that changes nothing.
+_ANEW, _NEAR = 3, 0.02
 # Sigmas of n pairs are widened by (n + 6) / n: few scores scatter less than they should. Share of
 # a pair's sigma that is alike in all pairs, and no mean makes smaller: blur, the tracker's bias, a
 # lens that the model does not fit.
 _UNSEEN_PAIRS, _SHARED = 6, 0.25
 # Deviations before the first pair, 1 sigma: rad, s, s, rad/s, -, -, -.
 PRIOR_SIGMA = np.array([0.2] * 3 + [0.05, 0.03] + [0.1] * 3 + [0.2, 0.3, 0.5])
+PRIOR_INFORMATION = np.diag(PRIOR_SIGMA**-2.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +48,8 @@ class Calibration:
     covariance: Array   # (11, 11)
     S: Array   # (11, 11) and (11,): sums of the pairs, without a prior
     b: Array
-    misfit: float   # variance of the scores over that by S: 1 where residuals are independent
+    scatter: float   # variance of the scores over that by S: 1 where residuals are independent
+    misfit: float   # the same with what all pairs share
     pairs: int
 
     @property
@@ -56,7 +59,7 @@ class Calibration:
 
 
 NOTHING_SEEN = Calibration(np.zeros(DEVIATIONS), np.diag(PRIOR_SIGMA**2),
-                           np.zeros((DEVIATIONS, DEVIATIONS)), np.zeros(DEVIATIONS), 1.0, 0)
+                           np.zeros((DEVIATIONS, DEVIATIONS)), np.zeros(DEVIATIONS), 1.0, 1.0, 0)
 
 
 class _Entry(NamedTuple):
@@ -100,8 +103,11 @@ class Recursion:
         return information
 
     def _linearise_anew(self, about: Array) -> None:
-        apart = [float(np.linalg.norm((pair.about - about) / PRIOR_SIGMA)) for pair in self._pairs]
+        apart = np.linalg.norm(
+            (np.array([pair.about for pair in self._pairs]) - about) / PRIOR_SIGMA, axis=1)
         for k in np.argsort(apart, kind='stable')[::-1][:_ANEW]:
+            if apart[k] < _NEAR:
+                break
             pair = self._pairs[k]
             information = pair_information(pair.evidence, pair.in_force, about)
             if information is not None:
@@ -122,7 +128,7 @@ class Recursion:
         scores = b - S @ c
         sandwich = inverse @ (scores.T @ scores) @ inverse
         ratios = np.maximum(np.diag(sandwich) / np.diag(inverse), 1.0) * (
-            1.0 + _SHARED**2 * n) * ((n + _UNSEEN_PAIRS) / n) ** 2
-        wider = np.sqrt(ratios)
-        return Calibration(c, inverse * np.outer(wider, wider), S.sum(axis=0), b.sum(axis=0),
-                           float(np.median(ratios)), n)
+            (n + _UNSEEN_PAIRS) / n) ** 2
+        shared, scatter = 1.0 + _SHARED**2 * n, float(np.median(ratios))
+        return Calibration(c, shared * inverse * np.sqrt(np.outer(ratios, ratios)), S.sum(axis=0),
+                           b.sum(axis=0), scatter, shared * scatter, n)

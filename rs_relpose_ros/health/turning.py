@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,12 @@ _WINDOW_NS = to_nanoseconds(8.0)
 _MOST_TURNS = 160
 # Turns, and turning [rad, their sum], that a comparison needs.
 _LEAST_TURNS, _LEAST_TURN = 5, 0.15
+# Rotation of axes [rad] that the recursive calibration does not reach.
+_LARGE_TURN = 1.0
+# Logarithm of a ratio of likelihoods that is certain, errors of neighbours being alike.
+_LOG_LIKELIHOOD = 20.0
+# Images over gyro from which on what the gyro says may be its bias for the most part.
+_MOSTLY_BIAS = 5.0
 
 
 def rotation_of_rays(rays1: Array, rays2: Array) -> Array | None:
@@ -58,9 +65,33 @@ class TurnComparison:
     left_at_best: float   # `rotation`
     left_mirrored: float   # the best reflection: a gyro whose axes are left-handed
     rotation: Array   # (3, 3) Q: the true gyro is Q times the told one
+    reflection: Array   # (3, 3) the best one
     scale: float   # images over gyro, after `rotation`
     by_images: float   # [rad] turning, summed
     by_gyro: float
+    turns: int
+
+    @property
+    def is_turned(self) -> bool:
+        """Whether the axes are another way round: `rotation` is large, and better for certain."""
+        return self.angle > _LARGE_TURN and self._certain(self.left_as_told, self.left_at_best)
+
+    @property
+    def is_left_handed(self) -> bool:
+        """Whether a reflection explains the images better than any rotation, for certain.
+
+        Where all turns are about two axes both explain the same.
+        """
+        return self._certain(self.left_at_best, self.left_mirrored)
+
+    def _certain(self, left: float, left_instead: float) -> bool:
+        """Whether the second of two explanations is better.
+
+        By the ratio of their likelihoods, with normal errors of a variance that nobody knows; each
+        turn has three components.
+        """
+        ratio = max(left, 1e-9) / max(left_instead, 1e-9)
+        return 1.5 * self.turns * math.log(ratio) > _LOG_LIKELIHOOD
 
     @property
     def angle(self) -> float:
@@ -68,34 +99,46 @@ class TurnComparison:
         return float(np.linalg.norm(log_so3(self.rotation)))
 
 
+class _Turned(NamedTuple):
+    """Rotation vectors (3,) over some frames."""
+
+    stamp_ns: int
+    interval: float   # [s]
+    by_images: Array
+    by_gyro: Array
+
+
 class TurnSums:
     """The turns of the last seconds."""
 
     def __init__(self) -> None:
-        self._turns: deque[tuple[int, Array, Array]] = deque(maxlen=_MOST_TURNS)
+        self._turns: deque[_Turned] = deque(maxlen=_MOST_TURNS)
 
     def clear(self) -> None:
         """Forget all turns."""
         self._turns.clear()
 
-    def add(self, stamp_ns: int, by_images: Array, by_gyro: Array) -> None:
-        """Take in the turns (3,) over the same frames, in the order of time."""
-        if self._turns and stamp_ns < self._turns[-1][0]:
+    def add(self, stamp_ns: int, interval: float, by_images: Array, by_gyro: Array) -> None:
+        """Take in the turns (3,) over the same frames, `interval` [s], in the order of time."""
+        if self._turns and stamp_ns < self._turns[-1].stamp_ns:
             self.clear()
-        self._turns.append((stamp_ns, by_images, by_gyro))
-        while self._turns[0][0] < stamp_ns - _WINDOW_NS:
+        self._turns.append(_Turned(stamp_ns, interval, by_images, by_gyro))
+        while self._turns[0].stamp_ns < stamp_ns - _WINDOW_NS:
             self._turns.popleft()
 
     def compared(self) -> TurnComparison | None:
         """Both upon each other; None where they turned too little, or too few frames came."""
         if len(self._turns) < _LEAST_TURNS:
             return None
-        theta = np.array([turn for _, turn, _ in self._turns])
-        phi = np.array([turn for _, _, turn in self._turns])
+        theta = np.array([turn.by_images for turn in self._turns])
+        phi = np.array([turn.by_gyro for turn in self._turns])
         by_images = float(np.linalg.norm(theta, axis=1).sum())
         by_gyro = float(np.linalg.norm(phi, axis=1).sum())
         if max(by_images, by_gyro) < _LEAST_TURN or by_gyro < 1e-3 * _LEAST_TURN:
             return None
+        if by_images > _MOSTLY_BIAS * by_gyro:
+            intervals = np.array([turn.interval for turn in self._turns])
+            theta, phi = _unsteady(theta, intervals), _unsteady(phi, intervals)
         M, power, gyro = theta.T @ phi, float((theta**2).sum()), float((phi**2).sum())
 
         def left(trace: float) -> float:
@@ -109,4 +152,10 @@ class TurnSums:
         return TurnComparison(
             left(float(np.trace(M))), left(trace),
             left(float(singular[0] + singular[1] - handed * singular[2])), rotation,
-            trace / gyro, by_images, by_gyro)
+            np.ascontiguousarray((U * (1.0, 1.0, -handed)) @ Vt), trace / gyro, by_images,
+            by_gyro, len(self._turns))
+
+
+def _unsteady(turns: Array, intervals: Array) -> Array:
+    """Turns (N, 3) over intervals (N,) [s] without the constant rate that fits them best."""
+    return np.asarray(turns - np.outer(intervals, intervals @ turns / (intervals @ intervals)))

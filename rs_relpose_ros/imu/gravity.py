@@ -9,6 +9,13 @@ is a Kalman filter of the direction ``u`` (up, IMU frame) and of what is left of
 
 The noise is the camera's own acceleration over 9.81 m/s^2. A specific force that differs from
 that in length is known to hold acceleration and gets less weight.
+
+That noise is not white. A process noise that no sensor has keeps the memory short: with it the
+covariance P sets the gain K. The covariance E of the errors knows the noise of sensors and carrier
+alone (as of any suboptimal filter: A. Gelb, ed., *Applied Optimal Estimation*, MIT Press 1974,
+chapter 7)::
+
+    E <- F E F^T + Q_gyro dt           E <- (I - K H) E (I - K H)^T + K noise K^T
 """
 
 from __future__ import annotations
@@ -65,7 +72,8 @@ class _Noise(NamedTuple):
     """Noise of the filter, per axis."""
 
     acceleration: float   # [m^2/s^4] variance of the camera's own acceleration
-    turning: float   # [rad^2/s] growth of the variance of the direction
+    turning: float   # [rad^2/s] growth of the variance of the direction that sets the gain
+    gyro: float   # [rad^2/s] that of the gyro's white noise alone
     bias: float   # [rad^2/s^3] growth of the variance of the gyro bias
 
 
@@ -74,7 +82,8 @@ class _State(NamedTuple):
 
     up: Array   # (3,) u
     bias: Array   # (3,) b [rad/s]
-    covariance: Array   # (6, 6) P, of (d, e)
+    covariance: Array   # (6, 6) P, of (d, e), which sets the gain
+    errors: Array   # (6, 6) E, of (d, e) as they are
     residual: Array   # (3,) mean of f / |f| - u over about the last second
     length: Array   # (2,) of the specific force at rest [m/s^2], and its variance
 
@@ -90,10 +99,12 @@ class GravityFilter:
         turning = (across * _CORRELATION_TIME / config.gravity_time_constant**2
                    + config.gyro_noise_density**2)
         self._noise = _Noise(config.gravity_acceleration_sigma**2, turning,
+                             config.gyro_noise_density**2,
                              config.gyro_bias_sigma**2 / BIAS_MEMORY)
-        self._state = _State(np.zeros(3), np.zeros(3), np.zeros((6, 6)), np.zeros(3),
-                             np.array([STANDARD_GRAVITY, LENGTH_SIGMA**2]))
-        self._state.covariance[3:, 3:] = config.gyro_bias_sigma**2 * np.eye(3)
+        self._state = _State(np.zeros(3), np.zeros(3), np.zeros((6, 6)), np.zeros((6, 6)),
+                             np.zeros(3), np.array([STANDARD_GRAVITY, LENGTH_SIGMA**2]))
+        for covariance in (self._state.covariance, self._state.errors):
+            covariance[3:, 3:] = config.gyro_bias_sigma**2 * np.eye(3)
         # Of the last sample taken in: None while the direction is unknown.
         self.stamp_ns: int | None = None
         self._rate = np.zeros(3)
@@ -120,12 +131,16 @@ class GravityFilter:
             return None
         up = self._state.up
         # An error along the direction itself turns nothing.
-        spread = self._state.covariance[:3, :3]
+        spread = self._state.errors[:3, :3]
         variance = 0.5 * float(np.trace(spread) - up @ spread @ up)
-        dragged = (float(np.linalg.norm(self._state.residual))
-                   * min(_LASTING / self._config.gravity_time_constant, 1.0))
+        # What the noise does not explain of the mean residual lasts, and drags the direction.
+        residual = self._state.residual - up * (up @ self._state.residual)
+        of_noise = 2.0 * self._noise.acceleration / STANDARD_GRAVITY**2
+        unexplained = max(float(residual @ residual)
+                          - of_noise * _CORRELATION_TIME / _LASTING, 0.0)
+        variance += unexplained * min(_LASTING / self._config.gravity_time_constant, 1.0)**2
         length, length_variance = self._state.length
-        return GravityEstimate(-up, math.sqrt(variance + dragged * dragged), float(length),
+        return GravityEstimate(-up, math.sqrt(variance), float(length),
                                math.sqrt(length_variance))
 
     def _begin(self, k: int, stamps_ns: NDArray[np.int64], rates: Array, forces: Array) -> int:
@@ -138,10 +153,12 @@ class GravityFilter:
             return len(stamps_ns)
         first = k + int(usable[0])
         length = float(np.linalg.norm(forces[first]))
-        up, _, covariance, residual, _ = self._state
-        up[:], residual[:] = forces[first] / length, 0.0
-        covariance[:3, 3:] = covariance[3:, :3] = 0.0
-        covariance[:3, :3] = _direction_variance(length, self._noise.acceleration) * np.eye(3)
+        state = self._state
+        state.up[:], state.residual[:] = forces[first] / length, 0.0
+        for covariance in (state.covariance, state.errors):
+            covariance[:3, 3:] = covariance[3:, :3] = 0.0
+            covariance[:3, :3] = (_direction_variance(length, self._noise.acceleration)
+                                  * np.eye(3))
         self.stamp_ns, self._rate = int(stamps_ns[first]), rates[first].copy()
         return first + 1
 
@@ -186,20 +203,21 @@ def _predict(state: _State, noise: _Noise, turn: Array, dt: float) -> None:
     u <- E u        F = | E  dt I |        P <- F P F^T + Q dt
                         | 0     I |
     """
-    P = state.covariance
     E = exp_so3(turn)
     _turn(E, state.up)
     _turn(E, state.residual)
-    F, FP = np.zeros((6, 6)), np.zeros((6, 6))
+    F = np.zeros((6, 6))
     for i in range(3):
         F[i, 3 + i], F[3 + i, 3 + i] = dt, 1.0
         for j in range(3):
             F[i, j] = E[i, j]
-    _add_product(F, P, FP)
-    _write_product_transposed(FP, F, P)
-    for i in range(3):
-        P[i, i] += noise.turning * dt
-        P[3 + i, 3 + i] += noise.bias * dt
+    for P, growth in ((state.covariance, noise.turning), (state.errors, noise.gyro)):
+        FP = np.zeros((6, 6))
+        _add_product(F, P, FP)
+        _write_product_transposed(FP, F, P)
+        for i in range(3):
+            P[i, i] += growth * dt
+            P[3 + i, 3 + i] += noise.bias * dt
 
 
 @kernel
@@ -208,17 +226,19 @@ def _correct(state: _State, noise: _Noise, force: Array, dt: float) -> None:
 
     H = | -[u]x  0 |        S = H P H^T + variance I        K = P H^T S^-1
     (d, e) = K (f / |f| - u)        P <- P - K H P
+    E <- (I - K H) E (I - K H)^T + K noise K^T
     u <- Exp(d) u        b <- b + e
     """
-    up, bias, P, residual, at_rest = state
+    up, bias, P, E, residual, at_rest = state
     length = norm(force)
     at_rest[1] += _LENGTH_GROWTH * dt
     gain = at_rest[1] / (at_rest[1] + _LENGTH_NOISE**2 * max(_CORRELATION_TIME / dt, 1.0))
     at_rest[0] += gain * (dot(up, force) - at_rest[0])
     at_rest[1] *= 1.0 - gain
     # Samples closer than the correlation time share one measurement's weight.
-    variance = (_direction_variance(length, noise.acceleration)
-                * max(_CORRELATION_TIME / dt, 1.0))
+    sharing = max(_CORRELATION_TIME / dt, 1.0)
+    variance = sharing * _direction_variance(length, noise.acceleration)
+    usual = sharing * noise.acceleration / (STANDARD_GRAVITY * STANDARD_GRAVITY)
     H, PHt = np.zeros((3, 6)), np.empty((6, 3))
     H[0, 1], H[1, 0] = up[2], -up[2]
     H[0, 2], H[2, 0] = -up[1], up[1]
@@ -246,6 +266,18 @@ def _correct(state: _State, noise: _Noise, force: Array, dt: float) -> None:
         for j in range(6):
             P[i, j] -= KHP[i, j]
     _mirror(P)
+    rest, half = np.eye(6), np.zeros((6, 6))
+    scaled = np.empty((6, 3))
+    for i in range(6):
+        for j in range(3):
+            scaled[i, j] = -K[i, j]
+    _add_product(scaled, H, rest)   # I - K H
+    _add_product(rest, E, half)
+    _write_product_transposed(half, rest, E)
+    for i in range(6):
+        for j in range(6):
+            E[i, j] += usual * dot(K[i], K[j])
+    _mirror(E)
     _turn(exp_so3(turn), up)
     length = norm(up)
     for i in range(3):

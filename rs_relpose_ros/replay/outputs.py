@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,7 +64,10 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
     """
     run = Replay(bag, topics, parameters, stamps=stamps, keep_images=pictures, on_image=on_image)
     truth = read_truth(bag, topics)
-    _prepare(folder, with_bag)
+    if with_bag and (folder / BAG_FOLDER).exists():
+        raise InputError(f'{folder / BAG_FOLDER} exists already: remove it or choose another '
+                         'directory with --out')
+    prepare_folder(folder, (POSES_FILE, ERRORS_FILE, SUMMARY_FILE, *_PICTURES))
     records: list[PairRecord] = []
     shown: PairResult | None = None
     last, health = None, NOT_JUDGED
@@ -97,15 +100,13 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
                          files)
 
 
-def _prepare(folder: Path, with_bag: bool) -> None:
+def prepare_folder(folder: Path, replaced: Sequence[str]) -> None:
+    """Create a folder of results as needed, and remove the files that will be replaced."""
     if folder.exists() and not folder.is_dir():
         raise InputError(f'{folder} is a file: choose another directory with --out')
-    if with_bag and (folder / BAG_FOLDER).exists():
-        raise InputError(f'{folder / BAG_FOLDER} exists already: remove it or choose another '
-                         'directory with --out')
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name in (POSES_FILE, ERRORS_FILE, SUMMARY_FILE, *_PICTURES):
+        for name in replaced:
             (folder / name).unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f'{folder} cannot be written: {error.strerror}') from error

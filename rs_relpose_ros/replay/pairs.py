@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 import csv
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from rs_relpose_ros.bags.reader import Bag, BagMessage
 from rs_relpose_ros.bags.topics import SensorTopics
@@ -21,11 +23,17 @@ from rs_relpose_ros.front_end.sequencer import FrameRefused
 from rs_relpose_ros.messages.incoming import stamp_ns
 from rs_relpose_ros.messages.intake import Intake
 from rs_relpose_ros.messages.sensor_feed import Role
+from rs_relpose_ros.replay.outputs import ERRORS_FILE, POSES_FILE, prepare_folder
+from rs_relpose_ros.replay.run import read_truth
+from rs_relpose_ros.replay.summary import errors_against_truth
 from rs_relpose_ros.replay.tables import (
+    error_cells,
+    ERROR_COLUMNS,
     pair_record,
     PairRecord,
     relative_pose_cells,
     RELATIVE_POSE_COLUMNS,
+    table_writer,
 )
 from rs_relpose_ros.replay.truth import TrueTrajectory
 
@@ -79,13 +87,44 @@ class PairRow:
         return [*stamps, *relative_pose_cells(self.record)[len(stamps):], self.reason]
 
 
-def estimate_pairs(bag: Bag, topics: SensorTopics, parameters: Parameters,
-                   pairs: Sequence[Stamps], *, truth: TrueTrajectory | None = None,
-                   on_image: Callable[[], object] = lambda: None) -> list[PairRow]:
-    """A row for each of the pairs, in their order. `on_image` is called after each image."""
+@dataclass(frozen=True, slots=True, eq=False)
+class PairsOutcome:
+    """What came of a list; `figures`: as in summary.json; `files`: names of the tables."""
+
+    rows: list[PairRow]
+    figures: dict[str, Any]
+    files: list[str]
+
+
+def pairs_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parameters,
+               pairs: Sequence[Stamps], *,
+               on_image: Callable[[], object] = lambda: None) -> PairsOutcome:
+    """Write a row for each of the pairs, in their order, into tables in `folder`.
+
+    Those of an earlier run are replaced. `on_image` is called after each image.
+    """
+    truth = read_truth(bag, topics)
     run = _Run(bag, topics, parameters, [pair for pair in pairs if pair[0] < pair[1]], on_image)
     run.run()
-    return [run.row(pair, truth) for pair in pairs]
+    rows = [run.row(pair, truth) for pair in pairs]
+    records = [row.record for row in rows if row.record is not None]
+    prepare_folder(folder, (POSES_FILE, ERRORS_FILE))
+    files = [POSES_FILE]
+    with table_writer(folder / POSES_FILE, PAIR_COLUMNS) as write:
+        for row in rows:
+            write(row.cells())
+    if truth is not None:
+        files.append(ERRORS_FILE)
+        with table_writer(folder / ERRORS_FILE, ERROR_COLUMNS) as write:
+            for record in records:
+                write(error_cells(record))
+    answered = [record for record in records if record.pose]
+    by_status = Counter(record.status for record in records)
+    by_status[Status.BAD_INPUT] += len(rows) - len(records)
+    return PairsOutcome(rows, {
+        'pairs': {'total': len(rows), 'answered': len(answered),
+                  'by_status': {status.value: by_status[status] for status in Status}},
+        'errors_against_truth': errors_against_truth(answered)}, files)
 
 
 class _Run:

@@ -63,7 +63,7 @@ def summarize(records: Sequence[PairRecord], run: Replay,
         'medians': {
             figure.name: _median([record.figures[figure.name] for record in answered])
             for figure in PAIR_FIGURES},
-        'errors_against_truth': _errors(answered),
+        'errors_against_truth': errors_against_truth(answered),
         'timing': {
             'bag_s': (counts.last_ns - counts.first_ns) * 1e-9,
             'wall_s': counts.seconds,
@@ -107,7 +107,8 @@ def _tracked(last: PairResult | None) -> dict[str, Any] | None:
     }
 
 
-def _errors(answered: Sequence[PairRecord]) -> dict[str, Any] | None:
+def errors_against_truth(answered: Sequence[PairRecord]) -> dict[str, Any] | None:
+    """Medians and 90th percentiles of the errors; None without a truth."""
     errors = [record.errors for record in answered if record.errors is not None]
     if not errors:
         return None
