@@ -2,7 +2,7 @@
 #
 #   docker build --tag rs_relpose_ros .
 #   docker run --rm --network host --ipc host --volume "$PWD:/data" rs_relpose_ros \
-#       ros2 launch rs_relpose_ros relpose.launch.py camera_namespace:=/camera params_file:=/data/my_camera.yaml
+#       ros2 launch rs_relpose_ros relpose.launch.py params_file:=/data/my_camera.yaml
 #
 # Host network and shared memory, as the driver has them. `rs_relpose COMMAND` works, too.
 FROM ros:jazzy
@@ -14,7 +14,7 @@ COPY package.xml src/rs_relpose_ros/
 RUN apt-get update \
     && apt-get install --yes --no-install-recommends python3-pip \
     && rosdep update --rosdistro jazzy \
-    && rosdep install --from-paths src --ignore-src --yes --dependency-types exec \
+    && rosdep install --from-paths src --ignore-src -y --dependency-types exec \
     && rm -rf /var/lib/apt/lists/*
 COPY . src/rs_relpose_ros
 RUN . /opt/ros/jazzy/setup.sh && colcon build --packages-select rs_relpose_ros

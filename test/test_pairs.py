@@ -209,7 +209,7 @@ def test_gyro_is_carried_over_the_frames_between(returned, tmp_path):
     _, alone = run_pairs(bag, parameters, [(first, last)], tmp_path / 'a')
     _, with_it = run_pairs(bag, parameters, [(first, between), (between, last), (first, last)],
                            tmp_path / 'b')
-    assert with_it[2]['sigma_rz'] < alone[0]['sigma_rz']
+    assert float(with_it[2]['sigma_rz']) < 0.95 * float(alone[0]['sigma_rz'])
 
 
 # -- as a library ------------------------------------------------------------------------------
