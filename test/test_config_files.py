@@ -101,7 +101,11 @@ def test_launch_file_remaps_what_the_node_subscribes_to():
     keywords = {keyword.arg: keyword.value for keyword in node.keywords}
     assert ast.literal_eval(keywords['package']) == 'rs_relpose_ros'
     assert ast.unparse(keywords['executable']) == 'executable'
-    assert "'executable': ('relpose_node'," in LAUNCH_FILE.read_text(encoding='utf-8')
+    [arguments] = [part.value for part in tree.body if isinstance(part, ast.Assign)
+                   and ast.unparse(part.targets[0]) == 'ARGUMENTS']
+    defaults = {ast.literal_eval(name): ast.unparse(value.elts[0])
+                for name, value in zip(arguments.keys, arguments.values, strict=True)}
+    assert defaults['executable'] == "'relpose_node'"
     remapped = [ast.literal_eval(pair.elts[0]) for pair in keywords['remappings'].elts]
     assert remapped == ['image', 'camera_info', 'imu', 'accel']
 

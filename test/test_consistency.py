@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_lab.experiments.baseline_chain import steps
+from rs_relpose_lab.experiments.baseline_chain import steps, write_report
 from rs_relpose_lab.experiments.consistency import on_recording, pair_consistency, read_true_pairs
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.cli.main import main
@@ -83,7 +83,7 @@ def test_a_table_of_something_else_is_refused(tmp_path, capsys):
     assert 'nothing to measure' in capsys.readouterr().err
 
 
-def test_baselines_agree_with_the_scale_of_their_tracks(bundled_bag):
+def test_baselines_agree_with_the_scale_of_their_tracks(bundled_bag, tmp_path):
     """By the truth they do; one that is told half as large again does not."""
     parameters = read_parameters(PARAMETERS)
     with open_bag(bundled_bag) as bag:
@@ -105,3 +105,8 @@ def test_baselines_agree_with_the_scale_of_their_tracks(bundled_bag):
     assert [step.disagreement - ours.disagreement for step, ours in zip(
         told, right, strict=True)][1:3] == pytest.approx([np.log(1.5), -np.log(1.5)])
     assert abs(told[1].sigmas) > 3.0
+    beyond = sum(abs(step.sigmas) > 3.0 for step in told)
+    lines = write_report(tmp_path, told).splitlines()
+    for line in lines[2:]:   # all of them, and those that are known well: all
+        assert [int(cell) for cell in line.split('|')[2:4]] == [len(told), beyond]
+    assert (tmp_path / 'baseline_chain.csv').read_text().count('\n') == 1 + len(told)

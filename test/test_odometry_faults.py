@@ -25,7 +25,7 @@ from std_srvs.srv import Trigger
 from test_odometry import LEVER, PARAMETERS, QUAT, START_NS, Walk, walk
 
 from rs_relpose_lab.live.graph import diagnostic_values, Graph
-from rs_relpose_lab.live.processes import node_process, wait_until
+from rs_relpose_lab.live.processes import node_process, wait_until, wait_until_quiet
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.front_end.landmarks import Landmarks
 from rs_relpose_ros.front_end.pair import PairResult
@@ -141,7 +141,9 @@ def session(module_ros_domain_id: int) -> Iterator[Session]:
     given = walk(f'walk:{END + 1:g}', END, imu_rate=IMU_RATE)
     events = sorted(stream(given), key=lambda event: event[0])
     parameters = {'quat_cam_imu_xyzw': list(QUAT), 'imu_position': list(LEVER),
-                  'gyro_bias': list(PARAMETERS.imu.gyro_bias)}
+                  'gyro_bias': list(PARAMETERS.imu.gyro_bias),
+                  # A busy machine must not lose samples: that is not what is tested.
+                  f'qos_overrides.{BAG_TOPICS["imu"]}.subscription.reliability': 'reliable'}
     with Graph() as graph, node_process(
             BUNDLED_PARAMETERS, remap={'imu': BAG_TOPICS['imu']}, parameters=parameters,
             folder='odometry') as node:
@@ -158,6 +160,7 @@ def session(module_ros_domain_id: int) -> Iterator[Session]:
                             for at, message in events if begin <= at < end)
 
         play(-math.inf, RESET)
+        wait_until_quiet(lambda: len(received), 1.0, node)
         reset = graph.call(Trigger, f'{OWN}/reset', Trigger.Request())
         play(RESET, math.inf)
         count = len(paths)
