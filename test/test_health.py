@@ -310,6 +310,17 @@ def test_a_gyro_that_says_little_but_its_bias(turning):
         assert faults[0].seen == pytest.approx(math.degrees(1.0), rel=0.02)
 
 
+def test_images_that_move_sideways_seem_to_turn():
+    """A steady translation looks like a steady turn to the images: it says nothing of the axes."""
+    rng, sums = np.random.default_rng(5), TurnSums()
+    steady, drift = np.array([0.0, 0.15, 0.0]), np.array([0.0, -0.25, 0.07])   # [rad/s]
+    for k, spread in enumerate([0.01] * 12 + [1e-4] * 40):   # it sways, then goes steadily
+        by_gyro = 0.1 * steady + spread * rng.normal(size=3)
+        sums.add(100 * MS * k, 0.1, by_gyro + 0.1 * drift + 1e-3 * rng.normal(size=3), by_gyro)
+    told = Told(PARAMETERS.sensor, CAMERA, np.zeros(3), 0.003, NONE)
+    assert not judged(NOTHING_SEEN, [], sums.compared(), told).faults
+
+
 @pytest.mark.parametrize('axis', range(3))
 def test_left_handed_axes_are_no_rotation(axis):
     """One sign of the IMU's own axes, though translation hides a third of the turning."""

@@ -3,7 +3,8 @@
 No prior and no pose takes part, so that the comparison holds however wrong axes, unit or sign of
 the gyro are told. Rotation vectors over some frames, ``theta`` by images and ``phi`` by gyro
 in the camera frame as told, are gathered in ``M = sum theta phi^T``; the rotation Q that maximises
-``trace(Q^T M)`` lays one upon the other (Kabsch 1976).
+``trace(Q^T M)`` lays one upon the other (Kabsch 1976). A constant rate is taken out of both first:
+the gyro has it by its bias, images by a steady translation, which looks like a turn to them.
 """
 
 from __future__ import annotations
@@ -33,8 +34,6 @@ _LEAST_TURNS, _LEAST_TURN = 5, 0.15
 _LARGE_TURN = 1.0
 # Logarithm of a ratio of likelihoods that is certain, errors of neighbours being alike.
 _LOG_LIKELIHOOD = 20.0
-# Images over gyro from which on what the gyro says may be its bias for the most part.
-_MOSTLY_BIAS = 5.0
 
 
 def rotation_of_rays(rays1: Array, rays2: Array) -> Array | None:
@@ -136,9 +135,8 @@ class TurnSums:
         by_gyro = float(np.linalg.norm(phi, axis=1).sum())
         if max(by_images, by_gyro) < _LEAST_TURN or by_gyro < 1e-3 * _LEAST_TURN:
             return None
-        if by_images > _MOSTLY_BIAS * by_gyro:
-            intervals = np.array([turn.interval for turn in self._turns])
-            theta, phi = _unsteady(theta, intervals), _unsteady(phi, intervals)
+        intervals = np.array([turn.interval for turn in self._turns])
+        theta, phi = _unsteady(theta, intervals), _unsteady(phi, intervals)
         M, power, gyro = theta.T @ phi, float((theta**2).sum()), float((phi**2).sum())
 
         def left(trace: float) -> float:
