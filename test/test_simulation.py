@@ -273,7 +273,8 @@ def test_clocks_and_coverage():
 @pytest.fixture(scope='module')
 def bundled():
     """Arguments in bags/README.md and the simulation that they describe."""
-    line = re.search(r'^ +rs_relpose simulate (.*)$', (BAGS / 'README.md').read_text(), re.M)
+    readme = (BAGS / 'README.md').read_text().replace('\\\n', ' ')
+    line = re.search(r'^ +rs_relpose simulate (.*)$', readme, re.M)
     parser = argparse.ArgumentParser()
     command.add_arguments(parser)
     args = parser.parse_args(shlex.split(line.group(1)))
