@@ -52,7 +52,8 @@ def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag):
         # The one of this test, and the node's, which must not miss the first pair.
         wait_until(lambda: graph.node.count_subscribers('/relpose_node/pairs') == 2,
                    'the subscriptions', node)
-        with player_process(bundled_bag) as playing:
+        # Three topics of relpose_node, the IMU of odometry_node.
+        with player_process(bundled_bag, '--subscriptions', '4') as playing:
             assert playing.wait() == 0
         # The last keyframe waits for samples; on a busy machine the last pairs are late.
         wait_until_quiet(lambda: len(received), 2.0, node)

@@ -56,7 +56,9 @@ def run_beside(bag: Path, parameters: Path, folder: Path, profile: Path) -> list
             node.wait_for('ready')
         graph.wait_for_publisher('/global_shutter_node/image')
         before = {name: process_figures(node.pid) for name, node in nodes.items()}
-        with player_process(bag, '--decode', 'mono8', log=folder / 'player.log') as player:
+        # Three topics, two nodes.
+        with player_process(bag, '--decode', 'mono8', '--subscriptions', '6',
+                            log=folder / 'player.log') as player:
             wait_until(player.ended, 'the end of the player', *nodes.values(),
                        timeout=2.0 * PATIENCE + duration)
         count = len(reports)

@@ -59,6 +59,7 @@ class PlayerOptions:
     decode: str
     topics: Sequence[str]
     wait_for_subscribers: float
+    subscriptions: int
     loop: float
     duration: float
     log: Path | None
@@ -82,7 +83,7 @@ def play(node: Node, options: PlayerOptions) -> int:
         if options.wait_for_subscribers > 0.0:
             _wait_for_subscribers(
                 [publishers[topic.name] for topic in topics if topic.msgtype in _SENSOR_TYPES],
-                options.wait_for_subscribers)
+                options.subscriptions, options.wait_for_subscribers)
         return _publish(messages, publishers, options)
 
 
@@ -106,18 +107,21 @@ def _publisher(node: Node, topic: Topic, options: PlayerOptions) -> Publisher:
         reliability=reliability))
 
 
-def _wait_for_subscribers(publishers: Sequence[Publisher], seconds: float) -> None:
+def _wait_for_subscribers(publishers: Sequence[Publisher], least: int, seconds: float) -> None:
+    counts: dict[str, int] = {}
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline and rclpy.ok():
-        if all(p.get_subscription_count() > 0 for p in publishers):
+        counts = {p.topic_name: p.get_subscription_count() for p in publishers}
+        if all(counts.values()) and sum(counts.values()) >= least:
             time.sleep(_SETTLE)
             return
         time.sleep(0.02)
-    lonely = [p.topic_name for p in publishers if p.get_subscription_count() == 0]
-    if lonely:
-        raise MissingInputError(
-            f'nobody subscribed to {", ".join(lonely)} within {seconds:g} s: start the node '
-            'first, and remap its topics to these names')
+    if rclpy.ok():
+        lonely = [topic for topic, count in counts.items() if not count]
+        raise MissingInputError((
+            f'nobody subscribed to {", ".join(lonely)}' if lonely else
+            f'{sum(counts.values())} of {least} subscriptions came') + f' within {seconds:g} s: '
+            'start the node first, and remap its topics to these names')
 
 
 def _outgoing(bag: Bag, topics: Sequence[Topic], options: PlayerOptions) -> Iterator[Outgoing]:
@@ -191,6 +195,8 @@ def parse(arguments: Sequence[str]) -> PlayerOptions:
     parser.add_argument('--wait-for-subscribers', type=float, default=0.0, metavar='SECONDS',
                         help='longest wait for a subscription to each sensor topic; '
                              '0 (default) starts at once')
+    parser.add_argument('--subscriptions', type=int, default=0, metavar='N',
+                        help='wait for so many to all sensor topics together, of several nodes')
     parser.add_argument('--loop', type=float, default=0.0, metavar='SECONDS',
                         help='repeat a recording whose motion has this period, without a seam: '
                              'stamps go on from turn to turn; everything is decoded ahead')
