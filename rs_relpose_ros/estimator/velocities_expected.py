@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.config.estimator import CarrierMotion, MOTIONS
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.estimator.information import inverse
 from rs_relpose_ros.estimator.priors import PINNED, VelocityPrior
 from rs_relpose_ros.estimator.problem import TwoViewProblem
 from rs_relpose_ros.estimator.velocity_prior import Scales
@@ -70,7 +71,7 @@ def velocities_expected(problem: TwoViewProblem, motion: str, interval: float,
     centres = np.array([math.log(interval * carrier.slow) + step * (0.5 + k)
                         for k in range(SCALES)])
     prior = VelocityPrior(1.0 / interval, to_velocities @ expected,
-                          np.ascontiguousarray(np.linalg.inv(covariance)),
+                          inverse(covariance),
                           float(centres[SCALES // 2]), 0.0, (WIDTH * step) ** -2, 0.0)
     return prior, Scales(centres, np.zeros(SCALES))
 

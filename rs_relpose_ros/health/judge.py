@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.config.parameters import SensorConfig
+from rs_relpose_ros.estimator.information import inverse
 from rs_relpose_ros.geometry.camera import REFERENCE_ROWS, RollingShutterCamera
 from rs_relpose_ros.geometry.so3 import exp_so3
 from rs_relpose_ros.health.deviation import (
@@ -196,7 +197,7 @@ def undetermined(seen: Calibration, in_force: Array) -> Array:
 def _solved(seen: Calibration, taken: NDArray[np.bool_], in_force: Array) -> tuple[Array, Array]:
     """Deviations (11,) from what is in force where only those `taken` are off; 1 sigma each."""
     together, sigma = np.zeros(DEVIATIONS), np.zeros(DEVIATIONS)
-    covariance = np.linalg.inv(seen.S[np.ix_(taken, taken)])
+    covariance = inverse(seen.S[np.ix_(taken, taken)])
     together[taken] = covariance @ (seen.b - seen.S @ in_force)[taken]
     sigma[taken] = np.sqrt(seen.misfit * np.diag(covariance))
     return together, sigma
@@ -214,7 +215,7 @@ def _alone(figure: Figure, seen: Calibration, left: Array, taken: NDArray[np.boo
     S = seen.S[part, part] + PRIOR_INFORMATION[part, part]
     if taken.any():
         cross = seen.S[part][:, taken]
-        S = S - cross @ np.linalg.solve(seen.S[np.ix_(taken, taken)], cross.T)
+        S = S - cross @ inverse(seen.S[np.ix_(taken, taken)]) @ cross.T
     of_part = left[part] / S[0] if len(S) == 1 else np.linalg.solve(S, left[part])
     gain = float(left[part] @ of_part) / seen.misfit
     # A vector gains more by chance.

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.health.deviation import DEVIATIONS
@@ -111,6 +112,6 @@ def _effect(information: PairInformation, pose: RelativePose) -> Effect:
     # t is a direction: along itself it has no variance, and nothing moves it there.
     along = np.concatenate([pose.t, np.zeros(3)])
     claimed = np.linalg.cholesky(pose.covariance + np.outer(along, along))
-    return Effect(information.shift_by_deviation, np.asarray(
-        np.linalg.solve(claimed, information.pose_by_deviation)))
+    return Effect(information.shift_by_deviation, solve_triangular(
+        claimed, information.pose_by_deviation, lower=True))
 

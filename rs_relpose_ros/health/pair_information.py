@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 
 from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.estimator.information import inverse
@@ -150,7 +151,7 @@ def pair_information(pair: PairEvidence, in_force: Array, about: Array) -> PairI
     moved = _at_stamped_row(pair, problem, state, -covariance @ C)
     spread = np.linalg.cholesky(covariance[:D1, :D1])
     return PairInformation(S, b + S @ about, _pose_by_deviation(problem, state, moved),
-                           np.linalg.solve(spread, moved[:D1]), images)
+                           solve_triangular(spread, moved[:D1], lower=True), images)
 
 
 def _without_gyro(H: Array, gradient: Array, information: Array, theta: Array) -> Array:

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.estimator.information import inverse
 from rs_relpose_ros.geometry.timing import to_nanoseconds
 from rs_relpose_ros.health.deviation import DEVIATIONS
 from rs_relpose_ros.health.pair_information import (
@@ -124,13 +125,13 @@ class Recursion:
         # Scaled by the prior: the deviations have units of their own.
         scale = PRIOR_SIGMA
         hessian = S.sum(axis=0) * np.outer(scale, scale) + np.eye(DEVIATIONS)
-        inverse = np.linalg.inv(hessian) * np.outer(scale, scale)
-        c = inverse @ b.sum(axis=0)
+        covariance = inverse(hessian) * np.outer(scale, scale)
+        c = covariance @ b.sum(axis=0)
         scores = b - S @ c
-        sandwich = inverse @ (scores.T @ scores) @ inverse
-        ratios = np.maximum(np.diag(sandwich) / np.diag(inverse), 1.0) * (
+        sandwich = covariance @ (scores.T @ scores) @ covariance
+        ratios = np.maximum(np.diag(sandwich) / np.diag(covariance), 1.0) * (
             (n + _UNSEEN_PAIRS) / n) ** 2
         shared, scatter = 1.0 + _SHARED**2 * n, float(np.median(ratios))
-        undetermined = inverse * np.sqrt(np.outer(ratios, ratios))
+        undetermined = covariance * np.sqrt(np.outer(ratios, ratios))
         return Calibration(c, shared * undetermined, undetermined, S.sum(axis=0), b.sum(axis=0),
                            scatter, shared * scatter, n)
