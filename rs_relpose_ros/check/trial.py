@@ -10,7 +10,7 @@ from rs_relpose_ros.front_end.front_end import FrameFailed, FrontEnd
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.front_end.sequencer import FrameRefused
 from rs_relpose_ros.geometry.timing import to_nanoseconds
-from rs_relpose_ros.health.findings import Health, HealthState, NOT_JUDGED, worst_of
+from rs_relpose_ros.health.findings import Health, NOT_JUDGED, worst_of
 from rs_relpose_ros.messages.causes import CauseCounts
 from rs_relpose_ros.messages.incoming import stamp_ns
 from rs_relpose_ros.messages.intake import Intake
@@ -93,9 +93,8 @@ class Trial:
         """Whether a figure may be too far off for the trial to see by how much."""
         if not self.matches:
             return False
-        wrong = {fault.figure for fault in self.health.faults
-                 if fault.state is HealthState.WRONG}
-        return bool(wrong & _FAR_OFF) or self.poses < MOST_POSED * len(self.matches)
+        off = {fault.figure for fault in self.health.faults}
+        return bool(off & _FAR_OFF) or self.poses < MOST_POSED * len(self.matches)
 
     def _wants(self, message: BagMessage) -> bool:
         """Count an image; whether it belongs to a part."""

@@ -37,7 +37,7 @@ def _scaled_factor(information: Array) -> tuple[Array, Array]:
 def inverse(information: Array) -> Array:
     """Covariance (n, n) of an information matrix, or the other way round.
 
-    Bit-equal on any number of threads, which ``numpy.linalg.inv`` and ``solve`` are not from n = 6 on.
+    Bit-equal on any number of threads, which those of NumPy are not from n = 6 on.
     """
     scale, factor = _scaled_factor(information)
     n = len(scale)
