@@ -13,7 +13,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_lab.experiments.trust import bag_row, plans, recording_of, simulation_of, tasks
+from rs_relpose_lab.experiments.trust import (
+    bag_row,
+    BagPlan,
+    plans,
+    recording_of,
+    simulation_of,
+    tasks,
+)
 from rs_relpose_lab.experiments.trust_information import (
     pair_information,
     PLACES,
@@ -31,7 +38,7 @@ from rs_relpose_lab.experiments.trust_rows import (
     ROWS,
     UPSIDE_DOWN,
 )
-from rs_relpose_lab.experiments.trust_runs import JudgedPair, NO_HEALTH, run, Verdict
+from rs_relpose_lab.experiments.trust_runs import judged, JudgedPair, NO_HEALTH, run, Verdict
 from rs_relpose_lab.experiments.trust_tracks import (
     number_of,
     numbered_image,
@@ -350,6 +357,15 @@ def test_a_phone_that_turns_on_the_spot_is_told_right():
     pairs = [pair for pair, _ in run(recording, recording.told, 4.5)]
     assert 'PURE_ROTATION' in {pair.pose.status.value for pair in pairs}
     assert not [pair.health.faults for pair in pairs if pair.health.faults]
+
+
+def test_a_lens_left_out_is_told_where_a_little_more_of_it_would_not_move_the_pose():
+    """Its poses are off by 7 deg already; about what is seen, they move by ten sigmas."""
+    recording = recording_of(BagPlan(2, 64003, 3.0, 0.0186))
+    told = ROWS['no-distortion'].wrong(recording.told, np.random.default_rng(0))
+    pairs = [judged(recording, *result) for result in run(recording, told, 1.6)]
+    assert {pair.verdict.named for pair in pairs if pair.at > 1.0} == {('distortion',)}
+    assert not [pair.direction_error for pair in pairs if pair.has_pose]   # withheld
 
 
 def test_the_command_tells_wrong_from_right(tmp_path):

@@ -92,8 +92,12 @@ class HealthMonitor:
             if self._causes else np.zeros(DEVIATIONS)
 
     def _linearised_at(self, told: Told) -> Array:
-        """What is in force, or, once a figure is found off, what is seen."""
-        if not any(cause.matters(told) for cause in self._causes):
+        """What is in force, or, once a figure is found off, what is seen.
+
+        Whether it matters is told there: where poses are off already, a little more or less may
+        move them hardly at all.
+        """
+        if not self._causes:
             return told.in_force
         return np.asarray(told.in_force + np.clip(self._deviation(), -_LARGEST, _LARGEST))
 
