@@ -746,6 +746,18 @@ def test_a_pose_is_within_its_covariance_before_a_figure_is_told(c):
     assert within < 14.2
 
 
+def test_a_figure_so_far_off_that_no_pair_has_a_translation():
+    told = Told(PARAMETERS.sensor, CAMERA, np.zeros(3), 0.003, NONE)
+    monitor = HealthMonitor()
+    for k, pair in enumerate(flight(deviation(focal=-0.08), 12)):
+        pose = estimate_relative_pose(
+            pair.points1, pair.points2, pair.camera, pair.motion1, pair.motion2,
+            pair.gyro_rotation, pair.gyro_covariance, pair.interval, EstimatorConfig())
+        turned = pose.without_translation(Status.LOW_PARALLAX, 'as if it were none')
+        monitor.add_pair(400 * MS * k, replace(pair, R=pose.R, t=turned.t), turned, told)
+    assert {fault.figure for fault in monitor.health.faults} == {'focal_length'}
+
+
 # -- figures that are applied, on the bundled bag ------------------------------------------------
 
 

@@ -6,7 +6,7 @@ sigma of a pose that is told right, *wrong* where it moves the pose out of its c
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
 from typing import NamedTuple
@@ -82,10 +82,11 @@ class Told:
 
 
 class Effect(NamedTuple):
-    """What deviations do to a pair's pose."""
+    """What deviations do to a pair's pose, or to its rotation where it has no more."""
 
-    shift: Array   # (5, 11) in sigmas of a pose that is told right
-    claimed_shift: Array   # (6, 11) in those that were claimed, which may hold the disagreement
+    shift: Array   # (5 or 3, 11) in sigmas of a pose that is told right
+    # (6 or 3, 11) in those that were claimed, which may hold the disagreement
+    claimed_shift: Array
 
 
 class Figure(NamedTuple):
@@ -131,7 +132,7 @@ class Cause(NamedTuple):
         return self.shift > _MATTERS and (self.figure.part != BIAS or bool(beyond.any()))
 
 
-def causes(seen: Calibration, effects: list[Effect], in_force: Array) -> list[Cause]:
+def causes(seen: Calibration, effects: Sequence[Effect], in_force: Array) -> list[Cause]:
     """The fewest figures that explain the pairs, by forward selection; the strongest first.
 
     All figures at once would share a deviation of one among each other where few pairs tell them
@@ -223,7 +224,7 @@ def _alone(figure: Figure, seen: Calibration, left: Array, taken: NDArray[np.boo
 
 
 def _cause(figure: Figure, together: Array, sigma: Array, certainty: float,
-           effects: list[Effect]) -> Cause:
+           effects: Sequence[Effect]) -> Cause:
     deviation = np.zeros(DEVIATIONS)
     deviation[figure.part] = together[figure.part]
     return Cause(figure, deviation, sigma, certainty,
@@ -264,7 +265,7 @@ def judged(seen: Calibration, explained: list[Cause], turned: TurnComparison | N
 
 
 def _length(shifts: list[Array], quantile: float) -> float:
-    return float(np.quantile(np.linalg.norm(shifts, axis=1), quantile)) if shifts else 0.0
+    return float(np.quantile([np.linalg.norm(s) for s in shifts], quantile)) if shifts else 0.0
 
 
 # -- figures one by one ----------------------------------------------------------------------

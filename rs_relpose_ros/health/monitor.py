@@ -19,7 +19,7 @@ from rs_relpose_ros.health.turning import TurnSums
 
 Array = NDArray[np.float64]
 
-# Latest pairs with a pose over which the effect of a deviation is taken.
+# Latest pairs over which the effect of a deviation is taken.
 _EFFECTS = 30
 # Deviations about which a pair is linearised at most: lens and read-out must stay possible.
 _LARGEST = np.array([0.5] * 3 + [0.06, 0.1] + [0.2] * 3 + [0.3, 0.45, 0.6])
@@ -31,7 +31,8 @@ class HealthMonitor:
     def __init__(self) -> None:
         self._turns = TurnSums()
         self._recursion = Recursion()
-        self._effects: deque[Effect] = deque(maxlen=_EFFECTS)
+        self._on_poses: deque[Effect] = deque(maxlen=_EFFECTS)
+        self._on_rotations: deque[Effect] = deque(maxlen=_EFFECTS)
         self.health: Health = NOT_JUDGED
         self.calibration = NOTHING_SEEN
         self._causes: list[Cause] = []
@@ -41,7 +42,8 @@ class HealthMonitor:
         """Start anew: another camera."""
         self._turns.clear()
         self._recursion.clear()
-        self._effects.clear()
+        self._on_poses.clear()
+        self._on_rotations.clear()
         self._causes = []
         self.health, self.calibration = NOT_JUDGED, NOTHING_SEEN
 
@@ -74,8 +76,12 @@ class HealthMonitor:
         self.latest = information
         self.calibration = self._recursion.solved()
         if pose:
-            self._effects.append(_effect(information, pose))
-        self._causes = causes(self.calibration, list(self._effects), told.in_force)
+            self._on_poses.append(_on_pose(information, pose))
+        else:
+            self._on_rotations.append(_on_rotation(information, pose))
+        # A figure may be so far off that no pair has a pose.
+        self._causes = causes(self.calibration, self._on_poses or self._on_rotations,
+                              told.in_force)
         by_deviation = information.pose_by_deviation
         shift = by_deviation @ self._deviation()
         # What is off, and what the pairs so far have not yet shown to be as told.
@@ -112,10 +118,15 @@ def withheld(pose: RelativePose, health: Health) -> RelativePose:
         residual_rms=pose.residual_rms, duration=pose.duration)
 
 
-def _effect(information: PairInformation, pose: RelativePose) -> Effect:
+def _on_pose(information: PairInformation, pose: RelativePose) -> Effect:
     # t is a direction: along itself it has no variance, and nothing moves it there.
     along = np.concatenate([pose.t, np.zeros(3)])
     claimed = np.linalg.cholesky(pose.covariance + np.outer(along, along))
     return Effect(information.shift_by_deviation, solve_triangular(
         claimed, information.pose_by_deviation, lower=True))
 
+
+def _on_rotation(information: PairInformation, pose: RelativePose) -> Effect:
+    claimed = np.linalg.cholesky(pose.covariance[3:, 3:])
+    return Effect(information.shift_by_deviation[:3], solve_triangular(
+        claimed, information.pose_by_deviation[3:], lower=True))

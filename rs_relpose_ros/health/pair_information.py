@@ -26,7 +26,7 @@ from rs_relpose_ros.estimator.map_fit import FitMatches, stepped
 from rs_relpose_ros.estimator.priors import add_priors, isotropic, Priors
 from rs_relpose_ros.estimator.problem import build_problem, observed, TwoViewProblem
 from rs_relpose_ros.estimator.sampson import jacobian, residuals
-from rs_relpose_ros.estimator.state import D1, PARAMETERS, TANGENT, THETA, TwoViewState
+from rs_relpose_ros.estimator.state import PARAMETERS, TANGENT, THETA, TwoViewState
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3, skew
@@ -87,7 +87,8 @@ class PairInformation:
     S: Array   # (11, 11)
     b: Array   # (11,)
     pose_by_deviation: Array   # (6, 11) of (dt, dtheta) in camera 1, first order
-    shift_by_deviation: Array   # (5, 11) the same in sigmas of a pose that is told right, whitened
+    # (5, 11) the same in sigmas of a pose that is told right, whitened; rotation in the first 3.
+    shift_by_deviation: Array
     images_against_gyro: Array   # (3,) [rad] Log of the rotation by images alone and R_gyro^T
 
 
@@ -149,9 +150,10 @@ def pair_information(pair: PairEvidence, in_force: Array, about: Array) -> PairI
     C[THETA:THETA + 3] += (information - information_told) @ D
     covariance = inverse(H)
     moved = _at_stamped_row(pair, problem, state, -covariance @ C)
-    spread = np.linalg.cholesky(covariance[:D1, :D1])
+    pose = np.r_[THETA:THETA + 3, TANGENT:TANGENT + 2]
+    spread = np.linalg.cholesky(covariance[np.ix_(pose, pose)])
     return PairInformation(S, b + S @ about, _pose_by_deviation(problem, state, moved),
-                           solve_triangular(spread, moved[:D1], lower=True), images)
+                           solve_triangular(spread, moved[pose], lower=True), images)
 
 
 def _without_gyro(H: Array, gradient: Array, information: Array, theta: Array) -> Array:
