@@ -155,7 +155,8 @@ def _without_distortion(told: Told, rng: np.random.Generator) -> Told:
 
 
 def _distortion_error(told: Told, rng: np.random.Generator) -> Injected:
-    return Injected('distortion', np.array([told.intrinsics.distortion[0]]))
+    # A pinhole has none to leave out.
+    return Injected('distortion', np.array([*told.intrinsics.distortion[:1], 0.0][:1]))
 
 
 # -- what arrives -----------------------------------------------------------------------------
