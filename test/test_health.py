@@ -321,6 +321,21 @@ def test_images_that_move_sideways_seem_to_turn():
     assert not judged(NOTHING_SEEN, [], sums.compared(), told).faults
 
 
+@pytest.mark.parametrize('noise', [0.0, 1e-5])
+@pytest.mark.parametrize('stands', [True, False])
+def test_a_steady_turn(noise, stands):
+    """A turntable is told right; images that stand still while the gyro turns are not of it."""
+    rng, sums = np.random.default_rng(5), TurnSums()
+    steady = 0.125 * np.array([0.0, 0.5, 0.0])   # in 1/8 s, which leaves nothing to rounding
+    for k in range(60):
+        sums.add(125 * MS * k, 0.125, (not stands) * steady + 1e-3 * rng.normal(size=3),
+                 steady + noise * rng.normal(size=3))
+    told = Told(PARAMETERS.sensor, CAMERA, np.zeros(3), 0.003, NONE)
+    faults = judged(NOTHING_SEEN, [], sums.compared(), told).faults
+    assert [fault.figure for fault in faults] == (
+        ['image_geometry', 'time_offset'] if stands else [])
+
+
 @pytest.mark.parametrize('axis', range(3))
 def test_left_handed_axes_are_no_rotation(axis):
     """One sign of the IMU's own axes, though translation hides a third of the turning."""

@@ -29,8 +29,8 @@ Array = NDArray[np.float64]
 # Pairs that count: those of the last seconds, at most so many.
 _WINDOW_NS = to_nanoseconds(20.0)
 _MOST_PAIRS = 100
-# Older pairs that are linearised anew with each new one, and distance in sigmas of the prior within
-# which that changes nothing.
+# Older pairs that are linearised anew with each new one, and distance in sigmas of the prior
+# within which that changes nothing.
 _ANEW, _NEAR = 3, 0.02
 # Sigmas of n pairs are widened by (n + 6) / n: few scores scatter less than they should. Share of
 # a pair's sigma that is alike in all pairs, and no mean makes smaller: blur, the tracker's bias, a
