@@ -321,6 +321,21 @@ def test_images_that_move_sideways_seem_to_turn():
     assert not judged(NOTHING_SEEN, [], sums.compared(), told).faults
 
 
+@pytest.mark.parametrize('noise', [0.0, 1e-5])
+@pytest.mark.parametrize('stands', [True, False])
+def test_a_steady_turn(noise, stands):
+    """A turntable is told right; images that stand still while the gyro turns are not of it."""
+    rng, sums = np.random.default_rng(5), TurnSums()
+    steady = 0.125 * np.array([0.0, 0.5, 0.0])   # in 1/8 s, which leaves nothing to rounding
+    for k in range(60):
+        sums.add(125 * MS * k, 0.125, (not stands) * steady + 1e-3 * rng.normal(size=3),
+                 steady + noise * rng.normal(size=3))
+    told = Told(PARAMETERS.sensor, CAMERA, np.zeros(3), 0.003, NONE)
+    faults = judged(NOTHING_SEEN, [], sums.compared(), told).faults
+    assert [fault.figure for fault in faults] == (
+        ['image_geometry', 'time_offset'] if stands else [])
+
+
 @pytest.mark.parametrize('axis', range(3))
 def test_left_handed_axes_are_no_rotation(axis):
     """One sign of the IMU's own axes, though translation hides a third of the turning."""
@@ -772,12 +787,13 @@ def test_the_bag_shows_its_bias_and_a_wrong_time_offset(bundled_bag):
     assert last.health.state is HealthState.OK
 
 
-@pytest.mark.parametrize('told', [0.027, pytest.param(0.034, marks=pytest.mark.long)])
+@pytest.mark.parametrize('told', [pytest.param(0.027, marks=pytest.mark.long), 0.034])
 def test_a_wrong_readout_time_is_followed(bundled_bag, told):
-    """The bag's is 30 ms."""
+    """The bag's is 30 ms. Pairs of before it was applied must not hold it where it was told."""
     results, _ = replayed(bundled_bag, f'readout_time={told}', 'track_readout_time=true')
     last = results[-1]
     assert last.tracked.readout_time == pytest.approx(0.03, abs=5e-4)
+    assert abs(last.tracked.readout_time - 0.03) < last.tracked.readout_time_sigma < 1e-3
     assert told + last.applied.readout_time == pytest.approx(0.03, abs=5e-4)
     assert last.health.state is HealthState.OK
 

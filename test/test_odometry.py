@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+import gc
 import math
+from types import FunctionType, ModuleType
 
 import numpy as np
 import pytest
@@ -409,6 +411,30 @@ def test_pairs_without_imu_do_not_pile_up(walked):
         estimator.add_pair(replace(walked.pairs[0], current_ns=START_NS + k * SECOND))
         estimator.take()
     assert estimator.counts['without IMU'] == 200
+
+
+def test_memory_is_flat_where_the_path_is_not_kept(walked):
+    estimator, sizes, come_ns = OdometryEstimator(PARAMETERS), [], 0
+    for k in range(20, 80, 20):
+        pairs = walked.pairs[k - 20:k]
+        until_ns = pairs[-1].current_ns + SECOND // 10
+        run(walked, estimator=estimator, pairs=pairs, samples=[
+            sample for sample in walked.samples if come_ns < sample.stamp_ns <= until_ns])
+        come_ns = until_ns
+        sizes.append(objects_behind(estimator))
+    assert estimator.state is State.TRACKING
+    assert sizes[2] - sizes[1] < 5   # a small int is one object wherever it stands
+
+
+def objects_behind(root) -> int:
+    """Number of objects that an object keeps alive; not those of modules and types."""
+    seen, ahead = {}, [root]
+    while ahead:
+        one = ahead.pop()
+        if id(one) not in seen and not isinstance(one, (type, ModuleType, FunctionType)):
+            seen[id(one)] = one
+            ahead += gc.get_referents(one)
+    return len(seen)
 
 
 def test_without_gtsam_one_line_says_how_to_get_it(monkeypatch):

@@ -154,6 +154,32 @@ def test_list_that_is_none(text, said, bundled_bag, tmp_path, capsys):
     assert not (tmp_path / 'out').exists()
 
 
+def test_files_of_an_earlier_run_are_not_taken_for_results(
+        bundled_bag, tmp_path, capsys, monkeypatch):
+    def refuse(*_: object) -> None:
+        raise InputError('not calibrated')
+
+    listed, out = tmp_path / 'pairs.csv', tmp_path / 'out'
+    listed.write_text('reference_stamp_ns,stamp_ns\n1,2\n')
+    out.mkdir()
+    for name in ('relative_poses.csv', 'errors.csv', 'summary.json'):
+        (out / name).write_text('earlier')
+    monkeypatch.setattr('rs_relpose_ros.messages.intake.Intake.receive', refuse)
+    assert main(['pairs', str(bundled_bag), '--list', str(listed), '--params',
+                 str(BUNDLED_PARAMETERS), '--out', str(out)]) == 2
+    assert 'not calibrated' in capsys.readouterr().err
+    assert not list(out.iterdir())
+
+
+def test_the_list_is_not_replaced_by_the_results(bundled_bag, tmp_path, capsys):
+    listed = tmp_path / 'relative_poses.csv'
+    listed.write_text('reference_stamp_ns,stamp_ns\n1,2\n')
+    assert main(['pairs', str(bundled_bag), '--list', str(listed), '--params',
+                 str(BUNDLED_PARAMETERS), '--out', str(tmp_path)]) == 2
+    assert 'would replace the list' in capsys.readouterr().err
+    assert listed.read_text() == 'reference_stamp_ns,stamp_ns\n1,2\n'
+
+
 # -- a walk that returns -----------------------------------------------------------------------
 
 FPS, SECONDS = 5.0, 6.0

@@ -551,11 +551,27 @@ def test_bad_stamps(tmp_path, capsys, good_bag, text, said):
     assert code == 2 and len(error.splitlines()) == 1 and said in error
 
 
-def test_output_directory_that_is_a_file(tmp_path, capsys, good_bag):
-    file = tmp_path / 'out'
+@pytest.mark.parametrize('below', ['', '/below'])
+@pytest.mark.parametrize('words', [
+    'replay BAG SENSOR --out OUT', 'odometry BAG SENSOR --out OUT',
+    'pairs BAG SENSOR --list LIST --out OUT', 'calibrate BAG --out OUT', 'unroll BAG OUT SENSOR',
+    'batch replay BAG --out OUT', 'convert video VIDEO OUT'], ids=lambda words: words.split()[0])
+def test_output_that_is_a_file_is_refused_before_any_work(
+        words, below, tmp_path, capsys, good_bag, monkeypatch):
+    def work(*_: object, **__: object) -> None:
+        raise AssertionError('it works for an output that cannot be written')
+
+    monkeypatch.setattr('rs_relpose_ros.bags.reader.Bag.messages', work)
+    monkeypatch.setattr('rs_relpose_ros.bags.reader.Bag.raw_messages', work)
+    monkeypatch.setattr('rs_relpose_ros.cli.batch.open_cluster', work)
+    file, listed = tmp_path / 'out', tmp_path / 'list.csv'
     file.write_text('precious')
-    code, error = run(capsys, str(good_bag), *SENSOR, '--out', str(file))
-    assert code == 2 and len(error.splitlines()) == 1
+    listed.write_text('reference_stamp_ns,stamp_ns\n1,2\n')
+    meant = {'BAG': [str(good_bag)], 'SENSOR': SENSOR, 'OUT': [f'{file}{below}'],
+             'LIST': [str(listed)], 'VIDEO': [str(tmp_path / 'absent.mp4')]}
+    assert main([one for word in words.split() for one in meant.get(word, [word])]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f'rs_relpose: error: {file}') and len(error.splitlines()) == 1
     assert file.read_text() == 'precious'
 
 

@@ -25,7 +25,7 @@ from rs_relpose_ros.cli.main import load_command, make_parser
 from rs_relpose_ros.cli.options import add_parameter_arguments, package_version, progress_bar
 from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.errors import InputError, RsRelposeError
-from rs_relpose_ros.result_files import SUMMARY_FILE
+from rs_relpose_ros.result_files import refuse_unwritable, SUMMARY_FILE
 
 HELP = ('Run check, calibrate or replay over many bags: on processes of this machine, one thread '
         'each, or on a running Dask cluster (pip install "dask[distributed]"). Writes results.csv '
@@ -62,6 +62,7 @@ def run(args: argparse.Namespace) -> int:
     if args.workers is not None and args.workers < 1:
         raise InputError(f'--workers must be at least 1, got {args.workers}')
     request = _request(args)
+    refuse_unwritable(args.out)
     with open_cluster(args.scheduler, args.workers) as client, \
             progress_bar(0, 'bag', args.batch_command) as bar:
         version = ask_a_worker(client, package_version)

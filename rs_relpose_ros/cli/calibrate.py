@@ -23,6 +23,7 @@ from rs_relpose_ros.cli.options import (
 from rs_relpose_ros.config.calibration import CalibrationConfig, TRACKED_IN_IMAGES
 from rs_relpose_ros.config.tracking import TRACKERS, TrackingConfig
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.result_files import prepare_folder, refuse_unwritable
 
 HELP = (
     'Calibrate a rolling-shutter camera against its IMU from a bag (rosbag2 or ROS 1) alone, '
@@ -34,6 +35,7 @@ HELP = (
     'recording; it says what to record instead.')
 
 _NOT_OBSERVABLE = 1
+_FILES = ('calibration.yaml', 'calibration.json', 'cost_over_readout.png')
 
 _logger = logging.getLogger(__name__)
 
@@ -66,6 +68,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(str(error).replace('feature_rows', '--rows').replace(
             'max_time_offset', '--max-offset')) from None
     folder: Path = args.out or Path(f'{bag_name(args.bag)}_calibration')
+    refuse_unwritable(folder)
     with open_bag(args.bag) as bag:
         topics = bag.find_topics(topic_options(args), needs_camera_info=False)
         with progress_bar(topics.image.count, 'image', 'tracking') as bar:
@@ -80,16 +83,17 @@ def run(args: argparse.Namespace) -> int:
         result = calibrate(recording.tracks, recording.gyro, recording.camera,
                            focal_known=recording.focal_known, config=config,
                            progress=lambda share: bar.update(round(100 * share) - bar.n))
-    folder.mkdir(parents=True, exist_ok=True)
+    prepare_folder(folder, _FILES)
     text = parameter_file(
         result, f'Parameters of relpose_node from `rs_relpose calibrate {args.bag.name}`.',
         camera=recording.camera, compressed=topics.image.msgtype == COMPRESSED_IMAGE,
         feature_rows=tuple(args.rows))
-    (folder / 'calibration.yaml').write_text(text, encoding='utf-8')
-    (folder / 'calibration.json').write_text(
+    parameters, figures, curve = (folder / name for name in _FILES)
+    parameters.write_text(text, encoding='utf-8')
+    figures.write_text(
         json.dumps(as_mapping(result, recording.camera), indent=1) + '\n', encoding='utf-8')
-    draw_curve(result, folder / 'cost_over_readout.png')
+    draw_curve(result, curve)
     for line in report(result, recording.camera):
         print(line)
-    print(f'in {folder}: calibration.yaml, calibration.json, cost_over_readout.png')
+    print(f'in {folder}: {", ".join(_FILES)}')
     return 0 if result.observable else _NOT_OBSERVABLE

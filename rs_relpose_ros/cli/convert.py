@@ -10,6 +10,7 @@ from rs_relpose_ros.cli.options import progress_bar
 from rs_relpose_ros.config.parameter_file import write_parameters
 from rs_relpose_ros.convert.recording import write_bag
 from rs_relpose_ros.convert.sources import SOURCES
+from rs_relpose_ros.result_files import refuse_unwritable
 
 HELP = ('Turn a recording into a rosbag2 directory (MCAP) with /camera/image_raw/compressed, '
         '/imu/data_raw (or /imu/gyro and /imu/accel, where they are stamped apart), '
@@ -40,6 +41,7 @@ def run(args: argparse.Namespace) -> int:
     """Write the bag and its parameter file."""
     parameters = args.out_bag.with_name(args.out_bag.name + '.yaml')
     refuse_existing(args.out_bag, parameters)
+    refuse_unwritable(args.out_bag.parent)
     conversion = SOURCES[args.source].conversion(args.path, args.lens_profile)
     recording = conversion.recording
     with progress_bar(len(recording.images), 'image', args.out_bag.name) as bar:

@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
+from rs_relpose_ros.bags.reader import Bag
+from rs_relpose_ros.bags.topics import SensorTopics
 from rs_relpose_ros.cli.bag_run import add_run_arguments, errors_line, run_on_bag
-from rs_relpose_ros.replay.pairs import pairs_into, read_pairs
+from rs_relpose_ros.config.parameters import Parameters
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.replay.outputs import POSES_FILE
+from rs_relpose_ros.replay.pairs import pairs_into, PairsOutcome, read_pairs
 from rs_relpose_ros.result_files import SUMMARY_FILE
 
 HELP = (
@@ -34,9 +40,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Poses of the listed pairs; 1 when none has one."""
     pairs = read_pairs(args.list)
-    folder, outcome = run_on_bag(
-        args, 'pairs', lambda folder, bag, topics, parameters, on_image: pairs_into(
-            folder, bag, topics, parameters, pairs, on_image=on_image))
+
+    def work(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parameters,
+             on_image: Callable[[], object]) -> PairsOutcome:
+        if args.list.resolve() == (folder / POSES_FILE).resolve():
+            raise InputError(f'the results would replace the list {args.list}: choose another '
+                             'directory with --out')
+        return pairs_into(folder, bag, topics, parameters, pairs, on_image=on_image)
+
+    folder, outcome = run_on_bag(args, 'pairs', work)
     counts, errors = (outcome.figures[name] for name in ('pairs', 'errors_against_truth'))
     print(f'{counts["total"]} pairs, {counts["answered"]} with a pose')
     reasons = Counter(row.reason for row in outcome.rows if row.reason)

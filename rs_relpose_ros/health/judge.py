@@ -398,7 +398,8 @@ def _gross(turned: TurnComparison | None, told: Told) -> Iterator[Finding]:
                          1.0, turned.scale)
         if turned.is_left_handed or turned.is_turned:
             yield from _turned_axes(turned, told)
-    elif turned.by_gyro > _LONG_TURN and explained > _INDEPENDENT:
+    elif turned.by_gyro > _LONG_TURN and min(explained, turned.left_of_all) > _INDEPENDENT:
+        # Of a steady turn nothing but noise is left once the constant rate is taken out.
         text = ('images and gyro turn independently of each other: is it the IMU of this camera, '
                 'do both stamp by one clock, is electronic stabilisation off?')
         yield _fault('image_geometry', wrong, text)

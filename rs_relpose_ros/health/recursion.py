@@ -29,8 +29,8 @@ Array = NDArray[np.float64]
 # Pairs that count: those of the last seconds, at most so many.
 _WINDOW_NS = to_nanoseconds(20.0)
 _MOST_PAIRS = 100
-# Older pairs that are linearised anew with each new one, once a figure is found off, and distance
-# in sigmas of the prior within which that changes nothing.
+# Older pairs that are linearised anew with each new one, and distance in sigmas of the prior
+# within which that changes nothing.
 _ANEW, _NEAR = 3, 0.02
 # Sigmas of n pairs are widened by (n + 6) / n: few scores scatter less than they should. Share of
 # a pair's sigma that is alike in all pairs, and no mean makes smaller: blur, the tracker's bias, a
@@ -89,15 +89,16 @@ class Recursion:
         """Take in a pair, in the order of time; a stamp further back starts anew.
 
         It is linearised about the deviations `about` (11,), which differ from those `in_force`
-        once a figure is found off: then some of the older pairs are, too, those first whose
-        linearisation is furthest from there. What the pair says; None where it says nothing.
+        once a figure is found off. Some of the older pairs are, too, those first whose
+        linearisation is furthest from there: they came before that figure was found, or was
+        applied. What the pair says; None where it says nothing.
         """
         if self._pairs and stamp_ns < self._pairs[-1].stamp_ns:
             self.clear()
         information = pair_information(evidence, in_force, about)
         if information is None or not np.isfinite(information.S).all():
             return None
-        if (about != in_force).any():
+        if self._pairs:
             self._linearise_anew(about)
         self._pairs.append(_Entry(stamp_ns, evidence, in_force, about, information))
         while self._pairs[0].stamp_ns < stamp_ns - _WINDOW_NS:

@@ -30,6 +30,8 @@ _WINDOW_NS = to_nanoseconds(8.0)
 _MOST_TURNS = 160
 # Turns, and turning [rad, their sum], that a comparison needs.
 _LEAST_TURNS, _LEAST_TURN = 5, 0.15
+# Sums of squares that rounding alone leaves of a rate that is constant.
+_NO_TURNING = 1e-30
 # Rotation of axes [rad] that the recursive calibration does not reach.
 _LARGE_TURN = 1.0
 # Logarithm of a ratio of likelihoods that is certain, errors of neighbours being alike.
@@ -61,6 +63,7 @@ class TurnComparison:
     """
 
     left_as_told: float   # no rotation
+    left_of_all: float   # no rotation, and no constant rate taken out
     left_at_best: float   # `rotation`
     left_mirrored: float   # the best reflection: a gyro whose axes are left-handed
     rotation: Array   # (3, 3) Q: the true gyro is Q times the told one
@@ -135,23 +138,29 @@ class TurnSums:
         by_gyro = float(np.linalg.norm(phi, axis=1).sum())
         if max(by_images, by_gyro) < _LEAST_TURN or by_gyro < 1e-3 * _LEAST_TURN:
             return None
+        left_of_all = _left(float((theta * phi).sum()), theta, phi)
         intervals = np.array([turn.interval for turn in self._turns])
         theta, phi = _unsteady(theta, intervals), _unsteady(phi, intervals)
-        M, power, gyro = theta.T @ phi, float((theta**2).sum()), float((phi**2).sum())
-
-        def left(trace: float) -> float:
-            # min over s of sum |theta - s Q phi|^2 / sum |theta|^2; a negative scale is worse
-            return 1.0 - trace * abs(trace) / max(power * gyro, 1e-30)
-
+        M = theta.T @ phi
         U, singular, Vt = np.linalg.svd(M)
         handed = math.copysign(1.0, float(np.linalg.det(U @ Vt)))
         rotation = np.ascontiguousarray((U * (1.0, 1.0, handed)) @ Vt)
         trace = float(singular[0] + singular[1] + handed * singular[2])
+        mirrored = float(singular[0] + singular[1] - handed * singular[2])
         return TurnComparison(
-            left(float(np.trace(M))), left(trace),
-            left(float(singular[0] + singular[1] - handed * singular[2])), rotation,
-            np.ascontiguousarray((U * (1.0, 1.0, -handed)) @ Vt), trace / gyro, by_images,
-            by_gyro, len(self._turns))
+            _left(float(np.trace(M)), theta, phi), left_of_all, _left(trace, theta, phi),
+            _left(mirrored, theta, phi), rotation,
+            np.ascontiguousarray((U * (1.0, 1.0, -handed)) @ Vt),
+            trace / max(float((phi**2).sum()), _NO_TURNING), by_images, by_gyro, len(self._turns))
+
+
+def _left(trace: float, theta: Array, phi: Array) -> float:
+    """Share of the turns `theta` (N, 3) that the turns Q `phi` leave, by trace(Q^T M).
+
+    ``min over s of sum |theta - s Q phi|^2 / sum |theta|^2``; a negative scale is worse.
+    """
+    power = float((theta**2).sum()) * float((phi**2).sum())
+    return 1.0 - trace * abs(trace) / max(power, _NO_TURNING)
 
 
 def _unsteady(turns: Array, intervals: Array) -> Array:

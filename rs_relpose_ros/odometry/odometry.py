@@ -6,9 +6,10 @@ they come within `_LATE_NS`.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass
 from enum import Enum
+from itertools import pairwise
 import math
 from typing import NamedTuple
 
@@ -116,12 +117,17 @@ class _Run:
     first_ns: int
     newest_ns: int   # of the newest keyframe
     seen_ns: int   # of the newest pair that was used
-    stamps: list[tuple[int, int]]   # of the keyframes, camera clock and IMU clock
+    # Of the keyframes, camera clock and IMU clock: of the newest, or of all where they are kept.
+    stamps: deque[tuple[int, int]]
     frame_id: str
-    interval: ImuInterval   # up to the newest keyframe
     pairs: int = 0
     published: bool = False
     path: int = 0   # number of starts before
+
+    def moved_on(self, stamp_ns: int, imu_ns: int) -> None:
+        """Take the instant of a new keyframe."""
+        self.stamps.append((stamp_ns, imu_ns))
+        self.newest_ns = imu_ns
 
 
 class OdometryEstimator:
@@ -240,8 +246,8 @@ class OdometryEstimator:
     def smoothed_steps(self) -> list[tuple[int, int, Step]]:
         """Steps between consecutive ones of these, with both instants on the IMU's clock."""
         return [(start, end, step) for run in self._runs
-                for (_, start), (_, end), step in zip(
-                    run.stamps, run.stamps[1:], run.graph.smoothed_steps(), strict=False)]
+                for ((_, start), (_, end)), step in zip(
+                    pairwise(run.stamps), run.graph.smoothed_steps(), strict=True)]
 
     # -- pairs -------------------------------------------------------------------------------
 
@@ -274,7 +280,7 @@ class OdometryEstimator:
             return None
         standing = pair.turned_only and interval.at_rest
         chi2 = run.graph.add(interval, pair, standing)
-        self._moved_on(run, interval, pair)
+        run.moved_on(pair.stamp_ns, pair.current_ns)
         if chi2 > _CONTRADICTING and run.published:
             run.graph.without_pair()
             self.counts['contradicting'] += 1
@@ -306,13 +312,8 @@ class OdometryEstimator:
         # A pair is missing: the IMU bridges it.
         run.graph.add(interval, None, standing=False)
         offset = pair.current_ns - pair.stamp_ns
-        run.stamps.append((pair.reference_ns - offset, pair.reference_ns))
-        run.newest_ns, run.interval = pair.reference_ns, interval
+        run.moved_on(pair.reference_ns - offset, pair.reference_ns)
         return run
-
-    def _moved_on(self, run: _Run, interval: ImuInterval, pair: PairMeasurement) -> None:
-        run.stamps.append((pair.stamp_ns, pair.current_ns))
-        run.newest_ns, run.interval = pair.current_ns, interval
 
     # -- start and end -----------------------------------------------------------------------
 
@@ -345,8 +346,10 @@ class OdometryEstimator:
         graph = KeyframeGraph(start, interval.rates[0], self._mounting, self._imu, self._config,
                               keep=self._keep)
         offset = pair.current_ns - pair.stamp_ns
+        stamps = deque([(pair.reference_ns - offset, pair.reference_ns)],
+                       maxlen=None if self._keep else 1)
         return _Run(graph, left, at_rest, pair.reference_ns, pair.reference_ns, pair.reference_ns,
-                    [(pair.reference_ns - offset, pair.reference_ns)], pair.frame_id, interval)
+                    stamps, pair.frame_id)
 
     def _left_at(self, imu_ns: int) -> _Left:
         """Where the path goes on at an instant: where it ended, carried on by the IMU."""

@@ -26,6 +26,7 @@ from rs_relpose_ros.odometry.odometry import Odometry, OdometryEstimator
 from rs_relpose_ros.odometry.trajectory import against_truth, write_tum
 from rs_relpose_ros.picture_files import save_picture
 from rs_relpose_ros.replay.run import read_truth, Replay
+from rs_relpose_ros.result_files import prepare_folder, SUMMARY_FILE
 
 Array = NDArray[np.float64]
 
@@ -60,10 +61,7 @@ def odometry_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Para
 
     Files of an earlier run are replaced.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f'cannot make the folder {folder}: {error.strerror}') from error
+    prepare_folder(folder, (LIVE_FILE, SMOOTHED_FILE, PICTURE, SUMMARY_FILE))
     estimator = OdometryEstimator(parameters, keep=True)
     replay = Replay(bag, topics, parameters, on_image=on_image)
     health = HealthState.UNKNOWN

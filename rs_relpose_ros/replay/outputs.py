@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +29,7 @@ from rs_relpose_ros.replay.tables import (
     table_writer,
 )
 from rs_relpose_ros.replay.truth import TrueTrajectory
-from rs_relpose_ros.result_files import SUMMARY_FILE
+from rs_relpose_ros.result_files import prepare_folder, SUMMARY_FILE
 
 POSES_FILE, ERRORS_FILE = 'relative_poses.csv', 'errors.csv'
 BAG_FOLDER = 'relpose_bag'
@@ -98,18 +98,6 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
         files += _draw(folder, records, shown, truth)
     return ReplayOutcome(records, run.intrinsics, summarize(records, run, last, health), health,
                          files)
-
-
-def prepare_folder(folder: Path, replaced: Sequence[str]) -> None:
-    """Create a folder of results as needed, and remove the files that will be replaced."""
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f'{folder} is a file: choose another directory with --out')
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name in replaced:
-            (folder / name).unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(f'{folder} cannot be written: {error.strerror}') from error
 
 
 def _write_messages(bag: BagWriter, pair: ReplayedPair, reference_frame: str) -> None:

@@ -23,7 +23,7 @@ from rs_relpose_ros.front_end.sequencer import FrameRefused
 from rs_relpose_ros.messages.incoming import stamp_ns
 from rs_relpose_ros.messages.intake import Intake
 from rs_relpose_ros.messages.sensor_feed import Role
-from rs_relpose_ros.replay.outputs import ERRORS_FILE, POSES_FILE, prepare_folder
+from rs_relpose_ros.replay.outputs import ERRORS_FILE, POSES_FILE
 from rs_relpose_ros.replay.run import read_truth
 from rs_relpose_ros.replay.summary import errors_against_truth
 from rs_relpose_ros.replay.tables import (
@@ -36,6 +36,7 @@ from rs_relpose_ros.replay.tables import (
     table_writer,
 )
 from rs_relpose_ros.replay.truth import TrueTrajectory
+from rs_relpose_ros.result_files import prepare_folder, SUMMARY_FILE
 
 # Of the list: those of the tables of `replay`, which can be lists as they are.
 LIST_COLUMNS = RELATIVE_POSE_COLUMNS[:2]
@@ -103,12 +104,12 @@ def pairs_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Paramet
 
     Those of an earlier run are replaced. `on_image` is called after each image.
     """
+    prepare_folder(folder, (POSES_FILE, ERRORS_FILE, SUMMARY_FILE))
     truth = read_truth(bag, topics)
     run = _Run(bag, topics, parameters, [pair for pair in pairs if pair[0] < pair[1]], on_image)
     run.run()
     rows = [run.row(pair, truth) for pair in pairs]
     records = [row.record for row in rows if row.record is not None]
-    prepare_folder(folder, (POSES_FILE, ERRORS_FILE))
     files = [POSES_FILE]
     with table_writer(folder / POSES_FILE, PAIR_COLUMNS) as write:
         for row in rows:
