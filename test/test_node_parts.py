@@ -171,6 +171,16 @@ def test_silence_is_counted_from_the_last_result(clock):
                                               'LOW_PARALLAX: it stands')
 
 
+def test_before_the_first_image_nothing_could_come_of_any(clock):
+    statistics = Statistics(clock)
+    for second in range(8):
+        clock.now = second * SECOND
+        assert statistics.report(inputs(0), counts(), problem='', missing=()).silence.seconds == 0
+    clock.now = 9 * SECOND
+    assert statistics.report(
+        inputs(30), counts(), problem='', missing=()).silence == Silence(2.0, 30, {}, '')
+
+
 @pytest.mark.parametrize(('rate', 'size', 'told'), [
     (9, 921_600, True), (29, 921_600, False), (9, 300_000, False), (0, 921_600, False)])
 def test_images_that_are_lost_on_the_way_are_told(rate, size, told):

@@ -51,6 +51,8 @@ PAIR_TOPICS = {
 }
 # Those of a pair with a pose only.
 POSE_TOPICS = ('relative_pose', 'reference', 'velocity', 'matches')
+# A picture of a pair, for people.
+DEBUG_IMAGE = 'debug_image'
 
 # Of images that are turned; as image_transport's default.
 _JPEG_QUALITY = 95

@@ -130,7 +130,8 @@ class FrameStatistics(ABC):
         return Report(level, text, tuple(values), silence)
 
     def _silence(self, now_ns: int, images: int, refused: Counter[Refusal]) -> Silence:
-        if self._results > self._results_told:
+        # Without an image there is nothing that something could come of.
+        if self._results > self._results_told or images == self._silent_since[1]:
             self._results_told = self._results
             self._silent_since = (now_ns, images, refused)
         since_ns, images_before, refused_before = self._silent_since

@@ -21,7 +21,12 @@ from rs_relpose_ros.config.parameters import PairConfig
 from rs_relpose_ros.errors import MissingInputError
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.images.encoded import Pixels
-from rs_relpose_ros.messages.outgoing import image_message, pair_messages, PAIR_TOPICS
+from rs_relpose_ros.messages.outgoing import (
+    DEBUG_IMAGE,
+    image_message,
+    pair_messages,
+    PAIR_TOPICS,
+)
 from rs_relpose_ros.node.debug_image import draw_debug_image
 from rs_relpose_ros.node.message_types import message_class
 
@@ -36,7 +41,7 @@ class PairPublishers:
         self._pair = {name: node.create_publisher(message_class(msgtype), f'~/{name}', 10)
                       for name, msgtype in PAIR_TOPICS.items()}
         self._debug_image = node.create_publisher(
-            message_class('sensor_msgs/msg/Image'), '~/debug_image', 2)
+            message_class('sensor_msgs/msg/Image'), f'~/{DEBUG_IMAGE}', 2)
         self._transforms = _transform_broadcaster(node) if config.publish_tf else None
 
     def publish(self, result: PairResult, config: PairConfig) -> None:

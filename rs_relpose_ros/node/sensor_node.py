@@ -18,7 +18,7 @@ from rs_relpose_ros.front_end.front_end import FrameFailed, FrameLoop, FrameProc
 from rs_relpose_ros.front_end.sequencer import FrameRefused, Refusal, Sequencer
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.messages.intake import Intake
-from rs_relpose_ros.messages.outgoing import diagnostics_message, status_message
+from rs_relpose_ros.messages.outgoing import DEBUG_IMAGE, diagnostics_message, status_message
 from rs_relpose_ros.messages.sensor_feed import PARTS, Role
 from rs_relpose_ros.node.cause_log import CauseLog
 from rs_relpose_ros.node.frame_statistics import FrameStatistics, Inputs, SILENCE
@@ -236,10 +236,10 @@ class SensorNode(StoppableNode):
 
     def _tell_silence(self, inputs: SensorInputs, silence: Silence, problem: str) -> None:
         """Say why nothing comes out, once as long as it stays the same."""
-        if silence.seconds < PATIENCE:
-            self._told_silence = ''
-        elif inputs.silent(Role.IMAGE, PATIENCE):
+        if inputs.silent(Role.IMAGE, PATIENCE):
             self._tell_reason(why_no_image(self._image_topic(), self._topics_with_images()))
+        elif silence.seconds < PATIENCE:
+            self._told_silence = ''
         elif not problem:   # which has a line of its own
             self._tell_reason(why_nothing(silence))
 
@@ -249,12 +249,12 @@ class SensorNode(StoppableNode):
             self._warn(f'{self._frame_statistics.idle}: {reason.text}')
 
     def _topics_with_images(self) -> list[str]:
-        """Those that others publish."""
+        """Those that others publish, but for pictures of pairs."""
         own = f'{self.get_fully_qualified_name()}/'
         images = set(PARTS[Role.IMAGE].msgtypes)
         return [name for name, types in self.get_topic_names_and_types()
                 if images.intersection(types) and not name.startswith(own)
-                and self.count_publishers(name)]
+                and not name.endswith(f'/{DEBUG_IMAGE}') and self.count_publishers(name)]
 
     def _image_topic(self) -> str:
         """The subscribed one, with its transport, once there is one."""
