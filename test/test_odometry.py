@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 import gc
 import math
+import pickle
 from types import FunctionType, ModuleType
 
 import gtsam
@@ -448,6 +449,16 @@ def test_memory_is_flat_where_the_path_is_not_kept(walked):
         sizes.append(objects_behind(estimator))
     assert estimator.state is State.TRACKING
     assert sizes[2] - sizes[1] < 5   # a small int is one object wherever it stands
+
+
+def test_memory_is_flat_where_no_pair_comes():
+    estimator, rng, sizes = OdometryEstimator(PARAMETERS), np.random.default_rng(0), []
+    for k in range(12_000):   # two minutes
+        if k % 4000 == 0:
+            sizes.append(len(pickle.dumps(estimator)))
+        estimator.add_imu(ImuSample(START_NS + k * SECOND // 100, tuple(rng.normal(size=3)),
+                                    tuple(rng.normal(size=3))))
+    assert sizes[0] < sizes[1] == sizes[2]
 
 
 def objects_behind(root) -> int:
