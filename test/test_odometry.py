@@ -123,6 +123,12 @@ def run(given: Walk, *, pairs=None, samples=None, estimator=None):
     return estimator, out + estimator.take(end=True)
 
 
+def without(pairs, begin, end):
+    """Pairs that are not of the time between two instants [s]."""
+    return [pair for pair in pairs if pair.current_ns < START_NS + begin * SECOND
+            or pair.reference_ns > START_NS + end * SECOND]
+
+
 def positions(keyframes):
     return np.array([keyframe.position for keyframe in keyframes])
 
@@ -325,9 +331,7 @@ def test_a_graph_that_is_not_solved_is_lost_and_the_path_goes_on(walked, monkeyp
 
 
 def test_camera_that_stops_for_a_second_is_bridged(walked):
-    away = (START_NS + 4 * SECOND, START_NS + 5 * SECOND)
-    pairs = [pair for pair in walked.pairs
-             if pair.current_ns < away[0] or pair.reference_ns > away[1]]
+    pairs = without(walked.pairs, 4, 5)
     estimator, out = run(walked, pairs=pairs)
     assert estimator.counts['lost'] == 0
     assert len(estimator.starts) == 1
@@ -335,9 +339,7 @@ def test_camera_that_stops_for_a_second_is_bridged(walked):
 
 
 def test_camera_that_stops_for_longer_is_lost_and_the_path_goes_on(walked):
-    away = (START_NS + 3 * SECOND, START_NS + 6 * SECOND)
-    pairs = [pair for pair in walked.pairs
-             if pair.current_ns < away[0] or pair.reference_ns > away[1]]
+    pairs = without(walked.pairs, 3, 6)
     estimator, out = run(walked, pairs=pairs)
     assert estimator.counts['lost'] == 1
     assert len(estimator.starts) == 2
@@ -403,9 +405,7 @@ def test_what_was_lost_before_stays_unknown(walked):
     """Without IMU heading and place are lost; the next loss does not find them again."""
     samples = [sample for sample in walked.samples
                if not 3.0 < (sample.stamp_ns - START_NS) / SECOND < 3.4]
-    away = (START_NS + 6 * SECOND, START_NS + 8.5 * SECOND)
-    pairs = [pair for pair in walked.pairs
-             if pair.current_ns < away[0] or pair.reference_ns > away[1]]
+    pairs = without(walked.pairs, 6, 8.5)
     _, out = run(walked, pairs=pairs, samples=samples)
     last = [[k for k in out if k.path == path][-1] for path in range(3)]
     variances = [np.trace(k.pose_covariance[:3, :3]) for k in last]
