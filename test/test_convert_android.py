@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+from damaged_files import removed, replaced
 from made_videos import brightness, write_video
 import numpy as np
 import pytest
@@ -376,18 +377,6 @@ def test_phone_recording(recordings, tmp_path):
 
 
 # --- what cannot be used
-
-
-def replaced(name: str, old: str, new: str) -> Callable[[Path], None]:
-    def damage(folder: Path) -> None:
-        text = (folder / name).read_text()
-        assert old in text
-        (folder / name).write_text(text.replace(old, new, 1))
-    return damage
-
-
-def removed(name: str) -> Callable[[Path], None]:
-    return lambda folder: (folder / name).unlink()
 
 
 def portrait(name: str) -> Callable[[Path], None]:

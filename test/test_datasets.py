@@ -7,6 +7,7 @@ from pathlib import Path
 import re
 
 import cv2
+from damaged_files import removed, replaced
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -169,18 +170,6 @@ def test_decimal_stamps_keep_every_nanosecond(tmp_path):
 
 
 # --- what cannot be used
-
-
-def replaced(name: str, old: str, new: str) -> Callable[[Path], None]:
-    def damage(folder: Path) -> None:
-        text = (folder / name).read_text()
-        assert old in text
-        (folder / name).write_text(text.replace(old, new, 1))
-    return damage
-
-
-def removed(name: str) -> Callable[[Path], None]:
-    return lambda folder: (folder / name).unlink()
 
 
 def written(name: str, data: bytes) -> Callable[[Path], None]:

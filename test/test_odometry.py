@@ -6,8 +6,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 import gc
 import math
+import pickle
 from types import FunctionType, ModuleType
 
+import gtsam
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -119,6 +121,12 @@ def run(given: Walk, *, pairs=None, samples=None, estimator=None):
     for sample in waiting:
         estimator.add_imu(sample)
     return estimator, out + estimator.take(end=True)
+
+
+def without(pairs, begin, end):
+    """Pairs that are not of the time between two instants [s]."""
+    return [pair for pair in pairs if pair.current_ns < START_NS + begin * SECOND
+            or pair.reference_ns > START_NS + end * SECOND]
 
 
 def positions(keyframes):
@@ -288,21 +296,42 @@ def test_the_imu_carries_keyframes_on(walked):
 # --- faults
 
 
-def test_contradicting_pair_is_left_out(walked):
-    bad = len(walked.pairs) - 12
-    images = walked.pairs[bad].images
+def contradicting(pairs):
+    bad = len(pairs) - 12
+    images = pairs[bad].images
     wrong = replace(images, R=exp_so3(np.array([0.0, 0.03, 0.0])) @ images.R)
-    pairs = [replace(pair, images=wrong) if k == bad else pair
-             for k, pair in enumerate(walked.pairs)]
-    estimator, out = run(walked, pairs=pairs)
+    return [replace(pair, images=wrong) if k == bad else pair for k, pair in enumerate(pairs)]
+
+
+def test_contradicting_pair_is_left_out(walked):
+    estimator, out = run(walked, pairs=contradicting(walked.pairs))
     assert estimator.counts['contradicting'] == 1
     assert against_truth(out, walked.truth).errors.ate_m < 0.05
 
 
+@pytest.mark.parametrize('fails', ['a keyframe', 'taking a pair out'])
+def test_a_graph_that_is_not_solved_is_lost_and_the_path_goes_on(walked, monkeypatch, fails):
+    class Flaky(gtsam.BatchFixedLagSmoother):
+        updates = 0
+
+        def update(self, factors, *others):
+            Flaky.updates += 1
+            if (factors.size() == 0) if fails == 'taking a pair out' else (Flaky.updates == 50):
+                raise RuntimeError('\nIndeterminant linear system\nwhile working near x50')
+            return super().update(factors, *others)
+
+    monkeypatch.setattr(gtsam, 'BatchFixedLagSmoother', Flaky)
+    estimator, out = run(walked, pairs=contradicting(walked.pairs))
+    told = 'lost: the graph cannot be solved: Indeterminant linear system; starting anew'
+    assert any(sentence.startswith(told) for sentence in estimator.sentences())
+    assert estimator.state is State.TRACKING
+    assert out[-1].path == estimator.counts['lost'] > 0
+    assert len(estimator.smoothed()) >= len(out)
+    assert against_truth(out, walked.truth).errors.ate_m < 0.1
+
+
 def test_camera_that_stops_for_a_second_is_bridged(walked):
-    away = (START_NS + 4 * SECOND, START_NS + 5 * SECOND)
-    pairs = [pair for pair in walked.pairs
-             if pair.current_ns < away[0] or pair.reference_ns > away[1]]
+    pairs = without(walked.pairs, 4, 5)
     estimator, out = run(walked, pairs=pairs)
     assert estimator.counts['lost'] == 0
     assert len(estimator.starts) == 1
@@ -310,9 +339,7 @@ def test_camera_that_stops_for_a_second_is_bridged(walked):
 
 
 def test_camera_that_stops_for_longer_is_lost_and_the_path_goes_on(walked):
-    away = (START_NS + 3 * SECOND, START_NS + 6 * SECOND)
-    pairs = [pair for pair in walked.pairs
-             if pair.current_ns < away[0] or pair.reference_ns > away[1]]
+    pairs = without(walked.pairs, 3, 6)
     estimator, out = run(walked, pairs=pairs)
     assert estimator.counts['lost'] == 1
     assert len(estimator.starts) == 2
@@ -378,9 +405,7 @@ def test_what_was_lost_before_stays_unknown(walked):
     """Without IMU heading and place are lost; the next loss does not find them again."""
     samples = [sample for sample in walked.samples
                if not 3.0 < (sample.stamp_ns - START_NS) / SECOND < 3.4]
-    away = (START_NS + 6 * SECOND, START_NS + 8.5 * SECOND)
-    pairs = [pair for pair in walked.pairs
-             if pair.current_ns < away[0] or pair.reference_ns > away[1]]
+    pairs = without(walked.pairs, 6, 8.5)
     _, out = run(walked, pairs=pairs, samples=samples)
     last = [[k for k in out if k.path == path][-1] for path in range(3)]
     variances = [np.trace(k.pose_covariance[:3, :3]) for k in last]
@@ -424,6 +449,16 @@ def test_memory_is_flat_where_the_path_is_not_kept(walked):
         sizes.append(objects_behind(estimator))
     assert estimator.state is State.TRACKING
     assert sizes[2] - sizes[1] < 5   # a small int is one object wherever it stands
+
+
+def test_memory_is_flat_where_no_pair_comes():
+    estimator, rng, sizes = OdometryEstimator(PARAMETERS), np.random.default_rng(0), []
+    for k in range(12_000):   # two minutes
+        if k % 4000 == 0:
+            sizes.append(len(pickle.dumps(estimator)))
+        estimator.add_imu(ImuSample(START_NS + k * SECOND // 100, tuple(rng.normal(size=3)),
+                                    tuple(rng.normal(size=3))))
+    assert sizes[0] < sizes[1] == sizes[2]
 
 
 def objects_behind(root) -> int:

@@ -230,6 +230,20 @@ def test_reset_starts_anew_at_the_origin(session):
     assert min(stamps) > shifted(round(START_NS + RESET * SECOND)) - 0.2 * SECOND
 
 
+def test_the_imu_is_read_though_little_is_published(ros_domain_id):
+    with Graph() as graph, node_process(
+            BUNDLED_PARAMETERS, remap={'imu': BAG_TOPICS['imu']},
+            parameters={'odometry_rate': 0.1}, folder='odometry') as node:
+        diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
+        node.wait_for('ready')
+        imu = graph.publisher(Imu, BAG_TOPICS['imu'])
+        samples = walk('walk:7', 6.0, imu_rate=IMU_RATE).samples
+        publish_in_time((imu, sample.stamp_ns - START_NS, imu_message(sample))
+                        for sample in samples)
+        [status] = diagnostics[-1].status
+        assert status.message.startswith('no message on /relpose_node/pairs')
+
+
 def test_silence_is_told(session):
     [status] = session.diagnostics[-1].status
     assert status.message.startswith('no message on ')

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import csv
 from dataclasses import replace
+import gc
 import math
 from pathlib import Path
 import subprocess
 import sys
+import weakref
 
 from conftest import BUNDLED_PARAMETERS, ROOT
 import numpy as np
@@ -20,7 +22,7 @@ from rs_relpose_lab.simulation.trajectory import Trajectory
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.front_end.chosen_pairs import estimate_wide_pair, view_frame
+from rs_relpose_ros.front_end.chosen_pairs import ChosenPairs, estimate_wide_pair, view_frame
 from rs_relpose_ros.front_end.frame import Frame
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.imu.buffer import ImuBuffer
@@ -274,6 +276,27 @@ def test_frames_and_an_imu_buffer(library, returned):
     assert second.imu.since_previous is not None
     with pytest.raises(InputError, match='must be later than the first: exchange them'):
         estimate_wide_pair(second, first, parameters)
+
+
+def test_images_are_kept_until_the_last_of_their_pairs(library):
+    """Four frames in a row: the first waits for the last, the second only for the third."""
+    parameters, imu, (frame, _) = library
+    stamps = [START_NS + k * 10**9 for k in range(4)]
+    pairs, images, done = ChosenPairs([(stamps[0], stamps[3]), (stamps[1], stamps[2])]), [], []
+    since = None
+    for stamp in stamps:
+        image = np.zeros_like(frame.image)
+        images.append(weakref.ref(image))
+        view = view_frame(replace(frame, stamp_ns=stamp, image=image), imu, parameters, since)
+        done += pairs.process(view.frame, view.imu, parameters) or ()
+        since = replace(view, frame=frame)
+        del image, view
+        if stamp == stamps[2]:
+            gc.collect()
+            assert [one() is not None for one in images] == [True, False, False]
+    assert [pair.stamps_ns for pair in done] == [(stamps[1], stamps[2]), (stamps[0], stamps[3])]
+    # The gyro is carried over the frames between.
+    assert all(pair.result.gyro_rotation is not None for pair in done)
 
 
 def test_one_calibration_for_both_frames(library):

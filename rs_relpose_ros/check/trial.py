@@ -54,7 +54,8 @@ class Trial:
 
     def __init__(self, images: int, parameters: Parameters) -> None:
         warm_up(parameters.estimator)
-        told = parameters.updated({'withhold_when_wrong': False, 'track_time_offset': False})
+        told = parameters.updated({'withhold_when_wrong': False, 'track_time_offset': False,
+                                   'track_readout_time': False})
         self._front_end = FrontEnd(told, offline=True)
         self._intake = Intake(self._front_end.sequencer, told.imu.stuck_gyro_time, told.intrinsics)
         self._parts = tuple(_part_of(images, part) for part in range(_PARTS))

@@ -112,7 +112,7 @@ class ChosenPairs:
     """What a `FrameLoop` makes of chosen frames: those of the `wanted` pairs that a frame ends.
 
     `wanted`: stamps of the earlier and of the later image. Frames are kept until the last of their
-    pairs.
+    pairs, and what the IMU says of all frames since the oldest of them.
     """
 
     def __init__(self, wanted: Collection[tuple[int, int]]) -> None:
@@ -120,7 +120,8 @@ class ChosenPairs:
         self._last: dict[int, int] = {}
         for first_ns, second_ns in self._wanted:
             self._last[first_ns] = max(second_ns, self._last.get(first_ns, second_ns))
-        self._views: list[View] = []
+        self._views: dict[int, View] = {}   # by stamp
+        self._imus: dict[int, FrameImu] = {}
 
     @property
     def applied(self) -> Applied:
@@ -133,23 +134,29 @@ class ChosenPairs:
     def reset(self) -> None:
         """Forget the frames so far."""
         self._views.clear()
+        self._imus.clear()
 
     def process(self, frame: Frame, imu: FrameImu,
                 parameters: Parameters) -> tuple[ChosenPair, ...] | None:
         """The pairs of this frame with earlier ones."""
-        self._views.append(View(frame, imu))
-        pairs = tuple(self._pair(k, parameters) for k, first in enumerate(self._views[:-1])
-                      if (first.frame.stamp_ns, frame.stamp_ns) in self._wanted)
-        while self._views and self._last.get(
-                self._views[0].frame.stamp_ns, 0) <= frame.stamp_ns:
-            del self._views[0]
+        current_ns = frame.stamp_ns
+        self._imus[current_ns] = imu
+        view = View(frame, imu)
+        pairs = tuple(self._pair(first_ns, view, parameters) for first_ns in self._views
+                      if (first_ns, current_ns) in self._wanted)
+        self._views[current_ns] = view
+        self._views = {stamp_ns: one for stamp_ns, one in self._views.items()
+                       if self._last.get(stamp_ns, 0) > current_ns}
+        oldest_ns = min(self._views, default=current_ns)
+        self._imus = {stamp_ns: one for stamp_ns, one in self._imus.items()
+                      if stamp_ns > oldest_ns}
         return pairs or None
 
-    def _pair(self, k: int, parameters: Parameters) -> ChosenPair:
-        """Of the k-th frame that is kept and the current one."""
-        first, second = self._views[k], self._views[-1]
-        stamps = first.frame.stamp_ns, second.frame.stamp_ns
-        second = replace(second, imu=_joined([view.imu for view in self._views[k + 1:]]))
+    def _pair(self, first_ns: int, second: View, parameters: Parameters) -> ChosenPair:
+        """Of a frame that is kept and the current one."""
+        first, stamps = self._views[first_ns], (first_ns, second.frame.stamp_ns)
+        second = replace(second, imu=_joined([
+            imu for stamp_ns, imu in self._imus.items() if stamp_ns > first_ns]))
         try:
             return ChosenPair(stamps, estimate_wide_pair(first, second, parameters))
         except RsRelposeError as error:

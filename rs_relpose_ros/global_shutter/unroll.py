@@ -180,6 +180,8 @@ class _Unrolling:
             self._stamps.add(stamp)
             self._images.setdefault(stamp, deque()).append(place)
         else:
+            if stamp in self._infos:   # two of one stamp: the later one is the image's
+                self._infos[stamp].messages = ()
             self._infos[stamp] = place
         self._receive(role, message)
 

@@ -7,6 +7,8 @@ Between consecutive ones, the preintegrated IMU; of a pair, what its images alon
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 import math
 from typing import Any, NamedTuple
@@ -124,8 +126,6 @@ class KeyframeGraph:
         self._smoother = gtsam.BatchFixedLagSmoother(config.smoothing_lag, params)
         self._record = Record() if keep else None
         self._rate = rate   # of the body at the newest keyframe, as measured
-        self._count = 1   # of keyframes
-        self._seconds = 0.0   # of the newest
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         pose = gtsam.Pose3(gtsam.Rot3(start.R), start.position)
         bias = gtsam.imuBias.ConstantBias(np.zeros(3), start.gyro_bias)
@@ -140,7 +140,7 @@ class KeyframeGraph:
         factors.addPriorVector(V(0), start.velocity, _diagonal([start.velocity_sigma] * 3))
         factors.addPriorConstantBias(B(0), bias, _diagonal(
             [imu.accel_bias_sigma] * 3 + [start.gyro_bias_sigma] * 3))
-        self._update(factors, values, 0.0)
+        self._update(factors, values, 0, 0.0)
 
     @property
     def newest(self) -> KeyframeState:
@@ -191,8 +191,7 @@ class KeyframeGraph:
         if standing:
             for key in (V(i), V(j)):
                 factors.addPriorVector(key, np.zeros(3), _diagonal([_STANDING] * 3))
-        self._count += 1
-        self._update(factors, values, self._seconds + interval.duration)
+        self._update(factors, values, j, self._seconds + interval.duration)
         if of_pair is None:
             return 0.0
         return 2.0 * of_pair.error(self._values) / of_pair.dim()
@@ -200,12 +199,13 @@ class KeyframeGraph:
     def without_pair(self) -> None:
         """Take the newest pair out again."""
         i, j = self._count - 2, self._count - 1
-        self._smoother.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), {},
-                              _pair_slots(self._smoother.getFactors(), i, j))
-        if self._record is not None:
-            for slot in _pair_slots(self._record.factors, i, j):
-                self._record.factors.remove(slot)
-        self._read()
+        with _solving():
+            self._smoother.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), {},
+                                  _pair_slots(self._smoother.getFactors(), i, j))
+            if self._record is not None:
+                for slot in _pair_slots(self._record.factors, i, j):
+                    self._record.factors.remove(slot)
+            self._read(j)
 
     def scale_sigma(self) -> float:
         """Relative 1 sigma of the newest speed; of the velocity where it is below 0.1 m/s."""
@@ -251,9 +251,10 @@ class KeyframeGraph:
         """Values and marginals of all that was recorded."""
         assert self._record is not None
         factors = _compact(self._record.factors)
-        values = gtsam.LevenbergMarquardtOptimizer(
-            factors, self._record.values, self._params).optimize()
-        return values, gtsam.Marginals(factors, values)
+        with _solving():
+            values = gtsam.LevenbergMarquardtOptimizer(
+                factors, self._record.values, self._params).optimize()
+            return values, gtsam.Marginals(factors, values)
 
     def _predicted(self, pim: Any) -> Any:
         state = gtsam.NavState(self._values.atPose3(X(self._count - 1)),
@@ -304,26 +305,33 @@ class KeyframeGraph:
 
         return gtsam.CustomFactor(_diagonal([sigma] * 3), [X(i), X(j)], error)
 
-    def _update(self, factors: Any, values: Any, seconds: float) -> None:
-        stamps = dict.fromkeys(list(values.keys()), seconds)
-        self._seconds = seconds
-        try:
-            self._smoother.update(factors, values, stamps)
-            self._read()
-        except RuntimeError as error:   # of gtsam, of several lines
-            first_line = str(error).strip().partition('\n')[0]
-            raise GraphError(f'the graph cannot be solved: {first_line}') from error
+    def _update(self, factors: Any, values: Any, newest: int, seconds: float) -> None:
+        """Take in the newest keyframe, at `seconds` since the first; where it fails, none."""
+        with _solving():
+            self._smoother.update(factors, values, dict.fromkeys(list(values.keys()), seconds))
+            self._read(newest)
+        self._count, self._seconds = newest + 1, seconds   # keyframes, and time of the newest
         if self._record is not None:
             self._record.factors.push_back(factors)
 
-    def _read(self) -> None:
+    def _read(self, newest: int) -> None:
         """Take over what the smoother has found."""
-        self._values, newest = self._smoother.calculateEstimate(), self._count - 1
+        self._values = self._smoother.calculateEstimate()
         self._bias = self._values.atConstantBias(B(newest))
         self._newest = _state(self._values, gtsam.Marginals(
             _compact(self._smoother.getFactors()), self._values), newest)
         if self._record is not None:
             self._record.values.insert_or_assign(self._values)
+
+
+@contextmanager
+def _solving() -> Iterator[None]:
+    """What gtsam cannot solve is a GraphError."""
+    try:
+        yield
+    except RuntimeError as error:   # of several lines
+        first_line = str(error).strip().partition('\n')[0]
+        raise GraphError(f'the graph cannot be solved: {first_line}') from error
 
 
 def _body(values: Any, pose_key: int, velocity_key: int, rate: Array) -> BodyState:

@@ -40,7 +40,7 @@ NAME = 'odometry_node'
 # Topic of the pairs, below the node's namespace.
 _PAIRS = 'relpose_node/pairs'
 _IMU_DEPTH, _DEPTH = 2000, 50
-# Rate at which the IMU is read where nothing is published between keyframes [Hz].
+# Rate at which the IMU is read at least, though less may be published between keyframes [Hz].
 _LEAST_RATE = 10.0
 # Keyframes of ~/path, the newest ones; a rate at which it can be drawn [s].
 _PATH_LENGTH, _PATH_PERIOD = 3000, 1.0
@@ -83,8 +83,11 @@ class OdometryNode(StoppableNode):
             self._open_topics()
         self.create_service(Trigger, '~/reset', self._reset)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(1.0 / (self._config.odometry_rate or _LEAST_RATE), self._carry_on,
-                          clock=steady)
+        rate = self._config.odometry_rate
+        if rate > 0.0:
+            self.create_timer(1.0 / rate, self._carry_on, clock=steady)
+        if rate < _LEAST_RATE:
+            self.create_timer(1.0 / _LEAST_RATE, self._read_sensors, clock=steady)
         self.create_timer(_PATH_PERIOD, self._publish_path, clock=steady)
         self.create_timer(1.0, self._report, clock=steady)
         self._info(f'ready: {" and ".join(self._silent)}')
@@ -146,7 +149,7 @@ class OdometryNode(StoppableNode):
     def _carry_on(self) -> None:
         """Publish where the IMU has led the newest keyframe."""
         self._read_sensors()
-        if self._config.odometry_rate > 0.0 and self._newest_ns != self._last_ns:
+        if self._newest_ns != self._last_ns:
             carried = self._estimator.carried(self._newest_ns)
             if carried is not None:
                 self._publish(carried)

@@ -56,8 +56,9 @@ _ANY_VELOCITY = 3.0
 _START_LOG_SIGMA, _GUESSED_SPEED = 0.7, 1.0
 # Chi squared per degree of freedom of a pair that contradicts, and of a start that went wrong.
 _CONTRADICTING, _WRONG_START = 4.0, 3.0
-# Longest time over which the IMU carries a path that was lost [s].
-_LONGEST_CARRIED = 10.0
+# Longest time over which the IMU carries a path that was lost [s], and by which a pair comes later
+# than its samples.
+_LONGEST_CARRIED, _LONGEST_DELAY = 10.0, 10.0
 # A start that takes longer is begun anew [s].
 _LONGEST_START = 4.0
 # Pairs that tell the scale of a start in motion, at least.
@@ -169,6 +170,8 @@ class OdometryEstimator:
             self._waiting, self._last_ns = {}, None
         if not self._gyro.repeats(sample):
             self._samples.add(sample)
+            self._samples.prune(sample.stamp_ns - to_nanoseconds(
+                max(_LONGEST_CARRIED, self._config.max_coast) + _LONGEST_DELAY))
         run = self._run
         if run is not None and run.published and not self._waiting and (
                 sample.stamp_ns - run.seen_ns
@@ -216,8 +219,6 @@ class OdometryEstimator:
                 self._end(str(error))
             if found is not None:
                 out.append(found)
-            self._samples.prune(pair.current_ns - to_nanoseconds(
-                max(_GRAVITY_WINDOW, self._config.max_coast) + 1.0))
         return out
 
     def carried(self, imu_ns: int) -> Odometry | None:
