@@ -107,7 +107,7 @@ def draw_residuals(records: Sequence[PairRecord], path: Path) -> None:
         ([f['residual_rms_px'] for f in known], 'residual of inliers,\nrms [px]'),
         ([100.0 * f['inlier_ratio'] for f in known], 'inliers [%]'),
         ([f['rotation_difference_to_gyro_deg'] for f in known],
-         'rotation: estimate\nagainst gyro [deg]'))
+         'rotation: images\nagainst gyro [deg]'))
     for axis, (values, label) in zip(axes, series, strict=True):
         finite = [value for value in values if np.isfinite(value)]
         if finite:
