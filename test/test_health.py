@@ -18,10 +18,12 @@ from rs_relpose_ros.config.imu import ImuConfig
 from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.estimator.estimate import estimate_relative_pose
+from rs_relpose_ros.estimator.inertial_evidence import InertialEvidence
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.front_end.front_end import FrameFailed, FrameProcessed, FrontEnd
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
+from rs_relpose_ros.health.acceleration import AccelerationSums
 from rs_relpose_ros.health.deviation import (
     AXES,
     BIAS,
@@ -588,6 +590,23 @@ def test_tracked_figures_are_those_of_the_parameters(direction, sign):
     assert seen.time_offset_sigma == pytest.approx(math.hypot(5e-4, 0.5e-3), rel=0.02)
 
 
+def test_pairs_that_contradict_the_accelerometer():
+    sums = AccelerationSums()
+    for k in range(3):   # one pair does not decide, however loud
+        sums.add(k * 1000 * MS, InertialEvidence(-50.0, -80.0))
+        assert not sums.contradicts and sums.finding() is None
+    sums.add(3000 * MS, InertialEvidence(-50.0, 0.5))
+    assert sums.contradicts
+    assert 'its axes are not those of the gyro' in sums.finding().sentence
+    for k in range(4, 11):
+        sums.add(k * 1000 * MS, InertialEvidence(-1.0, 3.0))
+    assert 'it has the other sign' in sums.finding().sentence
+    for k in range(11, 36):   # and back, once the data say so
+        sums.add(k * 1000 * MS, InertialEvidence(1.0, -1.0))
+    assert not sums.contradicts
+    assert sums.finding().state is HealthState.OK
+
+
 # -- told wrong, end to end: the bundled bag ----------------------------------------------------
 
 
@@ -613,14 +632,18 @@ def camera_with(**values):
         name: value(getattr(told, name)) for name, value in values.items()})
 
 
-def imu_with(axes=UNTURNED, gyro=1.0, late=0.0):
-    """All samples: v' = axes v, rates times `gyro`, stamps `late` seconds later."""
+def imu_with(axes=UNTURNED, gyro=1.0, late=0.0, force=UNTURNED):
+    """All samples: v' = axes v, rates times `gyro`, stamps `late` seconds later.
+
+    `force` (3, 3): what the accelerometer reads, times this.
+    """
     def changed(sample):
-        rate, force = sample.angular_velocity, sample.linear_acceleration
+        rate, felt = sample.angular_velocity, sample.linear_acceleration
         return replace(
             sample, stamp_ns=sample.stamp_ns + round(1e9 * late),
             angular_velocity=None if rate is None else tuple(gyro * axes @ np.array(rate)),
-            linear_acceleration=None if force is None else tuple(axes @ np.array(force)))
+            linear_acceleration=(
+                None if felt is None else tuple(force @ axes @ np.array(felt))))
     return Role.IMU, changed
 
 
@@ -651,8 +674,10 @@ FAST = [
     wrong('K 1.3', 'focal_length', changes=[camera_with(fx=lambda f: 1.3 * f,
                                                         fy=lambda f: 1.3 * f)],
           seen=450.0, tolerance=5.0, pairs=12),
+    wrong('acceleration, other sign', 'accel_axes', changes=[imu_with(force=-UNTURNED)]),
 ]
 LONG = [
+    wrong('accelerometer cycled', 'accel_axes', changes=[imu_with(force=CYCLED)]),
     # Poses are published with the covariance of what is off.
     wrong('offset by 40 ms', 'time_offset', 'time_offset=0.04', seen=0.0, tolerance=3e-3,
           stamps_late=0.04),

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import multivariate_normal
 
 from rs_relpose_lab.simulation.fine_path import FinePath
 from rs_relpose_lab.simulation.hand_held import hand_held, Plan
@@ -20,6 +21,10 @@ from rs_relpose_ros import (
     RollingShutterCamera,
 )
 from rs_relpose_ros.config.imu import ImuConfig
+from rs_relpose_ros.estimator.inertial_evidence import _log_evidence, inertial_evidence
+from rs_relpose_ros.estimator.priors import VelocityPrior
+from rs_relpose_ros.estimator.problem import build_problem
+from rs_relpose_ros.geometry.vectors import tangent_basis
 from rs_relpose_ros.imu.preintegration import preintegrate
 
 CAMERA = RollingShutterCamera(width=640, height=480, fx=450.0, fy=450.0, cx=319.5, cy=239.5,
@@ -144,3 +149,58 @@ def test_other_carriers(pairs, motion):
     errors = [np.log(pose.baseline / pair.baseline)
               for pose, pair in zip(poses, pairs, strict=False)]
     assert np.nanmedian(np.abs(errors)) < 0.3
+
+
+def evidence(pair, pose, inertial):
+    nothing = np.empty((0, 2))
+    problem = build_problem(nothing, nothing, CAMERA, *pair.motions, pair.R, 1e-8 * np.eye(3))
+    return inertial_evidence(problem, pose.images, 'hand_held', INTERVAL, inertial)
+
+
+@pytest.mark.parametrize('with_accelerometer', [True, False])
+def test_images_tell_the_acceleration_from_another_one(pairs, with_accelerometer):
+    """By the images alone, whatever the pose rests on."""
+    right, reversed_, turned = [], [], []
+    axes = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    for pair in pairs:
+        told = pair.inertial
+        pose = pair.estimate(
+            **({'inertial': told} if with_accelerometer else {'interval': INTERVAL}))
+        for found, map_ in ((right, np.eye(3)), (reversed_, -np.eye(3)), (turned, axes)):
+            found.append(evidence(pair, pose, replace(told, **{
+                name: map_ @ np.asarray(getattr(told, name))
+                for name in ('alpha', 'beta', 'acceleration1', 'acceleration2')})))
+    told, opposite = np.sum(right, axis=0)
+    assert told > 10.0 and opposite < -10.0
+    np.testing.assert_allclose(np.sum(reversed_, axis=0), (opposite, told))
+    assert np.sum(turned, axis=0)[0] < -10.0
+
+
+def test_a_global_shutter_tells_nothing_of_the_acceleration(pairs):
+    """Its rows are at one instant: no velocity shows, and no evidence is made up."""
+    pair = pairs[0]
+    still = replace(CAMERA, readout_time=0.0)
+    pose = estimate_relative_pose(
+        *pair.points, still, *pair.motions, relative_rotation=pair.R,
+        relative_rotation_covariance=1e-8 * np.eye(3), config=CONFIG, interval=INTERVAL)
+    assert np.abs(evidence(pair, pose, pair.inertial)).max() < 0.5
+
+
+def test_evidence_by_the_density_of_the_acceleration():
+    """At one baseline: the images' y is normal, and so is what the acceleration should be."""
+    rng = np.random.default_rng(3)
+    half = rng.normal(size=(8, 12))
+    H, g, b, c = half @ half.T, rng.normal(size=8), 0.3, 4.0
+    t, velocities = np.array([0.6, 0.0, 0.8]), rng.normal(size=6)
+    basis = tangent_basis(t)
+    J = np.hstack([-c * np.vstack([basis, basis]), np.eye(6)])
+    mean = b * (velocities - c * np.tile(t, 2) - J @ np.linalg.solve(H, g))
+    covariance = b**2 * J @ np.linalg.solve(H, J.T)
+
+    def both(a, V):
+        prior = VelocityPrior(c, a, np.linalg.inv(V), 0.0, 0.0, 1.0, 0.0)
+        return (_log_evidence(H, g, t, velocities, prior, np.array([np.log(b)])),
+                multivariate_normal(mean, covariance + V).logpdf(-a))
+
+    first, second = both(rng.normal(size=6), 0.3 * np.eye(6)), both(np.zeros(6), 2.0 * np.eye(6))
+    assert first[0] - second[0] == pytest.approx(first[1] - second[1], abs=1e-9)

@@ -172,6 +172,16 @@ def _gyro_times(factor: float) -> Callable[[ImuSample], ImuSample]:
     return lambda sample: replace(sample, angular_velocity=scaled(sample.angular_velocity))
 
 
+def _felt(turn: Rotation, sign: float) -> Callable[[ImuSample], ImuSample]:
+    """Accelerometer whose axes are turned, or that reads the acceleration of free fall."""
+    def changed(sample: ImuSample) -> ImuSample:
+        if sample.linear_acceleration is None:
+            return sample
+        x, y, z = sign * turn.apply(sample.linear_acceleration)
+        return replace(sample, linear_acceleration=(float(x), float(y), float(z)))
+    return changed
+
+
 def _stamped_late(sample: ImuSample) -> ImuSample:
     return replace(sample, stamp_ns=sample.stamp_ns + 30_000_000)
 
@@ -232,6 +242,8 @@ ROWS: Mapping[str, Row] = {
     'readout-2': Row(('readout_time',), GROSS, _readout(2.0), _readout_error(2.0)),
     'readout-0.5': Row(('readout_time',), GROSS, _readout(0.5), _readout_error(0.5)),
     'readout-0': Row(('readout_time',), GROSS, _readout(0.0), _readout_error(0.0)),
+    'accel-cycled': Row(('accel_axes',), SMALL, _arrives(_felt(_CYCLE, 1.0))),
+    'accel-opposite': Row(('accel_axes',), SMALL, _arrives(_felt(Rotation.identity(), -1.0))),
     'axes-3deg': Row(('axes',), SMALL, _axes_turned(_slightly), _slight_turn),
     'offset-10ms': Row(('time_offset',), SMALL, _later(0.01),
                        lambda told, rng: Injected('time_offset', np.array([0.01]))),

@@ -67,13 +67,20 @@ def velocities_expected(problem: TwoViewProblem, motion: str, interval: float,
     # (alpha', beta') to u = b (d - c t) + a: a = (alpha' / T, alpha' / T - beta')
     to_velocities = np.kron(np.array([[1.0 / interval, 0.0], [1.0 / interval, -1.0]]), np.eye(3))
     covariance = to_velocities @ covariance @ to_velocities.T + ROW_VELOCITY_SIGMA**2 * np.eye(6)
-    step = math.log(carrier.fast / carrier.slow) / SCALES
-    centres = np.array([math.log(interval * carrier.slow) + step * (0.5 + k)
-                        for k in range(SCALES)])
+    lowest, highest = span_of_scales(motion, interval)
+    step = (highest - lowest) / SCALES
+    centres = np.array([lowest + step * (0.5 + k) for k in range(SCALES)])
     prior = VelocityPrior(1.0 / interval, to_velocities @ expected,
                           inverse(covariance),
                           float(centres[SCALES // 2]), 0.0, (WIDTH * step) ** -2, 0.0)
     return prior, Scales(centres, np.zeros(SCALES))
+
+
+def span_of_scales(motion: str, interval: float) -> tuple[float, float]:
+    """``log b`` between which a carrier's speeds put it."""
+    carrier = MOTIONS[motion]
+    lowest = math.log(interval * carrier.slow)
+    return lowest, lowest + math.log(carrier.fast / carrier.slow)
 
 
 def _of_imu(problem: TwoViewProblem, inertial: InertialMotion) -> tuple[Array, Array]:

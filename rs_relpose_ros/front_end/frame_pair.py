@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from rs_relpose_ros.config.imu import ImuConfig
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.estimator.estimate import estimate_relative_pose
+from rs_relpose_ros.estimator.inertial_evidence import inertial_evidence, InertialEvidence
+from rs_relpose_ros.estimator.problem import build_problem
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.front_end.derotated_rays import DerotatedRays, median_parallax, Sensor
 from rs_relpose_ros.front_end.frame import Frame, pose_row_delay
@@ -119,6 +121,19 @@ def estimate_pair(first: View, second: View, matches: Matches, sensor: Sensor,
     if pose.status in _LACK_OF_MATCHES and is_dark(second.frame.image):
         pose = replace(pose, reason=f'the image is dark: {pose.reason}')
     return pose
+
+
+def evidence_of(pose: RelativePose, first: View, second: View, sensor: Sensor,
+                gyro: GyroTurn | None, inertial: InertialMotion | str,
+                parameters: Parameters) -> InertialEvidence | None:
+    """Whether the accelerometer agrees with the images of a pair; None where nothing tells."""
+    if gyro is None or isinstance(inertial, str) or pose.images is None:
+        return None
+    no_matches = np.empty((0, 2))
+    problem = build_problem(no_matches, no_matches, sensor.camera, first.imu.motion,
+                            second.imu.motion, gyro.rotation, gyro.covariance)
+    return inertial_evidence(problem, pose.images, parameters.estimator.motion,
+                             interval_of(first, second), inertial)
 
 
 def parallax_of(rays1: DerotatedRays, rays2: DerotatedRays, gyro: GyroTurn | None,

@@ -14,6 +14,7 @@ from rs_relpose_ros.front_end.derotated_rays import DerotatedRays, Sensor
 from rs_relpose_ros.front_end.frame import Frame, sensor_camera
 from rs_relpose_ros.front_end.frame_pair import (
     estimate_pair,
+    evidence_of,
     GyroTurn,
     inertial_of,
     interval_of,
@@ -23,6 +24,7 @@ from rs_relpose_ros.front_end.frame_pair import (
 )
 from rs_relpose_ros.front_end.pair import closes_pair, PairResult, SinceKeyframe
 from rs_relpose_ros.front_end.stamp_scatter import StampScatter
+from rs_relpose_ros.geometry.inertial import InertialMotion
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between
@@ -42,6 +44,8 @@ Array = NDArray[np.float64]
 
 # Points of which the turning of the images is taken, of the longest tracks, and frames between.
 _TURN_POINTS, _TURN_FRAMES = 120, 3
+# Why a pair does without the accelerometer.
+_CONTRADICTED = 'images and accelerometer contradict each other (see health)'
 
 
 @dataclass(slots=True, eq=False)
@@ -235,10 +239,7 @@ class Pipeline:
     def _close_pair(self, reference: View, view: View, sensor: Sensor,
                     parameters: Parameters) -> PairResult:
         matches, gyro = self._tracker.refined_matches(), self._gyro
-        inertial = inertial_of(reference, view, gyro, self._forces, parameters)
-        pose = estimate_pair(reference, view, matches, sensor, gyro, inertial, parameters,
-                             interval=interval_of(reference, view),
-                             stamp_sigma=self._stamps.sigma)
+        pose = self._estimated(matches, reference, view, sensor, parameters)
         pose = self._judged(pose, matches, reference, view, sensor, parameters)
         rays1, rays2 = self._derotate(matches, reference.imu.motion, view.imu.motion, sensor)
         seen = self._health.latest
@@ -248,6 +249,24 @@ class Pipeline:
             health=self._health.health, tracked=self._seen, applied=self._applied,
             image1=reference.frame.image if self._keep_images else None,
             image2=view.frame.image if self._keep_images else None)
+
+    def _estimated(self, matches: Matches, reference: View, view: View, sensor: Sensor,
+                   parameters: Parameters) -> RelativePose:
+        """The pose, without the accelerometer where images contradict it."""
+        def estimate(acceleration: InertialMotion | str) -> RelativePose:
+            return estimate_pair(
+                reference, view, matches, sensor, self._gyro, acceleration, parameters,
+                interval=interval_of(reference, view), stamp_sigma=self._stamps.sigma)
+
+        inertial = inertial_of(reference, view, self._gyro, self._forces, parameters)
+        believed = self._health.believes(None)
+        pose = estimate(inertial if believed else _CONTRADICTED)
+        evidence = evidence_of(pose, reference, view, sensor, self._gyro, inertial, parameters)
+        if evidence is not None:
+            self._health.add_acceleration(view.frame.stamp_ns, evidence)
+            if believed and not self._health.believes(evidence):
+                pose = estimate(_CONTRADICTED)
+        return pose
 
     # -- health ------------------------------------------------------------------------------
 

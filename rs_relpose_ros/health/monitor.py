@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from rs_relpose_ros.estimator.inertial_evidence import InertialEvidence
 from rs_relpose_ros.estimator.result import RelativePose, Status
+from rs_relpose_ros.health.acceleration import AccelerationSums
 from rs_relpose_ros.health.deviation import DEVIATIONS
 from rs_relpose_ros.health.findings import Health, HealthState, NOT_JUDGED
 from rs_relpose_ros.health.judge import Cause, causes, Effect, judged, Told, undetermined
@@ -31,25 +33,38 @@ class HealthMonitor:
     def __init__(self) -> None:
         self._turns = TurnSums()
         self._recursion = Recursion()
+        self._acceleration = AccelerationSums()
         self._on_poses: deque[Effect] = deque(maxlen=_EFFECTS)
         self._on_rotations: deque[Effect] = deque(maxlen=_EFFECTS)
         self.health: Health = NOT_JUDGED
         self.calibration = NOTHING_SEEN
         self._causes: list[Cause] = []
+        self._told_wrong = False   # by the last pair
         self.latest: PairInformation | None = None   # of the last pair
 
     def clear(self) -> None:
         """Start anew: another camera."""
         self._turns.clear()
         self._recursion.clear()
+        self._acceleration.clear()
         self._on_poses.clear()
         self._on_rotations.clear()
-        self._causes = []
+        self._causes, self._told_wrong = [], False
         self.health, self.calibration = NOT_JUDGED, NOTHING_SEEN
 
     def add_turn(self, stamp_ns: int, interval: float, by_images: Array, by_gyro: Array) -> None:
         """Take in the turns (3,) over some frames, `interval` [s], by images alone and by gyro."""
         self._turns.add(stamp_ns, interval, by_images, by_gyro)
+
+    def believes(self, acceleration: InertialEvidence | None) -> bool:
+        """Whether a pair of such evidence is to use the accelerometer; None: not known yet."""
+        return self._acceleration.believes(acceleration)
+
+    def add_acceleration(self, stamp_ns: int, evidence: InertialEvidence) -> None:
+        """Take in what a pair says of the accelerometer, before the pair itself."""
+        # Velocities of a pair that is told wrong say nothing of it.
+        if not self._told_wrong:
+            self._acceleration.add(stamp_ns, evidence)
 
     def add_pair(self, stamp_ns: int, evidence: PairEvidence | None, pose: RelativePose,
                  told: Told) -> RelativePose:
@@ -65,6 +80,11 @@ class HealthMonitor:
                 # A pair without rank says nothing of the calibration; its pose stays as it is.
                 self._causes = []
         self.health = judged(self.calibration, self._causes, self._turns.compared(), told)
+        self._told_wrong = bool(self.health.faults)
+        if self._told_wrong:
+            self._acceleration.clear()
+        if (finding := self._acceleration.finding()) is not None:
+            self.health = Health((*self.health.findings, finding))
         return pose
 
     def _take_in(self, stamp_ns: int, evidence: PairEvidence, pose: RelativePose,
