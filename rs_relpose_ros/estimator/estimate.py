@@ -23,12 +23,19 @@ from rs_relpose_ros.estimator.image_information import (
     ImageInformation,
     rotation_information,
 )
+from rs_relpose_ros.estimator.inertial_evidence import inertial_evidence, InertialEvidence
 from rs_relpose_ros.estimator.information import inverse
 from rs_relpose_ros.estimator.inliers import cheirality_sign, Flags, Matches, select_inliers
 from rs_relpose_ros.estimator.local_optimisation import optimise
 from rs_relpose_ros.estimator.map_fit import FitMatches
 from rs_relpose_ros.estimator.noise import noise_mixture
-from rs_relpose_ros.estimator.priors import isotropic, PINNED, Priors, with_velocity
+from rs_relpose_ros.estimator.priors import (
+    isotropic,
+    PINNED,
+    Priors,
+    VelocityPrior,
+    with_velocity,
+)
 from rs_relpose_ros.estimator.problem import (
     build_problem,
     PairState,
@@ -177,7 +184,9 @@ class Estimation:
                                config.pixel_sigma / problem.focal)
         self.priors = _priors(problem, mode, config, interval)
         self.interval, self.inertial = interval, inertial
-        # How far the measured acceleration is from none: chi-square of six degrees of freedom.
+        # What the measured acceleration says of the velocities, and how far it is from none:
+        # chi-square of six degrees of freedom.
+        self.measured: VelocityPrior | None = None
         self.inertial_chi2 = 0.0
         self.iterations = 0
         self.deadline = (time.perf_counter() + config.time_limit if config.time_limit > 0.0
@@ -259,6 +268,7 @@ class Estimation:
                 velocity, scales = velocities_expected(self.problem, config.motion, self.interval,
                                                        self.inertial)
                 priors = with_velocity(priors, velocity)
+                self.measured = None if self.inertial is None else velocity
                 self.inertial_chi2 = float(
                     velocity.offset @ velocity.information @ velocity.offset)
             return fit_with_evidence(matches, state, priors,
@@ -371,6 +381,7 @@ class Estimation:
         r = residuals(self.problem.observations, refined.state)[refined.inliers]
         v2w2 = np.r_[9:12, 15:18]
         baseline, baseline_sigma, reason = self._baseline(pose)
+        images = self._images(refined)
         result = RelativePose(
             status=Status.OK, R=pose.R, t=pose.t, linear_velocity1=pose.v1,
             linear_velocity2=pose.v2, angular_velocity1=pose.w1, angular_velocity2=pose.w2,
@@ -378,8 +389,8 @@ class Estimation:
             velocity_covariance=pose.covariance[np.ix_(v2w2, v2w2)], model=self.mode.model.name,
             velocity_sigma=refined.velocity_sigma,
             baseline=baseline, baseline_log_sigma=baseline_sigma, baseline_reason=reason,
-            images=self._images(refined), iterations=self.iterations,
-            residual_rms=float(np.sqrt(np.mean(r**2))))
+            images=images, inertial_evidence=self._evidence(images),
+            iterations=self.iterations, residual_rms=float(np.sqrt(np.mean(r**2))))
         limit = self.config.max_translation_sigma
         if sigma <= limit:
             return result
@@ -397,6 +408,13 @@ class Estimation:
         return image_information(
             FitMatches(problem.observations, weights, sigma), state, self.priors,
             -problem.reference_row_time)
+
+    def _evidence(self, images: ImageInformation | None) -> InertialEvidence | None:
+        """Whether the images show the acceleration that was measured."""
+        if images is None or self.measured is None or self.interval is None:
+            return None
+        return inertial_evidence(self.problem, images, self.config.motion, self.interval,
+                                 self.measured)
 
     def _baseline(self, pose: PairState) -> tuple[float, float, str]:
         """Baseline [m] and 1 sigma of its logarithm; or NaN twice, and why."""

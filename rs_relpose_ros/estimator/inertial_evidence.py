@@ -15,7 +15,6 @@ the images show what was measured, 1 where they show nothing, below where they s
 
 from __future__ import annotations
 
-from dataclasses import replace
 import math
 from typing import NamedTuple
 
@@ -28,7 +27,6 @@ from rs_relpose_ros.estimator.information import inverse, log_determinant
 from rs_relpose_ros.estimator.priors import VelocityPrior
 from rs_relpose_ros.estimator.problem import TwoViewProblem
 from rs_relpose_ros.estimator.velocities_expected import span_of_scales, velocities_expected
-from rs_relpose_ros.geometry.inertial import InertialMotion
 from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.vectors import tangent_basis
 
@@ -39,7 +37,7 @@ _BASELINES = 14
 
 
 class InertialEvidence(NamedTuple):
-    """Logarithms of the Bayes factors of one pair.
+    """Logarithms of the Bayes factors of one pair, by its images.
 
     `told`: of the acceleration that was measured; `opposite`: of the opposite one, as of an
     accelerometer with the other sign.
@@ -50,7 +48,7 @@ class InertialEvidence(NamedTuple):
 
 
 def inertial_evidence(problem: TwoViewProblem, images: ImageInformation, motion: str,
-                      interval: float, inertial: InertialMotion) -> InertialEvidence | None:
+                      interval: float, measured: VelocityPrior) -> InertialEvidence | None:
     """What the images of a pair say of its acceleration; None where they say nothing.
 
     Parameters
@@ -58,27 +56,27 @@ def inertial_evidence(problem: TwoViewProblem, images: ImageInformation, motion:
     problem : TwoViewProblem
         With the gyro's rotation; its matches take no part.
     images : ImageInformation
-        Of the pose, which may rest on `inertial` or not.
+        Of the pose, which may rest on that acceleration or not.
     motion : str
         Of `MOTIONS`.
     interval : float
         Between the frames [s].
+    measured : VelocityPrior
+        By the acceleration (`velocities_expected`). The opposite one has the lever arm's part
+        reversed, too, which is small.
     """
     if len(images.gradient) == ROTATION or problem.rotation is None \
             or problem.rotation_information is None:
         return None
     H, g = _without_rotation(images, problem.rotation, problem.rotation_information)
-    opposite = replace(inertial, alpha=-inertial.alpha, beta=-inertial.beta,
-                       acceleration1=-np.asarray(inertial.acceleration1),
-                       acceleration2=-np.asarray(inertial.acceleration2))
+    unknown, _ = velocities_expected(problem, motion, interval, None)
     log_b = np.linspace(*span_of_scales(motion, interval), _BASELINES)
-    told, other, nothing = (
-        _log_evidence(H, g, images.t, images.velocities,
-                      velocities_expected(problem, motion, interval, acceleration)[0], log_b)
-        for acceleration in (inertial, opposite, None))
-    if not math.isfinite(told + other - nothing):
+    told, opposite, nothing = (
+        _log_evidence(H, g, images.t, images.velocities, prior, log_b)
+        for prior in (measured, measured._replace(offset=-measured.offset), unknown))
+    if not math.isfinite(told + opposite - nothing):
         return None
-    return InertialEvidence(told - nothing, other - nothing)
+    return InertialEvidence(told - nothing, opposite - nothing)
 
 
 def _without_rotation(images: ImageInformation, rotation: Array,

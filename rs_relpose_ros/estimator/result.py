@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.estimator.image_information import ImageInformation
+from rs_relpose_ros.estimator.inertial_evidence import InertialEvidence
 from rs_relpose_ros.geometry.so3 import skew
 
 Array = NDArray[np.float64]
@@ -66,6 +67,9 @@ class RelativePose:
     images : ImageInformation or None
         What the images alone say of it, without the priors of the IMU; None where they say
         nothing.
+    inertial_evidence : InertialEvidence or None
+        Whether the images show the acceleration that was given (`inertial`); None where nothing
+        tells.
     velocity_sigma : float
         Prior sigma of the linear velocities that was used [baselines per second].
     iterations : int
@@ -92,6 +96,7 @@ class RelativePose:
     baseline_log_sigma: float = float('nan')
     baseline_reason: str = ''
     images: ImageInformation | None = None
+    inertial_evidence: InertialEvidence | None = None
     velocity_sigma: float = float('nan')
     iterations: int = 0
     residual_rms: float = float('nan')

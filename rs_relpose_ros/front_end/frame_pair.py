@@ -18,6 +18,7 @@ from rs_relpose_ros.estimator.estimate import estimate_relative_pose
 from rs_relpose_ros.estimator.inertial_evidence import inertial_evidence, InertialEvidence
 from rs_relpose_ros.estimator.problem import build_problem
 from rs_relpose_ros.estimator.result import RelativePose, Status
+from rs_relpose_ros.estimator.velocities_expected import velocities_expected
 from rs_relpose_ros.front_end.derotated_rays import DerotatedRays, median_parallax, Sensor
 from rs_relpose_ros.front_end.frame import Frame, pose_row_delay
 from rs_relpose_ros.front_end.landmarks import landmarks
@@ -123,17 +124,18 @@ def estimate_pair(first: View, second: View, matches: Matches, sensor: Sensor,
     return pose
 
 
-def evidence_of(pose: RelativePose, first: View, second: View, sensor: Sensor,
-                gyro: GyroTurn | None, inertial: InertialMotion | str,
-                parameters: Parameters) -> InertialEvidence | None:
-    """Whether the accelerometer agrees with the images of a pair; None where nothing tells."""
-    if gyro is None or isinstance(inertial, str) or pose.images is None:
+def evidence_without(pose: RelativePose, first: View, second: View, sensor: Sensor,
+                     gyro: GyroTurn, inertial: InertialMotion,
+                     parameters: Parameters) -> InertialEvidence | None:
+    """What the images of a pair say of an acceleration that was not used; None where nothing."""
+    if pose.images is None:
         return None
-    no_matches = np.empty((0, 2))
-    problem = build_problem(no_matches, no_matches, sensor.camera, first.imu.motion,
-                            second.imu.motion, gyro.rotation, gyro.covariance)
-    return inertial_evidence(problem, pose.images, parameters.estimator.motion,
-                             interval_of(first, second), inertial)
+    nothing, interval = np.empty((0, 2)), interval_of(first, second)
+    problem = build_problem(nothing, nothing, sensor.camera, first.imu.motion, second.imu.motion,
+                            gyro.rotation, gyro.covariance)
+    motion = parameters.estimator.motion
+    return inertial_evidence(problem, pose.images, motion, interval, velocities_expected(
+        problem, motion, interval, inertial)[0])
 
 
 def parallax_of(rays1: DerotatedRays, rays2: DerotatedRays, gyro: GyroTurn | None,

@@ -14,7 +14,7 @@ from rs_relpose_ros.front_end.derotated_rays import DerotatedRays, Sensor
 from rs_relpose_ros.front_end.frame import Frame, sensor_camera
 from rs_relpose_ros.front_end.frame_pair import (
     estimate_pair,
-    evidence_of,
+    evidence_without,
     GyroTurn,
     inertial_of,
     interval_of,
@@ -261,7 +261,10 @@ class Pipeline:
         inertial = inertial_of(reference, view, self._gyro, self._forces, parameters)
         believed = self._health.believes(None)
         pose = estimate(inertial if believed else _CONTRADICTED)
-        evidence = evidence_of(pose, reference, view, sensor, self._gyro, inertial, parameters)
+        evidence = pose.inertial_evidence
+        if not (believed or isinstance(inertial, str) or self._gyro is None):
+            evidence = evidence_without(
+                pose, reference, view, sensor, self._gyro, inertial, parameters)
         if evidence is not None:
             self._health.add_acceleration(view.frame.stamp_ns, evidence)
             if believed and not self._health.believes(evidence):
