@@ -24,6 +24,8 @@ def main(bag, parameter_file, *stamps):
     """Print R and t of the two images as three lines of four numbers."""
     stamps = sorted(map(int, stamps))
     images, info, samples = read_bag(Path(bag), stamps)
+    if missing := [stamp for stamp in stamps if stamp not in images]:
+        sys.exit(f'{bag} has no image of the stamp {missing[0]}')
 
     # What a SLAM system has: images, intrinsics, IMU samples, and the parameters of the node. The
     # buffer must reach back to the first image when it is asked for that.
