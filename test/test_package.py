@@ -375,3 +375,28 @@ def test_recordings_skip_only_where_none_are_given(data, outcome, tmp_path):
                 tmp_path, '-p', 'no:cacheprovider', tmp_path / 'test_one.py', env=environment)
     expected = outcome if outcome != 'failed' else 'error'
     assert f'1 {expected}' in ended.stdout, ended.stdout
+
+
+@pytest.mark.parametrize('before, after', [(None, '1'), ('2', '2')])
+@pytest.mark.parametrize('entry', ['main(["--version"])', 'start("made_up")'])
+def test_linear_algebra_has_one_thread_where_the_process_is_ours(entry, before, after):
+    """Set before NumPy is there, which reads it once."""
+    code = f"""
+import os, sys, types
+from rs_relpose_ros.cli.main import main
+from rs_relpose_ros.node.start import start
+
+def tell(on_started=None):
+    print(os.environ["OPENBLAS_NUM_THREADS"], flush=True)
+    os._exit(0)
+
+assert "numpy" not in sys.modules
+sys.modules["made_up"] = types.SimpleNamespace(main=tell)
+{entry}
+tell()
+"""
+    environment = {key: value for key, value in os.environ.items()
+                   if not key.endswith('_NUM_THREADS')}
+    if before is not None:
+        environment['OPENBLAS_NUM_THREADS'] = before
+    assert run(sys.executable, '-c', code, env=environment).stdout.splitlines()[-1] == after

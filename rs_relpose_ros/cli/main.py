@@ -12,6 +12,7 @@ import sys
 from types import ModuleType
 from typing import Any
 
+from rs_relpose_ros.blas_threads import use_one_blas_thread
 from rs_relpose_ros.errors import MissingInputError, RsRelposeError
 
 PROGRAM = 'rs_relpose'
@@ -97,6 +98,7 @@ def make_parser(selected: str | None) -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line `argv` (default: that of the process) and return its exit code."""
+    use_one_blas_thread()
     try:
         code = _run(sys.argv[1:] if argv is None else list(argv))
         # A closed pipe shows here, and not as a complaint while the interpreter shuts down.

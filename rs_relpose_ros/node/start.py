@@ -14,6 +14,8 @@ import threading
 from types import FrameType
 from typing import NoReturn
 
+from rs_relpose_ros.blas_threads import use_one_blas_thread
+
 # Time [s] for rclpy to end its contexts.
 _GRACE = 0.3
 
@@ -29,6 +31,7 @@ def start(module: str) -> NoReturn:
     """Run the node whose `main` is in `module`, and end the process with its exit code."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _on_signal)
+    use_one_blas_thread()
     from rs_relpose_ros.node.run import leave
     run = importlib.import_module(module).main
     leave(run(on_started=_on_started))
