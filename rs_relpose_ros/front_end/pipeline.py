@@ -259,12 +259,12 @@ class Pipeline:
                 interval=interval_of(reference, view), stamp_sigma=self._stamps.sigma)
 
         inertial = inertial_of(reference, view, self._gyro, self._forces, parameters)
+        if isinstance(inertial, str) or self._gyro is None:
+            return estimate(inertial)
         believed = self._health.believes(None)
         pose = estimate(inertial if believed else _CONTRADICTED)
-        evidence = pose.inertial_evidence
-        if not (believed or isinstance(inertial, str) or self._gyro is None):
-            evidence = evidence_without(
-                pose, reference, view, sensor, self._gyro, inertial, parameters)
+        evidence = pose.inertial_evidence if believed else evidence_without(
+            pose, reference, view, sensor, self._gyro, inertial, parameters)
         if evidence is not None:
             self._health.add_acceleration(view.frame.stamp_ns, evidence)
             if believed and not self._health.believes(evidence):

@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections import deque
 
 from rs_relpose_ros.estimator.inertial_evidence import InertialEvidence
-from rs_relpose_ros.geometry.timing import to_nanoseconds
 from rs_relpose_ros.health.findings import Finding, HealthState
+from rs_relpose_ros.health.recursion import MOST_PAIRS, WINDOW_NS
 
-# Pairs that count: those of the last seconds, at most so many.
-_WINDOW_NS = to_nanoseconds(20.0)
-_MOST_PAIRS = 100
 # Most that one pair says: one whose matches mislead it must not decide alone.
 _LOUDEST = 3.0
 # Logarithm of a Bayes factor that is certain, errors of neighbours being alike.
@@ -21,7 +18,7 @@ class AccelerationSums:
     """Log Bayes factors of the measured acceleration and of its opposite, added up."""
 
     def __init__(self) -> None:
-        self._pairs: deque[tuple[int, float, float]] = deque(maxlen=_MOST_PAIRS)
+        self._pairs: deque[tuple[int, float, float]] = deque(maxlen=MOST_PAIRS)
 
     def clear(self) -> None:
         """Forget all pairs: they belong to other figures or another time."""
@@ -33,7 +30,7 @@ class AccelerationSums:
             self.clear()
         told, opposite = (max(-_LOUDEST, min(value, _LOUDEST)) for value in evidence)
         self._pairs.append((stamp_ns, told, opposite))
-        while self._pairs[0][0] < stamp_ns - _WINDOW_NS:
+        while self._pairs[0][0] < stamp_ns - WINDOW_NS:
             self._pairs.popleft()
 
     def believes(self, evidence: InertialEvidence | None) -> bool:

@@ -27,8 +27,8 @@ from rs_relpose_ros.health.pair_information import (
 Array = NDArray[np.float64]
 
 # Pairs that count: those of the last seconds, at most so many.
-_WINDOW_NS = to_nanoseconds(20.0)
-_MOST_PAIRS = 100
+WINDOW_NS = to_nanoseconds(20.0)
+MOST_PAIRS = 100
 # Older pairs that are linearised anew with each new one, and distance in sigmas of the prior
 # within which that changes nothing.
 _ANEW, _NEAR = 3, 0.02
@@ -78,7 +78,7 @@ class Recursion:
     """The pairs of the last seconds."""
 
     def __init__(self) -> None:
-        self._pairs: deque[_Entry] = deque(maxlen=_MOST_PAIRS)
+        self._pairs: deque[_Entry] = deque(maxlen=MOST_PAIRS)
 
     def clear(self) -> None:
         """Forget all pairs: they belong to another camera or another time."""
@@ -101,7 +101,7 @@ class Recursion:
         if self._pairs:
             self._linearise_anew(about)
         self._pairs.append(_Entry(stamp_ns, evidence, in_force, about, information))
-        while self._pairs[0].stamp_ns < stamp_ns - _WINDOW_NS:
+        while self._pairs[0].stamp_ns < stamp_ns - WINDOW_NS:
             self._pairs.popleft()
         return information
 
