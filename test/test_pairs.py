@@ -141,7 +141,7 @@ def test_too_few_matches(bundled_bag, tmp_path):
 
 @pytest.mark.parametrize(('text', 'said'), [
     ('', 'must begin with a line of column names'),
-    ('1,2\n', 'reference_stamp_ns and stamp_ns is missing'),
+    ('1,2\n', 'missing: reference_stamp_ns, stamp_ns'),
     ('reference_stamp_ns,stamp_ns\n', 'has no pairs'),
     ('reference_stamp_ns,stamp_ns\n1,2\n1.7e18,3\n',
      "line 3: reference_stamp_ns must be the stamp of an image, an integer [ns], got '1.7e18'"),

@@ -53,8 +53,8 @@ def read_pairs(path: Path) -> list[Stamps]:
         rows = csv.DictReader(file)
         if missing := set(LIST_COLUMNS) - set(rows.fieldnames or ()):
             raise InputError(f'{path} must begin with a line of column names that has '
-                             f'{" and ".join(LIST_COLUMNS)}; {" and ".join(sorted(missing))} '
-                             'is missing')
+                             f'{" and ".join(LIST_COLUMNS)}; missing: '
+                             f'{", ".join(sorted(missing))}')
         pairs = [_stamps(row, f'{path}, line {rows.line_num}') for row in rows]
     if not pairs:
         raise InputError(f'{path} has no pairs')
