@@ -294,8 +294,8 @@ def test_diagnostics_count_what_happened(session):
     assert int(values['clock_jumps']) >= 4
     assert int(values['messages_invalid']) > 200
     assert values['frames_failed'] == '0'
-    # A listener that got no processor time may have missed one.
-    assert 0 <= int(values['poses']) - len(session.poses) <= 2
+    # A listener that got no processor time may have missed some.
+    assert 0.95 * int(values['poses']) <= len(session.poses) <= int(values['poses'])
     assert values['last_reason_no_pose'].split(':')[0] in (
         'TOO_FEW_MATCHES', 'NO_CONSENSUS', 'LOW_PARALLAX', 'PURE_ROTATION')
 

@@ -30,6 +30,9 @@ from rs_relpose_ros.messages.outgoing import (
 from rs_relpose_ros.node.debug_image import draw_debug_image
 from rs_relpose_ros.node.message_types import message_class
 
+# Messages kept for a subscriber that is late: three seconds of pairs at 30 Hz.
+_HISTORY = 100
+
 # What rclpy raises where a signal has ended the context amid a call.
 SHUT_DOWN = (rclpy_implementation.RCLError, InvalidHandle)
 
@@ -38,7 +41,7 @@ class PairPublishers:
     """Publishes pairs on the topics of the node, and as a transform if asked for."""
 
     def __init__(self, node: Node, config: PairConfig) -> None:
-        self._pair = {name: node.create_publisher(message_class(msgtype), f'~/{name}', 10)
+        self._pair = {name: node.create_publisher(message_class(msgtype), f'~/{name}', _HISTORY)
                       for name, msgtype in PAIR_TOPICS.items()}
         self._debug_image = node.create_publisher(
             message_class('sensor_msgs/msg/Image'), f'~/{DEBUG_IMAGE}', 2)

@@ -39,7 +39,7 @@ NAME = 'odometry_node'
 
 # Topic of the pairs, below the node's namespace.
 _PAIRS = 'relpose_node/pairs'
-_IMU_DEPTH, _DEPTH = 2000, 50
+_IMU_DEPTH, _DEPTH = 2000, 100
 # Rate at which the IMU is read at least, though less may be published between keyframes [Hz].
 _LEAST_RATE = 10.0
 # Keyframes of ~/path, the newest ones; a rate at which it can be drawn [s].
@@ -188,8 +188,10 @@ class OdometryNode(StoppableNode):
         level, state = _STATES[estimator.state.value]
         for topic in self._silent:
             self._silent[topic] += 1
-            if self._silent[topic] > _SILENCE:
-                level, state = 2, f'no message on {topic} for {self._silent[topic] - 1} s'
+        silent = [f'{topic} for {reports - 1} s' for topic, reports in self._silent.items()
+                  if reports > _SILENCE]
+        if silent:
+            level, state = 2, f'no message on {" and ".join(silent)}'
         values = [('state', estimator.state.value), *(
             (name.replace(' ', '_'), str(estimator.counts[name])) for name in (
                 'pairs', 'contradicting', 'late', 'without IMU', 'lost', 'told wrong'))]
