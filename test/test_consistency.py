@@ -10,7 +10,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.experiments.baseline_chain import steps, write_report
-from rs_relpose_lab.experiments.consistency import on_recording, pair_consistency, read_true_pairs
+from rs_relpose_lab.experiments.consistency import (
+    chosen_pairs,
+    image_stamps,
+    on_recording,
+    pair_consistency,
+    read_true_pairs,
+)
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.config.parameter_file import read_parameters
@@ -44,19 +50,34 @@ def test_errors_drawn_from_a_covariance(claimed):
     assert np.mean([p.translation_nees for p in found]) == pytest.approx(claimed**-2, rel=0.07)
 
 
-def true_pairs(bag_path, path, frames):
-    """A table of pairs of the bundled bag, by its truth; also what they were written from."""
-    parameters = read_parameters(PARAMETERS)
+# Frames of the bundled bag, where the policy has no keyframes. The second overlaps both others.
+ENDS = ((60, 71), (65, 76), (71, 90))
+
+
+def chosen(bag_path, ends):
+    """Pairs with these ends, and the stamps of the ends."""
+    stamps = image_stamps(bag_path)
+    wanted = [(stamps[first], stamps[second]) for first, second in ends]
+    return list(chosen_pairs(bag_path, read_parameters(PARAMETERS), wanted)), wanted
+
+
+def test_pairs_are_closed_where_they_are_chosen(bundled_bag):
+    pairs, wanted = chosen(bundled_bag, ENDS[::2])
+    assert [(pair.reference_stamp_ns, pair.stamp_ns) for pair in pairs] == wanted
+    # Of the pairs before, which the policy closed.
+    assert any(finding.observable for finding in pairs[0].health.findings)
+
+
+def true_pairs(bag_path, path):
+    """A table of `ENDS`, by the truth; also what it was written from."""
     with open_bag(bag_path) as bag:
-        topics = bag.find_topics()
-        truth = read_truth(bag, topics)
-        pairs = Replay(bag, topics, parameters).pairs()
-        results = [pair.result for pair, _ in zip(pairs, range(3), strict=False)]
-    results = [results[k] for k in frames]
+        truth = read_truth(bag, bag.find_topics())
+    first, second = (chosen(bag_path, ends)[0] for ends in (ENDS[::2], ENDS[1:2]))
+    results = [*first, *second]
     with path.open('w', newline='', encoding='utf-8') as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
-        for result in results:
+        for result in reversed(results):
             R, t = truth.relative_pose(result.reference_ns1, result.reference_ns2)
             writer.writerow([result.reference_stamp_ns, result.stamp_ns, *R.ravel(),
                              *t / np.linalg.norm(t), 1.0])
@@ -65,12 +86,12 @@ def true_pairs(bag_path, path, frames):
 
 def test_pairs_of_a_recording_are_those_of_the_table(bundled_bag, tmp_path):
     table = tmp_path / 'pairs.csv'
-    results = true_pairs(bundled_bag, table, (1, 2))
-    assert [pair.translation_sigma for pair in read_true_pairs(table)] == [np.radians(1.0)] * 2
+    results = true_pairs(bundled_bag, table)
+    assert [pair.translation_sigma for pair in read_true_pairs(table)] == [np.radians(1.0)] * 3
     found = list(on_recording(bundled_bag, PARAMETERS, table))
     assert [p.interval for p in found] == [r.interval for r in results]
     for pair in found:
-        assert pair.rotation < 0.2 and pair.translation < 8.0
+        assert pair.rotation < 0.1 and pair.translation < 2.0
         assert pair.rotation_nees < 5.0 and pair.translation_nees < 5.0
 
 

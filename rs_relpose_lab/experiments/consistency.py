@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 import csv
 from dataclasses import dataclass, replace
+import itertools
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,8 +26,10 @@ from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.estimator.result import RelativePose
+from rs_relpose_ros.front_end.front_end import FrameProcessed, FrontEnd
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.messages.incoming import PublishedImage
+from rs_relpose_ros.messages.intake import Intake
 from rs_relpose_ros.messages.sensor_feed import Role, SensorFeed
 from rs_relpose_ros.replay.run import read_truth, Replay
 
@@ -129,15 +132,67 @@ def read_true_pairs(path: Path) -> list[TruePair]:
 
 
 def on_recording(path: Path, parameter_file: Path, truth: Path) -> Iterator[PairConsistency]:
-    """The true pairs of a recording, each from a replay of its own frames alone."""
-    parameters, stamps = read_parameters(parameter_file), image_stamps(path)
-    for true in read_true_pairs(truth):
-        frames = frozenset(s for s in stamps if true.stamp1_ns <= s <= true.stamp2_ns)
-        result = pair_of(path, parameters, frames)
-        if result is not None and result.pose and (
-                result.reference_stamp_ns, result.stamp_ns) == true[:2]:
-            yield pair_consistency(path.name, path.name, result.interval, result.pose, true.R,
-                                   true.t, true.translation_sigma)
+    """The true pairs of a recording, as a node publishes them that has run from its begin."""
+    parameters = read_parameters(parameter_file)
+    for apart in _passes(read_true_pairs(truth)):
+        pairs = {(true.stamp1_ns, true.stamp2_ns): true for true in apart}
+        for result in chosen_pairs(path, parameters, list(pairs)):
+            if result.pose:
+                true = pairs[result.reference_stamp_ns, result.stamp_ns]
+                yield pair_consistency(path.name, path.name, result.interval, result.pose, true.R,
+                                       true.t, true.translation_sigma)
+
+
+def _passes(pairs: Sequence[TruePair]) -> list[list[TruePair]]:
+    """Pairs in groups within which none overlaps another, each in the order of time."""
+    groups: list[list[TruePair]] = []
+    for pair in sorted(pairs, key=lambda pair: pair.stamp1_ns):
+        group = next((g for g in groups if g[-1].stamp2_ns <= pair.stamp1_ns), None)
+        if group is None:
+            groups.append(group := [])
+        group.append(pair)
+    return groups
+
+
+def chosen_pairs(path: Path, parameters: Parameters,
+                 ends: Sequence[tuple[int, int]]) -> Iterator[PairResult]:
+    """Pairs with given ends, amid those of the keyframe policy, of one run over a recording.
+
+    `ends`: stamps of both images [ns], in the order of time and without overlap. A pair in which
+    tracks or gyro are lost is left out.
+    """
+    following = dict(itertools.pairwise([0, *image_stamps(path)]))
+    keyframes, wanted = frozenset(itertools.chain.from_iterable(ends)), set(ends)
+    within = {s for s in following if any(begin < s < end for begin, end in ends)}
+    at_once, never = (parameters.updated(policy) for policy in (
+        {'max_keyframe_frames': 1},
+        {'min_keyframe_parallax': 1000.0, 'max_keyframe_interval': 60.0,
+         'min_tracked_fraction': 0.0, 'max_keyframe_frames': 1000}))
+    front_end = FrontEnd(parameters, offline=True)
+    intake = Intake(front_end.sequencer, parameters.imu.stuck_gyro_time, parameters.intrinsics)
+    done = 0   # stamp of the last image that was processed or refused
+
+    def closed() -> Iterator[PairResult]:
+        nonlocal done
+        while True:
+            stamp = following.get(done)
+            front_end.parameters = (at_once if stamp in keyframes else
+                                    never if stamp in within else parameters)
+            outcome = front_end.step()
+            if outcome is None:
+                return
+            done = outcome.stamp_ns or done
+            if isinstance(outcome, FrameProcessed) and outcome.result is not None and (
+                    outcome.result.reference_stamp_ns, outcome.result.stamp_ns) in wanted:
+                yield outcome.result
+
+    with open_bag(path) as bag:
+        topics = bag.find_topics(needs_camera_info=not parameters.intrinsics.given)
+        for role, message in intake.feed.messages(bag, topics):
+            intake.receive(role, message.message)
+            yield from closed()
+    front_end.sequencer.close()
+    yield from closed()
 
 
 def image_stamps(path: Path) -> list[int]:
@@ -148,17 +203,6 @@ def image_stamps(path: Path) -> list[int]:
         for role, message in feed.messages(bag, bag.find_topics(needs_camera_info=False)):
             feed.receive(role, message.message)
     return [image.stamp_ns for image in images]
-
-
-def pair_of(path: Path, parameters: Parameters, stamps: frozenset[int]) -> PairResult | None:
-    """The pair of the first and the last of some frames; None where tracks or gyro are lost."""
-    keyframes = replace(parameters.keyframes, min_keyframe_parallax=1000.0,
-                        max_keyframe_interval=60.0, min_tracked_fraction=0.0,
-                        max_keyframe_frames=len(stamps) - 1)
-    with open_bag(path) as bag:
-        topics = bag.find_topics(needs_camera_info=not parameters.intrinsics.given)
-        replay = Replay(bag, topics, replace(parameters, keyframes=keyframes), stamps=stamps)
-        return next((pair.result for pair in replay.pairs()), None)
 
 
 def write_report(folder: Path, pairs: Sequence[PairConsistency]) -> str:

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from rs_relpose_lab.experiments.comparison import best_opencv_score, Score
 from rs_relpose_lab.experiments.consistency import (
     image_stamps,
-    pair_of,
     read_true_pairs,
     SHORT,
     STILL,
@@ -31,6 +30,7 @@ from rs_relpose_ros.config.parameter_file import read_parameters
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.front_end.frame import sensor_camera
 from rs_relpose_ros.front_end.front_end import FrameProcessed
+from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 from rs_relpose_ros.global_shutter.frames import color_frames, GlobalShutterFrame
@@ -218,10 +218,21 @@ def _turn(gyro: ImuBuffer, parameters: Parameters, stamp_ns: int, delay_ns: int)
     return np.asarray(R_cam_imu @ turn @ R_cam_imu.T)
 
 
+def _pair_of(path: Path, parameters: Parameters, stamps: frozenset[int]) -> PairResult | None:
+    """The pair of the first and the last of some frames; None where tracks or gyro are lost."""
+    keyframes = replace(parameters.keyframes, min_keyframe_parallax=1000.0,
+                        max_keyframe_interval=60.0, min_tracked_fraction=0.0,
+                        max_keyframe_frames=len(stamps) - 1)
+    with open_bag(path) as bag:
+        topics = bag.find_topics(needs_camera_info=not parameters.intrinsics.given)
+        replay = Replay(bag, topics, replace(parameters, keyframes=keyframes), stamps=stamps)
+        return next((pair.result for pair in replay.pairs()), None)
+
+
 def _errors(path: Path, parameters: Parameters, intrinsics: Intrinsics, stamps: frozenset[int],
             truths: Sequence[TruePair]) -> list[_Errors]:
     """Errors of OpenCV's 5-point on the matches of a pair, against each truth."""
-    result, camera = pair_of(path, parameters, stamps), intrinsics.global_shutter_camera()
+    result, camera = _pair_of(path, parameters, stamps), intrinsics.global_shutter_camera()
     poses = []
     for estimator in OPENCV_ESTIMATORS:
         for threshold in _THRESHOLDS:

@@ -54,6 +54,8 @@ def run(args: argparse.Namespace) -> int:
     reasons = Counter(row.reason for row in outcome.rows if row.reason)
     for reason, count in reasons.most_common(_MOST_REASONS):
         print(f'no pose, {count} times: {reason}')
+    if len(reasons) > _MOST_REASONS:
+        print(f'{len(reasons) - _MOST_REASONS} more reasons: column reason of {POSES_FILE}')
     if errors:
         print(errors_line(errors))
     print(f'in {folder}: {", ".join([*outcome.files, SUMMARY_FILE])}')

@@ -6,6 +6,7 @@ Figures are drawn on a canvas of their own, so that nothing of matplotlib's glob
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 
 from matplotlib.axes import Axes
@@ -85,7 +86,7 @@ def draw_errors(records: Sequence[PairRecord], path: Path,
             axis.plot(0.5 * (begins + ends), values, 'o', color=_BLUE, markersize=5, label='error')
             _median_line(axis, values, f'median error {np.median(values):.2g} deg')
             for (method, errors), color, marker in zip(
-                    (baselines or {}).items(), (_RED, _GREEN), '+x', strict=False):
+                    (baselines or {}).items(), cycle((_RED, _GREEN)), cycle('+x12'), strict=False):
                 others = [np.nan if e is None else getattr(e, name) for e in errors]
                 axis.plot(0.5 * (begins + ends), others, marker, color=color, markersize=6,
                           label=f'{method}:\nmedian {np.nanmedian(others):.2g} deg')
