@@ -193,6 +193,9 @@ def session(module_ros_domain_id: int, bag_messages: list[tuple[int, Any]]) -> I
         play(publishers, [item for item in stream.sent if item.phase == last])
         count = len(diagnostics)
         wait_until(lambda: len(diagnostics) >= count + 2, 'diagnostics')
+        # On a busy machine debug images hold up what comes with them; it is sent anew.
+        wait_until(lambda: min(len(poses), len(references)) >= int(
+            diagnostic_values(diagnostics[-1])['poses']), 'all poses', timeout=30.0)
         code, _ = node.signal(signal.SIGINT)
         print(node.output)
         yield Session(stream, poses, {
@@ -294,8 +297,7 @@ def test_diagnostics_count_what_happened(session):
     assert int(values['clock_jumps']) >= 4
     assert int(values['messages_invalid']) > 200
     assert values['frames_failed'] == '0'
-    # A listener that got no processor time may have missed some.
-    assert 0.95 * int(values['poses']) <= len(session.poses) <= int(values['poses'])
+    assert int(values['poses']) == len(session.poses)
     assert values['last_reason_no_pose'].split(':')[0] in (
         'TOO_FEW_MATCHES', 'NO_CONSENSUS', 'LOW_PARALLAX', 'PURE_ROTATION')
 
