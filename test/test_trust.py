@@ -346,6 +346,9 @@ def test_bags_of_all_kinds():
     assert len({plan.seed for plan in asked}) == 24
     right = [task for task in tasks(('K-1.3',), 2, 30.0, 50, right=6) if task.rows == (RIGHT,)]
     assert {task.bag.noise for task in right} == {0.5, 1.0, 2.0}
+    tracks, images = tasks(('K-1.3',), 2, 30.0, 50), tasks(('K-1.3',), 2, 30.0, 50, rendered=1)
+    assert images[:2] == tracks and images[2].bag == tracks[0].bag._replace(images=True)
+    assert len(tasks(('K-1.3',), 0, 30.0, 50, rendered=3)) == 3
 
 
 def test_a_phone_that_turns_on_the_spot_is_told_right():

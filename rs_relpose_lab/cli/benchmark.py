@@ -326,7 +326,7 @@ def _trust_arguments(parser: argparse.ArgumentParser) -> None:
                         help='length of a simulated bag (default: %(default)s)')
     _number(parser, '--right', 0, 'further bags that are told right, for false alarms: noise at '
                                   'the told level, half of it and twice')
-    _number(parser, '--rendered', 0, 'further bags with images: the first ones of the others')
+    _number(parser, '--rendered', 0, 'bags with images: the first ones of the others, rendered')
     parser.add_argument('--recordings', type=Path, nargs='+', default=[], metavar='PATH',
                         help='bags with their right parameters beside them (BAG.yaml), or folders '
                              'of real recordings, e.g. "$RS_RELPOSE_DATA"/android_phone_rs')

@@ -182,8 +182,9 @@ def tasks(rows: Sequence[str], bags: int, seconds: float, first_seed: int, *, ri
     """All that is to be measured; arguments as the options of the command."""
     wrong = tuple(rows)
     asked = [Task(plan, wrong) for plan in plans(bags, seconds, first_seed)]
-    asked += [Task(task.bag._replace(images=True), wrong) for task in asked[:rendered]
-              if isinstance(task.bag, BagPlan)]
+    # The same read-outs, however many of them are rendered.
+    with_images = plans(max(bags, rendered), seconds, first_seed, images=True)
+    asked += [Task(plan, wrong) for plan in with_images[:rendered]]
     asked += [Task(path, wrong) for path in recordings]
     # Seeds of their own.
     asked += [Task(plan, (RIGHT,))
