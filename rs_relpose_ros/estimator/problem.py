@@ -96,12 +96,12 @@ def observed(points1: Array, points2: Array, camera: RollingShutterCamera, motio
     for k, (points, motion) in enumerate(((points1, motion1), (points2, motion2))):
         rays, jacobian = camera.unproject_with_jacobian(points)
         tau = camera.row_times(points[:, 1]) - delay
-        turns, rate = np.broadcast_to(np.eye(3), (len(points), 3, 3)), np.zeros(3)
+        observations[:, 18 + k], block = tau, observations[:, 9 * k:9 * k + 9]
         if derotate:
-            turns, rate = motion.rotations(tau), motion.angular_velocity
-        observations[:, 18 + k] = tau
-        _derotate(rays, jacobian, np.ascontiguousarray(turns), camera.line_delay * rate,
-                  observations[:, 9 * k:9 * k + 9])
+            _derotate(rays, jacobian, motion.rotations(tau),
+                      camera.line_delay * motion.angular_velocity, block)
+        else:
+            _derotate(rays, jacobian, np.tile(np.eye(3), (len(points), 1, 1)), np.zeros(3), block)
     return observations
 
 

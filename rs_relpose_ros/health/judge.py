@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.config.parameters import SensorConfig
-from rs_relpose_ros.estimator.information import inverse
+from rs_relpose_ros.estimator.information import inverse, log_determinant
 from rs_relpose_ros.geometry.camera import REFERENCE_ROWS, RollingShutterCamera
 from rs_relpose_ros.geometry.so3 import exp_so3
 from rs_relpose_ros.health.deviation import (
@@ -108,8 +108,8 @@ FIGURES = (
     Figure('distortion', slice(DISTORTION, DISTORTION + 1), 0.05, ''),
 )
 
-# Deviations of each figure, and the determinant of their prior.
-_PRIORS = tuple((figure.part, float(np.prod(PRIOR_SIGMA[figure.part] ** 2.0)))
+# Deviations of each figure, and the log-determinant of what is known of them before.
+_PRIORS = tuple((figure.part, -2.0 * float(np.log(PRIOR_SIGMA[figure.part]).sum()))
                 for figure in FIGURES)
 
 
@@ -185,12 +185,10 @@ def undetermined(seen: Calibration, in_force: Array) -> Array:
     odds = 0.0
     posterior = seen.S / seen.scatter + PRIOR_INFORMATION
     left = (seen.b - seen.S @ in_force) / seen.scatter
-    for part, largest in _PRIORS:
-        covariance = np.linalg.inv(posterior[part, part])
-        determinant = float(np.linalg.det(covariance))
-        deviation = covariance @ left[part]
-        gain = min(float(left[part] @ deviation), _LARGEST_GAIN)
-        odds += math.sqrt(determinant / largest) * math.exp(0.5 * gain) / len(FIGURES)
+    for part, of_prior in _PRIORS:
+        information = np.ascontiguousarray(posterior[part, part])
+        gain = min(float(left[part] @ inverse(information) @ left[part]), _LARGEST_GAIN)
+        odds += math.exp(0.5 * (of_prior - log_determinant(information) + gain)) / len(FIGURES)
     off = seen.c - in_force
     return (seen.undetermined + off[:, None] * off) * odds / (1.0 + odds)
 

@@ -29,6 +29,7 @@ from rs_relpose_ros.estimator.sampson import jacobian, residuals
 from rs_relpose_ros.estimator.state import PARAMETERS, TANGENT, THETA, TwoViewState
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
+from rs_relpose_ros.geometry.order import median
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3, skew
 from rs_relpose_ros.geometry.vectors import tangent_basis
 from rs_relpose_ros.health.deviation import (
@@ -58,6 +59,8 @@ _MOST_MATCHES = 120
 _STEP = 1e-5
 # Steps by which a pair is fitted anew.
 _STEPS_ANEW = 3
+# Of a state: rotation and direction of translation.
+_POSE = np.r_[THETA:THETA + 3, TANGENT:TANGENT + 2]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,10 +153,9 @@ def pair_information(pair: PairEvidence, in_force: Array, about: Array) -> PairI
     C[THETA:THETA + 3] += (information - information_told) @ D
     covariance = inverse(H)
     moved = _at_stamped_row(pair, problem, state, -covariance @ C)
-    pose = np.r_[THETA:THETA + 3, TANGENT:TANGENT + 2]
-    spread = np.linalg.cholesky(covariance[np.ix_(pose, pose)])
+    spread = np.linalg.cholesky(covariance[_POSE[:, None], _POSE])
     return PairInformation(S, b + S @ about, _pose_by_deviation(problem, state, moved),
-                           solve_triangular(spread, moved[pose], lower=True), images)
+                           solve_triangular(spread, moved[_POSE], lower=True), images)
 
 
 def _without_gyro(H: Array, gradient: Array, information: Array, theta: Array) -> Array:
@@ -166,7 +168,7 @@ def _without_gyro(H: Array, gradient: Array, information: Array, theta: Array) -
 
 def _noise(r: Array) -> float:
     """Sigma of the matches [px] from their residuals."""
-    return max(1.4826 * float(np.median(np.abs(r))), _LEAST_SIGMA)
+    return max(1.4826 * median(np.abs(r)), _LEAST_SIGMA)
 
 
 def _state(pair: PairEvidence, problem: TwoViewProblem, observations: Array) -> TwoViewState:
@@ -194,8 +196,8 @@ def _at_stamped_row(pair: PairEvidence, problem: TwoViewProblem, state: TwoViewS
     share, rate1 = middle_share(pair.camera), turn @ pair.rates[0]
     rate2 = turn @ (pair.gyro_rotation @ pair.rates[1])
     moved = moved.copy()
-    moved[TANGENT:TANGENT + 2, READOUT] += share * (tangent_basis(state.t).T
-                                                    @ np.cross(rate1, state.t))
+    moved[TANGENT:TANGENT + 2, READOUT] += share * (tangent_basis(state.t).T @ skew(rate1)
+                                                    @ state.t)
     moved[THETA:THETA + 3, READOUT] += share * (rate1 - rate2)
     return moved
 
@@ -255,14 +257,13 @@ class _Rows(NamedTuple):
     @classmethod
     def of(cls, pair: PairEvidence, problem: TwoViewProblem, keep: NDArray[np.bool_]) -> _Rows:
         """Those of a pair's usable matches."""
-        camera = pair.camera
-        turns, shares = [], []
+        camera, n = pair.camera, np.count_nonzero(keep)
+        turns, shares = np.empty((2, n, 3, FOCAL)), np.empty((2, n))
         for k, (points, motion) in enumerate(((pair.points1, problem.motion1),
                                               (pair.points2, problem.motion2))):
-            share = (points[keep, 1] - 0.5 * (camera.height - 1)) / camera.height
-            turns.append(_turn_of_a_row(motion, pair, share, problem.observations[keep, 18 + k]))
-            shares.append(share)
-        return cls(np.stack(turns), np.stack(shares))
+            shares[k] = (points[keep, 1] - 0.5 * (camera.height - 1)) / camera.height
+            _turn_of_a_row(motion, pair, shares[k], problem.observations[keep, 18 + k], turns[k])
+        return cls(turns, shares)
 
     def displaced(self, observations: Array, at: Array) -> Array:
         """Observations (N, 20) with the deviations `at` all at once; those of the lens aside."""
@@ -280,18 +281,17 @@ class _Rows(NamedTuple):
         return (residuals(out, state).reshape(FOCAL, n) - r).T / _STEP
 
 
-def _turn_of_a_row(motion: FrameMotion, pair: PairEvidence, shares: Array, tau: Array) -> Array:
-    """Turn (N, 3, 9) of a ray on its way from its row to the middle one, by each deviation."""
+def _turn_of_a_row(motion: FrameMotion, pair: PairEvidence, shares: Array, tau: Array,
+                   turn: Array) -> None:
+    """Fill `turn` (N, 3, 9) of a ray on its way from its row to the middle one, by deviation."""
     rate, along = motion.angular_velocity, tau[:, None, None]
     later = tau[:, None] * _acceleration(motion, pair.camera.row_time_span)
-    turn = np.empty((len(tau), 3, FOCAL))
     # Exp(c) A Exp(-c) for the small rotation A = Exp(w tau): c x (w tau)
     turn[:, :, AXES] = -along * skew(rate)
     turn[:, :, OFFSET] = later
     turn[:, :, READOUT] = shares[:, None] * rate + middle_share(pair.camera) * later
     turn[:, :, BIAS] = -along * pair.R_cam_imu
     turn[:, :, SCALE] = tau[:, None] * rate
-    return turn
 
 
 def middle_share(camera: RollingShutterCamera) -> float:

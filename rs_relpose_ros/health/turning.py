@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.geometry.order import median
 from rs_relpose_ros.geometry.so3 import aligning_rotation, log_so3
 from rs_relpose_ros.geometry.timing import to_nanoseconds
@@ -48,10 +49,28 @@ def rotation_of_rays(rays1: Array, rays2: Array) -> Array | None:
     if np.count_nonzero(finite) < _LEAST_RAYS:
         return None
     first, second = rays1[finite], rays2[finite]
-    off = first - second @ aligning_rotation(first.T @ second).T
-    squares = np.einsum('ni,ni->n', off, off)
-    weights = 1.0 / (1.0 + squares / max(median(squares.copy()), 1e-12))
-    return log_so3(aligning_rotation((first.T * weights) @ second))
+    rotation = aligning_rotation(first.T @ second)
+    return log_so3(aligning_rotation(_correlation(first, second, rotation)))
+
+
+@kernel
+def _correlation(rays1: Array, rays2: Array, rotation: Array) -> Array:
+    """``sum w a b^T`` (3, 3) of rays (N, 3); weights w by what `rotation` leaves."""
+    n = len(rays1)
+    squares, out = np.zeros(n), np.zeros((3, 3))
+    for i in range(n):
+        for j in range(3):
+            off = rays1[i, j]
+            for k in range(3):
+                off -= rotation[j, k] * rays2[i, k]
+            squares[i] += off * off
+    limit = max(median(squares.copy()), 1e-12)
+    for i in range(n):
+        weight = 1.0 / (1.0 + squares[i] / limit)
+        for j in range(3):
+            for k in range(3):
+                out[j, k] += weight * rays1[i, j] * rays2[i, k]
+    return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
