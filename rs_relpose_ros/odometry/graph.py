@@ -91,8 +91,8 @@ class Record:
     values: Any = field(default_factory=gtsam.Values)
 
 
-def preintegrated(interval: ImuInterval, bias: Any, imu: ImuConfig, config: OdometryConfig) -> Any:
-    """``gtsam.PreintegratedCombinedMeasurements`` of an interval, at the mean of two samples."""
+def _preintegration(imu: ImuConfig, config: OdometryConfig) -> Any:
+    """Noises of the samples, as gtsam has them."""
     params = gtsam.PreintegrationCombinedParams.MakeSharedU(STANDARD_GRAVITY)
     eye = np.eye(3)
     params.setGyroscopeCovariance(imu.gyro_noise_density**2 * eye)
@@ -100,12 +100,7 @@ def preintegrated(interval: ImuInterval, bias: Any, imu: ImuConfig, config: Odom
     params.setIntegrationCovariance(_INTEGRATION**2 * eye)
     params.setBiasOmegaCovariance(config.gyro_bias_walk**2 * eye)
     params.setBiasAccCovariance(config.accel_bias_walk**2 * eye)
-    out = gtsam.PreintegratedCombinedMeasurements(params, bias)
-    rates = 0.5 * (interval.rates[1:] + interval.rates[:-1])
-    forces = 0.5 * (interval.forces[1:] + interval.forces[:-1])
-    for force, rate, step in zip(forces, rates, np.diff(interval.seconds), strict=True):
-        out.integrateMeasurement(force, rate, step)
-    return out
+    return params
 
 
 class KeyframeGraph:
@@ -116,7 +111,8 @@ class KeyframeGraph:
 
     def __init__(self, start: Start, rate: Array, mounting: Mounting, imu: ImuConfig,
                  config: OdometryConfig, *, keep: bool = False) -> None:
-        self._mounting, self._imu, self._config = mounting, imu, config
+        self._mounting, self._config = mounting, config
+        self._preintegration = _preintegration(imu, config)
         params = gtsam.LevenbergMarquardtParams()
         params.setMaxIterations(10)
         params.setRelativeErrorTol(1e-4)
@@ -154,7 +150,7 @@ class KeyframeGraph:
         of the keyframe tilts gravity is left to the latter.
         """
         newest, dt = self._newest, interval.duration
-        pim = preintegrated(interval, self._bias, self._imu, self._config)
+        pim = self._preintegrated(interval)
         state = self._predicted(pim)
         R = state.attitude().matrix()
         back, noise = R.T @ newest.R, pim.preintMeasCov()
@@ -173,7 +169,7 @@ class KeyframeGraph:
         Returns what a pair adds to chi squared per degree of freedom, 0 without.
         """
         i, j = self._count - 1, self._count
-        pim = preintegrated(interval, self._bias, self._imu, self._config)
+        pim = self._preintegrated(interval)
         state = self._predicted(pim)
         rates, self._rate = (self._rate, interval.rates[-1]), interval.rates[-1]
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -255,6 +251,15 @@ class KeyframeGraph:
             values = gtsam.LevenbergMarquardtOptimizer(
                 factors, self._record.values, self._params).optimize()
             return values, gtsam.Marginals(factors, values)
+
+    def _preintegrated(self, interval: ImuInterval) -> Any:
+        """``gtsam.PreintegratedCombinedMeasurements``, at the mean of two samples each."""
+        out = gtsam.PreintegratedCombinedMeasurements(self._preintegration, self._bias)
+        rates = 0.5 * (interval.rates[1:] + interval.rates[:-1])
+        forces = 0.5 * (interval.forces[1:] + interval.forces[:-1])
+        for force, rate, step in zip(forces, rates, np.diff(interval.seconds), strict=True):
+            out.integrateMeasurement(force, rate, step)
+        return out
 
     def _predicted(self, pim: Any) -> Any:
         state = gtsam.NavState(self._values.atPose3(X(self._count - 1)),
