@@ -330,6 +330,21 @@ def test_a_graph_that_is_not_solved_is_lost_and_the_path_goes_on(walked, monkeyp
     assert against_truth(out, walked.truth).errors.ate_m < 0.1
 
 
+def test_a_path_that_cannot_be_smoothed_is_left_out_and_told(walked, monkeypatch):
+    class Singular(gtsam.Marginals):
+        def marginalCovariance(self, key):
+            raise RuntimeError('\nIndeterminant linear system\nwhile working near b15')
+
+    estimator, out = run(walked)
+    estimator.sentences()
+    monkeypatch.setattr(gtsam, 'Marginals', Singular)
+    assert out
+    assert estimator.smoothed() == []
+    [told] = estimator.sentences()
+    assert told.startswith('not smoothed: ')
+    assert 'Indeterminant linear system' in told
+
+
 def test_camera_that_stops_for_a_second_is_bridged(walked):
     pairs = without(walked.pairs, 4, 5)
     estimator, out = run(walked, pairs=pairs)

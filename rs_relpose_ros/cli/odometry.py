@@ -12,9 +12,10 @@ from rs_relpose_ros.result_files import SUMMARY_FILE
 HELP = (
     'Metric odometry from a bag: the relative poses of its keyframe pairs and its IMU in one '
     'graph (gtsam, an extra), as odometry_node does it live. Writes trajectory.tum (live '
-    'estimates of the camera, z up, image stamps), trajectory_smoothed.tum (each with all that '
-    "came later), summary.json and a picture; with errors where the bag has the camera's true "
-    'poses. The parameter imu_position should be told. Exit code 1: odometry did not start.')
+    "estimates of the camera, z up, stamped with the image's middle row on the camera's clock), "
+    'trajectory_smoothed.tum (each with all that came later), summary.json and a picture; with '
+    "errors where the bag has the camera's true poses. The parameter imu_position should be told. "
+    'Exit code 1: odometry did not start.')
 
 _NOT_STARTED = 1
 

@@ -236,10 +236,17 @@ class OdometryEstimator:
                           stamp_ns + imu_ns - at_ns, imu_ns)
 
     def smoothed(self) -> list[Odometry]:
-        """All keyframes, each with all that came before and after it; needs `keep`."""
+        """All keyframes, each with all that came before and after it; needs `keep`.
+
+        A run whose graph cannot be solved as a whole is left out, which is told.
+        """
         out = []
         for run in self._runs:
-            states = run.graph.smoothed()
+            try:
+                states = run.graph.smoothed()
+            except GraphError as error:
+                self._sentences.append(f'not smoothed: {len(run.stamps)} keyframes: {error}')
+                continue
             out += [self._told(run, state, np.full(3, math.nan), *stamps)
                     for state, stamps in zip(states, run.stamps, strict=True)]
         return out

@@ -73,8 +73,8 @@ def odometry_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Para
             yield pair.bag_time_ns, PairMeasurement.of_result(pair.result)
 
     live = follow(estimator, pairs(), _samples(bag, topics))
-    sentences = estimator.sentences()
     smoothed = estimator.smoothed()
+    sentences = estimator.sentences()
     truth = read_truth(bag, topics)
     figures: dict[str, Any] = {
         'keyframes': len(live), 'pairs': {name: estimator.counts[name] for name in (
