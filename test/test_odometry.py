@@ -309,6 +309,19 @@ def test_contradicting_pair_is_left_out(walked):
     assert against_truth(out, walked.truth).errors.ate_m < 0.05
 
 
+def test_contradicting_pairs_end_a_path_as_missing_ones_do(walked):
+    first = START_NS + 6 * SECOND
+    turn = exp_so3(np.array([0.0, 0.3, 0.0]))
+    pairs = [pair if pair.current_ns < first
+             else replace(pair, images=replace(pair.images, R=turn @ pair.images.R))
+             for pair in walked.pairs if pair.current_ns < first + 4 * SECOND]
+    estimator, out = run(walked, pairs=pairs)
+    assert estimator.counts['contradicting'] > 5
+    longest = (PARAMETERS.odometry.max_coast + INTERVAL) * SECOND
+    assert all(keyframe.imu_ns < first + longest for keyframe in out if not keyframe.path)
+    assert any(text.startswith('lost: no pair that can be used') for text in estimator.sentences())
+
+
 @pytest.mark.parametrize('fails', ['a keyframe', 'taking a pair out'])
 def test_a_graph_that_is_not_solved_is_lost_and_the_path_goes_on(walked, monkeypatch, fails):
     class Flaky(gtsam.BatchFixedLagSmoother):

@@ -294,8 +294,8 @@ class OdometryEstimator:
             self.counts['contradicting'] += 1
         elif pair.images is not None:
             run.seen_ns, run.pairs = pair.current_ns, run.pairs + 1
-        elif seconds_between(run.seen_ns, pair.current_ns) > self._config.max_coast:
-            self._end(f'no pair that says anything for {self._config.max_coast:g} s')
+        if seconds_between(run.seen_ns, pair.current_ns) > self._config.max_coast:
+            self._end(f'no pair that can be used for {self._config.max_coast:g} s')
             return None
         if not run.published and not self._known(run):
             return None
