@@ -258,6 +258,22 @@ def test_nothing_is_told_before_the_scale_is_known():
     assert estimator.carried(pairs[-1].current_ns) is None
 
 
+@pytest.mark.parametrize('changed, told', [
+    (lambda force: None, 'there is no accelerometer'),
+    (lambda force: tuple(value / 9.80665 for value in force), 'must be specific force in m/s^2')])
+def test_it_says_where_the_accelerometer_keeps_it_from_starting(walked, changed, told):
+    samples = [replace(sample, linear_acceleration=changed(sample.linear_acceleration))
+               for sample in walked.samples]
+    estimator, out = run(walked, samples=samples)
+    assert out == []
+    assert told in estimator.obstacle
+
+
+def test_nothing_keeps_it_from_starting_where_all_is_well(walked):
+    assert OdometryEstimator(PARAMETERS).obstacle == ''
+    assert run(walked)[0].obstacle == ''
+
+
 def test_order_of_messages_does_not_matter(walked):
     _, expected = run(walked)
     rng = np.random.default_rng(3)

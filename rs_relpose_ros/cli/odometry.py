@@ -42,8 +42,9 @@ def run(args: argparse.Namespace) -> int:
         if figures[trajectory]:
             print(f'{trajectory}, against the truth: {_errors(figures[trajectory])}')
     if not outcome.live:
-        print('odometry did not start: it needs some seconds of motion, or standing still, and '
-              'pairs that tell more than nothing')
+        print('odometry did not start: ' + (
+            outcome.obstacle or 'it needs some seconds of motion, or standing still, and pairs '
+            'that tell more than nothing'))
         return _NOT_STARTED
     print(f'in {folder}: {LIVE_FILE}, {SMOOTHED_FILE}, {PICTURE}, {SUMMARY_FILE}')
     return 0

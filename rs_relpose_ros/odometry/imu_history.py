@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
+from rs_relpose_ros.imu.forces import force_fault
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.imu.series import Series
 from rs_relpose_ros.odometry.interval import ImuInterval
@@ -28,6 +29,11 @@ class ImuHistory:
         """Up to where both sensors are known."""
         gyro, force = self._gyro.newest_ns, self._force.newest_ns
         return None if gyro is None or force is None else min(gyro, force)
+
+    @property
+    def fault(self) -> str:
+        """What is wrong with the accelerometer; empty where nothing is, or no sample came yet."""
+        return '' if self._gyro.newest_ns is None else force_fault(self._force.values)
 
     def add(self, sample: ImuSample) -> None:
         """Store a sample."""

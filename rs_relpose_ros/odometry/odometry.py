@@ -161,6 +161,11 @@ class OdometryEstimator:
         """Whether a pair waits for samples."""
         return bool(self._waiting)
 
+    @property
+    def obstacle(self) -> str:
+        """What of the accelerometer keeps it from starting; empty where it is none of it."""
+        return self._samples.fault if self.state is State.STARTING else ''
+
     def add_imu(self, sample: ImuSample) -> None:
         """Take in a sample; InputError where a gyro hangs."""
         newest = self._samples.newest_ns
