@@ -270,7 +270,11 @@ def test_it_says_where_the_accelerometer_keeps_it_from_starting(walked, changed,
 
 
 def test_nothing_keeps_it_from_starting_where_all_is_well(walked):
-    assert OdometryEstimator(PARAMETERS).obstacle == ''
+    fresh = OdometryEstimator(PARAMETERS)
+    assert fresh.obstacle == ''
+    sample = walked.samples[0]
+    fresh.add_imu(replace(sample, linear_acceleration=(0.0, 0.0, 20.0)))   # a bump
+    assert fresh.obstacle == ''
     assert run(walked)[0].obstacle == ''
 
 

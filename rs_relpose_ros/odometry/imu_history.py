@@ -15,6 +15,8 @@ Stamps = NDArray[np.int64]
 
 # A step between samples of more than so many times the usual one: a sample may still come.
 _STEP = 1.5
+# Of samples over so long the accelerometer is judged: a step of a walk is shorter.
+_JUDGED_NS = 1_000_000_000
 
 
 class ImuHistory:
@@ -32,8 +34,10 @@ class ImuHistory:
 
     @property
     def fault(self) -> str:
-        """What is wrong with the accelerometer; empty where nothing is, or no sample came yet."""
-        return '' if self._gyro.newest_ns is None else force_fault(self._force.values)
+        """What is wrong with the accelerometer; empty where nothing is, or it is not known yet."""
+        stamps = self._gyro.stamps
+        known = len(stamps) and stamps[-1] - stamps[0] >= _JUDGED_NS
+        return force_fault(self._force.values) if known else ''
 
     def add(self, sample: ImuSample) -> None:
         """Store a sample."""
