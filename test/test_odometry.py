@@ -269,6 +269,12 @@ def test_it_says_where_the_accelerometer_keeps_it_from_starting(walked, changed,
     assert told in estimator.obstacle
 
 
+def test_a_lever_arm_of_zero_is_not_assumed_in_silence():
+    assert OdometryEstimator(PARAMETERS).sentences() == []
+    [told] = OdometryEstimator(PARAMETERS.updated({'imu_position': (0.0, 0.0, 0.0)})).sentences()
+    assert told.startswith('imu_position is zero')
+
+
 def test_nothing_keeps_it_from_starting_where_all_is_well(walked):
     fresh = OdometryEstimator(PARAMETERS)
     assert fresh.obstacle == ''

@@ -155,6 +155,9 @@ class OdometryEstimator:
         # Of pairs and runs, by what became of them.
         self.counts: Counter[str] = Counter()
         self._sentences: list[str] = []
+        if not lever.any():
+            self._sentences.append('imu_position is zero: the IMU is taken to be exactly in the '
+                                   "camera's place")
 
     @property
     def waiting(self) -> bool:
