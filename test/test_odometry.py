@@ -258,6 +258,32 @@ def test_nothing_is_told_before_the_scale_is_known():
     assert estimator.carried(pairs[-1].current_ns) is None
 
 
+@pytest.mark.parametrize('changed, told', [
+    (lambda force: None, 'there is no accelerometer'),
+    (lambda force: tuple(value / 9.80665 for value in force), 'must be specific force in m/s^2')])
+def test_it_says_where_the_accelerometer_keeps_it_from_starting(walked, changed, told):
+    samples = [replace(sample, linear_acceleration=changed(sample.linear_acceleration))
+               for sample in walked.samples]
+    estimator, out = run(walked, samples=samples)
+    assert out == []
+    assert told in estimator.obstacle
+
+
+def test_a_lever_arm_of_zero_is_not_assumed_in_silence():
+    assert OdometryEstimator(PARAMETERS).sentences() == []
+    [told] = OdometryEstimator(PARAMETERS.updated({'imu_position': (0.0, 0.0, 0.0)})).sentences()
+    assert told.startswith('imu_position is zero')
+
+
+def test_nothing_keeps_it_from_starting_where_all_is_well(walked):
+    fresh = OdometryEstimator(PARAMETERS)
+    assert fresh.obstacle == ''
+    sample = walked.samples[0]
+    fresh.add_imu(replace(sample, linear_acceleration=(0.0, 0.0, 20.0)))   # a bump
+    assert fresh.obstacle == ''
+    assert run(walked)[0].obstacle == ''
+
+
 def test_order_of_messages_does_not_matter(walked):
     _, expected = run(walked)
     rng = np.random.default_rng(3)
@@ -309,6 +335,19 @@ def test_contradicting_pair_is_left_out(walked):
     assert against_truth(out, walked.truth).errors.ate_m < 0.05
 
 
+def test_contradicting_pairs_end_a_path_as_missing_ones_do(walked):
+    first = START_NS + 6 * SECOND
+    turn = exp_so3(np.array([0.0, 0.3, 0.0]))
+    pairs = [pair if pair.current_ns < first
+             else replace(pair, images=replace(pair.images, R=turn @ pair.images.R))
+             for pair in walked.pairs if pair.current_ns < first + 4 * SECOND]
+    estimator, out = run(walked, pairs=pairs)
+    assert estimator.counts['contradicting'] > 5
+    longest = (PARAMETERS.odometry.max_coast + INTERVAL) * SECOND
+    assert all(keyframe.imu_ns < first + longest for keyframe in out if not keyframe.path)
+    assert any(text.startswith('lost: no pair that can be used') for text in estimator.sentences())
+
+
 @pytest.mark.parametrize('fails', ['a keyframe', 'taking a pair out'])
 def test_a_graph_that_is_not_solved_is_lost_and_the_path_goes_on(walked, monkeypatch, fails):
     class Flaky(gtsam.BatchFixedLagSmoother):
@@ -328,6 +367,21 @@ def test_a_graph_that_is_not_solved_is_lost_and_the_path_goes_on(walked, monkeyp
     assert out[-1].path == estimator.counts['lost'] > 0
     assert len(estimator.smoothed()) >= len(out)
     assert against_truth(out, walked.truth).errors.ate_m < 0.1
+
+
+def test_a_path_that_cannot_be_smoothed_is_left_out_and_told(walked, monkeypatch):
+    class Singular(gtsam.Marginals):
+        def marginalCovariance(self, key):
+            raise RuntimeError('\nIndeterminant linear system\nwhile working near b15')
+
+    estimator, out = run(walked)
+    estimator.sentences()
+    monkeypatch.setattr(gtsam, 'Marginals', Singular)
+    assert out
+    assert estimator.smoothed() == []
+    [told] = estimator.sentences()
+    assert told.startswith('not smoothed: ')
+    assert 'Indeterminant linear system' in told
 
 
 def test_camera_that_stops_for_a_second_is_bridged(walked):

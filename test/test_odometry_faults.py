@@ -83,6 +83,10 @@ def imu_message(sample: ImuSample) -> Imu:
 
 def pairs_message(pair: PairMeasurement, health: Health) -> Any:
     """On ``~/pairs``, as relpose_node tells it."""
+    return pair_messages(pair_result(pair, health), build.rclpy_types).pairs
+
+
+def pair_result(pair: PairMeasurement, health: Health) -> PairResult:
     pose = RelativePose(Status(pair.status))
     if pair.images is not None:
         zero, eye = np.zeros(3), np.eye(6)
@@ -91,12 +95,21 @@ def pairs_message(pair: PairMeasurement, health: Health) -> Any:
                        angular_velocity2=zero, covariance=1e-6 * eye, velocity_covariance=eye,
                        baseline=pair.baseline, baseline_log_sigma=pair.baseline_log_sigma)
     none = np.zeros((0, 3))
-    return pair_messages(PairResult(
+    return PairResult(
         shifted(pair.reference_ns), shifted(pair.stamp_ns), shifted(pair.reference_ns),
         shifted(pair.current_ns), pair.frame_id, 0.15, pose, Matches.none(), none[:, 0],
         none[:, 0], none, none, 10.0, Landmarks(none[:, :2], none[:, :2], none),
-        gyro_bias=pair.gyro_bias, health=health),
-        build.rclpy_types).pairs
+        gyro_bias=pair.gyro_bias, health=health)
+
+
+@pytest.mark.parametrize('figure, state, stops', [
+    ('accel_axes', HealthState.SUSPECT, True), ('accel_axes', HealthState.OK, False),
+    ('time_offset', HealthState.SUSPECT, False), ('time_offset', HealthState.WRONG, True)])
+def test_a_path_stops_where_its_accelerometer_is_contradicted(figure, state, stops):
+    health = Health((Finding(figure, None, None, None, '', True, state, 'because'),))
+    pair = walk('walk:2', 1.0).pairs[0]
+    assert PairMeasurement.of_result(pair_result(pair, health)).told_wrong is stops
+    assert PairMeasurement.of_message(pairs_message(pair, health)).told_wrong is stops
 
 
 def stream(given: Walk) -> Iterator[tuple[float, Any]]:

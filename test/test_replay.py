@@ -191,6 +191,11 @@ def test_summary_agrees_with_the_table(replayed, bundled_bag):
     assert summary['frames']['refused'] == {} and summary['not_used'] == {}
     answered = [row for row in rows if row['status'] == 'OK']
     assert summary['medians']['inliers'] == np.median([int(row['inliers']) for row in answered])
+    sigmas = [float(row['baseline_log_sigma']) for row in answered if row['baseline_m']]
+    baselines = summary['baselines']
+    assert baselines['known'] == len(sigmas) > 10
+    assert baselines['log_sigma_median'] == pytest.approx(np.median(sigmas))
+    assert sum(baselines['not_known'].values()) == len(answered) - len(sigmas) > 0
     assert summary['topics']['truth'] == '/ground_truth/pose'
     assert summary['parameters']['readout_time'] == 0.03
     assert summary['versions']['opencv'] == cv2.__version__

@@ -81,10 +81,21 @@ def report(outcome: ReplayOutcome, folder: Path) -> list[str]:
             f'medians: {_text(medians["inliers"], "inliers")}, residual '
             f'{_text(medians["residual_rms_px"], "px")}, rotation against the gyro '
             f'{_text(medians["rotation_difference_to_gyro_deg"], "deg")}')
+        lines += _baseline_lines(figures['baselines'], pairs['answered'])
     lines += _health_lines(outcome)
     names = [*(path.name for path in outcome.files), SUMMARY_FILE]
     lines.append(f'in {folder}: {", ".join(names)}')
     return lines
+
+
+def _baseline_lines(baselines: dict[str, Any], poses: int) -> list[str]:
+    """How many poses have a baseline in metres, and the reasons of the others."""
+    known = baselines['known']
+    line = f'baseline in metres: of {known} of {poses} poses'
+    if known:
+        line += f', known to {100.0 * baselines["log_sigma_median"]:.0f} % in the median'
+    return [line, *(f'{reason} ({count} poses)'
+                    for reason, count in baselines['not_known'].items())]
 
 
 def _health_lines(outcome: ReplayOutcome) -> list[str]:

@@ -220,14 +220,16 @@ class KeyframeGraph:
 
     def smoothed(self) -> list[KeyframeState]:
         """All keyframes since the start, each with what came after it; needs `keep`."""
-        values, marginals = self._smoothed()
-        return [_state(values, marginals, k) for k in range(self._count)]
+        with _solving():
+            values, marginals = self._smoothed()
+            return [_state(values, marginals, k) for k in range(self._count)]
 
     def smoothed_steps(self) -> list[Step]:
         """Of the same keyframes, each against the one before: for evaluations."""
-        values, marginals = self._smoothed()
         C, c = self._mounting
         steps, arm = [], skew(c)
+        with _solving():
+            values, marginals = self._smoothed()
         for i in range(self._count - 1):
             first, second = (values.atPose3(X(k)) for k in (i, i + 1))
             R1, R2 = first.rotation().matrix(), second.rotation().matrix()
@@ -235,7 +237,8 @@ class KeyframeGraph:
             back = R1.T @ R2
             # Of turns and steps of both bodies, each in its axes.
             by = np.hstack([skew(way) + arm, -np.eye(3), -back @ arm, back])
-            both = marginals.jointMarginalCovariance([X(i), X(i + 1)])
+            with _solving():
+                both = marginals.jointMarginalCovariance([X(i), X(i + 1)])
             covariance = np.block([[both.at(X(a), X(b)) for b in (i, i + 1)]
                                    for a in (i, i + 1)])
             steps.append(Step(C @ way, C @ by @ covariance @ by.T @ C.T))
@@ -247,10 +250,9 @@ class KeyframeGraph:
         """Values and marginals of all that was recorded."""
         assert self._record is not None
         factors = _compact(self._record.factors)
-        with _solving():
-            values = gtsam.LevenbergMarquardtOptimizer(
-                factors, self._record.values, self._params).optimize()
-            return values, gtsam.Marginals(factors, values)
+        values = gtsam.LevenbergMarquardtOptimizer(
+            factors, self._record.values, self._params).optimize()
+        return values, gtsam.Marginals(factors, values)
 
     def _preintegrated(self, interval: ImuInterval) -> Any:
         """``gtsam.PreintegratedCombinedMeasurements``, at the mean of two samples each."""

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
+from rs_relpose_ros.imu.forces import force_fault
 from rs_relpose_ros.imu.samples import ImuSample
 from rs_relpose_ros.imu.series import Series
 from rs_relpose_ros.odometry.interval import ImuInterval
@@ -14,6 +15,8 @@ Stamps = NDArray[np.int64]
 
 # A step between samples of more than so many times the usual one: a sample may still come.
 _STEP = 1.5
+# Of samples over so long the accelerometer is judged: a step of a walk is shorter.
+_JUDGED_NS = 1_000_000_000
 
 
 class ImuHistory:
@@ -28,6 +31,13 @@ class ImuHistory:
         """Up to where both sensors are known."""
         gyro, force = self._gyro.newest_ns, self._force.newest_ns
         return None if gyro is None or force is None else min(gyro, force)
+
+    @property
+    def fault(self) -> str:
+        """What is wrong with the accelerometer; empty where nothing is, or it is not known yet."""
+        stamps = self._gyro.stamps
+        known = len(stamps) and stamps[-1] - stamps[0] >= _JUDGED_NS
+        return force_fault(self._force.values) if known else ''
 
     def add(self, sample: ImuSample) -> None:
         """Store a sample."""

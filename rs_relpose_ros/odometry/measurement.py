@@ -32,7 +32,7 @@ class PairMeasurement:
     baseline: float   # [m]; NaN where it is not known
     baseline_log_sigma: float
     gyro_bias: Array   # (3,) [rad/s] in force, IMU frame; NaN where it is not known
-    told_wrong: bool   # what was told of camera or IMU
+    told_wrong: bool   # what was told of camera or IMU, or the accelerometer
 
     @classmethod
     def of_result(cls, pair: PairResult) -> PairMeasurement:
@@ -42,7 +42,7 @@ class PairMeasurement:
         return cls(pair.stamp_ns, pair.reference_ns1,
                    pair.reference_ns2, pair.frame_id, pose.status.value, pose.images,
                    pose.baseline, pose.baseline_log_sigma, bias,
-                   pair.health.state is HealthState.WRONG)
+                   _stops(pair.health.state.value, pair.health.text))
 
     @classmethod
     def of_message(cls, pairs: Any) -> PairMeasurement:
@@ -54,7 +54,7 @@ class PairMeasurement:
                    str(pairs.status[0].hardware_id), status.text('status'), status.images(),
                    status.real('baseline_m'), status.real('baseline_log_sigma'),
                    status.vector('gyro_bias_rad_s'),
-                   status.text('health') == HealthState.WRONG.value)
+                   _stops(status.text('health'), status.text('health_findings')))
 
     def later(self, delay_ns: int) -> PairMeasurement:
         """The same, of rows that were read so much later."""
@@ -72,3 +72,11 @@ class PairMeasurement:
         """Whether the images tell where the camera moved."""
         return self.images is not None and bool(np.isfinite(self.images.t).all())
 
+
+def _stops(state: str, findings: str) -> bool:
+    """Whether a path must not go on: a figure is wrong, or images contradict the accelerometer.
+
+    Pairs go on without the accelerometer then; a path has nothing else to tell metres from.
+    """
+    return (state == HealthState.WRONG.value
+            or f'accel_axes {HealthState.SUSPECT.value}:' in findings)

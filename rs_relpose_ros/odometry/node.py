@@ -186,6 +186,9 @@ class OdometryNode(StoppableNode):
     def _report(self) -> None:
         estimator = self._estimator
         level, state = _STATES[estimator.state.value]
+        if obstacle := estimator.obstacle:
+            level, state = 2, f'not started: {obstacle}'
+            self._warn(state)
         for topic in self._silent:
             self._silent[topic] += 1
         silent = [f'{topic} for {reports - 1} s' for topic, reports in self._silent.items()

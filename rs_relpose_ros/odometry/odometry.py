@@ -155,11 +155,19 @@ class OdometryEstimator:
         # Of pairs and runs, by what became of them.
         self.counts: Counter[str] = Counter()
         self._sentences: list[str] = []
+        if not lever.any():
+            self._sentences.append('imu_position is zero: the IMU is taken to be exactly in the '
+                                   "camera's place")
 
     @property
     def waiting(self) -> bool:
         """Whether a pair waits for samples."""
         return bool(self._waiting)
+
+    @property
+    def obstacle(self) -> str:
+        """What of the accelerometer keeps it from starting; empty where it is none of it."""
+        return self._samples.fault if self.state is State.STARTING else ''
 
     def add_imu(self, sample: ImuSample) -> None:
         """Take in a sample; InputError where a gyro hangs."""
@@ -236,10 +244,17 @@ class OdometryEstimator:
                           stamp_ns + imu_ns - at_ns, imu_ns)
 
     def smoothed(self) -> list[Odometry]:
-        """All keyframes, each with all that came before and after it; needs `keep`."""
+        """All keyframes, each with all that came before and after it; needs `keep`.
+
+        A run whose graph cannot be solved as a whole is left out, which is told.
+        """
         out = []
         for run in self._runs:
-            states = run.graph.smoothed()
+            try:
+                states = run.graph.smoothed()
+            except GraphError as error:
+                self._sentences.append(f'not smoothed: {len(run.stamps)} keyframes: {error}')
+                continue
             out += [self._told(run, state, np.full(3, math.nan), *stamps)
                     for state, stamps in zip(states, run.stamps, strict=True)]
         return out
@@ -287,8 +302,8 @@ class OdometryEstimator:
             self.counts['contradicting'] += 1
         elif pair.images is not None:
             run.seen_ns, run.pairs = pair.current_ns, run.pairs + 1
-        elif seconds_between(run.seen_ns, pair.current_ns) > self._config.max_coast:
-            self._end(f'no pair that says anything for {self._config.max_coast:g} s')
+        if seconds_between(run.seen_ns, pair.current_ns) > self._config.max_coast:
+            self._end(f'no pair that can be used for {self._config.max_coast:g} s')
             return None
         if not run.published and not self._known(run):
             return None

@@ -45,6 +45,7 @@ class OdometryOutcome:
     smoothed: list[Odometry]
     figures: dict[str, Any]
     sentences: list[str]
+    obstacle: str   # why it did not start, where the accelerometer is the reason
 
 
 class Drawn(NamedTuple):
@@ -73,8 +74,8 @@ def odometry_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Para
             yield pair.bag_time_ns, PairMeasurement.of_result(pair.result)
 
     live = follow(estimator, pairs(), _samples(bag, topics))
-    sentences = estimator.sentences()
     smoothed = estimator.smoothed()
+    sentences = estimator.sentences()
     truth = read_truth(bag, topics)
     figures: dict[str, Any] = {
         'keyframes': len(live), 'pairs': {name: estimator.counts[name] for name in (
@@ -94,7 +95,7 @@ def odometry_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Para
     write_tum(folder / LIVE_FILE, live)
     write_tum(folder / SMOOTHED_FILE, smoothed)
     draw_paths(drawn, folder / PICTURE)
-    return OdometryOutcome(live, smoothed, figures, sentences)
+    return OdometryOutcome(live, smoothed, figures, sentences, estimator.obstacle)
 
 
 def follow(estimator: OdometryEstimator, pairs: Iterable[tuple[int, PairMeasurement]],

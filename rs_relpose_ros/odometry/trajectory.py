@@ -40,7 +40,7 @@ class AgainstTruth(NamedTuple):
 
 
 def write_tum(path: Path, trajectory: Sequence[Odometry]) -> None:
-    """Lines ``seconds x y z qx qy qz qw`` of image stamps."""
+    """Lines ``seconds x y z qx qy qz qw``, seconds being those of the stamps."""
     with path.open('w', encoding='ascii') as file:
         for pose in trajectory:
             figures = [*pose.position, *quat_xyzw(pose.R)]

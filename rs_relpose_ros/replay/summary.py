@@ -21,6 +21,7 @@ from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.front_end.pair import PAIR_FIGURES, PairResult
 from rs_relpose_ros.health.findings import Health, NOT_JUDGED
+from rs_relpose_ros.messages.causes import CauseCounts
 from rs_relpose_ros.replay.run import Replay
 from rs_relpose_ros.replay.tables import PairRecord
 from rs_relpose_ros.replay.truth import median_and_p90
@@ -63,6 +64,7 @@ def summarize(records: Sequence[PairRecord], run: Replay,
         'medians': {
             figure.name: _median([record.figures[figure.name] for record in answered])
             for figure in PAIR_FIGURES},
+        'baselines': _baselines(answered),
         'errors_against_truth': errors_against_truth(answered),
         'timing': {
             'bag_s': (counts.last_ns - counts.first_ns) * 1e-9,
@@ -105,6 +107,18 @@ def _tracked(last: PairResult | None) -> dict[str, Any] | None:
         'readout_time_sigma_s': seen.readout_time_sigma,
         'applied_readout_time_s': last.applied.readout_time,
     }
+
+
+def _baselines(answered: Sequence[PairRecord]) -> dict[str, Any]:
+    """Of how many poses the baseline is known, how well in the median, and why not of others."""
+    known = [record.pose.baseline_log_sigma for record in answered
+             if not record.pose.baseline_reason]
+    reasons = CauseCounts()
+    for record in answered:
+        if record.pose.baseline_reason:
+            reasons.add(record.pose.baseline_reason)
+    return {'known': len(known), 'log_sigma_median': _median(known),
+            'not_known': reasons.most_common()}
 
 
 def errors_against_truth(answered: Sequence[PairRecord]) -> dict[str, Any] | None:
