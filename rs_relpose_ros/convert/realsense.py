@@ -39,6 +39,7 @@ PARAMETERS = (
         '(auto exposure). Negative: the rows were exposed before the stamp.'),
     SourcedValue('quat_cam_imu_xyzw', (-0.01218755, -0.0025826, -0.00469531, 0.99991137),
         'Rotation of T_cam_imu in camchain.yaml of the dataset (p_cam = T p_imu).'),
+    SourcedValue('imu_position', (0.0121, -0.0023, -0.0023), 'Its translation.'),
     SourcedValue('gyro_bias', (-0.0015, 0.0002, 0.0019), 'Mean of the gyro at rest, about.'),
 )
 
