@@ -120,6 +120,16 @@ def test_health_is_told_once_a_figure_and_when_it_is_well_again(clock):
     assert lines[4][1].endswith('(1 more since the last such line)')
 
 
+def test_a_gross_error_is_told_at_once_after_small_steps_of_the_same_figure(clock):
+    lines: list[str] = []
+    log = HealthLog(*(CauseLog(lines.append, clock=clock) for _ in range(3)))
+    small = finding(HealthState.WRONG, 9.0, 'axes')
+    gross = replace(small, sigma=None, sentence='images turn about axes that are 122 deg off')
+    for fault in (small, gross, small, gross):
+        log(Health((fault,)), withhold=True)
+    assert [line.partition(';')[0] for line in lines] == [small.text, gross.text]
+
+
 # -- silence ---------------------------------------------------------------------------------
 
 
