@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.config.parameters import SensorConfig
 from rs_relpose_ros.geometry.timing import to_nanoseconds
-from rs_relpose_ros.health.deviation import (
-    BIAS, LARGEST_OFFSET, LARGEST_READOUT, OFFSET, READOUT)
+from rs_relpose_ros.health.deviation import BIAS, LARGEST_OFFSET, LARGEST_READOUT, OFFSET, READOUT
 from rs_relpose_ros.health.judge import Told
 from rs_relpose_ros.health.pair_information import middle_share
 from rs_relpose_ros.health.recursion import Calibration
