@@ -274,10 +274,10 @@ def test_overload_is_told_as_such(clock):
                                problem='', missing=())
     assert report.level == WARN
     assert report.text.startswith('5 frames were not used')
-    assert '3 of them because the worker is too slow' in report.text
+    assert report.text.endswith('(3 overload, 2 no_imu): the worker is too slow for the camera')
     later = counts(frames=10, taken=4, overload=3, no_imu=3)
     report = statistics.report(inputs(), later, problem='', missing=())
-    assert report.text == '1 frames were not used since the last report'
+    assert report.text == '1 frames were not used since the last report (1 no_imu)'
     # Told once: those of the last second.
     assert statistics.report(inputs(), later, problem='', missing=()).level == OK
 
