@@ -190,6 +190,10 @@ def without_force(self, bag, stamp_ns):
     return bag.imu(stamp_ns, 'imu', self.rate((stamp_ns - START) * 1e-9), None)
 
 
+def frozen(self, bag, stamp_ns):
+    return 'sensor_msgs/msg/Image', bag.image(stamp_ns, 'camera', self.pixels)
+
+
 W, F = Verdict.WARNING, Verdict.FAILURE
 BROKEN = {
     'no image topic': ({'image_topic': ''}, 'topics', F, 'record images'),
@@ -235,6 +239,7 @@ BROKEN = {
                           'calibrate'),
     'big images': ({'pixels': np.zeros((800, 800), np.uint8), 'seconds': 0.5}, 'live transport', W,
                    'fastdds.xml'),
+    'frozen camera': ({'image': frozen}, 'pairs', F, 'repeats the one before'),
     'no texture': ({'pixels': np.full((120, 160), 90, np.uint8)}, 'texture', F, 'textured'),
 }
 

@@ -466,6 +466,32 @@ def test_a_figure_is_off_by_what_it_does_to_the_pose(size, state):
         assert f'set time_offset: {0.004 + size:.4f}' in finding.sentence
 
 
+@pytest.mark.parametrize('figure, size, on, offered', [
+    ('offset', -0.03, False, True), ('offset', -0.03, True, False),
+    ('offset', -0.06, False, False),
+    ('readout', 0.008, False, True), ('readout', 0.008, True, False),
+    ('readout', 0.02, False, False)])
+def test_tracking_is_offered_where_it_is_off_and_reaches_what_is_seen(figure, size, on, offered):
+    tracking = {'offset': 'track_time_offset', 'readout': 'track_readout_time'}[figure]
+    seen = calibration(deviation(**{figure: size}), SIGMA)
+    told = Told(sensor(**{tracking: on}), CAMERA, np.zeros(3), 0.003, NONE)
+    effect = Effect(2.0 * EFFECT.shift, 2.0 * EFFECT.claimed_shift)
+    fault = judged(seen, causes(seen, [effect], NONE), None, told).faults[0]
+    assert (f'{tracking}: true' in fault.sentence) is offered
+
+
+def test_sentences_name_what_is_in_force_and_have_no_negative_zero():
+    """The intrinsics may be those of the parameter file."""
+    told = Told(sensor(time_offset=0.0), CAMERA, np.array([0.0, -1e-7, 0.0]), 0.003, NONE)
+    seen = calibration(deviation(offset=-1e-6), SIGMA)
+    health = judged(seen, causes(seen, [EFFECT], NONE), None, told)
+    assert health.state is HealthState.OK
+    text = health.text
+    assert text.count('in force') == 5
+    assert 'CameraInfo' not in text
+    assert '-0.0,' not in text and '-0.0 ' not in text and '-0.0]' not in text
+
+
 def test_axes_are_wrong_though_most_turning_is_about_their_axis():
     """Half a turn about the vertical leaves the yaw of a vehicle as it is."""
     told = Told(PARAMETERS.sensor, CAMERA, np.zeros(3), 0.003, NONE)

@@ -120,6 +120,16 @@ def test_health_is_told_once_a_figure_and_when_it_is_well_again(clock):
     assert lines[4][1].endswith('(1 more since the last such line)')
 
 
+def test_a_gross_error_is_told_at_once_after_small_steps_of_the_same_figure(clock):
+    lines: list[str] = []
+    log = HealthLog(*(CauseLog(lines.append, clock=clock) for _ in range(3)))
+    small = finding(HealthState.WRONG, 9.0, 'axes')
+    gross = replace(small, sigma=None, sentence='images turn about axes that are 122 deg off')
+    for fault in (small, gross, small, gross):
+        log(Health((fault,)), withhold=True)
+    assert [line.partition(';')[0] for line in lines] == [small.text, gross.text]
+
+
 # -- silence ---------------------------------------------------------------------------------
 
 
@@ -264,10 +274,10 @@ def test_overload_is_told_as_such(clock):
                                problem='', missing=())
     assert report.level == WARN
     assert report.text.startswith('5 frames were not used')
-    assert '3 of them because the worker is too slow' in report.text
+    assert report.text.endswith('(3 overload, 2 no_imu): the worker is too slow for the camera')
     later = counts(frames=10, taken=4, overload=3, no_imu=3)
     report = statistics.report(inputs(), later, problem='', missing=())
-    assert report.text == '1 frames were not used since the last report'
+    assert report.text == '1 frames were not used since the last report (1 no_imu)'
     # Told once: those of the last second.
     assert statistics.report(inputs(), later, problem='', missing=()).level == OK
 

@@ -492,7 +492,7 @@ def spoiling(topic: str, change):
 
 BAD_BAGS = {
     'no_imu': ({'topics': ('image', 'camera_info')}, 'no IMU topic'),
-    'no_camera_info': ({'topics': ('image', 'imu')}, 'no CameraInfo topic'),
+    'no_camera_info': ({'topics': ('image', 'imu')}, 'give camera_matrix'),
     'no_image': ({'topics': ('imu', 'camera_info')}, 'no image topic'),
     'uncalibrated': ({'spoil': spoiling('camera_info', lambda m: m.k.put(0, 0.0))},
                      'uncalibrated'),

@@ -111,6 +111,10 @@ class TopicFinder:
                   if topic.name == f'{folder}/camera_info']
         if beside and not chosen:
             return beside[0]
+        if not chosen and not self._of_type(CAMERA_INFO):
+            raise MissingInputError(
+                f'{self.bag} has no CameraInfo topic ({CAMERA_INFO}); give camera_matrix, whose '
+                f'focal length "rs_relpose calibrate" finds; {self._listed()}')
         return self._one(chosen, (CAMERA_INFO,), 'CameraInfo', '--camera-info-topic')
 
     def _imu(self, options: TopicOptions) -> tuple[Topic, Topic | None]:

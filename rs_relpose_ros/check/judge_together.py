@@ -102,6 +102,8 @@ def _pairs(trial: Trial, health: Health) -> Finding:
                'too few images were processed')
     return judged(
         'pairs', f'{pairs} pairs in {trial.frames} images, {posed} with a pose', figures,
+        Case(trial.is_refused, FAILURE, 'hardly any image can be used: remove the cause',
+             f': {why}'),
         Case(not posed, UNKNOWN, '', f': {why}'),
         Case(posed < MOST_POSED * pairs and health.state is HealthState.WRONG, WARNING,
              'set right what is wrong, below', f'; without: {why}'),

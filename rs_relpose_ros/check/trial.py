@@ -24,6 +24,8 @@ _PARTS, _PART_IMAGES, _CALIBRATED_IMAGES = 3, 300, 600
 _SETTLED_NS = to_nanoseconds(10.0)
 # Pairs so far apart are of two parts.
 _APART_NS = to_nanoseconds(3.0)
+# Share of the images below which hardly any was used.
+_FEW_USED = 0.1
 # Share of the pairs that have a pose where the camera moves and the figures are right.
 MOST_POSED = 0.7
 # Figures of which the trial sees that they are far off, but not by how much.
@@ -88,6 +90,11 @@ class Trial:
     def health(self) -> Health:
         """Of each figure the worst that a part shows."""
         return self._before if self._last is None else worst_of(self._before, self._last.health)
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether hardly any image could be used."""
+        return self.frames < _FEW_USED * self._handed
 
     @property
     def is_lost(self) -> bool:

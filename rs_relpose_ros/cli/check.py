@@ -20,10 +20,10 @@ from rs_relpose_ros.cli.options import (
 from rs_relpose_ros.config.parameter_file import read_parameters
 
 HELP = ('Look through a bag (rosbag2 or ROS 1) for whatever would spoil relative poses: topics, '
-        'rates, gaps, stamps, clocks, encodings, transport, and, from a minute of it run through '
-        'the front end, axes, time offset, read-out, bias, units, focal length and lens. One '
-        'line for each, with a verdict (ok, unknown, warning, failure) and the remedy. Exit code '
-        '1 where something would make the estimation fail or its poses wrong.')
+        'rates, gaps, stamps, clocks, encodings, transport, and, from half a minute of it run '
+        'through the front end, axes, time offset, read-out, bias, units, focal length and '
+        'lens. One line for each, with a verdict (ok, unknown, warning, failure) and the remedy. '
+        'Exit code 1 where something would make the estimation fail or its poses wrong.')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -22,3 +22,6 @@ SCALE = 8
 FOCAL = 9
 DISTORTION = 10
 DEVIATIONS = 11
+
+# Largest deviations [s] that tracking applies.
+LARGEST_OFFSET, LARGEST_READOUT = 0.05, 0.01

@@ -25,6 +25,8 @@ from rs_relpose_ros.health.deviation import (
     DEVIATIONS,
     DISTORTION,
     FOCAL,
+    LARGEST_OFFSET,
+    LARGEST_READOUT,
     OFFSET,
     READOUT,
     SCALE,
@@ -339,25 +341,26 @@ def _described(figure: Figure, left: Array, sigmas: Array, told: Told) -> _Descr
     if figure.name == 'focal_length':
         seen = camera.fx / (1.0 + deviation)
         return _Described(camera.fx, seen, sigma * seen, f'{seen:.1f} +- {sigma * seen:.1f} px is '
-                          f'seen, the CameraInfo says {camera.fx:.1f} px')
+                          f'seen, {camera.fx:.1f} px in force')
     first = camera.distortion[0] if camera.distortion else 0.0
     return _Described(first, first + deviation, sigma, f'the first coefficient is seen as '
-                      f'{first + deviation:+.3f} +- {sigma:.3f}, the CameraInfo says {first:+.3f}')
+                      f'{first + deviation:+z.3f} +- {sigma:.3f}, {first:+z.3f} in force')
 
 
 def _in_ms(told: float, deviation: float, sigma: float) -> _Described:
     seen = told + deviation
-    return _Described(told, seen, sigma, f'{1e3 * seen:.1f} +- {1e3 * sigma:.1f} ms is seen, '
-                      f'{1e3 * told:.1f} ms in force')
+    return _Described(told, seen, sigma, f'{1e3 * seen:z.1f} +- {1e3 * sigma:.1f} ms is seen, '
+                      f'{1e3 * told:z.1f} ms in force')
 
 
 def _listed(values: Array, digits: int = 5) -> list[float]:
-    return [round(float(value), digits) for value in values]
+    # Plus zero: a value that is rounded to -0.0 is no other than 0.0.
+    return [round(float(value), digits) + 0.0 for value in values]
 
 
 def _remedy(figure: Figure, left: Array, described: _Described, told: Told) -> str:
     """What to do about a figure that is off."""
-    seen = described.seen
+    seen, sensor = described.seen, told.sensor
     if figure.name == 'axes':
         xyzw = Rotation.from_matrix(exp_so3(left) @ told.sensor.R_cam_imu).as_quat()
         return f'set quat_cam_imu_xyzw: {_listed(xyzw)}'
@@ -365,8 +368,12 @@ def _remedy(figure: Figure, left: Array, described: _Described, told: Told) -> s
         return (f'set gyro_bias: {_listed(told.gyro_bias + told.in_force[BIAS] + left)}, and let '
                 'the camera stand still at the start')
     return {
-        'time_offset': f'set time_offset: {seen:.4f}, or track_time_offset: true',
-        'readout_time': f'set readout_time: {seen:.4f}',
+        'time_offset': f'set time_offset: {seen:z.4f}' + (
+            ', or track_time_offset: true' if not sensor.track_time_offset
+            and abs(seen - sensor.time_offset) < LARGEST_OFFSET else ''),
+        'readout_time': f'set readout_time: {seen:.4f}' + (
+            ', or track_readout_time: true' if not sensor.track_readout_time
+            and abs(seen - (sensor.readout_time or 0.0)) < LARGEST_READOUT else ''),
         'gyro_scale': 'calibrate the gyro, or correct its driver',
         'focal_length': 'calibrate the camera at this resolution and focus',
         'distortion': 'calibrate the lens'}[figure.name]

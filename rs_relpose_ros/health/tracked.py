@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.config.parameters import SensorConfig
 from rs_relpose_ros.geometry.timing import to_nanoseconds
-from rs_relpose_ros.health.deviation import BIAS, OFFSET, READOUT
+from rs_relpose_ros.health.deviation import BIAS, LARGEST_OFFSET, LARGEST_READOUT, OFFSET, READOUT
 from rs_relpose_ros.health.judge import Told
 from rs_relpose_ros.health.pair_information import middle_share
 from rs_relpose_ros.health.recursion import Calibration
@@ -19,9 +19,8 @@ Array = NDArray[np.float64]
 
 # 1 sigma [s] below which a figure is applied.
 _APPLIED_SIGMA = 2e-3
-# Largest deviations that are applied [s], and largest changes of them [s per pair].
-_LARGEST_OFFSET, _OFFSET_STEP = 0.05, 1e-3
-_LARGEST_READOUT, _READOUT_STEP = 0.01, 5e-4
+# Largest changes of what is applied [s per pair].
+_OFFSET_STEP, _READOUT_STEP = 1e-3, 5e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,10 +84,10 @@ class Applied:
             known = seen.readout_time_sigma < _APPLIED_SIGMA
             readout = max(seen.readout_time, 0.0) - told if known else self.readout_time
         # What the frames so far cover, and no more.
-        readout = min(_stepped(self.readout_time, readout, _LARGEST_READOUT, _READOUT_STEP),
+        readout = min(_stepped(self.readout_time, readout, LARGEST_READOUT, _READOUT_STEP),
                       self.margin)
         ahead = _READOUT_STEP if sensor.track_readout_time else 0.0
-        return Applied(_stepped(self.time_offset, offset, _LARGEST_OFFSET, _OFFSET_STEP),
+        return Applied(_stepped(self.time_offset, offset, LARGEST_OFFSET, _OFFSET_STEP),
                        readout, max(readout + ahead, 0.0))
 
 

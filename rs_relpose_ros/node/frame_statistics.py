@@ -103,7 +103,7 @@ class FrameStatistics(ABC):
             refused = Counter({} if counts is None else counts.refused)
             dropped, self._refused = refused - self._refused, refused
             busy, self._busy_ns = self._busy_ns / NANOSECONDS / elapsed, 0
-            level, text = self._judge(problem, dropped.total(), dropped[Refusal.OVERLOAD])
+            level, text = self._judge(problem, dropped)
             state = self.idle if problem else {
                 OK: 'ok', WARN: 'degraded', ERROR: self.wrong}[level]
             silence = self._silence(now_ns, inputs.images, refused)
@@ -138,17 +138,17 @@ class FrameStatistics(ABC):
         return Silence((now_ns - since_ns) / NANOSECONDS, images - images_before,
                        refused - refused_before, self._last_failure)
 
-    def _judge(self, problem: str, dropped: int, overload: int) -> tuple[int, str]:
+    def _judge(self, problem: str, dropped: Counter[Refusal]) -> tuple[int, str]:
         if problem:
             return ERROR, problem
         wrong = self._told_wrong()
         if wrong:
             return ERROR, wrong
-        if overload > 0:
-            return WARN, (f'{dropped} frames were not used since the last report, {overload} of '
-                          'them because the worker is too slow for the camera')
-        if dropped > 0:
-            return WARN, f'{dropped} frames were not used since the last report'
+        if dropped:
+            causes = ', '.join(f'{count} {cause.value}' for cause, count in dropped.most_common())
+            why = ': the worker is too slow for the camera' if dropped[Refusal.OVERLOAD] else ''
+            return WARN, (f'{dropped.total()} frames were not used since the last report '
+                          f'({causes}){why}')
         return self._judge_results()
 
     def _published(self, ready_ns: int) -> None:
