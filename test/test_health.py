@@ -537,6 +537,20 @@ def test_the_worst_of_a_run():
     assert Health((finding('a', suspect), finding('b', wrong))).faults[0].figure == 'b'
 
 
+def test_traces_of_a_gross_error_are_left_out_of_a_run():
+    wrong = HealthState.WRONG
+    small = Health((finding('gyro_bias', wrong), finding('focal_length', HealthState.OK)))
+    gross = Health((replace(finding('axes', wrong), sigma=None),
+                    finding('gyro_bias', HealthState.UNKNOWN)))
+    assert not small.is_gross and gross.is_gross
+    run = worst_of(worst_of(small, gross), gross)
+    assert [(f.figure, f.state) for f in run.faults] == [('axes', wrong)]
+    # What comes once it is past counts.
+    later = worst_of(run, small)
+    assert [f.figure for f in later.faults] == ['axes', 'gyro_bias']
+
+
+
 def test_a_finding_as_json():
     written = json.loads(json.dumps(Health((finding('a', HealthState.SUSPECT),)).as_json()))
     assert written == {'state': 'suspect', 'findings': [

@@ -64,6 +64,12 @@ class Health:
                      for finding in self.findings if finding.state is state)
 
     @property
+    def is_gross(self) -> bool:
+        """Whether axes, unit or geometry are wrong altogether: such a fault has no sigma."""
+        return bool(self.faults) and self.faults[0].state is HealthState.WRONG \
+            and self.faults[0].sigma is None
+
+    @property
     def text(self) -> str:
         """Figure, state and sentence of each finding, in one line."""
         return '; '.join(f'{finding.figure} {finding.state.value}: {finding.sentence}'
@@ -79,8 +85,12 @@ NOT_JUDGED = Health(())
 
 
 def worst_of(before: Health, now: Health) -> Health:
-    """Of each figure the worse finding, the later one where both are alike: for a whole run."""
-    found = {finding.figure: finding for finding in before.findings}
+    """Of each figure the worse finding, the later one where both are alike: for a whole run.
+
+    Small deviations that were found before a gross error are traces of it, and left out.
+    """
+    traces = now.is_gross and not before.is_gross
+    found = {} if traces else {finding.figure: finding for finding in before.findings}
     for finding in now.findings:
         known = found.get(finding.figure)
         if known is None or _BLAME.index(finding.state) >= _BLAME.index(known.state):

@@ -302,8 +302,8 @@ def _another_row(cause: Cause, state: HealthState, told: Told) -> Iterator[Findi
         row = replace(camera, reference_row=name).reference_row_index
         makes = (camera.reference_row_index - row) * camera.line_delay
         if name != camera.reference_row and abs(deviation - makes) < 2.0 * cause.sigma[OFFSET]:
-            yield _fault('stamp_row', state, f'or the stamps mark the {name} row, which makes the '
-                         f'same offset: set stamp_row: {name}')
+            yield _fault('stamp_row', state, f'the stamps may mark the {name} row instead, which '
+                         f'makes the same offset: set stamp_row: {name}')
 
 
 class _Described(NamedTuple):
@@ -432,5 +432,5 @@ def _turned_axes(turned: TurnComparison, told: Told) -> Iterator[Finding]:
         axis = np.abs(np.linalg.eigh(Q + Q.T)[1][:, -1])
         if float(axis.max()) > math.cos(_HALF_TURN):
             how = 'upside down' if axis[2] == axis.max() else 'mirrored'
-            yield _fault('image_geometry', wrong, f'or the images are {how}: publish them as the '
-                         'sensor gives them')
+            yield _fault('image_geometry', wrong, f'the images may be {how} instead: publish them '
+                         'as the sensor gives them')

@@ -19,7 +19,7 @@ class HealthLog:
         if faults:
             # The numbers and lesser faults change from pair to pair, the worst figure hardly.
             text, cause = '; '.join(fault.text for fault in faults), faults[0].figure
-            if faults[0].sigma is None:
+            if health.is_gross:
                 # A gross error has a remedy of its own, which the first small steps do not know.
                 cause += ', gross'
             if health.state is HealthState.WRONG:
