@@ -111,7 +111,8 @@ def _calibration(seen: Scan) -> Finding:
     if intrinsics is None:
         return Finding(name, FAILURE, seen.problems.get(Role.CAMERA_INFO, 'no CameraInfo'),
                        'calibrate the camera (camera_calibration, OpenCV) and let its driver '
-                       'publish the CameraInfo, or give camera_matrix')
+                       'publish the CameraInfo, or give camera_matrix: "rs_relpose calibrate" '
+                       'finds its focal length')
     figures = {'fx': intrinsics.fx, 'fy': intrinsics.fy,
                'distortion_model': intrinsics.distortion_model, 'different': seen.calibrations}
     size = intrinsics.image_width, intrinsics.image_height
