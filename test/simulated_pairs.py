@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 import two_view_scene
 
+from rs_relpose_ros.estimator.landmarks import Landmarks, landmarks
 from rs_relpose_ros.estimator.result import RelativePose, Status
-from rs_relpose_ros.front_end.derotated_rays import DerotatedRays, Sensor
-from rs_relpose_ros.front_end.landmarks import Landmarks, landmarks
+from rs_relpose_ros.front_end.derotated_rays import Sensor
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.tracking.matches import Matches
@@ -114,9 +114,8 @@ def simulated_flight(seed: int, points: int = 120,
             reference_ns2=START_NS + round(1e9 * TIMES[k + 1]), frame_id='camera',
             interval=TIMES[k + 1] - TIMES[k], pose=pose,
             matches=matches, landmarks=landmarks(
-                pose, DerotatedRays(matches.track_ids, a.pixels[use], a.rays[use], a.tau[use]),
-                DerotatedRays(matches.track_ids, b.pixels[use], b.rays[use], b.tau[use]),
-                SENSOR) if pose else None,
+                pose, a.rays[use], b.rays[use], a.tau[use], b.tau[use],
+                SENSOR.camera) if pose else None,
             row_times1=a.tau[use], row_times2=b.tau[use], rays1=a.rays[use], rays2=b.rays[use],
             parallax=10.0))
     positions = np.array([first.rotation.inv().apply(v.position - first.position) for v in views])

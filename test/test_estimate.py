@@ -100,6 +100,33 @@ def test_exact_data_give_the_exact_pose_at_every_speed():
         assert rotation_error(pose.R, scene.R) < 0.001
 
 
+def test_pixels_of_global_shutters_are_epipolar_as_such():
+    """By OpenCV's essential matrix of the truth; the raw ones are not."""
+    scene = make_scene(2, speed=5.0, pixel_noise=0.0, gravity_noise=0.0, gyro_noise=0.0,
+                       outliers=0.1)
+    config = EstimatorConfig(pixel_sigma=0.01, gravity_sigma=1e-5, gyro_sigma=1e-6)
+    assert estimate(scene, config).pixels1_gs is None
+    pose = estimate(scene, config, global_shutter_pixels=True)
+    assert np.isnan(pose.pixels1_gs[~pose.inliers]).all()
+    tx = np.cross(np.eye(3), scene.t / np.linalg.norm(scene.t)).T
+    E = tx @ scene.R   # X1 = R X2 + t
+
+    def distance(points1, points2):
+        """Sampson distances [px]."""
+        rays1, rays2 = (cv2.convertPointsToHomogeneous(
+            (points[pose.inliers] - CENTRE) / FOCAL)[:, 0] for points in (points1, points2))
+        return FOCAL * np.sqrt([cv2.sampsonDistance(a, b, E.T) for a, b in zip(
+            rays1, rays2, strict=True)])
+
+    turned = distance(pose.pixels1_gs, pose.pixels2_gs)
+    assert np.median(turned) < 0.01
+    assert np.median(distance(scene.points1, scene.points2)) > 100.0 * np.median(turned)
+    still, point = FrameMotion(np.zeros(3)), [[1.0, 2.0]]
+    none = estimate_relative_pose(point, point, make_camera(), still, still,
+                                  global_shutter_pixels=True)
+    assert none.pixels1_gs is None
+
+
 @pytest.mark.parametrize('reference', ['first', 'middle', 'last'])
 def test_the_pose_belongs_to_the_reference_row(reference):
     scene = make_scene(5, speed=5.0, reference=reference)

@@ -10,8 +10,7 @@ import pytest
 from simulated_pairs import SENSOR, simulated_flight
 
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.front_end.derotated_rays import DerotatedRays
-from rs_relpose_ros.front_end.landmarks import landmarks
+from rs_relpose_ros.estimator.landmarks import landmarks
 from rs_relpose_ros.messages.outgoing import inlier_records, pair_messages
 from rs_relpose_ros.messages.published_pair import match_records
 
@@ -29,17 +28,11 @@ def test_exact_matches_give_the_truth(seed):
         assert np.linalg.norm(pair.matches.points1 - truth.pixels1, axis=1).max() > 3.0
 
 
-def rays_of(pair, second=None):
-    matches = pair.matches
-    first = DerotatedRays(matches.track_ids, matches.points1, pair.rays1, pair.row_times1)
-    rays2 = pair.rays2 if second is None else second
-    return first, DerotatedRays(matches.track_ids, matches.points2, rays2, pair.row_times2)
-
-
 def test_rays_that_are_parallel_have_pixels_and_no_point():
     pair = simulated_flight(1).pairs[0]
     parallel = pair.rays1 @ pair.pose.R
-    found = landmarks(pair.pose, *rays_of(pair, parallel), SENSOR)
+    found = landmarks(pair.pose, pair.rays1, parallel, pair.row_times1, pair.row_times2,
+                      SENSOR.camera)
     assert np.isnan(found.points).all()
     # Turned to the stamped row, as a camera that only turns sees them.
     np.testing.assert_allclose(found.pixels1, SENSOR.camera.project(pair.rays1), atol=1e-9)
@@ -49,7 +42,8 @@ def test_rays_that_are_parallel_have_pixels_and_no_point():
 def test_outliers_have_none():
     pair = simulated_flight(2).pairs[0]
     inliers = np.arange(len(pair.matches)) % 3 > 0
-    found = landmarks(replace(pair.pose, inliers=inliers), *rays_of(pair), SENSOR)
+    found = landmarks(replace(pair.pose, inliers=inliers), pair.rays1, pair.rays2, pair.row_times1,
+                      pair.row_times2, SENSOR.camera)
     for values in found:
         np.testing.assert_array_equal(np.isfinite(values).all(axis=1), inliers)
 

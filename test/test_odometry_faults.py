@@ -27,8 +27,8 @@ from test_odometry import LEVER, PARAMETERS, QUAT, START_NS, Walk, walk
 
 from rs_relpose_lab.live.graph import diagnostic_values, Graph
 from rs_relpose_lab.live.processes import node_process, wait_until, wait_until_quiet
+from rs_relpose_ros.estimator.landmarks import Landmarks
 from rs_relpose_ros.estimator.result import RelativePose, Status
-from rs_relpose_ros.front_end.landmarks import Landmarks
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.health.findings import Finding, Health, HealthState
 from rs_relpose_ros.imu.samples import ImuSample

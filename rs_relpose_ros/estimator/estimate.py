@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import math
 import time
 
@@ -26,6 +27,7 @@ from rs_relpose_ros.estimator.image_information import (
 from rs_relpose_ros.estimator.inertial_evidence import inertial_evidence, InertialEvidence
 from rs_relpose_ros.estimator.information import inverse
 from rs_relpose_ros.estimator.inliers import cheirality_sign, Flags, Matches, select_inliers
+from rs_relpose_ros.estimator.landmarks import landmarks
 from rs_relpose_ros.estimator.local_optimisation import optimise
 from rs_relpose_ros.estimator.map_fit import FitMatches
 from rs_relpose_ros.estimator.noise import noise_mixture
@@ -88,8 +90,8 @@ def estimate_relative_pose(
         motion2: FrameMotion, relative_rotation: ArrayLike | None = None,
         relative_rotation_covariance: ArrayLike | None = None, interval: float | None = None,
         config: EstimatorConfig | None = None, rng: int | np.random.Generator = 0, *,
-        quality: ArrayLike | None = None,
-        inertial: InertialMotion | None = None) -> RelativePose:
+        quality: ArrayLike | None = None, inertial: InertialMotion | None = None,
+        global_shutter_pixels: bool = False) -> RelativePose:
     """Relative pose of two rolling-shutter frames from matches, gyro and gravity.
 
     Parameters
@@ -116,6 +118,8 @@ def estimate_relative_pose(
     inertial : InertialMotion, optional
         Preintegrated acceleration between the two reference instants: velocities and baseline in
         metres follow from it. `interval` must be its duration, or None.
+    global_shutter_pixels : bool
+        Whether the result has `pixels1_gs` and `pixels2_gs`.
 
     Returns
     -------
@@ -157,6 +161,12 @@ def estimate_relative_pose(
                             rotation_covariance, mode.model.derotated)
     seed = np.array([np.random.default_rng(rng).integers(2**63)], dtype=np.uint64)
     pose = Estimation(problem, mode, config, order, seed, interval, inertial).run()
+    if global_shutter_pixels and pose:
+        times1, times2 = camera.row_times(points1[:, 1]), camera.row_times(points2[:, 1])
+        seen = landmarks(pose, motion1.derotate(camera.unproject(points1), times1),
+                         motion2.derotate(camera.unproject(points2), times2), times1, times2,
+                         camera)
+        pose = replace(pose, pixels1_gs=seen.pixels1, pixels2_gs=seen.pixels2)
     object.__setattr__(pose, 'duration', time.perf_counter() - started)
     return pose
 

@@ -70,6 +70,9 @@ class RelativePose:
     inertial_evidence : InertialEvidence or None
         Whether the images show the acceleration that was given (`inertial`); None where nothing
         tells.
+    pixels1_gs, pixels2_gs : (N, 2) ndarray or None
+        Where global shutters at the instants of the reference rows would see the matches, on the
+        sensor [px]: NaN for outliers; None unless asked for, and without a pose.
     velocity_sigma : float
         Prior sigma of the linear velocities that was used [baselines per second].
     iterations : int
@@ -97,6 +100,8 @@ class RelativePose:
     baseline_reason: str = ''
     images: ImageInformation | None = None
     inertial_evidence: InertialEvidence | None = None
+    pixels1_gs: Array | None = None
+    pixels2_gs: Array | None = None
     velocity_sigma: float = float('nan')
     iterations: int = 0
     residual_rms: float = float('nan')

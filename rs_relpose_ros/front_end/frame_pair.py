@@ -16,12 +16,12 @@ from rs_relpose_ros.config.imu import ImuConfig
 from rs_relpose_ros.config.parameters import Parameters
 from rs_relpose_ros.estimator.estimate import estimate_relative_pose
 from rs_relpose_ros.estimator.inertial_evidence import inertial_evidence, InertialEvidence
+from rs_relpose_ros.estimator.landmarks import Landmarks, landmarks
 from rs_relpose_ros.estimator.problem import build_problem
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.estimator.velocities_expected import velocities_expected
 from rs_relpose_ros.front_end.derotated_rays import DerotatedRays, median_parallax, Sensor
 from rs_relpose_ros.front_end.frame import Frame, pose_row_delay
-from rs_relpose_ros.front_end.landmarks import landmarks
 from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.geometry.inertial import InertialMotion
 from rs_relpose_ros.geometry.motion import FrameMotion
@@ -157,9 +157,18 @@ def pair_result(first: View, second: View, matches: Matches, rays1: DerotatedRay
         frame_id=second.frame.frame_id, interval=interval_of(first, second), pose=pose,
         matches=matches, row_times1=rays1.row_times, row_times2=rays2.row_times,
         rays1=rays1.rays, rays2=rays2.rays, parallax=parallax_of(rays1, rays2, gyro, sensor),
-        landmarks=landmarks(pose, rays1, rays2, sensor) if pose else None,
+        landmarks=_landmarks(pose, rays1, rays2, sensor) if pose else None,
         gyro_rotation=None if gyro is None else gyro.rotation,
         gyro_bias=None if gyro is None else parameters.sensor.R_cam_imu.T @ gyro.segment.bias)
+
+
+def _landmarks(pose: RelativePose, rays1: DerotatedRays, rays2: DerotatedRays,
+               sensor: Sensor) -> Landmarks:
+    """Landmarks with pixels of the published images."""
+    found = landmarks(pose, rays1.rays, rays2.rays, rays1.row_times, rays2.row_times,
+                      sensor.camera)
+    to_image = sensor.intrinsics.to_image
+    return found._replace(pixels1=to_image(found.pixels1), pixels2=to_image(found.pixels2))
 
 
 def _gravity_prior(imu1: FrameImu, imu2: FrameImu, parameters: Parameters) -> _GravityPrior:

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.config.keyframes import KeyframeConfig
+from rs_relpose_ros.estimator.landmarks import Landmarks
 from rs_relpose_ros.estimator.result import RelativePose
-from rs_relpose_ros.front_end.landmarks import Landmarks
 from rs_relpose_ros.health.findings import Health, NOT_JUDGED
 from rs_relpose_ros.health.tracked import Applied, NOTHING_APPLIED, Tracked
 from rs_relpose_ros.tracking.matches import Matches

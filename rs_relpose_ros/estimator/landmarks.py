@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.estimator.result import RelativePose
-from rs_relpose_ros.front_end.derotated_rays import DerotatedRays, Sensor
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
 Array = NDArray[np.float64]
 
@@ -27,8 +27,8 @@ _PARALLEL = 4e-8
 class Landmarks(NamedTuple):
     """Of the N matches of a pair with a pose; NaN for outliers.
 
-    `pixels1`, `pixels2` (N, 2): where global shutters at the stamped rows' instants would see them
-    in the published images. `points` (N, 3): in the reference camera [baselines]; NaN where the
+    `pixels1`, `pixels2` (N, 2): where global shutters at the stamped rows' instants would see
+    them. `points` (N, 3): in the reference camera [baselines]; NaN where the
     rays are parallel or meet behind a camera: their pixels are turned as if they were far away.
     """
 
@@ -37,13 +37,21 @@ class Landmarks(NamedTuple):
     points: Array
 
 
-def landmarks(pose: RelativePose, first: DerotatedRays, second: DerotatedRays,
-              sensor: Sensor) -> Landmarks:
-    """Landmarks of the inliers of a pose."""
+def landmarks(pose: RelativePose, rays1: Array, rays2: Array, row_times1: Array, row_times2: Array,
+              camera: RollingShutterCamera) -> Landmarks:
+    """Landmarks of the inliers of a pose, pixels on the sensor.
+
+    Parameters
+    ----------
+    rays1, rays2 : (N, 3) ndarray
+        Unit rays of the matches, turned to the stamped row of their frame.
+    row_times1, row_times2 : (N,) ndarray
+        Instants at which they were seen, from that of the stamped row [s].
+    """
     inliers = pose.inliers
-    f1, f2 = first.rays[inliers], second.rays[inliers]
-    moved1 = first.row_times[inliers, None] * pose.linear_velocity1
-    moved2 = second.row_times[inliers, None] * pose.linear_velocity2
+    f1, f2 = rays1[inliers], rays2[inliers]
+    moved1 = row_times1[inliers, None] * pose.linear_velocity1
+    moved2 = row_times2[inliers, None] * pose.linear_velocity2
     in_first = f2 @ pose.R.T
     baselines = pose.t + moved2 @ pose.R.T - moved1
     normals = np.cross(f1, in_first)
@@ -59,8 +67,7 @@ def landmarks(pose: RelativePose, first: DerotatedRays, second: DerotatedRays,
     middle = 0.5 * (l1[:, None] * seen1 + pose.t + (l2[:, None] * seen2) @ pose.R.T)
     out = Landmarks(*(np.full((len(inliers), size), np.nan) for size in (2, 2, 3)))
     for values, found in zip(out, (
-            sensor.intrinsics.to_image(sensor.camera.project(seen1)),
-            sensor.intrinsics.to_image(sensor.camera.project(seen2)),
+            camera.project(seen1), camera.project(seen2),
             np.where(near[:, None], middle, np.nan)), strict=True):
         values[inliers] = found
     return out
