@@ -262,6 +262,15 @@ def test_any_interval(interval, config):
         assert rotation_error(pose.R, GOOD.R) < 0.5
 
 
+@pytest.mark.parametrize('threshold', [2.0, 4.0, 8.0, 13.0, 25.0])
+@pytest.mark.parametrize('n', [40, 80, 160])
+def test_random_matches_agree_by_chance(threshold, n):
+    """The wider the threshold, the more of them."""
+    for seed in range(0, 40, 2):
+        assert not estimate(random_points(seed, n), random_points(seed + 1, n),
+                            config={'threshold': threshold})
+
+
 @examples(100)
 @given(st.sampled_from(['threshold', 'pixel_sigma', 'gravity_sigma', 'gyro_sigma', 'confidence',
                         'max_iterations', 'time_limit', 'min_inliers', 'min_parallax',

@@ -6,7 +6,6 @@ import argparse
 from typing import Any
 
 from rs_relpose_ros.cli.bag_run import add_run_arguments, run_on_bag
-from rs_relpose_ros.health.findings import HealthState
 from rs_relpose_ros.odometry.library import need_gtsam
 from rs_relpose_ros.result_files import SUMMARY_FILE
 
@@ -39,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
           f'{figures["length_m"]:.1f} m'
           + (f', {pairs["contradicting"]} pairs left out' if pairs['contradicting'] else '')
           + (f', lost {figures["lost"]} times' if figures['lost'] else ''))
-    if figures['health'] in (HealthState.SUSPECT.value, HealthState.WRONG.value):
+    if figures['health'] in ('suspect', 'wrong'):
         print(f'health: {figures["health"]}: "rs_relpose replay" says of which figure')
     for trajectory in ('live', 'smoothed'):
         if figures[trajectory]:
