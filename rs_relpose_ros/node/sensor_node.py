@@ -283,7 +283,9 @@ class SensorNode(StoppableNode):
         # Without any image the driver is probably not running yet: a status, but no log line.
         if image in missing:
             return f'{idle}: no image on {image} for {SILENCE:g} s', missing
-        if self._intake.intrinsics is None and camera_info in missing:
+        # Told intrinsics are taken once some images have waited for a CameraInfo in vain.
+        told = self._settings.current.intrinsics.given
+        if self._intake.intrinsics is None and camera_info in missing and not told:
             text = (f'{idle}: no CameraInfo on {camera_info}; remap camera_info to the '
                     'topic of the driver, which must publish a calibration, or give '
                     'camera_matrix')
