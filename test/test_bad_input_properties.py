@@ -286,6 +286,9 @@ def test_any_setting(name, value):
 @examples(60)
 @given(hnp.arrays(np.float64, st.integers(2, 6), elements=any_float | strange),
        st.integers(0, 6), seeds)
+@example(np.array([-3e76, 0.0]), 2, 1)
+@example(np.array([-1e308, 8e307]), 2, 1)
+@example(np.array([-1e6, 0.0]), 2, 1)
 def test_any_gyro_samples(times, rows, seed):
     rates = np.random.default_rng(seed).normal(size=(rows, 3)) * 10.0**(seed % 9)
     try:

@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 
 # Far beyond any gyro [rad/s]; a larger number is no rate, and its products may overflow.
 _LARGEST_RATE = 1e4
+# Far beyond any frame [s]; products of longer times may overflow.
+_LONGEST = 1e6
 # Of row times against the gyro samples that must enclose them [s].
 _TOLERANCE = 1e-6
 
@@ -85,6 +87,9 @@ class FrameMotion:
                              f'K >= 2, got {times.shape} and {rates.shape}')
         if not (np.isfinite(times).all() and np.isfinite(rates).all()):
             raise InputError('times and angular_velocities must be finite')
+        if np.abs(times).max() > _LONGEST:
+            raise InputError(f'times must be within {_LONGEST:g} s of the reference row, got up '
+                             f'to {np.abs(times).max():g} s')
         steps = np.diff(times)
         if not (steps > 0.0).all():
             raise InputError('times must be strictly increasing')
