@@ -56,9 +56,12 @@ def run(module_ros_domain_id: int, bundled_bag: Path,
         tmp_path_factory: pytest.TempPathFactory) -> Published:
     stamps_file = tmp_path_factory.mktemp('live') / 'stamps.txt'
     own = '/relpose_node'
+    # All messages are counted: a busy machine loses best effort.
+    reliable = {f'qos_overrides.{topic}.subscription.reliability': 'reliable'
+                for topic in (f'{BAG_TOPICS["image"]}/compressed', BAG_TOPICS['imu'])}
     with Graph() as graph, node_process(
             BUNDLED_PARAMETERS, remap=BAG_TOPICS,
-            parameters={'stamps_file': stamps_file}) as node:
+            parameters={'stamps_file': stamps_file, **reliable}) as node:
         poses = graph.listen(PoseWithCovarianceStamped, f'{own}/relative_pose')
         rotations = graph.listen(Imu, f'{own}/relative_rotation')
         pairs = graph.listen(DiagnosticArray, f'{own}/pairs')
