@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV ?= .venv
 # Optional pip constraints, e.g. CONSTRAINTS=requirements/ubuntu-24.04.txt
 CONSTRAINTS ?=
-# More options for pytest, e.g. PYTEST_ARGS='test/test_camera.py -x'
+# More options for pytest, e.g. PYTEST_ARGS='test/test_geometry.py -x'
 PYTEST_ARGS ?=
 
 bin := $(VENV)/bin
@@ -16,7 +16,7 @@ pip := $(bin)/python -m pip --quiet --quiet --disable-pip-version-check
 
 # What a run imports is byte-compiled by the set-up, or else the first run would do it, and every run
 # where PYTHONDONTWRITEBYTECODE is set. pip would do it for all 6,000 modules of the environment.
-first_run := rs_relpose_ros.node.node, rs_relpose_ros.global_shutter.node, rs_relpose_ros.cli.replay, \
+first_run := rs_relpose_ros.nodes.relpose_node, rs_relpose_ros.nodes.global_shutter_node, rs_relpose_ros.cli.poses, \
     rs_relpose_ros.odometry.offline, rs_relpose_lab.live.player, \
     rs_relpose_lab.live.live_run, rs_relpose_lab.experiments.comparison
 

@@ -12,11 +12,23 @@ from setuptools.command.develop import develop
 
 NAME = 'rs_relpose_ros'
 LABORATORY = 'rs_relpose_lab'
+# Module -> call in it that compiles the kernels of a node with its default parameters.
+WARM_UPS = {
+    'pipeline.warm_up': 'fill_cache()',
+    'pipeline.global_shutter': 'warm_up_unroller(module.Parameters())',
+    'odometry.pair': 'warm_up_odometry()',
+}
 
 
 def files_in(folder: str) -> list[str]:
     """Files directly in `folder`, relative to the package root, as data_files takes them."""
     return sorted(str(path) for path in Path(folder).glob('[!.]*') if path.is_file())
+
+
+def libraries() -> list[str]:
+    """Run-time dependencies from PyPI: requirements/base.txt without ROS and the build tool."""
+    lines = Path('requirements', 'base.txt').read_text().splitlines()
+    return [line for line in lines if not line.startswith(('#', 'ros-', 'setuptools'))]
 
 
 def compile_kernels(folder: str) -> None:
@@ -28,9 +40,10 @@ def compile_kernels(folder: str) -> None:
     paths = [path for path in os.environ.get('PYTHONPATH', '').split(os.pathsep)
              if path and not (Path(path) / 'sitecustomize.py').exists()]
     environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(paths)}
-    for module in ('front_end', 'global_shutter', 'odometry'):
-        filled = subprocess.run([sys.executable, '-m', f'{NAME}.{module}.warm_up'], cwd=folder,
-                                env=environment, stderr=subprocess.PIPE, text=True, check=False)
+    for module, call in WARM_UPS.items():
+        command = f'import {NAME}.{module} as module; module.{call}'
+        filled = subprocess.run([sys.executable, '-c', command], cwd=folder, env=environment,
+                                stderr=subprocess.PIPE, text=True, check=False)
         if filled.returncode:
             reason = (filled.stderr.splitlines() or ['no reason given'])[-1]
             logging.getLogger(NAME).warning(
@@ -65,16 +78,17 @@ setup(
     license='Apache-2.0',
     python_requires='>=3.11',
     packages=find_packages(include=[NAME, NAME + '.*', LABORATORY, LABORATORY + '.*']),
-    package_data={NAME: ['py.typed'], LABORATORY: ['py.typed']},
+    package_data={NAME: ['py.typed'], LABORATORY: ['py.typed', 'recordings/*.yaml']},
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/' + NAME]),
         ('share/' + NAME, ['package.xml']),
         ('share/' + NAME + '/config', files_in('config')),
         ('share/' + NAME + '/launch', files_in('launch')),
     ],
-    # Run-time dependencies are rosdep keys in package.xml and, for pip, requirements/base.txt.
-    # Named here, pip would lay its own OpenCV and NumPy over those of a ROS machine.
-    install_requires=['setuptools'],
+    # For pip. On a ROS machine colcon resolves none of them: rosdep installs those in package.xml.
+    # Use pip with --no-deps there. It does not recognise Ubuntu's OpenCV as opencv-python-headless
+    # and would install that, and perhaps another NumPy, over Ubuntu's.
+    install_requires=['setuptools', *libraries()],
     extras_require={
         'test': ['pytest'],
         'odometry': ['gtsam>=4.3,<4.4'],
@@ -85,9 +99,9 @@ setup(
     cmdclass={'build_py': BuildWithKernels, 'develop': DevelopWithKernels},
     entry_points={
         'console_scripts': [
-            'relpose_node = rs_relpose_ros.node.start:main',
-            'global_shutter_node = rs_relpose_ros.global_shutter.start:main',
-            'odometry_node = rs_relpose_ros.odometry.start:main',
+            'relpose_node = rs_relpose_ros.nodes.start:relpose_node',
+            'global_shutter_node = rs_relpose_ros.nodes.start:global_shutter_node',
+            'odometry_node = rs_relpose_ros.nodes.start:odometry_node',
             'rs_relpose = rs_relpose_ros.cli.main:main',
         ],
     },

@@ -2,7 +2,7 @@
 
     make demo
 
-Starts relpose_node and a player as processes of their own, plays bags/hand_held in real time and
+Starts relpose_node and a player as separate processes, plays bags/hand_held in real time and
 records the poses, replays the same bag offline with several methods, and prints a table.
 """
 
@@ -24,17 +24,17 @@ from rs_relpose_lab.experiments.comparison import (
     score_of_replay,
     score_table,
 )
-from rs_relpose_lab.experiments.unrolled_poses import (
+from rs_relpose_lab.experiments.global_shutter import (
     draw_before_and_after,
-    five_point_when_turned,
+    five_point_when_derotated,
 )
 from rs_relpose_lab.live.live_run import LiveRun, run_live
 from rs_relpose_ros.bags.reader import open_bag
-from rs_relpose_ros.config.parameter_file import read_parameters
+from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.estimator.result import Status
-from rs_relpose_ros.replay.outputs import POSES_FILE
-from rs_relpose_ros.replay.pictures import draw_errors
+from rs_relpose_ros.offline.pictures import draw_errors
+from rs_relpose_ros.offline.tables import POSES
 
 ROOT = Path(__file__).resolve().parent.parent
 BAG = ROOT / 'bags' / 'hand_held'
@@ -46,21 +46,21 @@ STARTED = time.monotonic()
 
 
 def compare(live: LiveRun) -> list[str]:
-    """Replay the bag with all methods, side by side; the lines to print."""
-    say("replaying it offline: the node's pipeline, the paper's algorithms, OpenCV's 5-point, a "
+    """Replay the bag with all methods in parallel; the lines to print."""
+    log("replaying it offline: the node's pipeline, the paper's algorithms, OpenCV's 5-point, a "
         'metric path ...')
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context('spawn')) as pool:
         paper = [pool.submit(score_of_paper, name) for name in PAPER_ALGORITHMS]
-        turned = pool.submit(five_point_when_turned, BAG, read_parameters(PARAMETERS), OUT)
+        derotated = pool.submit(five_point_when_derotated, BAG, read_parameters(PARAMETERS), OUT)
         path = pool.submit(metric_path)
         replayed = compare_live(live.table, live.stamps, BAG, PARAMETERS, OUT, pictures=True)
         opencv = replayed.opencv_scores()
         shift = draw_before_and_after(BAG, read_parameters(PARAMETERS), OUT / BEFORE_AND_AFTER)
         scores = [replayed.node, score_of_records('the same, replayed', replayed.records),
-                  *(future.result() for future in paper), *opencv, turned.result()]
+                  *(future.result() for future in paper), *opencv, derotated.result()]
         draw_errors(replayed.records, OUT / 'errors.png', {s.name: s.errors for s in opencv})
-        turning = f'images turned to their middle row: pixels move by up to {shift:.1f} px'
-        return [*score_table(scores), '', *remarks(replayed, opencv), turning, path.result()]
+        largest = f'images derotated to their middle row: pixels move by up to {shift:.1f} px'
+        return [*score_table(scores), '', *remarks(replayed, opencv), largest, path.result()]
 
 
 def score_of_paper(name: str) -> Score:
@@ -73,13 +73,13 @@ def metric_path() -> str:
     from rs_relpose_ros.odometry.offline import odometry_into
     with open_bag(BAG) as bag:
         found = odometry_into(OUT, bag, bag.find_topics(), read_parameters(PARAMETERS))
-    errors = found.figures['live']
+    errors = found.metrics['live']
     return (f'metric path from pairs and IMU: {100.0 * errors["ate_m"]:.1f} cm off (rms) over '
             f'{errors["length_m"]:.1f} m, scale {100.0 * errors["scale_error"]:+.2f} %')
 
 
 def remarks(replayed: LiveComparison, opencv: list[Score]) -> list[str]:
-    """What the table does not say."""
+    """Lines below the table."""
     without = [record for record in replayed.records if record.status is not Status.OK]
     statuses = ', '.join(sorted({record.status.value for record in without}))
     equal = f'{replayed.unequal} of them not equal' if replayed.unequal else 'bit-equal'
@@ -94,7 +94,7 @@ def remarks(replayed: LiveComparison, opencv: list[Score]) -> list[str]:
     return lines
 
 
-def say(text: str) -> None:
+def log(text: str) -> None:
     """Progress, with the seconds since the start."""
     print(f'[{time.monotonic() - STARTED:5.1f} s] {text}', flush=True)
 
@@ -103,18 +103,18 @@ def main() -> int:
     """Run the demo; its exit code."""
     OUT.mkdir(exist_ok=True)
     try:
-        say(f'playing {BAG.relative_to(ROOT)} to relpose_node over Fast DDS, in real time ...')
+        log(f'playing {BAG.relative_to(ROOT)} to relpose_node over Fast DDS, in real time ...')
         lines = compare(run_live(BAG, PARAMETERS, OUT))
     except RsRelposeError as error:
         print(f'demo: {error}', file=sys.stderr)
         return 1
     print()
-    print('errors against the truth of the bag (simulated, hand-held, read-out 30 ms):')
+    print('errors against the truth of the bag (simulated, hand-held, readout 30 ms):')
     print('\n'.join(lines))
     print()
     print('pictures and tables:')
     for name in ('matches.png', 'errors.png', 'residuals.png', 'rotation.png',
-                 BEFORE_AND_AFTER, PATH, 'trajectory.tum', POSES_FILE, 'live.csv'):
+                 BEFORE_AND_AFTER, PATH, 'trajectory.tum', POSES.file, 'live.csv'):
         print(f'  {(OUT / name).relative_to(ROOT)}')
     return 0
 

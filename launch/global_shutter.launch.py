@@ -1,4 +1,4 @@
-"""Start global_shutter_node beside a camera driver.
+"""Start global_shutter_node for a running camera driver.
 
 ::
 

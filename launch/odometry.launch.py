@@ -1,11 +1,11 @@
-"""Start relpose_node and odometry_node, which needs gtsam, beside a camera driver.
+"""Start relpose_node and odometry_node, which needs gtsam, for a running camera driver.
 
 ::
 
     ros2 launch rs_relpose_ros odometry.launch.py camera_namespace:=/camera \
         imu:=/imu/data_raw params_file:=my_camera.yaml
 
-Its arguments are those of relpose.launch.py. The parameter imu_position should be told.
+Its arguments are those of relpose.launch.py. The parameter imu_position should be set.
 """
 
 from launch import LaunchDescription

@@ -1,4 +1,4 @@
-"""Start relpose_node, or other nodes of the package, beside a camera driver.
+"""Start relpose_node, or other nodes of the package, for a running camera driver.
 
 ::
 
@@ -16,20 +16,20 @@ from launch.substitutions import (
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-# Where Fast DDS looks for a profile; one that the user has set stays.
+# Environment variable with the Fast DDS profile; the user's own profile has priority.
 PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 ARGUMENTS = {
     'namespace': ('', 'namespace of the node'),
     'executable': (
         'relpose_node',
-        'nodes to start, with commas between: relpose_node, global_shutter_node, odometry_node'),
+        'nodes to start, separated by commas: relpose_node, global_shutter_node, odometry_node'),
     'name': ('', 'name of a node that is started alone; empty: that of its executable'),
     'camera_namespace': ('/camera', 'namespace of the camera driver'),
     'image': ('image_raw', 'raw image topic, within camera_namespace unless absolute'),
     'camera_info': ('camera_info', 'CameraInfo topic, likewise'),
     'imu': ('/imu/data_raw', 'IMU topic'),
-    'accel': ('accel', 'topic of an accelerometer that is published apart from the gyro'),
-    'image_transport': ('', 'raw or compressed; empty: as the parameter file has it'),
+    'accel': ('accel', 'topic of an accelerometer that is published separately from the gyro'),
+    'image_transport': ('', 'raw or compressed; empty: as in the parameter file'),
     'params_file': (
         PathJoinSubstitution([FindPackageShare('rs_relpose_ros'), 'config', 'relpose.yaml']),
         'parameter file; readout_time and quat_cam_imu_xyzw have no default'),
@@ -37,12 +37,12 @@ ARGUMENTS = {
         EnvironmentVariable(PROFILE, default_value=PathJoinSubstitution(
             [FindPackageShare('rs_relpose_ros'), 'config', 'fastdds.xml'])),
         'Fast DDS profile of the node, for images above 512 KB; the driver needs it, too'),
-    'use_sim_time': ('false', 'clock of log lines and diagnostics; estimates go by stamps alone'),
+    'use_sim_time': ('false', 'clock of log lines and diagnostics; estimates use stamps alone'),
 }
 
 
 def start_nodes(context: LaunchContext) -> list[Action]:
-    """The nodes, with the arguments that were given in place of the file's parameters."""
+    """The nodes; arguments of the command line override the file's parameters."""
     argument = {name: LaunchConfiguration(name) for name in ARGUMENTS}
     camera = argument['camera_namespace']
     overrides = {name: argument[name] for name in ('image_transport', 'use_sim_time')
@@ -55,7 +55,7 @@ def start_nodes(context: LaunchContext) -> list[Action]:
         namespace=argument['namespace'], output='screen',
         parameters=[argument['params_file'], overrides],
         remappings=[
-            # An absolute path swallows what stands before it.
+            # An absolute path replaces everything before it.
             ('image', PathJoinSubstitution([camera, argument['image']])),
             ('camera_info', PathJoinSubstitution([camera, argument['camera_info']])),
             ('imu', argument['imu']),

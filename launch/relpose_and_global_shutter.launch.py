@@ -1,11 +1,11 @@
-"""Start relpose_node and global_shutter_node beside a camera driver.
+"""Start relpose_node and global_shutter_node for a running camera driver.
 
 ::
 
     ros2 launch rs_relpose_ros relpose_and_global_shutter.launch.py camera_namespace:=/camera \
         imu:=/imu/data_raw params_file:=my_camera.yaml
 
-Its arguments are those of relpose.launch.py. Each node decodes compressed images for itself
+Its arguments are those of relpose.launch.py. Each node decodes compressed images itself
 (docs/any_slam.md).
 """
 

@@ -12,39 +12,37 @@ import logging
 from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rs_relpose_ros.config.estimator import EstimatorConfig
-    from rs_relpose_ros.config.parameters import Parameters
+    from rs_relpose_ros.config.settings import EstimatorConfig, Parameters
     from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
     from rs_relpose_ros.estimator.estimate import estimate_relative_pose
+    from rs_relpose_ros.estimator.frames_between import IntermediateFrame
     from rs_relpose_ros.estimator.result import RelativePose, Status
-    from rs_relpose_ros.estimator.warm_up import warm_up
-    from rs_relpose_ros.front_end.chosen_pairs import estimate_wide_pair, view_frame
-    from rs_relpose_ros.front_end.frame import Frame
-    from rs_relpose_ros.geometry.camera import RollingShutterCamera
-    from rs_relpose_ros.geometry.inertial import InertialMotion
-    from rs_relpose_ros.geometry.intrinsics import Intrinsics
-    from rs_relpose_ros.geometry.motion import FrameMotion
-    from rs_relpose_ros.imu.buffer import ImuBuffer
-    from rs_relpose_ros.imu.samples import ImuSample
-    from rs_relpose_ros.messages.pose_chain import PoseChain
-    from rs_relpose_ros.messages.published_pair import PairSynchronizer
+    from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
+    from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
+    from rs_relpose_ros.imu.buffer import ImuBuffer, ImuSample
+    from rs_relpose_ros.messages.published_pair import PairSynchronizer, PoseChain
+    from rs_relpose_ros.pipeline.chosen_pairs import estimate_wide_pair, view_frame
+    from rs_relpose_ros.pipeline.pair import Frame
+    from rs_relpose_ros.pipeline.warm_up import warm_up
 
 __all__ = ['EstimatorConfig', 'Frame', 'FrameMotion', 'ImuBuffer', 'ImuSample', 'InertialMotion',
-           'InputError', 'Intrinsics', 'MissingInputError', 'PairSynchronizer', 'Parameters',
-           'PoseChain', 'RelativePose', 'RollingShutterCamera', 'RsRelposeError', 'Status',
-           'estimate_relative_pose', 'estimate_wide_pair', 'view_frame', 'warm_up']
+           'InputError', 'IntermediateFrame', 'Intrinsics', 'MissingInputError',
+           'PairSynchronizer', 'Parameters', 'PoseChain', 'RelativePose', 'RollingShutterCamera',
+           'RsRelposeError', 'Status', 'estimate_relative_pose', 'estimate_wide_pair',
+           'view_frame', 'warm_up']
 
 _HOMES = {
-    'EstimatorConfig': 'config.estimator', 'Frame': 'front_end.frame',
-    'FrameMotion': 'geometry.motion', 'ImuBuffer': 'imu.buffer', 'ImuSample': 'imu.samples',
-    'InertialMotion': 'geometry.inertial', 'InputError': 'errors',
-    'Intrinsics': 'geometry.intrinsics', 'MissingInputError': 'errors',
-    'PairSynchronizer': 'messages.published_pair', 'Parameters': 'config.parameters',
-    'PoseChain': 'messages.pose_chain', 'RelativePose': 'estimator.result',
+    'EstimatorConfig': 'config.settings', 'Frame': 'pipeline.pair',
+    'FrameMotion': 'geometry.motion', 'ImuBuffer': 'imu.buffer', 'ImuSample': 'imu.buffer',
+    'InertialMotion': 'geometry.motion', 'InputError': 'errors',
+    'IntermediateFrame': 'estimator.frames_between',
+    'Intrinsics': 'geometry.camera', 'MissingInputError': 'errors',
+    'PairSynchronizer': 'messages.published_pair', 'Parameters': 'config.settings',
+    'PoseChain': 'messages.published_pair', 'RelativePose': 'estimator.result',
     'RollingShutterCamera': 'geometry.camera', 'RsRelposeError': 'errors',
     'Status': 'estimator.result', 'estimate_relative_pose': 'estimator.estimate',
-    'estimate_wide_pair': 'front_end.chosen_pairs', 'view_frame': 'front_end.chosen_pairs',
-    'warm_up': 'estimator.warm_up',
+    'estimate_wide_pair': 'pipeline.chosen_pairs', 'view_frame': 'pipeline.chosen_pairs',
+    'warm_up': 'pipeline.warm_up',
 }
 
 logging.getLogger(__name__).addHandler(logging.NullHandler())

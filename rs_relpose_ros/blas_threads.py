@@ -1,8 +1,7 @@
-"""One thread for linear algebra, where the process is ours.
+"""One thread for linear algebra in the processes of this package.
 
-No matrix of an estimate has more than some tens of rows: a second thread finishes none sooner.
-Those of OpenBLAS wait for work without sleeping, on the core that the camera driver and the
-threads of DDS need (figures: docs/lab/node.md).
+Matrices of an estimate have some tens of rows: more threads do not help. Idle threads of OpenBLAS
+wait without sleeping on the cores of camera driver and DDS (measured in docs/lab/node.md).
 """
 
 from __future__ import annotations
@@ -11,6 +10,6 @@ import os
 
 
 def use_one_blas_thread() -> None:
-    """Call it before NumPy is imported; whoever has set a number keeps it."""
+    """Call it before NumPy is imported; a number that the user has set is kept."""
     for library in ('OPENBLAS', 'MKL'):
         os.environ.setdefault(f'{library}_NUM_THREADS', '1')

@@ -1,4 +1,4 @@
-"""Exceptions of the package: one root, so that a caller can catch all of them at once."""
+"""Exceptions of the package, with one root class."""
 
 
 class RsRelposeError(Exception):
@@ -6,8 +6,8 @@ class RsRelposeError(Exception):
 
 
 class InputError(RsRelposeError, ValueError):
-    """A value, file or message that cannot be used; the text says what is legal and what came."""
+    """An unusable value, file or message; the text has what is legal and what was given."""
 
 
 class MissingInputError(RsRelposeError):
-    """Something that the work needs is absent (a topic, a calibration, the read-out time)."""
+    """A required input is absent (a topic, a calibration, the readout time)."""

@@ -11,7 +11,6 @@ import time
 from typing import Any
 
 import rclpy
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Image
 
@@ -40,24 +39,16 @@ def receive(node: Any, count: int) -> None:
     # As they come from the wire: what Python makes of them is another matter.
     node.create_subscription(Image, TOPIC, lambda raw: received.append(raw[4:8]),
                              qos_profile_sensor_data, raw=True)
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
     print('ready', flush=True)
     deadline = time.monotonic() + PATIENCE
     last = (count - 1).to_bytes(4, 'little')
     while last not in received and time.monotonic() < deadline:
-        executor.spin_once(timeout_sec=0.2)
+        rclpy.spin_once(node, timeout_sec=0.2)
     print(f'received {len(set(received))}', flush=True)
 
 
-def main() -> None:
+if __name__ == '__main__':
     rclpy.init()
     role, count = sys.argv[1], int(sys.argv[2])
-    node = rclpy.create_node(f'big_images_{role}')
-    (send if role == 'send' else receive)(node, count)
-    node.destroy_node()
+    (send if role == 'send' else receive)(rclpy.create_node(f'big_images_{role}'), count)
     rclpy.shutdown()
-
-
-if __name__ == '__main__':
-    main()

@@ -2,17 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+import csv
 import os
 from pathlib import Path
 import sys
 
+from hypothesis import HealthCheck, settings
 import pytest
 
 from rs_relpose_lab.live.graph import private_domain
+from rs_relpose_ros.cli import main as command_line
 
 ROOT = Path(__file__).resolve().parent.parent
 BUNDLED_PARAMETERS = ROOT / 'bags' / 'hand_held.yaml'
+
+# The same examples in every run; the first one may compile kernels.
+settings.register_profile('repeatable', derandomize=True, deadline=None, database=None,
+                          suppress_health_check=[HealthCheck.too_slow,
+                                                 HealthCheck.data_too_large])
+settings.load_profile('repeatable')
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    """Rows of a table, by the names of its columns."""
+    with path.open(newline='') as file:
+        return list(csv.DictReader(file))
+
 
 # For a bare `pytest` as well as for `make test`, and inherited by the processes that tests start.
 os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)
@@ -46,7 +62,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.path not in live)
 
 
-def _recordings() -> Path:
+def recordings_folder() -> Path:
     """Folder of the recorded data; skips the test where none is given, fails where it is gone."""
     folder = os.environ.get('RS_RELPOSE_DATA')
     if not folder:
@@ -58,13 +74,13 @@ def _recordings() -> Path:
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     if item.get_closest_marker('recordings'):
-        _recordings()
+        recordings_folder()
 
 
 @pytest.fixture(scope='session')
 def recordings() -> Path:
     """Folder of the recorded data (RS_RELPOSE_DATA)."""
-    return _recordings()
+    return recordings_folder()
 
 
 @pytest.fixture(scope='session')
@@ -73,6 +89,17 @@ def bundled_bag() -> Path:
     bag = ROOT / 'bags' / 'hand_held'
     assert (bag / 'metadata.yaml').is_file(), f'{bag} is no rosbag2 directory'
     return bag
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., None]:
+    """Runs a command line that is refused: exit code 2, and one line with these words."""
+    def run(words: str, *arguments: object) -> None:
+        assert command_line.main([str(argument) for argument in arguments]) == 2
+        error = capsys.readouterr().err
+        assert error.startswith('rs_relpose: error: ') and error.count('\n') == 1
+        assert words in error
+    return run
 
 
 @pytest.fixture

@@ -1,11 +1,12 @@
-"""A sensor stream with faults in it: phases of a bag, each good, then faulty, then good again."""
+"""A sensor stream with faults: phases of a bag, each good, then faulty, then good again."""
 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 import copy
 from dataclasses import dataclass
+import itertools
 from pathlib import Path
 import time
 from typing import Any
@@ -16,18 +17,26 @@ import rclpy.serialization
 from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 
-from rs_relpose_ros.bags.layout import CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMU_TOPIC, RAW_TOPIC
+from rs_relpose_lab.live.graph import Graph
+from rs_relpose_ros.bags.reader import CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMU_TOPIC, RAW_TOPIC
 from rs_relpose_ros.messages.incoming import stamp_ns
 
 SECOND = 10**9
 # Topics of the node -> those of the bag.
+TOPIC_OF = {Image: RAW_TOPIC, CameraInfo: CAMERA_INFO_TOPIC, Imu: IMU_TOPIC}
 BAG_TOPICS = {'image': RAW_TOPIC, 'camera_info': CAMERA_INFO_TOPIC, 'imu': IMU_TOPIC}
 _TYPES = {IMU_TOPIC: Imu, CAMERA_INFO_TOPIC: CameraInfo, COMPRESSED_TOPIC: CompressedImage}
 
-# Of a phase [s]: when its fault begins and ends, and how much of the bag it plays.
-FAULT_FROM, FAULT_UNTIL, PHASE = 0.25, 0.65, 1.55
-# Between two phases, on all clocks [s].
-PAUSE = 0.15
+# Of a phase [s]: begin and end of its fault, longest duration, and pause before the next one.
+FAULT_FROM, FAULT_UNTIL, PHASE, PAUSE = 0.25, 0.65, 1.55, 0.15
+# The nodes go by stamps: phases are played faster than in real time.
+FASTER = 2.0
+
+
+def reliable(*topics: str) -> dict[str, str]:
+    """For tests that count or compare all messages: a busy machine loses those of best effort."""
+    return {f'qos_overrides.{topic}.subscription.reliability': 'reliable' for topic in topics}
+
 
 # A message and its time [s] in the phase -> what is sent instead, with delays [s].
 Edit = Callable[[Any, float], Iterable[tuple[float, Any]]]
@@ -35,10 +44,10 @@ Edit = Callable[[Any, float], Iterable[tuple[float, Any]]]
 
 @dataclass(frozen=True)
 class Fault:
-    """What is done to the messages of a phase while it lasts.
+    """Fault of the messages of a phase.
 
-    It begins at `begin` [s] of the phase. `jump` is added to all stamps [s] from its beginning on,
-    `said` must be logged.
+    It begins at `begin` [s] of the phase; `jump` [s] is added to all stamps from there on, `said`
+    must be logged.
     """
 
     name: str
@@ -50,65 +59,87 @@ class Fault:
 
 @dataclass(frozen=True)
 class Sent:
-    """A message to send at `time_ns` of the whole stream."""
+    """A message to send at `time_ns` of its phase, made from an image of `taken_ns` in the bag."""
 
     time_ns: int
-    phase: int
+    taken_ns: int
+    stamp_ns: int   # without the fault
     message: Any
 
 
 class Stream:
-    """All phases in a row.
-
-    Attributes
-    ----------
-    sent : list of Sent
-    taken_at : dict
-        Stamp of an image as sent -> the instant of the bag at which it was taken; None where two
-        images of different instants carry the same stamp.
-    phase_of : dict
-        Stamp of an image as sent -> its phase.
-    good : list of (int, int)
-        Of each phase the stamps between which all is good again.
-    """
+    """Plays phases of a bag's beginning, each good, then faulty, then good again."""
 
     def __init__(self, messages: list[tuple[int, Any]], faults: list[Fault],
                  first_stamp_ns: int) -> None:
-        self.sent: list[Sent] = []
+        self.bag_start_ns, first = messages[0]
+        # Of an image by its stamp as sent: stamp in the bag (None if of two images), and phase.
         self.taken_at: dict[int, int | None] = {}
         self.phase_of: dict[int, int] = {}
+        # For each phase the stamps between which the data are good again.
         self.good: list[tuple[int, int]] = []
-        bag_start_ns, bag_first_stamp_ns = messages[0][0], stamp_of(messages[0][1])
-        self.bag_start_ns = bag_start_ns
-        later_ns = first_stamp_ns - bag_first_stamp_ns
-        start_ns = 0
-        for phase, fault in enumerate(faults):
-            for bag_time_ns, message in messages:
-                seconds = (bag_time_ns - bag_start_ns) / SECOND
-                if seconds > PHASE:
+        self._faults = faults
+        self._bag_first_ns = stamp_of(first)
+        self._later_ns = self._first_later_ns = first_stamp_ns - stamp_of(first)
+        self._phases = [self._phase(messages, fault) for fault in faults]
+
+    def _phase(self, messages: list[tuple[int, Any]], fault: Fault) -> list[Sent]:
+        sent = []
+        for bag_time_ns, message in messages:
+            time_ns = bag_time_ns - self.bag_start_ns
+            seconds = time_ns / SECOND
+            if seconds > PHASE:
+                break
+            taken_ns = stamp_of(message)
+            out = with_stamp(message, taken_ns + round(
+                fault.jump * SECOND if seconds >= fault.begin else 0))
+            faulty = fault.begin <= seconds < FAULT_UNTIL
+            sent += [Sent(time_ns + round(delay * SECOND), taken_ns, stamp_of(out), item)
+                     for delay, item in (fault.edit(out, seconds) if faulty else [(0.0, out)])]
+        return sorted(sent, key=lambda item: item.time_ns)
+
+    def rewind(self) -> None:
+        """The next phase has the first stamps again."""
+        self._later_ns = self._first_later_ns
+
+    def play(self, publish: Callable[[int, Any], object], results: list[Any],
+             phases: range | None = None, enough: int = 2) -> None:
+        """Publish (number of the phase, message) of some phases, all by default.
+
+        A phase ends once there are `enough` results with stamps of its good end.
+        """
+        for phase in range(len(self._phases)) if phases is None else phases:
+            jump_ns, before = round(self._faults[phase].jump * SECOND), len(results)
+            begin_ns = (self._bag_first_ns + self._later_ns + jump_ns
+                        + round(FAULT_UNTIL * SECOND))
+            # Delayed messages come later than the fault ends.
+            faulty_ns = max(item.time_ns for item in self._phases[phase] if item.taken_ns
+                            < self._bag_first_ns + FAULT_UNTIL * SECOND)
+            started, last_ns = time.monotonic(), 0
+            for item in self._phases[phase]:
+                if item.time_ns > faulty_ns and sum(
+                        begin_ns <= stamp_of(result) <= begin_ns + SECOND
+                        for result in results[before:]) >= enough:
                     break
-                out = with_stamp(message, stamp_of(message) + later_ns + round(
-                    fault.jump * SECOND if seconds >= fault.begin else 0))
-                if isinstance(out, Image):
-                    self.phase_of[stamp_of(out)] = phase
-                    known = self.taken_at.setdefault(stamp_of(out), stamp_of(message))
-                    if known != stamp_of(message):
-                        self.taken_at[stamp_of(out)] = None
-                faulty = fault.begin <= seconds < FAULT_UNTIL
-                for delay, item in (fault.edit(out, seconds) if faulty else [(0.0, out)]):
-                    self.sent.append(Sent(start_ns + bag_time_ns - bag_start_ns
-                                          + round(delay * SECOND), phase, item))
-            begin_ns = bag_first_stamp_ns + later_ns + round(fault.jump * SECOND)
-            self.good.append((begin_ns + round(FAULT_UNTIL * SECOND),
-                              begin_ns + round(PHASE * SECOND)))
-            start_ns += round((PHASE + PAUSE) * SECOND)
-            later_ns += round((PHASE + PAUSE + fault.jump) * SECOND)
-        self.sent.sort(key=lambda sent: sent.time_ns)
+                last_ns = item.time_ns
+                delay = started + last_ns / SECOND / FASTER - time.monotonic()
+                if delay > 0.0:
+                    time.sleep(delay)
+                if isinstance(item.message, Image):
+                    stamp = item.stamp_ns + self._later_ns
+                    self.phase_of[stamp] = phase
+                    if self.taken_at.setdefault(stamp, item.taken_ns) != item.taken_ns:
+                        self.taken_at[stamp] = None
+                publish(phase, with_stamp(item.message, stamp_of(item.message) + self._later_ns))
+            self.good.append((begin_ns, begin_ns + last_ns - round(FAULT_UNTIL * SECOND)))
+            self._later_ns += last_ns + round(PAUSE * SECOND) + jump_ns
+            time.sleep(PAUSE / FASTER)
 
 
-def read_messages(bag: Path, seconds: float) -> list[tuple[int, Any]]:
-    """Bag time [ns] and message of the bag's first seconds, images decoded."""
+def read_messages(bag: Path, seconds: float, every: int = 1) -> list[tuple[int, Any]]:
+    """Bag time [ns] and message of the bag's first seconds; only `every`-th image, decoded."""
     messages: list[tuple[int, Any]] = []
+    images = itertools.count()
     with AnyReader([bag]) as reader:
         connections = [c for c in reader.connections if c.topic in _TYPES]
         for connection, bag_time_ns, raw in reader.messages(connections):
@@ -117,6 +148,8 @@ def read_messages(bag: Path, seconds: float) -> list[tuple[int, Any]]:
             message = rclpy.serialization.deserialize_message(
                 bytes(raw), _TYPES[connection.topic])
             if isinstance(message, CompressedImage):
+                if next(images) % every:
+                    continue
                 pixels = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_GRAYSCALE)
                 message = gray_image(message.header, pixels)
             messages.append((bag_time_ns, message))
@@ -132,6 +165,22 @@ def publish_in_time(messages: Iterable[tuple[Any, int, Any]]) -> None:
         if delay > 0.0:
             time.sleep(delay)
         publisher.publish(message)
+
+
+def drivers(graph: Graph, *kinds: type, namespace: str = '',
+            best_effort: Collection[type] = ()) -> dict[type, Any]:
+    """Subscribed publishers of a camera and an IMU by type of message, all by default."""
+    return {kind: graph.publisher(kind, namespace + topic, kind in best_effort)
+            for kind, topic in TOPIC_OF.items() if kind in (kinds or TOPIC_OF)}
+
+
+def play(publishers: dict[type, Any], messages: list[tuple[int, Any]],
+         later: float = 0.0) -> None:
+    """Publish at bag time the messages that have a publisher, their stamps `later` [s]."""
+    publish_in_time(
+        (publishers[type(message)], bag_time_ns,
+         with_stamp(message, stamp_of(message) + round(later * SECOND)))
+        for bag_time_ns, message in messages if type(message) in publishers)
 
 
 def gray_image(header: Any, pixels: np.ndarray) -> Image:

@@ -1,13 +1,15 @@
-"""Messages for tests, of rclpy's classes or of those of rosbags."""
+"""Messages for tests, of rclpy's classes or of those of rosbags; and damage to them."""
 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+import copy
 from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 from rosbags.typesys import get_typestore, Stores
 
 Types = Callable[[str], Any]
@@ -19,8 +21,20 @@ def rosbags_types(name: str) -> Any:
 
 
 def rclpy_types(name: str) -> Any:
-    from rs_relpose_ros.node.message_types import message_class
+    from rs_relpose_ros.nodes.inputs import message_class
     return message_class(name)
+
+
+both_types = pytest.mark.parametrize('types', [rclpy_types, rosbags_types],
+                                     ids=['rclpy', 'rosbags'])
+
+
+def serialized(message: Any) -> bytes:
+    """CDR of a message of either kind."""
+    if hasattr(message, '__msgtype__'):
+        return bytes(TYPESTORE.serialize_cdr(message, message.__msgtype__))
+    from rclpy.serialization import serialize_message
+    return bytes(serialize_message(message))
 
 
 def byte_data(types: Types, data: bytes) -> Any:
@@ -89,3 +103,96 @@ def imu(types: Types, stamp_ns: int, gyro: tuple[float, float, float] = (0.1, 0.
         angular_velocity_covariance=block(gyro_covariance),
         linear_acceleration=vector(accelerometer),
         linear_acceleration_covariance=block(accelerometer_covariance))
+
+
+# --- damage to bytes and messages, described by numbers: an edit is place, way and value
+
+# Each number of an edit is below this one; a place is a share of it.
+WHOLE = 1 << 16
+Edit = Sequence[int]
+
+INTEGERS = (0, 1, -1, 2, 3, 7, 0xff, 0x7fff, 0xffff, 2**31 - 1, -2**31, 2**32 - 1,
+            16384, 16385)   # no field has more than 32 bits
+FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-320, 1e308, -1e308, float('nan'), float('inf'), float('-inf'))
+STRINGS = ('', '\0', 'mono8', 'MONO8', 'bgr8', 'mono16', 'plumb_bob', 'fisheye', 'x' * 100_000,
+           'äöü\u202e', '%s%n{0}', '../../etc/passwd')
+
+
+def _at(place: int, length: int) -> int:
+    """An index up to `length`; small numbers, which Hypothesis prefers, are spread as well."""
+    return place * 40_503 % WHOLE * length // WHOLE
+
+
+def random_edits(rng: np.random.Generator) -> list[Edit]:
+    return rng.integers(0, WHOLE, (int(rng.integers(1, 5)), 3)).tolist()
+
+
+def damaged(data: bytes, edits: Sequence[Edit]) -> bytes:
+    """`data` with places flipped, overwritten, cut out or repeated."""
+    out = bytearray(data)
+    for place, way, value in edits:
+        at = _at(place, len(out) + 1)
+        kind, size = way % 6, 1 + way % 63
+        if kind == 0 and at < len(out):
+            out[at] ^= 1 << value % 8
+        elif kind == 1:
+            out[at:at + 1 + way % 8] = value.to_bytes(2, 'little') * (1 + way % 4)
+        elif kind == 2:
+            width = 4 + 4 * (way % 2)
+            number = INTEGERS[value % len(INTEGERS)] & (2**(8 * width) - 1)
+            out[at:at + width] = number.to_bytes(width, 'little')
+        elif kind == 3:
+            del out[at:at + size]
+        elif kind == 4:
+            source = _at(value, len(out) + 1)
+            out[at:at] = out[source:source + size]
+        elif value % 3 == 0:
+            del out[at:]
+    return bytes(out)
+
+
+def with_other_fields(message: Any, edits: Sequence[Edit]) -> Any:
+    """A message some of whose fields have other values that their types allow."""
+    message = copy.deepcopy(message)
+    for place, way, value in edits:
+        fields = list(_fields(message))
+        owner, name = fields[_at(place, len(fields))]
+        old = getattr(owner, name)
+        if isinstance(old, bool):
+            new: Any = not old
+        elif isinstance(old, int):
+            new = INTEGERS[value % len(INTEGERS)]
+        elif isinstance(old, float):
+            new = FLOATS[value % len(FLOATS)]
+        elif isinstance(old, str):
+            new = STRINGS[value % len(STRINGS)]
+        else:
+            fixed = name in ('k', 'r', 'p') or name.endswith('covariance')
+            new = _other_array(old, 0 if fixed else way % 4, value)
+        setattr(owner, name, new)
+    return message
+
+
+def _fields(message: Any) -> Iterator[tuple[Any, str]]:
+    for name, value in vars(message).items():
+        if hasattr(value, '__msgtype__'):
+            yield from _fields(value)
+        elif name != '__msgtype__':
+            yield message, name
+
+
+def _other_array(values: np.ndarray, way: int, value: int) -> np.ndarray:
+    """Other values, or another length."""
+    place = _at(value, len(values))
+    if way == 0 and len(values):
+        values = values.copy()
+        if values.dtype == np.uint8:
+            values[place:place + 8] = value % 256
+        else:
+            values[place] = FLOATS[value % len(FLOATS)]
+        return values
+    if way == 1:
+        return values[:place]
+    if way == 2:
+        return np.concatenate([values, values])
+    return np.zeros((0, 1, 9, 65, 1000)[value % 5], dtype=values.dtype)

@@ -1,4 +1,4 @@
-"""Pairs of a camera that flies through points, exact: SciPy, none of the package's geometry."""
+"""Estimates of `two_view_scene`; pairs of a camera that flies through points, exact, by SciPy."""
 
 from __future__ import annotations
 
@@ -8,23 +8,38 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-import two_view_scene
+import two_view_scene as scenes
+from two_view_scene import CENTRE, FOCAL
 
-from rs_relpose_ros.estimator.landmarks import Landmarks, landmarks
-from rs_relpose_ros.estimator.result import RelativePose, Status
-from rs_relpose_ros.front_end.derotated_rays import Sensor
-from rs_relpose_ros.front_end.pair import PairResult
-from rs_relpose_ros.geometry.intrinsics import Intrinsics
-from rs_relpose_ros.tracking.matches import Matches
+from rs_relpose_ros import estimate_relative_pose, FrameMotion, RollingShutterCamera
+from rs_relpose_ros.estimator.result import Landmarks, landmarks, RelativePose, Status
+from rs_relpose_ros.geometry.camera import Intrinsics
+from rs_relpose_ros.geometry.timing import ImageClock, Sensor
+from rs_relpose_ros.pipeline.pair import PairResult
+from rs_relpose_ros.tracking.features import Matches
+
+SCENE_CAMERA = {
+    'width': scenes.WIDTH, 'height': scenes.HEIGHT, 'fx': FOCAL, 'fy': FOCAL, 'cx': CENTRE[0],
+    'cy': CENTRE[1], 'readout_time': scenes.HEIGHT * scenes.LINE_DELAY}
+
+
+def estimate_scene(scene, config, gravity=True, camera=(), **arguments):
+    """`camera`: what differs from the camera of the scene."""
+    return estimate_relative_pose(
+        scene.points1, scene.points2, RollingShutterCamera(**SCENE_CAMERA | dict(camera)),
+        FrameMotion(scene.measured_rate1, scene.measured_gravity1 if gravity else None),
+        FrameMotion(scene.measured_rate2, scene.measured_gravity2 if gravity else None),
+        config=config, **arguments)
+
 
 VELOCITY = np.array([0.8, -0.3, 1.5])   # m/s, in the world
 # Of the keyframes [s]: unequal, so that each baseline is of another length.
 TIMES = (0.0, 0.2, 0.5, 0.6, 1.0)
-# Pinhole of the scene; what is seen outside of the image counts as well.
-_INTRINSICS = Intrinsics(
-    width=1920, height=1080, image_width=1920, image_height=1080, fx=two_view_scene.FOCAL,
-    fy=two_view_scene.FOCAL, cx=two_view_scene.CENTRE[0], cy=two_view_scene.CENTRE[1])
-SENSOR = Sensor(_INTRINSICS.global_shutter_camera(), _INTRINSICS)
+# Pinhole of the scene; points outside of the image count as well.
+_INTRINSICS = Intrinsics(image_width=1920, image_height=1080, **{
+    key: value for key, value in SCENE_CAMERA.items() if key != 'readout_time'})
+_CAMERA = _INTRINSICS.global_shutter_camera()
+SENSOR = Sensor(_CAMERA, _INTRINSICS, ImageClock(_CAMERA))
 START_NS = 1_700_000_000_900_000_000
 
 
@@ -36,41 +51,37 @@ class Flight:
     positions: NDArray[np.float64]
     R: list[NDArray[np.float64]]
     baselines: NDArray[np.float64]
-    # Of the matches of each pair: pixels that global shutters would see, points in the reference
+    # Of the matches of each pair: equivalent global-shutter pixels, points in the reference
     # camera [m].
     true_landmarks: list[Landmarks]
 
 
 @dataclass(frozen=True)
 class View:
-    """What a keyframe sees of each point: its row time, distance [m], and derotated unit ray."""
+    """Observations of each point in a keyframe: pixels, row time, derotated unit ray."""
 
     rotation: Rotation
     position: NDArray[np.float64]
     angular_velocity: NDArray[np.float64]
+    velocity: NDArray[np.float64]
     pixels: NDArray[np.float64]
     tau: NDArray[np.float64]
-    distances: NDArray[np.float64]
     rays: NDArray[np.float64]
     points: NDArray[np.float64]   # in the camera as it is at row time 0 [m]
 
-    @property
-    def pixels_at_once(self) -> NDArray[np.float64]:
-        """Where a global shutter would see the points at row time 0."""
-        return (two_view_scene.FOCAL * self.points[:, :2] / self.points[:, 2:]
-                + two_view_scene.CENTRE)
+
+def projected(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    return FOCAL * points[:, :2] / points[:, 2:] + CENTRE
 
 
 def view(world: NDArray[np.float64], time: float, rng: np.random.Generator) -> View:
     rotation = Rotation.from_rotvec(rng.normal(size=3) * 0.1)
-    position, w = time * VELOCITY, rng.normal(size=3)
-    v = rotation.inv().apply(VELOCITY)
-    local, tau, settled = two_view_scene.expose(world, rotation, position, w, v, 0.0, 60)
+    position, w, v = time * VELOCITY, rng.normal(size=3), rotation.inv().apply(VELOCITY)
+    local, tau, settled = scenes.expose(world, rotation, position, w, v, 0.0, 60)
     assert settled.all()
-    distances = np.linalg.norm(local, axis=1)
-    rays = Rotation.from_rotvec(tau[:, None] * w).apply(local / distances[:, None])
-    pixels = two_view_scene.FOCAL * local[:, :2] / local[:, 2:] + two_view_scene.CENTRE
-    return View(rotation, position, w, pixels, tau, distances, rays,
+    rays = Rotation.from_rotvec(tau[:, None] * w).apply(
+        local / np.linalg.norm(local, axis=1, keepdims=True))
+    return View(rotation, position, w, v, projected(local), tau, rays,
                 rotation.inv().apply(world - position))
 
 
@@ -79,8 +90,8 @@ def simulated_flight(seed: int, points: int = 120,
                      places: Sequence[float] = TIMES) -> Flight:
     """`tracks`: which points are matched, for each pair; all of them by default.
 
-    `places`: at which time's place each keyframe is [s]; where it is that of the keyframe before,
-    the pair is a pure rotation.
+    `places`: time of the position of each keyframe [s]; a pair with equal times is a pure
+    rotation.
     """
     rng = np.random.default_rng(seed)
     world = rng.uniform([-4.0, -2.0, 6.0], [4.0, 2.0, 20.0], (points, 3))
@@ -91,33 +102,26 @@ def simulated_flight(seed: int, points: int = 120,
         t = a.rotation.inv().apply(b.position - a.position)
         length = float(np.linalg.norm(t))
         baselines.append(length)
-        # Shuffled: only the ids tell what belongs together.
+        # Shuffled: only the ids identify the tracks.
         use = rng.permutation(use)
         pose = RelativePose(
             status=Status.OK, R=(a.rotation.inv() * b.rotation).as_matrix(),
             angular_velocity2=b.angular_velocity, inliers=np.ones(len(use), dtype=bool),
             covariance=1e-6 * np.eye(6), velocity_covariance=1e-4 * np.eye(6), model='uniform')
         if length > 0.0:
-            pose = replace(pose, t=t / length,
-                           linear_velocity1=a.rotation.inv().apply(VELOCITY) / length,
-                           linear_velocity2=b.rotation.inv().apply(VELOCITY) / length)
+            pose = replace(pose, t=t / length, linear_velocity1=a.velocity / length,
+                           linear_velocity2=b.velocity / length)
         else:
             pose = pose.without_translation(Status.PURE_ROTATION, 'no translation')
         matches = Matches(use.astype(np.uint32) + 7, a.pixels[use], b.pixels[use],
                           np.ones(len(use)))
-        true_landmarks.append(Landmarks(a.pixels_at_once[use], b.pixels_at_once[use],
-                                        a.points[use]))
+        truth = Landmarks(projected(a.points[use]), projected(b.points[use]), a.points[use])
+        true_landmarks.append(truth)
+        rows = a.rays[use], b.rays[use], a.tau[use], b.tau[use]
+        stamps = [START_NS + round(1e9 * time) for time in TIMES[k:k + 2]]
         pairs.append(PairResult(
-            reference_stamp_ns=START_NS + round(1e9 * TIMES[k]),
-            stamp_ns=START_NS + round(1e9 * TIMES[k + 1]),
-            reference_ns1=START_NS + round(1e9 * TIMES[k]),
-            reference_ns2=START_NS + round(1e9 * TIMES[k + 1]), frame_id='camera',
-            interval=TIMES[k + 1] - TIMES[k], pose=pose,
-            matches=matches, landmarks=landmarks(
-                pose, a.rays[use], b.rays[use], a.tau[use], b.tau[use],
-                SENSOR.camera) if pose else None,
-            row_times1=a.tau[use], row_times2=b.tau[use], rays1=a.rays[use], rays2=b.rays[use],
-            parallax=10.0))
+            *stamps, *stamps, 'camera', TIMES[k + 1] - TIMES[k], pose, matches, *rows[2:],
+            *rows[:2], 10.0, landmarks(pose, *rows, SENSOR.camera) if pose else None))
     positions = np.array([first.rotation.inv().apply(v.position - first.position) for v in views])
     return Flight(pairs, positions, [(first.rotation.inv() * v.rotation).as_matrix()
                                      for v in views], np.array(baselines), true_landmarks)

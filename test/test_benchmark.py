@@ -1,41 +1,53 @@
-"""The benchmarks: their statistics, their reports, and the methods that they compare."""
+"""The benchmarks: one smoke run each, their statistics, the demo's comparison."""
+
+from __future__ import annotations
 
 import csv
 from dataclasses import replace
-from operator import attrgetter
+import re
+import subprocess
+import sys
 
+from conftest import BUNDLED_PARAMETERS, ROOT, rows_of
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+from two_view_scene import rotation_error
 
 from rs_relpose_lab.cli.benchmark import matching_cells
-from rs_relpose_lab.experiments import accuracy, accuracy_report, speed_report
-from rs_relpose_lab.experiments.accuracy import AccuracyRun, OracleCache, run_accuracy, Trial
-from rs_relpose_lab.experiments.accuracy_report import cell_statistics, consistency, summary
-from rs_relpose_lab.experiments.methods import as_pair, METHODS, prepared, run_method
+from rs_relpose_lab.experiments import accuracy, comparison, methods, speed
+from rs_relpose_lab.experiments import consistency as pair_errors
+from rs_relpose_lab.experiments.accuracy import Trial
+from rs_relpose_lab.experiments.comparison import Score
+from rs_relpose_lab.experiments.harness import grouped
+from rs_relpose_lab.experiments.methods import METHODS
 from rs_relpose_lab.experiments.problems import Cell, CELLS, make_problem
 from rs_relpose_lab.experiments.scoring import NO_POSE, PoseError
-from rs_relpose_lab.experiments.speed import (
-    compare,
-    COMPARED,
-    exponent,
-    LIBRARY,
-    medians,
-    REFERENCE,
-    soak,
-    Timing,
-)
-from rs_relpose_lab.experiments.speed_report import method_statistics, write_report
+from rs_relpose_lab.experiments.speed import LIBRARY, REFERENCE, Timing
+from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.cli.main import main
+from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.estimator.result import RelativePose, Status
+from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
+from rs_relpose_ros.offline import pictures
+from rs_relpose_ros.offline.replay import read_truth
+from rs_relpose_ros.offline.tables import PairRecord, POSES, table_writer
+from rs_relpose_ros.offline.truth import PairErrors, TrueTrajectory
+from rs_relpose_ros.pipeline.pair import PairResult
+from rs_relpose_ros.tracking.features import Matches
 
 STILL = Cell(speed=0.0, rate=0.0, pixel_noise=1e-2, gravity_noise=1e-3, gyro_noise=1e-3,
              outliers=0.2)
 
 
-def trial(seed, rotation, oracle_rotation, nees=5.0, mixture=NO_POSE):
-    error = NO_POSE if rotation is None else PoseError(rotation, 2.0 * rotation, nees)
+# -- accuracy ---------------------------------------------------------------------------------
+
+
+def trial(seed, rotation, oracle_rotation):
+    error = NO_POSE if rotation is None else PoseError(rotation, 2.0 * rotation, 5.0)
     return Trial('forward-base', 'paper', 1.0, seed, 'OK', error,
-                 PoseError(oracle_rotation, oracle_rotation, 5.0), mixture, 0.003)
+                 PoseError(oracle_rotation, oracle_rotation, 5.0), 0.003)
 
 
 def test_cells_are_selected_by_pattern():
@@ -46,130 +58,92 @@ def test_cells_are_selected_by_pattern():
         matching_cells(['backward-*'], CELLS)
 
 
-def test_ratios_are_of_medians_and_percentiles():
-    rng = np.random.default_rng(0)
-    errors = rng.uniform(0.1, 1.0, 101)
-    statistics = cell_statistics([trial(k, 3.0 * e, e) for k, e in enumerate(errors)])
-    assert statistics.rotation_ratio.median == pytest.approx(3.0)
-    assert statistics.rotation_ratio.p90 == pytest.approx(3.0)
-    assert statistics.translation_ratio.median == pytest.approx(6.0)
-    assert statistics.lost == 0
-    assert statistics.gross == (3.0 * errors > 2.0).sum()
-    assert statistics.duration == pytest.approx(3.0)
+def test_statistics_of_a_cell():
+    """Ratios of medians and percentiles; a lost pose is an infinite error without NEES."""
+    errors = np.random.default_rng(0).uniform(0.1, 1.0, 101)
+    complete = accuracy.cell_statistics([trial(k, 3.0 * e, e) for k, e in enumerate(errors)])
+    assert [complete.rotation_ratio.median, complete.rotation_ratio.p90,
+            complete.translation_ratio.median, complete.duration] == pytest.approx([3, 3, 6, 3])
+    assert (complete.lost, complete.gross) == (0, (3.0 * errors > 2.0).sum())
+    with_lost = accuracy.cell_statistics(
+        [trial(k, 0.1 if k < 8 else None, 0.1) for k in range(10)])
+    assert (with_lost.lost, with_lost.rotation.p90) == (2, np.inf)
+    assert [with_lost.rotation.median, with_lost.nees.mean] == pytest.approx([0.1, 1.0])
+    assert {name: value for name, value, _ in accuracy.summary([with_lost])}['lost poses'] == 2
 
 
-def test_the_oracle_without_labels_is_compared_where_it_was_asked():
-    name = "ratio of 90th percentiles of translation to the mixture oracle's, largest of a cell"
-    asked = cell_statistics([trial(k, 0.3, 0.1, mixture=PoseError(0.2, 0.4)) for k in range(5)])
-    others = cell_statistics([trial(k, 0.3, 0.1) for k in range(5)])
-    assert asked.mixture_ratio.p90 == pytest.approx(1.5)
-    for cells, expected in (([others], 0.0), ([others, asked], 1.5)):
-        figures = {name: figure for name, figure, _ in summary(cells)}
-        assert figures[name] == pytest.approx(expected)
-
-
-def test_a_lost_pose_is_an_infinite_error_and_has_no_nees():
-    trials = [trial(k, 0.1, 0.1) for k in range(8)] + [trial(k, None, 0.1) for k in range(8, 10)]
-    statistics = cell_statistics(trials)
-    assert statistics.lost == 2
-    assert statistics.rotation.median == pytest.approx(0.1)
-    assert statistics.rotation.p90 == np.inf
-    assert statistics.nees.mean == pytest.approx(1.0)
-    figures = {name: figure for name, figure, _ in summary([statistics])}
-    assert figures['lost poses'] == 2
-
-
-@pytest.mark.parametrize('overconfidence', [1.0, 2.0])
-def test_consistency_tells_right_from_overconfident(overconfidence):
+@pytest.mark.parametrize(('overconfidence', 'above'), [(1.0, 0.05), (2.0, 0.355)])
+def test_consistency_of_normalised_errors(overconfidence, above):
     nees = overconfidence * np.random.default_rng(1).chisquare(5, 20_000)
-    found = consistency(list(nees))
+    found = accuracy.consistency(list(nees))
     # Trimming one percent of a skewed distribution on each side lowers its mean by 2 %.
     assert found.mean == pytest.approx(0.98 * overconfidence, rel=0.02)
-    assert found.above == pytest.approx({1.0: 0.05, 2.0: 0.355}[overconfidence], abs=0.01)
+    assert found.above == pytest.approx(above, abs=0.01)
 
 
-@pytest.fixture(scope='module')
-def run(tmp_path_factory):
-    """Two problems of a cell, told right and double sigmas; the folder keeps the oracle."""
-    folder = tmp_path_factory.mktemp('oracle')
-    asked = AccuracyRun(('sideways-outliers-50',), ('gaussian',), (1.0, 2.0), trials=2)
-    counts = []
-    trials = run_accuracy(asked, OracleCache(folder), on_trials=counts.append)
-    assert sum(counts) == asked.estimates == len(trials) == 4
-    return asked, folder, trials
-
-
-def test_the_oracle_is_kept(run, monkeypatch):
-    asked, folder, trials = run
-    assert {(t.seed, t.sigma_factor) for t in trials} == {(0, 1.0), (0, 2.0), (1, 1.0), (1, 2.0)}
-    assert all(t.error.rotation < 0.5 for t in trials)
-
-    def forbidden(*args):
-        raise AssertionError('asked again')
-    monkeypatch.setattr(accuracy, 'oracle_estimate', forbidden)
-    monkeypatch.setattr(accuracy, 'mixture_estimate', forbidden)
-    again = run_accuracy(asked, OracleCache(folder))
-    assert ([(t.error, t.oracle, t.mixture) for t in again]
-            == [(t.error, t.oracle, t.mixture) for t in trials])
-    assert all(0.0 < t.mixture.translation < 20.0 for t in trials)
-
-
-def test_plot_of_accuracy_shows_the_statistics(run, tmp_path):
-    _, _, trials = run
-    cells = [cell_statistics([t for t in trials if t.sigma_factor == factor])
-             for factor in (1.0, 2.0)]
-    figure = accuracy_report.draw(tmp_path / 'accuracy.png', cells)
-    assert (tmp_path / 'accuracy.png').read_bytes().startswith(b'\x89PNG')
-    for axis, value in zip(figure.axes, ('rotation_ratio.median', 'translation_ratio.median',
-                                         'nees.mean'), strict=True):
-        shown = [line.get_xdata()[0] for line in axis.lines if line.get_marker() == 'o']
-        assert shown == [attrgetter(value)(cell) for cell in cells]
-    assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == [
-        'sideways-outliers-50']
-
-
-def test_command_writes_tables_and_a_plot(run, tmp_path, capsys):
-    _, oracle, trials = run
-    assert main(['benchmark', 'accuracy', '--trials', '2', '--cells', 'sideways-outliers-50',
-                 '--noise', 'gaussian', '--cache', str(oracle), '--output', str(tmp_path)]) == 0
+def test_accuracy_command(tmp_path, capsys, monkeypatch):
+    """Two problems with right and double sigmas; a second run uses the kept oracle."""
+    command = ['benchmark', 'accuracy', '--trials', '2', '--cells', 'sideways-outliers-50',
+               '--noise', 'gaussian', '--sigma-factor', '1', '2', '--output', str(tmp_path)]
+    assert main(command) == 0
     report = (tmp_path / 'accuracy.md').read_text()
     assert report in capsys.readouterr().out
-    statistics = cell_statistics([t for t in trials if t.sigma_factor == 1.0])
-    assert f'| sideways-outliers-50 | {statistics.rotation.text(3)} |' in report
-    with (tmp_path / 'trials.csv').open() as file:
-        assert [float(row['error_rotation']) for row in csv.DictReader(file)] == [
-            t.error.rotation for t in trials if t.sigma_factor == 1.0]
-    assert {path.name for path in tmp_path.iterdir()} == {
-        'accuracy.md', 'accuracy.png', 'trials.csv', 'cells.csv'}
+    assert report.count('| sideways-outliers-50 |') == 2
+    rows = rows_of(tmp_path / 'trials.csv')
+    assert {(row['seed'], row['sigma_factor']) for row in rows} == {
+        (seed, factor) for seed in '01' for factor in ('1.0', '2.0')}
+    assert all(float(row['error_rotation']) < 0.5 for row in rows)
+    monkeypatch.setattr(accuracy, 'oracle_estimate', lambda *args: pytest.fail('it runs again'))
+    assert main(command) == 0
+    assert [{**row, 'duration': ''} for row in rows_of(tmp_path / 'trials.csv')] == [
+        {**row, 'duration': ''} for row in rows]
 
 
-@pytest.mark.parametrize(('arguments', 'complaint'), [
+@pytest.mark.parametrize(('arguments', 'message'), [
     (['accuracy', '--cells', 'nowhere'], "no cell is named 'nowhere'"),
     (['accuracy', '--trials', '0'], '--trials must be at least 1, got 0'),
     (['accuracy', '--sigma-factor', '0'], '--sigma-factor must be positive'),
     (['speed', '--matches', '10'], '--matches must be at least 50'),
-])
-def test_bad_input_is_one_line(arguments, complaint, capsys, tmp_path):
+    (['consistency', '--bags', '0'], 'nothing to measure'),
+    (['consistency', '--exposure', '300'], 'exposure_time must be in [0, 0.2] s, got 0.3'),
+    (['consistency', '--compare'], '--compare needs a --recording'),
+    (['trust', '--rows', 'nonsense'], 'no cell is named'),
+    (['trust', '--seconds', '2'], '--seconds must be'),
+    (['trust', '--bags', '0'], 'nothing to measure'),
+    (['live', '--cells', '4k-*'], 'no cell is named'),
+    (['live', '--duration', '1'], '--duration must be at least 5')])
+def test_bad_input_is_one_line(arguments, message, capsys, tmp_path):
     assert main(['benchmark', *arguments, '--output', str(tmp_path)]) == 2
-    assert complaint in capsys.readouterr().err
+    assert message in capsys.readouterr().err
+
+
+def test_without_the_laboratory_its_commands_name_it(monkeypatch, capsys):
+    monkeypatch.setattr('importlib.util.find_spec', lambda name: None)
+    assert main(['benchmark', 'speed']) == 2
+    error = capsys.readouterr().err
+    assert 'benchmark needs the package rs_relpose_lab' in error and error.count('\n') == 1
+
+
+# -- methods and speed ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize('name', [name for name, m in METHODS.items() if not m.continuous_gyro])
 def test_every_method_answers_in_our_convention(name):
     # A camera at rest in each frame: a global shutter, on which all of them are right.
-    status, error = run_method(name, as_pair(make_problem(STILL, 1), STILL), 1)
+    status, error = methods.run_method(
+        name, methods.as_pair(make_problem(STILL, 1), STILL), 1)
     assert status.value == 'OK'
     assert error.rotation < 0.1
     assert error.translation < 0.5
 
 
 @pytest.mark.parametrize('name', ['opencv_derotated', 'poselib_derotated'])
-def test_derotated_points_make_a_turning_camera_a_global_shutter(name):
+def test_derotated_points_make_a_rotating_camera_a_global_shutter(name):
     cell = replace(STILL, rate=3.0)
-    pair = as_pair(make_problem(cell, 1), cell)
+    pair = methods.as_pair(make_problem(cell, 1), cell)
     if name not in METHODS:
         pytest.skip('PoseLib is not installed')
-    error, raw = (run_method(method, pair, 1)[1]
+    error, raw = (methods.run_method(method, pair, 1)[1]
                   for method in (name, name.removesuffix('_derotated')))
     assert error.rotation < 0.1 < 1.0 < raw.rotation
     assert error.translation < 0.5
@@ -177,56 +151,233 @@ def test_derotated_points_make_a_turning_camera_a_global_shutter(name):
 
 @pytest.mark.parametrize('seed', [60, 88, 89])
 def test_gravity_off_by_a_degree_does_not_end_the_search(seed):
-    # Angular hypotheses from gravity explain half of the matches of these problems, wrongly.
+    # Angular hypotheses from gravity are consistent with half of these matches, wrongly.
     cell = CELLS['sideways-gravity-1']
     problem = make_problem(cell, seed, 'gaussian')
-    pair = as_pair(problem, cell)
-    pose = prepared(METHODS['auto'], pair, seed)()
+    pair = methods.as_pair(problem, cell)
+    pose = methods.prepared(METHODS['auto'], pair, seed)()
     assert pair.error(pose).rotation < 0.3
     assert pose.inliers[~problem.is_outlier].mean() > 0.95
 
 
-def test_comparison_and_its_report(tmp_path):
-    timings = compare('forward-base', 100, trials=1, repeats=1)
-    assert [timing.method for timing in timings] == list(COMPARED)
+def test_speed_and_its_report(tmp_path):
+    timings = speed.compare('forward-base', 100, trials=1, repeats=1)
+    assert [timing.method for timing in timings] == list(speed.COMPARED)
     assert all(timing.matches == 100 and timing.duration > 0.0 for timing in timings)
-    report = write_report(tmp_path, timings, timings, [(50.0, 3.0)], soak(10))
-    statistics = {entry.method: entry for entry in method_statistics(timings)}
-    for name in COMPARED:
-        row = next(line for line in report.splitlines() if line.startswith(f'| {name} '))
-        assert [cell.strip() for cell in row.split('|')[2:6:2]] == [
-            statistics[name].time.text(2), statistics[name].rotation.text(3)]
+    report = speed.write_report(tmp_path, timings, timings, [(50.0, 3.0)], speed.soak(10))
+    for found in speed.method_statistics(timings):
+        assert re.search(rf'^\| {found.method} +\| +{found.time.text(2)} .*\| '
+                         rf'+{found.rotation.text(3)} \|', report, re.MULTILINE)
     assert 'First estimate 50 ms' in report
     assert 'after 10 estimates' in report
-    assert {path.name for path in tmp_path.iterdir()} == {
-        'runs.csv', 'methods.csv', 'scaling.csv', 'speed.md', 'speed.png'}
 
 
-def timings_of(method, factor):
-    """Five problems each, of times in proportion to the square of the number of matches."""
-    return [Timing('forward-base', n, method, seed, factor * n**2 * (1.0 + 0.1 * seed), 0.1, 0.1)
-            for n in (300, 1000, 3000) for seed in range(5)]
+def test_times_are_compared_problem_by_problem():
+    # Five problems each, of times in proportion to the square of the number of matches.
+    timings = [Timing('forward-base', n, method, seed, factor * n**2 * (1.0 + 0.1 * seed), 0.1,
+                      0.1) for method, factor in ((REFERENCE, 1e-3), (LIBRARY, 4e-4))
+               for n in (300, 1000, 3000) for seed in range(5)]
+    assert speed.medians(timings, REFERENCE)[1000] == pytest.approx(1200.0)
+    assert speed.exponent(speed.medians(timings, LIBRARY)) == pytest.approx(2.0)
+    assert {(entry.method, round(entry.time_ratio, 9))
+            for entry in speed.method_statistics(timings)} == {(REFERENCE, 1.0), (LIBRARY, 0.4)}
 
 
-def test_growth_is_the_slope_of_the_logarithms():
-    timings = timings_of(LIBRARY, 1e-3)
-    assert medians(timings, LIBRARY)[1000] == pytest.approx(1200.0)
-    assert exponent(medians(timings, LIBRARY)) == pytest.approx(2.0)
+# -- covariances ------------------------------------------------------------------------------
 
 
-def test_times_are_compared_problem_by_problem(tmp_path):
-    timings = [*timings_of(REFERENCE, 10.0), *timings_of(LIBRARY, 4.0)]
-    statistics = method_statistics(timings)
-    assert {(entry.method, round(entry.time_ratio, 9)) for entry in statistics} == {
-        (REFERENCE, 1.0), (LIBRARY, 0.4)}
-    _, right = speed_report.draw(tmp_path / 'speed.png', statistics, timings).axes
-    assert [(list(line.get_xdata()), list(line.get_ydata())) for line in right.lines] == [
-        (list(times), list(times.values()))
-        for times in (medians(timings, REFERENCE), medians(timings, LIBRARY))]
+@pytest.mark.parametrize('claimed', [1.0, 0.5])
+def test_nees_of_errors_drawn_from_a_covariance(claimed):
+    """NEES by freedom is 1 where the covariance is right, 4 where its sigmas are half of it."""
+    rng = np.random.default_rng(0)
+    t = np.array([0.6, 0.0, 0.8])
+    across = np.eye(3) - np.outer(t, t)
+    root = 0.01 * rng.normal(size=(6, 6))
+    root[:3] = across @ root[:3]
+    sigma, R_sigma = 0.02, 0.01   # of the truth
+    found = []
+    for _ in range(2000):
+        error = root @ rng.normal(size=6)
+        true_t = t + error[:3] + sigma * across @ rng.normal(size=3)
+        pose = RelativePose(Status.OK, R=np.eye(3), t=t, covariance=claimed**2 * root @ root.T)
+        turned = Rotation.from_rotvec(error[3:] + R_sigma * rng.normal(size=3)).as_matrix()
+        found.append(pair_errors.pair_consistency('', '', pair_errors.TruePair(
+            0, 1, turned, true_t, claimed * sigma, claimed * R_sigma), pose))
+    assert np.mean([p.rotation_nees for p in found]) == pytest.approx(claimed**-2, rel=0.07)
+    assert np.mean([p.translation_nees for p in found]) == pytest.approx(claimed**-2, rel=0.07)
 
 
-def test_without_the_laboratory_its_commands_say_so(monkeypatch, capsys):
-    monkeypatch.setattr('importlib.util.find_spec', lambda name: None)
-    assert main(['benchmark', 'speed']) == 2
-    said = capsys.readouterr().err
-    assert 'benchmark needs the package rs_relpose_lab' in said and said.count('\n') == 1
+def test_chosen_pairs_of_a_recording_and_of_its_table(bundled_bag, tmp_path):
+    """At frames where the policy has no keyframes; the second overlaps both others."""
+    stamps, parameters = pair_errors.image_stamps(bundled_bag), read_parameters(BUNDLED_PARAMETERS)
+    ends = [(stamps[first], stamps[last]) for first, last in ((60, 71), (65, 76), (71, 90))]
+    (first, _), (last, _) = pair_errors.chosen_pairs(bundled_bag, parameters, ends[::2])
+    assert [(pair.reference_stamp_ns, pair.stamp_ns) for pair in (first, last)] == ends[::2]
+    # By the pairs of the policy before.
+    assert any(finding.observable for finding in first.health.findings)
+    with open_bag(bundled_bag) as bag:
+        truth = read_truth(bag, bag.find_topics())
+    delay_ns = first.reference_ns1 - first.reference_stamp_ns
+    table = tmp_path / 'pairs.csv'
+    with table.open('w', newline='', encoding='utf-8') as file:
+        writer = csv.writer(file)
+        writer.writerow(['stamp1_ns', 'stamp2_ns',
+                         *(f'r{i}{j}' for i in (1, 2, 3) for j in (1, 2, 3)), 'tx', 'ty', 'tz',
+                         'sigma_t_deg', 'sigma_r_deg'])
+        # The first is of a frame that is not there: asked for, and not answered.
+        for start, end in ((stamps[90] - 1, stamps[95]), *reversed(ends)):
+            R, t = truth.relative_pose(start + delay_ns, end + delay_ns)
+            writer.writerow([start, end, *R.ravel(), *t / np.linalg.norm(t), 1.0, 0.1])
+    # The first is that of the largest axis, the second the root of the sum over three.
+    assert [pair[4:] for pair in pair_errors.read_true_pairs(table)] == [
+        pytest.approx(np.radians([1.0, 0.1 / np.sqrt(3.0)]))] * 4
+    assert main(['benchmark', 'consistency', '--bags', '0', '--recording', str(bundled_bag),
+                 str(BUNDLED_PARAMETERS), str(table), '--compare', '--output', str(tmp_path)]) == 0
+    report = (tmp_path / 'consistency.md').read_text()
+    for method in ('recordings', 'readout ignored', 'MAGSAC'):
+        assert re.search(rf'^\| {method} +\| +3 of 4 \|', report, re.MULTILINE)
+    assert 'nan' not in report
+    found = grouped([row for row in rows_of(tmp_path / 'consistency.csv') if row['rotation']],
+                    lambda row: row['source'])
+    for rows in found.values():
+        assert {(int(row['stamp1_ns']), int(row['stamp2_ns'])) for row in rows} == set(ends)
+    for row in found['recordings']:
+        assert float(row['rotation']) < 0.1 and float(row['translation']) < 2.0
+        assert float(row['rotation_nees']) < 5.0 and float(row['translation_nees']) < 5.0
+    assert all(not row['rotation_nees'] for row in found['MAGSAC'])   # has no covariance
+    # The readout of 30 ms, ignored.
+    for method in ('readout ignored', 'MAGSAC'):
+        assert min(float(row['rotation']) for row in found[method]) > 0.1
+    table.write_text('stamp,x\n1,2\n', encoding='utf-8')
+    with pytest.raises(InputError, match='is no table of true pairs'):
+        list(pair_errors.on_recording(bundled_bag, BUNDLED_PARAMETERS, table))
+
+
+# -- the demo's comparison --------------------------------------------------------------------
+
+START_NS = 1_700_000_000_000_000_000
+INTRINSICS = {'width': 640, 'height': 480, 'fx': 450.0, 'fy': 452.0, 'cx': 322.0, 'cy': 238.0,
+              'distortion': (-0.12, 0.05, 0.0008, -0.0005, 0.0)}
+CAMERA = RollingShutterCamera(**INTRINSICS, readout_time=0.0)
+CALIBRATION = Intrinsics(**INTRINSICS, image_width=640, image_height=480)
+# Camera 2 is half a metre to the right of camera 1, a little ahead, and rotated.
+R_TRUE = Rotation.from_rotvec([0.02, -0.08, 0.03]).as_matrix()
+T_TRUE = np.array([0.5, 0.05, 0.1])
+
+
+def view(noise, outliers, seed=0):
+    """Pixels of 300 points in both cameras; ``X1 = R X2 + t``, so ``X2 = R^T (X1 - t)``."""
+    rng = np.random.default_rng(seed)
+    X1 = rng.uniform([-3.0, -2.0, 4.0], [3.0, 2.0, 12.0], (300, 3))
+    points1 = CAMERA.project(X1) + noise * rng.standard_normal((300, 2))
+    points2 = CAMERA.project((X1 - T_TRUE) @ R_TRUE) + noise * rng.standard_normal((300, 2))
+    points2[:outliers] = rng.uniform([0.0, 0.0], [640.0, 480.0], (outliers, 2))
+    return points1, points2
+
+
+def by_opencv(points1, points2, estimator, threshold=1.0):
+    return methods.opencv_five_point(
+        *(methods.undistorted(points, CAMERA) for points in (points1, points2)), CAMERA,
+        threshold, estimator=estimator)
+
+
+def pair_of(noise, outliers, seed=0):
+    points1, points2 = view(noise, outliers, seed)
+    count = len(points1)
+    pose = RelativePose(Status.OK, R=R_TRUE, t=T_TRUE / np.linalg.norm(T_TRUE),
+                        inliers=np.ones(count, dtype=bool), covariance=1e-6 * np.eye(6),
+                        model='uniform')
+    return PairResult(
+        START_NS, START_NS + 10**9, START_NS, START_NS + 10**9, 'camera', 1.0, pose,
+        Matches(np.arange(count, dtype=np.uint32), points1, points2, np.ones(count)),
+        np.zeros(count), np.zeros(count), np.zeros((count, 3)), np.zeros((count, 3)), 20.0)
+
+
+@pytest.fixture
+def truth():
+    """A steady motion by the true relative pose within the first second."""
+    seconds = np.arange(21) / 20.0
+    rotvec = Rotation.from_matrix(R_TRUE).as_rotvec()
+    return TrueTrajectory(START_NS + (seconds * 1e9).astype(np.int64), np.outer(seconds, T_TRUE),
+                          Rotation.from_rotvec(np.outer(seconds, rotvec)).as_quat())
+
+
+def test_best_threshold_is_the_best_and_is_drawn(truth, tmp_path, monkeypatch):
+    pairs = [pair_of(0.5, 90, seed) for seed in range(3)]
+    best = comparison.best_opencv_score('RANSAC', pairs, CALIBRATION, truth)
+    assert (best.pairs, best.answered) == (3, 3)
+    # In our convention: its RANSAC does not refine, but the inverse would be off by 10 deg.
+    assert best.rotation[0] < 1.0 and best.translation[0] < 5.0
+    assert by_opencv(*(points[:4] for points in view(0.5, 0)), 'RANSAC') is None
+    errors = {threshold: np.median([rotation_error(by_opencv(
+        pair.matches.points1, pair.matches.points2, 'RANSAC', threshold).R, R_TRUE)
+        for pair in pairs]) for threshold in (0.5, 1.0, 2.0)}
+    threshold = min(errors, key=errors.__getitem__)
+    assert best.name.endswith(f'{threshold:g} px')
+    assert best.rotation[0] == pytest.approx(errors[threshold], abs=1e-6)
+    drawn = []
+    monkeypatch.setattr(pictures, 'save_picture', lambda figure, path: drawn.append(figure))
+    pictures.draw_errors([PairRecord.of(pair, truth) for pair in pairs],
+                         tmp_path / 'errors.png', {best.name: best.errors})
+    for axis, median in zip(drawn[0].axes, (best.rotation[0], best.translation[0]), strict=True):
+        assert f'{best.name}:\nmedian {median:.2g} deg' in {
+            text.get_text() for text in axis.get_legend().get_texts()}
+
+
+def test_scores_of_a_table_and_of_its_records_agree(truth, tmp_path):
+    records = [PairRecord.of(pair_of(0.1, 10), truth)]
+    with table_writer(tmp_path, [POSES]) as write:
+        write(records[0])
+    live = comparison.score_of_table('live', tmp_path / POSES.file, records, truth)
+    assert (live.pairs, live.answered) == (1, 1)
+    assert live.rotation == pytest.approx(
+        comparison.score_of_records('', records).rotation, abs=1e-5)
+    assert live.rotation[0] < 1e-4 and live.translation[0] < 1e-4   # the poses are the truth
+
+
+def test_differing_poses_are_found(tmp_path):
+    row = '{},0.6,0.8,0,0,0,0,1,0.1,0.1,0.1,0.1,0.1,50,{},{},OK'
+    first, second = (row.format(ends, 60, 'uniform') for ends in ('1,2', '2,3'))
+    live = [row.format('1,2', '', ''), row.format('2,3', '', '')]
+    for rows, found in (((first, second, '3,4' + ',' * 14 + '9,,BAD_INPUT'), (0, 2)),
+                        ((first.replace('0.6,', '0.6000000000000001,'), second), (1, 2)),
+                        (live[:1], (1, 2))):
+        paths = []
+        for name, lines in (('live.csv', live), ('replay.csv', rows)):
+            paths.append(tmp_path / name)
+            paths[-1].write_text('\n'.join([','.join(POSES.columns), *lines]) + '\n')
+        assert comparison.differing_poses(*paths) == found
+
+
+def test_table_of_scores():
+    lines = comparison.score_table([
+        Score('node', 30, 27, (0.0123, 0.0456), (0.789, 12.34)),
+        comparison.score('a method without a pose', [None, None], pairs=30),
+        comparison.score('one', [PairErrors(1.0, 2.0, 0.25, 4.0), None])])
+    node, none, one = (line.split() for line in lines[-3:])
+    assert node[1:] == ['30', '27', '0.012', '0.046', '0.789', '12.3']
+    assert none[-6:] == ['30', '0', '-', '-', '-', '-']
+    assert one[1:] == ['2', '1', '0.250', '0.250', '4.000', '4.000']
+    assert len({len(line) for line in lines[2:]}) == 1, 'columns are aligned'
+
+
+@pytest.mark.long
+@pytest.mark.timeout(300)
+def test_demo():
+    """The demo itself: three processes over DDS, replays, and the table."""
+    done = subprocess.run([sys.executable, ROOT / 'demo' / 'run_demo.py'], capture_output=True,
+                          text=True, timeout=290)
+    assert done.returncode == 0, done.stderr
+    rows = {name: re.search(rf'^{name}\s+(\d+)\s+(\d+)\s+(\S+)\s+\S+\s+(\S+)', done.stdout, re.M)
+            for name in ('relpose_node, live', 'uniform 9-point', 'uniform 11-point',
+                         '5-point on derotated rays', r'OpenCV 5-point, RANSAC, \S+ px',
+                         r'OpenCV 5-point, USAC_MAGSAC, \S+ px')}
+    assert all(rows.values()), done.stdout
+    pairs, poses, rotation, translation = rows['relpose_node, live'].groups()
+    assert int(pairs) >= 25 and int(poses) >= 20
+    assert float(rotation) <= 0.15 and float(translation) <= 3.0
+    for name in list(rows)[-2:]:
+        assert float(rows[name][3]) >= 3.0 * float(rotation)
+    assert 'bit-equal' in done.stdout
+    for picture in re.findall(r'\S+\.png', done.stdout):
+        assert (ROOT / picture).is_file()

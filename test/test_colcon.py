@@ -8,13 +8,11 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 
 from conftest import ROOT
 import pytest
 
 NAME = 'rs_relpose_ros'
-START_UP = 60.0  # seconds; discovery takes up to 4
 KERNELS = Path(NAME) / '__pycache__' / 'kernels'
 
 
@@ -39,7 +37,7 @@ def install_space(tmp_path_factory: pytest.TempPathFactory) -> Path:
         copy = workspace / 'src' / NAME / name
         copy.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, copy)
-    # As an earlier build left them: compiled anew is only what is of another source.
+    # As an earlier build left them: only what has another source is compiled again.
     if (ROOT / KERNELS).is_dir():
         shutil.copytree(ROOT / KERNELS, workspace / 'build' / NAME / 'build' / 'lib' / KERNELS)
     built = subprocess.run(
@@ -55,8 +53,8 @@ def install_space(tmp_path_factory: pytest.TempPathFactory) -> Path:
 FIRST_START = """
 import gc
 from numba.core.dispatcher import Dispatcher
-from rs_relpose_ros.config.parameters import Parameters
-from rs_relpose_ros.front_end.warm_up import warm_up_pipeline
+from rs_relpose_ros.config.settings import Parameters
+from rs_relpose_ros.pipeline.warm_up import warm_up_pipeline
 warm_up_pipeline(Parameters())
 stats = [kernel.stats for kernel in gc.get_objects() if isinstance(kernel, Dispatcher)]
 print(sum(len(stat.cache_hits) for stat in stats), sum(len(stat.cache_misses) for stat in stats))
@@ -69,20 +67,29 @@ def in_install_space(install_space: Path, *command: str) -> list[str]:
             *command]
 
 
+def printed(install_space: Path, *command: str) -> str:
+    """Output of a command in the install space, which must succeed."""
+    ended = subprocess.run(in_install_space(install_space, *command), cwd=install_space,
+                           capture_output=True, text=True, timeout=100, check=False)
+    assert ended.returncode == 0, ended.stderr
+    return ended.stdout.strip()
+
+
 def executable(install_space: Path, name: str) -> str:
     """Return the path where ``ros2 run`` looks for executable `name`."""
     return str(install_space / NAME / 'lib' / NAME / name)
 
 
-def test_everything_is_installed(install_space):
+def test_everything_is_installed_and_found(install_space):
     share = install_space / NAME / 'share'
     assert (share / 'ament_index' / 'resource_index' / 'packages' / NAME).is_file()
     assert (share / NAME / 'package.xml').is_file()
-    located = subprocess.run(
-        in_install_space(install_space, sys.executable, '-c',
-                         f'import {NAME}; print({NAME}.__path__[0])'),
-        cwd=install_space, capture_output=True, text=True, timeout=60, check=True)
-    library = Path(located.stdout.strip())
+    located = printed(
+        install_space, sys.executable, '-c', f'import {NAME}; print({NAME}.__path__[0]);'
+        'from ament_index_python import get_package_share_directory as share;'
+        f'print(share("{NAME}"))')
+    library, found = map(Path, located.splitlines())
+    assert found == share / NAME
     assert library.is_relative_to(install_space)
     missing = [str(name) for name in tracked_files()
                if (name.parts[0] == NAME and not (library.parent / name).is_file())
@@ -92,61 +99,27 @@ def test_everything_is_installed(install_space):
 
 
 def test_first_start_compiles_nothing(install_space):
-    started = subprocess.run(
-        in_install_space(install_space, sys.executable, '-c', FIRST_START), cwd=install_space,
-        capture_output=True, text=True, timeout=100, check=True)
-    loaded, compiled = map(int, started.stdout.split())
+    loaded, compiled = map(int, printed(install_space, sys.executable, '-c', FIRST_START).split())
     assert loaded > 20
     assert compiled == 0
 
 
-def test_share_folder_is_found(install_space):
-    found = subprocess.run(
-        in_install_space(install_space, sys.executable, '-c',
-                         'from ament_index_python import get_package_share_directory as share;'
-                         f'print(share("{NAME}"))'),
-        capture_output=True, text=True, timeout=60, check=True)
-    assert Path(found.stdout.strip()) == install_space / NAME / 'share' / NAME
-
-
 def test_command_line_runs(install_space):
-    shown = subprocess.run(
-        in_install_space(install_space, executable(install_space, 'rs_relpose'), '--help'),
-        cwd=install_space, capture_output=True, text=True, timeout=60, check=False)
-    assert shown.returncode == 0, shown.stderr
-    assert 'replay' in shown.stdout
+    assert 'replay' in printed(install_space, executable(install_space, 'rs_relpose'), '--help')
 
 
-def test_node_starts_and_stops(install_space, ros_domain_id, tmp_path):
+def test_node_starts_and_stops(install_space, ros_domain_id):
     from diagnostic_msgs.msg import DiagnosticArray
-    import rclpy
-    from rclpy.executors import SingleThreadedExecutor
 
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=ros_domain_id)
-    observer = rclpy.create_node('observer', context=context)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(observer)
-    received = []
-    observer.create_subscription(DiagnosticArray, '/diagnostics', received.append, 10)
-    output = tmp_path / 'node.txt'
-    with output.open('w') as sink:
-        node = subprocess.Popen(
-            in_install_space(install_space, executable(install_space, 'relpose_node'),
-                             '--ros-args', '-r', '__node:=installed', '-p', 'readout_time:=0.03'),
-            cwd=install_space, stdout=sink, stderr=subprocess.STDOUT)
-    try:
-        deadline = time.monotonic() + START_UP
-        while not received and node.poll() is None and time.monotonic() < deadline:
-            executor.spin_once(timeout_sec=0.1)
-        assert received, output.read_text()
-        assert 'installed' in observer.get_node_names()
-        node.send_signal(signal.SIGINT)
-        assert node.wait(timeout=20) == 0, output.read_text()
-    finally:
-        node.kill()
-        node.wait()
-        executor.shutdown()
-        observer.destroy_node()
-        rclpy.shutdown(context=context)
-    assert 'Traceback' not in output.read_text()
+    from rs_relpose_lab.live.graph import Graph
+    from rs_relpose_lab.live.processes import Process, wait_until
+
+    command = in_install_space(install_space, executable(install_space, 'relpose_node'),
+                               '--ros-args', '-r', '__node:=installed', '-p', 'readout_time:=0.03')
+    with Graph() as graph, Process(
+            '-c', 'import os, sys; os.execvp("bash", sys.argv[1:])', *command) as node:
+        received = graph.listen(DiagnosticArray, '/diagnostics')
+        wait_until(lambda: received, 'diagnostics', node)
+        assert received[0].status[0].name.startswith('/installed: ')
+        assert node.signal(signal.SIGINT)[0] == 0
+        assert 'Traceback' not in node.output

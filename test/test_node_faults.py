@@ -7,18 +7,17 @@ wrong: those of frames during the faults are compared with the truth as well.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 import re
 import signal
-import time
+from types import SimpleNamespace
 from typing import Any
 
 from conftest import BUNDLED_PARAMETERS
 import cv2
 from diagnostic_msgs.msg import DiagnosticArray
 import fault_stream as faults
-from fault_stream import BAG_TOPICS, Fault, publish_in_time, SECOND, Sent, Stream
+from fault_stream import BAG_TOPICS, Fault, SECOND, Stream
 from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
 import pytest
@@ -31,8 +30,8 @@ from rs_relpose_lab.live.graph import diagnostic_values, Graph
 from rs_relpose_lab.live.processes import node_process, Process, wait_until
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.messages.incoming import time_ns
-from rs_relpose_ros.replay.run import read_truth
-from rs_relpose_ros.replay.truth import TrueTrajectory
+from rs_relpose_ros.offline.replay import read_truth
+from rs_relpose_ros.offline.truth import TrueTrajectory
 
 # The first node may have to compile the kernels.
 pytestmark = [pytest.mark.live, pytest.mark.timeout(600)]
@@ -74,7 +73,7 @@ def blurred(sigma: float) -> Any:
     return faults.pixels(lambda image: cv2.GaussianBlur(image, (0, 0), sigma))
 
 
-GAP = 'the gyro does not cover the read-out of the frame'
+GAP = 'the gyro does not cover the readout of the frame'
 HANGS = 'the gyro repeats the same values bit by bit'
 SAME = 'the image repeats the one before bit by bit'
 FAULTS = [
@@ -92,7 +91,7 @@ FAULTS = [
     Fault('camera slows down', faults.every(Image, 3)),
     Fault('image and CameraInfo are cropped', faults.changed((Image, CameraInfo), cropped)),
     Fault('image is smaller', faults.changed(Image, faults.pixels(lambda i: i[::2, ::2])),
-          'image is 320x240, but its CameraInfo tells 640x480'),
+          'image is 320x240, but its CameraInfo is for 640x480'),
     Fault('unknown encoding', faults.changed(Image, put('encoding', 'mono12')),
           "image encoding 'mono12' is not known; publish one of mono8"),
     Fault('CameraInfo stops', faults.without(CameraInfo)),
@@ -100,8 +99,8 @@ FAULTS = [
           'the camera is uncalibrated (k[0] of its CameraInfo is 0)'),
     Fault('unknown distortion model', faults.changed(
         CameraInfo, put('distortion_model', 'double_sphere')),
-          "distortion_model must be one of ('plumb_bob', 'rational_polynomial', 'equidistant'), "
-          "got 'double_sphere'"),
+          'distortion_model must be one of plumb_bob, rational_polynomial, equidistant, got '
+          "'double_sphere'"),
     Fault('every message twice', faults.twice, 'a frame of this stamp came before'),
     Fault('messages overtake each other', faults.delayed(
         object, lambda: float(_rng.uniform(0.0, 0.04)))),
@@ -123,33 +122,40 @@ FAULTS = [
 ]
 
 
-@dataclass(frozen=True)
-class Session:
-    """What the node published and wrote while all phases were played."""
+class Node:
+    """relpose_node in a namespace, its drivers, and what it publishes."""
 
-    stream: Stream
-    poses: list[PoseWithCovarianceStamped]
-    references: dict[int, int]
-    diagnostics: list[DiagnosticArray]
-    output: str
-    memory_growth: float
-    restarted: Any
-    debug_images: list[Image]
-    exit_code: int
+    def __init__(self, graph: Graph, name: str) -> None:
+        self.graph, self.name = graph, name
+        self.own = f'/{name}/relpose_node'
+        self.poses = graph.listen(PoseWithCovarianceStamped, f'{self.own}/relative_pose')
+        self.references = graph.listen(TimeReference, f'{self.own}/reference')
+        self.publishers: list[dict[type, Any]] = []
 
+    def process(self, **parameters: Any) -> Process:
+        return node_process(
+            BUNDLED_PARAMETERS, parameters={'image_transport': 'raw', **parameters},
+            remap={'__ns': f'/{self.name}', **{topic: f'/{self.name}{target}'
+                                               for topic, target in BAG_TOPICS.items()}})
 
-def drivers(graph: Graph, namespace: str = '') -> dict[tuple[type, bool], Any]:
-    """Publishers of each kind of message, reliable ones and those of best effort."""
-    return {(kind, best_effort): graph.publisher(kind, f'{namespace}{topic}', best_effort)
-            for kind, topic in ((Image, '/camera/image_raw'),
-                                (CameraInfo, '/camera/camera_info'), (Imu, '/imu/data_raw'))
-            for best_effort in (False, True)}
+    def connect(self) -> None:
+        """Make the drivers' publishers, of both qualities of service."""
+        self.publishers = [
+            faults.drivers(self.graph, namespace=f'/{self.name}', best_effort=kinds)
+            for kinds in ((), faults.TOPIC_OF)]
 
+    def endpoints(self) -> list[set[tuple[int, ...]]]:
+        """Ids of its subscriptions and publishers; those of a killed node remain for 20 s."""
+        node = self.graph.node
+        known = [node.get_subscriptions_info_by_topic(f'/{self.name}{topic}')
+                 for topic in BAG_TOPICS.values()]
+        known += [node.get_publishers_info_by_topic(f'{self.own}/{topic}')
+                  for topic in ('relative_pose', 'reference')]
+        return [{tuple(info.endpoint_gid) for info in of_topic} for of_topic in known]
 
-def play(publishers: dict[tuple[type, bool], Any], sent: list[Sent]) -> None:
-    """Publish in real time; from phase to phase with the other quality of service."""
-    publish_in_time((publishers[type(item.message), item.phase % 2 == 1], item.time_ns,
-                               item.message) for item in sent)
+    def publish(self, phase: int, message: Any) -> None:
+        """From phase to phase with the other quality of service."""
+        self.publishers[phase % 2][type(message)].publish(message)
 
 
 def resident(pid: int) -> float:
@@ -157,9 +163,14 @@ def resident(pid: int) -> float:
     return int(Path(f'/proc/{pid}/statm').read_text().split()[1]) * 4096 / 2**20
 
 
+def values_of(name: str, diagnostics: list[DiagnosticArray]) -> list[dict[str, str]]:
+    return [diagnostic_values(item) for item in diagnostics
+            if item.status[0].name.startswith(f'/{name}/')]
+
+
 @pytest.fixture(scope='module')
 def bag_messages(bundled_bag: Path) -> list[tuple[int, Any]]:
-    return faults.read_messages(bundled_bag, faults.PHASE + 0.1)
+    return faults.read_messages(bundled_bag, faults.PHASE + 0.1, every=2)
 
 
 @pytest.fixture(scope='module')
@@ -171,37 +182,39 @@ def truth(bundled_bag: Path) -> TrueTrajectory:
 
 
 @pytest.fixture(scope='module')
-def session(module_ros_domain_id: int, bag_messages: list[tuple[int, Any]]) -> Iterator[Session]:
+def session(module_ros_domain_id: int,
+            bag_messages: list[tuple[int, Any]]) -> Iterator[SimpleNamespace]:
+    """What the node published and wrote while all phases were played; it is still running."""
     stream = Stream(bag_messages, FAULTS, FIRST_STAMP_NS)
     last = len(FAULTS) - 1
-    with Graph() as graph, node_process(
-            BUNDLED_PARAMETERS, remap=BAG_TOPICS,
-            parameters={'image_transport': 'raw'}) as node:
-        poses = graph.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
-        references = graph.listen(TimeReference, '/relpose_node/reference')
-        diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
-        node.wait_for('ready')
-        publishers = drivers(graph)
-        play(publishers, [item for item in stream.sent if item.phase <= 2])
-        memory = resident(node.pid)
-        play(publishers, [item for item in stream.sent if 2 < item.phase < last])
-        growth = resident(node.pid) - memory
-        restarted = graph.call(Trigger, '/relpose_node/reset', Trigger.Request())
-        debug_images = graph.listen(Image, '/relpose_node/debug_image')
-        wait_until(
-            lambda: graph.node.count_publishers('/relpose_node/debug_image'), 'discovery')
-        play(publishers, [item for item in stream.sent if item.phase == last])
-        count = len(diagnostics)
-        wait_until(lambda: len(diagnostics) >= count + 2, 'diagnostics')
-        # On a busy machine debug images hold up what comes with them; it is sent anew.
-        wait_until(lambda: min(len(poses), len(references)) >= int(
-            diagnostic_values(diagnostics[-1])['poses']), 'all poses', timeout=30.0)
-        code, _ = node.signal(signal.SIGINT)
-        print(node.output)
-        yield Session(stream, poses, {
-            faults.stamp_of(item): time_ns(item.time_ref)
-            for item in references}, diagnostics, node.output, growth, restarted, debug_images,
-            code)
+    with Graph() as graph:
+        node = Node(graph, 'a')
+        # The second one is started with the first, for the last test.
+        with node.process() as process, Node(graph, 'b').process(use_sim_time=True) as looping:
+            diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
+            process.wait_for('ready')
+            node.connect()
+            stream.play(node.publish, node.poses, range(3))
+            memory = resident(process.pid)
+            stream.play(node.publish, node.poses, range(3, last))
+            growth = resident(process.pid) - memory
+            restarted = graph.call(Trigger, f'{node.own}/reset', Trigger.Request())
+            debug_images = graph.listen(Image, f'{node.own}/debug_image')
+            wait_until(lambda: graph.node.count_publishers(f'{node.own}/debug_image'),
+                       'discovery')
+            stream.play(node.publish, node.poses, range(last, last + 1), enough=4)
+            count = len(values_of('a', diagnostics))
+            wait_until(lambda: len(values_of('a', diagnostics)) >= count + 2, 'diagnostics')
+            # On a busy machine debug images hold up what comes with them; it is sent again.
+            wait_until(lambda: min(len(node.poses), len(node.references)) >= int(
+                values_of('a', diagnostics)[-1]['poses']), 'all poses', timeout=30.0)
+            print(process.output)
+            yield SimpleNamespace(
+                graph=graph, node=node, process=process, looping=looping, stream=stream,
+                poses=list(node.poses), references={
+                    faults.stamp_of(item): time_ns(item.time_ref) for item in node.references},
+                values=values_of('a', diagnostics)[-1], output=process.output,
+                memory_growth=growth, restarted=restarted, debug_images=list(debug_images))
 
 
 def wrong(message: PoseWithCovarianceStamped, begin_ns: int, end_ns: int,
@@ -232,12 +245,12 @@ def test_a_pose_comes_within_a_second_of_good_data(session, name):
 
 
 def test_no_pose_comes_without_a_calibration(session):
-    # Four images wait for the first CameraInfo, which comes before or after its image.
-    held_ns = 4 * SECOND // 30
+    # Four images wait for the first CameraInfo, which comes before or after its image; on a busy
+    # machine up to four more are still on their way.
+    held_ns = 8 * SECOND // 15
     assert faults.stamp_of(session.poses[0]) > session.stream.good[0][0] - held_ns
-    values = diagnostic_values(session.diagnostics[-1])
-    # Those of the first phase; later a CameraInfo that cannot be used ends the one in force.
-    assert int(values['frames_refused_no_calibration']) > 15
+    # Those of the first phase; later an unusable CameraInfo ends the active one.
+    assert int(session.values['frames_refused_no_calibration']) > 8
 
 
 def test_no_wrong_pose_is_published(session, truth):
@@ -246,7 +259,7 @@ def test_no_wrong_pose_is_published(session, truth):
         stamp = faults.stamp_of(message)
         reference = session.references[stamp]
         begin_ns, end_ns = stream.taken_at[reference], stream.taken_at[stamp]
-        # A stamp that two images carry says of none when it was taken.
+        # A stamp of two images identifies none.
         if begin_ns is None or end_ns is None:
             continue
         checked += 1
@@ -257,42 +270,41 @@ def test_no_wrong_pose_is_published(session, truth):
                          f'{(begin_ns - stream.bag_start_ns) / SECOND:.3f} s and '
                          f'{(end_ns - stream.bag_start_ns) / SECOND:.3f} s: {how}')
     assert found == []
-    assert checked > 5 * len(FAULTS)
+    assert checked > 3 * len(FAULTS)
 
 
 @pytest.mark.parametrize('name', [fault.name for fault in FAULTS if fault.said])
-def test_a_fault_is_told(session, name):
+def test_a_fault_is_reported(session, name):
     [fault] = [fault for fault in FAULTS if fault.name == name]
     # Once, and after half a minute once more if it lasts or comes back.
-    assert 1 <= len([line for line in told(session) if fault.said in line]) <= 4
+    assert 1 <= len([line for line in configured(session) if fault.said in line]) <= 4
 
 
-def test_nothing_else_is_told(session):
+def test_nothing_else_is_reported(session):
     said = [fault.said for fault in FAULTS if fault.said]
     # While clocks and sensors change, frames wait in vain, come late or in between; where the
     # machine is slow the first phase, without CameraInfo, lasts until the node says so.
     said += ['newer frames wait for the gyro', 'no gyro sample that covers', '(overload)',
              'frame is ', 'stamps jumped', 'image is ', '(reset)', 'no CameraInfo on ']
-    assert [line for line in told(session) if not any(text in line for text in said)] == []
+    assert [line for line in configured(session) if not any(text in line for text in said)] == []
     assert 'Traceback' not in session.output
-    assert session.exit_code == 0
 
 
-def told(session: Session) -> list[str]:
+def configured(session: SimpleNamespace) -> list[str]:
     """Warnings and errors of the log."""
     return [line for line in session.output.splitlines()
             if re.match(r'\[(WARN|ERROR|FATAL)\]', line)]
 
 
 def test_diagnostics_count_what_happened(session):
-    values = diagnostic_values(session.diagnostics[-1])
+    values = session.values
     refused = {key.removeprefix('frames_refused_'): int(value) for key, value in values.items()
                if key.startswith('frames_refused_')}
     assert int(values['frames_received']) == int(values['frames_processed']) + sum(
         refused.values())
-    for cause in ('imu_gap', 'duplicate', 'out_of_order', 'clock_jump', 'bad_image',
-                  'no_calibration'):
-        assert refused[cause] > 0, cause
+    for reason in ('imu_gap', 'duplicate', 'out_of_order', 'clock_jump', 'bad_image',
+                   'no_calibration'):
+        assert refused[reason] > 0, reason
     assert int(values['imu_gaps']) >= 5
     assert int(values['clock_jumps']) >= 4
     assert int(values['messages_invalid']) > 200
@@ -337,86 +349,72 @@ def test_debug_images_show_pairs(session):
 # -- two nodes -------------------------------------------------------------------------------
 
 
-class Namespaces:
-    """Nodes in the namespaces /a and /b, which get the same messages, and what they publish."""
+def play_until_poses(stream: Stream, nodes: list[Node], clock: Any) -> None:
+    """The same stamps again and again, with the clock of the bag."""
+    def publish(phase: int, message: Any) -> None:
+        for node in nodes:
+            node.publish(phase, message)
+        clock.publish(Clock(clock=message.header.stamp))
 
-    def __init__(self, graph: Graph, messages: list[tuple[int, Any]]) -> None:
-        self.graph = graph
-        self.phase = Stream(messages, [Fault('', faults.nothing)], FIRST_STAMP_NS)
-        self.poses, self.references = (
-            {name: graph.listen(kind, f'/{name}/relpose_node/{topic}') for name in 'ab'}
-            for kind, topic in ((PoseWithCovarianceStamped, 'relative_pose'),
-                                (TimeReference, 'reference')))
-        self.diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
-        self.clock = graph.node.create_publisher(Clock, '/clock', 10)
-        self.publishers: dict[str, Any] = {}
-
-    def start(self, name: str, **parameters: Any) -> Process:
-        return node_process(
-            BUNDLED_PARAMETERS, parameters={'image_transport': 'raw', **parameters},
-            remap={'__ns': f'/{name}', **{source: f'/{name}{target}'
-                                          for source, target in BAG_TOPICS.items()}})
-
-    def messages(self) -> Iterator[tuple[Any, int, Any]]:
-        """For both nodes, with the clock of the bag."""
-        for item in self.phase.sent:
-            for name in 'ab':
-                yield (self.publishers[name][type(item.message), False], item.time_ns,
-                       item.message)
-            tick = Clock()
-            tick.clock.sec, tick.clock.nanosec = divmod(FIRST_STAMP_NS + item.time_ns, SECOND)
-            yield self.clock, item.time_ns, tick
-
-    def play_until_poses(self, *names: str) -> None:
-        """The same stamps again and again: a busy machine leaves most frames out."""
-        known = {name: len(self.poses[name]) for name in names}
-        for _ in range(8):
-            publish_in_time(self.messages())
-            time.sleep(0.1)
-            if all(len(self.poses[name]) > known[name] for name in names):
-                return
-        pytest.fail(f'no poses of {names}')
-
-    def wrong_poses(self, name: str, truth: TrueTrajectory) -> list[str]:
-        """Of poses and references in the order in which they came: stamps repeat themselves."""
-        references, found = list(self.references[name]), []
-        for message in self.poses[name]:
-            stamp = faults.stamp_of(message)
-            # A node that was killed between two messages leaves a pose without its reference.
-            if references and faults.stamp_of(references[0]) == stamp:
-                begin_ns = time_ns(references.pop(0).time_ref)
-                found.append(wrong(message, self.phase.taken_at[begin_ns],
-                                   self.phase.taken_at[stamp], truth))
-        assert found and len(self.poses[name]) - len(found) <= 2
-        return [how for how in found if how]
+    known = [len(node.poses) for node in nodes]
+    for _ in range(8):   # a busy machine omits most frames
+        stream.rewind()
+        stream.play(publish, nodes[-1].poses)
+        if all(len(node.poses) > before for node, before in zip(nodes, known, strict=True)):
+            return
+    pytest.fail(f'no poses of {[node.name for node in nodes]}')
 
 
-def test_two_nodes_one_is_killed_and_the_other_lives_in_a_looping_bag(
-        ros_domain_id, bag_messages, truth):
+def wrong_poses(node: Node, known: tuple[int, int], stream: Stream,
+                truth: TrueTrajectory) -> list[str]:
+    """Errors of the poses since `known`; stamps repeat themselves, as the bag is played again.
+
+    A pose is right with one of the references of its stamp. It has none where the node was killed
+    between the two messages.
+    """
+    begins: dict[int, set[int]] = {}
+    for reference in node.references[known[1]:]:
+        begins.setdefault(faults.stamp_of(reference), set()).add(time_ns(reference.time_ref))
+    poses, found = node.poses[known[0]:], []
+    for message in poses:
+        stamp = faults.stamp_of(message)
+        errors = [wrong(message, stream.taken_at[begin_ns], stream.taken_at[stamp], truth)
+                  for begin_ns in begins.get(stamp, ())]
+        if errors:
+            found.append(min(errors, key=len))
+    assert len(found) >= 0.75 * len(poses) > 0.0
+    return [how for how in found if how]
+
+
+def test_two_nodes_one_is_killed_and_the_other_continues_in_a_looping_bag(
+        session, bag_messages, truth):
     """Two namespaces; one on the clock of a bag that starts again, one killed and restarted."""
-    with Graph() as graph:
-        both = Namespaces(graph, bag_messages)
-        with both.start('b', use_sim_time=True) as looping:
-            with both.start('a') as killed:
-                for node in (killed, looping):
-                    node.wait_for('ready')
-                both.publishers = {name: drivers(graph, f'/{name}') for name in 'ab'}
-                both.play_until_poses('a', 'b')
-                assert killed.signal(signal.SIGKILL)[0] == -signal.SIGKILL
-            with both.start('a') as restarted:
-                both.play_until_poses('b')
-                restarted.wait_for('ready')
-                wait_until(lambda: all(
-                    publisher.get_subscription_count() == 1
-                    for publisher in both.publishers['a'].values()), 'the restarted node')
-                both.play_until_poses('a', 'b')
-                for node in (restarted, looping):
-                    assert node.signal(signal.SIGTERM)[0] == 0
-                    assert 'Traceback' not in node.output
-        assert [both.wrong_poses(name, truth) for name in 'ab'] == [[], []]
-        last = {name: [item for item in both.diagnostics
-                       if item.status[0].name.startswith(f'/{name}/')][-1] for name in 'ab'}
-        assert int(diagnostic_values(last['b'])['clock_jumps']) >= 2
-        # Stamped by the clock of the graph.
-        assert faults.stamp_of(last['b']) < FIRST_STAMP_NS + 10 * SECOND
-        assert faults.stamp_of(last['a']) > FIRST_STAMP_NS + 10 * SECOND
+    graph, killed, looping = session.graph, session.node, Node(session.graph, 'b')
+    diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
+    clock = graph.node.create_publisher(Clock, '/clock', 10)
+    stream = Stream(bag_messages, [Fault('', faults.nothing)], FIRST_STAMP_NS)
+    session.looping.wait_for('ready')
+    looping.connect()
+    wait_until(lambda: all(looping.endpoints()), 'the second node', session.looping)
+    known = len(killed.poses), len(killed.references)
+    play_until_poses(stream, [killed, looping], clock)
+    assert session.process.signal(signal.SIGKILL)[0] == -signal.SIGKILL
+    before = killed.endpoints()
+    with killed.process() as restarted:
+        play_until_poses(stream, [looping], clock)
+        restarted.wait_for('ready')
+        wait_until(lambda: all(now - old for now, old in zip(
+            killed.endpoints(), before, strict=True)), 'the restarted node', restarted)
+        play_until_poses(stream, [killed, looping], clock)
+        wait_until(lambda: int(values_of('b', diagnostics)[-1]['clock_jumps']) >= 2,
+                   'jumps of the clock', session.looping, timeout=30.0)
+        wait_until(lambda: values_of('a', diagnostics), 'diagnostics', restarted, timeout=30.0)
+        for process in (restarted, session.looping):
+            assert process.signal(signal.SIGINT)[0] == 0
+            assert 'Traceback' not in process.output
+    for node, before in ((killed, known), (looping, (0, 0))):
+        assert wrong_poses(node, before, stream, truth) == []
+    stamps = {name: [faults.stamp_of(item) for item in diagnostics
+                     if item.status[0].name.startswith(f'/{name}/')][-1] for name in 'ab'}
+    # Stamped by the clock of the graph.
+    assert stamps['b'] < FIRST_STAMP_NS + 10 * SECOND < stamps['a']

@@ -1,26 +1,40 @@
-"""Parts of the node that need no graph."""
+"""Parts of the node: log lines, silence, diagnostics, parameters, and its worker."""
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import replace
 import itertools
 import re
+import threading
+from typing import Any
 
 from conftest import ROOT
+import message_builders as build
 import numpy as np
 import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import CameraInfo, Image, Imu
 
+from rs_relpose_lab.live.processes import wait_until
+from rs_relpose_ros.config.declare import Declared
+from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.estimator.result import RelativePose, Status
-from rs_relpose_ros.front_end.pair import PairResult
-from rs_relpose_ros.front_end.sequencer import Refusal, SequencerCounts
-from rs_relpose_ros.health.findings import Finding, Health, HealthState
-from rs_relpose_ros.health.tracked import Applied, Tracked
-from rs_relpose_ros.node.cause_log import CauseLog
-from rs_relpose_ros.node.diagnostics import Statistics
-from rs_relpose_ros.node.frame_statistics import ERROR, Inputs, OK, WARN
-from rs_relpose_ros.node.health_log import HealthLog
-from rs_relpose_ros.node.silence import LostImages, Silence, why_no_image, why_nothing
-from rs_relpose_ros.tracking.matches import Matches
+from rs_relpose_ros.nodes import diagnostics
+from rs_relpose_ros.nodes.diagnostics import ERROR, OK, ReasonLog, Silence, Statistics, WARN
+from rs_relpose_ros.nodes.parameters import NodeParameters
+from rs_relpose_ros.nodes.relpose_node import RelposeNode
+from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState
+from rs_relpose_ros.pipeline.monitor import Applied, Tracked
+from rs_relpose_ros.pipeline.pair import Frame, PairResult
+from rs_relpose_ros.pipeline.sequencer import MAILBOX_FRAMES, Refusal, SequencerCounts
+from rs_relpose_ros.pipeline.warm_up import warm_up
+from rs_relpose_ros.tracking.features import Matches
 
 SECOND = 10**9
 
@@ -38,170 +52,150 @@ def clock() -> Clock:
     return Clock()
 
 
-# Of `test_every_counter_has_its_own_figure`, besides the refusals.
-EXPECTED = {
-    'state': 'degraded', 'missing': 'imu', 'image_rate_hz': '30.0', 'camera_info_rate_hz': '31.0',
-    'imu_rate_hz': '200.0', 'accel_rate_hz': '100.0', 'frames_received': '2000',
-    'frames_processed': '1064', 'frames_failed': '3', 'messages_invalid': '15',
-    'imu_samples': '9000', 'imu_gaps': '11', 'imu_repeated': '13', 'imu_late': '14',
-    'clock_jumps': '12', 'pairs': '3', 'poses': '2', 'matches': '20', 'inliers': '15',
-    'inlier_ratio': '0.750', 'parallax_px': '3.2', 'residual_rms_px': '',
-    'interval_s': '0.100', 'rotation_difference_to_gyro_deg': '', 'model': 'uniform',
-    'tracked_gyro_bias_rad_s': '0.01000 -0.02000 0.03000',
-    'tracked_gyro_bias_sigma_rad_s': '0.00100 0.00200 0.00300', 'tracked_time_offset_ms': '4.00',
-    'tracked_time_offset_sigma_ms': '0.50', 'applied_time_offset_ms': '-1.50',
-    'tracked_readout_time_ms': '31.00', 'tracked_readout_time_sigma_ms': '0.70',
-    'applied_readout_time_ms': '0.80',
-    'health': 'ok', 'health_findings': 'time_offset ok: 4 ms',
-    'latency_p50_ms': '15.0', 'latency_p99_ms': '15.0',
-    'frame_time_p50_ms': '30.0', 'frame_time_p99_ms': '30.0', 'worker_busy_percent': '2',
-    'last_reason_no_pose': 'LOW_PARALLAX: it stands'}
+@pytest.fixture
+def statistics(clock: Clock) -> Statistics:
+    return Statistics(clock)
 
 
 # -- log lines -------------------------------------------------------------------------------
 
 
-def test_a_cause_is_told_once_and_later_with_its_number(clock):
+def test_a_reason_is_logged_once_and_later_with_its_number(clock):
     lines: list[str] = []
-    log = CauseLog(lines.append, period=30.0, clock=clock)
+    log = ReasonLog(lines.append, period=30.0, clock=clock)
     for k in range(5):
         log(f'image has {k} bytes')
     log('something else')
     assert lines == ['image has 0 bytes', 'something else']
-    clock.now = 31
-    log('image has 7 bytes')
-    assert lines[2] == 'image has 7 bytes (4 more since the last such line)'
-    clock.now = 62
-    log('image has 8 bytes')
-    assert lines[3] == 'image has 8 bytes'
+    for now, number in ((31, 7), (62, 8)):
+        clock.now = now
+        log(f'image has {number} bytes')
+    assert lines[2:] == ['image has 7 bytes (4 more since the last such line)',
+                         'image has 8 bytes']
 
 
-def test_made_up_causes_do_not_fill_log_or_memory(clock):
+def test_ever_new_reasons_do_not_fill_log_or_memory(clock):
     lines: list[str] = []
-    log = CauseLog(lines.append, clock=clock)
-    for a, b, c in itertools.product('abcdefghij', repeat=3):
-        log(f'unknown encoding {a}{b}{c}')
+    log = ReasonLog(lines.append, clock=clock)
+    for letters in itertools.product('abcdefghij', repeat=3):
+        log(f'unknown encoding {"".join(letters)}')
     assert len(lines) <= 65
-    assert lines[-1] == 'further problems of other kinds (see /diagnostics)'
+    assert lines[-1].startswith('further problems')
 
 
-def finding(state: HealthState, ms: float, figure: str = 'time_offset') -> Finding:
-    return Finding(figure, 0.03, 1e-3 * ms, 0.0005, 's', True, state,
-                   f'{ms} ms is seen, 30.0 ms in force: set {figure}: {1e-3 * ms}')
+class Lines(list[tuple[str, str]]):
+    """Level and text of the lines of a `HealthLog`."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.log = diagnostics.HealthLog(*(
+            ReasonLog(lambda text, level=level: self.append((level, text)), clock=clock)
+            for level in ('info', 'warn', 'error')))
 
 
-def test_health_is_told_once_a_figure_and_when_it_is_well_again(clock):
-    lines: list[tuple[str, str]] = []
-    log = HealthLog(*(CauseLog(lambda text, level=level: lines.append((level, text)), clock=clock)
-                      for level in ('info', 'warn', 'error')))
-    ok, unknown, suspect, wrong = (Health((finding(state, 0.2),)) for state in HealthState)
-    for health in (unknown, ok, suspect, Health((finding(HealthState.SUSPECT, 1.5),)), wrong,
+def finding(state: FindingState, ms: float, quantity: str = 'time_offset') -> Finding:
+    return Finding(quantity, state, f'estimated {ms} ms, active 30.0 ms',
+                   f'set {quantity}: {1e-3 * ms}', 0.03, 1e-3 * ms, 0.0005, 's', True)
+
+
+def test_health_is_logged_once_a_quantity_and_when_it_is_ok_again(clock):
+    lines = Lines(clock)
+    ok, unknown, suspect, wrong = (Assessment((finding(state, 0.2),)) for state in FindingState)
+    for health in (unknown, ok, suspect, Assessment((finding(FindingState.SUSPECT, 1.5),)), wrong,
                    wrong):
-        log(health, withhold=True)
-    sentence = '0.2 ms is seen, 30.0 ms in force: set time_offset: 0.0002'
-    first, second = lines
-    assert first == ('warn', f'time_offset is suspect: {sentence}')
-    assert second[0] == 'error'
-    assert second[1] == (f'time_offset is wrong: {sentence}; poses are withheld: '
-                         'withhold_when_wrong: false publishes them all the same')
-    # The worst figure first; it is the line's cause.
-    log(Health((finding(HealthState.SUSPECT, 0.2), finding(HealthState.WRONG, 9.0, 'axes'))),
-        withhold=False)
-    assert lines[2][1].startswith('axes is wrong: 9.0 ms is seen')
-    assert lines[2][1].endswith(f'; time_offset is suspect: {sentence}; poses are published all '
-                                'the same, as withhold_when_wrong is false')
+        lines.log(health, withhold=True)
+    levels, texts = zip(*lines, strict=True)
+    assert levels == ('warn', 'error')
+    assert texts[0] == suspect.faults[0].text
+    assert texts[1].startswith(wrong.faults[0].text)
+    assert 'withhold_when_wrong: false' in texts[1]
+    # The worst parameter first; the repetitions of a line are those of its first parameter.
+    lines.log(Assessment((finding(FindingState.SUSPECT, 0.2),
+                          finding(FindingState.WRONG, 9.0, 'axes'))), withhold=False)
+    assert lines[2][1].startswith('axes is wrong: ')
+    assert f'; {suspect.faults[0].text}; ' in lines[2][1]
+    assert 'withhold_when_wrong is false' in lines[2][1]
     for health in (unknown, ok):
-        log(health, withhold=True)
-    [back] = lines[3:]
-    assert back == (
-        'info', 'health is unknown: no figure that was told is suspect or wrong any more')
+        lines.log(health, withhold=True)
+    assert [level for level, _ in lines[3:]] == ['info']
     clock.now = 31
-    log(wrong, withhold=True)
+    lines.log(wrong, withhold=True)
     assert lines[4][1].endswith('(1 more since the last such line)')
 
 
-def test_a_gross_error_is_told_at_once_after_small_steps_of_the_same_figure(clock):
-    lines: list[str] = []
-    log = HealthLog(*(CauseLog(lines.append, clock=clock) for _ in range(3)))
-    small = finding(HealthState.WRONG, 9.0, 'axes')
-    gross = replace(small, sigma=None, sentence='images turn about axes that are 122 deg off')
+def test_a_gross_error_is_logged_at_once_after_small_steps_of_the_same_quantity(clock):
+    lines = Lines(clock)
+    small = finding(FindingState.WRONG, 9.0, 'axes')
+    gross = replace(small, sigma=None, message='images turn about axes that are 122 deg off')
     for fault in (small, gross, small, gross):
-        log(Health((fault,)), withhold=True)
-    assert [line.partition(';')[0] for line in lines] == [small.text, gross.text]
+        lines.log(Assessment((fault,)), withhold=True)
+    assert [text.partition(';')[0] for _, text in lines] == [small.text, gross.text]
 
 
 # -- silence ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(('published', 'remedy'), [
-    (['/camera/image/compressed', '/b'],
-     'only /camera/image/compressed is published: set image_transport:=compressed'),
-    (['/b', '/a'], 'these topics with images have publishers: /a, /b; remap image'),
-    ([], 'no topic with images has a publisher'),
-    (['/camera/image'], 'it has a publisher: does its quality of service match'),
+@pytest.mark.parametrize(('image', 'published', 'fix'), [
+    ('/camera/image', ['/camera/image/compressed', '/b'], 'image_transport:=compressed'),
+    ('/camera/image', ['/b', '/a'], '/a, /b; remap image'),
+    ('/camera/image', [], 'no topic with images has a publisher'),
+    ('/camera/image', ['/camera/image'], 'quality of service'),
+    ('/image/compressed', ['/image'], 'image_transport:=raw'),
 ])
-def test_why_no_image_comes(published, remedy):
-    reason = why_no_image('/camera/image', published)
-    assert reason.text.startswith('no image on /camera/image for 5 s; ')
-    assert remedy in reason.text
+def test_why_no_image_comes(image, published, fix):
+    reason = diagnostics.why_no_image(image, published)
+    assert reason.text.startswith(f'no image on {image} for 5 s; ')
+    assert fix in reason.text
 
 
-def test_the_other_transport_is_told_in_both_directions():
-    assert 'image_transport:=raw' in why_no_image('/image/compressed', ['/image']).text
-
-
-def test_why_nothing_comes_out():
+def test_why_there_is_no_result():
     refused = {Refusal.IMU_GAP: 100, Refusal.NO_IMU: 30}
-    reason = why_nothing(Silence(5.0, 150, refused, 'PURE_ROTATION: it stands'))
-    assert '130 of 150 images were refused, 100 of them as imu_gap' in reason.text
+    why = diagnostics.why_nothing
+    reason = why(Silence(5.0, 150, refused, 'PURE_ROTATION: at rest'))
+    assert '130 of 150 images' in reason.text and '100 of them as imu_gap' in reason.text
     # Most images are used, and their pairs have no pose.
-    standing = why_nothing(Silence(5.0, 150, {Refusal.IMU_GAP: 20}, 'PURE_ROTATION: 0.1 px'))
+    standing = why(Silence(5.0, 150, {Refusal.IMU_GAP: 20}, 'PURE_ROTATION: 0.1 px'))
     assert 'PURE_ROTATION: 0.1 px' in standing.text
     # The numbers of a reason change, its kind does not.
-    assert standing.kind == why_nothing(Silence(6.0, 180, {}, 'PURE_ROTATION: 0.2 px')).kind
+    assert standing.kind == why(Silence(6.0, 180, {}, 'PURE_ROTATION: 0.2 px')).kind
     assert standing.kind != reason.kind
-    assert 'nothing came of 150 images' in why_nothing(Silence(5.0, 150, {}, '')).text
+    assert 'nothing came of 150 images' in why(Silence(5.0, 150, {}, '')).text
 
 
-def test_silence_is_counted_from_the_last_result(clock):
+def test_silence_is_counted_from_the_last_result(clock, statistics):
     def silence(images: int, **refused: int) -> Silence:
-        return statistics.report(inputs(images), counts(**refused), problem='',
-                                 missing=()).silence
+        return report(statistics, images, counts(**refused)).silence
 
-    statistics = Statistics(clock)
     clock.now = 60 * SECOND   # kernels were compiled
     statistics.start()
     clock.now = 63 * SECOND
     assert silence(90, no_imu=10) == Silence(3.0, 90, {Refusal.NO_IMU: 10})
     statistics.add_pair(pair(), clock.now)
     assert silence(90, no_imu=10).seconds == 0.0
-    statistics.add_pair(pair(Status.LOW_PARALLAX, 'it stands'), clock.now)
+    statistics.add_pair(pair(Status.LOW_PARALLAX, 'at rest'), clock.now)
     clock.now = 65 * SECOND
     assert silence(150, no_imu=12) == Silence(2.0, 60, {Refusal.NO_IMU: 2},
-                                              'LOW_PARALLAX: it stands')
+                                              'LOW_PARALLAX: at rest')
 
 
-def test_before_the_first_image_nothing_could_come_of_any(clock):
-    statistics = Statistics(clock)
+def test_silence_begins_with_the_first_image(clock, statistics):
     for second in range(8):
         clock.now = second * SECOND
-        assert statistics.report(inputs(0), counts(), problem='', missing=()).silence.seconds == 0
+        assert report(statistics).silence.seconds == 0
     clock.now = 9 * SECOND
-    assert statistics.report(
-        inputs(30), counts(), problem='', missing=()).silence == Silence(2.0, 30, {}, '')
+    assert report(statistics, 30).silence == Silence(2.0, 30, {}, '')
 
 
-@pytest.mark.parametrize(('rate', 'size', 'told'), [
+@pytest.mark.parametrize(('rate', 'size', 'expected'), [
     (9, 921_600, True), (29, 921_600, False), (9, 300_000, False), (0, 921_600, False)])
-def test_images_that_are_lost_on_the_way_are_told(rate, size, told):
-    lost = LostImages()
+def test_lost_images_are_reported(rate, size, expected):
+    lost = diagnostics.LostImages()
     for second in range(5):
         assert lost.add(rate * second, 30 * second, size) == ''
     text = lost.add(rate * 5, 150, size)
-    assert bool(text) == told
-    if told:
+    assert bool(text) == expected
+    if expected:
         assert text.startswith('9 images a second of 0.9 MB come, and 30 CameraInfo')
-        assert 'config/fastdds.xml' in text and 'ros2 launch' in text
+        assert 'config/fastdds.xml' in text
 
 
 # -- diagnostics -----------------------------------------------------------------------------
@@ -209,8 +203,7 @@ def test_images_that_are_lost_on_the_way_are_told(rate, size, told):
 
 def pair(status: Status = Status.OK, reason: str = '') -> PairResult:
     count = 20
-    inliers = np.zeros(count, dtype=bool)
-    inliers[:15] = True
+    inliers = np.arange(count) < 15
     zeros2, zeros3 = np.zeros((count, 2)), np.zeros((count, 3))
     return PairResult(
         reference_stamp_ns=0, stamp_ns=1, reference_ns1=0, reference_ns2=1, frame_id='',
@@ -227,70 +220,80 @@ def counts(frames: int = 0, taken: int = 0, **refused: int) -> SequencerCounts:
                            imu_samples=0, imu_gaps=0, clock_jumps=0)
 
 
-def inputs(images: int = 0, imu: int = 0) -> Inputs:
-    return Inputs(images, images, imu, 0, 0)
+def report(statistics: Statistics, images: int = 0, counted: SequencerCounts | None = None, *,
+           problem: str = '', missing: tuple[str, ...] = (), **inputs: int) -> diagnostics.Report:
+    return statistics.report(Counter(image=images, **inputs), counted or counts(),
+                             problem=problem, missing=missing)
 
 
-def test_rates_are_those_since_the_last_report(clock):
-    statistics = Statistics(clock)
-    clock.now = 2 * SECOND
-    first = dict(statistics.report(inputs(60, 400), counts(), problem='', missing=()).values)
-    assert (first['image_rate_hz'], first['imu_rate_hz']) == ('30.0', '200.0')
-    clock.now = 3 * SECOND
-    second = dict(statistics.report(inputs(75, 400), counts(), problem='', missing=()).values)
-    assert (second['image_rate_hz'], second['imu_rate_hz']) == ('15.0', '0.0')
+def values(statistics: Statistics, **options: Any) -> dict[str, str]:
+    return dict(report(statistics, **options).values)
 
 
-def test_latency_is_from_ready_to_publication(clock):
-    statistics = Statistics(clock)
-    for milliseconds in range(1, 101):
-        clock.now = SECOND
-        statistics.add_pair(pair(), SECOND - milliseconds * 10**6)
-    values = dict(statistics.report(inputs(), counts(), problem='', missing=()).values)
-    assert float(values['latency_p50_ms']) == pytest.approx(50.5, abs=0.1)
-    assert float(values['latency_p99_ms']) == pytest.approx(99.0, abs=0.1)
-    assert (values['pairs'], values['poses']) == ('100', '100')
-    assert (values['inlier_ratio'], values['inliers'], values['matches']) == ('0.750', '15', '20')
-
-
-def test_the_worker_s_share_is_that_since_the_last_report(clock):
-    statistics = Statistics(clock)
+def test_rates_and_load_are_those_since_the_last_report(clock, statistics):
     for k in range(30):
         clock.now = (k + 1) * SECOND // 30
         statistics.add_frame(clock.now - 20 * 10**6)
     clock.now = SECOND
-    values = dict(statistics.report(inputs(), counts(), problem='', missing=()).values)
-    assert (values['frame_time_p50_ms'], values['frame_time_p99_ms']) == ('20.0', '20.0')
-    assert values['worker_busy_percent'] == '60'
-    clock.now = 2 * SECOND
-    values = dict(statistics.report(inputs(), counts(), problem='', missing=()).values)
-    assert values['worker_busy_percent'] == '0'
-    assert values['frame_time_p50_ms'] == '20.0'
+    names = ('image_rate_hz', 'imu_rate_hz', 'worker_busy_percent', 'frame_time_p50_ms',
+             'frame_time_p99_ms')
+    for images, expected in ((60, ('60.0', '400.0', '60', '20.0', '20.0')),
+                             (75, ('15.0', '0.0', '0', '20.0', '20.0'))):
+        found = values(statistics, images=images, imu=400)
+        assert tuple(found[name] for name in names) == expected
+        clock.now += SECOND
 
 
-def test_overload_is_told_as_such(clock):
-    statistics = Statistics(clock)
-    report = statistics.report(inputs(), counts(frames=9, taken=4, overload=3, no_imu=2),
-                               problem='', missing=())
-    assert report.level == WARN
-    assert report.text.startswith('5 frames were not used')
-    assert report.text.endswith('(3 overload, 2 no_imu): the worker is too slow for the camera')
+def test_latency_is_from_ready_to_publication(clock, statistics):
+    clock.now = SECOND
+    for milliseconds in range(1, 101):
+        statistics.add_pair(pair(), SECOND - milliseconds * 10**6)
+    found = values(statistics)
+    assert float(found['latency_p50_ms']) == pytest.approx(50.5, abs=0.1)
+    assert float(found['latency_p99_ms']) == pytest.approx(99.0, abs=0.1)
+    assert (found['pairs'], found['poses']) == ('100', '100')
+
+
+def test_refused_frames_are_reported_once(statistics):
+    first = report(statistics, counted=counts(frames=9, taken=4, overload=3, no_imu=2))
+    assert first.level == WARN
+    assert first.text.startswith('5 frames') and 'too slow' in first.text
+    assert '(3 overload, 2 no_imu)' in first.text
     later = counts(frames=10, taken=4, overload=3, no_imu=3)
-    report = statistics.report(inputs(), later, problem='', missing=())
-    assert report.text == '1 frames were not used since the last report (1 no_imu)'
-    # Told once: those of the last second.
-    assert statistics.report(inputs(), later, problem='', missing=()).level == OK
+    second = report(statistics, counted=later)
+    assert second.text.startswith('1 frames') and '(1 no_imu)' in second.text
+    assert report(statistics, counted=later).level == OK
 
 
-def test_every_counter_has_its_own_figure(clock):
+# Besides the refusals.
+EXPECTED = {
+    'state': 'degraded', 'missing': 'imu', 'image_rate_hz': '30.0', 'camera_info_rate_hz': '31.0',
+    'imu_rate_hz': '200.0', 'accel_rate_hz': '100.0', 'frames_received': '2000',
+    'frames_processed': '1064', 'frames_failed': '3', 'messages_invalid': '15',
+    'imu_samples': '9000', 'imu_gaps': '11', 'imu_repeated': '13', 'imu_late': '14',
+    'clock_jumps': '12', 'pairs': '3', 'poses': '2', 'matches': '20', 'inliers': '15',
+    'inlier_ratio': '0.750', 'parallax_px': '3.2', 'residual_rms_px': '',
+    'pixel_sigma_px': '',
+    'interval_s': '0.100', 'rotation_difference_to_gyro_deg': '', 'model': 'uniform',
+    'tracked_gyro_bias_rad_s': '0.01000 -0.02000 0.03000',
+    'tracked_gyro_bias_sigma_rad_s': '0.00100 0.00200 0.00300', 'tracked_time_offset_ms': '4.00',
+    'tracked_time_offset_sigma_ms': '0.50', 'applied_time_offset_ms': '-1.50',
+    'tracked_readout_time_ms': '31.00', 'tracked_readout_time_sigma_ms': '0.70',
+    'applied_readout_time_ms': '0.80',
+    'health': 'ok', 'health_findings': 'time_offset ok: 4 ms',
+    'latency_p50_ms': '15.0', 'latency_p99_ms': '15.0',
+    'frame_time_p50_ms': '30.0', 'frame_time_p99_ms': '30.0', 'worker_busy_percent': '2',
+    'last_reason_no_pose': 'LOW_PARALLAX: at rest'}
+
+
+def test_every_counter_has_its_own_field(clock, statistics):
     """All different, so that none can stand for another."""
-    statistics = Statistics(clock)
-    refused = {cause: 100 + k for k, cause in enumerate(Refusal)}
+    refused = {reason: 100 + k for k, reason in enumerate(Refusal)}
     for _ in range(3):
         statistics.add_failure('a frame failed')
-    told = Finding('time_offset', 0.0, 0.004, 0.0005, 's', True, HealthState.OK, '4 ms')
+    offset = Finding('time_offset', FindingState.OK, '4 ms', '', 0.0, 0.004, 0.0005, 's', True)
     last = replace(
-        pair(Status.LOW_PARALLAX, 'it stands'), health=Health((told,)), tracked=Tracked(
+        pair(Status.LOW_PARALLAX, 'at rest'), health=Assessment((offset,)), tracked=Tracked(
             gyro_bias=np.array([0.01, -0.02, 0.03]), gyro_bias_sigma=np.array([1e-3, 2e-3, 3e-3]),
             time_offset=0.004, time_offset_sigma=0.0005, readout_time=0.031,
             readout_time_sigma=0.0007, pairs=7), applied=Applied(-0.0015, 0.0008))
@@ -301,57 +304,245 @@ def test_every_counter_has_its_own_figure(clock):
     counted = SequencerCounts(frames=2000, frames_taken=1064, refused=refused, imu_samples=9000,
                               imu_gaps=11, clock_jumps=12, imu_repeated=13, imu_late=14)
     clock.now = 2 * SECOND
-    report = statistics.report(Inputs(images=60, camera_infos=62, imu=400, accelerometer=200,
-                                      invalid=15), counted, problem='', missing=('imu',))
-    values = dict(report.values)
-    assert len(values) == len(report.values)
-    assert {name: values[name] for name in EXPECTED} == EXPECTED
-    refusals = {f'frames_refused_{cause.value}': str(n) for cause, n in refused.items()}
-    assert values == {**values, **refusals}
-    assert set(values) == {*EXPECTED, *refusals}
+    found = report(statistics, 60, counted, missing=('imu',), camera_info=62, imu=400, accel=200,
+                   invalid=15).values
+    expected = EXPECTED | {
+        f'frames_refused_{reason.value}': str(n) for reason, n in refused.items()}
+    assert (dict(found), len(found)) == (expected, len(expected))
 
 
-def test_every_figure_is_documented(clock):
-    report = Statistics(clock).report(inputs(), counts(), problem='', missing=())
+def test_every_field_is_documented(statistics):
     text = (ROOT / 'docs' / 'operation.md').read_text(encoding='utf-8')
     documented = set(re.findall(r'`(\w+)`', text[text.index('## Diagnostics'):]
                                 .partition('\n## ')[0]))
-    names = {name for name, _ in report.values}
-    causes = {f'frames_refused_{cause.value}' for cause in Refusal}
-    assert names - causes <= documented
-    assert {cause.value for cause in Refusal} <= documented
+    refusals = {f'frames_refused_{reason.value}' for reason in Refusal}
+    assert values(statistics).keys() - refusals <= documented
+    assert {reason.value for reason in Refusal} <= documented
 
 
-def test_level_and_text(clock):
-    statistics = Statistics(clock)
-    report = statistics.report(inputs(), None, problem='not estimating: why', missing=('a', 'b'))
-    assert (report.level, report.text) == (ERROR, 'not estimating: why')
-    values = dict(report.values)
-    assert (values['missing'], values['tracked_time_offset_ms']) == ('a, b', '')
-    assert statistics.report(inputs(), counts(), problem='', missing=()).level == OK
-    statistics.add_pair(pair(Status.LOW_PARALLAX, 'it stands'), 0)
-    report = statistics.report(inputs(), counts(), problem='', missing=())
-    assert report.level == WARN
-    assert 'LOW_PARALLAX: it stands' in report.text
+def test_level_and_text(statistics):
+    found = statistics.report(Counter(), None, problem='not estimating: why', missing=('a', 'b'))
+    assert (found.level, found.text) == (ERROR, 'not estimating: why')
+    assert dict(found.values)['missing'] == 'a, b'
+    assert dict(found.values)['tracked_time_offset_ms'] == ''
+    assert report(statistics).level == OK
+    statistics.add_pair(pair(Status.LOW_PARALLAX, 'at rest'), 0)
+    found = report(statistics)
+    assert found.level == WARN
+    assert 'LOW_PARALLAX: at rest' in found.text
     statistics.add_pair(pair(), 0)
-    assert statistics.report(inputs(), counts(), problem='', missing=()).level == OK
+    assert report(statistics).level == OK
 
 
 @pytest.mark.parametrize(('state', 'level', 'shown'), [
-    (HealthState.OK, OK, 'ok'), (HealthState.UNKNOWN, OK, 'ok'),
-    (HealthState.SUSPECT, WARN, 'degraded'), (HealthState.WRONG, ERROR, 'told wrong')])
-def test_level_and_text_of_the_health(clock, state, level, shown):
-    statistics = Statistics(clock)
-    told = finding(state, 0.2)
-    statistics.add_pair(replace(pair(), health=Health((told,))), 0)
-    report = statistics.report(inputs(), counts(), problem='', missing=())
-    values = dict(report.values)
-    assert (report.level, values['state'], values['health']) == (level, shown, state.value)
-    assert (report.text == told.text) is bool(level)
-    assert told.sentence in values['health_findings']
-    # Frames that are left out do not hide that poses are wrong, nor do they where none comes.
-    dropping = statistics.report(inputs(), counts(9, 4, overload=5), problem='', missing=())
-    assert (dropping.text == told.text) is (state is HealthState.WRONG)
-    cannot = statistics.report(inputs(), counts(), problem='no image', missing=('image',))
+    (FindingState.OK, OK, 'ok'), (FindingState.UNKNOWN, OK, 'ok'),
+    (FindingState.SUSPECT, WARN, 'degraded'), (FindingState.WRONG, ERROR, 'told wrong')])
+def test_level_and_text_of_the_health(statistics, state, level, shown):
+    fault = finding(state, 0.2)
+    statistics.add_pair(replace(pair(), health=Assessment((fault,))), 0)
+    found = report(statistics)
+    fields = dict(found.values)
+    assert (found.level, fields['state'], fields['health']) == (level, shown, state.value)
+    assert (found.text == fault.text) is bool(level)
+    assert fault.description in fields['health_findings']
+    # Refused frames do not hide that poses are wrong, nor that nothing is published.
+    dropping = report(statistics, counted=counts(9, 4, overload=5))
+    assert (dropping.text == fault.text) is (state is FindingState.WRONG)
+    cannot = report(statistics, problem='no image', missing=('image',))
     assert (cannot.level, cannot.text) == (ERROR, 'no image')
     assert dict(cannot.values)['state'] == 'not estimating'
+
+
+# -- parameters: legal, illegal, live or read-only ----------------------------------------------
+
+DECLARATIONS = {name: declared for name, _, declared in Parameters.declarations()}
+DEFAULTS = {name: default for name, default, _ in Parameters.declarations()}
+LIVE = [name for name, declared in DECLARATIONS.items() if declared.live]
+
+
+@pytest.fixture(scope='module')
+def node(module_ros_domain_id: int) -> Iterator[Node]:
+    context = Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node('parameters', context=context)
+    yield node
+    node.destroy_node()
+    context.try_shutdown()
+
+
+CHANGES: list[Parameters] = []
+
+
+@pytest.fixture(scope='module')
+def parameters(node: Node) -> NodeParameters:
+    return NodeParameters(node, CHANGES.append)
+
+
+def illegal_values(declared: Declared) -> Iterator[Any]:
+    """Of another type, and beyond each bound."""
+    yield 5 if declared.kind is str else 'five'
+    if declared.choices:
+        yield 'none of them'
+    if declared.kind is float:
+        yield float('nan')
+        yield from (bound + step for bound, step in ((declared.low, -1.0), (declared.high, 1.0))
+                    if abs(bound) < 1e12)
+    if declared.kind is int:
+        yield int(declared.low) - 1
+        yield int(declared.high) + 1
+
+
+def other_value(name: str, declared: Declared) -> Any:
+    """A legal one that is not the default."""
+    if declared.kind is bool:
+        return not DEFAULTS[name]
+    assert declared.kind in (float, int), name
+    return declared.kind(0.3 * declared.low + 0.7 * declared.high)
+
+
+def assert_refused(node: Node, parameter: Parameter, reason: str) -> None:
+    [result] = node.set_parameters([parameter])
+    assert not result.successful, parameter
+    assert reason in result.reason
+    assert '\n' not in result.reason
+
+
+@pytest.mark.parametrize('name', DECLARATIONS)
+def test_an_illegal_value_is_refused_with_its_reason(node, parameters, name):
+    before = len(CHANGES)
+    for value in illegal_values(DECLARATIONS[name]):
+        assert_refused(node, Parameter(name, value=value), name)
+    assert (parameters.current, len(CHANGES)) == (Parameters(), before)
+
+
+@pytest.mark.parametrize('name', sorted(DECLARATIONS.keys() - set(LIVE)))
+def test_the_parameters_of_the_construction_are_read_only(node, parameters, name):
+    value = DEFAULTS[name]
+    if value is None:
+        value = {'readout_time': 0.02, 'quat_cam_imu_xyzw': (0.0, 0.0, 0.0, 1.0),
+                 'camera_matrix': (5.0, 0.0, 2.0, 0.0, 5.0, 2.0, 0.0, 0.0, 1.0),
+                 'distortion_coefficients': (0.1, 0.0, 0.0, 0.0)}[name]
+    value = list(value) if isinstance(value, tuple) else value
+    assert_refused(node, Parameter(name, value=value), 'read-only')
+
+
+@pytest.mark.parametrize('name', LIVE)
+def test_a_live_parameter_is_passed_on(node, parameters, name):
+    value, before = other_value(name, DECLARATIONS[name]), len(CHANGES)
+    assert value != DEFAULTS[name]
+    [result] = node.set_parameters([Parameter(name, value=value)])
+    assert result.successful, result.reason
+    assert len(CHANGES) == before + 1
+    assert CHANGES[-1] is parameters.current
+    assert parameters.current.to_mapping() == {**Parameters().to_mapping(), name: value}
+    assert node.get_parameter(name).value == value
+    [result] = node.set_parameters([Parameter(name, value=DEFAULTS[name])])
+    assert result.successful
+    assert parameters.current == Parameters()
+
+
+def test_several_at_once_are_all_set_or_none(node, parameters):
+    result = node.set_parameters_atomically([
+        Parameter('threshold', value=1.5), Parameter('min_inliers', value=1)])
+    assert not result.successful
+    assert 'min_inliers' in result.reason
+    assert parameters.current == Parameters()
+
+
+def test_a_parameter_cannot_be_removed(node, parameters):
+    assert_refused(node, Parameter('threshold', Parameter.Type.NOT_SET), 'threshold')
+    assert parameters.current == Parameters()
+
+
+# -- a worker that is too slow, held by an event: nothing here depends on the machine's speed ----
+
+FRAME_NS, IMU_NS, READOUT_NS = SECOND // 30, SECOND // 400, SECOND // 50
+START_NS = 1_700_000_000 * SECOND
+WIDTH, HEIGHT = 64, 48
+FRAMES = 40
+IMAGE = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH), dtype=np.uint8)
+
+
+def frame_stamp(k: int) -> int:
+    return START_NS + k * FRAME_NS
+
+
+def noisy_rate(k: int) -> tuple[float, float, float]:
+    """A gyro with an axis that repeats itself bit by bit would be refused."""
+    noise = 1e-4 * np.sin(k)
+    return 0.1 + noise, 0.2 + noise, 0.3 + noise
+
+
+@pytest.mark.timeout(600)   # the kernels may not be compiled yet
+def test_a_busy_worker_costs_the_node_no_imu(module_ros_domain_id, monkeypatch):
+    """The node goes on receiving; the oldest frames are dropped, and the latest wait."""
+    warm_up()
+    held: list[Frame] = []
+    started, released = threading.Event(), threading.Event()
+
+    def process(frame: Frame, parameters: Parameters) -> None:
+        held.append(frame)
+        started.set()
+        assert released.wait(300.0)
+
+    context = Context()
+    rclpy.init(context=context)
+    rclpy.init(args=['--ros-args', '-p', f'readout_time:={READOUT_NS / SECOND}', '-p',
+                     'quat_cam_imu_xyzw:=[0.0, 0.0, 0.0, 1.0]'])
+    node = RelposeNode()
+    monkeypatch.setattr(node._loop._processor, 'process', process)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    driver = rclpy.create_node('driver', context=context)
+    publishers = {msgtype: driver.create_publisher(msgtype, topic, 1000) for msgtype, topic in (
+        (Image, 'image'), (CameraInfo, 'camera_info'), (Imu, 'imu'))}
+
+    def spin_until(condition: Any, what: str) -> None:
+        def spun() -> Any:
+            executor.spin_once(timeout_sec=0.02)
+            return condition()
+        wait_until(spun, what)
+
+    try:
+        spin_until(lambda: all(p.get_subscription_count() for p in publishers.values()),
+                   'discovery')
+        sequencer = node._loop.sequencer
+        publishers[CameraInfo].publish(build.camera_info(
+            build.rclpy_types, width=WIDTH, height=HEIGHT,
+            k=(60.0, 0.0, 32.0, 0.0, 60.0, 24.0, 0.0, 0.0, 1.0)))
+        spin_until(lambda: node._intake.intrinsics is not None, 'the calibration')
+        samples = 0
+        for k in range(FRAMES):
+            until_ns = frame_stamp(k) + READOUT_NS + IMU_NS
+            while START_NS + (samples - 1) * IMU_NS <= until_ns:
+                publishers[Imu].publish(build.imu(
+                    build.rclpy_types, START_NS + (samples - 1) * IMU_NS, noisy_rate(samples)))
+                samples += 1
+            # No image is that before: a frozen camera's are refused.
+            publishers[Image].publish(build.gray_image(
+                build.rclpy_types, IMAGE + np.uint8(k), frame_stamp(k)))
+            # Best effort: of the images only the latest five are kept for the callback.
+            spin_until(lambda k=k: sequencer.counts().frames == k + 1, f'image {k}')
+            if k == 0:
+                spin_until(started.is_set, 'the first frame')
+        spin_until(lambda: sequencer.counts().imu_samples == samples, 'all IMU samples')
+        counts = sequencer.counts()
+        assert counts.imu_gaps == 0
+        assert counts.frames_taken == 1
+        assert counts.refused == {Refusal.OVERLOAD: FRAMES - 1 - MAILBOX_FRAMES}
+        released.set()
+        wait_until(lambda: len(held) == 1 + MAILBOX_FRAMES, 'the frames that waited')
+        latest = [frame_stamp(k) for k in range(FRAMES - MAILBOX_FRAMES, FRAMES)]
+        assert [frame.stamp_ns for frame in held] == [frame_stamp(0), *latest]
+        # The gyro from the frame before to the first after all those that went has no hole.
+        stamps = held[1].imu.since_previous.stamps_ns
+        assert (stamps[0], stamps[-1]) == (frame_stamp(0), latest[0])
+        assert np.diff(stamps).max() <= IMU_NS
+    finally:
+        released.set()
+        node._worker.stop(10.0)
+        executor.shutdown()
+        node.destroy_node()
+        driver.destroy_node()
+        rclpy.try_shutdown()
+        context.try_shutdown()

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
 import doctest
 import fcntl
+import functools
 import graphlib
 import importlib
 from importlib.metadata import distribution
@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 
+import conftest
 from conftest import ROOT
 import pytest
 
@@ -45,20 +46,22 @@ def loaded_after(code: str) -> set[str]:
     return set(ended.stderr.splitlines()[-1].split())
 
 
-def imports(path: Path) -> Iterator[str]:
-    """Yield absolute names of what a module imports, wherever in it, except for types only."""
-    todo = [ast.parse(path.read_text())]
+@functools.cache
+def imports(path: Path) -> list[str]:
+    """Return absolute names of what a module imports, wherever in it, except for types only."""
+    found, todo = [], [ast.parse(path.read_text())]
     while todo:
         node = todo.pop()
         if isinstance(node, ast.If) and ast.unparse(node.test).endswith('TYPE_CHECKING'):
             todo.extend(node.orelse)
             continue
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f'{path}: relative import'
-            yield from (f'{node.module}.{alias.name}' for alias in node.names)
+            found += [f'{node.module}.{alias.name}' for alias in node.names]
         todo.extend(ast.iter_child_nodes(node))
+    return found
 
 
 def module_behind(name: str) -> str:
@@ -97,6 +100,40 @@ def test_manifest_names_every_ros_package_that_is_imported():
     assert {name for name in used if ROS.match(name)} - declared == set()
 
 
+# Import -> distribution for pip, and rosdep key of package.xml; the others have one name.
+LIBRARIES = {
+    'cv2': ('opencv-python-headless', 'python3-opencv'),
+    'rosbags': ('rosbags', 'python3-rosbags-pip'),
+    'yaml': ('pyyaml', 'python3-yaml'),
+    # Dependencies of others.
+    'llvmlite': ('numba', 'python3-numba'),
+    'lz4': ('rosbags', 'python3-rosbags-pip'),
+}
+OPTIONAL = {'av', 'dask', 'distributed', 'gtsam', 'telemetry_parser'}
+
+
+def test_pip_and_rosdep_install_every_library_that_is_imported():
+    imported = {name.partition('.')[0] for path in MODULES.values() for name in imports(path)
+                if path.is_relative_to(ROOT / NAME)}
+    used = {name for name in imported - sys.stdlib_module_names - OPTIONAL - {NAME}
+            if not ROS.match(name)}
+    assert {'numpy', 'cv2', 'numba'} < used
+    pip, rosdep = zip(*(LIBRARIES.get(name, (name, f'python3-{name}')) for name in used),
+                      strict=True)
+    lines = (ROOT / 'requirements' / 'base.txt').read_text().lower().splitlines()
+    listed = {re.match(r'[\w-]+', line)[0] for line in lines if not line.startswith(('#', 'ros-'))}
+    assert set(pip) == listed - {'setuptools'}
+    printing = (
+        'import runpy, setuptools\n'
+        'setuptools.setup = lambda **metadata: print(*metadata["install_requires"], sep="\\n")\n'
+        'runpy.run_path("setup.py")')
+    ended = run(sys.executable, '-c', printing, cwd=ROOT)
+    assert {re.match(r'[\w-]+', line)[0].lower() for line in ended.stdout.splitlines()} == listed
+    manifest = (ROOT / 'package.xml').read_text()
+    keys = set(re.findall(r'<exec_depend>(python3-.*?)</', manifest))
+    assert set(rosdep) == keys
+
+
 def test_every_folder_of_modules_is_a_package():
     missing = {path.parent for path in MODULES.values()} - {
         path.parent for path in MODULES.values() if path.name == '__init__.py'}
@@ -114,36 +151,36 @@ def test_examples_in_docstrings_are_true(name):
     assert failed == 0
 
 
+def test_the_build_compiles_kernels_of_modules_that_exist():
+    table = re.search(r'WARM_UPS = \{(.*?)\}', (ROOT / 'setup.py').read_text(), re.DOTALL)[1]
+    warm_ups = re.findall(r"'([\w.]+)': '(?:module\.)?(\w+)\(", table)
+    assert len(warm_ups) == 3
+    for module, function in warm_ups:
+        assert callable(getattr(importlib.import_module(f'{NAME}.{module}'), function))
+
+
 # --- layers
 
 
 # Folder -> what its modules may import of the package, besides itself and the modules at the top
-# (errors, how kernels are compiled, how pictures are saved), which import nothing of it.
+# (errors, how kernels are compiled, how files are saved), which import nothing of it.
 BASE = {'geometry', 'config'}
-CORE = BASE | {'images', 'solvers', 'estimator', 'imu', 'tracking'}
+CORE = BASE | {'solvers', 'estimator', 'imu', 'tracking'}
 MAY_IMPORT = {
     'geometry': set(),
     'config': {'geometry', 'solvers'},
-    'images': set(),
     'solvers': {'geometry'},
     'imu': BASE,
     'tracking': BASE,
     'estimator': BASE | {'solvers'},
-    'health': BASE | {'estimator', 'imu'},
-    'front_end': CORE | {'health'},
-    'messages': CORE | {'front_end', 'health'},
-    'bags': {'geometry'},
-    'node': BASE | {'images', 'front_end', 'health', 'messages'},
-    'global_shutter': BASE | {'images', 'imu', 'health', 'front_end', 'messages', 'bags', 'node'},
-    'replay': CORE | {'front_end', 'health', 'messages', 'bags'},
-    'calibrate': CORE | {'messages', 'bags'},
-    'check': CORE | {'front_end', 'health', 'messages', 'bags', 'calibrate'},
-    'odometry': BASE | {'estimator', 'imu', 'health', 'front_end', 'messages', 'bags', 'replay',
-                        'node'},
-    'convert': BASE | {'images', 'imu', 'messages', 'bags'},
-    'batch': set(),
-    'cli': BASE | {'bags', 'replay', 'calibrate', 'check', 'convert', 'global_shutter', 'batch',
-                   'odometry'},
+    'pipeline': CORE,
+    'messages': CORE | {'pipeline'},
+    'bags': BASE | {'imu', 'tracking', 'messages'},
+    'nodes': BASE | {'tracking', 'pipeline', 'messages', 'odometry'},
+    'calibrate': CORE | {'pipeline', 'messages', 'bags'},
+    'offline': CORE | {'pipeline', 'messages', 'bags', 'calibrate'},
+    'odometry': BASE | {'estimator', 'imu', 'pipeline', 'messages', 'bags', 'offline'},
+    'cli': BASE | {'bags', 'offline', 'calibrate', 'odometry'},
 }
 # The laboratory uses all of the product, and nothing of the product imports it.
 MAY_IMPORT_IN_THE_LABORATORY = {
@@ -152,8 +189,8 @@ MAY_IMPORT_IN_THE_LABORATORY = {
     'experiments': {'simulation', 'live'},
     'cli': {'simulation', 'live', 'experiments'},
 }
-FREE_OF_ROS = ('geometry', 'config', 'images', 'solvers', 'estimator', 'imu', 'tracking',
-               'health', 'front_end', 'messages')
+FREE_OF_ROS = ('geometry', 'config', 'solvers', 'estimator', 'imu', 'tracking', 'pipeline',
+               'messages')
 
 
 def room_of(module: str) -> tuple[str, str]:
@@ -173,7 +210,7 @@ def test_folders_import_what_their_layer_may():
                 continue
             other, room = room_of(imported)
             if package == LABORATORY:
-                allowed = other == NAME or room in MAY_IMPORT_IN_THE_LABORATORY[folder]
+                allowed = other == NAME or room in {'', *MAY_IMPORT_IN_THE_LABORATORY[folder]}
             else:
                 allowed = other == NAME and (room == '' or room in MAY_IMPORT.get(folder, set()))
             if not allowed:
@@ -201,7 +238,7 @@ def test_core_imports_neither_ros_nor_rosbags():
 
 
 @pytest.mark.parametrize(('library', 'folders'), [
-    (ROS, {f'{NAME}/node', f'{NAME}/global_shutter', f'{NAME}/odometry', f'{LABORATORY}/live'}),
+    (ROS, {f'{NAME}/nodes', f'{LABORATORY}/live'}),
     (re.compile('gtsam$'), {f'{NAME}/odometry'}),
     (re.compile('rosbags$'), {f'{NAME}/bags'})])
 def test_library_is_imported_in_its_folders_only(library, folders):
@@ -209,6 +246,14 @@ def test_library_is_imported_in_its_folders_only(library, folders):
              if any(library.match(name.partition('.')[0]) for name in imports(path))}
     assert users, f'nothing imports {library.pattern}: the test would see nothing'
     assert {str(path.parent.relative_to(ROOT)) for path in users} <= folders
+
+
+def test_gtsam_is_imported_where_odometry_runs_only():
+    loaded = loaded_after('\n'.join(f'import {name}' for name in MODULES
+                                    if name.startswith((f'{NAME}.cli', f'{NAME}.nodes',
+                                                        f'{NAME}.odometry.pair'))))
+    assert 'rclpy' in loaded
+    assert 'gtsam' not in loaded
 
 
 def test_modules_import_each_other_without_cycles():
@@ -221,7 +266,7 @@ def test_modules_import_each_other_without_cycles():
 def test_the_library_does_not_print_or_exit():
     """Only the command line and the node's main do (what ruff's T20 cannot see: sys.exit)."""
     exits = [f'{path.relative_to(ROOT)}:{node.lineno}'
-             for path in MODULES.values() if path.parent.name not in ('cli', 'node', 'live')
+             for path in MODULES.values() if path.parent.name not in ('cli', 'nodes', 'live')
              for node in ast.walk(ast.parse(path.read_text()))
              if isinstance(node, ast.Call)
              and ast.unparse(node.func) in ('sys.exit', 'exit', 'quit', 'os._exit', 'print')]
@@ -239,9 +284,9 @@ def test_console_script_resolves(script):
     assert callable(entries[script].load())
 
 
-@pytest.mark.parametrize('folder', ['node', 'global_shutter'])
-def test_node_describes_itself(folder):
-    ended = run(sys.executable, '-m', f'{NAME}.{folder}.node', '--help')
+@pytest.mark.parametrize('node', ['relpose_node', 'global_shutter_node'])
+def test_node_describes_itself(node):
+    ended = run(sys.executable, '-m', f'{NAME}.nodes.start', node, '--help')
     assert ended.returncode == 0, ended.stderr
     assert 'readout_time' in ended.stdout
     assert ended.stderr == ''
@@ -360,21 +405,12 @@ def test_domain_id_is_locked_while_the_test_runs(ros_domain_id):
         fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
-@pytest.mark.parametrize(('data', 'outcome'), [(None, 'skipped'), ('missing', 'failed'),
-                                               ('.', 'passed')])
-def test_recordings_skip_only_where_none_are_given(data, outcome, tmp_path):
-    (tmp_path / 'conftest.py').symlink_to(ROOT / 'test' / 'conftest.py')
-    (tmp_path / 'test_one.py').write_text(
-        'import pytest\n\n\n@pytest.mark.recordings\ndef test_one(recordings):\n'
-        '    assert recordings.is_dir()\n')
-    environment = {key: value for key, value in os.environ.items() if key != 'RS_RELPOSE_DATA'}
-    environment['PYTHONPATH'] = str(ROOT / 'test')  # what conftest.py imports from beside it
-    if data is not None:
-        environment['RS_RELPOSE_DATA'] = str(tmp_path / data)
-    ended = run(sys.executable, '-m', 'pytest', '-c', ROOT / 'pyproject.toml', '--rootdir',
-                tmp_path, '-p', 'no:cacheprovider', tmp_path / 'test_one.py', env=environment)
-    expected = outcome if outcome != 'failed' else 'error'
-    assert f'1 {expected}' in ended.stdout, ended.stdout
+@pytest.mark.parametrize(('data', 'outcome'), [
+    (None, pytest.skip.Exception), ('missing', pytest.fail.Exception)])
+def test_recordings_skip_only_where_none_are_given(data, outcome, tmp_path, monkeypatch):
+    monkeypatch.setenv('RS_RELPOSE_DATA', '' if data is None else str(tmp_path / data))
+    with pytest.raises(outcome):
+        conftest.recordings_folder()
 
 
 @pytest.mark.parametrize('before, after', [(None, '1'), ('2', '2')])
@@ -384,14 +420,14 @@ def test_linear_algebra_has_one_thread_where_the_process_is_ours(entry, before, 
     code = f"""
 import os, sys, types
 from rs_relpose_ros.cli.main import main
-from rs_relpose_ros.node.start import start
+from rs_relpose_ros.nodes.start import start
 
 def tell(on_started=None):
     print(os.environ["OPENBLAS_NUM_THREADS"], flush=True)
     os._exit(0)
 
 assert "numpy" not in sys.modules
-sys.modules["made_up"] = types.SimpleNamespace(main=tell)
+sys.modules["rs_relpose_ros.nodes.made_up"] = types.SimpleNamespace(main=tell)
 {entry}
 tell()
 """

@@ -1,4 +1,4 @@
-"""Random two-view problems by brute force: SciPy only, nothing of the package's geometry.
+"""Random two-view problems, independent of the package's geometry: SciPy only.
 
 The paper's set-up: 1920x1080, f = 640 px, 60 us per row, baseline about 2 m, points 6 to 34 m
 away, velocities opposite in the two frames.
@@ -6,10 +6,9 @@ away, velocities opposite in the two frames.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import make_dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 WIDTH, HEIGHT, FOCAL, CENTRE = 1920, 1080, 640.0, (959.5, 539.5)
@@ -17,50 +16,19 @@ LINE_DELAY = 60e-6
 GRAVITY_NOISE, GYRO_NOISE = np.radians(0.2), np.radians(0.1)
 
 
-@dataclass(frozen=True)
-class TwoViewScene:
-    """Matches in pixels, what the IMU measures, and the truth (velocities in baselines/s)."""
-
-    points1: NDArray[np.float64]
-    points2: NDArray[np.float64]
-    measured_rate1: NDArray[np.float64]
-    measured_rate2: NDArray[np.float64]
-    measured_gravity1: NDArray[np.float64]
-    measured_gravity2: NDArray[np.float64]
-    R: NDArray[np.float64]
-    t: NDArray[np.float64]
-    v1: NDArray[np.float64]
-    v2: NDArray[np.float64]
-    w1: NDArray[np.float64]
-    w2: NDArray[np.float64]
-    is_outlier: NDArray[np.bool_]
+# Matches in pixels, measurements of the IMU, and the truth (velocities in baselines/s).
+TwoViewScene = make_dataclass('TwoViewScene', (
+    'points1', 'points2', 'measured_rate1', 'measured_rate2', 'measured_gravity1',
+    'measured_gravity2', 'R', 't', 'v1', 'v2', 'w1', 'w2', 'is_outlier'), frozen=True)
+# K problems of n exact matches each; the truth in their own units (|t| = 1). `rays*` (K, n, 3) as
+# measured; `derotated*` the same in the camera's orientation at tau 0; row times `tau*` (K, n);
+# `gravity*`, `t`, `v*`, `w*` (K, 3); `R` (K, 3, 3).
+MinimalProblems = make_dataclass('MinimalProblems', (
+    'rays1', 'rays2', 'derotated1', 'derotated2', 'tau1', 'tau2', 'gravity1', 'gravity2', 'R', 't',
+    'v1', 'v2', 'w1', 'w2'), frozen=True)
 
 
-@dataclass(frozen=True)
-class MinimalProblems:
-    """K problems of n exact matches each; the truth in their own units (|t| = 1).
-
-    `rays*` (K, n, 3) as measured; `derotated*` the same in the camera's orientation at tau 0; row
-    times `tau*` (K, n); `gravity*`, `t`, `v*`, `w*` (K, 3); `R` (K, 3, 3).
-    """
-
-    rays1: NDArray[np.float64]
-    rays2: NDArray[np.float64]
-    derotated1: NDArray[np.float64]
-    derotated2: NDArray[np.float64]
-    tau1: NDArray[np.float64]
-    tau2: NDArray[np.float64]
-    gravity1: NDArray[np.float64]
-    gravity2: NDArray[np.float64]
-    R: NDArray[np.float64]
-    t: NDArray[np.float64]
-    v1: NDArray[np.float64]
-    v2: NDArray[np.float64]
-    w1: NDArray[np.float64]
-    w2: NDArray[np.float64]
-
-
-def seen_from(world, R, p, w, v, tau):
+def rays_from(world, R, p, w, v, tau):
     """World points (N, 3) in the frame of the camera as it is at the row times (N,)."""
     turn = R * Rotation.from_rotvec(tau[:, None] * w)
     return turn.inv().apply(world - p - tau[:, None] * R.apply(v))
@@ -80,10 +48,10 @@ def expose(world, R, p, w, v, reference_row, iterations):
         turn = R if R.single else R[left]
         at, velocity, rate = (x if np.ndim(x) == 1 else x[left] for x in (p, v, w))
         tau[left] = (rows[left] - reference_row) * LINE_DELAY
-        local[left] = seen_from(world[left], turn, at, rate, velocity, tau[left])
+        local[left] = rays_from(world[left], turn, at, rate, velocity, tau[left])
         moved = FOCAL * local[left, 1] / local[left, 2] + CENTRE[1]
         settled[left] = np.abs(moved - rows[left]) < 1e-9
-        # Another round would leave the others where they are, to the last bit.
+        # Another iteration would not change the others, to the last bit.
         again = moved != rows[left]
         rows[left] = moved
         left = left[again]
@@ -129,10 +97,10 @@ def make_scene(seed, *, n=300, direction='forward', speed=1.0, rate=1.0, pixel_n
         a, za, settled_a = project(world, R1, np.zeros(3), w1, v1, reference_row)
         b, zb, settled_b = project(world, R2, p2, w2, v2, reference_row)
         size = [WIDTH - 1, HEIGHT - 1]
-        seen = (za > 1) & (zb > 1) & settled_a & settled_b
-        seen &= ((a >= 0) & (b >= 0) & (a <= size) & (b <= size)).all(axis=1)
-        found1.append(a[seen])
-        found2.append(b[seen])
+        observed = (za > 1) & (zb > 1) & settled_a & settled_b
+        observed &= ((a >= 0) & (b >= 0) & (a <= size) & (b <= size)).all(axis=1)
+        found1.append(a[observed])
+        found2.append(b[observed])
     points1 = np.concatenate(found1)[:n] + rng.normal(size=(n, 2)) * pixel_noise
     points2 = np.concatenate(found2)[:n] + rng.normal(size=(n, 2)) * pixel_noise
     is_outlier = np.zeros(n, dtype=bool)
@@ -183,11 +151,11 @@ def make_minimal_problems(seed, count, n, *, speed=(0.0, 10.0), rate=(0.0, 3.0),
             tau[:, None] * R1[k].apply(v1[k]))
         b, later, _ = expose(world, R2[k], p2[k], w2[k], v2[k], 0.0, 15)
         pixels = FOCAL * b[:, :2] / b[:, 2:] + CENTRE
-        seen = (b[:, 2] > 1.0) & ((pixels >= 0) & (pixels <= size)).all(axis=1)
-        found = missing[seen]
-        rays1[found], tau1[found] = a[seen], tau[seen]
-        rays2[found], tau2[found] = b[seen], later[seen]
-        missing = missing[~seen]
+        observed = (b[:, 2] > 1.0) & ((pixels >= 0) & (pixels <= size)).all(axis=1)
+        found = missing[observed]
+        rays1[found], tau1[found] = a[observed], tau[observed]
+        rays2[found], tau2[found] = b[observed], later[observed]
+        missing = missing[~observed]
     Q1, Q2 = (Rotation.random(count, random_state=rng) if turned else Rotation.identity(count)
               for _ in range(2))
     derotated = [Rotation.from_rotvec(tau[:, None] * w[owner]).apply(rays)

@@ -11,11 +11,11 @@ from rclpy.node import Node
 
 from rs_relpose_ros import PairSynchronizer, PoseChain
 from rs_relpose_ros.messages.outgoing import PAIR_TOPICS, pose_stamped_message
-from rs_relpose_ros.node.message_types import message_class
+from rs_relpose_ros.nodes.inputs import message_class
 
 
 class PathNode(Node):
-    """Publishes ~/path; says where it has to start anew."""
+    """Publishes ~/path; logs each restart of the path."""
 
     def __init__(self):
         super().__init__('pose_chain')

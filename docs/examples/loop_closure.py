@@ -9,15 +9,8 @@ import cv2
 import numpy as np
 from rosbags.highlevel import AnyReader
 
-from rs_relpose_ros import (
-    estimate_wide_pair,
-    Frame,
-    ImuBuffer,
-    ImuSample,
-    Intrinsics,
-    view_frame,
-)
-from rs_relpose_ros.config.parameter_file import read_parameters
+from rs_relpose_ros import estimate_wide_pair, Frame, ImuBuffer, ImuSample, Intrinsics, view_frame
+from rs_relpose_ros.config.files import read_parameters
 
 
 def main(bag, parameter_file, *stamps):
@@ -27,8 +20,8 @@ def main(bag, parameter_file, *stamps):
     if missing := [stamp for stamp in stamps if stamp not in images]:
         sys.exit(f'{bag} has no image of the stamp {missing[0]}')
 
-    # What a SLAM system has: images, intrinsics, IMU samples, and the parameters of the node. The
-    # buffer must reach back to the first image when it is asked for that.
+    # Input, as a SLAM system has it: images, intrinsics, IMU samples, and the parameters of the
+    # node. The buffer must still cover the first image when its view is created.
     parameters = read_parameters(Path(parameter_file), ['imu_buffer_seconds=60'])
     intrinsics = Intrinsics(
         width=info.width, height=info.height, image_width=info.width, image_height=info.height,

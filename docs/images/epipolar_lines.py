@@ -2,8 +2,8 @@
 
 PYTHONPATH=. python docs/images/epipolar_lines.py
 
-Of the pairs whose direction of translation lies in the image, the one whose error by OpenCV's
-5-point (RANSAC, 1 px) is the median, the lower one of two.
+The pair with the median error of OpenCV's 5-point (RANSAC, 1 px) among the pairs whose direction
+of translation lies in the image; the lower one of two medians.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 
 from rs_relpose_lab.experiments.methods import opencv_five_point, Pose, undistorted
 from rs_relpose_ros.bags.reader import open_bag
-from rs_relpose_ros.config.parameter_file import read_parameters
+from rs_relpose_ros.config.files import read_parameters
+from rs_relpose_ros.config.settings import sensor_model
 from rs_relpose_ros.estimator.result import RelativePose
-from rs_relpose_ros.front_end.derotated_rays import Sensor
-from rs_relpose_ros.front_end.frame import sensor_camera
-from rs_relpose_ros.front_end.pair import PairResult
 from rs_relpose_ros.geometry.motion import FrameMotion
-from rs_relpose_ros.replay.run import read_truth, Replay
-from rs_relpose_ros.replay.truth import PairErrors
+from rs_relpose_ros.geometry.timing import Sensor
+from rs_relpose_ros.offline.replay import read_truth, Replay
+from rs_relpose_ros.offline.truth import PairErrors
+from rs_relpose_ros.pipeline.pair import PairResult
 
 Array = NDArray[np.float64]
 
@@ -33,19 +33,20 @@ SIZE = np.array([640.0, 480.0])
 LINES = 24
 DISTANCES = np.geomspace(1.5, 3000.0, 400)   # along a ray [baselines]
 STILL = FrameMotion(np.zeros(3))
-NAMES = 'OpenCV 5-point, which takes all rows as seen at once', 'this package'
+NAMES = 'OpenCV 5-point, which assumes a global shutter', 'this package'
 
 
 def curves(origins: Array, rays: Array, pose: Pose | RelativePose, velocity2: Array,
            motion2: FrameMotion, sensor: Sensor) -> list[Array]:
-    """Where image 2 shows the points along rays (N, 3) from origins (N, 3) of camera 1 [px]."""
+    """Pixels in image 2 of the points along rays (N, 3) from origins (N, 3) of camera 1."""
     found = []
     for origin, ray in zip(origins, rays, strict=True):
         in_second = (origin + DISTANCES[:, None] * ray - pose.t) @ pose.R
         times = np.zeros(len(DISTANCES))
         for _ in range(4):
-            seen = in_second - times[:, None] * velocity2
-            pixels = sensor.seen(seen / np.linalg.norm(seen, axis=1)[:, None], times, motion2)
+            observed = in_second - times[:, None] * velocity2
+            rays = observed / np.linalg.norm(observed, axis=1)[:, None]
+            pixels = sensor.project(rays, times, motion2)
             times = np.nan_to_num(sensor.camera.row_times(pixels[:, 1]))
         pixels[in_second[:, 2] < 0.1] = np.nan
         found.append(pixels)
@@ -53,7 +54,7 @@ def curves(origins: Array, rays: Array, pose: Pose | RelativePose, velocity2: Ar
 
 
 def distance(point: Array, curve: Array) -> float:
-    """From a point to a polyline [px]."""
+    """Distance of a point to a polyline [px]."""
     start, step = curve[:-1], np.diff(curve, axis=0)
     share = np.clip(np.sum((point - start) * step, axis=1)
                     / np.maximum(np.sum(step**2, axis=1), 1e-12), 0.0, 1.0)
@@ -62,7 +63,7 @@ def distance(point: Array, curve: Array) -> float:
 
 def draw(axis: Axes, result: PairResult, lines: list[Array], chosen: NDArray[np.int64], title: str,
          epipole: Array, true_epipole: Array) -> None:
-    """Image 2 with the curves of some matches, the matches, and where camera 1 was."""
+    """Image 2 with the curves of some matches, the matches, and the position of camera 1."""
     image = result.image2
     assert image is not None
     height, width = image.shape
@@ -70,7 +71,7 @@ def draw(axis: Axes, result: PairResult, lines: list[Array], chosen: NDArray[np.
     for k in chosen:
         axis.plot(*lines[k].T, color='#0072B2', linewidth=0.9)
     axis.plot(*result.matches.points2[chosen].T, 'o', color='#E69F00', markersize=3.5,
-              label='matched corners, of which each has its line')
+              label='matched corners, each with its line')
     axis.plot(*epipole, 'x', color='#D55E00', markersize=13, markeredgewidth=2.5,
               label='estimated direction of translation')
     axis.plot(*true_epipole, '+', color='#00E000', markersize=17, markeredgewidth=2.5,
@@ -92,11 +93,11 @@ def main() -> None:
         topics = bag.find_topics()
         truth = read_truth(bag, topics)
         replay = Replay(bag, topics, parameters, keep_images=True)
-        pairs = [pair.result for pair in replay.pairs() if pair.result.pose]
+        pairs = [pair for pair in replay.pairs() if pair.pose]
         intrinsics = replay.intrinsics
     assert truth is not None and intrinsics is not None
-    sensor = Sensor(sensor_camera(intrinsics, parameters), intrinsics)
-    at_once = Sensor(intrinsics.global_shutter_camera(), intrinsics)
+    sensor = sensor_model(intrinsics, parameters.sensor)
+    at_once = sensor._replace(camera=intrinsics.global_shutter_camera())
 
     found: list[tuple[PairErrors, PairResult, Pose]] = []
     for pair in pairs:
@@ -135,7 +136,7 @@ def main() -> None:
     handles, labels = axis.get_legend_handles_labels()
     figure.legend(handles, labels, loc='outside lower center', ncols=3, fontsize=10)
     readout, interval = 1e3 * sensor.camera.readout_time, 1e3 * pair.interval
-    figure.suptitle('an image pair: the lines on which its matches must lie, and where they meet '
+    figure.suptitle('an image pair: the epipolar lines of its matches, and the epipole '
                     f'(read out in {readout:.0f} ms, {interval:.0f} ms apart)', fontsize=12)
     figure.savefig(Path(__file__).with_suffix('.jpg'), pil_kwargs={'quality': 88})
 

@@ -1,4 +1,4 @@
-"""Draws global_shutter.jpg: a house front seen by a swinging camera, as read and turned.
+"""Draws global_shutter.jpg: a house front from a swinging camera, before and after derotation.
 
 PYTHONPATH=. python docs/images/global_shutter.py
 """
@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_lab.experiments.unrolled_map import swinging, told, turned_frames
+from rs_relpose_lab.experiments.global_shutter import configured, derotated_frames, swinging
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.scene import Scene, Surface
 
@@ -49,16 +49,16 @@ def labelled(image: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
 
 
 def main() -> None:
-    """Choose the frame that was moved most, and draw it."""
+    """Choose the frame with the largest shift, and draw it."""
     texture = house_front()
     front = Surface(np.array([6.5, WIDTH / 2, HEIGHT - 2.6]), np.array([0.0, -1.0, 0.0]),
                     np.array([0.0, 0.0, -1.0]), WIDTH, HEIGHT, texture)
     simulation = simulate(CONFIG, scene=Scene.of(front),
                           trajectory=swinging(RATE, CONFIG.duration, tilt=0.05))
-    index, turned = max(turned_frames(simulation, told(simulation), images=True),
-                        key=lambda found: found[1].map.shift)
+    index, derotated = max(derotated_frames(simulation, configured(simulation), images=True),
+                           key=lambda found: found[1].map.shift)
     pictures = (labelled(simulation.image(index), 'as the camera read it (33 ms, swinging)'),
-                labelled(turned.image().values, 'turned by the gyro to its middle row'))
+                labelled(derotated.image().values, 'derotated by the gyro to its middle row'))
     gap = np.full((len(pictures[0]), 12), 255, dtype=np.uint8)
     path = Path(__file__).with_name('global_shutter.jpg')
     cv2.imwrite(str(path), np.concatenate([pictures[0], gap, pictures[1]], axis=1),

@@ -13,7 +13,7 @@ import numpy as np
 
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.timing import ImageClock
-from rs_relpose_ros.picture_files import save_picture
+from rs_relpose_ros.output_files import save_picture
 
 MS = 1_000_000
 HEIGHT, READOUT, EXPOSURE, INTERVAL, OFFSET = 480, 0.020, 0.008, 0.0333, 0.006
@@ -32,7 +32,7 @@ def exposed_rows(axes: Axes, first_ms: float, label: bool) -> None:
     half, length = 500.0 * EXPOSURE, 1000.0 * READOUT
     axes.fill([first_ms - half, first_ms + half, first_ms + half + length,
                first_ms - half + length], [0, 0, HEIGHT, HEIGHT], color=EXPOSED,
-              label='row is exposed' if label else None)
+              label='exposure of a row' if label else None)
     axes.plot([first_ms, first_ms + length], [0, HEIGHT], color=ROWS, lw=2,
               label='mid-exposure: the row time' if label else None)
 
@@ -55,9 +55,9 @@ def draw_two_frames(axes: Axes) -> None:
         exposed_rows(axes, reference, label=k == 0)
         axes.plot([stamp, stamp], [-95, HEIGHT + 60], color=STAMPED, ls=':', lw=1.2)
         axes.plot(stamp, -95, 'v', color=STAMPED, ms=9,
-                  label='stamp, as the driver gives it' if k == 0 else None)
+                  label='stamp of the driver' if k == 0 else None)
         if k == 0:
-            earliest, latest = (t / MS for t in driver.row_span_ns(round(stamp * MS)))
+            earliest, latest = (reference + 1000.0 * t for t in driver.camera.row_time_span)
             arrow(axes, (stamp, -60), (stamp + 1000 * OFFSET, -60), 'time_offset',
                   (stamp + 500 * OFFSET, -28), STAMPED)
             arrow(axes, (reference - 500 * EXPOSURE, -95), (reference, -95),
@@ -83,15 +83,15 @@ def draw_two_frames(axes: Axes) -> None:
 
 
 def draw_conventions(axes: Axes) -> None:
-    """The nine instants that a stamp may mark."""
+    """The nine times that a stamp may mark."""
     exposed_rows(axes, 0.0, label=False)
     for row, at, name in (('first', 0, 'first'), ('middle', (HEIGHT - 1) / 2, 'middle'),
                           ('last', HEIGHT - 1, 'last')):
         for exposure, marker in (('start', '>'), ('middle', 'o'), ('end', '<')):
-            # Where the stamp lies when row 0 is in mid-exposure at 0.
+            # Position of the stamp if row 0 is in mid-exposure at 0.
             driver = clock(row, exposure)
-            earliest, _ = driver.row_span_ns(0)
-            axes.plot(-earliest / MS, at, marker, color=STAMPED, ms=9, clip_on=False,
+            earliest = driver.reference_ns(0) / MS + 1000.0 * driver.camera.row_time_span[0]
+            axes.plot(-earliest, at, marker, color=STAMPED, ms=9, clip_on=False,
                       label=f'stamp_exposure: {exposure}' if row == 'first' else None)
         axes.text(-1000 * EXPOSURE, at, f'stamp_row:\n{name}', ha='right', va='center', fontsize=9)
     axes.set(xlim=(-19, 27), ylim=(HEIGHT + 95, -140), xlabel='time from mid-exposure of row 0 '
@@ -101,7 +101,7 @@ def draw_conventions(axes: Axes) -> None:
 
 
 def main() -> None:
-    """Write the picture beside this file."""
+    """Write the picture into the folder of this file."""
     figure = Figure(figsize=(12.5, 4.6), layout='constrained')
     left, right = figure.subplots(1, 2, width_ratios=[1.9, 1.0])
     draw_two_frames(left)

@@ -11,9 +11,9 @@ from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.bag import write_bag, write_parameters
 from rs_relpose_ros.bags.writer import refuse_existing
 from rs_relpose_ros.cli.options import progress_bar
-from rs_relpose_ros.config.declarations import Declared, declared
+from rs_relpose_ros.config.declare import Declared, declared
 
-HELP = ('Render true rolling-shutter images (every row at its own instant) of a textured scene '
+HELP = ('Render true rolling-shutter images (every row at its own time) of a textured scene '
         'along a hand-held-like walk, with IMU and ground truth, into a rosbag2 directory (MCAP) '
         'with the topics /camera/image_raw/compressed, /camera/camera_info, /imu/data_raw and '
         '/ground_truth/pose. Writes OUT_BAG.yaml as well: the parameters of relpose_node for this '
@@ -23,7 +23,7 @@ HELP = ('Render true rolling-shutter images (every row at its own instant) of a 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments; one option per setting of the simulation."""
     parser.add_argument('out_bag', metavar='OUT_BAG', type=Path,
-                        help='bag directory to create; OUT_BAG.yaml is written beside it')
+                        help='bag directory to create; OUT_BAG.yaml is written next to it')
     parser.add_argument('--raw', action='store_true',
                         help='raw images on /camera/image_raw instead of JPEG')
     parser.add_argument('--jpeg-quality', type=int, default=88, metavar='Q',
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     """Write the bag and its parameter file."""
     config = configuration(args)
     parameters = args.out_bag.with_name(args.out_bag.name + '.yaml')
-    # Asked before the scene is made, which takes seconds.
+    # Checked before the scene is made, which takes seconds.
     refuse_existing(args.out_bag, parameters)
     simulation = simulate(config)
     with progress_bar(config.frame_count, 'frame', args.out_bag.name) as bar:

@@ -2,38 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 import functools
 import hashlib
 import json
+from operator import attrgetter
 from pathlib import Path
 import time
-from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2, trim_mean
 
-from rs_relpose_lab.experiments import mixture_oracle, oracle, problems
+from rs_relpose_lab.experiments import oracle, problems
+from rs_relpose_lab.experiments.harness import grouped, in_processes, markdown_table, write_csv
 from rs_relpose_lab.experiments.methods import as_pair, METHODS, prepared
-from rs_relpose_lab.experiments.mixture_oracle import mixture_estimate, mixture_of
-from rs_relpose_lab.experiments.oracle import oracle_estimate, OracleEstimate
+from rs_relpose_lab.experiments.oracle import oracle_estimate
 from rs_relpose_lab.experiments.problems import Cell, CELLS, make_problem, Noise, TwoViewProblem
-from rs_relpose_lab.experiments.scoring import NO_POSE, pose_error, PoseError
-from rs_relpose_lab.experiments.workers import in_processes
+from rs_relpose_lab.experiments.scoring import pose_error, POSE_FREEDOM, PoseError, Quantiles
 from rs_relpose_lab.simulation import rows
 from rs_relpose_ros import RelativePose, warm_up
-
-# Share of false matches from which on who knows the labels knows much more than anybody can.
-MANY_OUTLIERS = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
     """One problem, estimated.
 
-    `sigma_factor`: told sigmas by the true ones; `error`, `oracle`: of estimator and oracle;
-    `mixture`: of the oracle without labels, where there are many outliers; `duration`: of the
-    whole estimate [s].
+    `sigma_factor`: configured sigmas by the true ones; `error`, `oracle`: of estimator and oracle;
+    `duration`: of the whole estimate [s].
     """
 
     cell: str
@@ -43,20 +40,12 @@ class Trial:
     status: str
     error: PoseError
     oracle: PoseError
-    mixture: PoseError
     duration: float
-
-
-class Best(NamedTuple):
-    """Errors of the oracle, and of the one without labels (infinite where it was not asked)."""
-
-    oracle: PoseError
-    mixture: PoseError
 
 
 @dataclass(frozen=True, slots=True)
 class AccuracyRun:
-    """What is run: every cell with every kind of noise and every factor of the told sigmas."""
+    """Every cell with every kind of noise and every factor of the configured sigmas."""
 
     cells: tuple[str, ...]
     noises: tuple[Noise, ...] = ('paper', 'gaussian')
@@ -77,7 +66,7 @@ class _Task:
     cell: str
     noise: Noise
     seeds: tuple[int, ...]
-    known: dict[int, Best]
+    known: dict[int, PoseError]
 
 
 def run_accuracy(run: AccuracyRun, cache: OracleCache, jobs: int = 1,
@@ -96,8 +85,7 @@ def run_accuracy(run: AccuracyRun, cache: OracleCache, jobs: int = 1,
     for task, done in zip(tasks, in_processes(_run, tasks, jobs, warm_up), strict=True):
         trials += done
         cache.add(CELLS[task.cell], task.noise,
-                  {trial.seed: Best(trial.oracle, trial.mixture) for trial in done
-                   if trial.seed not in task.known})
+                  {trial.seed: trial.oracle for trial in done if trial.seed not in task.known})
         on_trials(len(done))
     return trials
 
@@ -108,7 +96,7 @@ def _run(task: _Task) -> list[Trial]:
     trials = []
     for seed in task.seeds:
         problem = make_problem(cell, seed, task.noise)
-        best = task.known.get(seed) or _best(cell, problem, seed)
+        best = task.known.get(seed) or _oracle_error(cell, problem)
         for factor in task.run.sigma_factors:
             pair = as_pair(problem, cell, factor)
             call = prepared(method, pair, seed)
@@ -117,26 +105,19 @@ def _run(task: _Task) -> list[Trial]:
             duration = time.perf_counter() - started
             assert isinstance(pose, RelativePose)
             trials.append(Trial(task.cell, task.noise, factor, seed, pose.status.value,
-                                pair.error(pose), *best, duration))
+                                pair.error(pose), best, duration))
     return trials
 
 
-def _best(cell: Cell, problem: TwoViewProblem, seed: int) -> Best:
-    def error(best: OracleEstimate) -> PoseError:
-        return pose_error(best.R, best.t, problem.R, problem.t, best.covariance)
-
-    sigmas = (cell.pixel_noise, float(np.radians(cell.gravity_noise)),
-              float(np.radians(cell.gyro_noise)))
-    mixture = NO_POSE
-    if cell.outliers >= MANY_OUTLIERS:
-        mixture = error(mixture_estimate(
-            problem, mixture_of(cell, seed, cell.pixel_noise), *sigmas))
-    return Best(error(oracle_estimate(problem, *sigmas)), mixture)
+def _oracle_error(cell: Cell, problem: TwoViewProblem) -> PoseError:
+    best = oracle_estimate(problem, cell.pixel_noise, float(np.radians(cell.gravity_noise)),
+                           float(np.radians(cell.gyro_noise)))
+    return pose_error(best.R, best.t, problem.R, problem.t, best.covariance)
 
 
 @dataclass(frozen=True, slots=True)
 class OracleCache:
-    """The oracle's errors on disk: it need not run again while the estimator is worked on.
+    """The oracle's errors on disk: it need not run again while the estimator is developed.
 
     A folder with one file per cell and kind of noise. A file's name holds the digest of
     all that decides its content: the cell, the noise, and the source of generator and oracle.
@@ -144,27 +125,26 @@ class OracleCache:
 
     folder: Path
 
-    def load(self, cell: Cell, noise: Noise) -> dict[int, Best]:
-        """Errors of the oracles by seed."""
+    def load(self, cell: Cell, noise: Noise) -> dict[int, PoseError]:
+        """Errors of the oracle by seed."""
         path = self._path(cell, noise)
         if not path.is_file():
             return {}
-        stored = json.loads(path.read_text())
-        return {int(seed): Best(*(PoseError(*error) for error in errors))
-                for seed, errors in stored.items()}
+        return {int(seed): PoseError(*error)
+                for seed, error in json.loads(path.read_text()).items()}
 
-    def add(self, cell: Cell, noise: Noise, errors: dict[int, Best]) -> None:
-        """Keep errors by seed, beside those that are kept already."""
+    def add(self, cell: Cell, noise: Noise, errors: dict[int, PoseError]) -> None:
+        """Add errors by seed to those already kept."""
         path = self._path(cell, noise)
         if not errors:
             return
         path.parent.mkdir(parents=True, exist_ok=True)
         merged = {**self.load(cell, noise), **errors}
-        # Replaced as a whole, so that a run that is stopped leaves no half of a file.
+        # Replaced as a whole, so that an interrupted run leaves no partial file.
         new = path.with_suffix('.new')
         new.write_text(json.dumps({
-            seed: [(error.rotation, error.translation, error.nees) for error in best]
-            for seed, best in sorted(merged.items())}))
+            seed: (error.rotation, error.translation, error.nees)
+            for seed, error in sorted(merged.items())}))
         new.replace(path)
 
     def _path(self, cell: Cell, noise: Noise) -> Path:
@@ -174,6 +154,170 @@ class OracleCache:
 
 @functools.cache
 def _source() -> bytes:
-    """Of generator and oracles, as they were when first asked for."""
+    """Source of generator and oracle when first read."""
     return b''.join(Path(str(module.__file__)).read_bytes()
-                    for module in (rows, problems, oracle, mixture_oracle))
+                    for module in (rows, problems, oracle))
+
+
+# -- report: statistics of each cell, against the project's limits ----------------------------
+
+Array = NDArray[np.float64]
+
+# A rotation this wrong [deg] is no noise in any of the cells.
+GROSS_ERROR = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Consistency:
+    """Errors in units of the covariance.
+
+    `mean`: of the inner 98 % of NEES / 5: 1 is right, more is overconfident.
+    `above`: share above the 95 % quantile of chi-square: 0.05 is right.
+    """
+
+    mean: float
+    above: float
+
+
+@dataclass(frozen=True, slots=True)
+class CellStatistics:
+    """Of one cell with one kind of noise and one factor of the configured sigmas.
+
+    `lost`, `gross`: trials without a pose, and with a rotation more than `GROSS_ERROR` wrong.
+    `rotation` ... `oracle_translation`: errors [deg]; a lost pose counts as infinite.
+    `rotation_ratio`, `translation_ratio`: estimator by oracle. `duration`: median [ms].
+    """
+
+    noise: str
+    sigma_factor: float
+    cell: str
+    trials: int
+    lost: int
+    gross: int
+    rotation: Quantiles
+    translation: Quantiles
+    oracle_rotation: Quantiles
+    oracle_translation: Quantiles
+    rotation_ratio: Quantiles
+    translation_ratio: Quantiles
+    nees: Consistency
+    oracle_nees: Consistency
+    duration: float
+
+
+def cell_statistics(trials: Sequence[Trial]) -> CellStatistics:
+    """Statistics of trials of one setting."""
+    rotation = Quantiles.of(trial.error.rotation for trial in trials)
+    translation = Quantiles.of(trial.error.translation for trial in trials)
+    best_rotation = Quantiles.of(trial.oracle.rotation for trial in trials)
+    best_translation = Quantiles.of(trial.oracle.translation for trial in trials)
+    return CellStatistics(
+        noise=trials[0].noise, sigma_factor=trials[0].sigma_factor, cell=trials[0].cell,
+        trials=len(trials),
+        lost=sum(bool(np.isinf(trial.error.rotation)) for trial in trials),
+        gross=sum(GROSS_ERROR < trial.error.rotation < np.inf for trial in trials),
+        rotation=rotation, translation=translation, oracle_rotation=best_rotation,
+        oracle_translation=best_translation, rotation_ratio=_ratio(rotation, best_rotation),
+        translation_ratio=_ratio(translation, best_translation),
+        nees=consistency([trial.error.nees for trial in trials]),
+        oracle_nees=consistency([trial.oracle.nees for trial in trials]),
+        duration=float(np.median([trial.duration for trial in trials])) * 1e3)
+
+
+def consistency(nees: Sequence[float]) -> Consistency:
+    """Statistics of normalised errors; NaN, of a pose that is lost, is left out."""
+    known = np.array([value for value in nees if not np.isnan(value)])
+    if len(known) == 0:
+        return Consistency(float('nan'), float('nan'))
+    return Consistency(float(trim_mean(known, 0.01)) / POSE_FREEDOM,
+                       float((known > chi2.ppf(0.95, POSE_FREEDOM)).mean()))
+
+
+def _ratio(error: Quantiles, reference: Quantiles) -> Quantiles:
+    return Quantiles(error.median / reference.median, error.p90 / reference.p90)
+
+
+def summary(cells: Sequence[CellStatistics]) -> list[tuple[str, float, str]]:
+    """Name, value and limit of the project's criteria, over cells of one noise and factor."""
+    def column(name: str) -> Array:
+        return np.array([attrgetter(name)(cell) for cell in cells])
+
+    rotation, translation = column('rotation_ratio.median'), column('translation_ratio.median')
+    mean, above = column('nees.mean'), 100.0 * column('nees.above')
+    return [
+        ('ratio of median rotation errors, median over cells', _median(rotation), '<= 1.10'),
+        ('ratio of median translation errors, median over cells', _median(translation), '<= 1.20'),
+        ('ratio of median errors, largest of a cell',
+         float(np.maximum(rotation, translation).max()), '<= 1.6'),
+        ('ratio of 90th percentiles of rotation, median over cells',
+         _median(column('rotation_ratio.p90')), '<= 1.5'),
+        ('ratio of 90th percentiles of translation, median over cells',
+         _median(column('translation_ratio.p90')), '<= 1.5'),
+
+        ('lost poses', float(column('lost').sum()), '0'),
+        (f'rotations wrong by more than {GROSS_ERROR:g} deg', float(column('gross').sum()), '0'),
+        ('NEES / 5, smallest of a cell', float(mean.min()), '>= 0.8'),
+        ('NEES / 5, largest of a cell', float(mean.max()), '<= 1.25'),
+        ('above the 95 % quantile, smallest of a cell [%]', float(above.min()), '>= 2'),
+        ('above the 95 % quantile, largest of a cell [%]', float(above.max()), '<= 10'),
+        ('median time of an estimate, median over cells [ms]', _median(column('duration')), ''),
+    ]
+
+
+def _median(values: Array) -> float:
+    return float(np.median(values))
+
+
+def write_report(folder: Path, run: AccuracyRun, trials: Sequence[Trial]) -> str:
+    """Write every trial, the statistics of every cell, the plot and the report; the report."""
+    cells = [cell_statistics(group) for group in grouped(
+        trials, attrgetter('noise', 'sigma_factor', 'cell')).values()]
+    write_csv(folder / 'trials.csv', trials)
+    write_csv(folder / 'cells.csv', cells)
+    report = _report(run, cells)
+    (folder / 'accuracy.md').write_text(report)
+    return report
+
+
+def _report(run: AccuracyRun, cells: Sequence[CellStatistics]) -> str:
+    parts = [
+        '# Accuracy against the oracle\n',
+        (f'{run.trials} trials a cell, solver `{run.solver}`, errors in degrees '
+         '(median / 90th percentile); a ratio is estimator by oracle. NEES / 5 is the mean of the '
+         'inner 98 %; "above" is the share above the 95 % quantile of chi-square(5).\n')]
+    settings = grouped(cells, attrgetter('noise', 'sigma_factor'))
+    for (noise, factor), group in settings.items():
+        parts.append(f'## Noise of gravity: {noise}; sigmas {factor:g} times the true ones\n')
+        parts.append(markdown_table(
+            ('cell', 'R', 'oracle', 'ratio', 't', 'oracle', 'ratio', 'lost', 'gross', 'NEES / 5',
+             'oracle', 'above [%]', 'oracle', 'ms'), [_row(cell) for cell in group]))
+        parts.append(markdown_table(
+            ('over all cells', 'value', 'wanted'),
+            [(name, f'{value:.3g}', limit) for name, value, limit in summary(group)]))
+        reference = settings.get((noise, 1.0))
+        if factor != 1.0 and reference:
+            parts.append(_against_true_sigmas(group, reference))
+    return '\n'.join(parts)
+
+
+def _row(cell: CellStatistics) -> tuple[str, ...]:
+    return (
+        cell.cell, cell.rotation.text(3), cell.oracle_rotation.text(3),
+        cell.rotation_ratio.text(2), cell.translation.text(3), cell.oracle_translation.text(3),
+        cell.translation_ratio.text(2), f'{cell.lost}', f'{cell.gross}', f'{cell.nees.mean:.2f}',
+        f'{cell.oracle_nees.mean:.2f}', f'{100 * cell.nees.above:.1f}',
+        f'{100 * cell.oracle_nees.above:.1f}', f'{cell.duration:.1f}')
+
+
+def _against_true_sigmas(group: Sequence[CellStatistics], reference: Sequence[CellStatistics],
+                         ) -> str:
+    """Table of errors by those with the true sigmas."""
+    configured = {cell.cell: cell for cell in reference}
+    rows = []
+    for name in ('rotation', 'translation'):
+        for statistic in ('median', 'p90'):
+            value = attrgetter(f'{name}.{statistic}')
+            ratios = np.array([value(cell) / value(configured[cell.cell]) for cell in group])
+            rows.append((f'{statistic} {name} error by that with the true sigmas',
+                         f'{_median(ratios):.3g}', f'{ratios.max():.3g}', '<= 1.3'))
+    return markdown_table(('over all cells', 'median', 'largest', 'wanted'), rows)

@@ -10,13 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_lab.simulation.fine_path import FinePath
-from rs_relpose_lab.simulation.hand_held import hand_held, Plan
-from rs_relpose_lab.simulation.rows import see, View
-from rs_relpose_lab.simulation.trajectory import Trajectory
-from rs_relpose_ros.calibrate.axis_maps import axis_maps
-from rs_relpose_ros.calibrate.gyro_path import GyroSeries
-from rs_relpose_ros.calibrate.tracks import Tracks
+from rs_relpose_lab.simulation.motions import hand_held, Plan
+from rs_relpose_lab.simulation.rows import observe, View
+from rs_relpose_lab.simulation.trajectory import FinePath, Trajectory
+from rs_relpose_ros.calibrate.observations import Tracks
+from rs_relpose_ros.calibrate.start import axis_maps, GyroSeries
 
 Array = NDArray[np.float64]
 
@@ -25,7 +23,7 @@ START_NS = 1_700_000_000_000_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """What a recording was made with; rotation as ``v_cam = R_cam_imu v_imu``.
+    """Truth of a recording; rotation as ``v_cam = R_cam_imu v_imu``.
 
     Times [s], noise of the pixels [px] and of the gyro [rad/s/sqrt(Hz)], bias [rad/s], speed
     [m/s], rms of the rotation [rad/s].
@@ -86,7 +84,7 @@ def about_one_axis(axis: int, duration: float) -> Trajectory:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recorded:
-    """What `calibrate` takes, and what it should find."""
+    """Input of `calibrate`, and the truth."""
 
     tracks: Tracks
     gyro: GyroSeries
@@ -100,17 +98,17 @@ def record(truth: Truth, rng: np.random.Generator,
     intervals = np.full(truth.frames, 1.0 / truth.fps)
     intervals[truth.frames // 2:] *= truth.long_interval
     # Instants of the first row on the IMU clock, which is the trajectory's.
-    instants = np.concatenate([[0.0], np.cumsum(intervals[:-1])])
+    times = np.concatenate([[0.0], np.cumsum(intervals[:-1])])
     before = np.concatenate([intervals[:1], intervals[:-1]])
     offsets = truth.time_offset + truth.exposure_slope * (before - np.median(before))
-    end = instants[-1] + 0.2
+    end = times[-1] + 0.2
     if trajectory is None:
         trajectory = hand_held(rng, -0.7, end + 0.5, Plan.parse(f'walk:{end + 1.0}'),
                                speed=truth.speed, rotation_rate=truth.rotation_rate)
-    frames = _frames(truth, trajectory, instants, _world(rng), rng)
+    frames = _frames(truth, trajectory, times, _world(rng), rng)
     if truth.stamp_jitter:
         offsets = offsets + truth.stamp_jitter * rng.standard_normal(truth.frames)
-    stamps = START_NS + np.rint((instants - offsets) * 1e9).astype(np.int64)
+    stamps = START_NS + np.rint((times - offsets) * 1e9).astype(np.int64)
     return Recorded(Tracks(stamps, *frames), _gyro(truth, trajectory, end, rng), truth, trajectory)
 
 
@@ -135,19 +133,19 @@ def _world(rng: np.random.Generator, count: int = 4000) -> Array:
     return points
 
 
-def _frames(truth: Truth, trajectory: Trajectory, instants: Array, world: Array,
+def _frames(truth: Truth, trajectory: Trajectory, times: Array, world: Array,
             rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     center = 0.5 * (np.array([truth.width, truth.height]) - 1.0)
     view = View(lambda local: center + truth.focal * local[:, :2] / local[:, 2:],
                 lambda pixels: np.column_stack([(pixels - center) / truth.focal,
                                                 np.ones(len(pixels))]),
                 truth.width, truth.height, truth.readout_time / truth.height, reference_row=0.0)
-    path = FinePath(trajectory, instants[0] - 0.1, instants[-1] + 0.15)
+    path = FinePath(trajectory, times[0] - 0.1, times[-1] + 0.15)
     ids = np.full(len(world), -1, dtype=np.int64)       # track of a point that is followed
     drift, start = np.zeros((len(world), 2)), np.zeros(len(world))
     next_id, frame, track, pixels = 0, [], [], []
-    for index, instant in enumerate(instants):
-        points = see(world, path.from_instant(instant), view, margin=-2.0)
+    for index, time in enumerate(times):
+        points = observe(world, path.motion_from(time), view, margin=-2.0)
         visible = np.isfinite(points).all(axis=1)
         # A track is lost now and then, even in sight.
         ids[~visible | (rng.uniform(size=len(world)) < 0.02)] = -1
@@ -159,9 +157,9 @@ def _frames(truth: Truth, trajectory: Trajectory, instants: Array, world: Array,
         # Half of the outliers slide over the scene, the others jump from frame to frame.
         slides = rng.uniform(size=len(new)) < 0.5 * truth.outliers
         drift[new] = slides[:, None] * rng.normal(0.0, 80.0, (len(new), 2))
-        start[new] = instant
+        start[new] = time
         followed = np.flatnonzero(ids >= 0)
-        measured = (points[followed] + drift[followed] * (instant - start[followed])[:, None]
+        measured = (points[followed] + drift[followed] * (time - start[followed])[:, None]
                     + truth.pixel_noise * rng.standard_normal((len(followed), 2)))
         jumps = rng.uniform(size=len(followed)) < 0.25 * truth.outliers
         measured[jumps] += rng.uniform(-50.0, 50.0, (int(jumps.sum()), 2))

@@ -1,4 +1,4 @@
-"""A live run, its replay and other methods side by side: errors over the same pairs."""
+"""Errors of a live run, its replay and other methods over the same pairs."""
 
 from __future__ import annotations
 
@@ -11,18 +11,22 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_lab.experiments.methods import OPENCV_ESTIMATORS, opencv_five_point, undistorted
-from rs_relpose_ros.bags.reader import Bag, open_bag
-from rs_relpose_ros.bags.topics import SensorTopics
-from rs_relpose_ros.config.parameter_file import read_parameters
-from rs_relpose_ros.config.parameters import Parameters
+from rs_relpose_lab.experiments.methods import (
+    OPENCV_ESTIMATORS,
+    opencv_five_point,
+    Pose,
+    undistorted,
+)
+from rs_relpose_ros.bags.reader import Bag, open_bag, SensorTopics
+from rs_relpose_ros.config.files import read_parameters
+from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import MissingInputError
 from rs_relpose_ros.estimator.result import Status
-from rs_relpose_ros.geometry.intrinsics import Intrinsics
-from rs_relpose_ros.replay.outputs import POSES_FILE, replay_into
-from rs_relpose_ros.replay.run import read_stamps, read_truth, Replay, ReplayedPair
-from rs_relpose_ros.replay.tables import pair_record, PairRecord
-from rs_relpose_ros.replay.truth import median_and_p90, PairErrors, TrueTrajectory
+from rs_relpose_ros.geometry.camera import Intrinsics
+from rs_relpose_ros.offline.replay import read_stamps, read_truth, Replay, replay_into
+from rs_relpose_ros.offline.tables import PairRecord, POSES
+from rs_relpose_ros.offline.truth import median_and_p90, PairErrors, TrueTrajectory
+from rs_relpose_ros.pipeline.pair import PairResult
 
 # The algorithms of the paper, by solver: its refinement, and the gyro only derotates rows.
 PAPER_ALGORITHMS: Mapping[str, Mapping[str, str | bool]] = {
@@ -63,7 +67,7 @@ def is_still(record: PairRecord) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiveComparison:
-    """What a live node published, beside the replay of the frames that it processed.
+    """Publications of a live node, and the replay of the frames that it processed.
 
     `records`, `pairs`: of the replay; `frames`, `processed`: in the bag, and by the node.
     `poses`, `unequal`: poses of both, and those that are not bit by bit the same in the two.
@@ -71,7 +75,7 @@ class LiveComparison:
 
     node: Score
     records: list[PairRecord]
-    pairs: list[ReplayedPair]
+    pairs: list[PairResult]
     truth: TrueTrajectory
     intrinsics: Intrinsics
     frames: int
@@ -81,7 +85,7 @@ class LiveComparison:
 
     def opencv_scores(self) -> list[Score]:
         """Scores of OpenCV's estimators on the matches of the replay's poses."""
-        answered = [pair for pair in self.pairs if pair.result.pose]
+        answered = [pair for pair in self.pairs if pair.pose]
         return [best_opencv_score(estimator, answered, self.intrinsics, self.truth)
                 for estimator in OPENCV_ESTIMATORS]
 
@@ -91,15 +95,15 @@ def compare_live(table: Path, stamps_file: Path, bag_path: Path, parameter_file:
     """Replay into `folder` the frames that a live node processed.
 
     `table`: poses that the node published; `stamps_file`: of the frames that it processed.
-    `bag_path`, `parameter_file`: what it was given; `pictures`: whether to draw the replay's.
+    `bag_path`, `parameter_file`: input of that run; `pictures`: whether to draw the replay's.
     """
     stamps = read_stamps(stamps_file)
-    pairs: list[ReplayedPair] = []
+    pairs: list[PairResult] = []
     with open_bag(bag_path) as bag:
         topics, truth = _topics_and_truth(bag)
         outcome = replay_into(folder, bag, topics, read_parameters(parameter_file), stamps=stamps,
                               pictures=pictures, on_pair=pairs.append)
-    unequal, poses = differing_poses(table, folder / POSES_FILE)
+    unequal, poses = differing_poses(table, folder / POSES.file)
     assert outcome.intrinsics is not None
     return LiveComparison(score_of_table('relpose_node, live', table, outcome.records, truth),
                           outcome.records, pairs, truth, outcome.intrinsics, topics.image.count,
@@ -119,23 +123,22 @@ def score_of_replay(name: str, bag_path: Path, parameters: Parameters) -> Score:
     with open_bag(bag_path) as bag:
         topics, truth = _topics_and_truth(bag)
         return score_of_records(name, [
-            pair_record(pair.result, truth)
-            for pair in Replay(bag, topics, parameters).pairs()])
+            PairRecord.of(pair, truth) for pair in Replay(bag, topics, parameters).pairs()])
 
 
 def score_of_table(name: str, path: Path, pairs: Sequence[PairRecord],
                    truth: TrueTrajectory) -> Score:
-    """Score of a live node's table; `pairs` of a replay of its frames tell number and instants."""
-    instants = {(r.reference_stamp_ns, r.stamp_ns): (r.reference_ns1, r.reference_ns2)
-                for r in pairs}
+    """Score of a live node's table; `pairs`: of a replay of its frames."""
+    times = {(r.reference_stamp_ns, r.stamp_ns): (r.reference_ns1, r.reference_ns2)
+             for r in pairs}
     errors = []
     with path.open(newline='', encoding='ascii') as file:
         for row in csv.DictReader(file):
             key = int(row['reference_stamp_ns'] or 0), int(row['stamp_ns'])
-            if key in instants:
+            if key in times:
                 R = Rotation.from_quat([float(row[c]) for c in ('qx', 'qy', 'qz', 'qw')])
                 t = np.array([float(row[c]) for c in ('tx', 'ty', 'tz')])
-                errors.append(truth.errors(R.as_matrix(), t, *instants[key]))
+                errors.append(truth.errors(R.as_matrix(), t, *times[key]))
     return score(name, errors, len(pairs))
 
 
@@ -156,26 +159,30 @@ def differing_poses(live: Path, replayed: Path) -> tuple[int, int]:
     return sum(tables[0].get(key) != tables[1].get(key) for key in keys), len(keys)
 
 
-def best_opencv_score(estimator: str, pairs: Sequence[ReplayedPair], intrinsics: Intrinsics,
+def best_opencv_score(estimator: str, pairs: Sequence[PairResult], intrinsics: Intrinsics,
                       truth: TrueTrajectory) -> Score:
-    """Score of an OpenCV estimator at that of three thresholds which suits it best.
+    """Score of an OpenCV estimator at the best of three thresholds.
 
-    Best in the median rotation error against the truth: a choice that no user could make, in the
-    baseline's favour. `pairs`: those that the pipeline answered, none of a camera that stands.
+    Best in the median rotation error against the truth, which favours the baseline. `pairs`: those
+    with a pose of the pipeline, none of a camera at rest.
     """
-    camera = intrinsics.global_shutter_camera()
-    matches = [tuple(undistorted(intrinsics.to_sensor(points), camera) for points in
-                     (pair.result.matches.points1, pair.result.matches.points2))
-               for pair in pairs]
     scores = []
     for threshold in (0.5, 1.0, 2.0):
-        poses = [opencv_five_point(pixels1, pixels2, camera, threshold, estimator=estimator)
-                 for pixels1, pixels2 in matches]
-        errors = [truth.errors(pose.R, pose.t, pair.result.reference_ns1,
-                               pair.result.reference_ns2) if pose else None
+        poses = [opencv_pose(pair, intrinsics, threshold, estimator) for pair in pairs]
+        errors = [truth.errors(pose.R, pose.t, pair.reference_ns1,
+                               pair.reference_ns2) if pose else None
                   for pair, pose in zip(pairs, poses, strict=True)]
         scores.append(score(f'OpenCV 5-point, {estimator}, {threshold:g} px', errors))
     return min(scores, key=lambda s: np.nan_to_num(s.rotation[0], nan=np.inf))
+
+
+def opencv_pose(pair: PairResult, intrinsics: Intrinsics, threshold: float,
+                estimator: str = 'USAC_MAGSAC') -> Pose | None:
+    """Pose by an OpenCV estimator from the matches of a pair, as of a global shutter."""
+    camera = intrinsics.global_shutter_camera()
+    pixels1, pixels2 = (undistorted(intrinsics.to_sensor(points), camera) for points in
+                        (pair.matches.points1, pair.matches.points2))
+    return opencv_five_point(pixels1, pixels2, camera, threshold, estimator=estimator)
 
 
 def score_table(scores: Sequence[Score]) -> list[str]:
@@ -186,9 +193,9 @@ def score_table(scores: Sequence[Score]) -> list[str]:
              f'{"":{width}}  pairs  poses    median     90 %    median     90 %']
     lines.append('-' * len(lines[-1]))
     for s in scores:
-        figures = '  '.join(f'{_cell(median)} {_cell(p90)}'
-                            for median, p90 in (s.rotation, s.translation))
-        lines.append(f'{s.name:{width}}  {s.pairs:5d}  {s.answered:5d}  {figures}')
+        errors = '  '.join(f'{_cell(median)} {_cell(p90)}'
+                           for median, p90 in (s.rotation, s.translation))
+        lines.append(f'{s.name:{width}}  {s.pairs:5d}  {s.answered:5d}  {errors}')
     return lines
 
 

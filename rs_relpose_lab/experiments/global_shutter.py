@@ -1,31 +1,302 @@
-"""`rs_relpose benchmark global-shutter`: images turned to their middle row, measured."""
+"""`rs_relpose benchmark global-shutter`: images derotated to their middle row, measured.
+
+Three measurements: the map against the truth, OpenCV's 5-point on raw and derotated images, time.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+import shutil
 import statistics
 import time
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from rs_relpose_lab.experiments.tables import markdown_table, write_csv
-from rs_relpose_lab.experiments.unrolled_map import MapErrors
-from rs_relpose_lab.experiments.unrolled_poses import FivePoint
-from rs_relpose_ros.config.parameters import Parameters
-from rs_relpose_ros.front_end.front_end import FrameProcessed
-from rs_relpose_ros.geometry.intrinsics import Intrinsics
-from rs_relpose_ros.geometry.timing import NANOSECONDS
-from rs_relpose_ros.global_shutter.frames import EncodedColorFrame
-from rs_relpose_ros.global_shutter.unroller import unrolling_loop
-from rs_relpose_ros.images.encoded import RawImage
-from rs_relpose_ros.imu.samples import ImuSample
+from rs_relpose_lab.experiments.comparison import best_opencv_score, Score
+from rs_relpose_lab.experiments.consistency import STILL
+from rs_relpose_lab.experiments.harness import markdown_table, write_csv
+from rs_relpose_lab.experiments.methods import OPENCV_ESTIMATORS
+from rs_relpose_lab.simulation import simulate, Simulation, SimulationConfig
+from rs_relpose_lab.simulation.bag import intrinsics_of, render_once, right_parameters
+from rs_relpose_lab.simulation.render import Renderer, view_of
+from rs_relpose_lab.simulation.rows import observe
+from rs_relpose_lab.simulation.scene import SCENES
+from rs_relpose_lab.simulation.trajectory import Trajectory
+from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.config.files import read_parameters
+from rs_relpose_ros.config.settings import Parameters
+from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
+from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
+from rs_relpose_ros.imu.buffer import ImuSample
+from rs_relpose_ros.messages.incoming import Intake, sensor_messages
+from rs_relpose_ros.offline.replay import MessageRefused, outcomes, read_truth, Replay
+from rs_relpose_ros.offline.unroll import unroll
+from rs_relpose_ros.pipeline.global_shutter import GlobalShutterFrame, unrolling_loop
+from rs_relpose_ros.pipeline.pair import Frame
+from rs_relpose_ros.pipeline.pipeline import FrameLoop
+from rs_relpose_ros.tracking.images import RawImage
 
-if TYPE_CHECKING:   # what is measured without ROS needs none
-    from rs_relpose_lab.live.beside import Beside
+Array = NDArray[np.float64]
+
+# -- the map against the truth of a simulation ------------------------------------------------
+#
+# The truth is that of the renderer, which shares no code with the map: pixels of scene points in
+# a camera whose rows are all read at the middle time.
+
+# Pixels from one compared point to the next.
+_SPACING = 20.0
+# IMU beyond the last row of a frame [s]: a tracked time offset may need it.
+_AHEAD = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class MapErrors:
+    """Distances [px] between sources of pixels by the map and by the truth, over a recording.
+
+    `left`: from the map to the true sources; `predicted`: from the true sources to those of
+    rotation alone; `map`: from the latter to the map, which models rotation alone. Median, 90 %.
+    """
+
+    name: str
+    readout_ms: float
+    rate: float   # [rad/s] largest
+    left: float
+    left_p90: float
+    predicted: float
+    predicted_p90: float
+    map: float
+    map_p90: float
+
+
+def swinging(rate: float, seconds: float, tilt: float = 0.3) -> Trajectory:
+    """A camera that swings about a fixed centre, mostly about the vertical; largest rate [rad/s].
+
+    `tilt`: share of the rate about the other axes.
+    """
+    spacing, frequency = 0.02, 1.1
+    times = np.arange(-1.0, seconds + 1.0, spacing)
+    phase = 2.0 * np.pi * frequency * times
+    swing = rate / (2.0 * np.pi * frequency) / np.hypot(1.0, tilt) * np.sin(phase)
+    angles = np.stack([swing, tilt * swing * np.cos(0.4 * phase), tilt * swing], axis=1)
+    return Trajectory(np.tile([0.0, 0.0, 1.6], (len(times), 1)), angles, times[0], spacing)
+
+
+def configured(simulation: Simulation) -> Parameters:
+    """Parameters of a calibrated node."""
+    return Parameters.from_mapping(right_parameters(simulation))
+
+
+def derotated_frames(simulation: Simulation, parameters: Parameters, *,
+                     images: bool = False) -> Iterator[tuple[int, GlobalShutterFrame]]:
+    """Number and derotated frame of each image; black images where none are rendered."""
+    config, camera = simulation.config, simulation.camera
+    loop = unrolling_loop(parameters, offline=True)
+    samples, fed = simulation.imu.samples(), 0
+    black = np.zeros((config.height, config.width), dtype=np.uint8)
+    for index in range(config.frame_count):
+        until = int(np.searchsorted(simulation.imu.stamps_ns, simulation.reference_ns(index)
+                                    + to_nanoseconds(camera.row_time_span[1] + _AHEAD)))
+        for sample in samples[fed:until]:
+            loop.sequencer.add_imu(sample)
+        fed = until
+        pixels = simulation.image(index) if images else black
+        yield index, _derotated(loop, RawImage.of_gray(pixels, simulation.stamp_ns(index)),
+                                intrinsics_of(camera))
+
+
+def _derotated(loop: FrameLoop[GlobalShutterFrame], image: RawImage,
+               intrinsics: Intrinsics) -> GlobalShutterFrame:
+    """The next frame through the loop; the IMU already covers its rows."""
+    loop.sequencer.add_frame(image, intrinsics)
+    outcome = loop.step()
+    assert isinstance(outcome, Frame), outcome
+    assert outcome.result is not None
+    return outcome.result
+
+
+def middle_renderer(simulation: Simulation) -> Renderer:
+    """The same camera with all rows read at the same time."""
+    return Renderer(simulation.renderer.scene, replace(simulation.camera, readout_time=0.0),
+                    simulation.trajectory, simulation.config.edge_samples)
+
+
+def middle_seconds(simulation: Simulation, index: int) -> float:
+    """Time of the middle row of a frame on the trajectory [s]."""
+    camera = simulation.camera
+    return simulation.seconds(simulation.reference_ns(index)) + float(
+        camera.row_times(0.5 * (camera.height - 1)))
+
+
+def map_errors(name: str, config: SimulationConfig,
+               trajectory: Trajectory | None = None) -> MapErrors:
+    """Compare the maps of all frames of a recording with the truth."""
+    simulation = simulate(config, trajectory=trajectory)
+    still, camera = middle_renderer(simulation), simulation.camera
+    points = np.stack(np.meshgrid(np.arange(0.0, config.width, _SPACING),
+                                  np.arange(0.0, config.height, _SPACING)), -1).reshape(-1, 2)
+    columns, rows = points.astype(int).T
+    distances, rate = [], 0.0
+    for index, derotated in derotated_frames(simulation, configured(simulation)):
+        middle = middle_seconds(simulation, index)
+        reference = simulation.seconds(simulation.reference_ns(index))
+        world, _ = still.locate(middle, points)
+        observed = simulation.renderer.project(reference, world)
+        by_rotation = _observed_by_rotation(simulation, reference, world, middle)
+        sources = np.concatenate([band for _, band in derotated.map.bands()])
+        by_map = sources[rows, columns]
+        rate = max(rate, float(np.linalg.norm(simulation.trajectory.states(
+            reference + np.asarray(camera.row_time_span)).angular_velocity, axis=1).max()))
+        distances.append(np.stack([np.linalg.norm(difference, axis=1) for difference in (
+            observed - by_map, observed - by_rotation, by_rotation - by_map)], axis=1))
+    all_distances = np.concatenate(distances)
+    known = all_distances[np.isfinite(all_distances).all(axis=1)]
+    (left, predicted, of_map), (left90, predicted90, of_map90) = np.percentile(
+        known, (50, 90), axis=0)
+    return MapErrors(name, 1e3 * config.readout_time, rate, left, left90, predicted, predicted90,
+                     of_map, of_map90)
+
+
+def _observed_by_rotation(simulation: Simulation, reference: float, world: Array,
+                          middle: float) -> Array:
+    """Pixels of world points for a camera that rotates only, at its position of `middle`."""
+    centre, _ = simulation.trajectory.poses([middle])
+
+    def motion(directions: Array, times: Array) -> Array:
+        _, rotations = simulation.trajectory.poses(reference + times)
+        return np.asarray(np.einsum('nji,nj->ni', rotations, directions))
+
+    return observe(world - centre, motion, view_of(simulation.camera), margin=0.5)
+
+
+# Name, recording, and the motion where it is not that of the recording's seed.
+Case = tuple[str, SimulationConfig, Trajectory | None]
+
+
+def map_cases(walks: int, first_seed: int) -> list[Case]:
+    """Swings of 1 and 3 rad/s, read down and up, then walks."""
+    cases: list[Case] = []
+    for rate, direction in ((1.0, 'down'), (3.0, 'down'), (3.0, 'up')):
+        config = SimulationConfig(seed=first_seed, duration=2.0, readout_direction=direction)
+        cases.append((f'swing {rate:g} rad/s, read {direction}', config, swinging(rate, 2.0)))
+    for seed in range(first_seed, first_seed + walks):
+        config = SimulationConfig(seed=seed, scene=SCENES[seed % len(SCENES)], duration=2.0,
+                                  plan='walk:2.0')
+        cases.append((f'walk {config.scene} {seed}', config, None))
+    return cases
+
+
+# -- OpenCV's 5-point on raw and derotated images ---------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class FivePoint:
+    """Median errors [deg] of OpenCV's 5-point, at its best threshold and estimator.
+
+    Best in the median rotation error against the truth, for raw and derotated images alike.
+    """
+
+    name: str
+    readout_ms: float
+    pairs: int
+    raw_rotation: float
+    raw_translation: float
+    derotated_pairs: int
+    derotated_rotation: float
+    derotated_translation: float
+
+    @property
+    def rotation_ratio(self) -> float:
+        """Raw by derotated images."""
+        return self.raw_rotation / self.derotated_rotation
+
+    @property
+    def translation_ratio(self) -> float:
+        """Raw by derotated images."""
+        return self.raw_translation / self.derotated_translation
+
+
+def five_point_on_bag(config: SimulationConfig, folder: Path) -> FivePoint:
+    """A walk, rendered and derotated into `folder` unless it exists."""
+    path, parameter_file = render_once(config, folder)
+    parameters = read_parameters(parameter_file)
+    raw = five_point(path, parameters)
+    corrected = five_point(_unrolled(path, parameters, folder), as_global_shutter(parameters))
+    return FivePoint(f'{config.scene} {config.seed}', 1e3 * config.readout_time,
+                     raw.answered, raw.rotation[0], raw.translation[0],
+                     corrected.answered, corrected.rotation[0], corrected.translation[0])
+
+
+def _unrolled(path: Path, parameters: Parameters, folder: Path) -> Path:
+    """The derotated bag, written into `folder` unless it exists."""
+    derotated = folder / f'{path.name}_derotated'
+    if not derotated.exists():
+        with open_bag(path) as bag:
+            unroll(bag, bag.find_topics(), parameters, derotated)
+    return derotated
+
+
+def as_global_shutter(parameters: Parameters) -> Parameters:
+    """Parameters for the derotated images of a camera, stamped on the IMU's clock."""
+    return parameters.updated({'readout_time': 0.0, 'time_offset': 0.0, 'stamp_row': 'first',
+                               'time_offset_per_interval': 0.0, 'stamp_exposure': 'middle'})
+
+
+def five_point(path: Path, parameters: Parameters) -> Score:
+    """The better of OpenCV's estimators over the pairs of a bag that the pipeline answers."""
+    with open_bag(path) as bag:
+        topics = bag.find_topics()
+        truth = read_truth(bag, topics)
+        assert truth is not None
+        replay = Replay(bag, topics, parameters)
+        pairs = []
+        for pair in replay.pairs():
+            known = truth.relative_pose(pair.reference_ns1, pair.reference_ns2)
+            if pair.pose and known and np.linalg.norm(known[1]) > STILL:
+                pairs.append(pair)
+        assert replay.intake.intrinsics is not None
+    return min((best_opencv_score(estimator, pairs, replay.intake.intrinsics, truth)
+                for estimator in OPENCV_ESTIMATORS), key=lambda found: found.rotation[0])
+
+
+def five_point_when_derotated(path: Path, parameters: Parameters, folder: Path) -> Score:
+    """Score of OpenCV on the derotated images of a bag, which are written into `folder`."""
+    shutil.rmtree(folder / f'{path.name}_derotated', ignore_errors=True)
+    return replace(five_point(_unrolled(path, parameters, folder), as_global_shutter(parameters)),
+                   name='OpenCV 5-point, derotated')
+
+
+def frames_of_bag(path: Path, parameters: Parameters) -> Iterator[GlobalShutterFrame]:
+    """The derotated frames of a bag."""
+    loop = unrolling_loop(parameters, offline=True)
+    intake = Intake(loop.sequencer, parameters)
+    with open_bag(path) as bag:
+        for outcome in outcomes(loop, intake, sensor_messages(bag, bag.find_topics())):
+            if isinstance(outcome, MessageRefused):
+                raise outcome.error
+            if isinstance(outcome, Frame) and outcome.result is not None:
+                yield outcome.result
+
+
+def draw_before_and_after(path: Path, parameters: Parameters, picture: Path) -> float:
+    """Draw the frame of a bag with the largest shift, raw and derotated; the shift [px]."""
+    frame = max(frames_of_bag(path, parameters), key=lambda found: found.map.shift)
+    cv2.imwrite(str(picture), np.hstack([frame.original.values, frame.image().values]))
+    return frame.map.shift
+
+
+def bag_configurations(bags: int, first_seed: int) -> list[SimulationConfig]:
+    """Walks of 6 s; scenes in rotation, readouts are spread from 15 to 35 ms."""
+    return [SimulationConfig(seed=seed, scene=SCENES[seed % len(SCENES)], duration=6.0,
+                             plan='walk:6.0',
+                             readout_time=round(0.015 + 0.02 * k / max(bags - 1, 1), 4))
+            for k, seed in enumerate(range(first_seed, first_seed + bags))]
+
+
+# -- time and report --------------------------------------------------------------------------
 
 SIZES = ((640, 480), (1280, 720))
 
@@ -44,17 +315,15 @@ class Speed:
 
 
 def frame_times(width: int, height: int) -> Speed:
-    """Turn frames of noise, from the mailbox to the turned pixels, on one core."""
+    """Derotate frames of noise, from the mailbox to the pixels, on one core."""
     cv2.setNumThreads(1)
-    intrinsics = Intrinsics(
+    intrinsics = intrinsics_of(RollingShutterCamera(
         width=width, height=height, fx=0.7 * width, fy=0.7 * width, cx=0.5 * width,
-        cy=0.5 * height, distortion=(-0.12, 0.05, 8e-4, -5e-4, 0.0), image_width=width,
-        image_height=height)
+        cy=0.5 * height, distortion=(-0.12, 0.05, 8e-4, -5e-4, 0.0), readout_time=0.03))
     loop = unrolling_loop(Parameters.from_mapping(
         {'readout_time': 0.03, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0]}), offline=True)
     rng = np.random.default_rng(0)
-    pixels = rng.integers(0, 256, width * height, dtype=np.uint8)
-    image = RawImage(pixels, 'mono8', width, height, width, False)
+    image = rng.integers(0, 256, width * height, dtype=np.uint8).reshape(height, width)
     times, stamp_ns = [], 0
     for frame in range(1, _FRAMES + 1):
         while stamp_ns < frame * _FRAME_NS + NANOSECONDS // 25:
@@ -63,57 +332,41 @@ def frame_times(width: int, height: int) -> Speed:
                 stamp_ns, tuple((rate + 1e-3 * rng.standard_normal(3)).tolist()),
                 (0.0, -9.81, 0.0)))
             stamp_ns += _IMU_NS
-        loop.sequencer.add_frame(EncodedColorFrame(frame * _FRAME_NS, image, '', intrinsics))
         started = time.thread_time()
-        outcome = loop.step()
-        assert isinstance(outcome, FrameProcessed), outcome
-        assert outcome.result is not None
-        outcome.result.image()
+        _derotated(loop, RawImage.of_gray(image, frame * _FRAME_NS), intrinsics).image()
         times.append(1e3 * (time.thread_time() - started))
-    # The first one loads or compiles the kernels.
+    # The first frame loads or compiles the kernels.
     return Speed(width, height, *map(float, np.percentile(times[1:], (50, 90))))
 
 
 def write_report(folder: Path, maps: Sequence[MapErrors], bags: Sequence[FivePoint],
-                 speeds: Sequence[Speed], beside: Sequence[Beside] = ()) -> str:
-    """Write the figures (CSV) and the report (Markdown), and return the latter."""
-    folder.mkdir(parents=True, exist_ok=True)
+                 speeds: Sequence[Speed]) -> str:
+    """Write the data (CSV) and the report (Markdown), and return the latter."""
     parts = []
     if maps:
         write_csv(folder / 'map.csv', maps)
         parts.append('Sources of pixels [px], median / 90 %\n\n' + markdown_table(
-            ('recording', 'read-out [ms]', 'largest rate [rad/s]', 'map to truth',
-             'moved by translation', 'map to rotation alone'),
+            ('recording', 'readout [ms]', 'largest rate [rad/s]', 'map to truth',
+             'shift by translation', 'map to rotation alone'),
             [(m.name, f'{m.readout_ms:.0f}', f'{m.rate:.1f}', f'{m.left:.3f} / {m.left_p90:.3f}',
               f'{m.predicted:.3f} / {m.predicted_p90:.3f}', f'{m.map:.3f} / {m.map_p90:.3f}')
              for m in maps]))
     if bags:
         write_csv(folder / 'five_point.csv', bags)
         rows = [(b.name, f'{b.readout_ms:.0f}', f'{b.raw_rotation:.3f}',
-                 f'{b.raw_translation:.2f}', f'{b.turned_rotation:.3f}',
-                 f'{b.turned_translation:.2f}', f'{b.rotation_ratio:.1f}',
+                 f'{b.raw_translation:.2f}', f'{b.derotated_rotation:.3f}',
+                 f'{b.derotated_translation:.2f}', f'{b.rotation_ratio:.1f}',
                  f'{b.translation_ratio:.1f}') for b in bags]
         parts.append("OpenCV's 5-point, median errors [deg]\n\n" + markdown_table(
-            ('recording', 'read-out [ms]', 'raw: R', 't', 'turned: R', 't', 'ratio of R',
+            ('recording', 'readout [ms]', 'raw: R', 't', 'derotated: R', 't', 'ratio of R',
              'of t'), rows))
-        walks = [b for b in bags if b.simulated]
-        if walks:
-            parts.append('Median of the ratios of the simulated ones: rotation '
-                         f'{statistics.median(b.rotation_ratio for b in walks):.1f}, translation '
-                         f'{statistics.median(b.translation_ratio for b in walks):.1f}\n')
-    if speeds:
-        write_csv(folder / 'speed.csv', speeds)
-        parts.append('Processor time of a frame [ms]\n\n' + markdown_table(
-            ('size', *(field.name for field in fields(Speed)[2:])),
-            [(f'{s.width}x{s.height} mono8', f'{s.median:.1f}', f'{s.p90:.1f}') for s in speeds]))
-    if beside:
-        write_csv(folder / 'beside.csv', beside)
-        parts.append('Both nodes at once, raw mono8 at 30 Hz\n\n' + markdown_table(
-            ('node', 'frames', 'dropped', 'frame [ms]', 'latency 50 % [ms]', '99 %',
-             'processor [%]'),
-            [(b.node, f'{b.received}', f'{b.refused}', f'{b.frame_time_p50:.1f}',
-              f'{b.latency_p50:.1f}', f'{b.latency_p99:.1f}', f'{b.cpu_percent:.0f}')
-             for b in beside]))
+        parts.append('Median of the ratios: rotation '
+                     f'{statistics.median(b.rotation_ratio for b in bags):.1f}, translation '
+                     f'{statistics.median(b.translation_ratio for b in bags):.1f}\n')
+    write_csv(folder / 'speed.csv', speeds)
+    parts.append('Processor time of a frame [ms]\n\n' + markdown_table(
+        ('size', 'median', '90 %'),
+        [(f'{s.width}x{s.height} mono8', f'{s.median:.1f}', f'{s.p90:.1f}') for s in speeds]))
     text = '\n'.join(parts)
     (folder / 'global_shutter.md').write_text(text, encoding='utf-8')
     return text

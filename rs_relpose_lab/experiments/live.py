@@ -4,32 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+import os
 from pathlib import Path
+import platform
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_lab.experiments.live_clip import (
-    Clip,
-    closed_loop,
-    configuration,
-    IMU_RATES,
-    imu_topic,
-    PERIOD,
-    seconds_into_loop,
-)
+from rs_relpose_lab.experiments import live_clip
+from rs_relpose_lab.experiments.harness import markdown_table, write_csv, write_table
 from rs_relpose_lab.experiments.scoring import pose_error
-from rs_relpose_lab.experiments.tables import write_csv
-from rs_relpose_lab.live.processes import ProcessFigures
-from rs_relpose_ros.bags.layout import CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, RAW_TOPIC
+from rs_relpose_lab.live.processes import ProcessMetrics
+from rs_relpose_ros.bags.reader import CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, RAW_TOPIC
 from rs_relpose_ros.estimator.result import Status
-from rs_relpose_ros.front_end.sequencer import Refusal
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
+from rs_relpose_ros.pipeline.sequencer import Refusal
 
 if TYPE_CHECKING:   # the rest of this module needs no ROS
-    from rs_relpose_lab.live.measured_run import MeasuredRun, ReceivedPose
+    from rs_relpose_lab.live.live_run import MeasuredRun, ReceivedPose
+
 
 Array = NDArray[np.float64]
 
@@ -61,12 +56,12 @@ class LiveCell:
 
 CELLS = {cell.name: cell for cell in (
     LiveCell(width, height, image_format, imu_rate)
-    for width, height in SIZES for image_format in FORMATS for imu_rate in IMU_RATES)}
+    for width, height in SIZES for image_format in FORMATS for imu_rate in live_clip.IMU_RATES)}
 
 
 @dataclass(frozen=True, slots=True)
 class Percentiles:
-    """Of some figure; NaN where there is none."""
+    """Percentiles of values; NaN without values."""
 
     p50: float
     p99: float
@@ -82,7 +77,7 @@ class Percentiles:
 
 @dataclass(frozen=True, slots=True)
 class LiveStatistics:
-    """Figures of one cell; times in ms, memory in MB, errors in degrees.
+    """Statistics of one cell; times in ms, memory in MB, errors in degrees.
 
     `frames_sent`, `frames_received`, `frames_used`: by the player, by the node's callback, and
         through the whole pipeline.
@@ -91,8 +86,8 @@ class LiveStatistics:
         last row, as the node's callbacks got them, to publication.
     `end_to_end`: the same from outside: from the later publication of the two by the player to the
         receipt of the pose by a third process. No delay inside the node can hide from it.
-    `frame_time`, `frame_cpu`: of every frame, pair or not: from its turn to its end, and processor
-        time of the worker.
+    `frame_time`, `frame_cpu`: of every frame, pair or not: wall time of its processing, and
+        processor time of the worker.
     `cpu`, `cpu_callbacks`, `cpu_player`: percent of one core: the node, its first thread, player.
     `memory_*`, `private_*`: of the node after the first pose and at the end: resident, and without
         what is shared with other processes.
@@ -134,53 +129,52 @@ class LiveStatistics:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Course:
-    """How latency and memory went over time.
+    """Latency and memory over time.
 
     `latency_seconds`, `latencies` (N,): seconds since the first pair, and ms.
-    `memory_seconds`, `resident`, `private` (M,): seconds likewise, and MB.
+    `memory_seconds`, `private` (M,): seconds likewise, and MB that are not shared.
     """
 
     latency_seconds: Array
     latencies: Array
     memory_seconds: Array
-    resident: Array
     private: Array
 
 
-def run_cell(cell: LiveCell, clip: Clip, duration: float, folder: Path, profile: Path,
+def run_cell(cell: LiveCell, clip: live_clip.Clip, duration: float, folder: Path, profile: Path,
              on_second: Callable[[], object] = lambda: None) -> tuple[LiveStatistics, Course]:
-    """Play a clip of the cell's size to a node of its own; logs and tables into `folder`.
+    """Play a clip of the cell's size to a new node; logs and tables into `folder`.
 
     `duration` [s]; `profile`: of Fast DDS, for big images; `on_second`: called once a second.
     """
     # Here, so that the names of cells are known without ROS.
-    from rs_relpose_lab.live.measured_run import measure, Play
+    from rs_relpose_lab.live.live_run import measure, Play
 
     folder.mkdir(parents=True, exist_ok=True)
     compressed = cell.image_format == 'jpeg'
-    topics = (COMPRESSED_TOPIC, CAMERA_INFO_TOPIC, imu_topic(cell.imu_rate))
-    player = ['--best-effort', '--loop', str(PERIOD), '--duration', str(duration), '--topics',
-              *topics, *([] if compressed else ['--decode', cell.image_format])]
+    topics = (COMPRESSED_TOPIC, CAMERA_INFO_TOPIC, live_clip.imu_topic(cell.imu_rate))
+    player = ['--best-effort', '--loop', str(live_clip.PERIOD), '--duration', str(duration),
+              '--topics', *topics, *([] if compressed else ['--decode', cell.image_format])]
     run = measure(Play(
         clip.bag, clip.parameters,
         {'image': RAW_TOPIC, 'camera_info': CAMERA_INFO_TOPIC, 'imu': topics[2]},
         'compressed' if compressed else 'raw', tuple(player), profile if cell.is_big else None),
         folder, on_second)
     # Processor time and memory of the node, a line per second.
-    write_csv(folder / 'node.csv', run.figures)
+    write_csv(folder / 'node.csv', run.metrics)
     return statistics_of(cell, duration, run), course_of(run)
 
 
 def statistics_of(cell: LiveCell, duration: float, run: MeasuredRun) -> LiveStatistics:
-    """Figures of a run."""
+    """Statistics of a run."""
     frames = _read_frames(run.timings)
     paired, posed = frames['outcome'] != 'none', frames['outcome'] == Status.OK.value
     latency = (frames['done_ns'] - frames['ready_ns']) / 1e6
     log = np.load(run.log)
     images, imu = log[log['is_image']], log[~log['is_image']]
-    refused = {cause: int(run.counters[f'frames_refused_{cause.value}']) for cause in Refusal}
+    refused = {reason: int(run.counters[f'frames_refused_{reason.value}']) for reason in Refusal}
     rotation, translation = errors(run.poses)
-    first, end = run.figures[0], run.figures[-1]
+    first, end = run.metrics[0], run.metrics[-1]
     return LiveStatistics(
         cell=cell.name, duration=duration, frames_sent=len(images),
         frames_received=int(run.counters['frames_received']), frames_used=len(frames),
@@ -192,7 +186,7 @@ def statistics_of(cell: LiveCell, duration: float, run: MeasuredRun) -> LiveStat
         frame_time=Percentiles.of((frames['done_ns'] - frames['taken_ns']) / 1e6),
         frame_cpu=Percentiles.of(frames['cpu_ns'] / 1e6),
         cpu=_percent(first, end, 'cpu'), cpu_callbacks=_percent(first, end, 'cpu_main'),
-        cpu_player=_percent(run.player_figures[0], run.player_figures[-1], 'cpu'),
+        cpu_player=_percent(run.player_metrics[0], run.player_metrics[-1], 'cpu'),
         memory_start=first.resident, memory_end=end.resident, private_start=first.private,
         private_end=end.private,
         seconds_to_ready=(run.ready_ns - run.started_ns) / NANOSECONDS,
@@ -203,24 +197,24 @@ def statistics_of(cell: LiveCell, duration: float, run: MeasuredRun) -> LiveStat
 
 
 def course_of(run: MeasuredRun) -> Course:
-    """How latency and memory went over time."""
+    """Latency and memory of a run over time."""
     frames = _read_frames(run.timings)
     posed = frames[frames['outcome'] == Status.OK.value]
     start_ns = posed['ready_ns'][0]
     return Course(
         (posed['ready_ns'] - start_ns) / NANOSECONDS,
         (posed['done_ns'] - posed['ready_ns']) / 1e6,
-        np.array([(f.time_ns - start_ns) / NANOSECONDS for f in run.figures]),
-        np.array([f.resident for f in run.figures]), np.array([f.private for f in run.figures]))
+        np.array([(f.time_ns - start_ns) / NANOSECONDS for f in run.metrics]),
+        np.array([f.private for f in run.metrics]))
 
 
 def errors(poses: Sequence[ReceivedPose]) -> tuple[Array, Array]:
     """Errors [deg] of rotation and direction of translation (N,) against the clip's motion."""
-    motion = closed_loop(PERIOD)
+    motion = live_clip.closed_loop(live_clip.PERIOD)
     found = []
     for pose in poses:
-        (p1, p2), (R1, R2) = motion.poses(
-            [seconds_into_loop(stamp) for stamp in (pose.reference_stamp_ns, pose.stamp_ns)])
+        (p1, p2), (R1, R2) = motion.poses([live_clip.seconds_into_loop(stamp) for stamp in (
+            pose.reference_stamp_ns, pose.stamp_ns)])
         found.append(pose_error(Rotation.from_quat(pose.quat_xyzw).as_matrix(), np.array(pose.t),
                                 R1.T @ R2, R1.T @ (p2 - p1)))
     return (np.array([error.rotation for error in found]),
@@ -230,7 +224,7 @@ def errors(poses: Sequence[ReceivedPose]) -> tuple[Array, Array]:
 def _end_to_end(poses: Sequence[ReceivedPose], images: NDArray[np.void],
                 imu: NDArray[np.void]) -> Array:
     # A row earlier does not matter: samples are further apart.
-    readout_ns = to_nanoseconds(configuration(*SIZES[0]).readout_time)
+    readout_ns = to_nanoseconds(live_clip.configuration(*SIZES[0]).readout_time)
     image_sent = dict(zip(images['stamp_ns'].tolist(), images['published_ns'].tolist(),
                           strict=True))
     covering = np.searchsorted(imu['stamp_ns'], [p.stamp_ns + readout_ns for p in poses])
@@ -244,8 +238,89 @@ def _read_frames(path: Path) -> NDArray[np.void]:
                                        encoding='ascii'))
 
 
-def _percent(first: ProcessFigures, last: ProcessFigures, name: str) -> float:
-    """Processor time between two instants, in percent of one core."""
+def _percent(first: ProcessMetrics, last: ProcessMetrics, name: str) -> float:
+    """Processor time between two measurements, in percent of one core."""
     elapsed = (last.time_ns - first.time_ns) / NANOSECONDS
     spent = getattr(last, name) - getattr(first, name)
     return float(100.0 * spent / elapsed) if elapsed > 0.0 else float('nan')
+
+
+# -- tables of the live benchmark -----------------------------------------------------------------
+
+def write_report(folder: Path, cells: Sequence[LiveStatistics]) -> str:
+    """Write table, plot and report into a folder; the report."""
+    report = '\n'.join([
+        '# The live node\n',
+        (f'Node and player on {os.cpu_count()} cores of {platform.machine()}, Python '
+         f'{platform.python_version()}; images at 30 Hz from best-effort publishers. Times in ms: '
+         'median / 99th percentile. CPU in percent of one core.\n'),
+        markdown_table(
+            ('cell', 'sent', 'lost before the node', 'used', 'dropped (overload)',
+             'dropped (other)', 'IMU lost', 'poses', 'wrong'),
+            [(c.cell, f'{c.frames_sent}', f'{c.frames_sent - c.frames_received}',
+              f'{c.frames_used}', f'{c.dropped_overload}', f'{c.dropped_other}',
+              f'{c.imu_sent - c.imu_received}', f'{c.poses} of {c.pairs}', f'{c.wrong}')
+             for c in cells]),
+        markdown_table(
+            ('cell', 'latency', 'end to end', 'time of a frame', 'CPU time of a frame',
+             'CPU of the node', 'of its callbacks', 'of the player', 'memory [MB]'),
+            [(c.cell, _two(c.latency), _two(c.end_to_end), _two(c.frame_time), _two(c.frame_cpu),
+              f'{c.cpu:.0f}', f'{c.cpu_callbacks:.0f}', f'{c.cpu_player:.0f}',
+              f'{c.memory_start:.0f} -> {c.memory_end:.0f}') for c in cells]),
+        markdown_table(
+            ('cell', 'process to ready [s]', 'first frame to first pose [s]', 'R [deg]',
+             't [deg]', 'player late [ms]'),
+            [(c.cell, f'{c.seconds_to_ready:.2f}', f'{c.seconds_to_pose:.2f}',
+              _two(c.rotation_error, 3), _two(c.translation_error, 2), _two(c.player_late, 2))
+             for c in cells]),
+        ('Latency is that of published pairs: from the later of image and first IMU sample that '
+         'covers its last row, at the callbacks of the node, to publication. End to end is the '
+         'same from outside: from the publication of the later of the two by the player to the '
+         'receipt of the pose by a third process. A frame without keyframe pair publishes nothing '
+         'and counts in the time of a frame, which is that of all frames, from its start to its '
+         'end.\n')])
+    write_table(folder, 'live', cells, report)
+    return report
+
+
+def write_soak_report(folder: Path, cell: LiveStatistics, course: Course) -> str:
+    """Write memory and latency over time; the summary (Markdown)."""
+    windows = latency_over_time(course)
+    report = '\n'.join([
+        f'## {cell.cell}: {cell.duration / 60.0:.0f} minutes\n',
+        (f'{cell.frames_sent} frames sent, {cell.frames_used} used, {cell.dropped_overload} '
+         f'dropped for overload, {cell.dropped_other} for other reasons; '
+         f'{cell.imu_sent - cell.imu_received} of {cell.imu_sent} IMU samples lost; {cell.poses} '
+         f'poses, {cell.wrong} of them wrong; the node took {cell.cpu:.0f} % of a core. Private '
+         f'memory {cell.private_start:.1f} MB after the first pose, {cell.private_end:.1f} MB at '
+         f'the end, {memory_drift(course):+.1f} MB/h after the first tenth.\n'),
+        markdown_table(
+            ('from [min]', 'latency p50 [ms]', 'p99 [ms]'),
+            [(f'{start / 60.0:.1f}', f'{latency.p50:.1f}', f'{latency.p99:.1f}')
+             for start, latency in windows])])
+    write_table(folder, 'live', [cell], report)
+    return report
+
+
+def latency_over_time(course: Course) -> list[tuple[float, Percentiles]]:
+    """Start [s] and latency of successive minutes; a run below 5 min is cut into ten windows."""
+    end = float(course.latency_seconds[-1])
+    length = 60.0 if end >= 300.0 else max(end / 10.0, 1e-3)
+    starts = np.arange(0.0, end, length)
+    return [(float(start), Percentiles.of(course.latencies[
+        (course.latency_seconds >= start) & (course.latency_seconds < start + length)]))
+        for start in starts]
+
+
+def memory_drift(course: Course) -> float:
+    """Slope of the private memory [MB/h] after a settling time; NaN for too few samples."""
+    # In the first tenth caches and pools fill, which is no leak.
+    settled = course.memory_seconds >= 0.1 * course.memory_seconds[-1]
+    if np.count_nonzero(settled) < 3:
+        return float('nan')
+    slope, _ = np.polyfit(course.memory_seconds[settled], course.private[settled], 1)
+    return float(slope * 3600.0)
+
+
+def _two(values: Percentiles, digits: int = 1) -> str:
+    return f'{values.p50:.{digits}f} / {values.p99:.{digits}f}'

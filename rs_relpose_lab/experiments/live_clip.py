@@ -21,11 +21,12 @@ from rs_relpose_lab.simulation.bag import (
     write_in_order,
     write_parameters,
 )
-from rs_relpose_lab.simulation.hand_held import EYE_HEIGHT
+from rs_relpose_lab.simulation.motions import EYE_HEIGHT
 from rs_relpose_lab.simulation.trajectory import DEGREE, Trajectory
-from rs_relpose_ros.bags.layout import CAMERA_FRAME, COMPRESSED_TOPIC, IMU_DELAY
+from rs_relpose_ros.bags.reader import CAMERA_FRAME, COMPRESSED_TOPIC, IMU_DELAY
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
+from rs_relpose_ros.messages.outgoing import encoded_image_message
 
 Array = NDArray[np.float64]
 
@@ -49,15 +50,15 @@ def imu_topic(rate: int) -> str:
 
 
 def configuration(width: int, height: int, imu_rate: int = IMU_RATES[0]) -> SimulationConfig:
-    """What a clip shows: 4 s of a hand-held-like walk in a hall, read out in 30 ms."""
-    # Field of view of 71 deg across, whatever the size.
+    """Recording of a clip: 4 s of a hand-held-like walk in a hall, read out in 30 ms."""
+    # Field of view of 71 deg across, for any size.
     return SimulationConfig(duration=PERIOD, fps=FPS, width=width, height=height, fx=0.7 * width,
                             imu_rate=float(imu_rate))
 
 
 def prepare_clip(folder: Path, width: int, height: int,
                  on_frame: Callable[[], object] = lambda: None) -> Clip:
-    """Render a clip into a folder, unless it is there; `on_frame` is called after each image."""
+    """Render a clip into a folder, unless it exists; `on_frame` is called after each image."""
     def render(path: Path, parameters: Path) -> None:
         trajectory = closed_loop(PERIOD)
         first = simulate(configuration(width, height), trajectory=trajectory)
@@ -81,9 +82,9 @@ def coloured(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def _images(simulation: Simulation, bag: BagWriter,
             on_frame: Callable[[], object]) -> Iterator[Entry]:
     def encode(stamp_ns: int, pixels: NDArray[np.uint8]) -> tuple[str, str, Any]:
-        return (COMPRESSED_TOPIC, 'sensor_msgs/msg/CompressedImage', bag.compressed_image(
-            stamp_ns, CAMERA_FRAME, jpeg(coloured(pixels), quality=95),
-            'bgr8; jpeg compressed bgr8'))
+        return (COMPRESSED_TOPIC, 'sensor_msgs/msg/CompressedImage',
+                encoded_image_message(stamp_ns, CAMERA_FRAME, jpeg(coloured(pixels), quality=95),
+                                      bag.type, 'bgr8; jpeg compressed bgr8'))
     return image_entries(simulation, bag, encode, on_frame)
 
 
@@ -95,7 +96,7 @@ def _imu_of_one_period(simulation: Simulation, bag: BagWriter) -> Iterator[Entry
 
 
 def seconds_into_loop(stamp_ns: int) -> float:
-    """Time on the closed trajectory of an instant of the endlessly played clip [s]."""
+    """Time on the closed trajectory of a stamp of the endlessly played clip [s]."""
     start_ns = SimulationConfig().start_ns
     return (stamp_ns - start_ns) % to_nanoseconds(PERIOD) / NANOSECONDS
 
@@ -104,8 +105,8 @@ def closed_loop(period: float) -> Trajectory:
     """Trajectory from -2 to `period` + 2 seconds that repeats itself after `period` [s].
 
     Around an ellipse, half as deep as wide, at a mean speed of 1.5 m/s, with the bob of the steps
-    and a hand's turns about all axes (30 deg/s rms), looking along x. A recording that is played
-    backwards will not do: its rows would still be those of the motion forwards.
+    and a hand's rotation about all axes (30 deg/s rms), looking along x. A recording played
+    backwards is no substitute: its rows would still be those of the motion forwards.
     """
     # 25 control points a second: quintic splines through them follow steps of 2 Hz.
     count = round(25 * period)
@@ -121,8 +122,8 @@ def closed_loop(period: float) -> Trajectory:
                        _waves(phase, period, ((2, 4.1), (4, 1.0), (7, 3.0)), 0.2)], axis=1)
     spacing = period / count
     before = math.ceil(2.0 / spacing) + DEGREE
-    turns = np.arange(-before, count + before) % count
-    return Trajectory(positions[turns], angles[turns], -before * spacing, spacing)
+    controls = np.arange(-before, count + before) % count
+    return Trajectory(positions[controls], angles[controls], -before * spacing, spacing)
 
 
 def _waves(phase: Array, period: float, waves: tuple[tuple[int, float], ...],

@@ -1,7 +1,7 @@
 """The estimators that are compared: this library, OpenCV's and PoseLib's, on the same matches.
 
-OpenCV and PoseLib know no rolling shutter. *Derotated* points have been turned by the gyro to the
-instant of the middle row, which is all that a user of theirs can do about it.
+OpenCV and PoseLib assume a global shutter. *Derotated* points are rotated by the gyro to the time
+of the middle row, which is all that a user of theirs can do.
 """
 
 from __future__ import annotations
@@ -16,18 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_lab.experiments.problems import (
-    Cell,
-    CENTRE_U,
-    CENTRE_V,
-    FOCAL,
-    HEIGHT,
-    LINE_DELAY,
-    TwoViewProblem,
-    WIDTH,
-)
+from rs_relpose_lab.experiments import problems
 from rs_relpose_lab.experiments.scoring import NO_POSE, pose_error, PoseError
-from rs_relpose_ros.config.estimator import EstimatorConfig
+from rs_relpose_ros.config.settings import EstimatorConfig
 from rs_relpose_ros.estimator.estimate import estimate_relative_pose
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
@@ -36,8 +27,9 @@ from rs_relpose_ros.geometry.motion import FrameMotion
 Array = NDArray[np.float64]
 
 # Camera of the problems that are drawn at random.
-CAMERA = RollingShutterCamera(width=WIDTH, height=HEIGHT, fx=FOCAL, fy=FOCAL, cx=CENTRE_U,
-                              cy=CENTRE_V, readout_time=HEIGHT * LINE_DELAY)
+CAMERA = RollingShutterCamera(
+    width=problems.WIDTH, height=problems.HEIGHT, fx=problems.FOCAL, fy=problems.FOCAL,
+    cx=problems.CENTRE_U, cy=problems.CENTRE_V, readout_time=problems.HEIGHT * problems.LINE_DELAY)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +37,8 @@ class Method:
     """How a pair is estimated.
 
     `solver`, `refinement`: of this library, as in `EstimatorConfig`.
-    `library`, `threshold` [px]: of another one; `derotated`: it gets the points as if all rows had
-        been read with the middle one, as far as the gyro knows.
+    `library`, `threshold` [px]: of another one; `derotated`: its points are derotated by the
+        gyro to the time of the middle row.
     `continuous_gyro`: the gyro over the rows and between the frames is used, too.
     """
 
@@ -59,8 +51,8 @@ class Method:
     threshold: float = 1.0
 
 
-# Of an answer [deg]: 0.5 rad, whatever the node's limit is. The other libraries, which tell no
-# sigma, are counted by all of their answers.
+# Of a pose [deg]: 0.5 rad, independent of the node's limit. For the other libraries, without
+# sigmas, all poses count.
 MAX_TRANSLATION_SIGMA = float(np.degrees(0.5))
 
 # The paper's algorithms have the paper's refinement, as in its experiments; auto is the default.
@@ -87,7 +79,7 @@ METHODS: Mapping[str, Method] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ContinuousGyro:
-    """What a gyro that runs on knows of a pair, beyond one mean rate a frame.
+    """Motion of a pair by a continuous gyro, in addition to one mean rate a frame.
 
     `rotation`, `covariance` (3, 3): ``R_1^T R_2`` between the reference rows, and the covariance
         of its error [rad^2]; `interval` [s] between them.
@@ -110,7 +102,7 @@ class PairProblem:
     `points1`, `points2` (N, 2): matches [px], with their `quality` (N,).
     `motion1`, `motion2`: one angular velocity and one direction of gravity each.
     `R`, `t`: true pose between the reference rows, ``X1 = R X2 + t``; t of any length.
-    `told`: noise figures that the estimator is told, and its other settings.
+    `configured`: settings of the estimator, noise levels among them.
     """
 
     points1: Array
@@ -120,7 +112,7 @@ class PairProblem:
     motion2: FrameMotion
     R: Array
     t: Array
-    told: EstimatorConfig
+    configured: EstimatorConfig
     quality: Array | None = None
     gyro: ContinuousGyro | None = None
 
@@ -131,22 +123,23 @@ class PairProblem:
         return pose_error(pose.R, pose.t, self.R, self.t, pose.covariance)
 
 
-def as_pair(problem: TwoViewProblem, cell: Cell, sigma_factor: float = 1.0) -> PairProblem:
-    """A random problem of a cell; methods are told its noise figures, times a factor."""
+def as_pair(problem: problems.TwoViewProblem, cell: problems.Cell,
+            sigma_factor: float = 1.0) -> PairProblem:
+    """A random problem of a cell; the configured sigmas are the true ones, times a factor."""
     # Sigmas must be positive, also where there is no noise at all.
-    told = EstimatorConfig(
+    configured = EstimatorConfig(
         pixel_sigma=max(cell.pixel_noise * sigma_factor, 0.01),
         gravity_sigma=max(float(np.radians(cell.gravity_noise)) * sigma_factor, 1e-5),
         gyro_sigma=max(float(np.radians(cell.gyro_noise)) * sigma_factor, 1e-6))
     return PairProblem(problem.points1, problem.points2, CAMERA,
                        FrameMotion(problem.measured_rate1, problem.measured_gravity1),
                        FrameMotion(problem.measured_rate2, problem.measured_gravity2),
-                       problem.R, problem.t, told)
+                       problem.R, problem.t, configured)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:
-    """Pose ``X1 = R X2 + t``, t of unit length, of a library that tells no covariance."""
+    """Pose ``X1 = R X2 + t``, t of unit length, of a library without covariance."""
 
     R: Array
     t: Array
@@ -170,9 +163,9 @@ def prepared(method: Method, problem: PairProblem, seed: int) -> Estimate:
     if method.continuous_gyro:
         assert problem.gyro is not None, f'{method.label} needs a pair with a continuous gyro'
         motions = problem.gyro.motion1, problem.gyro.motion2
-    points, turns = [problem.points1, problem.points2], (np.eye(3), np.eye(3))
+    points, middle = [problem.points1, problem.points2], (np.eye(3), np.eye(3))
     if method.derotated:
-        points, turns = _derotated(points, problem.camera, motions)
+        points, middle = _derotated(points, problem.camera, motions)
     pixels = [undistorted(p, problem.camera) for p in points]
     five_point = opencv_five_point if method.library == 'opencv' else poselib_five_point
 
@@ -181,7 +174,7 @@ def prepared(method: Method, problem: PairProblem, seed: int) -> Estimate:
         if pose is None:
             return None
         # From the middle rows to the reference rows; how the camera moved in between is unknown.
-        return replace(pose, R=turns[0] @ pose.R @ turns[1].T, t=turns[0] @ pose.t)
+        return replace(pose, R=middle[0] @ pose.R @ middle[1].T, t=middle[0] @ pose.t)
     return call
 
 
@@ -195,7 +188,7 @@ def run_method(name: str, problem: PairProblem, seed: int) -> tuple[Status, Pose
 
 def _of_this_library(method: Method, problem: PairProblem, seed: int) -> Estimate:
     motion1, motion2, gyro = problem.motion1, problem.motion2, None
-    config = replace(problem.told, solver=method.solver, refinement=method.refinement,
+    config = replace(problem.configured, solver=method.solver, refinement=method.refinement,
                      max_translation_sigma=MAX_TRANSLATION_SIGMA)
     if method.continuous_gyro:
         gyro = problem.gyro
@@ -215,17 +208,17 @@ def _of_this_library(method: Method, problem: PairProblem, seed: int) -> Estimat
 def _derotated(points: list[Array], camera: RollingShutterCamera,
                motions: tuple[FrameMotion, FrameMotion],
                ) -> tuple[list[Array], tuple[Array, Array]]:
-    """Pixels at which cameras with the orientation of their middle rows would see the points.
+    """Pixels of the points in cameras with the orientation of their middle rows.
 
-    Also each camera's turn from its reference row to its middle row. Matches of which one point
-    would not be seen are left out.
+    Also each camera's rotation from its reference row to its middle row. Matches with a point
+    outside of the lens are left out.
     """
     delay = float(camera.row_times((camera.height - 1) / 2))
-    turn1, turn2 = (motion.rotations([delay])[0] for motion in motions)
-    moved = [camera.project(motion.derotate(camera.unproject(p), camera.row_times(p[:, 1])) @ turn)
-             for p, motion, turn in zip(points, motions, (turn1, turn2), strict=True)]
-    seen = np.isfinite(np.hstack(moved)).all(axis=1)
-    return [p[seen] for p in moved], (turn1, turn2)
+    middle1, middle2 = (motion.rotations([delay])[0] for motion in motions)
+    moved = [camera.project(motion.derotate(camera.unproject(p), camera.row_times(p[:, 1])) @ R)
+             for p, motion, R in zip(points, motions, (middle1, middle2), strict=True)]
+    observed = np.isfinite(np.hstack(moved)).all(axis=1)
+    return [p[observed] for p in moved], (middle1, middle2)
 
 
 def undistorted(points: Array, camera: RollingShutterCamera) -> Array:

@@ -1,10 +1,9 @@
-"""What the data allow: the maximum-a-posteriori estimate of somebody who knows the answer.
+"""Limit of the data: a maximum-a-posteriori estimate with knowledge of the truth.
 
-The oracle knows which matches are true, every noise figure and how fast the cameras are, and
-starts at the truth. (One that does not know which are true: `mixture_oracle`.) It is written with
-NumPy and SciPy alone and shares nothing with the estimator: not the code, not the parameters
-(gravity is an unknown of its own, velocities are in each camera's own frame), not the derivatives
-(complex steps).
+The oracle knows which matches are true, every noise level and the magnitude of the velocities, and
+starts at the truth. It uses NumPy and SciPy alone and shares nothing with the estimator: neither
+the code nor the parametrisation (gravity is a separate unknown, velocities are in each camera's
+own frame) nor the derivatives (complex steps).
 
 For a match at pixels ``(u_1, v_1), (u_2, v_2)``, row times ``tau_i = v_i line_delay``::
 
@@ -36,8 +35,8 @@ from rs_relpose_lab.experiments.problems import (
 Array = NDArray[np.float64]
 Values = NDArray[Any]  # real, or complex under a complex step
 
-# Unknowns, as a step from a start: turn of R (3), tangent of t (2), tangent of gravity (2), gyro
-# corrections (6), velocities (6; left out where both cameras stand).
+# Unknowns, as a step from a start: rotation of R (3), tangent of t (2), tangent of gravity (2),
+# gyro corrections (6), velocities (6; left out where both cameras rest).
 _POSE, _GRAVITY, _GYRO, _VELOCITY = slice(0, 5), slice(5, 7), slice(7, 13), slice(13, 19)
 _STEP = 1e-30
 
@@ -75,8 +74,7 @@ class Objective:
     """Residuals, of which the oracle minimises the sum of squares, over a step x from `start`.
 
     `pixel_sigma` [px] per coordinate, `gravity_sigma` [rad] per axis of one frame's direction,
-    `gyro_sigma` [rad/s] per axis of one frame. `weights` (N,) of the matches; those of weight 0
-    take no part.
+    `gyro_sigma` [rad/s] per axis of one frame. Outliers are left out.
     """
 
     problem: TwoViewProblem
@@ -84,7 +82,6 @@ class Objective:
     gravity_sigma: float
     gyro_sigma: float
     start: Start
-    weights: Array
 
     @property
     def velocity_spread(self) -> float:
@@ -105,46 +102,21 @@ class Objective:
     def residuals(self, x: Values) -> Values:
         """Residuals (M, K) in sigmas at each column of x (P, K)."""
         problem, spread = self.problem, self.velocity_spread
-        use = self.weights > 0.0
-        turned, _, gravity = pose_at(self.start, x)
-        gravity2 = np.einsum('jik,jk->ik', turned, gravity)
+        use = ~problem.is_outlier
+        R, t, gravity = pose_at(self.start, x)
+        gravity2 = np.einsum('jik,jk->ik', R, gravity)
         gyro = x[_GYRO]
-        parts = [np.sqrt(self.weights[use])[:, None] * self.errors(x, use) / self.pixel_sigma,
+        velocity = x[_VELOCITY] if spread > 0.0 else np.zeros_like(gyro)
+        errors = _sampson(problem.points1[use], problem.points2[use], R, t,
+                          problem.measured_rate1[:, None] + gyro[:3],
+                          problem.measured_rate2[:, None] + gyro[3:], velocity[:3], velocity[3:])
+        parts = [errors / self.pixel_sigma,
                  _tangent(problem.measured_gravity1).T @ gravity / self.gravity_sigma,
                  _tangent(problem.measured_gravity2).T @ gravity2 / self.gravity_sigma,
                  gyro / self.gyro_sigma]
         if spread > 0.0:
-            parts.append(x[_VELOCITY] / spread)
+            parts.append(velocity / spread)
         return np.concatenate(parts)
-
-    def errors(self, x: Values, use: NDArray[np.bool_]) -> Values:
-        """Signed Sampson errors (K, C) [px] of K matches in `use` (N,), at each column of x."""
-        problem = self.problem
-        turned, direction, _ = pose_at(self.start, x)
-        return _sampson(problem.points1[use], problem.points2[use], turned, direction,
-                        *self._motions(x))
-
-    def depths(self, x: Array) -> Array:
-        """Depths (N, 2) [baselines] along both derotated rays, normalised to 1 on the axis."""
-        problem = self.problem
-        turned, direction, _ = pose_at(self.start, x[:, None])
-        w1, w2, v1, v2 = self._motions(x[:, None])
-        (f1, _, _), tau1 = _derotated(problem.points1, w1)
-        (f2, _, _), tau2 = _derotated(problem.points2, w2)
-        f1, h = f1[:, 0], np.einsum('ij,jn->in', turned[:, :, 0], f2[:, 0])
-        # X = a f_1 = b + c h, in the least-squares sense.
-        b = direction + tau2 * (turned[:, :, 0] @ v2) - tau1 * v1
-        normal = _cross(f1, h)
-        square = _dot(normal, normal)
-        return np.stack([_dot(_cross(b, h), normal), _dot(_cross(b, f1), normal)]).T / square[
-            :, None]
-
-    def _motions(self, x: Values) -> tuple[Values, Values, Values, Values]:
-        """Angular, then linear velocities (3, C) of both frames at each column of x."""
-        problem, gyro = self.problem, x[_GYRO]
-        velocity = x[_VELOCITY] if self.velocity_spread > 0.0 else np.zeros_like(gyro)
-        return (problem.measured_rate1[:, None] + gyro[:3],
-                problem.measured_rate2[:, None] + gyro[3:], velocity[:3], velocity[3:])
 
     def jacobian(self, x: Array) -> Array:
         """Derivatives (M, P) at x (P,), exact to the last digits: no difference is formed."""
@@ -157,23 +129,13 @@ def oracle_estimate(problem: TwoViewProblem, pixel_sigma: float, gravity_sigma: 
     """The oracle's estimate of a problem; `start`: pose to start from instead of the truth."""
     R, t = (problem.R, problem.t) if start is None else start
     objective = Objective(problem, pixel_sigma, gravity_sigma, gyro_sigma,
-                          start_at(R, t, problem.gravity1), (~problem.is_outlier).astype(float))
-    return estimate_at(objective, minimum(objective, objective.truth()))
-
-
-def minimum(objective: Objective, start: Array) -> Array:
-    """The unknowns (P,) of the least cost that is reached from `start` (P,)."""
-    return np.asarray(least_squares(
-        lambda x: objective.residuals(x[:, None])[:, 0], start, jac=objective.jacobian,
-        method='lm', x_scale='jac', xtol=1e-12, ftol=1e-12, gtol=1e-12).x)
-
-
-def estimate_at(objective: Objective, x: Array) -> OracleEstimate:
-    """Pose and covariance at an optimum x (P,)."""
-    turned, direction, gravity = pose_at(objective.start, x[:, None])
-    # Once more about the optimum, where the unknowns of the pose are a turn and a tangent of it.
-    optimum = start_at(turned[:, :, 0], direction[:, 0], gravity[:, 0])
-    x = x.copy()
+                          start_at(R, t, problem.gravity1))
+    x = np.array(least_squares(
+        lambda x: objective.residuals(x[:, None])[:, 0], objective.truth(),
+        jac=objective.jacobian, method='lm', x_scale='jac', xtol=1e-12, ftol=1e-12, gtol=1e-12).x)
+    R, t, gravity = pose_at(objective.start, x[:, None])
+    # Linearised again at the optimum, where the unknowns of the pose are a rotation and a tangent.
+    optimum = start_at(R[:, :, 0], t[:, 0], gravity[:, 0])
     x[_POSE], x[_GRAVITY] = 0.0, 0.0
     slopes = replace(objective, start=optimum).jacobian(x)
     pose = np.linalg.inv(slopes.T @ slopes)[_POSE, _POSE]
@@ -186,7 +148,7 @@ def estimate_at(objective: Objective, x: Array) -> OracleEstimate:
 def pose_at(origin: Start, x: Values) -> tuple[Values, Values, Values]:
     """R (3, 3, K), t (3, K) and gravity in camera 1 (3, K) at each column of x (P, K)."""
     series = _series(x[:3], np.ones(1))
-    R = np.stack([_turn(x[:3], column[:, None, None], series)[:, :, 0] for column in origin.R.T],
+    R = np.stack([_rotate(x[:3], column[:, None, None], series)[:, :, 0] for column in origin.R.T],
                  axis=1)
     t = origin.t[:, None] + origin.tangent @ x[3:5]
     gravity = origin.gravity[:, None] + origin.gravity_tangent @ x[_GRAVITY]
@@ -223,10 +185,10 @@ def _derotated(points: Array, w: Values,
                   np.ones(len(points))])[:, None]
     along_u, along_v = np.array([1.0, 0.0, 0.0]) / FOCAL, np.array([0.0, 1.0, 0.0]) / FOCAL
     series = _series(w, tau)
-    f = _turn(w, m, series)
-    f_u = _turn(w, along_u[:, None, None], series)
+    f = _rotate(w, m, series)
+    f_u = _rotate(w, along_u[:, None, None], series)
     # A row further down is a line delay later: d/dtau Exp(w tau) m = w x Exp(w tau) m.
-    f_v = _turn(w, along_v[:, None, None], series) + LINE_DELAY * _cross(w[:, :, None], f)
+    f_v = _rotate(w, along_v[:, None, None], series) + LINE_DELAY * _cross(w[:, :, None], f)
     return (f, f_u, f_v), tau
 
 
@@ -246,7 +208,7 @@ def _series(w: Values, tau: Array) -> tuple[Values, Values]:
     return sine, cosine
 
 
-def _turn(w: Values, m: Array, series: tuple[Values, Values],
+def _rotate(w: Values, m: Array, series: tuple[Values, Values],
           ) -> Values:
     """``Exp(w tau) m`` (3, K, N) for w (3, K), m (3, 1, 1 or N) and the `_series` of w and tau."""
     once = _cross(w[:, :, None], m)

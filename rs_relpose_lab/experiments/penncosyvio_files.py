@@ -1,17 +1,11 @@
 """PennCOSYVIO in the formats in which it is published (https://daniilidis-group.github.io/penncosyvio).
 
-The folder is a checkout of the data set's repository, into which its scripts have downloaded the
-sensors and extracted the frames::
+The folder is a checkout of the data set's repository::
 
     data/ground_truth/SEQUENCE/pose.txt   stamp [s], then the 3x4 pose of the rig in the world
-    data/CAMERA/SEQUENCE/frames/          frame_0001.png, ...; timestamps.txt [s], one a line
-    data/visensor/SEQUENCE/imu.txt        stamp [s], specific force, angular velocity
-    data/tango_bottom/SEQUENCE/           accelerometer.txt, gyroscope.txt: stamp [s], 3 figures
     tools/intrinsic_calibration/cc.mat    OCamCalib's models of the wide-angle cameras
-    tools/misc/extrinsic_calibration.txt  number of the sensor, axis, angle [rad], offset [mm]
-                                          of the transform from the rig to the sensor
 
-Frames count from 1, as their files do. The rig's axes are those of the GoPro C2.
+The rig's axes are those of the GoPro C2.
 """
 
 from __future__ import annotations
@@ -20,63 +14,136 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_lab.experiments.omnidirectional import OmnidirectionalCamera
-from rs_relpose_ros.convert.recording import ordered_samples
-from rs_relpose_ros.convert.tables import read_rows, Row
+from rs_relpose_ros.bags.convert import read_rows, Row
 from rs_relpose_ros.errors import InputError, MissingInputError
-from rs_relpose_ros.geometry.camera import RollingShutterCamera
-from rs_relpose_ros.imu.samples import ImuSample
+from rs_relpose_ros.geometry.camera import rays_with_jacobian, RollingShutterCamera
+
+# -- The camera model of the OCamCalib toolbox (Scaramuzza), in which PennCOSYVIO is calibrated ---
+#
+# With (c, d, e) and the polynomial f(rho) = a0 + a2 rho^2 + a3 rho^3 + ... (negative, its z axis
+# points backwards), and m = (x, y) right and down from the centre on an ideal sensor:
+#
+#     u - cx = x + e y          v - cy = d x + c y          ray ~ (x, y, -f(|m|))
 
 Array = NDArray[np.float64]
 
-# Place in cc.mat and in the table of extrinsics (from 1). The Tango's lower camera is calibrated
-# as a perspective one, in a format of Matlab's own: its figures are those of the data set's site.
-CAMERAS = {'c1': 1, 'c2': 2, 'c3': 3, 'tango_bottom': 4, 'tango_top': 5}
-GOPROS = ('c1', 'c2', 'c3')
-IMUS = {'visensor': 10, 'tango_bottom': 8, 'tango_top': 9}
-_TANGO_BOTTOM = {'width': 1920, 'height': 1080, 'fx': 1959.84, 'fy': 1959.39, 'cx': 980.87,
-                 'cy': 523.94, 'distortion': (0.21253, -0.46023, 0.0, 0.0)}
+_MAX_STEPS = 50
+_SETTLED = 1e-10
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OmnidirectionalCamera(RollingShutterCamera):
+    """A wide-angle rolling-shutter camera with a field of view below 180 degrees.
+
+    `polynomial`: a0, a1, a2, ... as OCamCalib prints ``ss``; a1 is 0, as its model demands.
+    `affine` (c, d, e): as OCamCalib names them.
+
+    Notes
+    -----
+    `fx` and `fy` are -a0, the pixels per radian at the centre; `cx` and `cy` its column and row,
+    the first pixel being 0 (OCamCalib, in Matlab, counts from 1, and has row, column).
+    """
+
+    polynomial: tuple[float, ...]
+    affine: tuple[float, float, float] = (1.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        # Without super(): a dataclass with slots is another class than that of the text.
+        RollingShutterCamera.__post_init__(self)
+        for name in ('polynomial', 'affine'):
+            values = tuple(float(value) for value in getattr(self, name))
+            if not np.isfinite(values).all():
+                raise InputError(f'{name} must be finite, got {values}')
+            object.__setattr__(self, name, values)
+        if len(self.polynomial) < 2 or not self.polynomial[0] < 0.0 or self.polynomial[1] != 0.0:
+            raise InputError('polynomial must begin with a negative number and 0, '
+                             f'got {self.polynomial}')
+        if not abs(np.linalg.det(self._stretch)) > 1e-3:
+            raise InputError(f'affine must be c, d, e of an invertible map, got {self.affine}')
+
+    @property
+    def is_undistorted(self) -> bool:
+        """Never a plain pinhole."""
+        return False
+
+    def project(self, points: ArrayLike) -> Array:
+        """Raw pixels (N, 2) of points (N, 3) in the camera frame; NaN outside of the lens."""
+        points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
+        across = np.hypot(points[:, 0], points[:, 1])
+        # rho of the ray: rho * depth = -f(rho) * across, by Newton's method.
+        with np.errstate(all='ignore'):
+            angle = np.arctan2(across, points[:, 2])
+            rho = -self.polynomial[0] * angle
+            for _ in range(_MAX_STEPS):
+                depth, by_rho = self._depth(rho)
+                step = ((rho * points[:, 2] - across * depth)
+                        / (points[:, 2] - across * rho * by_rho))
+                rho = rho - step
+                if not (np.abs(step) > _SETTLED * np.abs(rho)).any():
+                    break
+            observed = ((np.abs(step) <= 1e-6) & (rho >= 0.0) & (self._depth(rho)[0] > 0.0)
+                        & (points[:, 2] > 1e-9))
+            scale = np.where(across > 0.0, rho / np.where(across > 0.0, across, 1.0), 0.0)
+        pixels = (points[:, :2] * scale[:, None]) @ self._stretch.T + (self.cx, self.cy)
+        pixels[~observed] = np.nan
+        return pixels
+
+    def unproject_with_jacobian(self, points: ArrayLike) -> tuple[Array, Array]:
+        """Unit rays (N, 3) and their derivatives (N, 3, 2) by the raw pixel coordinates u, v."""
+        points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
+        inverse = np.linalg.inv(self._stretch)
+        plane = (points - (self.cx, self.cy)) @ inverse.T
+        depth, by_rho = self._depth(np.hypot(plane[:, 0], plane[:, 1]))
+        depth = np.where(depth > 0.0, depth, np.nan)
+        normalized = plane / depth[:, None]
+        # d(m / depth)/dm = (I - n (d depth/dm)) / depth, with d depth/dm = by_rho m.
+        by_plane = (np.eye(2) - normalized[:, :, None] * (by_rho[:, None] * plane)[:, None, :])
+        by_pixel = by_plane / depth[:, None, None] @ inverse
+        return rays_with_jacobian(normalized, np.ascontiguousarray(by_pixel))
+
+    @property
+    def _stretch(self) -> Array:
+        c, d, e = self.affine
+        return np.array([[1.0, e], [d, c]])
+
+    def _depth(self, rho: Array) -> tuple[Array, Array]:
+        """``-f(rho)`` and its derivative over rho (finite at 0, as a1 is 0)."""
+        a = np.array(self.polynomial)
+        slopes = np.arange(2, len(a)) * a[2:]
+        return (-np.polynomial.polynomial.polyval(rho, a),
+                -np.polynomial.polynomial.polyval(rho, slopes if len(slopes) else [0.0]))
+
 
 _GROUND_TRUTH = ('data/ground_truth', 'ground_truth')
 _INTRINSICS = ('tools/intrinsic_calibration/cc.mat', 'calibration/cc.mat')
-_EXTRINSICS = ('tools/misc/extrinsic_calibration.txt', 'calibration/extrinsic_calibration.txt')
-_MILLIMETRE = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Poses:
-    """Poses of a sensor in the world.
+    """Poses of the rig in the world.
 
-    `stamps_ns` (K,): increasing.
-    `positions` (K, 3): [m].
-    `rotations` (K,): from the sensor's axes to the world's, z up.
+    `stamps_ns` (K,): increasing; `positions` (K, 3) [m]; `rotations` (K,): to the world, z up.
     """
 
     stamps_ns: NDArray[np.int64]
     positions: Array
     rotations: Rotation
 
-    def of_sensor(self, R: Array, t: Array) -> Poses:
-        """Poses of a sensor on the rig that these are of: ``x_sensor = R x_rig + t``."""
-        return Poses(self.stamps_ns, self.positions - self.rotations.apply(R.T @ t),
-                     self.rotations * Rotation.from_matrix(R.T))
-
-
 def read_poses(folder: Path, sequence: str) -> Poses:
-    """Ground truth of a sequence: poses of the rig."""
+    """Ground truth of a sequence."""
     path = _first(folder, [f'{place}/{sequence}/pose.txt' for place in _GROUND_TRUTH])
     rows = list(_rows(path, 13))
     stamps = np.array([row.seconds_as_nanoseconds(0) for row in rows], dtype=np.int64)
     if len(rows) < 4 or not (np.diff(stamps) > 0).all():
         raise InputError(f'{path} must hold at least 4 poses in the order of their stamps')
-    matrices = np.array([row.reals(1, 12) for row in rows]).reshape(-1, 3, 4)
+    matrices = np.array([[row.real(column) for column in range(1, 13)]
+                         for row in rows]).reshape(-1, 3, 4)
     R = matrices[:, :, :3]
     off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     bad = np.flatnonzero((off > 1e-3) | (np.linalg.det(R) < 0.0))
@@ -85,91 +152,24 @@ def read_poses(folder: Path, sequence: str) -> Poses:
     return Poses(stamps, matrices[:, :, 3], Rotation.from_matrix(R))
 
 
-def read_camera(folder: Path, name: str, readout_time: float,
-                reference_row: str) -> RollingShutterCamera:
-    """Intrinsics of a camera of `CAMERAS`; nobody has measured its read-out time [s]."""
-    if name == 'tango_bottom':
-        return RollingShutterCamera(**_TANGO_BOTTOM, readout_time=readout_time,  # type: ignore[arg-type]
-                                    reference_row=reference_row)
+def read_camera(folder: Path, readout_time: float, reference_row: str) -> RollingShutterCamera:
+    """Intrinsics of the GoPro C2; its readout time [s] has not been measured."""
     path = _first(folder, _INTRINSICS)
     try:
-        model = loadmat(path)['cc'].flat[CAMERAS[name] - 1]
+        model = loadmat(path)['cc'].flat[1]
         values = {field: np.ravel(model[field].flat[0]).astype(np.float64)
                   for field in ('ss', 'xc', 'yc', 'c', 'd', 'e', 'width', 'height')}
         single = {field: value.item() for field, value in values.items() if field != 'ss'}
-    # Whatever SciPy and NumPy raise where a file is none or holds something else.
+    # Exceptions of SciPy and NumPy for other files and other contents.
     except (ValueError, KeyError, IndexError, TypeError, NotImplementedError, AttributeError,
             MatReadError, OSError) as error:
-        raise InputError(f'{path} does not hold the OCamCalib model of {name}: {error}') from error
+        raise InputError(f'{path} does not hold the OCamCalib model of C2: {error}') from error
     focal = -float(values['ss'][0])
     return OmnidirectionalCamera(
         width=int(single['width']), height=int(single['height']), fx=focal, fy=focal,
         cx=single['yc'] - 1.0, cy=single['xc'] - 1.0, readout_time=readout_time,
         reference_row=reference_row, polynomial=tuple(values['ss']),
         affine=(single['c'], single['d'], single['e']))
-
-
-def read_extrinsics(folder: Path, number: int) -> tuple[Array, Array]:
-    """R (3, 3) and t (3,) [m] with ``x_sensor = R x_rig + t`` of a sensor by its number."""
-    path = _first(folder, _EXTRINSICS)
-    for row in _rows(path, 8):
-        if row.real(0) == number:
-            axis, angle = np.array(row.reals(1, 3)), row.real(4)
-            if abs(np.linalg.norm(axis) - 1.0) > 1e-3:
-                raise row.error('columns 2 to 4 must be an axis of the length 1')
-            return (Rotation.from_rotvec(angle * axis).as_matrix(),
-                    _MILLIMETRE * np.array(row.reals(5, 3)))
-    raise InputError(f'{path} has no line for sensor {number}')
-
-
-def read_imu(folder: Path, name: str, sequence: str) -> tuple[ImuSample, ...]:
-    """Samples of an IMU of `IMUS`, in its own axes."""
-    place = _first(folder, [f'data/{name}/{sequence}', f'{name}/{sequence}'])
-    if name == 'visensor':
-        samples = [ImuSample(row.seconds_as_nanoseconds(0), _vector(row, 4), _vector(row, 1))
-                   for row in _rows(place / 'imu.txt', 7)]
-        return ordered_samples(samples)
-    forces = (ImuSample(row.seconds_as_nanoseconds(0), None, _vector(row, 1))
-              for row in _rows(place / 'accelerometer.txt', 4))
-    rates = (ImuSample(row.seconds_as_nanoseconds(0), _vector(row, 1), None)
-             for row in _rows(place / 'gyroscope.txt', 4))
-    # Equal stamps of the two sensors are two samples, not two answers.
-    return tuple(sorted([*ordered_samples(forces), *ordered_samples(rates)],
-                        key=lambda sample: sample.stamp_ns))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Frames:
-    """Extracted frames of a camera.
-
-    `stamps_ns` (K,): of frames 1 to K.
-    """
-
-    folder: Path
-    stamps_ns: NDArray[np.int64]
-
-    def image(self, number: int, camera: RollingShutterCamera) -> NDArray[np.uint8]:
-        """Gray image (H, W) of a frame, counted from 1."""
-        path = self.folder / f'frame_{number:04d}.png'
-        if not path.is_file():
-            raise MissingInputError(f"there is no image {path}: the data set's "
-                                    'tools/extract_frames.bash makes it of the video')
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        if image is None or image.shape != (camera.height, camera.width):
-            size = 'no image' if image is None else f'{image.shape[1]}x{image.shape[0]} pixels'
-            raise InputError(f'{path} must be an image of {camera.width}x{camera.height} pixels, '
-                             f'but is {size}')
-        return np.asarray(image, dtype=np.uint8)
-
-
-def read_frames(folder: Path, camera: str, sequence: str) -> Frames:
-    """Where the frames of a camera are, and their stamps."""
-    place = _first(folder, [f'data/{camera}/{sequence}/frames', f'{camera}/{sequence}/frames'])
-    stamps = np.array([row.seconds_as_nanoseconds(0)
-                       for row in _rows(place / 'timestamps.txt', 1)], dtype=np.int64)
-    if not len(stamps) or not (np.diff(stamps) > 0).all():
-        raise InputError(f'{place / "timestamps.txt"} must hold increasing stamps')
-    return Frames(place, stamps)
 
 
 def _first(folder: Path, places: Sequence[str]) -> Path:
@@ -181,14 +181,9 @@ def _first(folder: Path, places: Sequence[str]) -> Path:
 
 
 def _rows(path: Path, columns: int) -> Iterator[Row]:
-    """Rows of a flat text file, white space or commas between its figures."""
+    """Rows of a flat text file, separated by white space or commas."""
     if not path.is_file():
         raise MissingInputError(f'there is no {path}')
     with path.open(encoding='utf-8', errors='replace') as file:
         separator = ',' if ',' in file.readline(10_000) else None
-    return read_rows(path, columns, separator)
-
-
-def _vector(row: Row, first: int) -> tuple[float, float, float]:
-    x, y, z = row.reals(first, 3)
-    return x, y, z
+    return read_rows(path, range(columns), separator)

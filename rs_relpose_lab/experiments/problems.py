@@ -1,8 +1,9 @@
 """Random two-view problems with known truth: the paper's section 'Synthetic Data'.
 
 1920x1080 pixels, focal length 640 px, no distortion, 60 us per row; two cameras about 2 m apart,
-each turned by up to 10 degrees either way about each axis; about 300 points, 20 m away on average.
-Nothing of the estimator is used: points are projected at the instants of their own rows.
+each rotated by up to 10 degrees either way about each axis; about 300 points, 20 m away on
+average.
+Nothing of the estimator is used: points are projected at the times of their own rows.
 
 What the paper leaves open, and what is done here: the baseline is 2 m along the optical axis of
 the world frame (forward) or across it (sideways) plus 0.2 m (1 sigma) per axis; depths are 6 to
@@ -21,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_lab.simulation.rows import in_front, measured, seen_by_both, uniform_motion, View
+from rs_relpose_lab.simulation.rows import in_both_views, in_front, measured, uniform_motion, View
 
 Array = NDArray[np.float64]
 
@@ -143,8 +144,9 @@ def make_problem(cell: Cell, seed: int | Sequence[int], noise: Noise = 'paper',
             return in_front(VIEW, attitude1, np.zeros(3), count, _DEPTHS, rng)
         return rng.uniform([-30.0, -18.0, _DEPTHS[0]], [30.0, 18.0, _DEPTHS[1]], (count, 3))
 
-    exact = seen_by_both(candidates, uniform_motion(attitude1, np.zeros(3), rate1, velocity1),
-                         uniform_motion(attitude2, baseline, rate2, velocity2), VIEW, cell.matches)
+    exact = in_both_views(candidates, uniform_motion(attitude1, np.zeros(3), rate1, velocity1),
+                          uniform_motion(attitude2, baseline, rate2, velocity2), VIEW,
+                          cell.matches)
     points1, points2, is_outlier = measured(exact, VIEW, cell.pixel_noise, cell.outliers, rng)
     gyro_error1, gyro_error2 = np.radians(cell.gyro_noise) * rng.normal(size=(2, 3))
     if noise == 'paper':

@@ -41,15 +41,15 @@ def pose_error(R: Array, t: Array, true_R: Array, true_t: Array, covariance: Arr
     `covariance` (6, 6): of ``(dt, dtheta)`` with ``t_true = t + dt`` (dt perpendicular to t) and
         ``R_true = Exp(dtheta) R``, both in camera 1.
     """
-    turn, shift = _turn_and_shift(R, t, true_R, true_t)
-    rotation = float(np.degrees(np.linalg.norm(turn)))
+    rotation_error, shift = _rotation_and_shift(R, t, true_R, true_t)
+    rotation = float(np.degrees(np.linalg.norm(rotation_error)))
     translation = float(np.degrees(np.linalg.norm(shift)))
     if covariance is None:
         return PoseError(rotation, translation)
     basis = np.zeros((6, POSE_FREEDOM))
     basis[:3, :2] = _tangent(t)
     basis[3:, 2:] = np.eye(3)
-    error = basis.T @ np.concatenate([shift, turn])
+    error = basis.T @ np.concatenate([shift, rotation_error])
     nees = error @ np.linalg.solve(basis.T @ covariance @ basis, error)
     return PoseError(rotation, translation, float(nees))
 
@@ -64,18 +64,18 @@ class ChiSquares(NamedTuple):
 def chi_squares(R: Array, t: Array, true_R: Array, true_t: Array,
                 covariance: Array) -> ChiSquares:
     """Each error of a pose by its own part of the covariance; arguments as in `pose_error`."""
-    turn, shift = _turn_and_shift(R, t, true_R, true_t)
+    rotation_error, shift = _rotation_and_shift(R, t, true_R, true_t)
     tangent = _tangent(t)
     across = tangent.T @ shift
     return ChiSquares(
         float(across @ np.linalg.solve(tangent.T @ covariance[:3, :3] @ tangent, across)),
-        float(turn @ np.linalg.solve(covariance[3:, 3:], turn)))
+        float(rotation_error @ np.linalg.solve(covariance[3:, 3:], rotation_error)))
 
 
-def _turn_and_shift(R: Array, t: Array, true_R: Array, true_t: Array) -> tuple[Array, Array]:
+def _rotation_and_shift(R: Array, t: Array, true_R: Array, true_t: Array) -> tuple[Array, Array]:
     """Errors dtheta (3,) and dt (3,) of a pose [rad], dt along the great circle to the truth.
 
-    The direction of t is no vector space once the error is large.
+    For large errors the directions of t are no vector space.
     """
     true_t = true_t / np.linalg.norm(true_t)
     away = true_t - (true_t @ t) * t
@@ -100,7 +100,7 @@ class Quantiles:
     @classmethod
     def of(cls, values: Iterable[float]) -> Quantiles:
         """Quantiles of values, infinite ones among them."""
-        # Not interpolated: between a number and infinity there is nothing.
+        # Not interpolated: not defined between a number and infinity.
         median, p90 = np.quantile(list(values), [0.5, 0.9], method='higher')
         return cls(float(median), float(p90))
 

@@ -1,4 +1,4 @@
-"""Time and accuracy of this library, OpenCV and PoseLib, side by side on the same problems."""
+"""Time and accuracy of this library, OpenCV and PoseLib on the same problems."""
 
 from __future__ import annotations
 
@@ -6,16 +6,23 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 import gc
+from importlib.metadata import PackageNotFoundError, version
+import math
 from multiprocessing import get_context
+from operator import attrgetter
 import os
+from pathlib import Path
+import platform
 import time
 
 import cv2
 import numpy as np
 
+from rs_relpose_lab.experiments.harness import grouped, markdown_table, write_csv
 from rs_relpose_lab.experiments.methods import as_pair, Estimate, METHODS, prepared
 from rs_relpose_lab.experiments.problems import Cell, CELLS, make_problem
-from rs_relpose_lab.live.processes import process_figures
+from rs_relpose_lab.experiments.scoring import Quantiles
+from rs_relpose_lab.live.processes import process_metrics
 from rs_relpose_ros import warm_up
 
 THRESHOLD = 1.5  # [px], of OpenCV and PoseLib
@@ -55,11 +62,11 @@ def compare(cell_name: str, matches: int, trials: int, repeats: int, first_seed:
             on_problem: Callable[[], object] = lambda: None) -> list[Timing]:
     """Run every method on the same problems of a cell.
 
-    The methods take turns on each problem, and each of them the shortest of a few repeats, so that
-    what else the machine does spoils none more than the others.
+    The methods alternate on each problem, and the shortest of a few repeats counts, so that other
+    load of the machine affects all methods alike.
     """
     cell = replace(CELLS[cell_name], matches=matches)
-    # OpenCV would take all cores.
+    # OpenCV would use all cores.
     cv2.setNumThreads(1)
     warm_up()
     timings = []
@@ -113,9 +120,9 @@ def _first_estimates() -> tuple[float, float]:
 
 
 def soak(estimates: int, on_estimate: Callable[[], object] = lambda: None) -> Soak:
-    """Estimate again and again and see whether memory grows.
+    """Measure the growth of memory over many estimates.
 
-    A tenth as many estimates go before, so that buffers have their size.
+    A tenth as many estimates come first, so that buffers have their size.
     """
     calls = [_base_problem(seed) for seed in range(20)]
 
@@ -125,9 +132,9 @@ def soak(estimates: int, on_estimate: Callable[[], object] = lambda: None) -> So
             on_estimate()
 
     work(estimates // 10)
-    before = process_figures(os.getpid())
+    before = process_metrics(os.getpid())
     work(estimates)
-    return Soak(estimates, before.resident, process_figures(os.getpid()).resident)
+    return Soak(estimates, before.resident, process_metrics(os.getpid()).resident)
 
 
 def medians(timings: Sequence[Timing], method: str) -> dict[int, float]:
@@ -142,3 +149,113 @@ def exponent(times: dict[int, float]) -> float:
     if len(times) < 2:
         return float('nan')
     return float(np.polyfit(np.log(list(times)), np.log(list(times.values())), 1)[0])
+
+
+# -- report -----------------------------------------------------------------------------------
+
+@dataclass(frozen=True, slots=True)
+class MethodStatistics:
+    """Of one method in one cell: times [ms], errors [deg], a lost pose is infinite.
+
+    `time_ratio` is the median over problems of its time by that of PoseLib on derotated points;
+    NaN where PoseLib is not installed.
+    """
+
+    cell: str
+    matches: int
+    method: str
+    trials: int
+    lost: int
+    time: Quantiles
+    time_ratio: float
+    rotation: Quantiles
+    translation: Quantiles
+
+
+def method_statistics(timings: Sequence[Timing]) -> list[MethodStatistics]:
+    """Statistics of each method in each cell and number of matches."""
+    groups = grouped(timings, attrgetter('cell', 'matches', 'method'))
+    result = []
+    for (cell, matches, method), group in groups.items():
+        reference = {timing.seed: timing.duration
+                     for timing in groups.get((cell, matches, REFERENCE), [])}
+        result.append(MethodStatistics(
+            cell, matches, method, trials=len(group),
+            lost=sum(math.isinf(timing.rotation) for timing in group),
+            time=Quantiles.of(timing.duration for timing in group),
+            time_ratio=float(np.median([timing.duration / reference.get(timing.seed, math.nan)
+                                        for timing in group])),
+            rotation=Quantiles.of(timing.rotation for timing in group),
+            translation=Quantiles.of(timing.translation for timing in group)))
+    return result
+
+
+def write_report(folder: Path, comparison: Sequence[Timing], scaling: Sequence[Timing],
+                 first: Sequence[tuple[float, float]], soak: Soak | None) -> str:
+    """Write runs, tables, plot and report into a folder; the report."""
+    compared, scaled = method_statistics(comparison), method_statistics(scaling)
+    write_csv(folder / 'runs.csv', [*comparison, *scaling])
+    write_csv(folder / 'methods.csv', compared)
+    write_csv(folder / 'scaling.csv', scaled)
+    report = _report(compared, scaling, first, soak)
+    (folder / 'speed.md').write_text(report)
+    return report
+
+
+def _report(compared: Sequence[MethodStatistics], scaling: Sequence[Timing],
+            first: Sequence[tuple[float, float]], soak: Soak | None) -> str:
+    parts = [
+        '# Speed\n',
+        (f'One thread of {_processor()}; {_versions()}. OpenCV and PoseLib with a threshold of '
+         f'{THRESHOLD:g} px and default options; derotating their points is not counted. This '
+         'library in its default configuration, covariance included. Median / 90th percentile.\n')]
+    for cell in dict.fromkeys(entry.cell for entry in compared):
+        rows = [entry for entry in compared if entry.cell == cell]
+        parts.append(f'## {cell}, {rows[0].matches} matches, {rows[0].trials} problems\n')
+        parts.append(markdown_table(
+            ('method', 'time [ms]', 'by PoseLib, derotated', 'R [deg]', 't [deg]', 'lost'),
+            [(entry.method, entry.time.text(2), f'{entry.time_ratio:.2f}', entry.rotation.text(3),
+              entry.translation.text(3), f'{entry.lost}') for entry in rows]))
+    if scaling:
+        parts.append(_scaling_table(scaling))
+    if first:
+        firsts, seconds = zip(*first, strict=True)
+        parts.append('## A new process, kernels cached\n')
+        parts.append(f'First estimate {np.median(firsts):.0f} ms (largest of {len(first)} '
+                     f'processes: {max(firsts):.0f} ms), second {np.median(seconds):.1f} ms; '
+                     'imports not counted.\n')
+    if soak is not None:
+        parts.append('## Memory\n')
+        parts.append(f'Resident {soak.before:.1f} MB before and {soak.after:.1f} MB after '
+                     f'{soak.estimates} estimates.\n')
+    return '\n'.join(parts)
+
+
+def _scaling_table(scaling: Sequence[Timing]) -> str:
+    methods = list(dict.fromkeys(timing.method for timing in scaling))
+    sizes = sorted({timing.matches for timing in scaling})
+    rows = []
+    for method in methods:
+        times = medians(scaling, method)
+        rows.append((method, *(f'{times[size]:.2f}' for size in sizes), f'{exponent(times):.2f}'))
+    return '\n'.join([
+        f'## Median time [ms] by the number of matches ({scaling[0].cell})\n',
+        markdown_table(('method', *map(str, sizes), 'exponent'), rows),
+        'An exponent of 1 is linear growth.\n'])
+
+
+def _processor() -> str:
+    """Name of the processor on Linux, else of the architecture."""
+    path = Path('/proc/cpuinfo')
+    lines = path.read_text().splitlines() if path.exists() else []
+    names = [line.partition(':')[2].strip() for line in lines if line.startswith('model name')]
+    return names[0] if names else platform.machine()
+
+
+def _versions() -> str:
+    try:
+        poselib = f'PoseLib {version("poselib")}'
+    except PackageNotFoundError:
+        poselib = 'PoseLib is not installed'
+    return (f'Python {platform.python_version()}, NumPy {np.__version__}, '
+            f'Numba {version("numba")}, OpenCV {cv2.__version__}, {poselib}')

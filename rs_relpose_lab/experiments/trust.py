@@ -1,12 +1,12 @@
-"""The matrix of `rs_relpose benchmark trust`: what is told wrong, and what comes of it.
+"""The matrix of `rs_relpose benchmark trust`: wrong configurations, and their effect.
 
-Each bag is simulated once, run told right, and then run through every row of `ROWS`.
+Each bag is simulated once, run with the right configuration, and then with every row of `ROWS`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 import json
 import math
 from pathlib import Path
@@ -16,29 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_lab.experiments.tables import grouped, markdown_table, write_csv
-from rs_relpose_lab.experiments.trust_recordings import recording_at
+from rs_relpose_lab.experiments import trust_runs
+from rs_relpose_lab.experiments.harness import grouped, markdown_table, write_csv
 from rs_relpose_lab.experiments.trust_rows import RIGHT, ROWS
-from rs_relpose_lab.experiments.trust_runs import (
-    FLAGGED,
-    IMAGES,
-    judged,
-    JudgedPair,
-    RECORDING,
-    Recording,
-    run,
-    simulated,
-    Source,
-    telling_motion,
-    TRACKS,
-)
-from rs_relpose_lab.experiments.trust_tracks import TrackNoise
 from rs_relpose_lab.simulation.config import SimulationConfig
+from rs_relpose_lab.simulation.motions import vehicle
 from rs_relpose_lab.simulation.scene import make_scene, SCENES
 from rs_relpose_lab.simulation.simulation import simulate, Simulation
-from rs_relpose_lab.simulation.vehicle import vehicle
-from rs_relpose_ros.config.estimator import EstimatorConfig
-from rs_relpose_ros.config.imu import ImuConfig
+from rs_relpose_ros.config.settings import EstimatorConfig, ImuConfig
 
 Array = NDArray[np.float64]
 
@@ -46,17 +31,17 @@ Array = NDArray[np.float64]
 MOTIONS = ('hand-held', 'vehicle')
 # Beyond these lie 0.27 % of right poses: three sigmas of one dimension.
 LIMIT_T, LIMIT_R = 11.8, 14.2
-# Seconds that a run goes on after its error should have been flagged.
+# Seconds that a run continues after its error should have been flagged.
 _AFTERWARDS = 3.0
-# The scene's textures are made for a camera that sees no more than this: tracks need none [px].
+# Focal length for which the scene's textures are made where tracks need none [px].
 _NO_TEXTURE = 20.0
 
-# Streams of a bag's seed: what one draws leaves the others alone.
+# Independent random streams of a bag's seed.
 _DRAW, _SCENE, _MOTION, _TRACKS, _WRONG = range(10, 15)
 
 
 class BagPlan(NamedTuple):
-    """A bag of the matrix; `noise`: of the told one, or 0 for that of a usual camera and IMU.
+    """A bag of the matrix; `noise`: by the configured one, or 0 for a usual camera and IMU.
 
     `images`: rendered, rather than tracks alone.
     """
@@ -70,27 +55,27 @@ class BagPlan(NamedTuple):
 
     @property
     def motion(self) -> str:
-        """Hand-held and vehicle take turns."""
+        """Hand-held and vehicle alternate."""
         return MOTIONS[self.number % len(MOTIONS)]
 
     @property
     def scene(self) -> str:
-        """Scenes take turns, each with both motions."""
+        """Scenes alternate, each with both motions."""
         return SCENES[self.number // len(MOTIONS) % len(SCENES)]
 
 
 def plans(bags: int, seconds: float, first_seed: int, *, noises: Sequence[float] = (0.0,),
           images: bool = False) -> list[BagPlan]:
-    """Bags whose read-outs are spread from 12 to 35 ms; noises take turns."""
+    """Bags whose readouts are spread from 12 to 35 ms; noises alternate."""
     readouts = np.linspace(0.012, 0.035, max(bags, 2))[:bags]
-    # Neighbours in motion and scene get read-outs from all over.
+    # Neighbours in motion and scene get readouts from all over.
     order = np.random.default_rng(first_seed).permutation(bags)
     return [BagPlan(k, first_seed + k, seconds, round(float(readouts[order[k]]), 4),
                     noises[k // len(MOTIONS) % len(noises)], images) for k in range(bags)]
 
 
 def simulation_of(plan: BagPlan) -> Simulation:
-    """Camera, lens, mounting and offset are drawn; told noises are those of the defaults."""
+    """Camera, lens, mounting and offset are drawn; configured noises are the defaults."""
     rng = np.random.default_rng([plan.seed, _DRAW])
     default = SimulationConfig()
     tilt = Rotation.from_rotvec(np.radians(rng.uniform(-4.0, 4.0, 3)))
@@ -116,30 +101,34 @@ def simulation_of(plan: BagPlan) -> Simulation:
     return simulate(config, scene=scene, trajectory=trajectory)
 
 
-def recording_of(plan: BagPlan) -> Recording:
+def recording_of(plan: BagPlan) -> trust_runs.Recording:
     """The bag, as tracks or as images."""
-    noise = None if plan.images else TrackNoise()
+    noise = None if plan.images else trust_runs.TrackNoise()
     if noise is not None and plan.noise:
-        # Told is the noise of either image's points; here only those of the second one have any.
-        noise = TrackNoise(white=plan.noise * math.sqrt(2.0) * EstimatorConfig().pixel_sigma)
-    source = Source(f'{plan.seed}', IMAGES if plan.images else TRACKS, plan.motion, plan.scene,
-                    plan.seed, plan.noise)
-    return simulated(source, simulation_of(plan), noise,
-                     np.random.default_rng([plan.seed, _TRACKS]))
+        # Configured is the noise of either image's points; here only the second ones have any.
+        noise = trust_runs.TrackNoise(
+            white=plan.noise * math.sqrt(2.0) * EstimatorConfig().pixel_sigma)
+    kind = trust_runs.IMAGES if plan.images else trust_runs.TRACKS
+    source = trust_runs.Source(f'{plan.seed}', kind, plan.motion, plan.scene, plan.seed,
+                               plan.noise)
+    return trust_runs.simulated(source, simulation_of(plan), noise,
+                                np.random.default_rng([plan.seed, _TRACKS]))
 
 
 @dataclass(frozen=True, slots=True)
 class BagRow:
-    """One bag told one thing.
+    """One bag with one row.
 
-    `telling`: seconds of motion that can tell, while the run took; `qualifies`: they are enough.
+    `informative`: informative seconds of motion; `qualifies`: whether they are enough.
     `flagged`: within them; `flagged_after`: after so many of them, NaN where never.
-    `named`: figures that were named at the end of that time; `named_right`: at most two, with a
-        right one among them.
-    `poses`: at level ok or unknown, after the first of these seconds; `direction_beyond`,
-        `rotation_beyond`: those of them with errors beyond the limits; `all_`: from the start.
+    `named`: parameters named at the end of that time; `named_right`: at most two, with a right
+        one among them.
+    `poses`: published (at level ok or unknown) after the first of these seconds;
+        `direction_beyond`, `rotation_beyond`: those of them with errors beyond the limits; `all_`:
+        from the start.
     `nees_`: mean of the chi squares by their degrees of freedom; errors and claimed sigma: medians
-        [deg]; of `poses`, and of all where told right. `frame_ms`: median, frames with a pair.
+        [deg]; of `poses`, and of all with the right configuration. `frame_ms`: median, frames
+        with a pair.
     """
 
     bag: str
@@ -149,7 +138,7 @@ class BagRow:
     readout_ms: float
     noise: float
     row: str
-    telling: float
+    informative: float
     qualifies: bool
     flagged: bool
     flagged_after: float
@@ -171,7 +160,7 @@ class BagRow:
 
 
 class Task(NamedTuple):
-    """A bag to simulate, or the place of a recording, and the rows that it goes through."""
+    """A bag to simulate, or the path of a recording, and its rows."""
 
     bag: BagPlan | Path
     rows: tuple[str, ...]
@@ -179,76 +168,72 @@ class Task(NamedTuple):
 
 def tasks(rows: Sequence[str], bags: int, seconds: float, first_seed: int, *, right: int = 0,
           rendered: int = 0, recordings: Sequence[Path] = ()) -> list[Task]:
-    """All that is to be measured; arguments as the options of the command."""
+    """Bags and recordings to measure; arguments as the options of the command."""
     wrong = tuple(rows)
-    asked = [Task(plan, wrong) for plan in plans(bags, seconds, first_seed)]
-    # The same read-outs, however many of them are rendered.
+    chosen = [Task(plan, wrong) for plan in plans(bags, seconds, first_seed)]
+    # The same readouts, however many of them are rendered.
     with_images = plans(max(bags, rendered), seconds, first_seed, images=True)
-    asked += [Task(plan, wrong) for plan in with_images[:rendered]]
-    asked += [Task(path, wrong) for path in recordings]
+    chosen += [Task(plan, wrong) for plan in with_images[:rendered]]
+    chosen += [Task(path, wrong) for path in recordings]
     # Seeds of their own.
-    asked += [Task(plan, (RIGHT,))
-              for plan in plans(right, seconds, first_seed + 10_000, noises=(1.0, 0.5, 2.0))]
-    return asked
+    chosen += [Task(plan, (RIGHT,))
+               for plan in plans(right, seconds, first_seed + 10_000, noises=(1.0, 0.5, 2.0))]
+    return chosen
 
 
 def measure(task: Task) -> list[BagRow]:
-    """A recording through its rows that apply to it.
+    """A recording with all rows that apply to it.
 
-    Told right first: that run says which seconds tell what.
+    The run with the right configuration comes first: it determines the informative seconds.
     """
-    recording = (recording_at(task.bag) if isinstance(task.bag, Path)
+    recording = (trust_runs.recording_at(task.bag) if isinstance(task.bag, Path)
                  else recording_of(task.bag))
-    right = list(run(recording, recording.told))
-    motion = telling_motion(recording, [pair for pair, _ in right])
+    right = list(trust_runs.run(recording, recording.configured))
+    motion = trust_runs.informative_motion(recording, [pair for pair, _ in right])
     found = []
     for name in task.rows:
         row = ROWS[name]
-        # Twice the same stream: what is told and what the laboratory knows of it agree.
+        # Twice the same stream: the configuration and its error agree.
         drawn = [recording.source.seed, _WRONG]
-        told = row.wrong(recording.told, np.random.default_rng(drawn))
-        injected = row.injected(recording.told, np.random.default_rng(drawn))
+        configured = row.wrong(recording.configured, np.random.default_rng(drawn))
+        injected = row.injected(recording.configured, np.random.default_rng(drawn))
         if injected is not None and not injected.error.any():
             continue   # e.g. no distortion to leave out
-        tells = motion.seconds(injected)
-        results = right if name == RIGHT else run(recording, told, _end(tells, row.within))
-        found.append(bag_row(recording, name, tells,
-                             [judged(recording, *result) for result in results]))
+        informative = motion.seconds(injected)
+        # A run may end some seconds after all those that count.
+        passed = np.flatnonzero(np.cumsum(informative) >= row.within)
+        end = float(passed[0]) + 1.0 + _AFTERWARDS if len(passed) else math.inf
+        results = right if name == RIGHT else trust_runs.run(recording, configured, end)
+        found.append(bag_row(recording, name, informative,
+                             [trust_runs.evaluated(recording, *result) for result in results]))
     return found
 
 
-def _end(tells: NDArray[np.bool_], within: int) -> float:
-    """When a run may end: all seconds that count have passed, and some more [s]."""
-    passed = np.flatnonzero(np.cumsum(tells) >= within)
-    return float(passed[0]) + 1.0 + _AFTERWARDS if len(passed) else math.inf
-
-
-def bag_row(recording: Recording, name: str, tells: NDArray[np.bool_],
-            pairs: Sequence[JudgedPair]) -> BagRow:
-    """What came of a row; `tells`: which seconds of the recording can tell its error."""
+def bag_row(recording: trust_runs.Recording, name: str, informative: NDArray[np.bool_],
+            pairs: Sequence[trust_runs.EvaluatedPair]) -> BagRow:
+    """Result of a row; `informative`: which seconds of the recording are, for its error."""
     row, source = ROWS[name], recording.source
-    clocks = [_clock(tells, pair.at) for pair in pairs]
+    clocks = [_clock(informative, pair.at) for pair in pairs]
     flags = [(clock, pair) for clock, pair in zip(clocks, pairs, strict=True)
-             if pair.verdict.state in FLAGGED]
+             if pair.verdict.state in trust_runs.FLAGGED]
     in_time = [pair for clock, pair in flags if clock <= row.within]
-    # What it says when the time is over.
+    # Its last report within the time.
     named = in_time[-1].verdict.named if in_time else ()
-    believed = [pair for pair in pairs if pair.has_pose and pair.verdict.state not in FLAGGED]
-    later = [pair for clock, pair in zip(clocks, pairs, strict=True)
-             if clock > 1.0 and pair.has_pose and pair.verdict.state not in FLAGGED]
-    counted = later if name != RIGHT else believed
-    telling = _clock(tells, recording.seconds)
+    published = [(clock, pair) for clock, pair in zip(clocks, pairs, strict=True)
+                 if pair.has_pose and pair.verdict.state not in trust_runs.FLAGGED]
+    every, later = [p for _, p in published], [p for clock, p in published if clock > 1.0]
+    counted = later if name != RIGHT else every
+    seconds = _clock(informative, recording.seconds)
     return BagRow(
         bag=source.name, kind=source.kind, motion=source.motion, scene=source.scene,
         readout_ms=1e3 * recording.camera.readout_time, noise=source.noise, row=name,
-        telling=telling,
-        qualifies=telling >= row.within, flagged=bool(in_time),
+        informative=seconds, qualifies=seconds >= row.within, flagged=bool(in_time),
         flagged_after=flags[0][0] if flags else math.nan, named=' '.join(named),
         named_right=len(named) <= 2 and bool(set(named) & set(row.named)), pairs=len(pairs),
         poses=len(later), direction_beyond=_directions_beyond(later),
-        rotation_beyond=_rotations_beyond(later), all_poses=len(believed),
-        all_direction_beyond=_directions_beyond(believed),
-        all_rotation_beyond=_rotations_beyond(believed),
+        rotation_beyond=_rotations_beyond(later), all_poses=len(every),
+        all_direction_beyond=_directions_beyond(every),
+        all_rotation_beyond=_rotations_beyond(every),
         nees_direction=_mean([p.chi_direction / 2 for p in counted]),
         nees_rotation=_mean([p.chi_rotation / 3 for p in counted]),
         direction_error=_median([p.direction_error for p in counted]),
@@ -257,18 +242,18 @@ def bag_row(recording: Recording, name: str, tells: NDArray[np.bool_],
         frame_ms=1e3 * _median([p.seconds for p in pairs]))
 
 
-def _clock(tells: NDArray[np.bool_], at: float) -> float:
-    """Seconds of motion that can tell up to an instant [s]."""
-    full = min(int(at), len(tells))
-    running = at - full if full < len(tells) and tells[full] else 0.0
-    return float(np.count_nonzero(tells[:full])) + running
+def _clock(informative: NDArray[np.bool_], at: float) -> float:
+    """Informative seconds up to a time [s]."""
+    full = min(int(at), len(informative))
+    running = at - full if full < len(informative) and informative[full] else 0.0
+    return float(np.count_nonzero(informative[:full])) + running
 
 
-def _directions_beyond(pairs: Sequence[JudgedPair]) -> int:
+def _directions_beyond(pairs: Sequence[trust_runs.EvaluatedPair]) -> int:
     return sum(pair.chi_direction > LIMIT_T for pair in pairs)
 
 
-def _rotations_beyond(pairs: Sequence[JudgedPair]) -> int:
+def _rotations_beyond(pairs: Sequence[trust_runs.EvaluatedPair]) -> int:
     return sum(pair.chi_rotation > LIMIT_R for pair in pairs)
 
 
@@ -280,186 +265,131 @@ def _median(values: Sequence[float]) -> float:
     return float(np.median(values)) if values else math.nan
 
 
-
 # -- report -----------------------------------------------------------------------------------
 
+# Columns of the tables: title, name of the value, digits.
+_ROW_COLUMNS = (
+    ('bags', 'bags', 0), ('qualify', 'qualify', 0), ('within [s]', 'within', 0),
+    ('flagged', 'flagged', 0), ('named right', 'named', 0), ('after [s]', 'after', 1),
+    ('poses', 'poses', 0), ('t beyond', 'direction_beyond', 1),
+    ('R beyond', 'rotation_beyond', 1), ('all poses', 'all_poses', 0),
+    ('t beyond', 'all_direction_beyond', 1), ('R beyond', 'all_rotation_beyond', 1),
+    ('t error [deg]', 'direction_error', 2), ('claimed', 'direction_sigma', 2))
+_RIGHT_COLUMNS = (
+    ('bags', 'bags', 0), ('alarms', 'alarms', 0), ('pairs', 'pairs', 0), ('poses', 'poses', 0),
+    ('NEES t', 'nees_direction', 2), ('least', 'nees_direction_least', 2),
+    ('largest', 'nees_direction_largest', 2), ('NEES R', 'nees_rotation', 2),
+    ('least', 'nees_rotation_least', 2), ('largest', 'nees_rotation_largest', 2),
+    ('t error [deg]', 'direction_error', 2), ('R error [deg]', 'rotation_error', 3),
+    ('frame with pair [ms]', 'frame_ms', 1))
+_TITLES = {trust_runs.TRACKS: 'Simulated, without images',
+           trust_runs.IMAGES: 'Simulated, with images',
+           trust_runs.RECORDING: 'Recordings with truth'}
 
-@dataclass(frozen=True, slots=True)
-class RowSummary:
-    """A row over its bags; shares in per cent, NaN where there is nothing to share.
 
-    `flagged`, `named`: of the bags that qualify; `after`: median of the seconds of motion that can
-    tell before the flag. `direction_beyond`, `rotation_beyond`: of the poses after the first such
-    second; `all_`: of all poses.
+def summary(name: str, bags: Sequence[BagRow]) -> dict[str, Any]:
+    """One row's bags, or several rows' as one; shares in per cent, NaN without bags or poses.
+
+    `flagged`, `named`: of the bags that qualify; `after`: median of the informative seconds before
+    the flag. `direction_beyond`, `rotation_beyond`: of the poses after the first such second;
+    `all_`: of all poses.
     """
-
-    row: str
-    within: int
-    bags: int
-    qualify: float
-    flagged: float
-    named: float
-    after: float
-    poses: int
-    direction_beyond: float
-    rotation_beyond: float
-    all_poses: int
-    all_direction_beyond: float
-    all_rotation_beyond: float
-    direction_error: float
-    direction_sigma: float
-
-
-def summary(name: str, bags: Sequence[BagRow]) -> RowSummary:
-    """One row's bags, or several rows' as one."""
     fit = [bag for bag in bags if bag.qualifies]
     poses, all_poses = (sum(getattr(bag, of) for bag in bags) for of in ('poses', 'all_poses'))
     beyond = {of: _share(sum(getattr(bag, of) for bag in bags),
                          all_poses if of.startswith('all') else poses)
               for of in ('direction_beyond', 'rotation_beyond', 'all_direction_beyond',
                          'all_rotation_beyond')}
-    return RowSummary(
-        row=name, within=ROWS[bags[0].row].within, bags=len(bags),
-        qualify=_share(len(fit), len(bags)),
-        flagged=_share(sum(bag.flagged for bag in fit), len(fit)),
-        named=_share(sum(bag.named_right for bag in fit), len(fit)),
-        after=_finite_median([bag.flagged_after for bag in fit]), poses=poses,
-        all_poses=all_poses, direction_error=_finite_median([bag.direction_error for bag in bags]),
-        direction_sigma=_finite_median([bag.direction_sigma for bag in bags]), **beyond)
+    return {
+        'row': name, 'within': ROWS[bags[0].row].within, 'bags': len(bags),
+        'qualify': _share(len(fit), len(bags)),
+        'flagged': _share(sum(bag.flagged for bag in fit), len(fit)),
+        'named': _share(sum(bag.named_right for bag in fit), len(fit)),
+        'after': _finite_median(fit, 'flagged_after'), 'poses': poses, 'all_poses': all_poses,
+        'direction_error': _finite_median(bags, 'direction_error'),
+        'direction_sigma': _finite_median(bags, 'direction_sigma'), **beyond}
 
 
-@dataclass(frozen=True, slots=True)
-class RightSummary:
-    """Bags of a kind, told right: false alarms, and errors squared in sigmas by their freedom.
+def right_summary(kind: str, bags: Sequence[BagRow]) -> dict[str, Any]:
+    """Bags of a kind with the right configuration: false alarms, and NEES by freedom.
 
     NEES over all poses, and the least and the largest mean of a bag; medians over the bags.
     """
-
-    kind: str
-    bags: int
-    alarms: int
-    pairs: int
-    poses: int
-    nees_direction: float
-    nees_direction_least: float
-    nees_direction_largest: float
-    nees_rotation: float
-    nees_rotation_least: float
-    nees_rotation_largest: float
-    direction_error: float
-    rotation_error: float
-    frame_ms: float
-
-
-def right_summary(kind: str, bags: Sequence[BagRow]) -> RightSummary:
-    """Bags that were told right."""
-    nees = {}
+    nees: dict[str, float] = {}
     for name in ('nees_direction', 'nees_rotation'):
         known = [(getattr(bag, name), bag.all_poses) for bag in bags if bag.all_poses]
-        means = [mean for mean, _ in known]
-        poses = sum(count for _, count in known)
-        nees[name] = sum(mean * count for mean, count in known) / poses if poses else math.nan
-        nees[f'{name}_least'] = min(means, default=math.nan)
-        nees[f'{name}_largest'] = max(means, default=math.nan)
-    return RightSummary(
-        kind=kind, bags=len(bags), alarms=sum(not math.isnan(bag.flagged_after) for bag in bags),
-        pairs=sum(bag.pairs for bag in bags), poses=sum(bag.all_poses for bag in bags), **nees,
-        direction_error=_finite_median([bag.direction_error for bag in bags]),
-        rotation_error=_finite_median([bag.rotation_error for bag in bags]),
-        frame_ms=_finite_median([bag.frame_ms for bag in bags]))
-
-
-_TITLES = {TRACKS: 'Simulated, without images', IMAGES: 'Simulated, with images',
-           RECORDING: 'Recordings with truth'}
+        means, counts = zip(*known, strict=True) if known else ((math.nan,), (1,))
+        nees |= {name: float(np.average(means, weights=counts)), f'{name}_least': min(means),
+                 f'{name}_largest': max(means)}
+    return {
+        'kind': kind, 'bags': len(bags), **nees,
+        'alarms': sum(not math.isnan(bag.flagged_after) for bag in bags),
+        'pairs': sum(bag.pairs for bag in bags), 'poses': sum(bag.all_poses for bag in bags),
+        **{name: _finite_median(bags, name)
+           for name in ('direction_error', 'rotation_error', 'frame_ms')}}
 
 
 def write_report(folder: Path, bags: Sequence[BagRow]) -> str:
     """Write every bag and row (CSV), the summaries (JSON) and the tables (Markdown)."""
-    folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / 'trust_bags.csv', bags)
-    parts, told = [], {}
+    parts, summaries = [], {}
+    # A recording without truth has no poses that can be evaluated.
+    with_truth = {bag.bag for bag in bags if bag.kind != trust_runs.RECORDING or bag.all_poses}
     for kind, title in _TITLES.items():
-        # A recording without truth has no poses that can be judged.
-        judged_bags = {bag.bag for bag in bags if bag.kind != RECORDING or bag.all_poses}
-        of_kind = [bag for bag in bags if bag.kind == kind and bag.bag in judged_bags
+        of_kind = [bag for bag in bags if bag.kind == kind and bag.bag in with_truth
                    and not bag.noise]
         rows = [summary(name, of_row)
                 for name, of_row in grouped(of_kind, lambda bag: bag.row).items()]
         if len(rows) > 1:
             rows.append(summary('all rows', of_kind))
         if rows:
-            told[kind] = [_as_json(row) for row in rows]
-            parts.append(f'{title} (shares in per cent):\n\n{_matrix_table(rows)}')
-    recorded = [bag for bag in bags if bag.kind == RECORDING]
+            summaries[kind] = rows
+            parts.append(f'{title} (shares in per cent):\n\n{_table("row", rows, _ROW_COLUMNS)}')
+    recorded = [bag for bag in bags if bag.kind == trust_runs.RECORDING]
     if recorded:
-        parts.append('Recordings (flagged after so many seconds that can tell, of how many; '
-                     f'figures):\n\n{_recordings_table(recorded)}')
+        parts.append('Recordings (informative seconds until flagged, of how many; named '
+                     f'parameters):\n\n{_recordings_table(recorded)}')
     right = [right_summary(kind, of_kind) for kind, of_kind in grouped(
         [bag for bag in bags if bag.row == RIGHT], _kind).items()]
     if right:
-        parts.append(f'Told right:\n\n{_right_table(right)}')
+        parts.append(f'Right configuration:\n\n{_table("kind", right, _RIGHT_COLUMNS)}')
     text = '\n'.join(parts)
     (folder / 'trust.json').write_text(json.dumps(
-        {**told, 'right': [_as_json(row) for row in right]}, indent=1), encoding='utf-8')
+        {kind: [{name: None if value != value else value for name, value in row.items()}
+                for row in rows] for kind, rows in {**summaries, 'right': right}.items()},
+        indent=1), encoding='utf-8')
     (folder / 'trust.md').write_text(text, encoding='utf-8')
     return text
 
 
-def _as_json(row: RowSummary | RightSummary) -> dict[str, Any]:
-    return {name: None if value != value else value for name, value in asdict(row).items()}
-
-
-def _matrix_table(rows: Sequence[RowSummary]) -> str:
+def _table(key: str, rows: Sequence[dict[str, Any]],
+           columns: Sequence[tuple[str, str, int]]) -> str:
     return markdown_table(
-        ['told', 'bags', 'qualify', 'within [s]', 'flagged', 'named right', 'after [s]', 'poses',
-         't beyond', 'R beyond', 'all poses', 't beyond', 'R beyond', 't error [deg]',
-         'claimed'],
-        [[row.row, f'{row.bags}', _text(row.qualify, 0), f'{row.within}', _text(row.flagged, 0),
-          _text(row.named, 0), _text(row.after, 1), f'{row.poses}',
-          _text(row.direction_beyond, 1), _text(row.rotation_beyond, 1), f'{row.all_poses}',
-          _text(row.all_direction_beyond, 1), _text(row.all_rotation_beyond, 1),
-          _text(row.direction_error, 2), _text(row.direction_sigma, 2)]
-         for row in rows])
+        [key, *(title for title, _, _ in columns)],
+        [[row[key], *(_text(row[name], digits) for _, name, digits in columns)] for row in rows])
 
 
 def _recordings_table(bags: Sequence[BagRow]) -> str:
     names = tuple(grouped(bags, lambda bag: bag.bag))
-    cells = {(bag.row, bag.bag): f'{_text(bag.flagged_after, 1) or "-"} / {bag.telling:.1f} '
+    cells = {(bag.row, bag.bag): f'{_text(bag.flagged_after, 1) or "-"} / {bag.informative:.1f} '
                                  f'{bag.named}'.rstrip() for bag in bags}
     return markdown_table(
-        ['told', *names],
+        ['row', *names],
         [[row, *(cells.get((row, name), '') for name in names)]
          for row in grouped(bags, lambda bag: bag.row)])
 
 
 def _kind(bag: BagRow) -> str:
-    noise = f', noise {bag.noise:g} of the told one' if bag.noise else ''
-    return bag.bag if bag.kind == RECORDING else f'{bag.motion}, {bag.kind}{noise}'
-
-
-def _right_table(rows: Sequence[RightSummary]) -> str:
-    return markdown_table(
-        ['recordings', 'bags', 'alarms', 'pairs', 'poses', 'NEES t', 'by bag', 'NEES R', 'by bag',
-         't error [deg]', 'R error [deg]', 'frame with pair [ms]'],
-        [[row.kind, f'{row.bags}', f'{row.alarms}', f'{row.pairs}', f'{row.poses}',
-          _text(row.nees_direction, 2),
-          _range(row.nees_direction_least, row.nees_direction_largest),
-          _text(row.nees_rotation, 2),
-          _range(row.nees_rotation_least, row.nees_rotation_largest),
-          _text(row.direction_error, 2), _text(row.rotation_error, 3), _text(row.frame_ms, 1)]
-         for row in rows])
-
-
-def _range(least: float, largest: float) -> str:
-    return '' if math.isnan(least) else f'{least:.2f} .. {largest:.2f}'
+    noise = f', noise {bag.noise:g} of the configured one' if bag.noise else ''
+    return bag.bag if bag.kind == trust_runs.RECORDING else f'{bag.motion}, {bag.kind}{noise}'
 
 
 def _share(part: int, whole: int) -> float:
     return 100.0 * part / whole if whole else math.nan
 
 
-def _finite_median(values: Sequence[float]) -> float:
-    return _median([value for value in values if math.isfinite(value)])
+def _finite_median(bags: Sequence[BagRow], name: str) -> float:
+    return _median([value for bag in bags if math.isfinite(value := getattr(bag, name))])
 
 
 def _text(value: float, digits: int) -> str:

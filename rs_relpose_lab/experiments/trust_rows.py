@@ -1,13 +1,14 @@
-"""What a run can be told wrong: the rows of `rs_relpose benchmark trust`.
+"""Wrong configurations: the rows of `rs_relpose benchmark trust`, and the information about them.
 
-A row changes what is told (parameters, CameraInfo) or what arrives (IMU, images), and says which
-figure of the health must find it.
+A row changes the configuration (parameters, CameraInfo) or the messages (IMU, images), and names
+the parameter that the consistency monitor must report.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import accumulate
 import math
 from typing import Any, NamedTuple
 
@@ -16,22 +17,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.geometry.camera import RollingShutterCamera
-from rs_relpose_ros.geometry.intrinsics import Intrinsics
-from rs_relpose_ros.imu.samples import ImuSample, Vector
+from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
+from rs_relpose_ros.imu.buffer import ImuSample, Vector
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
-# Seconds of motion that can tell, within which an error must be flagged.
+# Informative seconds of motion within which an error must be flagged.
 GROSS, SMALL = 5, 15
-# Figures that the laboratory's information is about, and their number of unknowns.
-FIGURES: Mapping[str, int] = {'axes': 3, 'time_offset': 1, 'readout_time': 1, 'gyro_bias': 3,
-                              'gyro_scale': 1, 'focal_length': 1, 'distortion': 1}
+# Quantities of the laboratory's information, and their number of unknowns.
+QUANTITIES: Mapping[str, int] = {'axes': 3, 'time_offset': 1, 'readout_time': 1, 'gyro_bias': 3,
+                                 'gyro_scale': 1, 'focal_length': 1, 'distortion': 1}
 
 
 class Geometry(NamedTuple):
-    """How a published image differs from that of the sensor: pixels (N, 2), and the image."""
+    """Map from the sensor's image to the published one: of pixels (N, 2), and of the image."""
 
     points: Callable[[Array, RollingShutterCamera], Array]
     image: Callable[[Gray, RollingShutterCamera], Gray]
@@ -41,10 +41,10 @@ AS_IT_IS = Geometry(lambda points, camera: points, lambda image, camera: image)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Told:
-    """What a run is told, and what arrives.
+class Configured:
+    """Configuration and messages of a run.
 
-    `values`: parameters by name; `sample`: an IMU sample as it arrives; `geometry`: of the images.
+    `values`: parameters by name; `sample`: an IMU sample as received; `geometry`: of the images.
     """
 
     values: Mapping[str, Any]
@@ -52,146 +52,127 @@ class Told:
     sample: Callable[[ImuSample], ImuSample] = field(default=lambda sample: sample)
     geometry: Geometry = AS_IT_IS
 
-    def with_values(self, **changed: Any) -> Told:
+    @property
+    def R_cam_imu(self) -> Rotation:
+        """The configured rotation."""
+        return Rotation.from_quat(self.values['quat_cam_imu_xyzw'])
+
+    def with_values(self, **changed: Any) -> Configured:
         """With other parameters."""
         return replace(self, values={**self.values, **changed})
 
 
 class Injected(NamedTuple):
-    """An error of a figure of `FIGURES`, as the laboratory's information knows it.
+    """An error of a quantity of `QUANTITIES`, as the laboratory's information uses it.
 
     `error` (its unknowns): rotation vector [rad] in the camera frame, [s], signed [s], [rad/s] in
     the camera frame, share, share, first coefficient.
     """
 
-    figure: str
+    quantity: str
     error: Array
+
+
+# Both get the right configuration and may draw.
+Change = Callable[[Configured, np.random.Generator], Configured]
+Error = Callable[[Configured, np.random.Generator], Injected | None]
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
     """A row of the matrix.
 
-    `named`: figures of the health that are right; any of them. `within`: seconds of motion that
-    can tell. `wrong`: what is told instead of what is right; `injected`: the error in it, None
-    where turning about two axes tells. Both may draw.
+    `named`: the right parameters, any of them. `within`: informative seconds of motion. `wrong`:
+    the wrong configuration in place of the right one; `injected`: its error, None where rotation
+    about two axes is the information.
     """
 
     named: tuple[str, ...]
     within: int
-    wrong: Callable[[Told, np.random.Generator], Told]
-    injected: Callable[[Told, np.random.Generator], Injected | None] = lambda told, rng: None
+    wrong: Change
+    injected: Error = lambda right, rng: None
 
 
-# -- what is told -----------------------------------------------------------------------------
+# -- errors of the configuration --------------------------------------------------------------
 
 
-def _axes_turned(turn: Callable[[np.random.Generator], Rotation]) -> Callable[..., Told]:
-    """The IMU's own axes are turned: ``R_told = R_cam_imu T``."""
-    def wrong(told: Told, rng: np.random.Generator) -> Told:
-        R_cam_imu = Rotation.from_quat(told.values['quat_cam_imu_xyzw'])
-        return told.with_values(quat_cam_imu_xyzw=tuple(
-            float(v) for v in (R_cam_imu * turn(rng)).as_quat()))
-    return wrong
+def _error(quantity: str, value: float) -> Error:
+    return lambda right, rng: Injected(quantity, np.array([value]))
 
 
-def _slightly(rng: np.random.Generator) -> Rotation:
+def _axes_rotated(rotation: Callable[[np.random.Generator], Rotation]) -> Change:
+    """The IMU's own axes are rotated: ``R_wrong = R_cam_imu T``."""
+    return lambda right, rng: right.with_values(quat_cam_imu_xyzw=tuple(
+        float(v) for v in (right.R_cam_imu * rotation(rng)).as_quat()))
+
+
+def _random_vector(rng: np.random.Generator, length: float) -> Array:
     axis = rng.standard_normal(3)
-    return Rotation.from_rotvec(math.radians(3.0) * axis / np.linalg.norm(axis))
+    return np.asarray(length * axis / np.linalg.norm(axis))
 
 
-def _slight_turn(told: Told, rng: np.random.Generator) -> Injected:
-    R_cam_imu = Rotation.from_quat(told.values['quat_cam_imu_xyzw'])
-    return Injected('axes', R_cam_imu.apply(_slightly(rng).as_rotvec()))
+def _three_degrees(rng: np.random.Generator) -> Rotation:
+    return Rotation.from_rotvec(_random_vector(rng, math.radians(3.0)))
 
 
-def _focal_length(factor: float) -> Callable[..., Told]:
-    def wrong(told: Told, rng: np.random.Generator) -> Told:
-        intrinsics = told.intrinsics
-        return replace(told, intrinsics=replace(
-            intrinsics, fx=factor * intrinsics.fx, fy=factor * intrinsics.fy))
-    return wrong
+def _focal_length(factor: float) -> Change:
+    return lambda right, rng: replace(right, intrinsics=replace(
+        right.intrinsics, fx=factor * right.intrinsics.fx, fy=factor * right.intrinsics.fy))
 
 
-def _readout(factor: float) -> Callable[..., Told]:
-    return lambda told, rng: told.with_values(readout_time=factor * told.values['readout_time'])
+def _readout(factor: float) -> tuple[Change, Error]:
+    return (lambda right, rng: right.with_values(
+                readout_time=factor * right.values['readout_time']),
+            lambda right, rng: Injected(
+                'readout_time', np.array([(factor - 1.0) * right.values['readout_time']])))
 
 
-def _readout_error(factor: float) -> Callable[..., Injected]:
-    return lambda told, rng: Injected(
-        'readout_time', np.array([(factor - 1.0) * told.values['readout_time']]))
+def _reversed(right: Configured, rng: np.random.Generator) -> Configured:
+    other = {'down': 'up', 'up': 'down'}[right.values.get('readout_direction', 'down')]
+    return right.with_values(readout_direction=other)
 
 
-def _reversed(told: Told, rng: np.random.Generator) -> Told:
-    other = {'down': 'up', 'up': 'down'}[told.values.get('readout_direction', 'down')]
-    return told.with_values(readout_direction=other)
+def _biased(right: Configured, rng: np.random.Generator) -> Configured:
+    bias = np.array(right.values.get('gyro_bias', (0.0, 0.0, 0.0))) + _random_vector(rng, 0.05)
+    return right.with_values(gyro_bias=tuple(float(v) for v in bias))
 
 
-def _later(seconds: float) -> Callable[..., Told]:
-    def wrong(told: Told, rng: np.random.Generator) -> Told:
-        return told.with_values(time_offset=told.values['time_offset'] + seconds)
-    return wrong
+def _without_distortion(right: Configured, rng: np.random.Generator) -> Configured:
+    return replace(right, intrinsics=replace(
+        right.intrinsics, distortion=(0.0,) * len(right.intrinsics.distortion)))
 
 
-def _bias_change(rng: np.random.Generator) -> Array:
-    axis = rng.standard_normal(3)
-    return np.asarray(0.05 * axis / np.linalg.norm(axis))
+def _distortion_error(right: Configured, rng: np.random.Generator) -> Injected:
+    # 0 for a pinhole.
+    return Injected('distortion', np.array([*right.intrinsics.distortion[:1], 0.0][:1]))
 
 
-def _biased(told: Told, rng: np.random.Generator) -> Told:
-    bias = np.array(told.values.get('gyro_bias', (0.0, 0.0, 0.0))) + _bias_change(rng)
-    return told.with_values(gyro_bias=tuple(float(v) for v in bias))
+# -- errors of the messages -------------------------------------------------------------------
 
 
-def _bias_error(told: Told, rng: np.random.Generator) -> Injected:
-    R_cam_imu = Rotation.from_quat(told.values['quat_cam_imu_xyzw'])
-    return Injected('gyro_bias', R_cam_imu.apply(_bias_change(rng)))
+def _received(sample: Callable[[ImuSample], ImuSample]) -> Change:
+    return lambda right, rng: replace(right, sample=sample)
 
 
-def _without_distortion(told: Told, rng: np.random.Generator) -> Told:
-    intrinsics = told.intrinsics
-    return replace(told, intrinsics=replace(
-        intrinsics, distortion=(0.0,) * len(intrinsics.distortion)))
-
-
-def _distortion_error(told: Told, rng: np.random.Generator) -> Injected:
-    # A pinhole has none to leave out.
-    return Injected('distortion', np.array([*told.intrinsics.distortion[:1], 0.0][:1]))
-
-
-# -- what arrives -----------------------------------------------------------------------------
-
-
-def _arrives(sample: Callable[[ImuSample], ImuSample]) -> Callable[..., Told]:
-    return lambda told, rng: replace(told, sample=sample)
-
-
-def _gyro_times(factor: float) -> Callable[[ImuSample], ImuSample]:
+def _gyro_times(factor: float) -> Change:
     def scaled(rate: Vector | None) -> Vector | None:
         return None if rate is None else (factor * rate[0], factor * rate[1], factor * rate[2])
-    return lambda sample: replace(sample, angular_velocity=scaled(sample.angular_velocity))
+    return _received(lambda sample: replace(
+        sample, angular_velocity=scaled(sample.angular_velocity)))
 
 
-def _felt(turn: Rotation, sign: float) -> Callable[[ImuSample], ImuSample]:
-    """Accelerometer whose axes are turned, or that reads the acceleration of free fall."""
+def _accel(rotation: Rotation, sign: float) -> Change:
+    """Accelerometer with rotated axes, or that measures the acceleration of free fall."""
     def changed(sample: ImuSample) -> ImuSample:
         if sample.linear_acceleration is None:
             return sample
-        x, y, z = sign * turn.apply(sample.linear_acceleration)
+        x, y, z = sign * rotation.apply(sample.linear_acceleration)
         return replace(sample, linear_acceleration=(float(x), float(y), float(z)))
-    return changed
+    return _received(changed)
 
 
-def _stamped_late(sample: ImuSample) -> ImuSample:
-    return replace(sample, stamp_ns=sample.stamp_ns + 30_000_000)
-
-
-def _shown(geometry: Geometry) -> Callable[..., Told]:
-    return lambda told, rng: replace(told, geometry=geometry)
-
-
-def _corner(camera: RollingShutterCamera) -> Array:
-    return np.array([camera.width - 1.0, camera.height - 1.0])
+def _shown(geometry: Geometry) -> Change:
+    return lambda right, rng: replace(right, geometry=geometry)
 
 
 def _rectified(points: Array, camera: RollingShutterCamera) -> Array:
@@ -208,54 +189,277 @@ def _rectified_image(image: Gray, camera: RollingShutterCamera) -> Gray:
                       dtype=np.uint8)
 
 
-RECTIFIED = Geometry(_rectified, _rectified_image)
-UPSIDE_DOWN = Geometry(lambda points, camera: _corner(camera) - points,
-                       lambda image, camera: np.ascontiguousarray(image[::-1, ::-1]))
-FLIPPED = Geometry(
-    lambda points, camera: np.column_stack([points[:, 0], camera.height - 1.0 - points[:, 1]]),
-    lambda image, camera: np.ascontiguousarray(image[::-1]))
-MIRRORED = Geometry(
-    lambda points, camera: np.column_stack([camera.width - 1.0 - points[:, 0], points[:, 1]]),
-    lambda image, camera: np.ascontiguousarray(image[:, ::-1]))
+def _reversed_order(columns: bool, rows: bool) -> Geometry:
+    """Columns and rows of the image in reverse order."""
+    def points(pixels: Array, camera: RollingShutterCamera) -> Array:
+        last = np.array([camera.width - 1.0, camera.height - 1.0])
+        return np.where([columns, rows], last - pixels, pixels)
+    return Geometry(points, lambda image, camera: np.ascontiguousarray(
+        image[::-1 if rows else 1, ::-1 if columns else 1]))
 
-_HALF_TURN = Rotation.from_rotvec([0.0, 0.0, math.pi])
+
+RECTIFIED = Geometry(_rectified, _rectified_image)
+UPSIDE_DOWN = _reversed_order(columns=True, rows=True)
+FLIPPED = _reversed_order(columns=False, rows=True)
+MIRRORED = _reversed_order(columns=True, rows=False)
+
+_HALF_ROTATION = Rotation.from_rotvec([0.0, 0.0, math.pi])
 _CYCLE = Rotation.from_matrix([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 RIGHT = 'right'
 ROWS: Mapping[str, Row] = {
-    RIGHT: Row((), SMALL, lambda told, rng: told),
-    'imu-xy-negated': Row(('axes',), GROSS, _axes_turned(lambda rng: _HALF_TURN)),
-    'imu-cycled': Row(('axes',), GROSS, _axes_turned(lambda rng: _CYCLE)),
-    'gyro-degrees': Row(('gyro_unit',), GROSS, _arrives(_gyro_times(math.degrees(1.0)))),
-    'gyro-57th': Row(('gyro_unit',), GROSS, _arrives(_gyro_times(1.0 / math.degrees(1.0)))),
-    'K-1.3': Row(('focal_length',), GROSS, _focal_length(1.3),
-                 lambda told, rng: Injected('focal_length', np.array([0.3]))),
-    'K-1.05': Row(('focal_length',), GROSS, _focal_length(1.05),
-                  lambda told, rng: Injected('focal_length', np.array([0.05]))),
+    RIGHT: Row((), SMALL, lambda right, rng: right),
+    'imu-xy-negated': Row(('axes',), GROSS, _axes_rotated(lambda rng: _HALF_ROTATION)),
+    'imu-cycled': Row(('axes',), GROSS, _axes_rotated(lambda rng: _CYCLE)),
+    'gyro-degrees': Row(('gyro_unit',), GROSS, _gyro_times(math.degrees(1.0))),
+    'gyro-57th': Row(('gyro_unit',), GROSS, _gyro_times(1.0 / math.degrees(1.0))),
+    'K-1.3': Row(('focal_length',), GROSS, _focal_length(1.3), _error('focal_length', 0.3)),
+    'K-1.05': Row(('focal_length',), GROSS, _focal_length(1.05), _error('focal_length', 0.05)),
     'no-distortion': Row(('distortion',), GROSS, _without_distortion, _distortion_error),
     'rectified': Row(('distortion', 'image_geometry'), GROSS, _shown(RECTIFIED),
                      _distortion_error),
     'upside-down': Row(('image_geometry',), GROSS, _shown(UPSIDE_DOWN)),
     'flipped': Row(('image_geometry',), GROSS, _shown(FLIPPED)),
-    'imu-late-30ms': Row(('time_offset',), GROSS, _arrives(_stamped_late),
-                         lambda told, rng: Injected('time_offset', np.array([0.03]))),
-    'readout-2': Row(('readout_time',), GROSS, _readout(2.0), _readout_error(2.0)),
-    'readout-0.5': Row(('readout_time',), GROSS, _readout(0.5), _readout_error(0.5)),
-    'readout-0': Row(('readout_time',), GROSS, _readout(0.0), _readout_error(0.0)),
-    'accel-cycled': Row(('accel_axes',), SMALL, _arrives(_felt(_CYCLE, 1.0))),
-    'accel-opposite': Row(('accel_axes',), SMALL, _arrives(_felt(Rotation.identity(), -1.0))),
-    'axes-3deg': Row(('axes',), SMALL, _axes_turned(_slightly), _slight_turn),
-    'offset-10ms': Row(('time_offset',), SMALL, _later(0.01),
-                       lambda told, rng: Injected('time_offset', np.array([0.01]))),
-    'readout-1.2': Row(('readout_time',), SMALL, _readout(1.2), _readout_error(1.2)),
-    'readout-0.8': Row(('readout_time',), SMALL, _readout(0.8), _readout_error(0.8)),
-    'bias-0.05': Row(('gyro_bias',), SMALL, _biased, _bias_error),
-    'gyro-0.95': Row(('gyro_scale',), SMALL, _arrives(_gyro_times(0.95)),
-                     lambda told, rng: Injected('gyro_scale', np.array([0.05]))),
-    'K-0.97': Row(('focal_length',), SMALL, _focal_length(0.97),
-                  lambda told, rng: Injected('focal_length', np.array([0.03]))),
+    'imu-late-30ms': Row(
+        ('time_offset',), GROSS,
+        _received(lambda sample: replace(sample, stamp_ns=sample.stamp_ns + 30_000_000)),
+        _error('time_offset', 0.03)),
+    'readout-2': Row(('readout_time',), GROSS, *_readout(2.0)),
+    'readout-0.5': Row(('readout_time',), GROSS, *_readout(0.5)),
+    'readout-0': Row(('readout_time',), GROSS, *_readout(0.0)),
+    'accel-cycled': Row(('accel_axes',), SMALL, _accel(_CYCLE, 1.0)),
+    'accel-opposite': Row(('accel_axes',), SMALL, _accel(Rotation.identity(), -1.0)),
+    'axes-3deg': Row(('axes',), SMALL, _axes_rotated(_three_degrees), lambda right, rng: Injected(
+        'axes', right.R_cam_imu.apply(_three_degrees(rng).as_rotvec()))),
+    'offset-10ms': Row(
+        ('time_offset',), SMALL,
+        lambda right, rng: right.with_values(time_offset=right.values['time_offset'] + 0.01),
+        _error('time_offset', 0.01)),
+    'readout-1.2': Row(('readout_time',), SMALL, *_readout(1.2)),
+    'readout-0.8': Row(('readout_time',), SMALL, *_readout(0.8)),
+    'bias-0.05': Row(('gyro_bias',), SMALL, _biased, lambda right, rng: Injected(
+        'gyro_bias', right.R_cam_imu.apply(_random_vector(rng, 0.05)))),
+    'gyro-0.95': Row(('gyro_scale',), SMALL, _gyro_times(0.95), _error('gyro_scale', 0.05)),
+    'K-0.97': Row(('focal_length',), SMALL, _focal_length(0.97), _error('focal_length', 0.03)),
     'mirrored': Row(('image_geometry',), SMALL, _shown(MIRRORED)),
+    # Reading up instead of down is an error of twice the readout time.
     'direction-reversed': Row(('readout_direction',), SMALL, _reversed,
-                              lambda told, rng: Injected('readout_time', np.array(
-                                  [2.0 * told.values['readout_time']]))),
+                              lambda right, rng: Injected('readout_time', np.array(
+                                  [2.0 * right.values['readout_time']]))),
 }
+
+
+# -- information of a motion about the errors -------------------------------------------------
+#
+# For each pair of a run with the right configuration: unknowns x (rotation, direction of
+# translation, both velocities), calibration c (`QUANTITIES`, the offset at the middle row),
+# residuals of the matches and priors of velocity and of the rotation by the gyro. At the truth, by
+# finite differences:
+#
+#     S = J_c^T W J_c - J_c^T W J_x (J_x^T W J_x)^-1 J_x^T W J_c        summed over a second
+#
+# Nothing of `rs_relpose_ros.estimator` or `rs_relpose_ros.health` is used.
+
+_ENDS = dict(zip(QUANTITIES, accumulate(QUANTITIES.values()), strict=True))
+PLACES: Mapping[str, slice] = {name: slice(end - QUANTITIES[name], end)
+                               for name, end in _ENDS.items()}
+_UNKNOWNS = 11   # x: rotation, direction of translation, velocities
+_FREE = sum(QUANTITIES.values())
+# Of the finite differences, in the units of `Injected` and of x.
+_STEP = 1e-5
+# Prior of each quantity before any motion, 1 sigma.
+_BEFORE = np.repeat([0.5, 0.1, 0.05, 0.1, 0.2, 0.3, 0.3], list(QUANTITIES.values()))
+# Velocities differ from t / interval by so many baselines per second, 1 sigma.
+_VELOCITY_SIGMA = 1.0
+# Least noise of a match [px] and of a rotation by the gyro [rad]: no model is better.
+_LEAST_PIXEL, _LEAST_ROTATION = 0.05, 3e-4
+# An injected error must be so many times its sigma.
+INFORMATIVE = 5.0
+# Share of that information that an informative second must have itself.
+_LEAST_PART = 0.01
+# Matches of a pair that are used, at most.
+_MOST_MATCHES = 150
+
+
+class TruePair(NamedTuple):
+    """A pair with its true pose: ``X1 = R X2 + t`` of the middle rows, |t| = 1.
+
+    `pixels1`, `pixels2` (N, 2): of the inliers, on the sensor; `sigma` [px]: of a match.
+    `rates1`, `rates2` (N, 3): mean true rate [rad/s] from the middle row to each match's row;
+    `rate1`, `rate2` (3,): at the middle rows. All rates are in the camera frame.
+    """
+
+    pixels1: Array
+    pixels2: Array
+    R: Array
+    t: Array
+    interval: float
+    rates1: Array
+    rates2: Array
+    rate1: Array
+    rate2: Array
+    sigma: float
+    gyro_noise_density: float
+
+
+class PairInformation(NamedTuple):
+    """`quantities` (11, 11) about c; `rotation` (3, 3): its outer product, in sigmas."""
+
+    quantities: Array
+    rotation: Array
+
+
+def pair_information(pair: TruePair, camera: RollingShutterCamera) -> PairInformation:
+    """Information of a pair about the quantities, and its rotation."""
+    unknowns = _UNKNOWNS + _FREE
+    residuals = _Residuals(pair, camera)(_STEP * np.eye(unknowns + 1, unknowns, -1))
+    jacobian = (residuals[1:] - residuals[0]).T / _STEP
+    by_x, by_c = jacobian[:, :_UNKNOWNS], jacobian[:, _UNKNOWNS:]
+    H, mixed = by_x.T @ by_x, by_x.T @ by_c
+    # By the images alone, without the last three residuals, which are the gyro's.
+    by_images = by_x[:-3].T @ by_x[:-3]
+    information = np.linalg.inv(np.linalg.inv(by_images)[:3, :3])
+    rotation = Rotation.from_matrix(pair.R).as_rotvec()
+    length = (math.sqrt(float(rotation @ information @ rotation))
+              / max(float(np.linalg.norm(rotation)), 1e-9))
+    return PairInformation(by_c.T @ by_c - mixed.T @ np.linalg.solve(H, mixed),
+                           length**2 * np.outer(rotation, rotation))
+
+
+class _Residuals:
+    """Residuals, each by its sigma, of matches, velocities and gyro around the truth.
+
+    They are evaluated at K sets of unknowns at once: arrays of matches are (K, N, ...).
+    """
+
+    def __init__(self, pair: TruePair, camera: RollingShutterCamera) -> None:
+        chosen = slice(None, None, -(-len(pair.pixels1) // _MOST_MATCHES))
+        self._pair = pair._replace(pixels1=pair.pixels1[chosen], pixels2=pair.pixels2[chosen],
+                                   rates1=pair.rates1[chosen], rates2=pair.rates2[chosen])
+        # Each match represents those that were left out.
+        self._sigma = max(pair.sigma, _LEAST_PIXEL) * math.sqrt(
+            len(self._pair.pixels1) / len(pair.pixels1))
+        self._camera = camera
+        self._tangent = np.linalg.svd(pair.t[None])[2][1:]
+        self._rotation_sigma = math.hypot(
+            _LEAST_ROTATION, pair.gyro_noise_density * math.sqrt(pair.interval))
+        self._slopes = self._gradient_lengths()
+
+    def __call__(self, unknowns: Array) -> Array:
+        """Residuals (K, M) of unknowns (K, 22)."""
+        x, c = unknowns[:, :_UNKNOWNS], unknowns[:, _UNKNOWNS:]
+        pair, count = self._pair, len(unknowns)
+        t = pair.t + x[:, 3:5] @ self._tangent
+        d = x[:, 5:].reshape(count, 2, 3)
+        R = Rotation.from_rotvec(x[:, :3]).as_matrix() @ pair.R
+        matches = self._matches(R, t, d + pair.t / pair.interval, c)
+        # Prior of the velocities: that of the baseline, which goes with t.
+        slower = d - (t - pair.t)[:, None] / pair.interval
+        # Prior of the rotation: Log(R R_gyro(c)^T), whose change by c is linear.
+        theta = x[:, :3] - self._gyro_change(c)
+        return np.hstack([
+            matches / (self._sigma * self._slopes), slower.reshape(count, 6) / _VELOCITY_SIGMA,
+            theta / self._rotation_sigma])
+
+    def _gyro_change(self, c: Array) -> Array:
+        """Change (K, 3) of the gyro's rotation by c (K, 11): axes, offset, bias, scale.
+
+        ``Exp(a) R Exp(-a) = Exp(a - R a) R``; later by o: ``Exp(R w_2 o - w_1 o) R``.
+        """
+        pair = self._pair
+        axes = c[:, PLACES['axes']]
+        mean = 0.5 * pair.interval * (np.eye(3) + pair.R)
+        return np.asarray(
+            axes - axes @ pair.R.T
+            + c[:, PLACES['time_offset']] * (pair.R @ pair.rate2 - pair.rate1)
+            - c[:, PLACES['gyro_bias']] @ mean.T
+            + c[:, PLACES['gyro_scale']] * Rotation.from_matrix(pair.R).as_rotvec())
+
+    def _matches(self, R: Array, t: Array, velocities: Array, c: Array) -> Array:
+        """``(p_2 - p_1) . (g_1 x g_2)`` (K, N) of rays and positions at their rows."""
+        pair = self._pair
+        place1, ray1 = self._row(pair.pixels1, pair.rates1, velocities[:, 0], c)
+        place2, ray2 = self._row(pair.pixels2, pair.rates2, velocities[:, 1], c)
+        across = np.cross(ray1, ray2 @ np.swapaxes(R, 1, 2))
+        return np.asarray(((t[:, None] + place2 - place1) * across).sum(axis=2))
+
+    def _row(self, pixels: Array, rates: Array, velocity: Array, c: Array) -> tuple[Array, Array]:
+        """Displacement since the middle row (K, N, 3), and rays (K, N, 3) derotated to it."""
+        camera = self._camera
+        away = pixels[:, 1] - 0.5 * (camera.height - 1)
+        readout = camera.line_delay * camera.height + c[:, PLACES['readout_time']]
+        times = (readout * away / camera.height)[..., None]
+        # The gyro's rate with c; its change within the offset is in the rotation between the
+        # frames.
+        axes, bias, scale = (c[:, None, PLACES[name]]
+                             for name in ('axes', 'gyro_bias', 'gyro_scale'))
+        angles = times * ((1.0 + scale) * (rates + np.cross(axes, rates)) - bias)
+        rays = self._rays(pixels, c)
+        once = np.cross(angles, rays)
+        return times * velocity[:, None], rays + once + 0.5 * np.cross(angles, once)
+
+    def _rays(self, pixels: Array, c: Array) -> Array:
+        """Rays (K, N, 3) at z = 1 with another focal length and first coefficient.
+
+        ``x_d = x (1 + k1 r^2)``: a change dk1 moves the undistorted point by ``-dk1 r^2 x``.
+        """
+        rays = self._camera.unproject(pixels)
+        points = rays[:, :2] / rays[:, 2:]
+        squares = (points**2).sum(axis=1, keepdims=True)
+        focal, distortion = (c[:, None, PLACES[name]] for name in ('focal_length', 'distortion'))
+        points = points * (1.0 - focal - distortion * squares)
+        return np.concatenate([points, np.ones((*points.shape[:2], 1))], axis=2)
+
+    def _gradient_lengths(self) -> Array:
+        """Length (N,) of each residual's gradient by its four pixel coordinates."""
+        pair = self._pair
+        squares = np.zeros(len(pair.pixels1))
+        middle = self._at_truth()
+        for name in ('pixels1', 'pixels2'):
+            for shift in 0.01 * np.eye(2):
+                self._pair = pair._replace(**{name: getattr(pair, name) + shift})
+                squares += ((self._at_truth() - middle) / 0.01) ** 2
+        self._pair = pair
+        return np.sqrt(squares)
+
+    def _at_truth(self) -> Array:
+        pair = self._pair
+        velocities = np.stack([pair.t, pair.t]) / pair.interval
+        return np.asarray(self._matches(pair.R[None], pair.t[None], velocities[None],
+                                        np.zeros((1, _FREE)))[0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InformativeMotion:
+    """Information of each second of a recording: sums (F, 11, 11), (F, 3, 3) of its pairs."""
+
+    quantities: Array
+    rotations: Array
+
+    def seconds(self, injected: Injected | None) -> NDArray[np.bool_]:
+        """Which seconds (F,) are informative for an error; None: for permuted axes.
+
+        The information up to a second's end is sufficient for the error, and the second adds to
+        it: a resting camera has none, with any history.
+        """
+        if injected is None:
+            # A quarter turn, squared in sigmas, by rotation about one axis and about a second.
+            quarter = (math.pi / 2)**2
+            each = quarter * np.linalg.eigvalsh(self.rotations)[:, 2]
+            so_far = quarter * np.linalg.eigvalsh(np.cumsum(self.rotations, axis=0))[:, 1]
+        else:
+            each, so_far = (
+                np.array([_squared_error(injected, quantities) for quantities in information])
+                for information in (self.quantities, np.cumsum(self.quantities, axis=0)))
+        return np.asarray((so_far >= INFORMATIVE**2) & (each >= _LEAST_PART * INFORMATIVE**2))
+
+
+def _squared_error(injected: Injected, quantities: Array) -> float:
+    """An error squared in sigmas by the information, the other quantities eliminated."""
+    place = np.arange(_FREE)[PLACES[injected.quantity]]
+    rest = np.setdiff1d(np.arange(_FREE), place)
+    # The quantity itself has no prior.
+    others = quantities[np.ix_(rest, rest)] + np.diag(1.0 / _BEFORE[rest]**2)
+    mixed = quantities[np.ix_(rest, place)]
+    alone = quantities[np.ix_(place, place)] - mixed.T @ np.linalg.solve(others, mixed)
+    return float(injected.error @ alone @ injected.error)

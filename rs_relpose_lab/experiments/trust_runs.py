@@ -1,46 +1,266 @@
-"""A recording through the real front end, told right or wrong, and what its pairs are worth."""
+"""A recording through the real front end, with any configuration, and its pairs against the truth.
+
+Recordings are simulated, with rendered images or with tracks alone, or real.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import heapq
 import math
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from rs_relpose_lab.experiments import trust_rows
 from rs_relpose_lab.experiments.scoring import chi_squares, pose_error
-from rs_relpose_lab.experiments.trust_information import (
-    pair_information,
-    TellingMotion,
-    TruePair,
-)
-from rs_relpose_lab.experiments.trust_rows import FIGURES, Told
-from rs_relpose_lab.experiments.trust_tracks import (
-    numbered_image,
-    Sightings,
-    sightings,
-    SimulatedTracker,
-    TrackNoise,
-)
-from rs_relpose_lab.simulation.bag import right_parameters
+from rs_relpose_lab.simulation.bag import intrinsics_of, right_parameters
+from rs_relpose_lab.simulation.render import view_of
+from rs_relpose_lab.simulation.rows import observe
 from rs_relpose_lab.simulation.simulation import Simulation
-from rs_relpose_ros.bags.layout import CAMERA_FRAME, IMAGE_DELAY, IMU_DELAY
-from rs_relpose_ros.config.parameters import Parameters
-from rs_relpose_ros.front_end.frame import Frame
-from rs_relpose_ros.front_end.front_end import FrameProcessed, FrontEnd
-from rs_relpose_ros.front_end.pair import PairResult
+from rs_relpose_lab.simulation.trajectory import FinePath
+from rs_relpose_ros.bags.convert import by_stamp
+from rs_relpose_ros.bags.reader import CAMERA_FRAME, IMAGE_DELAY, IMU_DELAY, open_bag
+from rs_relpose_ros.config.files import read_parameters
+from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
-from rs_relpose_ros.geometry.intrinsics import Intrinsics
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, to_nanoseconds
-from rs_relpose_ros.imu.samples import ImuSample
+from rs_relpose_ros.imu.buffer import ImuSample
+from rs_relpose_ros.messages.incoming import PARTS, Role, sensor_messages
+from rs_relpose_ros.offline.replay import read_truth
+from rs_relpose_ros.pipeline.pair import Frame, PairResult
+from rs_relpose_ros.pipeline.pipeline import FrontEnd
+from rs_relpose_ros.tracking.features import keep_apart, Matches, TrackIds
+from rs_relpose_ros.tracking.images import Image, RawImage
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
-# States of the health at which a run counts as flagged, and those at which poses are believed.
+# -- tracks without images --------------------------------------------------------------------
+#
+# A rendered image costs 0.2 s, its tracks 20 ms. `SimulatedTracker` provides them like
+# `KltTracker`: corners of the reference keyframe, tracked with noise, lost where the prediction is
+# far off. Its images contain nothing but their number (`numbered_image`).
+
+Ids = NDArray[np.int64]
+# Pixels (N, 2) of the sensor to those of the published image.
+PointMap = Callable[[Array], Array]
+
+# Corners in sight, of which a tracker takes its 300; least distance between new ones [px].
+_IN_SIGHT, _LEAST_DISTANCE = 420, 10.0
+# Share of the corners that are lost from frame to frame, though in sight.
+_LOST = 0.01
+# Corners keep away from the image's border by half a window [px].
+_BORDER = 8.0
+# Distance [m] of two points at one pixel, from which one hides the other.
+_HIDDEN = 5e-3
+# KLT finds no corner whose place was predicted worse than this [px]: the reach of its pyramid.
+_REACH = 40.0
+# Share of lost corners from which on the prediction is not used.
+_MOST_LOST = 0.15
+# An odd number whose multiples scatter over the integers.
+_SCATTER = 2654435761
+
+
+@dataclass(frozen=True, slots=True)
+class TrackNoise:
+    """Errors of a track, as those of `KltTracker` in a rendered bag (docs/lab/trust.md).
+
+    `white` [px]: 1 sigma per coordinate of each match. As the camera moves on, each corner slips
+    off its place, in a direction of its own: within `settled` metres by `slip` [px] times
+    Student's t of `freedom` degrees. A share `wrong` slides by a normal number times `slide`
+    [px/m].
+    """
+
+    white: float = 0.04
+    slip: float = 0.08
+    freedom: float = 2.5
+    settled: float = 0.2
+    wrong: float = 0.003
+    slide: float = 10.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sightings:
+    """Where each frame of a recording shows the corners, errors apart.
+
+    `ids`: of each frame's corners (N,), increasing; one that is lost does not come back.
+    `pixels`: their places (N, 2) on the sensor; `noise`: standard normal (N, 2).
+    `travelled` (F,): way of the camera up to each frame [m]. `slips` [px], `slides` [px/m]: (M, 2)
+    by id.
+    """
+
+    ids: tuple[Ids, ...]
+    pixels: tuple[Array, ...]
+    noise: tuple[Array, ...]
+    travelled: Array
+    slips: Array
+    slides: Array
+    errors: TrackNoise
+
+
+def sightings(simulation: Simulation, noise: TrackNoise, rng: np.random.Generator) -> Sightings:
+    """Corners on the surfaces of the scene, followed until they leave, hide or are lost."""
+    frames = simulation.config.frame_count
+    times = [simulation.seconds(simulation.reference_ns(k)) for k in range(frames)]
+    camera = simulation.camera
+    first, last = camera.row_time_span
+    path = FinePath(simulation.trajectory, times[0] + first - 0.02, times[-1] + last + 0.02)
+    view = view_of(camera)
+    ids: Ids = np.empty(0, dtype=np.int64)
+    world = np.empty((0, 3))
+    observed_ids, observed_pixels, following = [], [], 0
+    for time in times:
+        pixels = observe(world, path.motion_from(time), view, margin=-_BORDER)
+        kept = np.isfinite(pixels).all(axis=1) & (rng.uniform(size=len(ids)) >= _LOST)
+        ids, world, pixels = ids[kept], world[kept], pixels[kept]
+        new = _new_corners(rng, pixels, camera.width, camera.height)
+        pixels = np.concatenate([pixels, new])
+        there, hits = simulation.renderer.locate(time, pixels)
+        ids = np.concatenate([ids, following + np.arange(len(new))])
+        following += len(new)
+        world = np.concatenate([world, there[len(world):]])
+        # Not where another surface hides it, nor where there is no surface.
+        kept = (hits >= 0) & (np.linalg.norm(there - world, axis=1) < _HIDDEN)
+        ids, world, pixels = ids[kept], world[kept], pixels[kept]
+        observed_ids.append(ids)
+        observed_pixels.append(pixels)
+    positions = simulation.trajectory.poses(times)[0]
+    steps = np.linalg.norm(np.diff(positions, axis=0, prepend=positions[:1]), axis=1)
+    # Student's t: a normal number by the root of chi squared over its degrees of freedom.
+    sigmas = noise.slip / np.sqrt(rng.chisquare(noise.freedom, following) / noise.freedom)
+    slides = noise.slide * (rng.uniform(size=following) < noise.wrong)
+    directions = rng.standard_normal((2, following, 2))
+    return Sightings(tuple(observed_ids), tuple(observed_pixels),
+                     tuple(rng.standard_normal((len(frame), 2)) for frame in observed_ids),
+                     np.cumsum(steps), sigmas[:, None] * directions[0],
+                     slides[:, None] * directions[1], noise)
+
+
+def _new_corners(rng: np.random.Generator, taken: Array, width: int, height: int) -> Array:
+    """As many corners as are missing, away from the border and from those that are taken."""
+    missing = _IN_SIGHT - len(taken)
+    if missing <= 0:
+        return np.empty((0, 2))
+    drawn = rng.uniform(_BORDER, (width - 1 - _BORDER, height - 1 - _BORDER), (3 * missing, 2))
+    apart = keep_apart(np.concatenate([taken, drawn]), _LEAST_DISTANCE)[len(taken):]
+    return drawn[apart][:missing]
+
+
+def numbered_image(number: int, shape: tuple[int, int]) -> Image:
+    """An image (H, W) that contains the number of its frame."""
+    image = np.zeros(shape, dtype=np.uint8)
+    image[0, :4] = np.frombuffer(np.uint32(number).tobytes(), dtype=np.uint8)
+    return image
+
+
+def number_of(image: Image) -> int:
+    """The frame of a numbered image."""
+    return int(np.frombuffer(image[0, :4].tobytes(), dtype=np.uint32)[0])
+
+
+class SimulatedTracker:
+    """A `rs_relpose_ros.tracking.features.Tracker` of numbered images.
+
+    The position of a corner in the reference keyframe is exact by definition, since a tracker
+    compares with it. So an error that a track has when its frame becomes the reference stays with
+    it, and is no error from then on.
+
+    `published`: from the sensor to the image that is really published.
+    """
+
+    def __init__(self, sightings: Sightings, published: PointMap, most: int) -> None:
+        self._sightings, self._published, self._most = sightings, published, most
+        self._ids = TrackIds()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all images; ids are not used again."""
+        self._frame = self._reference = -1
+        self._matches = Matches.none()
+        self._corners: Ids = np.empty(0, dtype=np.int64)
+        # Of each track, on the sensor: error that it had when the reference began, and place now.
+        self._offsets = self._places = np.empty((0, 2))
+        self._started, self._shape = 0, (0, 0)
+
+    @property
+    def tracked_fraction(self) -> float:
+        """Share of the reference's corners that are still tracked."""
+        return len(self._matches) / self._started if self._started else 0.0
+
+    @property
+    def points(self) -> Array:
+        """Corners (N, 2) in the current image [px]."""
+        return self._matches.points2
+
+    def start(self, image: Image) -> None:
+        """Make `image` the reference keyframe, with new corners only."""
+        self.reset()
+        self._frame, self._shape = number_of(image), (image.shape[0], image.shape[1])
+        self.promote()
+
+    def track(self, image: Image, predicted: Array | None = None,
+              interval: float = 1.0) -> Matches:
+        """Find the corners in `image`, as `Tracker.track` does."""
+        self._frame = number_of(image)
+        frame, known = self._frame, self._sightings
+        rows = np.searchsorted(known.ids[frame], self._corners)
+        rows = np.minimum(rows, len(known.ids[frame]) - 1)
+        way = known.travelled[frame] - known.travelled[self._reference]
+        places = (known.pixels[frame][rows] + self._offsets
+                  + known.errors.white * known.noise[frame][rows]
+                  + min(way / known.errors.settled, 1.0) * known.slips[self._corners]
+                  + way * known.slides[self._corners])
+        points = self._published(places)
+        expected = points if predicted is None else np.where(
+            np.isfinite(predicted), predicted, self._matches.points2)
+        reached = np.linalg.norm(points - expected, axis=1) < _REACH
+        if np.count_nonzero(~reached) > _MOST_LOST * len(reached):
+            # Then `KltTracker` searches at the previous positions.
+            reached |= np.linalg.norm(points - self._matches.points2, axis=1) < _REACH
+        good = (known.ids[frame][rows] == self._corners) & self._inside(points) & reached
+        self._matches = replace(self._matches, points2=points).kept(good)
+        self._corners, self._offsets = self._corners[good], self._offsets[good]
+        self._places = places[good]
+        return self._matches
+
+    def refined_matches(self) -> Matches:
+        """Matches of reference and current image; they are as exact as they get."""
+        return self._matches
+
+    def promote(self) -> None:
+        """Make the current image the reference; tracks continue, new corners fill the gaps."""
+        ids, pixels = self._sightings.ids[self._frame], self._sightings.pixels[self._frame]
+        kept = keep_apart(self.points, 0.5 * _LEAST_DISTANCE)
+        corners, places = self._corners[kept], self._places[kept]
+        free = ~np.isin(ids, corners) & self._inside(self._published(pixels))
+        # Any of them, but the same ones in every run.
+        order = np.argsort(ids[free] * _SCATTER % 2**32)[:max(self._most - len(corners), 0)]
+        new, new_places = ids[free][order], pixels[free][order]
+        self._corners = np.concatenate([corners, new])
+        self._places = np.concatenate([places, new_places])
+        rows = np.searchsorted(ids, self._corners)
+        self._offsets = self._places - pixels[rows]
+        points = self._published(self._places)
+        self._matches = Matches(
+            np.concatenate([self._matches.track_ids[kept], self._ids.take(len(new))]), points,
+            points, np.ones(len(points)))
+        self._started, self._reference = len(points), self._frame
+
+    def _inside(self, points: Array) -> NDArray[np.bool_]:
+        """Which points (N, 2) of the published image are clear of its border."""
+        height, width = self._shape
+        return np.asarray(((points >= _BORDER) & (points <= (width - 1 - _BORDER,
+                                                             height - 1 - _BORDER))).all(axis=1))
+
+
+# -- runs of a recording ----------------------------------------------------------------------
+
+# States of the consistency monitor at which a run counts as flagged.
 FLAGGED = ('suspect', 'wrong')
 
 
@@ -57,7 +277,7 @@ TRACKS, IMAGES, RECORDING = 'tracks', 'images', 'recording'
 
 
 class Source(NamedTuple):
-    """Where a recording comes from; `noise`: of the told one, 0 where nobody chose it."""
+    """Origin of a recording; `noise`: by the configured one, 0 where it was not chosen."""
 
     name: str
     kind: str
@@ -67,22 +287,18 @@ class Source(NamedTuple):
     noise: float = 0.0
 
 
-# Time of arrival [ns], and what arrives.
-_Event = tuple[int, ImuSample | Arrival]
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """What a run needs, and what is true.
+    """Input of a run, and the truth.
 
-    `told`: what is right. `image`: of a frame's number, as the sensor gives it; `sightings`: where
-    there are no images but tracks. `true_pose`: R and t [m] of the stamped rows of two stamps;
-    None where it is not known. `rate_stamps_ns` (K,), `rates` (K, 3): true angular rate [rad/s],
-    camera frame, on the IMU clock.
+    `configured`: the right configuration. `image`: of a frame's number, from the sensor;
+    `sightings`: tracks in place of images. `true_pose`: R and t [m] of the stamped rows of two
+    stamps; None where it is unknown. `rate_stamps_ns` (K,), `rates` (K, 3): true angular rate
+    [rad/s], camera frame, on the IMU clock.
     """
 
     source: Source
-    told: Told
+    configured: trust_rows.Configured
     camera: RollingShutterCamera
     arrivals: Sequence[Arrival]
     samples: Sequence[ImuSample]
@@ -98,62 +314,38 @@ class Recording:
         return seconds_between(self.arrivals[0].stamp_ns, self.arrivals[-1].stamp_ns)
 
 
-def intrinsics_of(camera: RollingShutterCamera) -> Intrinsics:
-    """What the CameraInfo of the whole image tells of a camera."""
-    return Intrinsics(
-        width=camera.width, height=camera.height, fx=camera.fx, fy=camera.fy, cx=camera.cx,
-        cy=camera.cy, distortion_model=camera.distortion_model, distortion=camera.distortion,
-        image_width=camera.width, image_height=camera.height)
-
-
 def simulated(source: Source, simulation: Simulation, noise: TrackNoise | None,
               rng: np.random.Generator) -> Recording:
     """A recording of a simulation: tracks with `noise`, or rendered images where it is None."""
     config, imu = simulation.config, simulation.imu
-    stamps = [simulation.stamp_ns(k) for k in range(config.frame_count)]
-    instants = dict(zip(stamps, map(simulation.reference_ns, range(config.frame_count)),
-                        strict=True))
+    reference_ns = {simulation.stamp_ns(k): simulation.reference_ns(k)
+                    for k in range(config.frame_count)}
     shape = (config.height, config.width)
     delay_ns = to_nanoseconds(config.time_offset + config.readout_time + IMAGE_DELAY)
 
     def true_pose(stamp1_ns: int, stamp2_ns: int) -> tuple[Array, Array]:
-        states = simulation.states([instants[stamp1_ns], instants[stamp2_ns]])
+        states = simulation.states([reference_ns[stamp1_ns], reference_ns[stamp2_ns]])
         R1, R2 = states.R_world_cam
         return R1.T @ R2, R1.T @ (states.position[1] - states.position[0])
 
     return Recording(
-        source, Told(right_parameters(simulation), intrinsics_of(simulation.camera)),
-        simulation.camera, [Arrival(k, stamp, stamp + delay_ns) for k, stamp in enumerate(stamps)],
-        [ImuSample(stamp, tuple(rate), tuple(force)) for stamp, rate, force in zip(
-            imu.stamps_ns.tolist(), imu.angular_velocities.tolist(),
-            imu.linear_accelerations.tolist(), strict=True)],
+        source,
+        trust_rows.Configured(right_parameters(simulation), intrinsics_of(simulation.camera)),
+        simulation.camera,
+        [Arrival(k, stamp, stamp + delay_ns) for k, stamp in enumerate(reference_ns)],
+        imu.samples(),
         (lambda number: numbered_image(number, shape)) if noise is not None else simulation.image,
         None if noise is None else sightings(simulation, noise, rng),
         true_pose, imu.stamps_ns, simulation.states(imu.stamps_ns).angular_velocity)
 
 
 class Verdict(NamedTuple):
-    """What the health says with a pair: its state, and the figures that it names."""
+    """State of the consistency monitor with a pair, and the parameters that it names."""
 
     state: str
     named: tuple[str, ...]
-
-
-# A product without health says this of every pair.
-NO_HEALTH = Verdict('unknown', ())
-
-
-def verdict_of(pair: PairResult) -> Verdict:
-    """The health that came with a pair."""
-    health = getattr(pair, 'health', None)
-    if health is None:
-        return NO_HEALTH
-    return Verdict(health.state.value, tuple(
-        finding.figure for finding in health.findings if finding.state in FLAGGED))
-
-
 @dataclass(frozen=True, slots=True)
-class JudgedPair:
+class EvaluatedPair:
     """A pair of a run, against the truth.
 
     `at`: stamp since the recording's first [s]; `seconds`: wall time of its frame. Of a pose, NaN
@@ -177,33 +369,36 @@ class JudgedPair:
         return not math.isnan(self.direction_error)
 
 
-def run(recording: Recording, told: Told, until: float = math.inf,
+def run(recording: Recording, configured: trust_rows.Configured, until: float = math.inf,
         ) -> Iterator[tuple[PairResult, float]]:
-    """Pairs of a run that is told so, with the wall time of their frames [s].
+    """Pairs of a run with a configuration, and the wall time of their frames [s].
 
     `until` [s]: frames after that are not processed.
     """
-    parameters = Parameters.from_mapping(told.values)
+    parameters = Parameters.from_mapping(configured.values)
     camera, known = recording.camera, recording.sightings
     tracker = None if known is None else SimulatedTracker(
-        known, lambda points: told.geometry.points(points, camera),
+        known, lambda points: configured.geometry.points(points, camera),
         parameters.tracking.max_features)
     front_end = FrontEnd(parameters, offline=True, tracker=tracker)
     first_ns = recording.arrivals[0].stamp_ns
-    samples: Iterator[_Event] = (
-        (sample.stamp_ns + to_nanoseconds(IMU_DELAY), sample) for sample in recording.samples)
-    frames: Iterator[_Event] = (
-        (arrival.arrives_ns, arrival) for arrival in recording.arrivals
-        if seconds_between(first_ns, arrival.stamp_ns) <= until)
-    for _, arrived in heapq.merge(samples, frames, key=lambda event: event[0]):
+    imu_delay_ns = to_nanoseconds(IMU_DELAY)
+    samples: Sequence[ImuSample | Arrival] = recording.samples
+    frames = [arrival for arrival in recording.arrivals
+              if seconds_between(first_ns, arrival.stamp_ns) <= until]
+
+    def arrival_ns(item: ImuSample | Arrival) -> int:
+        return item.arrives_ns if isinstance(item, Arrival) else item.stamp_ns + imu_delay_ns
+
+    for arrived in heapq.merge(samples, frames, key=arrival_ns):
         if isinstance(arrived, ImuSample):
-            front_end.sequencer.add_imu(told.sample(arrived))
+            front_end.sequencer.add_imu(configured.sample(arrived))
         else:
             image = recording.image(arrived.number)
             if known is None:
-                image = told.geometry.image(image, camera)
+                image = configured.geometry.image(image, camera)
             front_end.sequencer.add_frame(
-                Frame(arrived.stamp_ns, image, CAMERA_FRAME, told.intrinsics))
+                RawImage.of_gray(image, arrived.stamp_ns, CAMERA_FRAME), configured.intrinsics)
         yield from _closed(front_end)
     front_end.sequencer.close()
     yield from _closed(front_end)
@@ -211,42 +406,46 @@ def run(recording: Recording, told: Told, until: float = math.inf,
 
 def _closed(front_end: FrontEnd) -> Iterator[tuple[PairResult, float]]:
     while (outcome := front_end.step()) is not None:
-        if isinstance(outcome, FrameProcessed) and outcome.result is not None:
+        if isinstance(outcome, Frame) and outcome.result is not None:
             yield outcome.result, outcome.seconds
 
 
-def judged(recording: Recording, pair: PairResult, seconds: float) -> JudgedPair:
-    """A pair beside the truth."""
+def evaluated(recording: Recording, pair: PairResult, seconds: float) -> EvaluatedPair:
+    """A pair against the truth."""
     at = seconds_between(recording.arrivals[0].stamp_ns, pair.stamp_ns)
-    pose, verdict = pair.pose, verdict_of(pair)
+    pose = pair.pose
+    verdict = Verdict(pair.health.state.value, tuple(
+        finding.quantity for finding in pair.health.findings if finding.state in FLAGGED))
     truth = recording.true_pose(pair.reference_stamp_ns, pair.stamp_ns) if pose else None
     if truth is None or not np.linalg.norm(truth[1]) > 0.0:
-        return JudgedPair(at, pose.status.value, verdict, seconds)
+        return EvaluatedPair(at, pose.status.value, verdict, seconds)
     error = pose_error(pose.R, pose.t, *truth)
     chi = chi_squares(pose.R, pose.t, *truth, pose.covariance)
     # Of the two directions across t the mean variance.
     sigma = math.degrees(math.sqrt(0.5 * float(np.trace(pose.covariance[:3, :3]))))
-    return JudgedPair(at, pose.status.value, verdict, seconds, chi.translation, chi.rotation,
-                      error.translation, error.rotation, sigma)
+    return EvaluatedPair(at, pose.status.value, verdict, seconds, chi.translation, chi.rotation,
+                         error.translation, error.rotation, sigma)
 
 
-def telling_motion(recording: Recording, pairs: Sequence[PairResult]) -> TellingMotion:
-    """What each second of a recording tells, by the pairs of a run that was told right."""
+def informative_motion(recording: Recording,
+                       pairs: Sequence[PairResult]) -> trust_rows.InformativeMotion:
+    """Information of each second of a recording, by the pairs of a run, configured right."""
     count = math.ceil(recording.seconds) + 1
-    unknowns = sum(FIGURES.values())
-    motion = TellingMotion(np.zeros((count, unknowns, unknowns)), np.zeros((count, 3, 3)))
+    unknowns = sum(trust_rows.QUANTITIES.values())
+    motion = trust_rows.InformativeMotion(np.zeros((count, unknowns, unknowns)),
+                                          np.zeros((count, 3, 3)))
     for pair in pairs:
         true = _true_pair(recording, pair)
         if true is not None:
             second = int(seconds_between(recording.arrivals[0].stamp_ns, pair.stamp_ns))
-            information = pair_information(true, recording.camera)
-            motion.figures[second] += information.figures
-            motion.turns[second] += information.turn
+            information = trust_rows.pair_information(true, recording.camera)
+            motion.quantities[second] += information.quantities
+            motion.rotations[second] += information.rotation
     return motion
 
 
-def _true_pair(recording: Recording, pair: PairResult) -> TruePair | None:
-    """A pair with the truth, or, where that is not known, as it was estimated."""
+def _true_pair(recording: Recording, pair: PairResult) -> trust_rows.TruePair | None:
+    """A pair with the truth, or with its estimate where that is unknown."""
     if not pair.pose:
         return None
     truth = recording.true_pose(pair.reference_stamp_ns, pair.stamp_ns)
@@ -262,13 +461,49 @@ def _true_pair(recording: Recording, pair: PairResult) -> TruePair | None:
         # The mean rate between the two rows is about that half way between them.
         rates.append(_rate_at(recording, reference_ns + middle_ns, 0.5 * row_times))
         middles.append(_rate_at(recording, reference_ns + middle_ns, np.zeros(1))[0])
-    config = Parameters.from_mapping(recording.told.values).imu
-    return TruePair(pixels[0], pixels[1], R, t / np.linalg.norm(t), pair.interval, rates[0],
-                    rates[1], middles[0], middles[1], pair.pose.residual_rms,
-                    config.gyro_noise_density)
+    config = Parameters.from_mapping(recording.configured.values).imu
+    return trust_rows.TruePair(
+        pixels[0], pixels[1], R, t / np.linalg.norm(t), pair.interval, rates[0], rates[1],
+        middles[0], middles[1], pair.pose.residual_rms, config.gyro_noise_density)
 
 
-def _rate_at(recording: Recording, instant_ns: int, after: Array) -> Array:
-    """True rates (N, 3) [rad/s] at times (N,) [s] after an instant on the IMU clock."""
-    seconds = (recording.rate_stamps_ns - instant_ns) / NANOSECONDS
+def _rate_at(recording: Recording, time_ns: int, after: Array) -> Array:
+    """True rates (N, 3) [rad/s] at times (N,) [s] after a time on the IMU clock."""
+    seconds = (recording.rate_stamps_ns - time_ns) / NANOSECONDS
     return np.column_stack([np.interp(after, seconds, rate) for rate in recording.rates.T])
+
+
+# -- bags with images ---------------------------------------------------------------------------
+
+def recording_at(path: Path) -> Recording:
+    """A bag with the parameters that are right next to it (``BAG.yaml``), and its truth, if any.
+
+    Its rates are those of the gyro.
+    """
+    parameters = read_parameters(path.with_name(path.name + '.yaml'))
+    found: dict[Role, list[Any]] = {role: [] for role in Role}
+    with open_bag(path) as bag:
+        topics = bag.find_topics(needs_camera_info=not parameters.intrinsics.given)
+        for role, message in sensor_messages(bag, topics, found):
+            found[role].append(PARTS[role].read(message.message))
+        truth = read_truth(bag, topics)
+    images, samples = found[Role.IMAGE], by_stamp(found[Role.IMU] + found[Role.ACCEL])
+    first = images[0].decoded()
+    intrinsics = (found[Role.CAMERA_INFO] or [
+        parameters.intrinsics.of_image(first.shape[1], first.shape[0])])[0]
+    camera = sensor_model(intrinsics, parameters.sensor).camera
+    offset_ns = to_nanoseconds(parameters.sensor.time_offset)
+    delay_ns = to_nanoseconds(parameters.sensor.time_offset + camera.readout_time + IMAGE_DELAY)
+    gyro = [(sample.stamp_ns, sample.angular_velocity) for sample in samples
+            if sample.angular_velocity is not None]
+    rates = np.array([rate for _, rate in gyro]) - parameters.imu.gyro_bias
+    R_cam_imu = Rotation.from_quat(parameters.sensor.quat_cam_imu_xyzw)
+    return Recording(
+        Source(path.name, RECORDING),
+        trust_rows.Configured(parameters.to_mapping(), intrinsics), camera,
+        [Arrival(number, image.stamp_ns, image.stamp_ns + delay_ns)
+         for number, image in enumerate(images)],
+        samples, lambda number: images[number].decoded(), None,
+        lambda stamp1_ns, stamp2_ns: None if truth is None else truth.relative_pose(
+            stamp1_ns + offset_ns, stamp2_ns + offset_ns),
+        np.array([stamp for stamp, _ in gyro]), R_cam_imu.apply(rates))

@@ -1,4 +1,4 @@
-"""The rig's own part in the ROS graph: a private DDS domain, and a node that listens and calls."""
+"""The rig's own part of the ROS graph: a private DDS domain, and a node that subscribes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from rs_relpose_lab.live.processes import LiveRunError, Process, wait_until
 
 # Above 101 the ports of a DDS domain lie in the range of ephemeral ports.
 _DOMAIN_IDS = range(1, 101)
-# Two runs at once start at different ids, so that they rarely try for the same lock.
+# Parallel runs start at different ids, so that they rarely try for the same lock.
 _next_domain_id = itertools.count(os.getpid())
 
 
@@ -32,7 +32,7 @@ def private_domain() -> Iterator[int]:
     """A DDS domain of this process and its children alone, by environment variables.
 
     Nothing leaves this machine, and a lock keeps other runs on it from the same domain id. What
-    is set in ``os.environ`` within the block is forgotten after it.
+    is set in ``os.environ`` within the block is reset after it.
     """
     for _ in _DOMAIN_IDS:
         domain_id = _DOMAIN_IDS[next(_next_domain_id) % len(_DOMAIN_IDS)]
@@ -92,12 +92,12 @@ class Graph:
         return messages
 
     def wait_for_publisher(self, topic: str, *processes: Process) -> None:
-        """Wait until somebody publishes a topic, while processes run."""
+        """Wait until a topic has a publisher, while processes run."""
         wait_until(lambda: self.node.count_publishers(topic), f'a publisher of {topic}',
                    *processes)
 
     def publisher(self, message_type: type, topic: str, best_effort: bool = False) -> Any:
-        """A publisher that somebody has subscribed to."""
+        """A publisher with at least one subscription."""
         qos = qos_profile_sensor_data if best_effort else QoSProfile(depth=1000)
         publisher = self.node.create_publisher(message_type, topic, qos)
         wait_until(publisher.get_subscription_count, f'a subscription to {topic}')

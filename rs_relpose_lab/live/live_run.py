@@ -1,108 +1,240 @@
-"""The real node on a bag in real time: node and player as processes over Fast DDS.
+"""The real nodes on a bag in real time: nodes and player as processes over Fast DDS.
 
-For the demo and for measurements: what they say of the node is what a user's graph would give.
+For the demo and for measurements. This process only subscribes, and reads /proc once a second.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+import csv
 from dataclasses import dataclass
+import os
 from pathlib import Path
+import time
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
+from numpy.typing import NDArray
+from sensor_msgs.msg import TimeReference
 
+from rs_relpose_lab.live import processes
 from rs_relpose_lab.live.graph import diagnostic_values, Graph, private_domain
-from rs_relpose_lab.live.processes import (
-    LiveRunError,
-    node_process,
-    PATIENCE,
-    player_process,
-    Process,
-    wait_until,
-    wait_until_quiet,
-)
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.messages.incoming import stamp_ns, time_ns
-from rs_relpose_ros.messages.outgoing import PAIR_TOPICS
-from rs_relpose_ros.messages.pair_status import number
-from rs_relpose_ros.node.message_types import message_class
-from rs_relpose_ros.replay.tables import (
-    RELATIVE_POSE_COLUMNS,
-    rotation_sigmas,
-    table_writer,
-    translation_sigmas,
-)
+from rs_relpose_ros.messages.outgoing import number, PAIR_TOPICS
+from rs_relpose_ros.nodes.inputs import message_class
+from rs_relpose_ros.offline.tables import POSES, rotation_sigmas, translation_sigmas
 
 
 @dataclass(frozen=True, slots=True)
 class LiveRun:
-    """Files of a live run: poses that the node published, stamps of the frames it processed."""
+    """Files of a live run: published poses, and stamps of the processed frames."""
 
     table: Path
     stamps: Path
 
 
 def run_live(bag: Path, parameters: Path, folder: Path) -> LiveRun:
-    """Play `bag` to a relpose_node of its own; tables and logs into `folder`, which exists."""
+    """Play `bag` to a new relpose_node; tables and logs into `folder`, which exists."""
+    remap, duration = _remap_and_duration(bag)
+    run = LiveRun(folder / 'live.csv', folder / 'live_stamps.txt')
+    with private_domain(), Graph() as graph, processes.node_process(
+            parameters, remap=remap, parameters={'stamps_file': run.stamps},
+            log=folder / 'relpose_node.log') as node:
+        recorder = Recorder(graph, node)
+        with processes.player_process(bag, log=folder / 'player.log') as player:
+            processes.wait_until(player.ended, 'the end of the player', node,
+                                 timeout=2.0 * processes.PATIENCE + duration)
+        # The node is done when it has processed no frame for a second.
+        processes.wait_until_quiet(lambda: run.stamps.stat().st_size, 1.0, node)
+        node.stop()
+        if not recorder.write(run.table):
+            raise processes.LiveRunError(f'the node published no pose:\n{node.output}')
+    return run
+
+
+def _remap_and_duration(bag: Path) -> tuple[dict[str, str], float]:
+    """Names of a node's topics in a bag, and the length of the bag [s]."""
     with open_bag(bag) as opened:
         topics, duration = opened.find_topics(), opened.duration
-    run = LiveRun(folder / 'live.csv', folder / 'live_stamps.txt')
     remap = {'image': topics.image.name.removesuffix('/compressed'), 'imu': topics.imu.name}
     for name, topic in (('camera_info', topics.camera_info), ('accel', topics.accel)):
         if topic is not None:
             remap[name] = topic.name
-    with private_domain(), Graph() as graph, node_process(
-            parameters, remap=remap, parameters={'stamps_file': run.stamps},
-            log=folder / 'relpose_node.log') as node:
-        recorder = Recorder(graph, node)
-        with player_process(bag, log=folder / 'player.log') as player:
-            wait_until(player.ended, 'the end of the player', node,
-                       timeout=2.0 * PATIENCE + duration)
-        # It is done when it has taken no frame for a second.
-        wait_until_quiet(lambda: run.stamps.stat().st_size, 1.0, node)
-        node.stop()
-        if not recorder.write(run.table):
-            raise LiveRunError(f'the node published no pose:\n{node.output}')
-    return run
+    return remap, duration
 
 
 class Recorder:
-    """Collects the topics of the pairs that a node publishes.
+    """Records the pair topics of a node.
 
     `node`: must not end before it publishes.
     """
 
-    def __init__(self, graph: Graph, node: Process) -> None:
+    def __init__(self, graph: Graph, node: processes.Process) -> None:
         self._received = {name: graph.listen(message_class(msgtype), f'/relpose_node/{name}')
                           for name, msgtype in PAIR_TOPICS.items()}
         for name in PAIR_TOPICS:
             graph.wait_for_publisher(f'/relpose_node/{name}', node)
 
     def write(self, path: Path) -> int:
-        """Write the pairs that came, and return their number.
+        """Write the received pairs, and return their number.
 
-        Pairs without a pose are left out, and the cells of the number of matches and the model
-        stay empty.
+        Pairs without a pose are left out; the cells of number of matches and model are empty.
         """
         poses, references, matches, pairs = (
             {stamp_ns(msg.header): msg for msg in self._received[name]}
             for name in ('relative_pose', 'reference', 'matches', 'pairs'))
-        with table_writer(path, RELATIVE_POSE_COLUMNS) as write:
+        with path.open('w', newline='', encoding='ascii') as file:
+            writer = csv.writer(file, lineterminator='\n')
+            writer.writerow(POSES.columns)
             for stamp, pose in sorted(poses.items()):
                 reference = references.get(stamp)
                 cloud = matches.get(stamp)
-                told = diagnostic_values(pairs[stamp]) if stamp in pairs else {}
-                write([
+                values = diagnostic_values(pairs[stamp]) if stamp in pairs else {}
+                covariance = np.array(pose.pose.covariance).reshape(6, 6)
+                t, quat_xyzw = _pose_of(pose)
+                writer.writerow([
                     '' if reference is None else str(time_ns(reference.time_ref)), str(stamp),
-                    *map(number, _pose_figures(pose)), '' if cloud is None else str(cloud.width),
-                    '', '', Status.OK.value,
-                    *(told.get(name, '') for name in ('baseline_m', 'baseline_log_sigma'))])
+                    *map(number, (*t, *quat_xyzw, *translation_sigmas(covariance),
+                                  *rotation_sigmas(covariance))),
+                    '' if cloud is None else str(cloud.width), '', '', Status.OK.value,
+                    *(values.get(name, '') for name in ('baseline_m', 'baseline_log_sigma'))])
         return len(poses)
 
 
-def _pose_figures(msg: Any) -> list[float]:
+def _pose_of(msg: Any) -> tuple[list[float], list[float]]:
+    """Position and quaternion x y z w of a pose message."""
     t, q = msg.pose.pose.position, msg.pose.pose.orientation
-    covariance = np.array(msg.pose.covariance).reshape(6, 6)
-    return [t.x, t.y, t.z, q.x, q.y, q.z, q.w, *translation_sigmas(covariance),
-            *rotation_sigmas(covariance)]
+    return [t.x, t.y, t.z], [q.x, q.y, q.z, q.w]
+
+
+# -- measured: times of receipt, processor time, memory ---------------------------------------
+
+# The node is done when no pose has come for so long, and has reported its counters [s].
+_QUIET = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Play:
+    """A bag to be played to the node, and how.
+
+    `parameters`: file of the node; `transport`: its `image_transport`.
+    `remap`: the node's topics `image`, `camera_info` and `imu` by their names in the bag.
+    `player`: options of the player; `profile`: of Fast DDS, for all processes.
+    """
+
+    bag: Path
+    parameters: Path
+    remap: dict[str, str]
+    transport: str
+    player: tuple[str, ...]
+    profile: Path | None
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedPose:
+    """A relative pose, and its time of receipt on the monotonic clock."""
+
+    reference_stamp_ns: int
+    stamp_ns: int
+    received_ns: int
+    t: NDArray[np.float64]
+    quat_xyzw: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredRun:
+    """Results of `measure`.
+
+    `counters`: last values of the node's diagnostics.
+    `metrics`, `player_metrics`: of node and player, once a second while messages are played.
+    `started_ns`, `ready_ns`: times at which the node was started and had subscribed.
+    `timings`: table of the node's parameter `timings_file`; `log`: the player's.
+    """
+
+    poses: list[ReceivedPose]
+    counters: dict[str, str]
+    metrics: list[processes.ProcessMetrics]
+    player_metrics: list[processes.ProcessMetrics]
+    started_ns: int
+    ready_ns: int
+    timings: Path
+    log: Path
+
+
+class _Listener:
+    """Publications of the node, with the times of receipt."""
+
+    def __init__(self, graph: Graph) -> None:
+        self.poses: dict[int, tuple[int, PoseWithCovarianceStamped]] = {}
+        self.references = graph.listen(TimeReference, '/relpose_node/reference')
+        graph.subscribe(PoseWithCovarianceStamped, '/relpose_node/relative_pose', self._on_pose)
+        self.diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
+
+    def _on_pose(self, msg: Any) -> None:
+        self.poses[stamp_ns(msg.header)] = time.monotonic_ns(), msg
+
+    def received(self) -> list[ReceivedPose]:
+        """Poses whose reference came as well, in the order of their stamps."""
+        references = {stamp_ns(msg.header): time_ns(msg.time_ref) for msg in self.references}
+        received = []
+        for stamp in sorted(self.poses.keys() & references.keys()):
+            received_ns, msg = self.poses[stamp]
+            received.append(ReceivedPose(references[stamp], stamp, received_ns,
+                                         *map(np.array, _pose_of(msg))))
+        return received
+
+
+def measure(play: Play, folder: Path,
+            on_second: Callable[[], object] = lambda: None) -> MeasuredRun:
+    """Play a bag to a new node and measure; logs and tables into `folder`, which exists.
+
+    `on_second`: called once a second while messages are played.
+    """
+    timings, log = folder / 'frames.csv', folder / 'player.npy'
+    log.unlink(missing_ok=True)
+    with private_domain():
+        if play.profile is not None:
+            os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(play.profile)
+        else:
+            os.environ.pop('FASTRTPS_DEFAULT_PROFILES_FILE', None)
+        with Graph() as graph:
+            listener = _Listener(graph)
+            started_ns = time.monotonic_ns()
+            with processes.node_process(
+                    play.parameters, remap=play.remap, log=folder / 'relpose_node.log',
+                    parameters={'timings_file': timings,
+                                'image_transport': play.transport}) as node:
+                processes.wait_until(lambda: graph.node.count_subscribers(play.remap['imu']),
+                                     'a subscription of the node', node)
+                ready_ns = time.monotonic_ns()
+                with processes.player_process(play.bag, '--log', str(log), *play.player,
+                                              log=folder / 'player.log') as player:
+                    metrics = _watch(node, player, listener, on_second)
+                processes.wait_until_quiet(lambda: len(listener.poses), _QUIET, node)
+                node.stop()
+        return MeasuredRun(listener.received(), diagnostic_values(listener.diagnostics[-1]),
+                           metrics[0], metrics[1], started_ns, ready_ns, timings, log)
+
+
+def _watch(node: processes.Process, player: processes.Process, listener: _Listener,
+           on_second: Callable[[], object]) -> list[list[processes.ProcessMetrics]]:
+    """Metrics of node and player from the first pose to the end of the player."""
+    of_node: list[processes.ProcessMetrics] = []
+    of_player: list[processes.ProcessMetrics] = []
+    processes.wait_until(lambda: listener.poses or player.ended(), 'a pose', node)
+    while not (player.ended() or node.ended()):
+        try:
+            of_node.append(processes.process_metrics(node.pid))
+            of_player.append(processes.process_metrics(player.pid))
+        except (OSError, KeyError):   # a process has just ended
+            break
+        on_second()
+        time.sleep(1.0)
+    if not of_player:
+        raise processes.LiveRunError(f'the node published no pose:\n{node.output}')
+    processes.wait_until(player.ended, 'the end of the player')
+    return [of_node, of_player]

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import gc
 from pathlib import Path
+import struct
 import sys
 import time
 
@@ -29,53 +30,104 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import CompressedImage, Image
 
-from rs_relpose_lab.live.loop import in_turns, Outgoing, stamp_of
-from rs_relpose_ros.bags.reader import Bag, open_bag, RawMessage
-from rs_relpose_ros.bags.topics import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, IMU, Topic
+from rs_relpose_ros.bags import reader
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
-from rs_relpose_ros.node.message_types import message_class
+from rs_relpose_ros.nodes.inputs import message_class
 
-# When a message was due and when it was published, on the monotonic clock [ns].
+# -- endless play of a recording with periodic motion -----------------------------------------
+
+# CDR: 4 bytes of encapsulation (the second one is the byte order), then sec and nanosec of the
+# std_msgs/Header at the begin of the message.
+_STAMP = slice(4, 12)
+_TAIL_NS = NANOSECONDS // 20
+_IMAGES = (reader.IMAGE, reader.COMPRESSED_IMAGE)
+
+
+@dataclass(frozen=True, slots=True)
+class Outgoing:
+    """A serialised message, due so many nanoseconds after the first."""
+
+    due_ns: int
+    topic: str
+    msgtype: str
+    data: bytes
+
+
+def repeated(messages: Sequence[Outgoing], period_ns: int,
+             duration_ns: int) -> Iterator[Outgoing]:
+    """Messages of one period repeatedly, each round's stamps and dues a period later.
+
+    `messages`: in the order of `due_ns`; all begin with a header, and their stamps span one
+        period.
+    `duration_ns`: messages due later are left out. Images end 50 ms earlier, so that the IMU
+        samples which cover their last rows are still published.
+    """
+    stamps = [stamp_of(message.data) for message in messages]
+    if messages and max(stamps) - min(stamps) >= period_ns:
+        raise InputError(f'the recording is {(max(stamps) - min(stamps)) / NANOSECONDS:.3f} s '
+                         f'long, and so has no period of {period_ns / NANOSECONDS:g} s')
+    # A message due after the period's end is sent among the first messages of the next round.
+    order = sorted(range(len(messages)), key=lambda k: messages[k].due_ns % period_ns)
+    rounds = 0
+    while messages:
+        for k in order:
+            message = messages[k]
+            repeat_ns = (rounds - message.due_ns // period_ns) * period_ns
+            if repeat_ns < 0:
+                continue
+            due_ns = message.due_ns + repeat_ns
+            if due_ns >= duration_ns:
+                return
+            if message.msgtype in _IMAGES and due_ns >= duration_ns - _TAIL_NS:
+                continue
+            yield Outgoing(due_ns, message.topic, message.msgtype,
+                           _with_stamp(message.data, stamps[k] + repeat_ns))
+        rounds += 1
+
+
+def stamp_of(data: bytes) -> int:
+    """Header stamp [ns] of a serialised message."""
+    seconds, nanoseconds = struct.unpack(_time_format(data), data[_STAMP])
+    return int(seconds) * NANOSECONDS + int(nanoseconds)
+
+
+def _with_stamp(data: bytes, stamp_ns: int) -> bytes:
+    # One copy: publishers take bytes only.
+    stamp = struct.pack(_time_format(data), *divmod(stamp_ns, NANOSECONDS))
+    return b''.join((data[:_STAMP.start], stamp, memoryview(data)[_STAMP.stop:]))
+
+
+def _time_format(data: bytes) -> str:
+    return '<iI' if data[1] & 1 else '>iI'
+
+
+# -- the player -------------------------------------------------------------------------------
+
+# Times at which a message was due and was published, on the monotonic clock [ns].
 LOG_DTYPE = np.dtype([('is_image', '?'), ('stamp_ns', '<i8'), ('due_ns', '<i8'),
                       ('published_ns', '<i8')])
 
 # Types that the node subscribes to: the player waits for these subscriptions.
-_SENSOR_TYPES = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, IMU)
+_SENSOR_TYPES = (*_IMAGES, reader.CAMERA_INFO, reader.IMU)
 _DEPTH = 1000
-# From the match on the publisher's side to that on the subscriber's, which misses what is sent in
-# between [s].
+# Between the match on the publisher's side and that on the subscriber's, messages are lost [s].
 _SETTLE = 0.5
 # Best-effort messages are not acknowledged: time for the subscriber to read the last ones [s].
 _LINGER = 0.2
 
 
-@dataclass(frozen=True, slots=True)
-class PlayerOptions:
-    """How a bag is played: the options of `parse`, which describes them."""
-
-    bag: Path
-    best_effort: bool
-    decode: str
-    topics: Sequence[str]
-    wait_for_subscribers: float
-    subscriptions: int
-    loop: float
-    duration: float
-    log: Path | None
-
-
-def play(node: Node, options: PlayerOptions) -> int:
-    """Publish the bag; the number of messages published.
+def play(node: Node, options: argparse.Namespace) -> int:
+    """Publish the bag with the options of `parse`; the number of messages published.
 
     Raises InputError, MissingInputError: no bag, no such topic, or no subscriber in time.
     """
-    with open_bag(options.bag) as bag:
+    with reader.open_bag(options.bag) as bag:
         topics = _chosen(bag, options)
         publishers = {topic.name: _publisher(node, topic, options) for topic in topics}
         messages = _outgoing(bag, topics, options)
         if options.loop > 0.0:
-            messages = in_turns(list(messages), to_nanoseconds(options.loop),
+            messages = repeated(list(messages), to_nanoseconds(options.loop),
                                 to_nanoseconds(options.duration))
             # Garbage collection over so many objects would delay publishing.
             gc.collect()
@@ -87,7 +139,7 @@ def play(node: Node, options: PlayerOptions) -> int:
         return _publish(messages, publishers, options)
 
 
-def _chosen(bag: Bag, options: PlayerOptions) -> list[Topic]:
+def _chosen(bag: reader.Bag, options: argparse.Namespace) -> list[reader.Topic]:
     there = {topic.name for topic in bag.topics}
     for name in options.topics:
         if name not in there:
@@ -96,14 +148,14 @@ def _chosen(bag: Bag, options: PlayerOptions) -> list[Topic]:
     return [topic for topic in bag.topics if not options.topics or topic.name in options.topics]
 
 
-def _publisher(node: Node, topic: Topic, options: PlayerOptions) -> Publisher:
+def _publisher(node: Node, topic: reader.Topic, options: argparse.Namespace) -> Publisher:
     name, msgtype = topic.name, topic.msgtype
-    if options.decode and msgtype == COMPRESSED_IMAGE:
-        name, msgtype = name.removesuffix('/compressed'), IMAGE
+    if options.decode and msgtype == reader.COMPRESSED_IMAGE:
+        name, msgtype = name.removesuffix('/compressed'), reader.IMAGE
     reliability = (ReliabilityPolicy.BEST_EFFORT if options.best_effort
                    else ReliabilityPolicy.RELIABLE)
     return node.create_publisher(message_class(msgtype), name, QoSProfile(
-        history=HistoryPolicy.KEEP_LAST, depth=_DEPTH if msgtype == IMU else 10,
+        history=HistoryPolicy.KEEP_LAST, depth=_DEPTH if msgtype == reader.IMU else 10,
         reliability=reliability))
 
 
@@ -117,27 +169,23 @@ def _wait_for_subscribers(publishers: Sequence[Publisher], least: int, seconds: 
             return
         time.sleep(0.02)
     if rclpy.ok():
-        lonely = [topic for topic, count in counts.items() if not count]
+        without = [topic for topic, count in counts.items() if not count]
         raise MissingInputError((
-            f'nobody subscribed to {", ".join(lonely)}' if lonely else
+            f'nobody subscribed to {", ".join(without)}' if without else
             f'{sum(counts.values())} of {least} subscriptions came') + f' within {seconds:g} s: '
             'start the node first, and remap its topics to these names')
 
 
-def _outgoing(bag: Bag, topics: Sequence[Topic], options: PlayerOptions) -> Iterator[Outgoing]:
+def _outgoing(bag: reader.Bag, topics: Sequence[reader.Topic],
+              options: argparse.Namespace) -> Iterator[Outgoing]:
     first_ns: int | None = None
     for raw in bag.raw_messages(topics):
-        if first_ns is None:
-            first_ns = raw.bag_time_ns
-        yield Outgoing(raw.bag_time_ns - first_ns, raw.topic, raw.msgtype,
-                       _serialised(raw, options))
-
-
-def _serialised(raw: RawMessage, options: PlayerOptions) -> bytes:
-    if options.decode and raw.msgtype == COMPRESSED_IMAGE:
-        compressed = deserialize_message(raw.data, message_class(COMPRESSED_IMAGE))
-        return bytes(serialize_message(_decoded(compressed, options.decode)))
-    return bytes(raw.data)
+        first_ns = raw.bag_time_ns if first_ns is None else first_ns
+        data = bytes(raw.data)
+        if options.decode and raw.msgtype == reader.COMPRESSED_IMAGE:
+            compressed = deserialize_message(data, message_class(reader.COMPRESSED_IMAGE))
+            data = bytes(serialize_message(_decoded(compressed, options.decode)))
+        yield Outgoing(raw.bag_time_ns - first_ns, raw.topic, raw.msgtype, data)
 
 
 def _decoded(compressed: CompressedImage, encoding: str) -> Image:
@@ -154,7 +202,7 @@ def _decoded(compressed: CompressedImage, encoding: str) -> Image:
 
 
 def _publish(messages: Iterator[Outgoing], publishers: dict[str, Publisher],
-             options: PlayerOptions) -> int:
+             options: argparse.Namespace) -> int:
     count = start_ns = 0
     log: list[tuple[bool, int, int, int]] = []
     for message in messages:
@@ -169,8 +217,8 @@ def _publish(messages: Iterator[Outgoing], publishers: dict[str, Publisher],
         now_ns = time.monotonic_ns()
         publishers[message.topic].publish(message.data)
         count += 1
-        if options.log is not None and message.msgtype in (IMAGE, COMPRESSED_IMAGE, IMU):
-            log.append((message.msgtype != IMU, stamp_of(message.data), due_ns, now_ns))
+        if options.log is not None and message.msgtype in (*_IMAGES, reader.IMU):
+            log.append((message.msgtype != reader.IMU, stamp_of(message.data), due_ns, now_ns))
     if options.log is not None:
         np.save(options.log, np.array(log, dtype=LOG_DTYPE))
     if rclpy.ok():
@@ -180,7 +228,7 @@ def _publish(messages: Iterator[Outgoing], publishers: dict[str, Publisher],
     return count
 
 
-def parse(arguments: Sequence[str]) -> PlayerOptions:
+def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """Options of a command line."""
     parser = argparse.ArgumentParser(
         prog='player', description='Play a bag into the ROS graph at bag time.')
@@ -199,16 +247,16 @@ def parse(arguments: Sequence[str]) -> PlayerOptions:
                         help='wait for so many to all sensor topics together, of several nodes')
     parser.add_argument('--loop', type=float, default=0.0, metavar='SECONDS',
                         help='repeat a recording whose motion has this period, without a seam: '
-                             'stamps go on from turn to turn; everything is decoded ahead')
+                             'stamps continue from round to round; everything is decoded ahead')
     parser.add_argument('--duration', type=float, default=60.0, metavar='SECONDS',
                         help='with --loop: end after so many seconds (default: 60)')
     parser.add_argument('--log', type=Path, metavar='FILE',
-                        help='with --loop: write when each image and IMU message was due and '
-                             'published (NPY, LOG_DTYPE)')
+                        help='with --loop: write the times at which each image and IMU message '
+                             'was due and published (NPY, LOG_DTYPE)')
     given = parser.parse_args(arguments)
     if given.loop < 0.0 or given.duration <= 0.0:
         parser.error('--loop and --duration must be positive')
-    return PlayerOptions(**vars(given))
+    return given
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

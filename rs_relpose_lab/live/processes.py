@@ -1,4 +1,4 @@
-"""Processes of a live run, the node and a player: start, log, wait, signals, end, cost."""
+"""Processes of a live run, the nodes and a player: start, log, wait, signals, end, load."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ class LiveRunError(RsRelposeError):
 class Process:
     """A Python process with a log. Leaving the ``with`` block kills it if it still runs.
 
-    `*arguments`: of the interpreter: a file, or ``-m`` and a module, and what that is given.
+    `*arguments`: of the interpreter: a file, or ``-m`` and a module, and its arguments.
     `log`: file of standard output and error; a temporary one by default.
     """
 
     def __init__(self, *arguments: str, log: Path | None = None) -> None:
         self._name = arguments[arguments[0] == '-m']
-        # A file, as a pipe that nobody reads would block the process.
+        # A file, as a pipe without reader would block the process.
         self._log: BinaryIO = log.open('w+b') if log else tempfile.TemporaryFile()  # noqa: SIM115
         self._process = subprocess.Popen(
             [sys.executable, *arguments], stdout=self._log, stderr=subprocess.STDOUT,
@@ -111,18 +111,14 @@ class Process:
 
 def node_process(parameter_file: Path | None = None, *, remap: Mapping[str, str] | None = None,
                  parameters: Mapping[str, object] | None = None, log: Path | None = None,
-                 folder: str = 'node') -> Process:
-    """Start `relpose_node`; `remap` takes topics, ``__ns`` and ``__node``.
-
-    `folder`: of the package, whose `start` is to be run instead: ``'global_shutter'`` or
-    ``'odometry'``.
-    """
+                 node: str = 'relpose_node') -> Process:
+    """Start a node; `remap` takes topics, ``__ns`` and ``__node``."""
     words = [] if parameter_file is None else ['--params-file', str(parameter_file)]
     for name, value in (parameters or {}).items():
         words += ['-p', f'{name}:={value}']
     for source, target in (remap or {}).items():
         words += ['-r', f'{source}:={target}']
-    return Process('-m', f'rs_relpose_ros.{folder}.start', '--ros-args', *words, log=log)
+    return Process('-m', 'rs_relpose_ros.nodes.start', node, '--ros-args', *words, log=log)
 
 
 def player_process(bag: Path, *options: str, log: Path | None = None) -> Process:
@@ -133,7 +129,7 @@ def player_process(bag: Path, *options: str, log: Path | None = None) -> Process
 
 def wait_until(condition: Callable[[], Value], what: str, *processes: Process,
                timeout: float = PATIENCE) -> Value:
-    """Ask until the answer is true, and return it; LiveRunError where a process fails meanwhile.
+    """Poll until the value is true, and return it; LiveRunError where a process fails meanwhile.
 
     `what`: for the error message.
     """
@@ -158,8 +154,8 @@ def wait_until_quiet(count: Callable[[], int], seconds: float, process: Process)
 
 
 @dataclass(frozen=True, slots=True)
-class ProcessFigures:
-    """Processor time and memory of a process at an instant, as Linux tells them.
+class ProcessMetrics:
+    """Processor time and memory of a process at a time, from /proc.
 
     `cpu`, `cpu_main`: processor time since its start [s]: of all threads, and of the first one.
     `resident`, `private` [MB]: without what is shared (the transport's segments) in the latter.
@@ -172,15 +168,15 @@ class ProcessFigures:
     private: float
 
 
-def process_figures(pid: int) -> ProcessFigures:
-    """Figures of a running process."""
+def process_metrics(pid: int) -> ProcessMetrics:
+    """Metrics of a running process."""
     folder = Path('/proc') / str(pid)
     memory = dict(line.split(':', 1) for line in (folder / 'status').read_text().splitlines())
 
     def megabytes(name: str) -> float:
         return int(memory[name].split()[0]) / 1024.0
 
-    return ProcessFigures(time.monotonic_ns(), _cpu(folder / 'stat'),
+    return ProcessMetrics(time.monotonic_ns(), _cpu(folder / 'stat'),
                           _cpu(folder / 'task' / str(pid) / 'stat'), megabytes('VmRSS'),
                           megabytes('RssAnon'))
 

@@ -16,23 +16,15 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_lab.simulation.config import SimulationConfig
 from rs_relpose_lab.simulation.simulation import simulate, Simulation
 from rs_relpose_lab.simulation.trajectory import Trajectory
-from rs_relpose_ros.bags.layout import (
-    CAMERA_FRAME,
-    CAMERA_INFO_TOPIC,
-    COMPRESSED_TOPIC,
-    GROUND_TRUTH_TOPIC,
-    IMAGE_DELAY,
-    IMU_DELAY,
-    IMU_FRAME,
-    IMU_TOPIC,
-    RAW_TOPIC,
-    WORLD_FRAME,
-)
+from rs_relpose_ros.bags import reader
 from rs_relpose_ros.bags.writer import BagWriter
-from rs_relpose_ros.config import parameter_file
-from rs_relpose_ros.config.parameter_file import SourcedValue
+from rs_relpose_ros.config import files as parameter_file
+from rs_relpose_ros.config.files import SourcedValue
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.timing import to_nanoseconds
+from rs_relpose_ros.messages import outgoing
+from rs_relpose_ros.tracking.images import Pixels
 
 # Bag time [ns], topic, type, message.
 Entry = tuple[int, str, str, Any]
@@ -50,13 +42,16 @@ def write_bag(simulation: Simulation, path: Path | str, *, jpeg_quality: int = 8
 
     def encode(stamp_ns: int, pixels: NDArray[np.uint8]) -> tuple[str, str, Any]:
         if raw:
-            return RAW_TOPIC, 'sensor_msgs/msg/Image', bag.image(stamp_ns, CAMERA_FRAME, pixels)
-        return (COMPRESSED_TOPIC, 'sensor_msgs/msg/CompressedImage',
-                bag.compressed_image(stamp_ns, CAMERA_FRAME, jpeg(pixels, jpeg_quality)))
+            return reader.RAW_TOPIC, 'sensor_msgs/msg/Image', outgoing.image_message(
+                stamp_ns, reader.CAMERA_FRAME, Pixels(pixels, 'mono8'), bag.type)
+        return (reader.COMPRESSED_TOPIC, 'sensor_msgs/msg/CompressedImage',
+                outgoing.encoded_image_message(stamp_ns, reader.CAMERA_FRAME,
+                                               jpeg(pixels, jpeg_quality), bag.type))
 
     with BagWriter(path) as bag:
         write_in_order(bag, image_entries(simulation, bag, encode, on_frame),
-                       imu_entries(simulation, bag, IMU_TOPIC), _truth_entries(simulation, bag))
+                       imu_entries(simulation, bag, reader.IMU_TOPIC),
+                       _truth_entries(simulation, bag))
 
 
 def write_in_order(bag: BagWriter, *series: Iterator[Entry]) -> None:
@@ -67,7 +62,7 @@ def write_in_order(bag: BagWriter, *series: Iterator[Entry]) -> None:
 
 def render_once(config: SimulationConfig, folder: Path,
                 trajectory: Trajectory | None = None) -> tuple[Path, Path]:
-    """A bag and its parameter file in `folder`, rendered unless they are there."""
+    """A bag and its parameter file in `folder`, rendered unless they exist."""
     def render(bag: Path, parameters: Path) -> None:
         simulation = simulate(config, trajectory=trajectory)
         write_bag(simulation, bag)
@@ -77,10 +72,10 @@ def render_once(config: SimulationConfig, folder: Path,
 
 def made_once(folder: Path, name: str,
               make: Callable[[Path, Path], object]) -> tuple[Path, Path]:
-    """A bag and its parameter file; `make` writes the file last, unless both are there."""
+    """A bag and its parameter file; `make` writes the file last, unless both exist."""
     bag, parameters = folder / name, folder / f'{name}.yaml'
     if not (bag.exists() and parameters.exists()):
-        # What a run that was stopped has left.
+        # Remains of an interrupted run.
         shutil.rmtree(bag, ignore_errors=True)
         parameters.unlink(missing_ok=True)
         folder.mkdir(parents=True, exist_ok=True)
@@ -89,21 +84,30 @@ def made_once(folder: Path, name: str,
 
 
 def write_parameters(simulation: Simulation, path: Path, *, raw: bool = False) -> None:
-    """Write the parameters of the node that the recording needs; `raw` as in `write_bag`."""
+    """Write the parameter file of the node for the recording; `raw` as in `write_bag`."""
     values = {'image_transport': 'raw' if raw else 'compressed', **right_parameters(simulation)}
     parameter_file.write_parameters(
         path, 'Parameters of relpose_node for the simulated bag of the same name.',
         [SourcedValue(name, value, '') for name, value in values.items()])
 
 
+def intrinsics_of(camera: RollingShutterCamera) -> Intrinsics:
+    """Intrinsics of a camera as in the CameraInfo of its whole image."""
+    return Intrinsics(
+        width=camera.width, height=camera.height, fx=camera.fx, fy=camera.fy, cx=camera.cx,
+        cy=camera.cy, distortion_model=camera.distortion_model, distortion=camera.distortion,
+        image_width=camera.width, image_height=camera.height)
+
+
 def right_parameters(simulation: Simulation) -> dict[str, Any]:
-    """What a calibrated node is told of the recording's camera and IMU, by parameter name."""
+    """Parameters of a calibrated node for the recording's camera and IMU, by name."""
     config = simulation.config
     return {
         'readout_time': config.readout_time,
         'readout_direction': config.readout_direction,
         'stamp_row': config.stamp_row,
         'stamp_exposure': 'middle',
+        'exposure_time': config.exposure_time,
         'time_offset': config.time_offset,
         'quat_cam_imu_xyzw': config.quat_cam_imu_xyzw,
         'imu_position': config.lever_arm,
@@ -123,12 +127,13 @@ def image_entries(simulation: Simulation, bag: BagWriter,
                   encode: Callable[[int, NDArray[np.uint8]], tuple[str, str, Any]],
                   on_frame: Callable[[], object]) -> Iterator[Entry]:
     """Images and their CameraInfo; `encode`: topic, type and message of a stamp and pixels."""
-    delay_ns = to_nanoseconds(simulation.config.readout_time + IMAGE_DELAY)
+    delay_ns = to_nanoseconds(simulation.config.readout_time + reader.IMAGE_DELAY)
     for index in range(simulation.config.frame_count):
         stamp_ns = simulation.stamp_ns(index)
         topic, msgtype, message = encode(stamp_ns, simulation.image(index))
-        info = bag.camera_info(stamp_ns, CAMERA_FRAME, simulation.camera)
-        yield stamp_ns + delay_ns, CAMERA_INFO_TOPIC, 'sensor_msgs/msg/CameraInfo', info
+        info = outgoing.camera_info_message(stamp_ns, reader.CAMERA_FRAME, simulation.camera,
+                                            None, bag.type)
+        yield stamp_ns + delay_ns, reader.CAMERA_INFO_TOPIC, 'sensor_msgs/msg/CameraInfo', info
         yield stamp_ns + delay_ns, topic, msgtype, message
         on_frame()
 
@@ -136,13 +141,14 @@ def image_entries(simulation: Simulation, bag: BagWriter,
 def imu_entries(simulation: Simulation, bag: BagWriter, topic: str) -> Iterator[Entry]:
     """IMU samples with their noise's variances."""
     config, imu = simulation.config, simulation.imu
-    gyro_variance = config.gyro_noise_density**2 * config.imu_rate
-    accel_variance = config.accel_noise_density**2 * config.imu_rate
+    gyro_covariance, accel_covariance = (density**2 * config.imu_rate * np.eye(3) for density in (
+        config.gyro_noise_density, config.accel_noise_density))
     for stamp_ns, rate, force in zip(imu.stamps_ns.tolist(), imu.angular_velocities,
                                      imu.linear_accelerations, strict=True):
-        yield (stamp_ns + to_nanoseconds(IMU_DELAY), topic, 'sensor_msgs/msg/Imu',
-               bag.imu(stamp_ns, IMU_FRAME, rate, force, angular_velocity_variance=gyro_variance,
-                       linear_acceleration_variance=accel_variance))
+        yield (stamp_ns + to_nanoseconds(reader.IMU_DELAY), topic, 'sensor_msgs/msg/Imu',
+               outgoing.imu_message(stamp_ns, reader.IMU_FRAME, rate, force, bag.type,
+                                    angular_velocity_covariance=gyro_covariance,
+                                    linear_acceleration_covariance=accel_covariance))
 
 
 def _truth_entries(simulation: Simulation, bag: BagWriter) -> Iterator[Entry]:
@@ -151,6 +157,7 @@ def _truth_entries(simulation: Simulation, bag: BagWriter) -> Iterator[Entry]:
     quaternions = np.atleast_2d(Rotation.from_matrix(states.R_world_cam).as_quat())
     for stamp_ns, position, quat_xyzw in zip(stamps_ns.tolist(), states.position, quaternions,
                                              strict=True):
-        yield (stamp_ns + to_nanoseconds(IMU_DELAY), GROUND_TRUTH_TOPIC,
+        yield (stamp_ns + to_nanoseconds(reader.IMU_DELAY), reader.GROUND_TRUTH_TOPIC,
                'geometry_msgs/msg/PoseStamped',
-               bag.pose(stamp_ns, WORLD_FRAME, position, quat_xyzw))
+               outgoing.pose_stamped_message(stamp_ns, reader.WORLD_FRAME, quat_xyzw, position,
+                                             bag.type))

@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_lab.simulation.hand_held import Plan
+from rs_relpose_lab.simulation.motions import Plan
 from rs_relpose_lab.simulation.scene import SCENES
-from rs_relpose_ros.config.declarations import check_settings, setting
-from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.config.declare import setting, Settings
+from rs_relpose_ros.geometry import validate
 from rs_relpose_ros.geometry.camera import READOUT_DIRECTIONS, REFERENCE_ROWS, RollingShutterCamera
 
 
 @dataclass(frozen=True, slots=True)
-class SimulationConfig:
+class SimulationConfig(Settings):
     """A recording: camera, IMU, motion and scene.
 
     Clocks: the IMU's is the world's; ground truth is stamped on it. An image's header stamp is on
@@ -38,6 +38,8 @@ class SimulationConfig:
         0.03, 'image height times line delay; 0 for a global shutter', 's', low=0.0, high=0.2)
     readout_direction: str = setting(
         'down', 'whether row 0 is read first (down) or last (up)', choices=READOUT_DIRECTIONS)
+    exposure_time: float = setting(
+        0.0, 'exposure of a row, over which it is averaged (motion blur)', 's', low=0.0, high=0.2)
     stamp_row: str = setting('first', 'row that the image stamp marks', choices=REFERENCE_ROWS)
     time_offset: float = setting(
         0.0, 'IMU clock minus camera clock: t_imu = stamp + time_offset', 's', low=-10.0,
@@ -76,16 +78,12 @@ class SimulationConfig:
         (0.03, 0.01, -0.02), 'position of the IMU in the camera frame', 'm', low=-10.0, high=10.0,
         length=3)
     start_ns: int = setting(
-        1_700_000_000_000_000_000, 'instant of the first frame on the IMU clock', 'ns', low=0,
+        1_700_000_000_000_000_000, 'time of the first frame on the IMU clock', 'ns', low=0,
         high=2**62)
 
     def __post_init__(self) -> None:
-        check_settings(self)
-        norm = float(np.linalg.norm(self.quat_cam_imu_xyzw))
-        if not abs(norm - 1.0) < 1e-2:
-            raise InputError(
-                f'quat_cam_imu_xyzw must have length 1, got {list(self.quat_cam_imu_xyzw)} of '
-                f'length {norm:.4f}')
+        Settings.__post_init__(self)
+        validate.unit_length('quat_cam_imu_xyzw', self.quat_cam_imu_xyzw, 1e-2)
         if self.plan:
             Plan.parse(self.plan)
 

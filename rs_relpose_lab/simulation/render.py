@@ -1,4 +1,4 @@
-"""Rolling-shutter images of a scene: every row is seen from where the camera is at its instant."""
+"""Rolling-shutter images of a scene: every row at the camera's pose of its own time."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
-from rs_relpose_lab.simulation.rows import see, View
+from rs_relpose_lab.simulation.rows import observe, View
 from rs_relpose_lab.simulation.scene import Scene
 from rs_relpose_lab.simulation.trajectory import Trajectory
 from rs_relpose_ros.errors import InputError
@@ -25,6 +26,8 @@ _TAP_STRETCH = 1.6
 _MAX_TAPS = 6
 # Slightly sharper than the textbook choice of mip level, whose filter is wider than a pixel.
 _LEVEL_BIAS = -0.35
+# An exposure is sampled at times between which the nearest surface moves by at most this [px].
+_EXPOSURE_STEP = 1.0
 _NOTHING = 128.0
 
 # Nothing here lets the compiler fuse operations: the same image on every processor.
@@ -36,18 +39,20 @@ _inline = numba.njit(cache=True, nogil=True, error_model='numpy', forceinline=Tr
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Renderer:
-    """Renders a scene as a camera on a trajectory sees it.
+    """Renders a scene for a camera on a trajectory.
 
-    Pixel centres are at integer coordinates; row v is seen at the time of the reference row plus
-    ``camera.row_times(v)``.
+    Pixel centres are at integer coordinates; the exposure of row v has its middle at the time of
+    the reference row plus ``camera.row_times(v)``.
 
     `edge_samples`: pixels on the outline of a surface are the mean of this many samples squared.
+    `exposure_time` [s]: a row is the mean of its gray values over this time.
     """
 
     scene: Scene
     camera: RollingShutterCamera
     trajectory: Trajectory
     edge_samples: int = 2
+    exposure_time: float = 0.0
     _rays: Array = field(init=False, repr=False)
     _tile_angles: Array = field(init=False, repr=False)
 
@@ -64,8 +69,32 @@ class Renderer:
     def render(self, reference_time: float) -> NDArray[np.float32]:
         """Noise-free image (H, W) of gray values 0 to 255.
 
-        `reference_time`: time of the reference row on the trajectory [s].
+        `reference_time`: middle of the reference row's exposure, time on the trajectory [s].
         """
+        count = self._exposure_samples(reference_time)
+        within = self.exposure_time * ((np.arange(count) + 0.5) / count - 0.5)
+        image = self._at_once(reference_time + within[0])
+        for later in within[1:]:
+            image += self._at_once(reference_time + later)
+        image /= count
+        return image
+
+    def _exposure_samples(self, reference_time: float) -> int:
+        """Number of times at which the exposure of a row is sampled."""
+        if not self.exposure_time:
+            return 1
+        (start, end), (R_start, R_end) = self.trajectory.poses(
+            reference_time + self.exposure_time * np.array([-0.5, 0.5]))
+        corner = (self.camera.width - 1, self.camera.height - 1)
+        world, _ = self.locate(reference_time, np.stack(np.meshgrid(
+            *(np.linspace(0.0, last, 9) for last in corner)), axis=-1))
+        nearest = np.nanmin(np.linalg.norm(world - start, axis=1), initial=np.inf)
+        angle = Rotation.from_matrix(R_start.T @ R_end).magnitude()
+        motion = self.camera.fx * (angle + np.linalg.norm(end - start) / nearest)
+        return max(1, math.ceil(motion / _EXPOSURE_STEP))
+
+    def _at_once(self, reference_time: float) -> NDArray[np.float32]:
+        """Image of rows that are exposed for no time."""
         rows = np.arange(self.camera.height)
         positions, rotations = self.trajectory.poses(reference_time + self.camera.row_times(rows))
         exposure = _Exposure(self._rays, self._tile_angles, positions, rotations,
@@ -80,9 +109,9 @@ class Renderer:
 
     def locate(self, reference_time: float,
                points: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
-        """What pixels show: world points (N, 3) [m] and indices of surfaces (N,).
+        """World points (N, 3) [m] and indices of surfaces (N,) at pixels.
 
-        `points` (N, 2) may lie between pixels. Where nothing is hit: NaN and -1.
+        `points` (N, 2) may lie between pixels. Without a hit: NaN and -1.
         """
         points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
         times = reference_time + self.camera.row_times(points[:, 1])
@@ -94,7 +123,7 @@ class Renderer:
         return positions + distances[:, None] * rays, hits
 
     def project(self, reference_time: float, world_points: ArrayLike) -> Array:
-        """Pixels (N, 2) at which world points (N, 3) are seen, hidden or not.
+        """Pixels (N, 2) of world points (N, 3), hidden or not.
 
         NaN for a point outside of the image, to the outer border of its pixels.
         """
@@ -103,11 +132,11 @@ class Renderer:
             return np.asarray(np.einsum('nji,nj->ni', rotations, world - positions))
 
         points = np.asarray(world_points, dtype=np.float64).reshape(-1, 3)
-        return see(points, motion, view_of(self.camera), margin=0.5)
+        return observe(points, motion, view_of(self.camera), margin=0.5)
 
 
 def view_of(camera: RollingShutterCamera) -> View:
-    """What the camera sees, and when, for `rows.see`."""
+    """Projection and row times of the camera, for `rows.observe`."""
     line_delay = float(camera.row_times(1.0) - camera.row_times(0.0))
     return View(camera.project, camera.unproject, camera.width, camera.height, line_delay,
                 camera.reference_row_index)
@@ -129,7 +158,7 @@ def _tile_angles(rays: Array) -> Array:
 
 
 class _Exposure(NamedTuple):
-    """When and where each pixel is exposed.
+    """Times and poses of the pixels.
 
     `rays` (H, W, 3) in the camera frame, `tile_angles` (H, tiles) [rad] as `_tile_angles` has
     them, `positions` (H, 3) and `rotations` (H, 3, 3) of the camera at each row, `pixel_angle`
@@ -143,7 +172,7 @@ class _Exposure(NamedTuple):
     pixel_angle: float
 
 
-# Columns of a face, a surface as seen from one row's position: unit normal, height of the camera
+# Columns of a face, a surface from one row's position: unit normal, height of the camera
 # above its plane; axes of its texture and the camera's own place along them; size; the surface's
 # index; direction and half angle of a cone around it.
 _NORMAL, _HEIGHT, _ACROSS, _A, _DOWN, _B, _SIZE, _INDEX, _TOWARDS, _ANGLE = (
@@ -158,7 +187,7 @@ def _dot(x, y, z, faces, i, column):  # type: ignore[no-untyped-def]
 
 
 @_inline
-def _turned(rotation, x, y, z):  # type: ignore[no-untyped-def]
+def _rotated(rotation, x, y, z):  # type: ignore[no-untyped-def]
     return (rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,
             rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z,
             rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z)
@@ -166,7 +195,7 @@ def _turned(rotation, x, y, z):  # type: ignore[no-untyped-def]
 
 @_jit
 def _find_faces(position, scene, faces):  # type: ignore[no-untyped-def]
-    """Surfaces that turn their face to `position`; fills `faces` and returns their number."""
+    """Surfaces that face `position`; fills `faces` and returns their number."""
     corners, across, down, sizes = scene.corners, scene.across, scene.down, scene.sizes
     count = 0
     for s in range(len(corners)):
@@ -204,7 +233,7 @@ def _find_faces(position, scene, faces):  # type: ignore[no-untyped-def]
 @_jit
 def _shortlist(rotation, ray, half_angle, faces, face_count, chosen):  # type: ignore[no-untyped-def]
     """Faces that a cone around a ray may hit; fills `chosen` and returns their number."""
-    x, y, z = _turned(rotation, ray[0], ray[1], ray[2])
+    x, y, z = _rotated(rotation, ray[0], ray[1], ray[2])
     count = 0
     for i in range(face_count):
         limit = half_angle + faces[i, _ANGLE]
@@ -251,7 +280,7 @@ def _bilinear(pixels, offset, height, width, x, y):  # type: ignore[no-untyped-d
     i = min(int(y), height - 2)
     fx = x - j
     fy = y - i
-    # Unsigned, or every access asks whether the index counts from the end.
+    # Unsigned, or every access checks whether the index counts from the end.
     upper_left = np.uintp(offset + i * width + j)
     lower_left = np.uintp(offset + i * width + j + width)
     one = np.uintp(1)
@@ -317,7 +346,7 @@ def _render(exposure, scene, image, hits):  # type: ignore[no-untyped-def]
             count = _shortlist(rotation, rays[v, start + (end - start) // 2], tile_angles[v, tile],
                                faces, face_count, chosen)
             for u in range(start, end):
-                x, y, z = _turned(rotation, rays[v, u, 0], rays[v, u, 1], rays[v, u, 2])
+                x, y, z = _rotated(rotation, rays[v, u, 0], rays[v, u, 1], rays[v, u, 2])
                 hit, distance, a, b = _trace(x, y, z, faces, chosen, count)
                 if hit < 0:
                     hits[v, u] = -1
@@ -330,7 +359,7 @@ def _render(exposure, scene, image, hits):  # type: ignore[no-untyped-def]
 
 @_jit
 def _smooth_edges(exposure, scene, samples, image, hits):  # type: ignore[no-untyped-def]
-    """Replace pixels on outlines by the mean of samples within them, at their row's instant."""
+    """Replace pixels on outlines by the mean of samples within them, at their row's time."""
     rays, tile_angles, positions, rotations, pixel_angle = exposure
     height, width = image.shape
     faces = np.empty((len(scene.corners) + 1, _FACE_COLUMNS))
@@ -367,7 +396,7 @@ def _smooth_edges(exposure, scene, samples, image, hits):  # type: ignore[no-unt
                     for k in range(3):
                         ray[k] = (rays[v, u, k] + du * (rays[v, right, k] - rays[v, left, k])
                                   + dv * (rays[below, u, k] - rays[above, u, k]))
-                    x, y, z = _turned(rotation, ray[0], ray[1], ray[2])
+                    x, y, z = _rotated(rotation, ray[0], ray[1], ray[2])
                     hit, distance, a, b = _trace(x, y, z, faces, chosen, count)
                     if hit < 0:
                         total += _NOTHING

@@ -1,4 +1,4 @@
-"""Where a moving rolling-shutter camera sees points: each by the row that really sees it.
+"""Pixels of points in a moving rolling-shutter camera: each at the time of its own row.
 
 It uses nothing of the estimator's geometry, so that an error in one cannot hide behind the same
 error in the other.
@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
-# Points (N, 3) of the world [m] and instants (N,) [s] -> points (N, 3) in the camera frame as it
-# is at each one's instant. Time 0 is that of the reference row.
+# Points (N, 3) of the world [m] and times (N,) [s] -> points (N, 3) in the camera frame at each
+# one's time. Time 0 is that of the reference row.
 Motion = Callable[[Array, Array], Array]
 
 _SETTLED_ROWS = 1e-9
@@ -26,9 +26,9 @@ _LEAST_DEPTH = 0.1  # [m]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What a camera sees while it stands still, and when it reads its rows.
+    """Projection of a camera at rest, and its row times.
 
-    `project`: points (N, 3) in the camera frame to pixels (N, 2); NaN where the lens cannot see.
+    `project`: points (N, 3) in the camera frame to pixels (N, 2); NaN outside of the lens.
     `unproject`: pixels (N, 2) to directions (N, 3) in the camera frame, of any length.
     `line_delay`: time from one row to the row below [s]; `reference_row`: that is read at time 0.
     """
@@ -52,13 +52,14 @@ def uniform_motion(attitude: Rotation, position: Array, rate: Array, velocity: A
     return to_camera
 
 
-def see(world: Array, motion: Motion, view: View, margin: float = 0.0) -> Array:
-    """Pixels of points seen by a camera that moves while it reads its rows.
+def observe(world: Array, motion: Motion, view: View, margin: float = 0.0) -> Array:
+    """Pixels of points in a camera that moves while it reads its rows.
 
-    A point is seen in row v if it is projected into row v from where the camera is when that row
-    is read: a root of ``projected_row(v) - v``, found by secants.
+    A point appears in row v if it is projected into row v from the camera's pose at the time of
+    that row: a root of ``projected_row(v) - v``, found by secants.
 
-    `margin`: how far beyond the centres of the outermost pixels a point still counts as seen [px].
+    `margin`: distance beyond the centres of the outermost pixels at which a point still counts as
+        inside [px].
     Returns pixels; NaN for a point outside of the image or nearer than 0.1 m, and for one that
         crosses the rows as fast as they are read, whose row is not unique.
     """
@@ -67,7 +68,7 @@ def see(world: Array, motion: Motion, view: View, margin: float = 0.0) -> Array:
         with np.errstate(divide='ignore', invalid='ignore'):
             return np.where(local[:, 2:] > _LEAST_DEPTH, view.project(local), np.nan)
 
-    seen = np.full((len(world), 2), np.nan)
+    observed = np.full((len(world), 2), np.nan)
     left = np.arange(len(world))
     before = np.full(len(world), 0.5 * (view.height - 1))
     projected = project(left, before)[:, 1]
@@ -77,7 +78,7 @@ def see(world: Array, motion: Motion, view: View, margin: float = 0.0) -> Array:
     for _ in range(_MAX_ROUNDS):
         if not len(left):
             break
-        # A row far outside only says "not in the image"; the motion need not reach there.
+        # A row far outside only means "not in the image"; the motion need not cover its time.
         rows = np.clip(rows, -view.height, 2 * view.height)
         pixels = project(left, rows)
         change = rows - before
@@ -85,22 +86,22 @@ def see(world: Array, motion: Motion, view: View, margin: float = 0.0) -> Array:
         slope = np.where(moved, (pixels[:, 1] - projected) / np.where(moved, change, 1.0), slope)
         slow = np.abs(slope) < 1.0
         settled = np.abs(pixels[:, 1] - rows) < _SETTLED_ROWS
-        seen[left[settled & slow]] = pixels[settled & slow]
-        # Seen from the last of those rows still further outside: no row in between sees it.
+        observed[left[settled & slow]] = pixels[settled & slow]
+        # From the last of those rows it is still further outside: it appears in no row.
         beyond = ((rows <= -view.height) & (pixels[:, 1] < rows)
                   | (rows >= 2 * view.height) & (pixels[:, 1] > rows))
         again = ~settled & ~beyond & np.isfinite(pixels[:, 1])
         left, before, projected, slope = left[again], rows[again], pixels[again, 1], slope[again]
         rows = before + (projected - before) / np.where(slow[again], 1.0 - slope, 1.0)
-    inside = ((seen >= -margin)
-              & (seen <= np.array([view.width - 1, view.height - 1]) + margin)).all(axis=1)
-    seen[~inside] = np.nan
-    return seen
+    inside = ((observed >= -margin)
+              & (observed <= np.array([view.width - 1, view.height - 1]) + margin)).all(axis=1)
+    observed[~inside] = np.nan
+    return observed
 
 
 def in_front(view: View, attitude: Rotation, position: Array, count: int,
              depths: tuple[float, float], rng: np.random.Generator) -> Array:
-    """World points (count, 3) spread evenly over the image of a camera that stands still.
+    """World points (count, 3) spread evenly over the image of a camera at rest.
 
     `depths` [m]: range from which each point's depth is drawn.
     """
@@ -110,18 +111,18 @@ def in_front(view: View, attitude: Rotation, position: Array, count: int,
     return np.asarray(attitude.apply(depth * rays / rays[:, 2:]) + position)
 
 
-def seen_by_both(candidates: Callable[[], Array], motion1: Motion, motion2: Motion, view: View,
-                 count: int) -> tuple[Array, Array]:
-    """Pixels (count, 2) in each of two cameras of the first `candidates` that both see."""
+def in_both_views(candidates: Callable[[], Array], motion1: Motion, motion2: Motion, view: View,
+                  count: int) -> tuple[Array, Array]:
+    """Pixels (count, 2) in each of two cameras of the first `candidates` inside both images."""
     most = 1_000_000
     pixels = np.empty((0, 4))
     drawn = 0
     while len(pixels) < count:
         if drawn > most:
-            raise RuntimeError(f'{len(pixels)} of {drawn} points are seen by both cameras')
+            raise RuntimeError(f'{len(pixels)} of {drawn} points are inside both images')
         world = candidates()
         drawn += len(world)
-        both = np.hstack([see(world, motion, view) for motion in (motion1, motion2)])
+        both = np.hstack([observe(world, motion, view) for motion in (motion1, motion2)])
         pixels = np.concatenate([pixels, both[np.isfinite(both).all(axis=1)]])
     return pixels[:count, :2], pixels[:count, 2:]
 

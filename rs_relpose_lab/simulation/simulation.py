@@ -9,15 +9,52 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rs_relpose_lab.simulation.config import SimulationConfig
-from rs_relpose_lab.simulation.hand_held import hand_held, Plan
-from rs_relpose_lab.simulation.inertial import ImuModel
+from rs_relpose_lab.simulation.motions import hand_held, Plan
 from rs_relpose_lab.simulation.render import Renderer
 from rs_relpose_lab.simulation.scene import make_scene, Scene
 from rs_relpose_lab.simulation.trajectory import CameraStates, Trajectory
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
+from rs_relpose_ros.imu.buffer import ImuSample
 
 Array = NDArray[np.float64]
+
+GRAVITY = np.array([0.0, 0.0, -9.80665])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuModel:
+    """An IMU fixed to the camera: mounting, biases and noise.
+
+    ``v_cam = R_cam_imu v_imu``; `lever_arm`: position of the IMU in the camera frame [m].
+    `gyro_bias` [rad/s], `accel_bias` [m/s^2]: added to the truth, IMU frame; sigmas of a sample's
+    white noise, per axis: the density times the square root of the rate.
+    """
+
+    R_cam_imu: Array
+    lever_arm: ArrayLike = (0.0, 0.0, 0.0)
+    gyro_bias: ArrayLike = (0.0, 0.0, 0.0)
+    accel_bias: ArrayLike = (0.0, 0.0, 0.0)
+    gyro_sigma: float = 0.0
+    accel_sigma: float = 0.0
+
+    def measure(self, states: CameraStates, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Measured angular velocities and specific forces (N, 3) in the IMU frame.
+
+        Specific force is ``R^T (a - g)``: +g upwards at rest.
+        """
+        w, dw = states.angular_velocity, states.angular_acceleration
+        lever = np.broadcast_to(np.asarray(self.lever_arm, dtype=np.float64), w.shape)
+        # a_imu = a + R (dw x l + w x (w x l)), the rigid body's other point.
+        rotation = np.cross(dw, lever) + np.cross(w, np.cross(w, lever))
+        force = (np.einsum('nji,nj->ni', states.R_world_cam, states.acceleration - GRAVITY)
+                 + rotation)
+        gyro = w @ self.R_cam_imu + np.asarray(self.gyro_bias)
+        accel = force @ self.R_cam_imu + np.asarray(self.accel_bias)
+        gyro = gyro + self.gyro_sigma * rng.standard_normal(gyro.shape)
+        accel = accel + self.accel_sigma * rng.standard_normal(accel.shape)
+        return gyro, accel
+
 
 # IMU and truth begin and end this long before the first and after the last row [s].
 _MARGIN = 0.1
@@ -35,10 +72,16 @@ class ImuSeries:
     angular_velocities: Array
     linear_accelerations: Array
 
+    def samples(self) -> list[ImuSample]:
+        """The same as messages."""
+        return [ImuSample(stamp, tuple(rate), tuple(force)) for stamp, rate, force in zip(
+            self.stamps_ns.tolist(), self.angular_velocities.tolist(),
+            self.linear_accelerations.tolist(), strict=True)]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Simulation:
-    """What `simulate` returns; images are rendered when asked for."""
+    """A recording; its images are rendered on request."""
 
     config: SimulationConfig
     camera: RollingShutterCamera
@@ -48,7 +91,7 @@ class Simulation:
     calibrated_gyro_bias: Array
 
     def reference_ns(self, index: int) -> int:
-        """Instant of frame `index`'s stamped row on the IMU clock [ns]."""
+        """Time of frame `index`'s stamped row on the IMU clock [ns]."""
         return self.config.start_ns + round(index * 1e9 / self.config.fps)
 
     def stamp_ns(self, index: int) -> int:
@@ -63,17 +106,17 @@ class Simulation:
             gray.shape, dtype=np.float32)
         return np.clip(np.rint(gray), 0, 255).astype(np.uint8)
 
-    def seconds(self, instant_ns: int) -> float:
-        """Time on the trajectory of an instant on the IMU clock [s]."""
-        return seconds_between(self.config.start_ns, instant_ns)
+    def seconds(self, time_ns: int) -> float:
+        """Time on the trajectory [s] of a time on the IMU clock [ns]."""
+        return seconds_between(self.config.start_ns, time_ns)
 
-    def states(self, instants_ns: ArrayLike) -> CameraStates:
-        """True poses and derivatives at instants (N,) on the IMU clock [ns]."""
-        offsets = np.atleast_1d(np.asarray(instants_ns, dtype=np.int64)) - self.config.start_ns
+    def states(self, times_ns: ArrayLike) -> CameraStates:
+        """True poses and derivatives at times (N,) on the IMU clock [ns]."""
+        offsets = np.atleast_1d(np.asarray(times_ns, dtype=np.int64)) - self.config.start_ns
         return self.trajectory.states(offsets * 1e-9)
 
     def true_matches(self, index1: int, index2: int, points1: ArrayLike) -> Array:
-        """Where frame `index2` shows what frame `index1` shows at `points1` (N, 2) [px].
+        """Positions in frame `index2` of the scene points at `points1` (N, 2) [px] of `index1`.
 
         NaN for a point that is hidden or outside of frame `index2`.
         """
@@ -81,8 +124,8 @@ class Simulation:
         world, _ = self.renderer.locate(first, points1)
         points2 = self.renderer.project(second, world)
         inside = np.asarray(np.isfinite(points2).all(axis=1))
-        seen, _ = self.renderer.locate(second, np.where(inside[:, None], points2, 0.0))
-        apart: Array = np.linalg.norm(seen - world, axis=1)
+        observed, _ = self.renderer.locate(second, np.where(inside[:, None], points2, 0.0))
+        apart: Array = np.linalg.norm(observed - world, axis=1)
         points2[~(apart < 1e-3)] = np.nan
         return points2
 
@@ -92,19 +135,20 @@ def simulate(config: SimulationConfig | None = None, *, scene: Scene | None = No
     """Set up a recording; `scene`, `trajectory`: instead of those of the configuration."""
     config = SimulationConfig() if config is None else config
     camera = config.camera
-    before = -camera.row_time_span[0] + _MARGIN
-    after = config.frame_count / config.fps + camera.row_time_span[1] + _MARGIN
+    margin = _MARGIN + 0.5 * config.exposure_time
+    before = -camera.row_time_span[0] + margin
+    after = config.frame_count / config.fps + camera.row_time_span[1] + margin
     if trajectory is None:
         rng = _stream(config.seed, _MOTION)
         plan = Plan.parse(config.plan) if config.plan else Plan.drawn(rng, config.duration)
         speed, rotation_rate = rng.uniform(1.5, 1.8), math.radians(rng.uniform(25.0, 45.0))
-        # Wider than any camera needs: the motion must not depend on read-out or stamped row.
+        # Wider than any camera needs: the motion must not depend on readout or stamped row.
         trajectory = hand_held(rng, -_MOTION_MARGIN, config.duration + _MOTION_MARGIN, plan,
                                speed=config.speed or speed,
                                rotation_rate=config.rotation_rate or rotation_rate)
     if scene is None:
         scene = make_scene(config.scene, _stream(config.seed, _SCENE), config.fx)
-    renderer = Renderer(scene, camera, trajectory, config.edge_samples)
+    renderer = Renderer(scene, camera, trajectory, config.edge_samples, config.exposure_time)
     model = ImuModel(
         config.R_cam_imu, config.lever_arm, config.gyro_bias, config.accel_bias,
         config.gyro_noise_density * math.sqrt(config.imu_rate),

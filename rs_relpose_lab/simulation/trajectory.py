@@ -1,8 +1,8 @@
-"""A camera's motion as splines: poses and their exact derivatives at any instant.
+"""A camera's motion as splines: poses and their exact derivatives at any time.
 
 World: z up. Position and the angles (yaw, pitch, roll) are quintic B-splines, so acceleration and
-angular acceleration are continuous; where the control points are equal the camera is truly still,
-where they advance evenly it truly moves at constant velocity.
+angular acceleration are continuous; where the control points are equal the camera is at rest,
+where they advance evenly it moves at constant velocity.
 
     R_world_cam = Rz(yaw) Ry(pitch) Rx(roll) R_BODY_CAM
 
@@ -12,12 +12,14 @@ The body axes are x forward, y left, z up; the camera looks along x.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_lab.simulation.rows import Motion
 from rs_relpose_ros.errors import InputError
 
 Array = NDArray[np.float64]
@@ -43,7 +45,7 @@ class Segment:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraStates:
-    """Poses of the camera optical frame in the world at N instants, and their derivatives.
+    """Poses of the camera optical frame in the world at N times, and their derivatives.
 
     `position`, `velocity`, `acceleration` (N, 3): world frame [m], [m/s], [m/s^2].
     `angular_velocity`, `angular_acceleration` (N, 3): camera frame [rad/s], [rad/s^2].
@@ -105,8 +107,8 @@ class Trajectory:
         values: Array = self._spline(times, order)
         if np.isnan(values).any():
             first, last = self.span
-            raise InputError(f'the trajectory is defined from {first:.3f} to {last:.3f} s, asked '
-                             f'for {times.min():.3f} to {times.max():.3f} s')
+            raise InputError(f'the trajectory is defined from {first:.3f} to {last:.3f} s, '
+                             f'requested from {times.min():.3f} to {times.max():.3f} s')
         return values
 
 
@@ -132,3 +134,30 @@ def _body_rates(angles: Array, first: Array, second: Array) -> tuple[Array, Arra
         ddp * cr - dp * sr * dr + ddy * sr * cp + dy * (cr * cp * dr - sr * sp * dp),
         -ddp * sr - dp * cr * dr + ddy * cr * cp - dy * (sr * cp * dr + cr * sp * dp)], axis=1)
     return rate, change
+
+
+# -- a trajectory on a fine grid: poses at many times, in a fraction of the spline's time ------
+
+class FinePath:
+    """Poses of a trajectory from `begin` to `end` [s], linear between steps of a millisecond."""
+
+    step = 1e-3
+
+    def __init__(self, trajectory: Trajectory, begin: float, end: float) -> None:
+        self.begin = begin
+        times = begin + self.step * np.arange(math.ceil((end - begin) / self.step) + 1)
+        self.positions, self.rotations = trajectory.poses(times)
+        self.steps = Rotation.from_matrix(
+            np.einsum('nji,njk->nik', self.rotations[:-1], self.rotations[1:])).as_rotvec()
+
+    def motion_from(self, reference: float) -> Motion:
+        """Motion of a frame, whose times count from the time of its reference row [s]."""
+        def to_camera(points: Array, times: Array) -> Array:
+            at = (reference + times - self.begin) / self.step
+            k = np.clip(at.astype(int), 0, len(self.steps) - 1)
+            share = (at - k)[:, None]
+            position = self.positions[k] + share * (self.positions[k + 1] - self.positions[k])
+            rotated = np.einsum('nji,nj->ni', self.rotations[k], points - position)
+            # Of 1e-3 rad: exact to 1e-6.
+            return np.asarray(rotated - share * np.cross(self.steps[k], rotated))
+        return to_camera

@@ -1,30 +1,347 @@
-"""Read rosbag2 bags (SQLite3, MCAP, compressed) and ROS 1 bags."""
+"""Read rosbag2 bags (SQLite3, MCAP, compressed) and ROS 1 bags.
+
+A bag that is damaged, truncated or far too large raises an InputError with one line of text.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, ExitStack
+import bz2
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, ExitStack, suppress
+from dataclasses import dataclass
 import functools
+import logging
+import os
 from pathlib import Path
-from typing import Any, NamedTuple
+import struct
+from types import SimpleNamespace
+from typing import Any, BinaryIO, NamedTuple
 
+from lz4.frame import LZ4FrameDecompressor
 from rosbags.convert.converter import LATCH
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, Qos, QosReliability
 from rosbags.rosbag1 import Reader as Reader1
+from rosbags.rosbag1 import reader as rosbag1
 from rosbags.rosbag2 import Reader as Reader2
+from rosbags.rosbag2 import reader as rosbag2
+from rosbags.rosbag2 import storage_mcap as mcap
 from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
+import yaml
 
-from rs_relpose_ros.bags.limits import bound_decompression, check_metadata, MAX_MESSAGE_BYTES
-from rs_relpose_ros.bags.mcap_check import check_mcap
-from rs_relpose_ros.bags.topics import SensorTopics, Topic, TopicFinder, TopicOptions
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 
+# Topics and frames of the bags that the project writes.
+COMPRESSED_TOPIC = '/camera/image_raw/compressed'
+RAW_TOPIC = '/camera/image_raw'
+CAMERA_INFO_TOPIC = '/camera/camera_info'
+IMU_TOPIC = '/imu/data_raw'
+# Gyro and accelerometer of phones, which stamp them separately.
+GYRO_TOPIC = '/imu/gyro'
+ACCEL_TOPIC = '/imu/accel'
+GROUND_TRUTH_TOPIC = '/ground_truth/pose'
+
+CAMERA_FRAME = 'camera_optical_frame'
+IMU_FRAME = 'imu_link'
+WORLD_FRAME = 'world'
+
+# Delay of a driver between the stamp (of an image: the end of its readout) and delivery [s].
+IMAGE_DELAY = 0.005
+IMU_DELAY = 0.002
+
+IMAGE = 'sensor_msgs/msg/Image'
+COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
+CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
+IMU = 'sensor_msgs/msg/Imu'
+POSE_STAMPED = 'geometry_msgs/msg/PoseStamped'
+
 _STORAGE_SUFFIXES = ('.mcap', '.db3')
 
-bound_decompression()
+_logger = logging.getLogger(__name__)
 
+# -- Bounds: rosbags has none, and a few bytes can decompress to any size -------------------------
+
+# Bytes of the largest chunk that is decompressed; recorders write chunks of megabytes.
+MAX_CHUNK_BYTES = 1 << 30
+# Bytes of the largest message that is decoded: above any accepted image (64 Mpx, 4 channels).
+MAX_MESSAGE_BYTES = 1 << 29
+# A compressed storage file is decompressed to a temporary one of at most this and so many times
+# its size.
+MAX_FILE_BYTES = 1 << 30
+_MAX_FILE_GROWTH = 200
+# Bytes of the largest metadata.yaml that is parsed; thousands of topics need less.
+_MAX_METADATA_BYTES = 1 << 24
+
+# The zstd module that rosbags uses: Python's own from 3.14 on, a package before.
+_zstd: Any = vars(mcap)['zstd']
+
+
+def _bound_decompression() -> None:
+    """Replace the decompressors of rosbags, for all bags that this process reads.
+
+    rosbags has no setting for it. A version without such an entry in its tables raises
+    ImportError, since nothing would be bounded.
+    """
+    def of_chunk(decompressor: Callable[[], Any]) -> Callable[..., bytes]:
+        # MCAP gives the size of a chunk, ROS 1 does not.
+        return lambda data, *size: _decompressed(decompressor, data, min([*size, MAX_CHUNK_BYTES]))
+
+    whole_file = SimpleNamespace(open=_bounded_file, decompress=lambda data: _decompressed(
+        _zstd.ZstdDecompressor, data, MAX_MESSAGE_BYTES))
+    tables: Any = ((mcap.DECOMPRESSORS, 'zstd', of_chunk(_zstd.ZstdDecompressor)),
+                   (mcap.DECOMPRESSORS, 'lz4', of_chunk(LZ4FrameDecompressor)),
+                   (rosbag1.decompressors, 'lz4', of_chunk(LZ4FrameDecompressor)),
+                   (rosbag1.decompressors, 'bz2', of_chunk(bz2.BZ2Decompressor)),
+                   (vars(rosbag2), 'zstd', whole_file))
+    for table, name, bounded in tables:
+        if name not in table:
+            raise ImportError(f'rosbags decompresses {name} in another way than 0.11 does')
+        table[name] = bounded
+
+
+@contextmanager
+def _bounded_file(file: BinaryIO, mode: str) -> Iterator[SimpleNamespace]:
+    """Open a zstd file that can be read up to a bounded size; called by rosbags."""
+    size = os.fstat(file.fileno()).st_size
+    limit = MAX_FILE_BYTES + _MAX_FILE_GROWTH * size
+    count = 0
+    with _zstd.open(file, mode) as stream:
+        def read(most: int) -> bytes:
+            nonlocal count
+            data: bytes = stream.read(most)
+            count += len(data)
+            if count > limit:
+                raise InputError(f'{size} bytes decompress to more than {limit}')
+            return data
+
+        yield SimpleNamespace(read=read)
+
+
+def _decompressed(decompressor: Callable[[], Any], data: bytes, limit: int) -> bytes:
+    """Decompress one frame of at most `limit` bytes."""
+    stream = decompressor()
+    # One byte more: at exactly the limit the end of the frame may not be reached.
+    out: bytes = stream.decompress(data, limit + 1)
+    if len(out) > limit:
+        raise InputError(f'{len(data)} bytes decompress to more than {limit}')
+    if not stream.eof:
+        raise InputError(f'{len(data)} compressed bytes are incomplete')
+    return out
+
+
+_bound_decompression()
+
+
+# -- Checks before a parser reads the files -------------------------------------------------------
+
+_MAGIC = b'\x89MCAP0\r\n'
+_FOOTER, _CHUNK = 0x02, 0x06
+_RECORD = struct.Struct('<BQ')
+# Start time, end time, uncompressed size, CRC: the head of a chunk.
+_CHUNK_HEAD = struct.Struct('<QQQI')
+
+
+def _check_path(path: Path) -> None:
+    """Raise where there is no bag, or one whose files are incomplete."""
+    if not path.exists():
+        raise MissingInputError(f'there is no bag at {path}')
+    if path.is_dir():
+        files = sorted(file for file in path.iterdir() if file.suffix in _STORAGE_SUFFIXES)
+        if not (path / 'metadata.yaml').exists():
+            if files:
+                raise InputError(
+                    f'{path} has no metadata.yaml, so its recorder was not stopped properly: give '
+                    f'{files[0].name} itself, or make one with "ros2 bag reindex {path}"')
+            raise InputError(f'{path} is no bag: it has no metadata.yaml')
+        _check_metadata(path / 'metadata.yaml')
+    elif path.suffix in (*_STORAGE_SUFFIXES, '.bag'):
+        files = [path]
+    else:
+        raise InputError(f'{path} is no bag: give a rosbag2 directory (with metadata.yaml) or a '
+                         '.mcap, .db3 or .bag file')
+    for file in files:
+        if file.stat().st_size == 0:
+            raise InputError(f'{file} is empty')
+        if file.suffix == '.mcap':
+            _check_mcap(file)
+
+
+def _check_metadata(path: Path) -> None:
+    """Refuse a metadata.yaml that is too large, or has aliases: printed, these can be endless."""
+    if path.stat().st_size > _MAX_METADATA_BYTES:
+        raise InputError(f'{path} is no metadata of a bag: it has more than '
+                         f'{_MAX_METADATA_BYTES} bytes')
+    content = path.read_bytes()
+    # Recorders write no aliases, so mostly the bytes alone decide and nothing is parsed. A file
+    # that is no YAML is refused by the reader.
+    with suppress(yaml.YAMLError, RecursionError):
+        if b'*' in content and any(
+                isinstance(event, yaml.AliasEvent) for event in yaml.parse(content)):
+            raise InputError(f'{path} has YAML aliases, which no recorder writes: it is damaged')
+
+
+def _check_mcap(path: Path) -> None:
+    """Check that an MCAP file (https://mcap.dev/spec) is complete, from its record lengths."""
+    size = path.stat().st_size
+    with path.open('rb') as file:
+        if file.read(len(_MAGIC)) != _MAGIC:
+            raise InputError(f'{path} is no MCAP file')
+        at = len(_MAGIC)
+        opcode = None
+        while opcode != _FOOTER:
+            head = file.read(_RECORD.size)
+            if len(head) < _RECORD.size:
+                raise _truncated(path, at)
+            opcode, length = _RECORD.unpack(head)
+            at += _RECORD.size
+            if at + length > size:
+                raise _truncated(path, at)
+            if opcode == _CHUNK:
+                chunk = file.read(min(length, _CHUNK_HEAD.size))
+                if (len(chunk) < _CHUNK_HEAD.size
+                        or _CHUNK_HEAD.unpack(chunk)[2] > MAX_CHUNK_BYTES):
+                    raise InputError(f'{path} is corrupt: a chunk has an impossible size')
+            at += length
+            file.seek(at)
+        if file.read(len(_MAGIC)) != _MAGIC:
+            raise _truncated(path, at)
+
+
+def _truncated(path: Path, at: int) -> InputError:
+    return InputError(
+        f'{path} is truncated at byte {at}: the recorder was killed or the copy is incomplete; '
+        'copy it again, or save the complete part with '
+        f'"mcap recover {path.name} -o recovered.mcap"')
+
+
+# -- Topics of the sensors ------------------------------------------------------------------------
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A topic of a bag with the number of its messages."""
+
+    name: str
+    msgtype: str
+    count: int
+
+    def __str__(self) -> str:
+        return f'{self.name} ({self.msgtype})'
+
+    @property
+    def camera_info(self) -> str:
+        """Name of the topic on which drivers publish the CameraInfo of an image topic."""
+        return f'{self.name.removesuffix("/compressed").rpartition("/")[0]}/camera_info'
+
+
+@dataclass(frozen=True, slots=True)
+class SensorTopics:
+    """Topics to read; `accel` only if the driver publishes the accelerometer separately.
+
+    `camera_info` is None only if it is not needed.
+    """
+
+    image: Topic
+    camera_info: Topic | None
+    imu: Topic
+    accel: Topic | None
+    truth: Topic | None
+
+
+@dataclass(frozen=True, slots=True)
+class _TopicFinder:
+    """Finds the sensors' topics among all `topics` of a `bag`; `names`: those chosen, by role."""
+
+    bag: Path
+    topics: Sequence[Topic]
+    names: Mapping[str, str]
+
+    def find(self, needs_camera_info: bool) -> SensorTopics:
+        image = self._one('image', 'image', IMAGE, COMPRESSED_IMAGE)
+        if 'image_rect' in image.name:
+            raise InputError(f'{image.name} is a rectified image, in which a row no longer has '
+                             'one time: choose the raw one with --image-topic')
+        imu, accel = self._imu()
+        camera_info = None
+        if needs_camera_info or self.names.get('camera_info') or self._of_type(CAMERA_INFO):
+            camera_info = self._camera_info(image)
+        return SensorTopics(image, camera_info, imu, accel, self._truth())
+
+    def _one(self, role: str, content: str, *msgtypes: str, fix: str = '', hint: str = '',
+             without: Topic | None = None) -> Topic:
+        """The chosen topic, or the only one of these types.
+
+        `fix` if there is none, `hint` if there are several.
+        """
+        if chosen := self._chosen(role, *msgtypes):
+            return chosen
+        candidates = [topic for topic in self._of_type(*msgtypes) if topic != without]
+        if not candidates:
+            raise self._missing(f'{content} topic ({" or ".join(msgtypes)}){fix}')
+        if len(candidates) > 1:
+            raise InputError(f'{self.bag} has several {content} topics, choose one with '
+                             f'{_option(role)}{hint}: {", ".join(map(str, candidates))}')
+        return candidates[0]
+
+    def _chosen(self, role: str, *msgtypes: str) -> Topic | None:
+        name, option = self.names.get(role, ''), _option(role)
+        if not name:
+            return None
+        found = [topic for topic in self.topics if topic.name.lstrip('/') == name.lstrip('/')]
+        if not found:
+            raise self._missing(f'topic {name} ({option})')
+        if found[0].msgtype not in msgtypes:
+            raise InputError(f'topic {name} ({option}) is of type {found[0].msgtype}, but must be '
+                             f'{" or ".join(msgtypes)}')
+        if not found[0].count:
+            raise MissingInputError(f'topic {name} ({option}) of {self.bag} has no messages')
+        return found[0]
+
+    def _camera_info(self, image: Topic) -> Topic:
+        for topic in self._of_type(CAMERA_INFO):
+            if topic.name == image.camera_info and not self.names.get('camera_info'):
+                return topic
+        return self._one('camera_info', 'CameraInfo', CAMERA_INFO,
+                         fix='; give camera_matrix, whose focal length "rs_relpose calibrate" '
+                         'estimates')
+
+    def _imu(self) -> tuple[Topic, Topic | None]:
+        """Topics of the gyro, and of a separate accelerometer."""
+        accel = self._chosen('accel', IMU)
+        candidates = self._of_type(IMU)
+        if not (self.names.get('imu') or accel) and len(candidates) == 2:
+            gyros, accels = ([topic for topic in candidates if word in topic.name]
+                             for word in ('gyro', 'accel'))
+            if len(gyros) == 1 and len(accels) == 1 and gyros != accels:
+                return gyros[0], accels[0]
+        return self._one('imu', 'IMU', IMU, without=accel,
+                         hint=' (and --accel-topic for a separate accelerometer)'), accel
+
+    def _truth(self) -> Topic | None:
+        if chosen := self._chosen('truth', POSE_STAMPED):
+            return chosen
+        candidates = self._of_type(POSE_STAMPED)
+        named = [topic for topic in candidates if topic.name == GROUND_TRUTH_TOPIC]
+        if not named and len(candidates) > 1:
+            _logger.warning('several topics could be the ground truth and none is used; choose '
+                            'one with --truth-topic: %s', ', '.join(map(str, candidates)))
+            return None
+        return next(iter(named or candidates), None)
+
+    def _of_type(self, *msgtypes: str) -> list[Topic]:
+        return [topic for topic in self.topics if topic.msgtype in msgtypes and topic.count]
+
+    def _missing(self, content: str) -> MissingInputError:
+        there = ', '.join(map(str, self.topics))
+        return MissingInputError(f'{self.bag} has no {content}; '
+                                 + (f'it has {there}' if there else 'it has no topics at all'))
+
+
+def _option(role: str) -> str:
+    return f'--{role.replace("_", "-")}-topic'
+
+
+# -- Bags -----------------------------------------------------------------------------------------
 
 class BagMessage(NamedTuple):
     """A message with its topic and the time at which it was recorded [ns]."""
@@ -44,7 +361,7 @@ class RawMessage(NamedTuple):
 
 
 class TopicOrigin(NamedTuple):
-    """What a bag tells of a topic besides its name and type; empty where it tells nothing."""
+    """Metadata of a topic that a copy of it needs; empty if the bag does not have them."""
 
     definition: str   # of the message type
     type_hash: str
@@ -56,9 +373,9 @@ class TopicOrigin(NamedTuple):
 def _types(of_ros2: bool) -> Typestore:
     """Message types of one ROS, by their names alone.
 
-    rosbags would parse the definitions in a bag, also of topics that nobody asks for, and make
-    code of them: an expression in IDL takes any time and memory to parse, an array of empty
-    messages to read.
+    The definitions in a bag are not used: rosbags would parse them and make code of them, also of
+    unused topics. An expression in IDL can take any time and memory to parse, an array of empty
+    messages any memory to read.
     """
     return get_typestore(Stores.ROS2_JAZZY if of_ros2 else Stores.ROS1_NOETIC)
 
@@ -77,16 +394,18 @@ class Bag:
         self.path = path
         self._reader = reader
         self._is_ros2 = isinstance(reader, Reader2)
+        # Gets the topic of each message that is read, for a progress bar.
+        self.on_message: Callable[[str], object] = lambda topic: None
         self._types = _types(self._is_ros2)
         counts: dict[tuple[str, str], int] = {}
-        # Typed, but metadata is YAML, in which anything may stand anywhere.
+        # Typed, but metadata is YAML: any value can be of any type.
         connections: Any = reader.connections
         for connection in connections:
             if not (isinstance(connection.topic, str) and connection.topic.isprintable()
                     and isinstance(connection.msgtype, str) and connection.msgtype.isprintable()
                     and isinstance(connection.msgcount, int)):
-                raise InputError(f'{path} is damaged: its metadata has a topic whose name, type '
-                                 'or number of messages is none')
+                raise InputError(f'{path} is damaged: in its metadata, name, type or number of '
+                                 'messages of a topic is invalid')
             key = connection.topic, connection.msgtype
             counts[key] = counts.get(key, 0) + connection.msgcount
         self.topics = tuple(Topic(name, msgtype, count)
@@ -95,20 +414,17 @@ class Bag:
         self.duration = float(reader.duration) / NANOSECONDS
 
     def reliability(self, topic: Topic) -> str:
-        """``'reliable'`` or ``'best effort'`` as its publishers offered; empty where not told."""
-        offered = {
-            profile.reliability for connection in self._reader.connections
-            if (connection.topic, connection.msgtype) == (topic.name, topic.msgtype)
-            and isinstance(connection.ext, ConnectionExtRosbag2)
-            for profile in connection.ext.offered_qos_profiles}
+        """``'reliable'`` or ``'best effort'`` as its publishers offered; empty if not recorded."""
+        offered = {profile.reliability for connection in self._connections([topic])
+                   if isinstance(connection.ext, ConnectionExtRosbag2)
+                   for profile in connection.ext.offered_qos_profiles}
         if QosReliability.BEST_EFFORT in offered:
             return 'best effort'
         return 'reliable' if QosReliability.RELIABLE in offered else ''
 
     def origin(self, topic: Topic) -> TopicOrigin:
-        """What is to be written along where a topic of this bag is copied, as of ROS 2."""
-        connection = next(c for c in self._reader.connections
-                          if (c.topic, c.msgtype) == (topic.name, topic.msgtype))
+        """Metadata for a copy of a topic, in ROS 2."""
+        connection = self._connections([topic])[0]
         if not isinstance(connection.ext, ConnectionExtRosbag2):
             return TopicOrigin('', '', 'cdr', tuple(LATCH) if connection.ext.latching else ())
         return TopicOrigin(connection.msgdef.data, connection.digest,
@@ -116,14 +432,19 @@ class Bag:
                            tuple(connection.ext.offered_qos_profiles))
 
     def can_be_copied(self, topic: Topic) -> bool:
-        """Whether `raw_messages` can read it: from ROS 1 what ROS 2 has, too."""
+        """Whether `raw_messages` can read it: of ROS 1 only types that ROS 2 has, too."""
         return self._is_ros2 or topic.msgtype in _types(of_ros2=True).fielddefs
 
-    def find_topics(self, options: TopicOptions | None = None, *,
+    def find_topics(self, names: Mapping[str, str] | None = None, *,
                     needs_camera_info: bool = True) -> SensorTopics:
-        """The sensors' topics; see `TopicFinder.find`."""
-        finder = TopicFinder(self.path, self.topics)
-        return finder.find(options or TopicOptions(), needs_camera_info)
+        """The sensors' topics: as chosen, or by type if that is unambiguous.
+
+        `names`: those chosen, by field of `SensorTopics`; empty ones are as if absent. Of several
+        CameraInfo topics, that next to the image is used, and of two Imu topics one with 'gyro'
+        and one with 'accel' in its name make a pair (RealSense). MissingInputError if a topic is
+        absent; InputError if several are possible, or one has another type.
+        """
+        return _TopicFinder(self.path, self.topics, names or {}).find(needs_camera_info)
 
     def messages(self, topics: Sequence[Topic]) -> Iterator[BagMessage]:
         """Messages of `topics` in the order of bag time; their arrays are read-only.
@@ -132,17 +453,14 @@ class Bag:
         """
         read = self._types.deserialize_cdr if self._is_ros2 else self._types.deserialize_ros1
         for connection, bag_time_ns, data in self._raw(topics):
-            self._check_type(connection)
-            with self._decoding(connection):
-                message = read(data, connection.msgtype)
-            yield BagMessage(connection.topic, bag_time_ns, message)
+            yield BagMessage(connection.topic, bag_time_ns, self._read(connection, read, data))
 
     def raw_messages(self, topics: Sequence[Topic]) -> Iterator[RawMessage]:
-        """Messages of `topics` in the order of bag time, in CDR as publishers take them.
+        """Messages of `topics` in the order of bag time, in CDR as publishers expect them.
 
         A damaged bag or a ROS 1 message without a counterpart in ROS 2 raises InputError.
         """
-        # Of ROS 2, not of the bag: headers of ROS 1 have a number more.
+        # Of ROS 2, not of the bag: headers of ROS 1 have an additional number.
         typestore = _types(of_ros2=True)
         for connection, bag_time_ns, data in self._raw(topics):
             if not self._is_ros2:
@@ -150,62 +468,59 @@ class Bag:
                     raise InputError(f'topic {connection.topic} of {self.path} is of type '
                                      f'{connection.msgtype}, which ROS 2 does not have: leave it '
                                      'out')
-                with self._decoding(connection):
-                    data = bytes(typestore.ros1_to_cdr(data, connection.msgtype))
+                data = bytes(self._decoded(connection, typestore.ros1_to_cdr, data))
             yield RawMessage(connection.topic, connection.msgtype, bag_time_ns, data)
 
     def read(self, raw: RawMessage) -> Any:
-        """The message of ROS 2 that `raw_messages` gave; InputError where it is none."""
+        """The ROS 2 message of an item of `raw_messages`; InputError if it cannot be decoded."""
         connection = next(c for c in self._reader.connections
                           if (c.topic, c.msgtype) == (raw.topic, raw.msgtype))
-        self._check_type(connection)
-        with self._decoding(connection):
-            return _types(of_ros2=True).deserialize_cdr(raw.data, raw.msgtype)
+        return self._read(connection, _types(of_ros2=True).deserialize_cdr, raw.data)
+
+    def _connections(self, topics: Sequence[Topic]) -> list[Connection]:
+        chosen = {(topic.name, topic.msgtype) for topic in topics}
+        return [c for c in self._reader.connections if (c.topic, c.msgtype) in chosen]
 
     def _raw(self, topics: Sequence[Topic]) -> Iterator[tuple[Connection, int, bytes]]:
-        chosen = {(topic.name, topic.msgtype) for topic in topics}
-        connections = [c for c in self._reader.connections if (c.topic, c.msgtype) in chosen]
+        connections = self._connections(topics)
         if not connections:
             return
-        messages = self._reader.messages(connections)
-        while True:
-            try:
-                connection, bag_time_ns, data = next(messages)
-            except StopIteration:
-                return
-            # A damaged file makes the parsers below fail in any way.
-            except Exception as error:
-                raise InputError(f'{self.path} is damaged: {_sentence(error)}') from error
-            if len(data) > MAX_MESSAGE_BYTES:
-                raise InputError(f'a message of {connection.topic} in {self.path} has {len(data)} '
-                                 f'bytes; at most {MAX_MESSAGE_BYTES} are read')
-            yield connection, bag_time_ns, data
+        try:
+            for connection, bag_time_ns, data in self._reader.messages(connections):
+                if len(data) > MAX_MESSAGE_BYTES:
+                    raise InputError(f'a message of {connection.topic} has {len(data)} bytes; at '
+                                     f'most {MAX_MESSAGE_BYTES} are read')
+                self.on_message(connection.topic)
+                yield connection, bag_time_ns, data
+        # A damaged file can raise anything in the parsers.
+        except Exception as error:
+            raise InputError(f'{self.path} is damaged: {_message(error)}') from error
 
-    def _check_type(self, connection: Connection) -> None:
-        """A type of the same name may have had other fields where the bag was recorded."""
+    def _read(self, connection: Connection, decode: Callable[..., Any], data: bytes) -> Any:
+        """Decode a message, unless its type had other fields in the ROS of the recorder."""
         if (connection.msgtype in self._types.fielddefs and connection.digest
                 and connection.digest != _type_hash(connection.msgtype, self._is_ros2)):
             name = 'ROS 2 Jazzy' if self._is_ros2 else 'ROS 1 Noetic'
             raise InputError(f'topic {connection.topic} of {self.path} is of another '
                              f'{connection.msgtype} than that of {name}: its type hash is '
                              f'{str(connection.digest)[:80]!r}')
+        return self._decoded(connection, decode, data)
 
-    @contextmanager
-    def _decoding(self, connection: Connection) -> Iterator[None]:
+    def _decoded(self, connection: Connection, decode: Callable[..., Any], data: bytes) -> Any:
         try:
-            yield
+            return decode(data, connection.msgtype)
         except Exception as error:
             raise InputError(
                 f'a message of {connection.topic} in {self.path} is corrupt, it is no '
-                f'{connection.msgtype}: {_sentence(error)}') from error
+                f'{connection.msgtype}: {_message(error)}') from error
 
 
 @contextmanager
 def open_bag(path: Path | str) -> Iterator[Bag]:
     """Open a rosbag2 directory, or a single ``.mcap``, ``.db3`` or ROS 1 ``.bag`` file.
 
-    MissingInputError where there is nothing at `path`; InputError where it is no bag, or truncated
-    or damaged: one sentence says which.
+    MissingInputError if `path` does not exist; InputError, with the reason in one line, if it is
+    no bag, truncated or damaged.
     """
     path = Path(path)
     _check_path(path)
@@ -215,55 +530,28 @@ def open_bag(path: Path | str) -> Iterator[Bag]:
             reader.open()
             stack.callback(reader.close)
             bag = Bag(path, reader)
+        except RsRelposeError:
+            raise
         except PermissionError as error:
             raise InputError(f'{path} cannot be read: {error.strerror}') from error
-        # A damaged file makes the parsers fail in any way.
+        # A damaged file can raise anything in the parsers.
         except Exception as error:
-            raise InputError(_why_not_opened(path, error)) from error
+            raise InputError(_reason_not_opened(path, error)) from error
         yield bag
 
 
-def _check_path(path: Path) -> None:
-    """What can be told before a parser sees the bag."""
-    if not path.exists():
-        raise MissingInputError(f'there is no bag at {path}')
-    if path.is_dir():
-        files = sorted(file for file in path.iterdir() if file.suffix in _STORAGE_SUFFIXES)
-        if not (path / 'metadata.yaml').exists():
-            if files:
-                raise InputError(
-                    f'{path} has no metadata.yaml, so its recorder was not stopped properly: give '
-                    f'{files[0].name} itself, or make one with "ros2 bag reindex {path}"')
-            raise InputError(f'{path} is no bag: it has no metadata.yaml')
-        check_metadata(path / 'metadata.yaml')
-    elif path.suffix in (*_STORAGE_SUFFIXES, '.bag'):
-        files = [path]
-    else:
-        raise InputError(f'{path} is no bag: give a rosbag2 directory (with metadata.yaml) or a '
-                         '.mcap, .db3 or .bag file')
-    for file in files:
-        if file.stat().st_size == 0:
-            raise InputError(f'{file} is empty')
-        if file.suffix == '.mcap':
-            check_mcap(file)
-
-
-def _why_not_opened(path: Path, error: Exception) -> str:
-    if isinstance(error, RsRelposeError):
-        return str(error)
-    text = _sentence(error)
+def _reason_not_opened(path: Path, error: Exception) -> str:
     if path.suffix == '.bag':
         with path.open('rb') as file:
-            head = file.read(9)
-        if head != b'#ROSBAG V':
-            return f'{path} is no ROS 1 bag'
-        return (f'{path} is truncated or damaged ({text}): copy it again, or repair it with '
-                f'"rosbag reindex {path.name}"')
+            if file.read(9) != b'#ROSBAG V':
+                return f'{path} is no ROS 1 bag'
+        return (f'{path} is truncated or damaged ({_message(error)}): copy it again, or repair it '
+                f'with "rosbag reindex {path.name}"')
     kind = 'is truncated or damaged, or no bag' if path.is_file() else 'is damaged'
-    return f'{path} {kind}: {text}'
+    return f'{path} {kind}: {_message(error)}'
 
 
-def _sentence(error: Exception) -> str:
-    """What a parser says, in one line, without its full stop; its type where it says nothing."""
+def _message(error: Exception) -> str:
+    """Text of a parser's error in one line, without its full stop; else its type."""
     text = ' '.join(str(error).split()).rstrip('.')
     return text[:300] if text else type(error).__name__

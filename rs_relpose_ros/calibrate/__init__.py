@@ -1,1 +1,1 @@
-"""Read-out time, clock offset, axes, gyro bias and focal length from tracks and a gyro."""
+"""Readout time, clock offset, axes, gyro bias and focal length from tracks and a gyro."""

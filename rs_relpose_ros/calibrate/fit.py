@@ -1,9 +1,24 @@
-"""The robust fit: Levenberg-Marquardt over the calibration, everything of the pairs eliminated."""
+"""Robust fit of the calibration (Levenberg-Marquardt, pairs eliminated), and its sigmas.
+
+Three kinds of errors exceed the noise of the matches:
+
+- errors that a part of the image shares all the time: tracks of a blurred edge, a moving object,
+  the lens. Scatter between stretches of time does not contain them; that between regions of the
+  image does (two-way clustering: A. C. Cameron, J. B. Gelbach, D. L. Miller, Robust inference with
+  multiway clustering, J. Bus. Econ. Stat. 29, 2011);
+- errors that last longer than a stretch: exposure that follows the light, a second optimum. Both
+  halves of the recording are fitted by themselves; if they differ by more than their sigmas, all
+  sigmas are widened by as much (R. T. Birge, The calculation of errors by the method of least
+  squares, Phys. Rev. 40, 1932);
+- errors that are constant and equal in all of the image: lens and gyro differ from their model
+  (`ModelErrors`). How far each moves the calibration follows from one evaluation.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 import itertools
 import math
 from typing import NamedTuple
@@ -11,52 +26,86 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.stats import norm, truncnorm
+from scipy.stats import t as student_t
 
-from rs_relpose_ros.calibrate.coplanarity import (
-    accumulate,
-    ALL,
-    BIAS,
-    EXPOSURE,
-    find_directions,
-    FOCAL,
-    GLOBAL,
-    OFFSET,
-    Problem,
-    READOUT,
-    ROBUST,
-    ROTATION,
-    Sums,
-    Unknowns,
-)
-from rs_relpose_ros.calibrate.covariance import jackknife, stretches
-from rs_relpose_ros.calibrate.gyro_path import GyroPath
-from rs_relpose_ros.calibrate.result import CostCurve
+from rs_relpose_ros.calibrate import coplanarity as model
+from rs_relpose_ros.calibrate.coplanarity import GLOBAL, Problem, READOUT, ROTATION, Unknowns
+from rs_relpose_ros.calibrate.observations import Observations, Varying, with_lens
+from rs_relpose_ros.calibrate.result import AXES, CalibrationResult, CostCurve, Estimate
+from rs_relpose_ros.calibrate.start import GyroPath, nearest_axis_map
+from rs_relpose_ros.config.settings import CalibrationConfig
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry.so3 import log_so3
+from rs_relpose_ros.pipeline.findings import BY_NAME
 
 Array = NDArray[np.float64]
 
-# Change of the camera's velocity while it takes half a frame, over the depth of the scene [1/s]:
+# Stretches of a second, within which errors may be correlated, and limits of their number.
+_STRETCH = 1.0
+_LEAST_STRETCHES, _MOST_STRETCHES = 10, 30
+
+
+def stretches(times: Array) -> NDArray[np.int64]:
+    """Stretch (P,) of the recording that each time (P,) [s] belongs to."""
+    begin, duration = times.min(), max(float(np.ptp(times)), 1e-9)
+    count = int(np.clip(duration / _STRETCH, _LEAST_STRETCHES, _MOST_STRETCHES))
+    return np.minimum(((times - begin) / duration * count).astype(np.int64), count - 1)
+
+
+def jackknife(scores: Array, curvatures: Array, groups: NDArray[np.int64],
+              prior: Array) -> Array:
+    """Delete-a-group jackknife, each refit by one Newton step from the optimum.
+
+    It contains all differences between the groups: noise of points, of long tracks, of the gyro,
+    and motion that is not modelled. Unlike the sandwich estimate (the sum of the groups' squared
+    scores), it is not biased by the parameters having been fitted to the few groups.
+
+    `scores` (P, G) are the gradients of the cost at the optimum by pair, `curvatures` (P, G, G)
+    their derivatives, `prior` (G,) inverse variances that count as known; returns (G, G). See
+    B. Efron and R. Tibshirani, An Introduction to the Bootstrap, 1993, chapter 11.
+    """
+    total = curvatures.sum(axis=0) + np.diag(prior)
+    names = np.unique(groups)
+    moves = np.stack([
+        np.linalg.pinv(total - curvatures[groups == name].sum(axis=0), hermitian=True)
+        @ scores[groups == name].sum(axis=0) for name in names])
+    inverse = np.linalg.pinv(total, hermitian=True)
+    return np.asarray(jackknife_of(moves) + inverse @ np.diag(prior) @ inverse)
+
+
+def jackknife_of(moves: Array) -> Array:
+    """Covariance (G, G) from the moves (K, G) of the optimum without each of K groups."""
+    count = len(moves)
+    moves = moves - moves.mean(axis=0)
+    # The scatter of few groups is uncertain, so that errors in sigmas follow Student's t: widened,
+    # one sigma has the coverage of a normal deviate.
+    wider = student_t.ppf(norm.cdf(1.0), count - 1) ** 2
+    return np.asarray(wider * (count - 1) / count * moves.T @ moves)
+
+
+# Change of the camera's velocity during half a frame, over the depth of the scene [1/s]:
 # 2 m/s^2 for 15 ms at 3 m. Over the parallax per second it is `bend`, within these limits.
 _BEND, _BEND_RANGE = 0.01, (0.03, 0.5)
-# Scatter of a match as it is before anything is known [px], and at the least.
+# Scatter of a match before the fit [px], and at the least.
 _NOISE_AT_START, _LEAST_NOISE = 5.0, 0.05
 _HYPOTHESES = 60
 # Newton's step [sigma] below which the optimum is near.
 _NEAR = 2.0
 # Levenberg-Marquardt's damping of the pairs' own unknowns stays in this range.
 _DAMPING = (1e-6, 1e3)
-LOCAL = ALL - GLOBAL
-# Noise of a pair is not let out of this range of the median over all pairs.
+LOCAL = model.ALL - GLOBAL
+# Range of the noise of a pair, relative to the median over all pairs.
 _NOISE_RANGE = (0.6, 4.0)
 
 
 def initial(problem: Problem, R_imu_cam: Array, offset: float, readout: float = 0.0,
-            bias: Array | None = None, log_focal: float = 0.0,
-            noise: float = _NOISE_AT_START) -> Unknowns:
-    """A calibration, and the directions of the pairs that it makes likely."""
+            bias: Array | None = None, noise: float = _NOISE_AT_START) -> Unknowns:
+    """A calibration with the assumed lens, and the most likely directions of the pairs."""
     parameters, pairs = np.zeros(GLOBAL), problem.pairs
-    parameters[READOUT], parameters[OFFSET], parameters[FOCAL] = readout, offset, log_focal
+    parameters[[READOUT, model.OFFSET]] = readout, offset
     if bias is not None:
-        parameters[BIAS:BIAS + 3] = bias
+        parameters[model.BIAS:model.BIAS + 3] = bias
     # R_imu_cam is contiguous: a transposed one would have the kernels compiled a second time.
     return redirected(problem, Unknowns(
         parameters, np.ascontiguousarray(R_imu_cam), np.tile([1.0, 0.0, 0.0], (pairs, 1)),
@@ -65,10 +114,13 @@ def initial(problem: Problem, R_imu_cam: Array, offset: float, readout: float = 
 
 
 def restarted(problem: Problem, unknowns: Unknowns, caution: float = 1.0) -> Unknowns:
-    """The calibration of `unknowns` for other pairs, with a multiple of its median noise."""
+    """The calibration of `unknowns` for other pairs, with a multiple of its median noise.
+
+    `problem` is about the lens of `unknowns`.
+    """
     p = unknowns.parameters
-    return initial(problem, unknowns.R_imu_cam, p[OFFSET], p[READOUT], p[BIAS:BIAS + 3], p[FOCAL],
-                   caution * float(np.median(unknowns.noise)))
+    return initial(problem, unknowns.R_imu_cam, p[model.OFFSET], p[READOUT],
+                   p[model.BIAS:model.BIAS + 3], caution * float(np.median(unknowns.noise)))
 
 
 def stepped(unknowns: Unknowns, step: Array, local: Array) -> Unknowns:
@@ -76,7 +128,7 @@ def stepped(unknowns: Unknowns, step: Array, local: Array) -> Unknowns:
     parameters = unknowns.parameters + step
     parameters[ROTATION:ROTATION + 3] = 0.0
     rotation = Rotation.from_rotvec(step[ROTATION:ROTATION + 3]).as_matrix()
-    # At most a right angle or so: nothing limits a step that the matches do not determine.
+    # At most about a right angle: matches may not determine a step.
     along = np.clip(local[:, :2], -1.0, 1.0)
     direction = unknowns.direction + np.einsum('pk,pki->pi', along, _tangents(unknowns.direction))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -97,7 +149,7 @@ def _tangents(directions: Array) -> Array:
 class Evaluation:
     """Cost of all pairs, and their normal equations without the pairs' own unknowns.
 
-    The last three are empty where derivatives were not asked for.
+    The last three are empty unless derivatives are requested.
     """
 
     losses: Array       # (P,) robust losses of the matches and the prior of the pair
@@ -112,7 +164,7 @@ class Evaluation:
         return float(self.losses.sum())
 
     def local_step(self, step: Array) -> Array:
-        """Step (P, LOCAL) of the pairs' own unknowns that goes with one of the parameters."""
+        """Step (P, LOCAL) of the pairs' own unknowns for a step of the parameters."""
         return np.asarray(-self.back[:, :, GLOBAL] - self.back[:, :, :GLOBAL] @ step)
 
 
@@ -120,7 +172,7 @@ def redirected(problem: Problem, unknowns: Unknowns) -> Unknowns:
     """Unknowns with the best direction of each pair among many that two of its matches fix."""
     direction = unknowns.direction.copy()
     chosen = np.random.default_rng(0).integers(0, 2**30, (_HYPOTHESES, 2))
-    find_directions(problem, _path(problem, unknowns), unknowns, chosen, direction)
+    model.find_directions(problem, _path(problem, unknowns), unknowns, chosen, direction)
     changed = (np.abs((direction * unknowns.direction).sum(axis=1)) < 0.999)[:, None]
     return unknowns._replace(
         direction=direction, bend=np.where(changed, 0.0, unknowns.bend),
@@ -131,10 +183,10 @@ def evaluate(problem: Problem, unknowns: Unknowns, derivatives: bool = True) -> 
     """Residuals and, with `derivatives`, the normal equations at `unknowns`."""
     pairs = problem.pairs
     size = pairs if derivatives else 0
-    sums = Sums(np.empty(pairs), np.empty(len(problem.view1.points)), np.zeros((size, ALL)),
-                np.zeros((size, ALL, ALL)))
-    accumulate(problem, _path(problem, unknowns), unknowns, _tangents(unknowns.direction),
-               derivatives, sums)
+    sums = model.Sums(np.empty(pairs), np.empty(len(problem.view1.points)),
+                      np.zeros((size, model.ALL)), np.zeros((size, model.ALL, model.ALL)))
+    model.accumulate(problem, _path(problem, unknowns), unknowns, _tangents(unknowns.direction),
+                     derivatives, sums)
     # Priors of the pairs' own unknowns; the 1 keeps a direction that no match determines.
     own = np.hstack([np.zeros((pairs, 2)), unknowns.bend, unknowns.turn])
     weights = np.repeat([np.ones(pairs), problem.bend_sigma**-2, problem.turn_sigma**-2],
@@ -155,16 +207,17 @@ def evaluate(problem: Problem, unknowns: Unknowns, derivatives: bool = True) -> 
 
 
 def with_bends(problem: Problem, unknowns: Unknowns) -> Problem:
-    """Problem with priors of `bend` from the parallax per second that the matches show."""
+    """Problem with priors of `bend` from the parallax per second of the matches."""
     path, parameters = _path(problem, unknowns), unknowns.parameters
     pair = np.repeat(np.arange(problem.pairs), np.diff(problem.begin))
     rays = []
     for view in (problem.view1, problem.view2):
-        at = view.times[pair] + parameters[OFFSET] + parameters[READOUT] * view.rows
+        at = view.times[pair] + parameters[model.OFFSET] + parameters[READOUT] * view.rows
         turns = path.at(at) @ unknowns.R_imu_cam
-        seen = np.column_stack([view.points / np.exp(parameters[FOCAL]),
-                                np.ones(len(view.points))])
-        rays.append(np.einsum('nij,nj->ni', turns, seen / np.linalg.norm(seen, axis=1)[:, None]))
+        points = view.points + view.by_lens @ parameters[model.LENS]
+        directions = np.column_stack([points, np.ones(len(points))])
+        rays.append(np.einsum('nij,nj->ni', turns,
+                              directions / np.linalg.norm(directions, axis=1)[:, None]))
     angles = _medians(problem, np.linalg.norm(np.cross(rays[0], rays[1]), axis=1))
     passing = np.maximum(angles / (problem.view2.times - problem.view1.times), 1e-6)
     return problem._replace(bend_sigma=np.clip(_BEND / passing, *_BEND_RANGE))
@@ -178,8 +231,9 @@ def _medians(problem: Problem, values: Array) -> Array:
 
 def _path(problem: Problem, unknowns: Unknowns) -> GyroPath:
     parameters = unknowns.parameters
-    seen = problem.gyro_rates + parameters[EXPOSURE] * problem.blur_rates
-    return GyroPath.integrated(problem.gyro_times, seen, parameters[BIAS:BIAS + 3])
+    estimated = problem.gyro_rates + parameters[model.EXPOSURE] * problem.blur_rates
+    return GyroPath.integrated(problem.gyro_times, estimated,
+                               parameters[model.BIAS:model.BIAS + 3])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,6 +242,7 @@ class Fit:
 
     problem: Problem
     unknowns: Unknowns
+    free: NDArray[np.bool_]   # (GLOBAL,) parameters that were fitted
     weights: Array        # (N,) of the matches, 1 where the residual is 0
     covariance: Array     # (GLOBAL, GLOBAL), zero rows and columns where a parameter was held
     information: Array    # (GLOBAL, GLOBAL) the Hessian, before any prior
@@ -196,48 +251,52 @@ class Fit:
 
 def fit(problem: Problem, unknowns: Unknowns, free: NDArray[np.bool_], *, rounds: int = 40,
         tolerance: float = 0.1) -> Fit:
-    """Minimise the cost over the `free` (GLOBAL,) parameters, and learn the noise on the way.
+    """Minimise the cost over the `free` (GLOBAL,) parameters, and estimate the noise meanwhile.
 
     Newton steps shorter than `tolerance` [sigma of the parameters] end the fit.
     """
-    prior = problem.prior
     at = _Iterate(unknowns, evaluate(problem, unknowns))
     converged = False
     for _ in range(rounds):
-        at = _step(problem, at, free, prior)
+        at = _step(problem, at, free)
         if at.length > _NEAR:
             continue
-        # Noise is learned near the optimum only: far from it, residuals are no noise.
-        noise = _learned_noise(problem, at)
+        # Noise is estimated near the optimum only: far from it, residuals are no noise.
+        noise = _estimated_noise(problem, at)
         change = float(np.median(np.abs(np.log(noise / at.unknowns.noise))))
         converged = at.length < tolerance and change < 0.03
         if converged:
             break
         unknowns = at.unknowns._replace(noise=noise)
         if change > 0.1:
-            # The cost is not convex in the directions: less noise tells more of them apart.
-            unknowns = _better_directions(problem, unknowns)
+            # The cost is not convex in the directions: less noise distinguishes more of them.
+            unknowns = _chosen(problem, _settled(problem, redirected(problem, unknowns)),
+                               _settled(problem, unknowns))[0]
         at = at._replace(unknowns=unknowns, evaluation=evaluate(problem, unknowns))
     unknowns = at.unknowns._replace(damping=np.zeros(problem.pairs))
     evaluation = evaluate(problem, unknowns)
     noise = np.repeat(unknowns.noise, np.diff(problem.begin))
-    weights = np.asarray((1.0 + (evaluation.residuals / (ROBUST * noise)) ** 2) ** -2)
-    return Fit(problem, unknowns, weights, _covariance(problem, evaluation, weights, free, prior),
-               evaluation.reduced.sum(axis=0), converged)
+    weights = np.asarray((1.0 + (evaluation.residuals / (model.ROBUST * noise)) ** 2) ** -2)
+    covariance = np.zeros((GLOBAL, GLOBAL))
+    covariance[np.ix_(free, free)] = jackknife(
+        evaluation.score[:, free], bent(weights) * evaluation.reduced[:, free][:, :, free],
+        stretches(problem.middles), problem.prior[free])
+    return Fit(problem, unknowns, free, weights, covariance, evaluation.reduced.sum(axis=0),
+               converged)
 
 
 def refit(problem: Problem, coarse: Unknowns, free: NDArray[np.bool_], *, rounds: int = 40,
           tolerance: float = 0.1) -> Fit:
-    """Fit from the calibration of a coarser one, with priors of `bend` by what it shows."""
+    """Fit from a coarser calibration, with priors of `bend` by its parallax."""
     begin = restarted(problem, coarse, 2.0)
     return fit(with_bends(problem, begin), begin, free, rounds=rounds, tolerance=tolerance)
 
 
-def cost_curve(problem: Problem, final: Fit, free: NDArray[np.bool_], interval: float,
+def cost_curve(problem: Problem, final: Fit, interval: float,
                progress: Callable[[float], object]) -> CostCurve:
-    """Cost of `problem` with the read-out time held, from an interval upwards to one downwards."""
+    """Cost of `problem` with the readout time fixed, from an interval upwards to one downwards."""
     best = float(final.unknowns.parameters[READOUT])
-    held = free.copy()
+    held = final.free.copy()
     held[READOUT] = False
     values = np.unique(np.concatenate([np.linspace(-interval, interval, 13), [best]]))
     costs = np.empty(len(values))
@@ -251,10 +310,9 @@ def cost_curve(problem: Problem, final: Fit, free: NDArray[np.bool_], interval: 
             unknowns = _refitted(problem, unknowns._replace(parameters=parameters), held, 2)
             costs[k] = evaluate(problem, unknowns, derivatives=False).cost
             progress(float(np.isfinite(costs).mean()))
-    # One match of a frame serves in many pairs: scaled so that the curvature at the minimum is
-    # 1 / sigma^2.
+    # A match of a frame is in many pairs: scaled to the curvature 1 / sigma^2 at the minimum.
     information = (final.information * (problem.begin[-1] / final.problem.begin[-1])
-                   + np.diag(problem.prior))[np.ix_(free, free)]
+                   + np.diag(problem.prior))[np.ix_(final.free, final.free)]
     naive = float(np.linalg.inv(information)[0, 0])
     return CostCurve(values, (costs - costs.min()) * naive / final.covariance[READOUT, READOUT])
 
@@ -264,18 +322,20 @@ def _refitted(problem: Problem, unknowns: Unknowns, free: NDArray[np.bool_],
     """Unknowns after plain Gauss-Newton steps."""
     for _ in range(rounds):
         evaluation = evaluate(problem, unknowns)
-        H = (evaluation.reduced.sum(axis=0) + np.diag(problem.prior))[np.ix_(free, free)]
-        score = evaluation.score.sum(axis=0) + problem.prior * unknowns.parameters
+        H, gradient = _normal_equations(problem, evaluation, unknowns, free)
         step = np.zeros(GLOBAL)
-        step[free] = -np.linalg.solve(H + 1e-6 * np.diag(np.diag(H)), score[free])
+        step[free] = -np.linalg.solve(H + 1e-6 * np.diag(np.diag(H)), gradient)
         unknowns = stepped(unknowns, step, evaluation.local_step(step))
     return unknowns
 
 
-def _better_directions(problem: Problem, unknowns: Unknowns) -> Unknowns:
-    """Each pair with the better of its own direction and the one found anew."""
-    kept = _settled(problem, unknowns)
-    return _chosen(problem, _settled(problem, redirected(problem, unknowns)), kept)[0]
+def _normal_equations(problem: Problem, evaluation: Evaluation, unknowns: Unknowns,
+                      free: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Hessian and gradient of the cost with its prior by the free parameters."""
+    H = evaluation.reduced.sum(axis=0) + np.diag(problem.prior)
+    gradient = evaluation.score.sum(axis=0) + problem.prior * (
+        unknowns.parameters - problem.center)
+    return H[np.ix_(free, free)], gradient[free]
 
 
 def _settled(problem: Problem, unknowns: Unknowns) -> Unknowns:
@@ -302,7 +362,7 @@ def _chosen(problem: Problem, moved: Unknowns, kept: Unknowns) -> tuple[Unknowns
 
 
 class _Iterate(NamedTuple):
-    """Where the fit is."""
+    """State of the fit."""
 
     unknowns: Unknowns
     evaluation: Evaluation
@@ -310,21 +370,23 @@ class _Iterate(NamedTuple):
     length: float = math.inf    # of Newton's step to here [sigma]
 
 
-def _step(problem: Problem, at: _Iterate, free: NDArray[np.bool_], prior: Array) -> _Iterate:
-    """Where a step leads that lowers the cost; the same place where none does."""
-    cost = at.evaluation.cost + _prior_cost(at.unknowns, prior)
-    H = (at.evaluation.reduced.sum(axis=0) + np.diag(prior))[np.ix_(free, free)]
-    gradient = (at.evaluation.score.sum(axis=0) + prior * at.unknowns.parameters)[free]
+def _step(problem: Problem, at: _Iterate, free: NDArray[np.bool_]) -> _Iterate:
+    """State after a step that lowers the cost; the same if none does."""
+    def prior_cost(unknowns: Unknowns) -> float:
+        return 0.5 * float(problem.prior @ (unknowns.parameters - problem.center)**2)
+
+    cost = at.evaluation.cost + prior_cost(at.unknowns)
+    H, gradient = _normal_equations(problem, at.evaluation, at.unknowns, free)
     newton = np.linalg.solve(H + 1e-9 * np.diag(np.diag(H)), gradient)
-    length, damping = float(np.sqrt(max(gradient @ newton, 0.0))), at.damping
+    length, damping = math.sqrt(max(float(gradient @ newton), 0.0)), at.damping
     for _ in range(8):
         step = np.zeros(GLOBAL)
         step[free] = -np.linalg.solve(H + damping * np.diag(np.diag(H)), gradient)
         tried = stepped(at.unknowns, step, at.evaluation.local_step(step))
         result = evaluate(problem, tried)
-        if result.cost + _prior_cost(tried, prior) > cost:
+        if result.cost + prior_cost(tried) > cost:
             tried, tried_cost = _chosen(problem, tried, at.unknowns)
-            if tried_cost + _prior_cost(tried, prior) > cost:
+            if tried_cost + prior_cost(tried) > cost:
                 damping = max(10.0 * damping, 1e-3)
                 continue
             result = evaluate(problem, tried)
@@ -332,14 +394,10 @@ def _step(problem: Problem, at: _Iterate, free: NDArray[np.bool_], prior: Array)
     return at._replace(damping=damping, length=length)
 
 
-def _prior_cost(unknowns: Unknowns, prior: Array) -> float:
-    return 0.5 * float(prior @ unknowns.parameters**2)
-
-
-def _learned_noise(problem: Problem, at: _Iterate) -> Array:
-    """Noise (P,) of each pair that the residuals show [px]; a third of the last at least."""
+def _estimated_noise(problem: Problem, at: _Iterate) -> Array:
+    """Noise (P,) of each pair by its residuals [px]; a third of the last at least."""
     counts = np.diff(problem.begin)
-    # Two unknowns and a bit of each pair hide some of it.
+    # Some two unknowns of each pair hide a part of it.
     noise = 1.4826 * _medians(problem, np.abs(at.evaluation.residuals)) * np.sqrt(
         counts / np.maximum(counts - 3.0, 1.0))
     middle = max(float(np.median(noise)), _LEAST_NOISE)
@@ -347,15 +405,289 @@ def _learned_noise(problem: Problem, at: _Iterate) -> Array:
                       at.unknowns.noise / 3.0)
 
 
-def _covariance(problem: Problem, evaluation: Evaluation, weights: Array,
-                free: NDArray[np.bool_], prior: Array) -> Array:
-    covariance = np.zeros((GLOBAL, GLOBAL))
-    covariance[np.ix_(free, free)] = jackknife(
-        evaluation.score[:, free], bent(weights) * evaluation.reduced[:, free][:, :, free],
-        stretches(problem.middles), prior[free])
-    return covariance
-
-
 def bent(weights: Array) -> float:
-    """Curvature of the loss, all (N,) matches, over the weight that Gauss-Newton takes."""
+    """Curvature of the loss, all (N,) matches, over the weight of Gauss-Newton."""
     return float((weights * (4.0 * np.sqrt(weights) - 3.0)).sum() / weights.sum())
+
+
+# -- Errors beyond the noise of the matches ----------------------------------------------------
+
+# Regions of the image: columns and rows of equally many points.
+_COLUMNS, _ROWS = 4, 3
+# Squared difference, in sigmas, of the parameters of two halves by chance, at most: in the mean,
+# and of each.
+_CHANCE, _GROSS = 1.75, 9.0
+
+
+class ModelErrors(NamedTuple):
+    """Deviations of lens and gyro from their model, 1 sigma each."""
+
+    focal: float = 0.005        # focal length, relative
+    aspect: float = 0.002       # ratio of the two focal lengths
+    center: float = 0.005       # principal point, share of the image's width
+    radial: float = 0.02        # first coefficient of the distortion
+    second: float = 0.0         # second coefficient, r^4
+    gyro_scale: float = 0.005   # of each axis, relative
+    gyro_skew: float = 0.005    # between each two axes [rad]
+
+
+# Beyond an estimated lens: of the focal length, the first coefficient and the principal point.
+ESTIMATED_LENS = ModelErrors(focal=0.0, center=0.0, radial=0.0, second=0.02)
+
+
+def widened(final: Fit, errors: ModelErrors | None) -> Fit:
+    """The fit with a covariance of all errors, not only the noise of the matches."""
+    wider = np.sqrt(_between_regions(final) * _disagreement(final))
+    scatter = final.covariance * np.outer(wider, wider)
+    if errors is not None:
+        moves = np.array([_move(final, *there) for there in _perturbed(final, errors)])
+        scatter = scatter + moves.T @ moves
+    return replace(final, covariance=scatter)
+
+
+def _between_regions(final: Fit) -> Array:
+    """Factors (G,) of the variances by the scatter of regions of the image beyond that of cells.
+
+    Cells are regions times stretches of time: if the regions scatter no more than these, the
+    scatter of the stretches is complete.
+    """
+    problem, free, curve = final.problem, final.free, bent(final.weights)
+    index = np.ix_(free, free)
+    region, stretch = _regions(problem.view1.points), stretches(problem.middles)
+    whole = evaluate(problem, final.unknowns)
+    prior = np.diag(problem.prior)
+    inverse = np.linalg.inv((curve * whole.reduced.sum(axis=0) + prior)[index])
+    moves, cells = [], np.zeros_like(inverse)
+    for name in np.unique(region):
+        rest = evaluate(problem.matches(region != name), final.unknowns)
+        own = (whole.score - rest.score)[:, free]
+        rest_curvature = (curve * rest.reduced.sum(axis=0) + prior)[index]
+        moves.append(np.linalg.pinv(rest_curvature, hermitian=True) @ own.sum(axis=0))
+        of_cells = np.stack([own[stretch == k].sum(axis=0) for k in np.unique(stretch)]) @ inverse
+        cells += of_cells.T @ of_cells
+    beyond = np.diag(jackknife_of(np.array(moves)) - cells)
+    factors = np.ones(GLOBAL)
+    factors[free] += np.maximum(beyond, 0.0) / np.diag(final.covariance)[free]
+    return factors
+
+
+def _regions(points: Array) -> NDArray[np.int64]:
+    """Region (N,) of the image of each point (N, 2): columns and rows of equally many points."""
+    def band(values: Array, count: int) -> NDArray[np.int64]:
+        borders = np.quantile(values, np.arange(1, count) / count)
+        return np.searchsorted(borders, values)
+    return band(points[:, 0], _COLUMNS) + _COLUMNS * band(points[:, 1], _ROWS)
+
+
+def _disagreement(final: Fit) -> Array:
+    """Factors (G,) of the variances by the difference of both halves; 1 if it is by chance.
+
+    Common is the mean square of the differences in sigmas, each limited to `_GROSS`; a parameter
+    with a larger one has that.
+    """
+    middles, free = final.problem.middles, final.free
+    first = middles < np.median(middles)
+    one, other = (
+        fit(final.problem.pairs_of(part), final.unknowns.pairs_of(part), free, rounds=15)
+        for part in (first, ~first))
+    difference = one.unknowns.parameters - other.unknowns.parameters
+    difference[ROTATION:ROTATION + 3] = log_so3(
+        one.unknowns.R_imu_cam @ other.unknowns.R_imu_cam.T)
+    variances = np.diag(one.covariance + other.covariance)
+    squares = difference[free]**2 / variances[free]
+    mean = float(np.minimum(squares, _GROSS).mean())
+    factors = np.ones(GLOBAL)
+    factors[free] = np.maximum(mean if mean > _CHANCE else 1.0,
+                               np.where(squares > _GROSS, squares, 1.0))
+    return factors
+
+
+def _move(final: Fit, problem: Problem, unknowns: Unknowns) -> Array:
+    """Move (G,) of the optimum, by one Newton step, with other data or other fixed parameters."""
+    there, here = evaluate(problem, unknowns), evaluate(final.problem, final.unknowns)
+    H, _ = _normal_equations(problem, here, final.unknowns, final.free)
+    move = np.zeros(GLOBAL)
+    gradient = (there.score - here.score).sum(axis=0)[final.free]
+    move[final.free] = -np.linalg.solve(H, gradient)
+    return move
+
+
+def _perturbed(final: Fit, errors: ModelErrors) -> Iterator[tuple[Problem, Unknowns]]:
+    """Data and unknowns with one sigma of each error of the model."""
+    problem, unknowns = final.problem, final.unknowns
+    view = problem.view1
+    center = errors.center * float(np.ptp(view.points[:, 0]) / np.mean(view.by_pixel[:, 0, 0]))
+    for k, error in enumerate((errors.focal, errors.radial, center, center)):
+        if error:
+            parameters = unknowns.parameters.copy()
+            parameters[model.FOCAL + k] += error
+            yield problem, unknowns._replace(parameters=parameters)
+    lenses: list[Callable[[Array], Array]] = [
+        lambda points: points / [1.0, 1.0 + errors.aspect],
+        lambda points: points * (
+            1.0 - errors.second * (points**2).sum(axis=1, keepdims=True)**2)]
+    for lens in lenses:
+        view1, view2 = (view._replace(points=np.ascontiguousarray(lens(view.points)))
+                        for view in (problem.view1, problem.view2))
+        yield problem._replace(view1=view1, view2=view2), unknowns
+    for i in range(3):
+        for j in range(i + 1):
+            mixing = np.zeros((3, 3))
+            mixing[i, j] = mixing[j, i] = errors.gyro_scale if i == j else errors.gyro_skew
+            yield problem._replace(
+                gyro_rates=problem.gyro_rates @ (np.eye(3) + mixing)), unknowns
+
+
+# -- Result of a fit, and observability --------------------------------------------------------
+
+_RECORD_MORE = ('too little rotation, too short, or too few points: record 10 s or more of a '
+                'textured scene while rotating 20 to 60 deg/s about all three axes')
+# Error of every focal length, relative: the residual is not linear in the noise of the points.
+_LEAST_FOCAL_SIGMA = 2e-4
+# A note if the intervals between frames vary for an unknown reason.
+_UNCLEAR = defaultdict(str, {Varying.UNCLEAR: (
+    'the intervals between frames vary neither as automatic exposure does nor as jitter: the '
+    'offset is assumed to be the same in all frames')})
+# Sigma, in those of an observable value, beyond which a rotation or focal length is of no use.
+_USELESS = 10.0
+# Sigma of an observable slope of the offset [s/s].
+_MOST_SLOPE_SIGMA = 0.5
+
+
+def evaluated(data: Observations, final: Fit, curve: CostCurve,
+              config: CalibrationConfig) -> CalibrationResult:
+    """Result of a fit; InputError if the readout time is longer than the frame interval."""
+    covariance = final.covariance + np.diag(np.where(final.free, _tracker_sigmas(config), 0.0)**2)
+    bounded, covariance, beyond = _bounded(final.unknowns, covariance, data.interval)
+    parameters, R_cam_imu = bounded.parameters, bounded.R_imu_cam.T
+    rates, one_axis = _excitation(data, parameters[model.BIAS:model.BIAS + 3], R_cam_imu, config)
+    sigmas = np.sqrt(np.diag(covariance))
+    # Row 0 is read this share of the readout before the middle row.
+    to_first = np.zeros(GLOBAL)
+    height = data.camera.height
+    to_first[[model.OFFSET, READOUT]] = 1.0, -0.5 * (height - 1) / height
+    # Rotations about the axes of the camera.
+    rotation_covariance = covariance[ROTATION:ROTATION + 3, ROTATION:ROTATION + 3]
+    rotation_sigma = np.sqrt(np.diag(R_cam_imu @ rotation_covariance @ R_cam_imu.T))
+    axis_map = nearest_axis_map(R_cam_imu)
+    cosine = (np.trace(R_cam_imu @ axis_map.T) - 1.0) / 2.0
+    bias_x, bias_y, bias_z = (_estimate(parameters[i], sigmas[i], config.max_bias_sigma)
+                              for i in range(model.BIAS, model.BIAS + 3))
+    focal = slope = radial = center = None
+    if final.free[model.FOCAL]:
+        camera = with_lens(data.camera, parameters[model.LENS])
+        factor = math.exp(data.lens[0] + parameters[model.FOCAL])
+        focal = _estimate(factor, factor * sigmas[model.FOCAL], factor * config.max_focal_sigma,
+                          one_axis)
+        radial, column, row = (Estimate(value, float(sigma), True) for value, sigma in zip(
+            (camera.distortion[0], camera.cx, camera.cy), sigmas[model.LENS][1:], strict=True))
+        center = column, row
+    if final.free[model.SLOPE]:
+        slope = _estimate(parameters[model.SLOPE], sigmas[model.SLOPE], _MOST_SLOPE_SIGMA)
+    jitters = data.stamps.varying is Varying.JITTER
+    unsettled = '' if final.converged else 'the fit has not converged'
+    return CalibrationResult(
+        readout_time=replace(_estimate(parameters[READOUT], sigmas[READOUT],
+                                       config.max_readout_sigma), determined=True),
+        fitted_readout=float(final.unknowns.parameters[READOUT]),
+        time_offset=_estimate(float(to_first @ parameters),
+                              math.sqrt(to_first @ covariance @ to_first),
+                              config.max_offset_sigma),
+        R_cam_imu=R_cam_imu, rotation_sigma=rotation_sigma,
+        rotation=_estimate(math.acos(np.clip(cosine, -1.0, 1.0)), rotation_sigma.max(),
+                           config.max_rotation_sigma, one_axis),
+        axis_map=axis_map, gyro_bias=(bias_x, bias_y, bias_z), focal_factor=focal,
+        radial=radial, center=center, exposure=_exposure(data, final, sigmas[model.EXPOSURE]),
+        exposure_margin=data.exposure.margin,
+        offset_by_interval=None if jitters else slope,
+        offset_by_jitter=slope if jitters else None, stamp_jitter=data.stamps.jitter,
+        rotation_rates=rates, curve=curve,
+        pixel_sigma=float(np.median(final.unknowns.noise)),
+        inlier_ratio=float((final.weights > 0.25).mean()),
+        frames=len(data.tracks), pairs=final.problem.pairs, matches=int(final.problem.begin[-1]),
+        frame_interval=data.interval,
+        warnings=tuple(filter(None, (unsettled, one_axis, beyond, _UNCLEAR[data.stamps.varying]))))
+
+
+def _tracker_sigmas(config: CalibrationConfig) -> Array:
+    """Errors (GLOBAL,) of tracker and model that all of a recording has in common."""
+    sigmas = np.zeros(GLOBAL)
+    sigmas[[READOUT, model.OFFSET]] = config.tracking_time_sigma
+    sigmas[ROTATION:ROTATION + 3] = config.tracking_rotation_sigma
+    sigmas[model.BIAS:model.BIAS + 3] = config.tracking_bias_sigma
+    sigmas[[model.SLOPE, model.FOCAL]] = config.exposure_slope_sigma, _LEAST_FOCAL_SIGMA
+    return sigmas
+
+
+def _exposure(data: Observations, final: Fit, square_sigma: float) -> Estimate:
+    """Exposure at the median interval [s]."""
+    assumed = float(np.median(data.exposure.assumed))
+    square = assumed**2 + float(final.unknowns.parameters[model.EXPOSURE])
+    value = min(math.sqrt(max(square, 0.0)), data.interval)
+    # Also of a square near zero, where the root has no derivative.
+    sigma = math.sqrt(value**2 + square_sigma) - value
+    return _estimate(value, sigma, 0.5 * value)
+
+
+def _bounded(unknowns: Unknowns, covariance: Array,
+             interval: float) -> tuple[Unknowns, Array, str]:
+    """The calibration with its readout within an interval T between frames, and a note.
+
+    No camera reads longer than that. The readout time is the mean of its normal distribution
+    between these bounds, and the others follow by their covariance with it. Sigmas are kept: an
+    estimate beyond the bound has errors that the bound does not limit. An estimate less certain
+    than the bound itself, T / 2 +- T / sqrt(12) if read downwards, is joined with that.
+    """
+    known = interval / math.sqrt(12.0)
+    if covariance[READOUT, READOUT] > known**2:
+        gain = covariance[:, READOUT] / (covariance[READOUT, READOUT] + known**2)
+        step = gain * (0.5 * interval - unknowns.parameters[READOUT])
+        return (stepped(unknowns, step, np.zeros((len(unknowns.direction), LOCAL))),
+                covariance - np.outer(gain, covariance[READOUT]),
+                ('the images hardly determine the readout time: it is mostly that of any camera '
+                f'that is read downwards within the {1e3 * interval:.1f} ms between frames'))
+    readout, sigma = float(unknowns.parameters[READOUT]), math.sqrt(covariance[READOUT, READOUT])
+    found = 'the readout time is estimated as ' + BY_NAME['readout_time'].with_sigma(
+        abs(readout), sigma)
+    if abs(readout) - 3.0 * sigma > interval:
+        raise InputError(
+            f'{found}, longer than the interval of {1e3 * interval:.1f} ms between frames, which '
+            'no camera can do: check for frames that were dropped and stamped again, and for '
+            'images that were cropped, scaled or rotated')
+    mean = float(truncnorm.mean(*((np.array([-interval, interval]) - readout) / sigma),
+                                loc=readout, scale=sigma))
+    step = covariance[:, READOUT] * ((mean - readout) / sigma**2)
+    note = '' if abs(readout) <= interval else (
+        f'{found}, but is at most the {1e3 * interval:.1f} ms between frames: all parameters are '
+        f'for {1e3 * abs(mean):.1f} ms, the mean below that')
+    return stepped(unknowns, step, np.zeros((len(unknowns.direction), LOCAL))), covariance, note
+
+
+def _estimate(value: float, sigma: float, limit: float, blocking_reason: str = '') -> Estimate:
+    """Estimate, observable if its sigma is within `limit` and nothing blocks it.
+
+    Beyond `_USELESS` limits a value is of no use.
+    """
+    good = bool(sigma <= limit and not blocking_reason)
+    return Estimate(float(value), float(sigma), good,
+                    '' if good else blocking_reason or _RECORD_MORE,
+                    determined=sigma <= _USELESS * limit and not blocking_reason)
+
+
+def _excitation(data: Observations, bias: Array, R_cam_imu: Array,
+                config: CalibrationConfig) -> tuple[Array, str]:
+    """Rms rates about the camera's axes [rad/s], and what is missing (empty: nothing)."""
+    inside = (data.gyro_times >= data.times[0]) & (data.gyro_times <= data.times[-1])
+    rates = (data.gyro_rates[inside] - bias) @ R_cam_imu.T
+    rates = rates - rates.mean(axis=0)
+    rms = np.sqrt((rates**2).mean(axis=0))
+    values, vectors = np.linalg.eigh(rates.T @ rates / len(rates))
+    # Two axes fix a rotation.
+    if np.sqrt(max(values[1], 0.0)) >= config.min_rotation_rate:
+        return rms, ''
+    main = vectors[:, 2]
+    lacking = [AXES[i] for i in np.argsort(np.abs(main))[:2]]
+    about = AXES[int(np.argmax(np.abs(main)))]
+    return rms, (f'the camera rotates about one axis only, nearly {about}, so the rotation about '
+                 f'it is not observable: rotate about {lacking[0]} and {lacking[1]} too, 20 to 60 '
+                 'deg/s')

@@ -1,106 +1,113 @@
-"""The whole calibration on tracks: start from nothing, fit, judge."""
+"""The whole calibration on tracks: search, fit, evaluation; and tracks from a bag."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
+import logging
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.calibrate.alignment import find_starts, Start
+from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics
+from rs_relpose_ros.calibrate import fit
 from rs_relpose_ros.calibrate.coplanarity import (
     EXPOSURE,
     FOCAL,
     GLOBAL,
+    LENS,
     OFFSET,
-    Problem,
     SLOPE,
     Unknowns,
 )
-from rs_relpose_ros.calibrate.fit import cost_curve, fit, initial, refit, with_bends
-from rs_relpose_ros.calibrate.gyro_path import GyroSeries
-from rs_relpose_ros.calibrate.judgement import judged
-from rs_relpose_ros.calibrate.observations import Observations, PairSelection
+from rs_relpose_ros.calibrate.observations import Observations, PairSelection, Tracks
 from rs_relpose_ros.calibrate.result import CalibrationResult
-from rs_relpose_ros.calibrate.tracks import Tracks
-from rs_relpose_ros.calibrate.uncertainty import ModelErrors, UNCALIBRATED, widened
-from rs_relpose_ros.config.calibration import CalibrationConfig
-from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.calibrate.start import find_starts, GyroSeries, Start
+from rs_relpose_ros.config.settings import CalibrationConfig, TrackingConfig
+from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
+from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
+from rs_relpose_ros.geometry.distortion import DISTORTION_MODELS
+from rs_relpose_ros.messages.incoming import PARTS, ReasonCounts, Role, sensor_messages
+from rs_relpose_ros.tracking.features import make_tracker
+from rs_relpose_ros.tracking.images import EncodedImage, GrayLevels
 
 Array = NDArray[np.float64]
-Progress = Callable[[float], object]
 
 _LEAST_MATCHES = 20
 # Spans [s]: over long ones the gyro's rates at the rows differ; over short ones the errors of the
-# tracker add up less and the velocity of the camera is constant. The noise that is found for each
-# pair decides on its weight.
+# tracker add up less and the velocity of the camera is constant. The noise of each pair determines
+# its weight.
 _ALL_PAIRS = PairSelection((0.033, 0.067, 0.133, 0.267), 80, _LEAST_MATCHES, 800)
 _SOME_PAIRS = _ALL_PAIRS._replace(max_matches=40, most_pairs=100)
 _PAIRS_AT_START = _SOME_PAIRS._replace(spans=(0.067,))
+_NEIGHBOURS = _ALL_PAIRS._replace(spans=(0.0,), min_matches=8)
+# Changes of the lens within which the fit is linear in it, and fits at the most.
+_LENS_STAYS, _LENS_ROUNDS = (0.01, 0.02, 5.0, 5.0), 6
 _FOCAL_FACTORS = np.geomspace(0.5, 2.0, 9)
 
 
 def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
               focal_known: bool = True, config: CalibrationConfig | None = None,
               rng: np.random.Generator | int = 0,
-              progress: Progress = lambda share: None) -> CalibrationResult:
-    """Read-out time, clock offset, rotation, gyro bias and perhaps focal length, from nothing.
+              progress: Callable[[float], object] = lambda share: None) -> CalibrationResult:
+    """Readout time, clock offset, rotation, gyro bias and perhaps focal length, without a guess.
 
-    Two views of every pair of frames obey the coplanarity of the rows' own instants; see
+    Matches of every pair of frames are coplanar at the times of their rows; see
     `rs_relpose_ros.calibrate.coplanarity` and docs/calibration.md.
 
-    `tracks` are of the whole recording, `gyro` is on a clock that differs from the camera's by at
-    most ``config.max_time_offset``; the read-out time of `camera` is not looked at. Unless
-    `focal_known`, fx and fy are a guess within a factor of 2, whose ratio holds, and the camera
-    has no distortion. `rng` chooses among matches where there are more than needed; `progress` is
-    called with the share of the work that is done.
-
-    Raises
-    ------
-    InputError
-        The recording cannot be used; the text says what to record instead.
+    The clock of `gyro` differs from the camera's by at most ``config.max_time_offset``; the
+    readout time of `camera` is not used. Unless `focal_known`, fx and fy are a guess within a
+    factor of 2, whose ratio holds, and focal length, first coefficient of the distortion and
+    principal point are estimated. `rng` selects matches if
+    there are more than needed; `progress` is called with the finished share of the work.
+    InputError if the recording cannot be used, with what to record instead.
     """
     config = CalibrationConfig() if config is None else config
     rng = np.random.default_rng(rng)
     if len(tracks) < 2 or len(gyro) < 2:
         raise InputError(f'{len(tracks)} frames and {len(gyro)} gyro samples are too few: record '
                          'at least 10 s with both')
-    data = Observations.of(tracks, gyro, camera)
+    data = Observations.of(tracks, gyro, camera, config)
     _check_recording(data, config)
     starts = _starts(data, focal_known, config, rng)
     progress(0.15)
+
+    def about(lens: Array) -> Observations:
+        return data if not lens.any() else Observations.of(tracks, gyro, camera, config, lens)
+
     free = np.ones(GLOBAL, dtype=bool)
-    free[SLOPE] = False
-    free[FOCAL], free[EXPOSURE] = not focal_known, False
-    coarse = _coarse_fit(data, starts, free, config, rng)
+    free[[SLOPE, EXPOSURE]] = False
+    free[LENS] = False
+    free[FOCAL] = not focal_known
+    data, coarse = _coarse_fit(about, starts, free, config, rng)
+    free[LENS] = not focal_known
+    if not focal_known:
+        data, settled = _fit_with_lens(about, data, coarse, free, _SOME_PAIRS, config, rng)
+        coarse = settled.unknowns
     progress(0.4)
-    free[SLOPE] = bool(data.stamps.covariates.any())
-    free[EXPOSURE] = config.exposed
-    offset = coarse.parameters[OFFSET]
-    final = refit(_problem(data, _ALL_PAIRS, offset, config, rng), coarse, free)
+    free[[SLOPE, EXPOSURE]] = data.stamps.covariates.any(), data.exposure.square_sigma > 0.0
+    data, final = _fit_with_lens(about, data, coarse, free, _ALL_PAIRS, config, rng)
     progress(0.7)
-    errors = None if not config.exposed else ModelErrors() if focal_known else UNCALIBRATED
-    final = widened(final, free, errors)
+    errors = None
+    if config.exposed:
+        errors = fit.ModelErrors() if focal_known else fit.ESTIMATED_LENS
+    final = fit.widened(final, errors)
     progress(0.8)
-    offset = final.unknowns.parameters[OFFSET]
-    some = with_bends(_problem(data, _SOME_PAIRS, offset, config, rng), final.unknowns)
-    curve = cost_curve(some, final, free, data.interval,
-                       lambda share: progress(0.8 + 0.2 * share))
-    return judged(data, final, free, curve, config)
-
-
-# -- what comes in -----------------------------------------------------------------------------
+    some = data.selected_problem(_SOME_PAIRS, final.unknowns.parameters[OFFSET],
+                                 config.max_gyro_gap, rng)
+    curve = fit.cost_curve(fit.with_bends(some, final.unknowns), final, data.interval,
+                           lambda share: progress(0.8 + 0.2 * share))
+    return fit.evaluated(data, final, curve, config)
 
 
 def _check_recording(data: Observations, config: CalibrationConfig) -> None:
-    """Refuse what cannot give a calibration, with what to record instead."""
+    """Refuse recordings that do not determine a calibration, with what to record instead."""
     frames = len(data.tracks)
     if frames < config.min_frames:
         raise InputError(
             f'the recording is too short: {frames} frames in {data.times[-1]:.1f} s, at least '
-            f'{config.min_frames} are needed. Record 10 s or more while you turn the camera about '
-            'all three axes')
+            f'{config.min_frames} are needed. Record 10 s or more while you rotate the camera '
+            'about all three axes')
     first = max(data.times[0], data.gyro_times[0] - config.max_time_offset)
     last = min(data.times[-1], data.gyro_times[-1] + config.max_time_offset)
     if last - first < 0.5 * data.times[-1]:
@@ -115,31 +122,28 @@ def _check_recording(data: Observations, config: CalibrationConfig) -> None:
     counts = np.bincount(data.tracks.frames, minlength=frames)
     if np.median(counts) < _LEAST_MATCHES:
         raise InputError(
-            f'there is too little to follow: {np.median(counts):.0f} points per image in the '
+            f'there are too few points to follow: {np.median(counts):.0f} per image in the '
             f'median, at least {_LEAST_MATCHES} are needed. Record a scene with texture, in good '
             'light and focus')
     spread = data.gyro_rates - np.median(data.gyro_rates, axis=0)
     rate = float(np.sqrt((spread**2).sum(axis=1).mean()))
     if rate < config.min_rotation_rate:
         raise InputError(
-            f'the camera hardly turns: {np.degrees(rate):.2f} deg/s rms by the gyro, at least '
-            f'{np.degrees(config.min_rotation_rate):.1f} are needed. Turn it to and fro about all '
-            'three axes, 20 to 60 deg/s')
-
-
-# -- start -------------------------------------------------------------------------------------
+            f'the camera hardly rotates: {np.degrees(rate):.2f} deg/s rms by the gyro, at least '
+            f'{np.degrees(config.min_rotation_rate):.1f} are needed. Rotate it to and fro about '
+            'all three axes, 20 to 60 deg/s')
 
 
 def _starts(data: Observations, focal_known: bool, config: CalibrationConfig,
             rng: np.random.Generator) -> list[Start]:
-    pairs = data.pairs((1,), max_matches=80, min_matches=8, rng=rng)
+    pairs = data.pairs(_NEIGHBOURS, rng)
     if len(pairs) < 0.5 * len(data.tracks):
         raise InputError(
             f'points can be followed over {len(pairs)} of {len(data.tracks) - 1} steps between '
             'images only: the images are blurred, the scene has no texture, or it moves too fast. '
-            'Record with a short exposure in good light, and turn more slowly')
+            'Record with a short exposure in good light, and rotate more slowly')
     found = find_starts(
-        data.seen_rates(pairs), data.times[pairs.first], data.times[pairs.second],
+        data.image_rates(pairs), data.times[pairs.first], data.times[pairs.second],
         data.gyro_times, data.gyro_rates, max_offset=config.max_time_offset + 0.02, step=5e-3,
         focal_factors=np.ones(1) if focal_known else _FOCAL_FACTORS, count=3)
     if not found:
@@ -147,25 +151,166 @@ def _starts(data: Observations, focal_known: bool, config: CalibrationConfig,
     return found
 
 
-def _coarse_fit(data: Observations, starts: list[Start], free: NDArray[np.bool_],
-                config: CalibrationConfig, rng: np.random.Generator) -> Unknowns:
-    """The best of the fits to a few pairs from each of the starts."""
+def _coarse_fit(about: Callable[[Array], Observations], starts: list[Start],
+                free: NDArray[np.bool_], config: CalibrationConfig,
+                rng: np.random.Generator) -> tuple[Observations, Unknowns]:
+    """The best of the fits to a few pairs from each of the starts, and its data."""
     fits = []
     for start in starts:
-        problem = _problem(data, _PAIRS_AT_START, start.offset, config, rng)
-        unknowns = initial(problem, start.R_cam_imu.T, start.offset,
-                           log_focal=float(np.log(start.focal_factor)))
-        fits.append(fit(problem, unknowns, free, rounds=20, tolerance=0.3).unknowns)
+        data = about(np.array([np.log(start.focal_factor), 0.0, 0.0, 0.0]))
+        problem = data.selected_problem(_PAIRS_AT_START, start.offset, config.max_gyro_gap, rng)
+        unknowns = fit.initial(problem, start.R_cam_imu.T, start.offset)
+        fits.append((data, fit.fit(problem, unknowns, free, rounds=20, tolerance=0.3).unknowns))
     # By the noise of the matches: pairs and cost differ between the starts.
-    return min(fits, key=lambda found: float(np.median(found.noise)))
+    return min(fits, key=lambda found: float(np.median(found[1].noise)))
 
 
-def _problem(data: Observations, selection: PairSelection, offset: float,
-             config: CalibrationConfig, rng: np.random.Generator) -> Problem:
-    """Data of a fit to selected pairs whose rows the gyro covers at this `offset` [s]."""
-    pairs = data.selected(selection, offset, config.max_gyro_gap, rng)
-    if len(pairs) < 10:
+def _fit_with_lens(about: Callable[[Array], Observations], data: Observations, coarse: Unknowns,
+                   free: NDArray[np.bool_], selection: PairSelection, config: CalibrationConfig,
+                   rng: np.random.Generator) -> tuple[Observations, fit.Fit]:
+    """Fit from `coarse`, linear in the lens, repeated about its own lens until that stays."""
+    for _ in range(_LENS_ROUNDS):
+        data = about(data.lens + coarse.parameters[LENS])
+        problem = data.selected_problem(selection, coarse.parameters[OFFSET],
+                                        config.max_gyro_gap, rng)
+        found = fit.refit(problem, coarse, free)
+        coarse = found.unknowns
+        if (np.abs(coarse.parameters[LENS]) <= _LENS_STAYS).all():
+            break
+    return data, found
+
+
+# -- Tracks and gyro of a bag -------------------------------------------------------------------
+
+# Guess of an unknown focal length, share of the longer side: 64 deg of view.
+_FOCAL_GUESS = 0.8
+# The current image becomes the reference when this share of the points is left, or after so many
+# images.
+_KEPT, _RENEWED_AFTER = 0.8, 30
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationInput:
+    """Tracks (pixels of the full sensor), gyro and camera of a bag."""
+
+    tracks: Tracks
+    gyro: GyroSeries
+    camera: RollingShutterCamera    # of the full sensor, its readout time 0
+    focal_known: bool               # by the CameraInfo; else `camera` is a guess
+    unused: dict[str, int]          # messages that were not used, by reason
+
+    def with_unknown_lens(self, distortion_model: str) -> CalibrationInput:
+        """The same for a lens that is to be estimated; InputError if it has a distortion."""
+        if any(self.camera.distortion):
+            raise InputError('the CameraInfo has distortion coefficients, beyond the first of '
+                             'which nothing is estimated: calibrate without --lens')
+        counts = DISTORTION_MODELS[distortion_model].coefficient_counts
+        return replace(self, focal_known=False, camera=replace(
+            self.camera, distortion_model=distortion_model,
+            distortion=(0.0,) * max(counts[0], 5 if len(counts) > 2 else 4)))
+
+
+def read_recording(bag: Bag, topics: SensorTopics, tracking: TrackingConfig, *,
+                   images: range | None = None) -> CalibrationInput:
+    """Follow points through the images of an open bag, and collect its gyro.
+
+    Of `images`, by their number in the bag, and of the gyro meanwhile; None: all. InputError or
+    MissingInputError if the bag is damaged, or has no usable image or no gyro.
+    """
+    reader = _Reader(topics, tracking)
+    number = 0
+    for role, message in sensor_messages(bag, topics, (Role.IMU, Role.CAMERA_INFO, Role.IMAGE)):
+        if images is None or role is Role.CAMERA_INFO or number in images:
+            reader.take(role, message)
+        number += role is Role.IMAGE
+    return reader.recording()
+
+
+class _Reader:
+    """Follows points from image to image by the chosen tracker, and keeps the gyro."""
+
+    def __init__(self, topics: SensorTopics, tracking: TrackingConfig) -> None:
+        self._topics = topics
+        self._tracker, self._levels = make_tracker(tracking), GrayLevels()
+        self._since_renewed = 0     # images
+        self._stamps: list[int] = []
+        self._ids: list[NDArray[np.uint32]] = []
+        self._points: list[Array] = []
+        self._intrinsics: Intrinsics | None = None
+        self._uncalibrated = topics.camera_info is None
+        self._size: tuple[int, int] | None = None
+        self._gyro: dict[int, tuple[float, float, float]] = {}
+        self._unused = ReasonCounts()
+
+    def take(self, role: Role, message: BagMessage) -> None:
+        try:
+            value = PARTS[role].read(message.message)
+            if role is Role.IMAGE:
+                self._follow(value)
+            elif role is Role.CAMERA_INFO:
+                self._intrinsics = value
+            elif value.angular_velocity is None:
+                raise MissingInputError('an IMU message has no gyro')
+            else:
+                self._gyro.setdefault(value.stamp_ns, value.angular_velocity)
+        except RsRelposeError as error:
+            # Without a calibration the focal length is guessed.
+            if role is Role.CAMERA_INFO and isinstance(error, MissingInputError):
+                self._uncalibrated = True
+            elif self._unused.add(reason := f'{message.topic}: {error}'):
+                _logger.info('not used: %s', reason)
+
+    def _follow(self, encoded: EncodedImage) -> None:
+        if self._stamps and encoded.stamp_ns <= self._stamps[-1]:
+            raise InputError('the stamp of an image is not later than the previous one')
+        image, tracker = encoded.decoded(self._levels), self._tracker
+        if not self._stamps:
+            tracker.start(image)
+        # Matches with the reference, so that errors do not add up from frame to frame.
+        tracker.track(image)
+        matches = tracker.refined_matches()
+        self._since_renewed += 1
+        if tracker.tracked_fraction < _KEPT or self._since_renewed >= _RENEWED_AFTER:
+            tracker.promote()
+            self._since_renewed = 0
+        self._stamps.append(encoded.stamp_ns)
+        self._ids.append(matches.track_ids)
+        self._points.append(matches.points2)
+        self._size = image.shape[1], image.shape[0]
+
+    def recording(self) -> CalibrationInput:
+        unused = self._unused.most_common()
+        why = ''.join(f'; {reason}' for reason in list(unused)[:2])
+        if self._size is None:
+            raise InputError(f'no image of {self._topics.image.name} can be used{why}')
+        if not self._gyro:
+            raise MissingInputError(
+                f'no message of {self._topics.imu.name} has a gyro{why}: record the angular '
+                'velocity together with the images')
+        intrinsics = self._intrinsics
+        if intrinsics is None and not self._uncalibrated:
+            raise MissingInputError(f'no message of {self._topics.camera_info} can be used{why}')
+        points, stamps = np.concatenate(self._points), sorted(self._gyro)
+        if intrinsics is not None:
+            points = intrinsics.to_sensor(points)
+        frames = np.repeat(np.arange(len(self._ids)), [len(ids) for ids in self._ids])
+        tracks = Tracks(np.array(self._stamps), frames, np.concatenate(self._ids), points)
+        gyro = GyroSeries(np.array(stamps), np.array([self._gyro[stamp] for stamp in stamps]))
+        return CalibrationInput(tracks, gyro, _camera(intrinsics, *self._size),
+                                intrinsics is not None, unused)
+
+
+def _camera(intrinsics: Intrinsics | None, width: int, height: int) -> RollingShutterCamera:
+    """Camera of images of this size; a guess without intrinsics."""
+    if intrinsics is None:
+        guess = _FOCAL_GUESS * max(width, height)
+        return RollingShutterCamera(
+            width=width, height=height, fx=guess, fy=guess, cx=0.5 * (width - 1),
+            cy=0.5 * (height - 1), readout_time=0.0)
+    if (width, height) != (intrinsics.image_width, intrinsics.image_height):
         raise InputError(
-            f'only {len(pairs)} pairs of images have {_LEAST_MATCHES} points in common and a gyro '
-            'without gaps: record a textured scene with a short exposure, and all of the gyro')
-    return data.problem(pairs, offset)
+            f'the images are {width}x{height}, but the CameraInfo is for {intrinsics.image_width}x'
+            f'{intrinsics.image_height}: a resized image needs a CameraInfo of its own')
+    return intrinsics.global_shutter_camera()

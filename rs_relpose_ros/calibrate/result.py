@@ -1,12 +1,22 @@
-"""What a calibration found, how sure it is, and what to record where it is not."""
+"""Result of a calibration: values and sigmas, as report, parameter file, JSON and picture."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
+import math
+from pathlib import Path
+from typing import Any
 
+from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+
+from rs_relpose_ros.calibrate.start import axes_text
+from rs_relpose_ros.config.files import parameter_text, SourcedValue
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.output_files import save_picture
+from rs_relpose_ros.pipeline.findings import BY_NAME
 
 Array = NDArray[np.float64]
 
@@ -15,23 +25,24 @@ AXES = ('x (pitch)', 'y (yaw)', 'z (roll)')
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A figure with its 1 sigma, in the unit of the field; `remark` says why it is not observable.
+    """A value with its 1 sigma, in the unit of the field.
 
-    A figure that is not observable keeps its value, which means nothing then.
+    If it is not observable, it is too uncertain for accurate poses, and `remark` is the reason.
     """
 
     value: float
     sigma: float
     observable: bool
     remark: str = ''
+    determined: bool = True     # whether the value means anything
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CostCurve:
-    """Cost of the whole fit over the read-out time, everything else fitted anew."""
+    """Cost of the whole fit over the readout time, with all other parameters fitted again."""
 
     readout_times: Array    # (K,) signed [s]: negative is read upwards
-    # (K,) minus the log-likelihood above that of the best; thinned out to independent pairs.
+    # (K,) log-likelihood lost against the best; scaled to independent pairs.
     costs: Array
 
 
@@ -39,29 +50,35 @@ class CostCurve:
 class CalibrationResult:
     """Calibration of a rolling-shutter camera against a gyro.
 
-    ``t_imu(row v) = stamp + time_offset + v / height * readout_time``: a negative read-out time is
+    ``t_imu(row v) = stamp + time_offset + v / height * readout_time``: a negative readout time is
     read upwards, with `time_offset` still that of row 0.
     """
 
     readout_time: Estimate                  # signed [s]
-    fitted_readout: float                   # without its bound, the interval between frames [s]
+    fitted_readout: float                   # without its bound, the frame interval [s]
     time_offset: Estimate                   # of row 0 [s], at the median interval between frames
     R_cam_imu: Array                        # (3, 3) v_cam = R_cam_imu v_imu
     rotation_sigma: Array                   # (3,) 1 sigma about the camera's axes [rad]
     rotation: Estimate                      # angle to `axis_map` [rad], with the largest sigma
     axis_map: Array                         # (3, 3) the nearest rotation between axes
     gyro_bias: tuple[Estimate, Estimate, Estimate]   # IMU frame [rad/s]
-    focal_factor: Estimate | None           # true over assumed focal length; None where given
-    # Change of the offset by the interval between frames [s/s], which automatic exposure makes;
-    # None where the intervals do not vary like that.
+    # Lens, None if known: true over assumed focal length, first coefficient of the distortion,
+    # principal point [px].
+    focal_factor: Estimate | None
+    radial: Estimate | None
+    center: tuple[Estimate, Estimate] | None
+    exposure: Estimate                      # at the median interval between frames [s]
+    exposure_margin: float                  # that interval less the exposure, if it follows it
+    # Change of the offset by the interval between frames [s/s], as by automatic exposure; None if
+    # the intervals do not vary like that.
     offset_by_interval: Estimate | None
-    # Change of the offset by how early a stamp is against a smooth line [s/s], 1 where only the
-    # stamps jitter; None where they do not.
+    # Change of the offset by how early a stamp is against a smooth line [s/s], 1 if only the
+    # stamps jitter; None if they do not.
     offset_by_jitter: Estimate | None
     stamp_jitter: float                     # rms about the smooth line [s]
     rotation_rates: Array                   # (3,) rms about the camera's axes less mean [rad/s]
     curve: CostCurve
-    pixel_sigma: float                      # of a match, as seen [px]
+    pixel_sigma: float                      # of a match [px]
     inlier_ratio: float
     frames: int
     pairs: int
@@ -70,22 +87,24 @@ class CalibrationResult:
     warnings: tuple[str, ...] = ()
 
     @property
-    def observable(self) -> bool:
-        """Whether all that a node needs could be told."""
+    def needed(self) -> list[Estimate]:
+        """All that a node needs."""
         parts = [self.readout_time, self.time_offset, self.rotation, *self.gyro_bias]
-        if self.focal_factor is not None:
-            parts.append(self.focal_factor)
-        return all(part.observable for part in parts)
+        return parts if self.focal_factor is None else [*parts, self.focal_factor]
 
     @property
-    def follows_exposure(self) -> bool:
-        """Whether the offset surely moves with the interval between frames."""
-        slope = self.offset_by_interval
-        return slope is not None and slope.observable and abs(slope.value) > 3.0 * slope.sigma
+    def observable(self) -> bool:
+        """Whether all that a node needs is observable."""
+        return all(part.observable for part in self.needed)
+
+    @property
+    def complete(self) -> bool:
+        """Whether the parameter file has all that a node needs, however uncertain."""
+        return all(part.determined for part in self.needed)
 
     @property
     def quat_cam_imu_xyzw(self) -> tuple[float, float, float, float]:
-        """`R_cam_imu` as the node takes it."""
+        """`R_cam_imu` as the parameter of the node."""
         x, y, z, w = (float(v) for v in Rotation.from_matrix(self.R_cam_imu).as_quat())
         return x, y, z, w
 
@@ -93,10 +112,243 @@ class CalibrationResult:
     def shutter(self) -> str:
         """'rolling', 'global' or 'unsure'.
 
-        Rolling: the read-out time as fitted is 5 sigma and 1 ms from zero; global: it is within
+        Rolling: the readout time as fitted is 5 sigma and 1 ms from zero; global: it is within
         3 sigma or 1 ms of zero, and known to a millisecond.
         """
         value, sigma = abs(self.fitted_readout), self.readout_time.sigma
         if value > max(5.0 * sigma, 1e-3):
             return 'rolling'
         return 'global' if sigma < 1e-3 and value < max(3.0 * sigma, 1e-3) else 'unsure'
+
+
+# -- Report, parameter file, JSON and picture ----------------------------------------------------
+
+# Change of a gyro's bias from one start to the next [rad/s].
+_BIAS_CHANGE = 1e-3
+_FOUR_ZEROS = (0.0,) * 4
+_BLUE, _ORANGE = '#0072B2', '#E69F00'
+_MS = 1e3
+
+
+def report(result: CalibrationResult, camera: RollingShutterCamera) -> list[str]:
+    """Lines for a reader: each quantity with its 1 sigma and its observability."""
+    readout, focal = result.readout_time, result.focal_factor
+    slope, jitter = result.offset_by_interval, result.offset_by_jitter
+    rates = ', '.join(f'{axis} {np.degrees(rate):.1f}'
+                      for axis, rate in zip(AXES, result.rotation_rates, strict=True))
+    sigmas = ', '.join(f'{np.degrees(sigma):.3f}' for sigma in result.rotation_sigma)
+    rows = [('readout time', _shown('readout_time', readout, abs(readout.value))
+             + (', read upwards' if readout.value < 0.0 else ''), readout),
+            ('time offset (row 0)', _shown('time_offset', result.time_offset),
+             result.time_offset)]
+    if slope is not None:
+        text = (f'{slope.value:.3f} +- {slope.sigma:.3f} ms per ms of the interval to the '
+                f'previous frame, {_MS * result.frame_interval:.2f} ms in the median (automatic '
+                'exposure)')
+        rows.append(('offset by interval', text, slope))
+    if jitter is not None:
+        text = (f'{_MS * result.stamp_jitter:.2f} ms rms about a smooth line, which the images '
+                f'follow by {jitter.value:.2f} +- {jitter.sigma:.2f} (1: the stamps alone '
+                'jitter); not automatic exposure')
+        rows.append(('jitter of stamps', text, jitter))
+    text = (f'{axes_text(result.axis_map)}, and {np.degrees(result.rotation.value):.2f} deg off '
+            f"it; 1 sigma about the camera's x, y, z: {sigmas} deg")
+    rows.append(('rotation IMU to camera', text, result.rotation))
+    rows += [(f'gyro bias {axis}', _shown('gyro_bias', bias), bias)
+             for axis, bias in zip('xyz', result.gyro_bias, strict=True)]
+    exposure = result.exposure
+    if exposure.sigma:
+        text = (f'{_MS * exposure.value:.1f} +- {_MS * exposure.sigma:.1f} ms at the median '
+                'interval, over which the gyro is averaged')
+        if result.exposure_margin:
+            text += (f' (assumed: the interval less {_MS * result.exposure_margin:.0f} ms, as '
+                     'automatic exposure lengthens it)')
+        rows.append(('exposure', text, exposure))
+    if focal is not None and result.radial is not None and result.center is not None:
+        column, row = result.center
+        rows += [
+            ('focal length', BY_NAME['focal_length'].with_sigma(
+                camera.fx * focal.value, camera.fx * focal.sigma), focal),
+            ('distortion', (f'{result.radial.value:.3f} +- {result.radial.sigma:.3f} (first '
+             f'coefficient of {camera.distortion_model})'), result.radial),
+            ('principal point', (f'{column.value:.1f} +- {column.sigma:.1f}, {row.value:.1f} +- '
+             f'{row.sigma:.1f} px'), column)]
+    return [
+        (f'{result.frames} frames, {result.pairs} pairs, {result.matches} matches; '
+         f'{100 * result.inlier_ratio:.0f} % inliers, noise of a match '
+         f'{result.pixel_sigma:.2f} px'),
+        f'rotation of the camera, rms [deg/s]: {rates}', f'shutter: {_shutter_text(result)}',
+        *(f'{name}: {text} [{_state(of)}]' for name, text, of in rows),
+        'quaternion x y z w: ' + ', '.join(f'{v:.6f}' for v in result.quat_cam_imu_xyzw),
+        *(f'note: {warning}' for warning in result.warnings)]
+
+
+def _state(estimate: Estimate) -> str:
+    if estimate.observable:
+        return 'observable'
+    return ('weak: ' if estimate.determined else 'NOT OBSERVABLE: ') + estimate.remark
+
+
+def _shown(name: str, estimate: Estimate, value: float | None = None) -> str:
+    """A quantity with its sigma; `value` replaces its own."""
+    return BY_NAME[name].with_sigma(estimate.value if value is None else value, estimate.sigma)
+
+
+def _shutter_text(result: CalibrationResult) -> str:
+    readout = result.readout_time
+    if result.shutter == 'global':
+        return f'global: the readout time is {_shown("readout_time", readout)}'
+    if result.shutter == 'unsure':
+        return (f'unsure: {_shown("readout_time", readout)}; record longer, and rotate the camera '
+                'faster')
+    sigmas = abs(readout.value) / max(readout.sigma, 1e-9)
+    at_zero = float(np.interp(0.0, result.curve.readout_times, result.curve.costs))
+    return (f'rolling: the readout time is {sigmas:.0f} sigma from 0, and the log-likelihood '
+            f'of a global shutter is lower by {at_zero:.0f}')
+
+
+def parameter_file(result: CalibrationResult, title: str, *, camera: RollingShutterCamera,
+                   compressed: bool, feature_rows: tuple[float, ...] = (0.0, 0.0)) -> str:
+    """The node's parameter file: each value with its sigma; undetermined ones are named only.
+
+    `camera` is that of the calibration: a guess if the lens was not known.
+    """
+    # Parameters of each quantity, if it is determined.
+    groups = [
+        (result.readout_time, 'readout_time', _readout_values(result)),
+        (result.time_offset, 'time_offset', _clock_values(result)),
+        (result.rotation, 'quat_cam_imu_xyzw', [
+            SourcedValue('quat_cam_imu_xyzw',
+                         tuple(round(v, 7) for v in result.quat_cam_imu_xyzw),
+                         f'{axes_text(result.axis_map)}, '
+                         f'{np.degrees(result.rotation.value):.2f} deg off.'),
+            _sigma('axes', result.rotation.sigma, 5, 'Of the worst axis [rad].')])]
+    biases = result.gyro_bias
+    groups += [(max(biases, key=lambda bias: bias.sigma), 'gyro_bias', [
+        SourcedValue('gyro_bias', tuple(round(bias.value, 5) for bias in biases), '1 sigma '
+                     + ', '.join(f'{bias.sigma:.5f}' for bias in biases) + ' rad/s.'),
+        _sigma('gyro_bias', math.hypot(max(bias.sigma for bias in biases), _BIAS_CHANGE), 5,
+               f'Of the worst axis, and {_BIAS_CHANGE:g} rad/s from one start to the next.')])]
+    if result.focal_factor is not None:
+        groups.append((result.focal_factor, 'camera_matrix', _lens_values(result, camera)))
+    values = [SourcedValue('image_transport', 'compressed' if compressed else 'raw',
+                           'As the bag has them.')]
+    values += [value for part, _, group in groups if part.determined for value in group]
+    if feature_rows[1] > 0.0:
+        values.append(SourcedValue('feature_rows', tuple(feature_rows), 'As given to calibrate.'))
+    missing = [f'{name} ({part.remark})' for part, name, _ in groups if not part.determined]
+    if missing:
+        title += ' Not observable in this recording, so left out: ' + '; '.join(missing) + '.'
+    return parameter_text(title, values)
+
+
+def _sigma(name: str, value: float, digits: int, source: str = '') -> SourcedValue:
+    return SourcedValue(f'{name}_sigma', max(round(value, digits), 10.0**-digits), source)
+
+
+def _readout_values(result: CalibrationResult) -> list[SourcedValue]:
+    readout, shutter = result.readout_time, _shutter_text(result)
+    rolling = result.shutter != 'global'
+    return [
+        SourcedValue('readout_time', round(abs(readout.value), 6) if rolling else 0.0,
+                     f'{shutter[:1].upper()}{shutter[1:]}. Estimate '
+                     f'{_shown("readout_time", readout)} (1 sigma); at most the '
+                     f'{_MS * result.frame_interval:.1f} ms between frames.'),
+        _sigma('readout_time', readout.sigma, 6),
+        SourcedValue('readout_direction', 'up' if rolling and readout.value < 0.0 else 'down',
+                     'By the sign of that estimate.')]
+
+
+def _clock_values(result: CalibrationResult) -> list[SourcedValue]:
+    offset, slope, exposure = result.time_offset, result.offset_by_interval, result.exposure
+    values = [SourcedValue('stamp_row', 'first', 'Convention of time_offset here.'),
+              SourcedValue('time_offset', round(offset.value, 6),
+                           'To the middle of the exposure of row 0.'),
+              _sigma('time_offset', offset.sigma, 6)]
+    if slope is not None:
+        values += [
+            SourcedValue('time_offset_per_interval', round(slope.value, 4), 'Automatic exposure.'),
+            _sigma('time_offset_per_interval', slope.sigma, 4),
+            SourcedValue('time_offset_reference_interval', round(result.frame_interval, 6),
+                         'Median interval between frames, to which time_offset refers.')]
+    if result.exposure_margin:
+        margin = max(result.frame_interval - exposure.value, 1e-3)
+        values.append(SourcedValue(
+            'exposure_margin', round(margin, 5), f'Exposure {_MS * exposure.value:.1f} +- '
+            f'{_MS * exposure.sigma:.1f} ms at that interval, assumed as '
+            f'{_MS * result.exposure_margin:.0f} ms less than it before the fit.'))
+    elif exposure.value > 2.0 * exposure.sigma:
+        values.append(SourcedValue('exposure_time', round(exposure.value, 5),
+                                   f'1 sigma {_MS * exposure.sigma:.1f} ms.'))
+    return values
+
+
+def _lens_values(result: CalibrationResult, camera: RollingShutterCamera) -> list[SourcedValue]:
+    focal, radial, center = result.focal_factor, result.radial, result.center
+    if focal is None or radial is None or center is None:
+        return []
+    column, row = center
+    others = (0.0,) * (len(camera.distortion or _FOUR_ZEROS) - 1)
+    return [
+        SourcedValue('camera_matrix', (
+            round(camera.fx * focal.value, 2), 0.0, round(column.value, 2), 0.0,
+            round(camera.fy * focal.value, 2), round(row.value, 2), 0.0, 0.0, 1.0),
+            f'For images of {camera.width}x{camera.height}. A calibrated CameraInfo has '
+            'priority.'),
+        SourcedValue('distortion_model', camera.distortion_model, ''),
+        SourcedValue('distortion_coefficients', (round(radial.value, 5), *others),
+                     'The first coefficient is estimated, the others are assumed to be zero.'),
+        _sigma('focal_length', focal.sigma / focal.value, 5, 'Relative.'),
+        _sigma('distortion', radial.sigma, 5),
+        _sigma('principal_point', max(column.sigma, row.sigma), 2, 'In pixels.')]
+
+
+def as_mapping(result: CalibrationResult, camera: RollingShutterCamera) -> dict[str, Any]:
+    """The result for a JSON file; seconds, radians, pixels."""
+    slope, jitter = result.offset_by_interval, result.offset_by_jitter
+    focal = result.focal_factor
+    if focal is not None:
+        focal = replace(focal, value=focal.value * camera.fx, sigma=focal.sigma * camera.fx)
+    radial, center = result.radial, result.center
+    return {
+        'observable': result.observable, 'shutter': result.shutter,
+        'readout_time_s': asdict(result.readout_time),
+        'time_offset_s': asdict(result.time_offset),
+        'offset_by_interval': slope and asdict(slope),
+        'offset_by_jitter': jitter and asdict(jitter), 'stamp_jitter_s': result.stamp_jitter,
+        'quat_cam_imu_xyzw': list(result.quat_cam_imu_xyzw),
+        'rotation_sigma_rad': result.rotation_sigma.tolist(),
+        'rotation_from_axis_map_rad': asdict(result.rotation),
+        'axis_map': result.axis_map.tolist(),
+        'gyro_bias_rad_per_s': [asdict(bias) for bias in result.gyro_bias],
+        'focal_px': focal and asdict(focal), 'distortion_first': radial and asdict(radial),
+        'principal_point_px': center and [asdict(part) for part in center],
+        'exposure_s': asdict(result.exposure), 'exposure_margin_s': result.exposure_margin,
+        'rotation_rate_rms_rad_per_s': result.rotation_rates.tolist(),
+        'frames': result.frames, 'pairs': result.pairs, 'matches': result.matches,
+        'inlier_ratio': result.inlier_ratio, 'pixel_sigma': result.pixel_sigma,
+        'frame_interval_s': result.frame_interval, 'warnings': list(result.warnings),
+        'cost_over_readout': {'readout_s': result.curve.readout_times.tolist(),
+                              'cost': result.curve.costs.tolist()}}
+
+
+def draw_curve(result: CalibrationResult, path: Path) -> None:
+    """Draw the cost over the readout time."""
+    picture = Figure(figsize=(7.5, 4.5), dpi=110, layout='constrained')
+    axes = picture.subplots()
+    readout = result.readout_time
+    # The root of a parabola is straight on both sides of the best.
+    axes.plot(_MS * result.curve.readout_times, np.sqrt(2.0 * result.curve.costs), 'o-',
+              color=_BLUE)
+    axes.axvline(0.0, color='0.6', linewidth=0.8)
+    axes.axvline(_MS * readout.value, color=_ORANGE, label=_shown('readout_time', readout))
+    axes.axvspan(_MS * (readout.value - 3 * readout.sigma),
+                 _MS * (readout.value + 3 * readout.sigma), color=_ORANGE, alpha=0.25,
+                 label='3 sigma')
+    axes.set_ylim(bottom=0.0)
+    axes.set_xlabel('readout time [ms], negative: upwards; to +- one frame interval')
+    axes.set_ylabel('cost: sqrt(2 x log-likelihood lost) [sigma]')
+    axes.set_title(f'{result.shutter} shutter; all else fitted again at each point')
+    axes.legend()
+    axes.grid(alpha=0.3)
+    save_picture(picture, path)

@@ -3,39 +3,41 @@
 from __future__ import annotations
 
 import argparse
-from contextlib import redirect_stderr, redirect_stdout
+from collections.abc import Callable, Mapping
+from contextlib import redirect_stderr
 import io
+import json
 import math
 from pathlib import Path
 import shlex
 import sys
 from tempfile import TemporaryDirectory
 import time
+from typing import Any
 
 import cv2
 
-from rs_relpose_ros.batch.cluster import ask_a_worker, open_cluster
-from rs_relpose_ros.batch.combine import Combined
-from rs_relpose_ros.batch.figures import RESULT_FILES
-from rs_relpose_ros.batch.job import Job, Outcome, State
-from rs_relpose_ros.batch.picture import PICTURE_FILE
-from rs_relpose_ros.batch.run import BatchOutcome, Request, run_batch
-from rs_relpose_ros.batch.store import RESULTS_FILE
-from rs_relpose_ros.cli.main import load_command, make_parser
+from rs_relpose_ros.calibrate.result import as_mapping
+from rs_relpose_ros.cli.main import FAILED, make_parser
 from rs_relpose_ros.cli.options import add_parameter_arguments, package_version, progress_bar
-from rs_relpose_ros.config.parameter_file import read_parameters
+from rs_relpose_ros.cli.poses import has_good_poses, replay_bag
+from rs_relpose_ros.cli.recordings import calibrate_bag, inspect_bag
+from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.errors import InputError, RsRelposeError
-from rs_relpose_ros.result_files import refuse_unwritable, SUMMARY_FILE
+from rs_relpose_ros.offline import batch as runs
+from rs_relpose_ros.offline import batch_results
+from rs_relpose_ros.offline.batch import open_cluster, Request, run_on_worker
+from rs_relpose_ros.offline.batch_results import Job, Outcome, RESULT_FILES, State
+from rs_relpose_ros.output_files import refuse_unwritable, SUMMARY_FILE
 
 HELP = ('Run check, calibrate or replay over many bags: on processes of this machine, one thread '
         'each, or on a running Dask cluster (pip install "dask[distributed]"). Writes results.csv '
-        '(a row for each bag: state, figures, errors, times), summary.json, overview.png and a '
-        'folder with the results of each bag, as a single run writes them. A bag with its result '
-        'is not run again unless it, its parameters, the options or the version changed. For '
+        '(a row for each bag: state, metrics, errors, times), summary.json, overview.png and a '
+        'folder with the results of each bag, as of a single run. A bag with a result is not '
+        'processed again unless it, its parameters, the options or the version changed. For '
         'calibrate, all bags must be of one camera: the summary has weighted means, chi2 and '
         'outliers. Exit code 1: some bags were refused, failed, or are not as they should be.')
 
-_SOME_NOT_DONE = 1
 _MOST_LINES = 20
 
 
@@ -46,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('bags', metavar='BAGS', nargs='+',
                         help='bags, or globs in quotes, as the workers see them')
     parser.add_argument('--out', metavar='DIR', type=Path, required=True,
-                        help='directory of the results; those of an earlier run are taken over')
+                        help='directory of the results; those of an earlier run are reused')
     parser.add_argument('--scheduler', metavar='ADDRESS',
                         help='a running Dask cluster, such as tcp://host:8786; its workers need '
                         'this package (the same version), and one thread each')
@@ -58,81 +60,105 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the command over all bags; 1 where not all of them are done."""
+    """Run the command over all bags; 1 unless all of them are done."""
     if args.workers is not None and args.workers < 1:
         raise InputError(f'--workers must be at least 1, got {args.workers}')
     request = _request(args)
     refuse_unwritable(args.out)
     with open_cluster(args.scheduler, args.workers) as client, \
             progress_bar(0, 'bag', args.batch_command) as bar:
-        version = ask_a_worker(client, package_version)
+        version = run_on_worker(client, package_version)
         if version != request.version:
-            raise InputError(f'the workers have version {version} of this package, but here it is '
+            raise InputError(f'the workers have version {version} of this package, but here is '
                              f'{request.version}: their results would not be comparable')
-        result = run_batch(client, request, args.out, run_job,
-                           on_start=bar.reset, on_bag=bar.update)
+        result = runs.run_batch(client, request, args.out, run_job,
+                                on_start=bar.reset, on_bag=bar.update)
     for line in report(result, args.out):
         print(line)
-    return 0 if set(result.states) == {State.DONE} else _SOME_NOT_DONE
+    return 0 if set(result.states) == {State.DONE} else FAILED
+
+
+def _check(args: argparse.Namespace) -> tuple[bool, Mapping[str, Any]]:
+    report = inspect_bag(args)
+    return not report.failed, report.to_mapping()
+
+
+def _calibrate(args: argparse.Namespace) -> tuple[bool, Mapping[str, Any]]:
+    result, camera = calibrate_bag(args)
+    return result.complete, as_mapping(result, camera)
+
+
+def _replay(args: argparse.Namespace) -> tuple[bool, Mapping[str, Any]]:
+    _, outcome = replay_bag(args)
+    return has_good_poses(outcome), outcome.metrics
+
+
+# Command -> whether its exit code would be 0, and its results as in `RESULT_FILES`.
+_WORK: Mapping[str, Callable[[argparse.Namespace], tuple[bool, Mapping[str, Any]]]] = {
+    'check': _check, 'calibrate': _calibrate, 'replay': _replay}
 
 
 def run_job(job: Job) -> Outcome:
-    """Do on a worker what `rs_relpose COMMAND` does, and give its files back."""
+    """Do on a worker the work of `rs_relpose COMMAND`; the outcome has its files."""
     cv2.setNumThreads(1)
     started = time.perf_counter()
+    state, message, metrics = State.REFUSED, '', {}
     with TemporaryDirectory() as scratch:
-        out, printed = Path(scratch, 'out'), io.StringIO()
+        out = Path(scratch, 'out')
         words = _words(job, Path(scratch), out)
-        state, message = State.REFUSED, ''
-        arguments, sys.argv = sys.argv, ['rs_relpose', *words]   # summary.json has them
+        files = {}
+        arguments, sys.argv = sys.argv, ['rs_relpose', *words]   # for summary.json
         try:
-            with redirect_stdout(printed), redirect_stderr(io.StringIO()):
-                code = load_command(job.command).run(make_parser(job.command).parse_args(words))
-            state = State.FINDINGS if code else State.DONE
+            with redirect_stderr(io.StringIO()):
+                good, results = _WORK[job.command](make_parser(job.command).parse_args(words))
+            state, metrics = State.DONE, batch_results.metrics_of(job.command, results)
+            if not good:
+                state, message = State.FINDINGS, batch_results.message_of(job.command, results)
+            if job.command == 'check':
+                text = json.dumps(results, indent=2, allow_nan=False) + '\n'
+                files[RESULT_FILES['check']] = text.encode()
         except RsRelposeError as error:
             message = str(error)
         except OSError as error:
             state, message = State.FAILED, str(error)
         finally:
             sys.argv = arguments
-        files = {str(file.relative_to(out)): file.read_bytes()
-                 for file in sorted(out.rglob('*')) if file.is_file()}
-        if job.command == 'check' and printed.getvalue():
-            files[RESULT_FILES['check']] = printed.getvalue().encode()
-    return Outcome(state, message, time.perf_counter() - started, files)
+        files |= {str(file.relative_to(out)): file.read_bytes()
+                  for file in sorted(out.rglob('*')) if file.is_file()}
+    return Outcome(job, state, message, time.perf_counter() - started, metrics, files)
 
 
-def report(result: BatchOutcome, folder: Path) -> list[str]:
-    """The outcome in some lines."""
+def report(result: runs.BatchOutcome, folder: Path) -> list[str]:
+    """Lines that summarise a run."""
     counts = ', '.join(f'{result.states[state]} {state.value}' for state in State
                        if result.states[state])
     lines = [f'{len(result.rows)} bags: {counts}'
-             + (f'; {result.taken_over} of them from an earlier run' if result.taken_over else '')]
-    told = [row for row in result.rows if row.state is not State.DONE]
-    lines += [f'{row.state.value}: {row.bag}: {" ".join(row.message.split())}'
-              for row in told[:_MOST_LINES]]
-    if len(told) > _MOST_LINES:
-        lines.append(f'... and {len(told) - _MOST_LINES} more in {RESULTS_FILE}')
-    lines += [_combined_line(one) for one in result.combined.figures if len(one.bags) > 1]
+             + (f'; {result.reused} of them from an earlier run' if result.reused else '')]
+    unfinished = [row for row in result.rows if row.state is not State.DONE]
+    lines += [f'{row.state.value}: {row.job.bag.path}: {" ".join(row.message.split())}'
+              for row in unfinished[:_MOST_LINES]]
+    if len(unfinished) > _MOST_LINES:
+        lines.append(f'... and {len(unfinished) - _MOST_LINES} more in '
+                     f'{batch_results.RESULTS_FILE}')
+    lines += [_combined_line(one) for one in result.combined.metrics if len(one.bags) > 1]
     if result.combined.quat_cam_imu_xyzw is not None:
         numbers = ', '.join(f'{value:.6f}' for value in result.combined.quat_cam_imu_xyzw)
         lines.append(f'quat_cam_imu_xyzw: [{numbers}]')
-    lines.append(f'in {folder}: {RESULTS_FILE}, {SUMMARY_FILE}, {PICTURE_FILE}, and a folder for '
-                 'each bag')
+    lines.append(f'in {folder}: {batch_results.RESULTS_FILE}, {SUMMARY_FILE}, '
+                 f'{batch_results.PICTURE_FILE}, and a folder for each bag')
     return lines
 
 
-def _combined_line(one: Combined) -> str:
-    """A figure of one camera from several bags."""
+def _combined_line(one: batch_results.Combined) -> str:
     reduced = one.chi2 / max(one.degrees_of_freedom, 1)
-    return (f'{one.figure}: {one.mean:.6g} +- {one.sigma:.2g}, of {one.degrees_of_freedom + 1} '
+    return (f'{one.metric}: {one.mean:.6g} +- {one.sigma:.2g}, of {one.degrees_of_freedom + 1} '
             f'bags, chi2 {one.chi2:.3g} of {one.degrees_of_freedom} degrees of freedom'
             + (f' (sigma times {math.sqrt(reduced):.2g})' if reduced > 1.0 else '')
             + (f'; outliers: {", ".join(one.outliers)}' if one.outliers else ''))
 
 
 def _request(args: argparse.Namespace) -> Request:
-    """What is asked for; wrong options and parameters are told before any work."""
+    """The request; wrong options and parameters are refused before any work."""
     command: str = args.batch_command
     options = [word for value in args.set for word in ('--set', value)]
     options += shlex.split(args.options)
@@ -147,10 +173,10 @@ def _request(args: argparse.Namespace) -> Request:
             text = args.params.read_text(encoding='utf-8')
     for word in options:
         if word.split('=')[0] in ('--out', '--params', '--json'):
-            raise InputError(f'--options must not have {word}: batch itself gives it')
+            raise InputError(f'--options must not have {word}: batch itself sets it')
     try:
         make_parser(command).parse_args([command, 'BAG', *options])
-    except SystemExit as end:   # argparse has said why
+    except SystemExit as end:   # argparse has printed the reason
         raise InputError(f'--options: {shlex.join(options)} are no options of {command}') from end
     return Request(command, tuple(args.bags), text, tuple(options), package_version())
 
@@ -161,5 +187,6 @@ def _words(job: Job, scratch: Path, out: Path) -> list[str]:
         parameters = scratch / 'parameters.yaml'
         parameters.write_text(job.parameters, encoding='utf-8')
         words += ['--params', str(parameters)]
-    words += ['--json'] if job.command == 'check' else ['--out', str(out)]
+    if job.command != 'check':
+        words += ['--out', str(out)]
     return [*words, *job.options]

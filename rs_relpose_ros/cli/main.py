@@ -3,44 +3,44 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import importlib
 import importlib.util
 import logging
 import os
 import sys
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 from rs_relpose_ros.blas_threads import use_one_blas_thread
 from rs_relpose_ros.errors import MissingInputError, RsRelposeError
 
 PROGRAM = 'rs_relpose'
 
-# Name -> module, one line of help. The module is imported only when its command is asked for: the
-# overview does not wait for OpenCV and Numba. Those of the laboratory, another package, are found
-# by name, so that the product does not depend on it.
+# Name -> module (and its Command), one line of help. The module is imported only for its command:
+# the overview needs neither OpenCV nor Numba. Commands of the laboratory, another package, are
+# found by name, so that the product does not depend on it.
 COMMANDS: Mapping[str, tuple[str, str]] = {
     'batch': ('rs_relpose_ros.cli.batch',
               'check, calibrate or replay over many bags, on Dask'),
     'benchmark': ('rs_relpose_lab.cli.benchmark',
                   'measure accuracy and speed of the estimator: tables and plots'),
-    'check': ('rs_relpose_ros.cli.check',
-              'look through a bag for what would spoil the poses, with remedies'),
-    'calibrate': ('rs_relpose_ros.cli.calibrate',
-                  'read-out time, time offset, axes and gyro bias from a bag, without a target'),
-    'convert': ('rs_relpose_ros.cli.convert',
-                'turn a recording of a camera or phone into a bag and its parameter file'),
+    'check': ('rs_relpose_ros.cli.recordings:CHECK',
+              'check a bag for defects that degrade the poses, with suggested fixes'),
+    'calibrate': ('rs_relpose_ros.cli.recordings:CALIBRATE',
+                  'readout time, time offset, axes and gyro bias from a bag, without a target'),
+    'convert': ('rs_relpose_ros.cli.recordings:CONVERT',
+                'convert a recording of a camera or phone to a bag and its parameter file'),
     'evaluate': ('rs_relpose_lab.cli.evaluate',
                  'run the experiments of the paper: tables and box plots'),
-    'odometry': ('rs_relpose_ros.cli.odometry',
+    'odometry': ('rs_relpose_ros.cli.poses:ODOMETRY',
                  'a metric path from a bag: relative poses and IMU in one graph'),
-    'pairs': ('rs_relpose_ros.cli.pairs',
+    'pairs': ('rs_relpose_ros.cli.poses:PAIRS',
               'relative poses of chosen pairs of images, such as loop closures'),
-    'replay': ('rs_relpose_ros.cli.replay',
+    'replay': ('rs_relpose_ros.cli.poses:REPLAY',
                'estimate relative poses from a bag: CSV, summary and pictures'),
-    'unroll': ('rs_relpose_ros.cli.unroll',
-               'turn the images of a bag as if they came from a global shutter'),
+    'unroll': ('rs_relpose_ros.cli.recordings:UNROLL',
+               'derotate the images of a bag to the time of their middle row'),
     'simulate': ('rs_relpose_lab.cli.simulate',
                  'render rolling-shutter images and IMU of a known motion into a bag'),
 }
@@ -49,11 +49,23 @@ DONE, FAILED, BAD_INPUT = 0, 1, 2
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 PIPE_CLOSED = 141  # 128 + SIGPIPE
 
+# Errors of an unusable path of the user.
+_BAD_PATHS = (FileNotFoundError, FileExistsError, PermissionError, IsADirectoryError,
+              NotADirectoryError)
+
 _logger = logging.getLogger(__name__)
 
 
+class Command(NamedTuple):
+    """A command; a module that is one has the same names. `run` returns the exit code."""
+
+    HELP: str
+    add_arguments: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], int]
+
+
 class _Version(argparse.Action):
-    """``--version``; looks the version up only when asked."""
+    """``--version``, looked up on demand."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any, **__: Any) -> None:
         from importlib.metadata import version
@@ -61,17 +73,20 @@ class _Version(argparse.Action):
         parser.exit()
 
 
-def load_command(name: str) -> ModuleType:
-    """Import the module of command `name`: its HELP, `add_arguments(parser)` and `run(args)`.
+def load_command(name: str) -> Command:
+    """Import the command `name`; MissingInputError if its package is not installed."""
+    module, _, attribute = COMMANDS[name][0].partition(':')
+    command: Any = import_of(module, f'the command {name} needs')
+    if attribute:
+        command = getattr(command, attribute)
+    return Command(command.HELP, command.add_arguments, command.run)
 
-    `run` returns 0 when done, 1 when it ran and failed. MissingInputError where the command
-    belongs to the laboratory, which is not installed.
-    """
-    module, _ = COMMANDS[name]
+
+def import_of(module: str, needs: str) -> ModuleType:
+    """Import a module of a package that may be absent; `needs` begins the error's message."""
     package = module.partition('.')[0]
     if importlib.util.find_spec(package) is None:
-        raise MissingInputError(f'the command {name} needs the package {package}, which is not '
-                                'installed')
+        raise MissingInputError(f'{needs} the package {package}, which is not installed')
     return importlib.import_module(module)
 
 
@@ -88,9 +103,9 @@ def make_parser(selected: str | None) -> argparse.ArgumentParser:
     for name, (_, one_line) in COMMANDS.items():
         command = commands.add_parser(name, help=one_line)
         if name == selected:
-            module = load_command(name)
-            command.description = module.HELP
-            module.add_arguments(command)
+            loaded = load_command(name)
+            command.description = loaded.HELP
+            loaded.add_arguments(command)
             # Without a default of its own, so that an -v before the command is kept.
             _add_verbose(command, default=argparse.SUPPRESS)
     return parser
@@ -101,46 +116,43 @@ def main(argv: Sequence[str] | None = None) -> int:
     use_one_blas_thread()
     try:
         code = _run(sys.argv[1:] if argv is None else list(argv))
-        # A closed pipe shows here, and not as a complaint while the interpreter shuts down.
+        # Raises here if the pipe is closed, not while the interpreter shuts down.
         sys.stdout.flush()
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return PIPE_CLOSED
     except KeyboardInterrupt:
-        return _complain('interrupted', INTERRUPTED)
+        return _report_error('interrupted', INTERRUPTED)
     return code
 
 
 def _run(arguments: list[str]) -> int:
     """Parse and run; errors in the input become one line and exit code 2."""
-    # No option of the top parser takes a value, so the first plain word is the command.
+    # No option of the top parser has a value, so the first plain word is the command.
     selected = next((word for word in arguments if not word.startswith('-')), None)
     try:
         args = make_parser(selected).parse_args(arguments)
     except MissingInputError as error:
-        return _complain(f'error: {error}', BAD_INPUT)
-    except SystemExit as end:  # argparse has said why, or has printed the help
+        return _report_error(f'error: {error}', BAD_INPUT)
+    except SystemExit as end:  # argparse has printed the error or the help
         return end.code if isinstance(end.code, int) else BAD_INPUT
     _set_up_logging(args.verbose)
     try:
         return int(load_command(args.command).run(args))
-    except RsRelposeError as error:
-        _logger.debug('refused here', exc_info=True)
-        return _complain(f'error: {error}', BAD_INPUT)
     except BrokenPipeError:
         raise
-    except (FileNotFoundError, FileExistsError, PermissionError, IsADirectoryError,
-            NotADirectoryError) as error:  # a path of the user's that cannot be used
-        _logger.debug('refused here', exc_info=True)
-        return _complain(f'error: {error.filename}: {error.strerror}', BAD_INPUT)
-    except OSError as error:  # such as a full disk: the input was fine
-        _logger.debug('failed here', exc_info=True)
-        return _complain(f'error: {error}', FAILED)
+    except (RsRelposeError, OSError) as error:
+        _logger.debug('raised here', exc_info=True)
+        if isinstance(error, _BAD_PATHS):
+            return _report_error(f'error: {error.filename}: {error.strerror}', BAD_INPUT)
+        # Another OSError, such as a full disk: the input was fine.
+        return _report_error(f'error: {error}',
+                             FAILED if isinstance(error, OSError) else BAD_INPUT)
 
 
 def _add_verbose(parser: argparse.ArgumentParser, default: Any) -> None:
     parser.add_argument('-v', '--verbose', action='count', default=default,
-                        help='log what is done; twice for details')
+                        help='log the progress; twice for details')
 
 
 def _set_up_logging(verbosity: int) -> None:
@@ -151,7 +163,7 @@ def _set_up_logging(verbosity: int) -> None:
         logging.getLogger(package).setLevel(level)
 
 
-def _complain(message: str, code: int) -> int:
+def _report_error(message: str, code: int) -> int:
     """Print one line to stderr and return `code`."""
     print(f'{PROGRAM}: {" ".join(message.split())}', file=sys.stderr)
     return code

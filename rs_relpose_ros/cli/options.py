@@ -1,30 +1,50 @@
-"""What several commands have in common: options, progress bars, the version."""
+"""Common parts of the commands: options, progress bar, version, a run over a bag."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Mapping
 from importlib.metadata import PackageNotFoundError, version
+import logging
 from pathlib import Path
 import sys
+from typing import Any, Protocol, TypeVar
 
 from tqdm import tqdm
 
-from rs_relpose_ros.bags.topics import TopicOptions
-from rs_relpose_ros.config.parameters import Parameters
-from rs_relpose_ros.errors import MissingInputError
+from rs_relpose_ros.bags.reader import Bag, open_bag, SensorTopics, Topic
+from rs_relpose_ros.config.files import read_parameters
+from rs_relpose_ros.config.settings import Parameters
+from rs_relpose_ros.offline.replay import need_sensor_parameters
+from rs_relpose_ros.offline.tables import write_summary
+from rs_relpose_ros.output_files import SUMMARY_FILE
 
-# Role of a topic -> what it holds.
-_ROLES = {
+_TOPICS = {
     'image': 'Image or CompressedImage',
     'camera_info': 'CameraInfo',
-    'imu': 'Imu: gyro, and accelerometer where it is not apart',
-    'accel': 'Imu of the accelerometer, where it is apart',
-    'truth': "PoseStamped of the camera's true poses",
+    'imu': 'Imu: gyro, and accelerometer unless it is separate',
+    'accel': 'Imu of a separate accelerometer',
+    'truth': 'PoseStamped: ground truth of the camera',
 }
 
 
+class Results(Protocol):
+    """Results of a bag; `metrics`: content of summary.json without provenance."""
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """As in summary.json."""
+
+
+_logger = logging.getLogger(__name__)
+
+Made = TypeVar('Made', bound=Results)
+# Called with a folder, a bag, its topics, and the parameters.
+Work = Callable[[Path, Bag, SensorTopics, Parameters], Made]
+
+
 def add_bag_argument(parser: argparse.ArgumentParser) -> None:
-    """Declare BAG, the recording that is read."""
+    """Declare BAG, the input."""
     parser.add_argument('bag', metavar='BAG', type=Path,
                         help='rosbag2 directory, or a .mcap, .db3 or ROS 1 .bag file')
 
@@ -38,47 +58,87 @@ def add_parameter_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_topic_arguments(parser: argparse.ArgumentParser, *roles: str) -> None:
-    """Declare --ROLE-topic for each role: a field of `TopicOptions`."""
-    group = parser.add_argument_group(
-        'topics', 'found by their types where only one can be meant')
+    """Declare --ROLE-topic for each role: a field of `SensorTopics`."""
+    group = parser.add_argument_group('topics', 'found by type where that is unambiguous')
     for role in roles:
         group.add_argument(f'--{role.replace("_", "-")}-topic', metavar='TOPIC', default='',
-                           help=_ROLES[role])
+                           help=_TOPICS[role])
 
 
-def topic_options(args: argparse.Namespace) -> TopicOptions:
-    """Topics that `add_topic_arguments` declared, as given."""
-    return TopicOptions(**{name.removesuffix('_topic'): value for name, value in vars(args).items()
-                           if name.endswith('_topic')})
+def add_out_argument(parser: argparse.ArgumentParser, suffix: str) -> None:
+    """Declare --out, which is BAGNAME_`suffix` by default."""
+    parser.add_argument('--out', metavar='DIR', type=Path,
+                        help=f'directory of the results (default: BAGNAME_{suffix} in the current '
+                        'one); those of an earlier run are replaced')
 
 
-def need_sensor_parameters(parameters: Parameters, args: argparse.Namespace) -> None:
-    """Raise MissingInputError where one is missing that no message tells, and say how to give it.
+def add_run_arguments(parser: argparse.ArgumentParser, suffix: str) -> None:
+    """Declare the options of `run_on_bag`."""
+    add_bag_argument(parser)
+    add_parameter_arguments(parser)
+    add_out_argument(parser, suffix)
+    add_topic_arguments(parser, *_TOPICS)
 
-    `args` have `bag` and what `add_parameter_arguments` declares.
+
+def run_on_bag(args: argparse.Namespace, suffix: str, work: Work[Made]) -> tuple[Path, Made]:
+    """Run `work` and write summary.json into its folder; return the folder and the results."""
+    parameters = read_parameters(args.params, args.set)
+    folder = out_folder(args, suffix)
+    with open_bag(args.bag) as bag:
+        topics = bag.find_topics(topic_options(args),
+                                 needs_camera_info=not parameters.intrinsics.given)
+        check_parameters(parameters, args)
+        with image_progress(bag, topics.image, bag_name(args.bag)):
+            results = work(folder, bag, topics, parameters)
+    write_summary(folder / SUMMARY_FILE, results.metrics, bag=args.bag, topics=topics,
+                  parameters=parameters, command=sys.argv, package_version=package_version())
+    return folder, results
+
+
+def out_folder(args: argparse.Namespace, suffix: str) -> Path:
+    """Folder of the results, of the option that `add_out_argument` declared."""
+    return args.out or Path(f'{bag_name(args.bag)}_{suffix}')
+
+
+def warn_unused(reasons: Mapping[str, int], what: str = 'not used') -> None:
+    """Log the reasons why frames and messages were not used, with their counts."""
+    for reason, count in reasons.items():
+        _logger.warning('%s, %d times: %s', what, count, reason)
+
+
+def topic_options(args: argparse.Namespace) -> dict[str, str]:
+    """Names by role, of the options that `add_topic_arguments` declared."""
+    return {name.removesuffix('_topic'): value for name, value in vars(args).items()
+            if name.endswith('_topic')}
+
+
+def check_parameters(parameters: Parameters, args: argparse.Namespace) -> None:
+    """Raise MissingInputError for required parameters that no message contains.
+
+    `args` have `bag` and the options of `add_parameter_arguments`.
     """
-    missing = parameters.sensor.missing()
-    if not missing:
-        return
-    beside = args.bag.resolve().with_name(f'{bag_name(args.bag)}.yaml')
-    if args.params is None and beside.is_file():
-        raise MissingInputError(f'parameter {" and ".join(missing)} must be given; use '
-                                f'--params {beside}, which lies beside the bag')
-    raise MissingInputError(
-        f'parameter {" and ".join(missing)} must be given, by --params FILE or --set '
-        f'{missing[0]}=...: see config/relpose.yaml')
+    neighbour = args.bag.resolve().with_name(f'{bag_name(args.bag)}.yaml')
+    need_sensor_parameters(parameters, f'use --params {neighbour}, the file next to the bag'
+                           if args.params is None and neighbour.is_file() else '')
 
 
 def bag_name(bag: Path) -> str:
-    """Name of a bag without its folder, and without the suffix where it is a file."""
+    """Name of a bag without its folder, and without the suffix of a file."""
     bag = bag.resolve()
     return bag.stem if bag.is_file() else bag.name
 
 
 def progress_bar(total: int, unit: str, description: str | None = None) -> tqdm:
-    """Return a bar that a terminal shows while work lasts; a pipe gets none."""
+    """Return a progress bar, invisible unless stderr is a terminal."""
     return tqdm(total=total, unit=unit, desc=description, leave=False,
                 disable=not sys.stderr.isatty())
+
+
+def image_progress(bag: Bag, image: Topic, description: str) -> tqdm:
+    """A progress bar over the images of a bag, as they are read."""
+    bar = progress_bar(image.count, 'image', description)
+    bag.on_message = lambda topic: bar.update(topic == image.name)
+    return bar
 
 
 def package_version() -> str:

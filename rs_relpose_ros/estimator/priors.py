@@ -1,22 +1,22 @@
-"""What the IMU and the scale of motion say of a state, as terms of a least-squares objective.
+"""Unknowns of the uniform model, and the priors on them by IMU and scale of motion.
 
-Over the state of `state` (docs/estimator.md, step 5)::
+Terms of the least-squares objective over a `TwoViewState` (docs/estimator.md, step 5)::
 
     |g x k|^2 / (2 s_g^2)  +  (|dw_1|^2 + |dw_2|^2) / s_w^2  +  theta^T Lambda theta
         +  u^T W u,    u = b (d - c t) + a,   d = (d_1, d_2)
 
 with ``theta = Log(R R_gyro^T)``, and ``g = Exp(T dw_1) g_1``, ``k = Exp(T dw_2) R g_2``: gravity
-was measured T after the middle row, and the error of the rate is in what turned it from there.
+was measured T after the middle row and rotated to it with the gyro's rate, errors included.
 
-u are the velocities against what is expected of them, in the units in which their scale b is the
-length of the baseline. Where the time between the frames is known, ``c`` is its inverse, b is in
-metres, and a (6,) is what the preintegrated acceleration says of the velocities (`velocity_prior`;
-0 without accelerometer), W the inverse of its covariance. Where it is not, ``c = 0, a = 0, W = I``
-and 1 / b is the prior sigma of the velocities [baselines per second].
+u is the difference of the velocities from their expected values, in units in which the baseline
+has the length b. If the time between the frames is known, ``c`` is its inverse, b is in metres,
+a (6,) follows from the preintegrated acceleration (`velocity`; 0 without accelerometer), and W is
+the inverse of its covariance. Otherwise ``c = 0, a = 0, W = I``, and 1 / b is the prior sigma of
+the velocities [baselines per second].
 
 Each function adds its term to the normal equations, Hessian (n, n) and half gradient (n,), and to
-the cost. n is 17, or 18 where ``log b`` is unknown, too: ``-2 g log b + (log b - m)^2 / s^2`` then
-is part of the cost, g being the number of velocities that the matches know (`velocity_prior`).
+the cost. n is 17, or 18 if ``log b`` is unknown, too: the cost then contains
+``-2 g log b + (log b - m)^2 / s^2``, g being the number of velocities that the matches determine.
 """
 
 from __future__ import annotations
@@ -27,53 +27,105 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.compiled import kernel, linked_kernel
-from rs_relpose_ros.estimator.state import (
-    D1,
-    DW1,
-    DW2,
-    PARAMETERS,
-    SCALE,
-    TANGENT,
-    THETA,
-    TwoViewState,
-)
-from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
-from rs_relpose_ros.geometry.vectors import cross, dot, tangent_basis
+from rs_relpose_ros.geometry.so3 import cross, dot, exp_so3, log_so3, norm, tangent_basis
+from rs_relpose_ros.jit import kernel
+from rs_relpose_ros.solvers.algebra import cholesky
 
 Array = NDArray[np.float64]
 
-# A weight that holds its unknowns at their start: how the angular, linear and global models are
-# fitted as cases of the uniform one.
+# First local parameter of each unknown: a rotation on the left of R, two steps of t in its tangent
+# plane, and four vectors.
+PARAMETERS = 17
+# After those, if unknown: the logarithm of the velocities' scale.
+SCALE = 17
+THETA, TANGENT, D1, D2, DW1, DW2 = 0, 3, 5, 8, 11, 14
+
+
+class TwoViewState(NamedTuple):
+    """Pose, velocities and corrections of the gyro's rates, all in frame 1.
+
+    ``R, t`` (unit), ``d_1 = v_1, d_2 = R v_2`` [baselines per second], ``dw_1, dw_2`` [rad/s].
+    """
+
+    R: Array
+    t: Array
+    d1: Array
+    d2: Array
+    dw1: Array
+    dw2: Array
+
+
+@kernel
+def hypothesis_state(R: Array, x: Array) -> TwoViewState:
+    """The state of a hypothesis: R (3, 3) and ``x = (t, d_1, d_2)``, gyro as measured."""
+    return TwoViewState(R.copy(), x[0:3].copy(), x[3:6].copy(), x[6:9].copy(), np.zeros(3),
+                        np.zeros(3))
+
+
+@kernel
+def signed(state: TwoViewState, sign: float) -> TwoViewState:
+    """The state with its translation and velocities multiplied by `sign`."""
+    return TwoViewState(state.R, sign * state.t, sign * state.d1, sign * state.d2, state.dw1,
+                        state.dw2)
+
+
+@kernel
+def moved(state: TwoViewState, step: Array) -> TwoViewState:
+    """The state after a step (17,) of its local parameters."""
+    basis = tangent_basis(state.t)
+    t, d1, d2, dw1, dw2 = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for i in range(3):
+        t[i] = state.t[i] + basis[i, 0] * step[TANGENT] + basis[i, 1] * step[TANGENT + 1]
+        d1[i], d2[i] = state.d1[i] + step[D1 + i], state.d2[i] + step[D2 + i]
+        dw1[i], dw2[i] = state.dw1[i] + step[DW1 + i], state.dw2[i] + step[DW2 + i]
+    length = norm(t)
+    for i in range(3):
+        t[i] /= length
+    return TwoViewState(exp_so3(step[:3]) @ state.R, t, d1, d2, dw1, dw2)
+
+
+@kernel
+def step_between(state: TwoViewState, other: TwoViewState) -> Array:
+    """The step (17,) of local parameters from `state` to `other`: the inverse of `moved`."""
+    step = np.empty(PARAMETERS)
+    turn = log_so3(other.R @ state.R.T)
+    basis = tangent_basis(state.t)
+    along = dot(state.t, other.t)
+    for k in range(2):
+        step[TANGENT + k] = dot(basis[:, k], other.t) / along
+    for k in range(3):
+        step[THETA + k] = turn[k]
+        step[D1 + k] = other.d1[k] - state.d1[k]
+        step[D2 + k] = other.d2[k] - state.d2[k]
+        step[DW1 + k] = other.dw1[k] - state.dw1[k]
+        step[DW2 + k] = other.dw2[k] - state.dw2[k]
+    return step
+
+
+# A weight that fixes its unknowns: the angular, linear and global models as cases of the uniform
+# one.
 PINNED = 1e14
 
 
 class VelocityPrior(NamedTuple):
-    """What is known of the linear velocities: c, a (6,) and W (6, 6) of ``u = b (d - c t) + a``.
+    """Prior of the linear velocities: ``u = b (d - c t) + a`` of information W."""
 
-    `log_scale` is ``log b``, as it is now. Where it is unknown: mean `centre` and inverse variance
-    `weight` of its prior (0 where it is known), `freedom`: g, as above.
-    """
-
-    rate: float
-    offset: Array
-    information: Array
-    log_scale: float
-    centre: float
+    rate: float   # c
+    offset: Array   # a (6,)
+    information: Array   # W (6, 6)
+    log_scale: float   # current ``log b``
+    centre: float   # mean of its prior, and its inverse variance: 0 if it is known
     weight: float
-    freedom: float
+    freedom: float   # g, as above
 
 
 class Priors(NamedTuple):
-    """Weights are inverse variances; 0 where nothing is known. All at the middle row.
-
-    Gravity was measured `gravity_row_time` [s] after that and turned there by the gyro.
-    """
+    """Weights are inverse variances; 0 without a prior. All at the middle row."""
 
     gravity1: Array
     gravity2: Array
     gravity_weight: float
-    gravity_row_time: float
+    gravity_row_time: float   # [s] of its measurement; rotated from there by the gyro
     rate_weight: float
     rotation: Array
     rotation_information: Array
@@ -89,12 +141,11 @@ def with_velocity(priors: Priors, velocity: VelocityPrior) -> Priors:
 
 
 @kernel
-def with_log_scale(priors: Priors, log_scale: float) -> Priors:
-    """The priors about another ``log b``."""
+def at_scale(priors: Priors, log_scale: float, centre: float, freedom: float) -> Priors:
+    """The priors with another ``log b``, its prior mean, and g."""
     prior = priors.velocity
     return with_velocity(priors, VelocityPrior(
-        prior.rate, prior.offset, prior.information, log_scale, prior.centre, prior.weight,
-        prior.freedom))
+        prior.rate, prior.offset, prior.information, log_scale, centre, prior.weight, freedom))
 
 
 def isotropic(sigma: float, rate: float) -> VelocityPrior:
@@ -105,14 +156,14 @@ def isotropic(sigma: float, rate: float) -> VelocityPrior:
 
 @kernel
 def unknowns(priors: Priors) -> int:
-    """Number of unknowns: those of a state, and the velocities' scale where it is one."""
+    """Number of unknowns: those of a state, and the velocities' scale if it is unknown."""
     return PARAMETERS + 1 if priors.velocity.weight > 0.0 else PARAMETERS
 
 
-@linked_kernel
+@kernel
 def _add_gravity(state: TwoViewState, priors: Priors, hessian: Array, gradient: Array) -> float:
-    """``r = g x k`` of the two directions in frame 1; each is off by as much as one frame's."""
-    # Gravity is known at a row from which the gyro, errors included, leads to the middle row.
+    """``r = g x k`` of the two directions in frame 1."""
+    # From the row of the measurement to the middle row, with the errors of the gyro.
     tau = priors.gravity_row_time
     g = exp_so3(tau * state.dw1) @ priors.gravity1
     k = exp_so3(tau * state.dw2) @ (state.R @ priors.gravity2)
@@ -127,7 +178,7 @@ def _add_gravity(state: TwoViewState, priors: Priors, hessian: Array, gradient: 
             jac[i, 3 + j] = tau * (g[i] * k[j] - same)
             jac[i, 6 + j] = tau * jac[i, j]
     r = cross(g, k)
-    # Each of the two directions carries the error: twice the variance of one.
+    # Both directions have errors: twice the variance of one.
     w = 0.5 * priors.gravity_weight
     for a in range(9):
         row = blocks[a // 3] + a % 3
@@ -141,21 +192,6 @@ def _add_gravity(state: TwoViewState, priors: Priors, hessian: Array, gradient: 
 
 
 @kernel
-def _add_rotation(state: TwoViewState, priors: Priors, hessian: Array, gradient: Array,
-                  cost: float) -> float:
-    """``theta^T Lambda theta``, added to `cost`; Log's Jacobian is taken for the identity."""
-    theta = log_so3(state.R @ priors.rotation.T)
-    information = priors.rotation_information
-    for i in range(3):
-        product = dot(information[i], theta)
-        cost += theta[i] * product
-        gradient[THETA + i] += product
-        for j in range(3):
-            hessian[THETA + i, THETA + j] += information[i, j]
-    return cost
-
-
-@linked_kernel
 def add_velocities(state: TwoViewState, prior: VelocityPrior, hessian: Array,
                    gradient: Array) -> float:
     """``u^T W u`` of both velocities; t moves in its tangent plane."""
@@ -190,19 +226,28 @@ def add_velocities(state: TwoViewState, prior: VelocityPrior, hessian: Array,
 
 
 @kernel
-def _add_scale(prior: VelocityPrior, hessian: Array, gradient: Array, cost: float) -> float:
-    """``-2 g log b + (log b - m)^2 / s^2``, added to `cost`."""
-    away = prior.log_scale - prior.centre
-    # Of the velocities that the matches know, half the log-evidence curves by as much again.
-    hessian[SCALE, SCALE] += prior.weight + prior.freedom
-    gradient[SCALE] += prior.weight * away - prior.freedom
-    return cost + prior.weight * away * away - 2.0 * prior.freedom * prior.log_scale
-
-
-@kernel
-def _add_rates(state: TwoViewState, priors: Priors, hessian: Array, gradient: Array,
-               cost: float) -> float:
-    """``w |dw_k|^2`` of both corrections of the gyro, added to `cost`."""
+def add_priors(state: TwoViewState, priors: Priors, hessian: Array, gradient: Array) -> float:
+    """Add all priors to the normal equations; their part of the cost."""
+    cost = 0.0
+    if priors.gravity_weight > 0.0:
+        cost += _add_gravity(state, priors, hessian, gradient)
+    # theta^T Lambda theta: the Jacobian of Log is approximated by I.
+    theta = log_so3(state.R @ priors.rotation.T)
+    for i in range(3):
+        product = dot(priors.rotation_information[i], theta)
+        cost += theta[i] * product
+        gradient[THETA + i] += product
+        for j in range(3):
+            hessian[THETA + i, THETA + j] += priors.rotation_information[i, j]
+    prior = priors.velocity
+    cost += add_velocities(state, prior, hessian, gradient)
+    if len(gradient) > SCALE:
+        # -2 g log b + (log b - m)^2 / s^2. Half the log-evidence curves by as much again for the
+        # velocities that the matches determine.
+        away = prior.log_scale - prior.centre
+        hessian[SCALE, SCALE] += prior.weight + prior.freedom
+        gradient[SCALE] += prior.weight * away - prior.freedom
+        cost = cost + prior.weight * away * away - 2.0 * prior.freedom * prior.log_scale
     for i in range(3):
         hessian[DW1 + i, DW1 + i] += priors.rate_weight
         hessian[DW2 + i, DW2 + i] += priors.rate_weight
@@ -212,21 +257,62 @@ def _add_rates(state: TwoViewState, priors: Priors, hessian: Array, gradient: Ar
     return cost
 
 
-@linked_kernel
-def add_priors(state: TwoViewState, priors: Priors, hessian: Array, gradient: Array) -> float:
-    """Add all priors to the normal equations; their part of the cost."""
-    cost = 0.0
-    if priors.gravity_weight > 0.0:
-        cost += _add_gravity(state, priors, hessian, gradient)
-    cost = _add_rotation(state, priors, hessian, gradient, cost)
-    cost += add_velocities(state, priors.velocity, hessian, gradient)
-    if len(gradient) > SCALE:
-        cost = _add_scale(priors.velocity, hessian, gradient, cost)
-    return _add_rates(state, priors, hessian, gradient, cost)
-
-
 @kernel
 def prior_cost(state: TwoViewState, priors: Priors) -> float:
     """The priors' part of the cost."""
     n = unknowns(priors)
     return add_priors(state, priors, np.zeros((n, n)), np.zeros(n))
+
+
+# -- Information matrices (inverse covariances): badly scaled, but never indefinite ---------------
+
+@kernel
+def _scaled_factor(information: Array) -> tuple[Array, Array]:
+    """Scales (n,) that make the diagonal 1, and the Cholesky factor of the matrix so scaled.
+
+    A floor of rounding on the diagonal keeps it positive definite, however badly conditioned.
+    """
+    n = information.shape[0]
+    scale = np.empty(n)
+    for i in range(n):
+        scale[i] = 1.0 / math.sqrt(max(information[i, i], 1e-30))
+    scaled, factor = np.empty((n, n)), np.zeros((n, n))
+    for i in range(n):
+        for j in range(n):
+            scaled[i, j] = information[i, j] * scale[j] * scale[i]
+        scaled[i, i] += 1e-13
+    if not cholesky(scaled, factor):
+        factor[:] = np.nan
+    return scale, factor
+
+
+@kernel
+def inverse(information: Array) -> Array:
+    """Covariance (n, n) of an information matrix, or vice versa.
+
+    Bit-equal on any number of threads, unlike NumPy's from n = 6 on.
+    """
+    scale, factor = _scaled_factor(information)
+    n = len(scale)
+    rows = np.zeros((n, n))
+    for j in range(n):   # the inverse of the factor, column by column
+        rows[j, j] = 1.0 / factor[j, j]
+        for i in range(j + 1, n):
+            value = 0.0
+            for k in range(j, i):
+                value -= factor[i, k] * rows[k, j]
+            rows[i, j] = value / factor[i, i]
+    for i in range(n):
+        for j in range(n):
+            rows[i, j] *= scale[j]
+    return rows.T @ rows
+
+
+@kernel
+def log_determinant(information: Array) -> float:
+    """Log-determinant of a positive definite matrix."""
+    scale, factor = _scaled_factor(information)
+    value = 0.0
+    for i in range(len(scale)):
+        value += 2.0 * math.log(factor[i, i] / scale[i])
+    return value

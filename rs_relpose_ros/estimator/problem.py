@@ -1,8 +1,7 @@
-"""A two-view problem at the **middle** row: what every step of the estimator works on.
+"""The two-view problem at the **middle** rows, common to all steps of the estimator.
 
-The user's reference row is a matter of the interface. Inside, motion and pose refer to the middle
-row of each frame, which decouples the translation from the velocities; `to_reference_row` brings
-the result back, with its covariance.
+Motion and pose refer to the middle row of each frame, which decouples the translation from the
+velocities; `to_reference_row` moves the result, with its covariance, to the user's reference row.
 """
 
 from __future__ import annotations
@@ -13,46 +12,28 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import skew
+from rs_relpose_ros.jit import kernel
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TwoViewProblem:
-    """Observations and IMU knowledge of one pair, frames at their middle rows.
+    """Matches and IMU measurements of one pair, frames at their middle rows."""
 
-    Attributes
-    ----------
-    observations : (N, 20) ndarray
-        Rows of `sampson`; NaN-free (matches that cannot be unprojected are left out by `valid`).
-    points : (6, N) ndarray
-        Columns of `consensus.multi_scale_cost`.
-    valid : (N,) ndarray of bool
-        Matches with finite rays.
-    focal : float
-        Mean focal length [px]: pixels per radian at the image centre.
-    motion1, motion2 : FrameMotion
-        At the middle row.
-    reference_row_time : float
-        Row time [s] of the user's reference row, where gravity was measured, from the middle row.
-    rotation, rotation_information : (3, 3) ndarray or None
-        Gyro-predicted ``R_1^T R_2`` between the middle rows, and the inverse covariance of its
-        error in frame 1.
-    """
-
-    observations: Array
-    points: Array
-    valid: NDArray[np.bool_]
-    focal: float
+    observations: Array   # (N, 20) rows of `sampson`; zero if a match cannot be unprojected
+    points: Array   # (6, N) columns of `sampling.multi_scale_cost`
+    valid: NDArray[np.bool_]   # (N,) matches with finite rays
+    focal: float   # [px] mean focal length: pixels per radian at the image centre
     motion1: FrameMotion
     motion2: FrameMotion
+    # [s] of the user's reference row, at which gravity was measured, from the middle row
     reference_row_time: float
-    rotation: Array | None
-    rotation_information: Array | None
+    rotation: Array | None   # (3, 3) R_1^T R_2 by the gyro
+    rotation_information: Array | None   # (3, 3) inverse covariance of its error in frame 1
 
 
 def middle_row_delay(camera: RollingShutterCamera) -> float:
@@ -66,20 +47,17 @@ def build_problem(points1: Array, points2: Array, camera: RollingShutterCamera,
                   derotate: bool = True) -> TwoViewProblem:
     """Unproject, derotate and move to the middle row.
 
-    Parameters
-    ----------
-    derotate : bool
-        False for the models that know no angular velocity (linear, global): rays stay as measured.
+    Without `derotate` (models without angular velocity: linear, global) rays are as measured.
     """
     delay = middle_row_delay(camera)
     motion1, motion2 = motion1.shifted(delay), motion2.shifted(delay)
     rotation = information = None
     if relative_rotation is not None and relative_rotation_covariance is not None:
         # R' = Exp(w_1 D)^T R Exp(w_2 D); after the shift, the old reference row lies at -D.
-        turn1 = motion1.rotations([-delay])[0]
-        turn2 = motion2.rotations([-delay])[0]
-        rotation = turn1 @ relative_rotation @ turn2.T
-        covariance = turn1 @ relative_rotation_covariance @ turn1.T
+        e1 = motion1.rotations([-delay])[0]
+        e2 = motion2.rotations([-delay])[0]
+        rotation = e1 @ relative_rotation @ e2.T
+        covariance = e1 @ relative_rotation_covariance @ e1.T
         # A floor far below any gyro keeps the information finite.
         information = np.linalg.inv(covariance + 1e-14 * np.eye(3))
         information = 0.5 * (information + information.T)
@@ -106,26 +84,26 @@ def observed(points1: Array, points2: Array, camera: RollingShutterCamera, motio
 
 
 @kernel
-def _derotate(rays: Array, jacobian: Array, turns: Array, turn_of_a_row: Array,
+def _derotate(rays: Array, jacobian: Array, rotations: Array, row_rotation: Array,
               block: Array) -> None:
-    """Fill one camera's `block` (N, 9): turned ray and its derivatives by u and v."""
+    """Fill one camera's `block` (N, 9): derotated ray and its derivatives by u and v."""
     for i in range(len(rays)):
         for j in range(3):
             f = u = v = 0.0
             for k in range(3):
-                f += turns[i, j, k] * rays[i, k]
-                u += turns[i, j, k] * jacobian[i, k, 0]
-                v += turns[i, j, k] * jacobian[i, k, 1]
+                f += rotations[i, j, k] * rays[i, k]
+                u += rotations[i, j, k] * jacobian[i, k, 0]
+                v += rotations[i, j, k] * jacobian[i, k, 1]
             block[i, j], block[i, 3 + j], block[i, 6 + j] = f, u, v
-        # One row further down, the camera has turned on by one line delay.
+        # One row further down, the camera has rotated for one more line delay.
         for j in range(3):
             k, m = (j + 1) % 3, (j + 2) % 3
-            block[i, 6 + j] += turn_of_a_row[k] * block[i, m] - turn_of_a_row[m] * block[i, k]
+            block[i, 6 + j] += row_rotation[k] * block[i, m] - row_rotation[m] * block[i, k]
 
 
 @kernel
 def _checked_columns(observations: Array) -> tuple[NDArray[np.bool_], Array]:
-    """Which rows are finite (the others become zero), and the points for `consensus`."""
+    """Which rows are finite (the others become zero), and the points for `sampling`."""
     n = len(observations)
     valid, points = np.empty(n, dtype=np.bool_), np.full((6, n), np.nan)
     for i in range(n):
@@ -160,53 +138,40 @@ class PairState:
     covariance: Array
 
 
-def to_reference_row(state: PairState, delay: float, turn1: Array, turn2: Array) -> PairState:
-    """The same motion between rows that lie `delay` seconds later (design section 1).
+def to_reference_row(state: PairState, delay: float, e1: Array, e2: Array) -> PairState:
+    """The same motion between rows that are read `delay` seconds later.
 
     ``R' = E_1^T R E_2``, ``t' = E_1^T (t - D v_1 + D R v_2)``, then ``|t'| = 1`` again: velocities
-    and covariance are rescaled. First-order covariance.
-
-    Parameters
-    ----------
-    turn1, turn2 : (3, 3) ndarray
-        ``E_i``: how each camera turns during `delay`; ``Exp(w_i D)`` at a constant rate.
+    and covariance are rescaled. First-order covariance. `e1`, `e2` (3, 3): ``E_i``, the rotation
+    of each camera during `delay`; ``Exp(w_i D)`` at a constant rate.
     """
-    e1, e2 = turn1, turn2
     R = e1.T @ state.R @ e2
     baseline = state.t - delay * state.v1 + delay * state.R @ state.v2
     scale = float(np.linalg.norm(baseline))
-    moved = e1.T @ baseline
-    t = moved / scale
+    t = e1.T @ baseline / scale
     v1, v2 = e1.T @ state.v1 / scale, e2.T @ state.v2 / scale
 
     eye = np.eye(3)
     jacobian = np.zeros((19, 19))
     TT, TH, V1, V2, W1, W2 = (slice(3 * k, 3 * k + 3) for k in range(6))
     # t_true = t + dt, R_true = Exp(th) R: baseline' = E1^T (dt - D dv1 + D R dv2 - D [R v2]x th
-    #   + D [baseline]x dw1), for rate errors that turn E_i into Exp(D dw_i) E_i.
-    by = np.zeros((3, 19))
-    by[:, TT] = eye
-    by[:, V1] = -delay * eye
-    by[:, V2] = delay * state.R
-    by[:, TH] = -delay * skew(state.R @ state.v2)
-    by[:, W1] = delay * skew(baseline)
+    #   + D [baseline]x dw1), with rate errors as Exp(D dw_i) E_i.
+    by = np.hstack([eye, -delay * skew(state.R @ state.v2), -delay * eye, delay * state.R,
+                    delay * skew(baseline), np.zeros((3, 4))])
     by = e1.T @ by / scale
-    projector = eye - np.outer(t, t)
-    jacobian[TT] = projector @ by
-    # th' = E1^T (th - D dw1) + E1^T R E2 (D dw2): errors of the rates turn the rows.
+    jacobian[TT] = (eye - np.outer(t, t)) @ by
+    # th' = E1^T (th - D dw1) + E1^T R E2 (D dw2): errors of the rates rotate the rows.
     jacobian[TH, TH] = e1.T
     jacobian[TH, W1] = -delay * e1.T
     jacobian[TH, W2] = delay * e1.T @ state.R
     along = t @ by
-    for block, velocity, turn in ((V1, v1, e1), (V2, v2, e2)):
-        jacobian[block, block] = turn.T / scale
+    for block, velocity, e in ((V1, v1, e1), (V2, v2, e2)):
+        jacobian[block, block] = e.T / scale
         jacobian[block] -= np.outer(velocity, along)
     jacobian[V1, W1] += delay * skew(v1) @ e1.T
     jacobian[V2, W2] += delay * skew(v2) @ e2.T
-    jacobian[W1, W1] = eye
-    jacobian[W2, W2] = eye
+    jacobian[W1, W1] = jacobian[W2, W2] = eye
     jacobian[18] = along
     jacobian[18, 18] += 1.0
     return PairState(R, t, v1, v2, state.w1, state.w2, state.log_baseline + math.log(scale),
                      jacobian @ state.covariance @ jacobian.T)
-

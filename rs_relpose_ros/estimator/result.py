@@ -1,15 +1,17 @@
-"""The relative pose of two frames, or the reason why there is none."""
+"""The relative pose of two frames, or the reason why there is none; landmarks of its inliers."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.estimator.image_information import ImageInformation
-from rs_relpose_ros.estimator.inertial_evidence import InertialEvidence
+from rs_relpose_ros.estimator.covariance import ImageInformation
+from rs_relpose_ros.estimator.velocity import InertialEvidence
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.so3 import skew
 
 Array = NDArray[np.float64]
@@ -24,7 +26,7 @@ class Status(str, Enum):
     LOW_PARALLAX = 'LOW_PARALLAX'
     PURE_ROTATION = 'PURE_ROTATION'
     BAD_INPUT = 'BAD_INPUT'
-    WITHHELD = 'WITHHELD'   # what was told of camera or IMU is wrong, so the pose would be
+    WITHHELD = 'WITHHELD'   # a configured parameter of camera or IMU contradicts the data
 
 
 def _nan(*shape: int) -> Array:
@@ -40,11 +42,11 @@ class RelativePose:
     status : Status
         `PURE_ROTATION` and `LOW_PARALLAX` still fill `R` and its part of `covariance`.
     reason : str
-        One sentence; empty when there is a pose.
+        One line; empty if there is a pose.
     R : (3, 3) ndarray
         ``R_1^T R_2``, between the two frames' reference rows.
     t : (3,) ndarray
-        Unit direction of ``R_1^T (p_2 - p_1)``; NaN where it is not known.
+        Unit direction of ``R_1^T (p_2 - p_1)``; NaN if not known.
     linear_velocity1, linear_velocity2 : (3,) ndarray
         Each in its own camera's frame [baselines per second].
     angular_velocity1, angular_velocity2 : (3,) ndarray
@@ -55,30 +57,35 @@ class RelativePose:
         Of ``(dt, dtheta)`` with ``t_true = t + dt`` (dt perpendicular to t) and
         ``R_true = Exp(dtheta) R``, both in camera 1; NaN where `t` or `R` is.
     velocity_covariance : (6, 6) ndarray
-        Of `linear_velocity2` and `angular_velocity2`, in camera 2; NaN where they are not known.
+        Of `linear_velocity2` and `angular_velocity2`, in camera 2; NaN if they are not known.
     model : str
         'uniform', 'angular', 'linear' or 'global'.
     baseline : float
-        Length of the translation [m]; NaN where it is not known: images and gyro do not tell it.
+        Length of the translation [m]; NaN if not known: not observable from images and gyro.
     baseline_log_sigma : float
         1 sigma of its logarithm.
     baseline_reason : str
-        Why the baseline is not known; empty where it is, and without a pose.
+        Why the baseline is not known; empty if it is, and without a pose.
     images : ImageInformation or None
-        What the images alone say of it, without the priors of the IMU; None where they say
-        nothing.
+        Information of the images alone, without the priors of the IMU; None if there is none.
     inertial_evidence : InertialEvidence or None
-        Whether the images show the acceleration that was given (`inertial`); None where nothing
-        tells.
+        Whether the images are consistent with the given acceleration (`inertial`); None if that
+        is not observable.
     pixels1_gs, pixels2_gs : (N, 2) ndarray or None
-        Where global shutters at the instants of the reference rows would see the matches, on the
-        sensor [px]: NaN for outliers; None unless asked for, and without a pose.
+        Equivalent global-shutter pixels of the matches at the times of the reference rows, on the
+        sensor: NaN for outliers; None unless requested, and without a pose.
     velocity_sigma : float
         Prior sigma of the linear velocities that was used [baselines per second].
     iterations : int
         Hypothesis samples drawn.
     residual_rms : float
         Root mean square Sampson error of the inliers [px].
+    frames : int
+        Number of views that the pose was estimated from; 2 without frames between.
+    frames_reason : str
+        Why given frames between were not used; empty if they were.
+    pixel_sigma : float
+        Noise of a match as estimated from the residuals, 1 sigma per coordinate [px].
     duration : float
         Time of the estimate [s].
     """
@@ -105,6 +112,9 @@ class RelativePose:
     velocity_sigma: float = float('nan')
     iterations: int = 0
     residual_rms: float = float('nan')
+    frames: int = 2
+    frames_reason: str = ''
+    pixel_sigma: float = float('nan')
     duration: float = float('nan')
 
     def __bool__(self) -> bool:
@@ -113,57 +123,116 @@ class RelativePose:
 
     @property
     def rotation_known(self) -> bool:
-        """Whether `R` and its covariance are known; of every pose they are."""
+        """Whether `R` and its covariance are known, as of every pose."""
         return bool(np.isfinite(self.R).all())
 
     @property
     def metric_velocity1(self) -> Array:
-        """`linear_velocity1` (3,) in m/s; NaN where the baseline is not known."""
+        """`linear_velocity1` (3,) in m/s; NaN if the baseline is not known."""
         return self.baseline * self.linear_velocity1
 
     @property
     def metric_velocity2(self) -> Array:
-        """`linear_velocity2` (3,) in m/s; NaN where the baseline is not known."""
+        """`linear_velocity2` (3,) in m/s; NaN if the baseline is not known."""
         return self.baseline * self.linear_velocity2
 
     def without_translation(self, status: Status, reason: str) -> RelativePose:
-        """The same with the rotation alone, and why."""
+        """The same with the rotation alone, and the reason."""
         covariance, velocity_covariance = self.covariance.copy(), self.velocity_covariance.copy()
         for matrix in (covariance, velocity_covariance):
             matrix[:3] = matrix[:, :3] = np.nan
         return replace(
-            self, status=status, reason=reason, t=_nan(3), linear_velocity1=_nan(3),
-            linear_velocity2=_nan(3), covariance=covariance, baseline=float('nan'),
-            baseline_log_sigma=float('nan'), baseline_reason='',
+            self.without_baseline(''), status=status, reason=reason, t=_nan(3),
+            linear_velocity1=_nan(3), linear_velocity2=_nan(3), covariance=covariance,
             images=None if self.images is None else self.images.of_rotation(),
             velocity_covariance=velocity_covariance)
 
     def without_baseline(self, reason: str) -> RelativePose:
-        """The same with a baseline that is not known, and why."""
+        """The same without a baseline, and the reason."""
         return replace(self, baseline=float('nan'), baseline_log_sigma=float('nan'),
                        baseline_reason=reason)
 
     def inverse(self) -> RelativePose:
         """Pose of camera 1 in camera 2, covariance and velocities exchanged accordingly.
 
-        Without `images`: their information is about this pose, in the axes of camera 1.
+        Without `images`, whose information refers to this pose, in the axes of camera 1.
         """
         R_inv = self.R.T
         # t' = -R^T t: dt' = -R^T (dt + t x dtheta); theta' = -R^T theta.
-        tx = skew(self.t)
-        jacobian = np.zeros((6, 6))
-        jacobian[:3, :3] = -R_inv
-        jacobian[:3, 3:] = -R_inv @ tx
-        jacobian[3:, 3:] = -R_inv
+        jacobian = np.kron(np.eye(2), -R_inv)
+        jacobian[:3, 3:] = -R_inv @ skew(self.t)
         covariance = jacobian @ self.covariance @ jacobian.T
-        # Known without a translation, too, whose NaN the product spreads.
+        # Known without a translation, too, whose NaN spreads through the product.
         covariance[3:, 3:] = R_inv @ self.covariance[3:, 3:] @ self.R
-        return RelativePose(
-            status=self.status, reason=self.reason, R=R_inv, t=-R_inv @ self.t,
-            linear_velocity1=self.linear_velocity2, linear_velocity2=self.linear_velocity1,
-            angular_velocity1=self.angular_velocity2, angular_velocity2=self.angular_velocity1,
-            inliers=self.inliers, covariance=covariance, baseline=self.baseline,
-            baseline_log_sigma=self.baseline_log_sigma, baseline_reason=self.baseline_reason,
-            model=self.model, velocity_sigma=self.velocity_sigma, iterations=self.iterations,
-            residual_rms=self.residual_rms, duration=self.duration)
+        return replace(
+            self, R=R_inv, t=-R_inv @ self.t, linear_velocity1=self.linear_velocity2,
+            linear_velocity2=self.linear_velocity1, angular_velocity1=self.angular_velocity2,
+            angular_velocity2=self.angular_velocity1, covariance=covariance,
+            velocity_covariance=_nan(6, 6), images=None, inertial_evidence=None, pixels1_gs=None,
+            pixels2_gs=None)
 
+
+# -- Landmarks and equivalent global-shutter pixels -----------------------------------------------
+#
+# Camera i is at ``tau_i v_i`` in its own stamped frame at the row time of a match, so that, with
+# ``d_1 = v_1`` and ``d_2 = R v_2`` as in (4) of ``docs/conventions.md``,
+#
+#     tau_1 d_1 + l_1 f_1 = t + tau_2 d_2 + l_2 R f_2,
+#
+# which determines both distances l by least squares.
+
+# Squared sine of the angle below which rays are parallel: 2e-4 rad, a tenth of a pixel.
+_PARALLEL = 4e-8
+
+
+def depths_of_rays(f1: Array, f2: Array, baselines: Array,
+                   parallel: float) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Depths l (N,) of ``l_1 f_1 = b + l_2 f_2`` by least squares, and whether they are usable.
+
+    Rays (N, 3) are in one frame. Not usable behind a camera, or if the squared sine of the angle
+    between the rays is at most `parallel`.
+    """
+    normals = np.cross(f1, f2)
+    squared = np.sum(normals**2, axis=1)
+    usable = squared > parallel
+    squared = np.where(usable, squared, 1.0)
+    # The cross products of that equation with f_2 and f_1.
+    l1 = np.sum(np.cross(baselines, f2) * normals, axis=1) / squared
+    l2 = np.sum(np.cross(baselines, f1) * normals, axis=1) / squared
+    return l1, l2, usable & (l1 > 0.0) & (l2 > 0.0)
+
+
+class Landmarks(NamedTuple):
+    """Of the N matches of a pair with a pose; NaN for outliers."""
+
+    # (N, 2) equivalent global-shutter pixels at the times of the stamped rows
+    pixels1: Array
+    pixels2: Array
+    # (N, 3) in the reference camera [baselines]; NaN if the rays are parallel or meet behind a
+    # camera: their pixels are then derotated as those of a point at infinity
+    points: Array
+
+
+def landmarks(pose: RelativePose, rays1: Array, rays2: Array, row_times1: Array, row_times2: Array,
+              camera: RollingShutterCamera) -> Landmarks:
+    """Landmarks of the inliers of a pose, pixels on the sensor.
+
+    `rays*` (N, 3): unit rays of the matches, derotated to the stamped row of their frame.
+    `row_times*` (N,): of the matches, from that of the stamped row [s].
+    """
+    inliers = pose.inliers
+    f1, f2 = rays1[inliers], rays2[inliers]
+    moved1 = row_times1[inliers, None] * pose.linear_velocity1
+    moved2 = row_times2[inliers, None] * pose.linear_velocity2
+    in_first = f2 @ pose.R.T
+    l1, l2, near = depths_of_rays(f1, in_first, pose.t + moved2 @ pose.R.T - moved1,
+                                  _PARALLEL)
+    # Inverse distances: 0 at infinity.
+    r1, r2 = (np.where(near, 1.0 / np.where(near, depth, 1.0), 0.0)[:, None]
+              for depth in (l1, l2))
+    equal1, equal2 = f1 + r1 * moved1, f2 + r2 * moved2
+    middle = 0.5 * (l1[:, None] * equal1 + pose.t + (l2[:, None] * equal2) @ pose.R.T)
+    out = Landmarks(*(np.full((len(inliers), size), np.nan) for size in (2, 2, 3)))
+    out.pixels1[inliers], out.pixels2[inliers] = camera.project(equal1), camera.project(equal2)
+    out.points[inliers] = np.where(near[:, None], middle, np.nan)
+    return out

@@ -1,41 +1,108 @@
-"""Random sampling: draw, generate, score, keep the best few; the loop knows no geometry.
+"""Hypotheses of a pair: random sampling, scoring, and local optimisation of the best few.
 
-Matches come ordered by quality and the sampled set grows from the best ones to all of them, as in
-PROSAC (Chum and Matas, CVPR 2005). The stopping rule is the usual one on the inlier ratio.
+The sampled set grows from the matches of the highest quality to all of them, as in PROSAC (Chum
+and Matas, CVPR 2005). The stopping rule is the usual one on the inlier ratio.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 import math
+import time
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.compiled import kernel
-from rs_relpose_ros.estimator.consensus import multi_scale_cost
-from rs_relpose_ros.geometry.vectors import copy_matrix, dot
-from rs_relpose_ros.solvers.solver import Knowledge, Sample, Solutions, solve_at
+from rs_relpose_ros.config.settings import EstimatorConfig
+from rs_relpose_ros.estimator import priors, sampson
+from rs_relpose_ros.estimator.fit import FitMatches, gauss_newton
+from rs_relpose_ros.estimator.priors import Priors, TwoViewState
+from rs_relpose_ros.estimator.problem import TwoViewProblem
+from rs_relpose_ros.estimator.sampson import RayMatches
+from rs_relpose_ros.geometry import so3
+from rs_relpose_ros.jit import kernel
+from rs_relpose_ros.solvers import common
+from rs_relpose_ros.solvers.api import GYRO_2PT, SOLVERS, UNIFORM
+from rs_relpose_ros.solvers.common import Knowledge, Model, Sample, Solutions, Solver
+
+# -- Scoring of hypotheses: truncated Sampson errors at several scales, on normalised points ------
+#
+# Hypotheses are ranked with the Sampson error in the derotated normalised plane (one focal length
+# for all pixels, no derivative of the distortion): a tenth of the cost of the exact error of
+# `sampson`, which every later step uses. Points behind that plane count as outliers here.
+#
+# At 10 m/s during the readout the angular model leaves 20 px at true inliers, so a single narrow
+# threshold would discard good rotations: the cost is the mean of MSAC costs at growing thresholds.
 
 Array = NDArray[np.float64]
 
+# Multiples of the inlier threshold. The widest still rejects 19 of 20 random matches.
+SCALES = np.array([1.0, 4.0, 12.0])
+# Matches that are scored between two comparisons with the limit.
+BLOCK = 64
 
-class Matches(NamedTuple):
-    """What is sampled, and how hypotheses are ranked.
 
-    `points` (6, N), `threshold2` (3,): as in `consensus.multi_scale_cost`. `order` (M,): usable
-    matches, best first.
+@kernel
+def multi_scale_cost(points: Array, R: Array, x: Array, threshold2: Array,
+                     limit: float) -> tuple[float, int]:
+    """Sum over matches and scales of ``min(r^2 / T^2, 1)``, and the inliers of the middle scale.
+
+    `points` (6, N): ``x_1, y_1, x_2, y_2`` of the derotated rays at z = 1, ``tau_1, tau_2`` [s];
+    NaN for a match behind that plane. `x` (9,): ``t, d_1, d_2`` in frame 1. `threshold2` (3,):
+    squared thresholds, ascending, in units of the z = 1 plane. A sum above `limit` counts as
+    infinite, and the rest of the matches is not scored.
     """
+    # Essential matrices of t, -d_1 and d_2: that of a match is E_0 + tau_1 E_1 + tau_2 E_2.
+    E = np.empty((3, 3, 3))
+    for k in range(3):
+        sign = -1.0 if k == 1 else 1.0
+        bx, by, bz = sign * x[3 * k], sign * x[3 * k + 1], sign * x[3 * k + 2]
+        for j in range(3):
+            E[k, 0, j] = by * R[2, j] - bz * R[1, j]
+            E[k, 1, j] = bz * R[0, j] - bx * R[2, j]
+            E[k, 2, j] = bx * R[1, j] - by * R[0, j]
+    narrow, middle, wide = 1.0 / threshold2[0], 1.0 / threshold2[1], 1.0 / threshold2[2]
+    n = points.shape[1]
+    cost, inliers = 0.0, 0
+    for first in range(0, n, BLOCK):
+        for i in range(first, min(first + BLOCK, n)):
+            x1, y1, x2, y2 = points[0, i], points[1, i], points[2, i], points[3, i]
+            tau1, tau2 = points[4, i], points[5, i]
+            e00 = E[0, 0, 0] + tau1 * E[1, 0, 0] + tau2 * E[2, 0, 0]
+            e01 = E[0, 0, 1] + tau1 * E[1, 0, 1] + tau2 * E[2, 0, 1]
+            e02 = E[0, 0, 2] + tau1 * E[1, 0, 2] + tau2 * E[2, 0, 2]
+            e10 = E[0, 1, 0] + tau1 * E[1, 1, 0] + tau2 * E[2, 1, 0]
+            e11 = E[0, 1, 1] + tau1 * E[1, 1, 1] + tau2 * E[2, 1, 1]
+            e12 = E[0, 1, 2] + tau1 * E[1, 1, 2] + tau2 * E[2, 1, 2]
+            e20 = E[0, 2, 0] + tau1 * E[1, 2, 0] + tau2 * E[2, 2, 0]
+            e21 = E[0, 2, 1] + tau1 * E[1, 2, 1] + tau2 * E[2, 2, 1]
+            e22 = E[0, 2, 2] + tau1 * E[1, 2, 2] + tau2 * E[2, 2, 2]
+            # f_1^T [b]x R f_2: the constraint up to sign
+            gx = e00 * x2 + e01 * y2 + e02
+            gy = e10 * x2 + e11 * y2 + e12
+            gz = e20 * x2 + e21 * y2 + e22
+            kx = e00 * x1 + e10 * y1 + e20
+            ky = e01 * x1 + e11 * y1 + e21
+            value = x1 * gx + y1 * gy + gz
+            r2 = value * value / (gx * gx + gy * gy + kx * kx + ky * ky + 1e-30)
+            # False for NaN, which counts as an outlier.
+            cost += r2 * narrow if r2 * narrow < 1.0 else 1.0
+            cost += r2 * middle if r2 * middle < 1.0 else 1.0
+            cost += r2 * wide if r2 * wide < 1.0 else 1.0
+            inliers += 1 if r2 * middle < 1.0 else 0
+        if cost > limit:
+            return math.inf, 0
+    return cost, inliers
 
-    points: Array
-    order: NDArray[np.int64]
-    threshold2: Array
 
+class Sampling(NamedTuple):
+    """What is sampled, how hypotheses are ranked (`multi_scale_cost`), and when sampling stops."""
 
-class Stop(NamedTuple):
-    """Probability of an outlier-free sample, or number of samples, at which sampling stops."""
-
-    confidence: float
+    points: Array   # (6, N)
+    order: NDArray[np.int64]   # (M,) usable matches, best first
+    threshold2: Array   # (3,)
+    confidence: float   # probability of a sample without outliers
     max_samples: int
 
 
@@ -45,11 +112,6 @@ class Pool(NamedTuple):
     R: Array
     x: Array
     cost: Array
-
-
-def empty_pool(size: int) -> Pool:
-    """Room for the `size` best hypotheses."""
-    return Pool(np.zeros((size, 3, 3)), np.zeros((size, 9)), np.full(size, np.inf))
 
 
 @kernel
@@ -79,8 +141,8 @@ def draw(order: NDArray[np.int64], head: int, sample: NDArray[np.int64],
 
 
 @kernel
-def _gather(points: Array, chosen: NDArray[np.int64], sample: Sample) -> bool:
-    """Write unit rays and row times of the chosen matches; False where one cannot be drawn."""
+def _write_sample(points: Array, chosen: NDArray[np.int64], sample: Sample) -> bool:
+    """Write unit rays and row times of the chosen matches; False if one is not usable."""
     for k in range(chosen.shape[0]):
         i = chosen[k]
         x1, y1, x2, y2 = points[0, i], points[1, i], points[2, i], points[3, i]
@@ -96,109 +158,269 @@ def _gather(points: Array, chosen: NDArray[np.int64], sample: Sample) -> bool:
 
 @kernel
 def _same(Ra: Array, xa: Array, Rb: Array, xb: Array) -> bool:
-    """Whether two hypotheses are one: R within 0.01 rad, the direction of t within 0.1 rad."""
+    """Whether two hypotheses are equal: R within 0.01 rad, the direction of t within 0.1 rad."""
     trace = 0.0
     for i in range(3):
         for j in range(3):
             trace += Ra[i, j] * Rb[i, j]
     if trace < 3.0 - 0.01 * 0.01:
         return False
-    return abs(dot(xa, xb)) > 1.0 - 0.5 * 0.1 * 0.1
-
-
-@kernel
-def _worst(pool: Pool) -> int:
-    """Place of the most expensive hypothesis, or the first that is free."""
-    worst = 0
-    for k in range(1, len(pool.cost)):
-        if pool.cost[k] > pool.cost[worst]:
-            worst = k
-    return worst
+    return abs(so3.dot(xa, xb)) > 1.0 - 0.5 * 0.1 * 0.1
 
 
 @kernel
 def _offer(R: Array, x: Array, cost: float, pool: Pool) -> None:
-    """Put a hypothesis into the pool in place of its like or of the worst, if it is better."""
+    """Replace an equal hypothesis of the pool, or the worst one, by this one if it is better."""
     place = -1
     for k in range(pool.cost.shape[0]):
         if pool.cost[k] < math.inf and _same(R, x, pool.R[k], pool.x[k]):
             place = k
             break
     if place < 0:
-        place = _worst(pool)
+        place = int(np.argmax(pool.cost))
     if cost < pool.cost[place]:
-        copy_matrix(R, pool.R[place])
-        for i in range(9):
-            pool.x[place, i] = x[i]
+        so3.copy_matrix(R, pool.R[place])
+        so3.copy_vector(x, pool.x[place])
         pool.cost[place] = cost
 
 
 @kernel
-def sample_hypotheses(solver: int, size: int, matches: Matches, known: Knowledge, stop: Stop,
-                      drawn: int, block: int, best_inliers: int, out: Solutions, pool: Pool,
+def sample_hypotheses(solver: int, size: int, sampling: Sampling, known: Knowledge, drawn: int,
+                      block: int, best_inliers: int, out: Solutions, pool: Pool,
                       seed: NDArray[np.uint64]) -> tuple[int, int]:
-    """Draw samples for one solver and fill the pool.
+    """Draw samples for one solver and fill the pool, in place.
 
-    Parameters
-    ----------
-    solver, size : int
-        Address of its kernel, and matches of a sample.
-    drawn, block : int
-        Samples drawn by an earlier call, and most samples of this one.
-    best_inliers : int
-        Inliers of the best hypothesis of the pool: the stopping rule starts from there.
-    out : Solutions
-        Room for the solutions of one sample.
-    pool : Pool
-        Updated in place.
-
-    Returns
-    -------
-    samples, inliers : int
-        Samples drawn so far, and the inliers (middle scale) of the best hypothesis.
+    `solver`, `size`: address of its kernel, and matches of a sample. `drawn`, `block`: samples
+    drawn by earlier calls, and most samples of this one. `best_inliers`: of the best hypothesis of
+    the pool. `out`: room for the solutions of one sample. Returns the samples drawn so far, and
+    the inliers (middle scale) of the best hypothesis.
     """
-    usable = matches.order.shape[0]
+    usable = sampling.order.shape[0]
     if usable < size:
         return drawn, best_inliers
     chosen = np.empty(size, dtype=np.int64)
     sample = Sample(np.empty((size, 3)), np.empty((size, 3)), np.empty(size), np.empty(size))
-    needed = float(stop.max_samples)
-    last = min(drawn + block, stop.max_samples)
+    needed = float(sampling.max_samples)
+    last = min(drawn + block, sampling.max_samples)
     # Minimal sets are noisy: an outlier-free one is not yet an accurate one.
-    least = min(40, stop.max_samples)
-    best = math.inf
-    for cost in pool.cost:
-        best = min(best, cost)
+    least = min(40, sampling.max_samples)
+    best = pool.cost.min()
     if best < math.inf:
-        needed = samples_needed(best_inliers / usable, size, stop)
+        needed = samples_needed(best_inliers / usable, size, sampling)
     while drawn < last and (drawn < least or drawn < needed):
         # The set grows to all matches over 100 samples.
         head = min(usable, max(2 * size, (usable * (drawn + 1)) // 100))
-        draw(matches.order, head, chosen, seed)
+        draw(sampling.order, head, chosen, seed)
         drawn += 1
-        if not _gather(matches.points, chosen, sample):
+        if not _write_sample(sampling.points, chosen, sample):
             continue
         out.x[:] = 0.0
-        count = solve_at(solver, sample, known, out)
+        count = common.solve_at(solver, sample, known, out)
         for k in range(count):
-            limit = pool.cost[_worst(pool)]
-            cost, inliers = multi_scale_cost(matches.points, out.R[k], out.x[k],
-                                             matches.threshold2, limit)
+            limit = pool.cost.max()
+            cost, inliers = multi_scale_cost(sampling.points, out.R[k], out.x[k],
+                                             sampling.threshold2, limit)
             if cost < limit:
                 _offer(out.R[k], out.x[k], cost, pool)
                 if cost < best:
                     best = cost
                     best_inliers = inliers
-                    needed = samples_needed(inliers / usable, size, stop)
+                    needed = samples_needed(inliers / usable, size, sampling)
     return drawn, best_inliers
 
 
 @kernel
-def samples_needed(ratio: float, size: int, stop: Stop) -> float:
-    """Samples after which one is free of outliers with the probability that is asked for."""
+def samples_needed(ratio: float, size: int, sampling: Sampling) -> float:
+    """Samples after which one is free of outliers with probability `sampling.confidence`."""
     good = ratio**size
     if good >= 1.0 - 1e-12:
         return 1.0
     if good <= 1e-12:
-        return float(stop.max_samples)
-    return min(math.log(1.0 - stop.confidence) / math.log(1.0 - good), float(stop.max_samples))
+        return float(sampling.max_samples)
+    needed = math.log(1.0 - sampling.confidence) / math.log(1.0 - good)
+    return min(needed, float(sampling.max_samples))
+
+
+# -- Solvers of a mode, and the sampling of a frame pair ------------------------------------------
+
+# Hypotheses that are optimised further.
+POOL_SIZE = 6
+# With a time limit: samples between two readings of the clock (about 0.2 ms).
+_TIMED_BLOCK = 20
+
+
+@dataclass(frozen=True, slots=True)
+class SolverMode:
+    """Model that is estimated and its solvers, by decreasing prior knowledge."""
+
+    model: Model
+    solvers: tuple[Solver, ...]
+
+    @property
+    def needs_gravity(self) -> bool:
+        """Whether every solver requires gravity."""
+        return all(solver.needs_gravity for solver in self.solvers)
+
+    @property
+    def fitted_points(self) -> int:
+        """Matches that any hypothesis fits after its refinement, by its number of unknowns.
+
+        Those of its sample: 9 or 11 points, and some more by the fit of 11 unknowns.
+        """
+        return 14 if max(solver.sample_size for solver in self.solvers) >= 9 else 6
+
+
+MODES = {
+    'auto': SolverMode(UNIFORM, (GYRO_2PT, SOLVERS['angular_3pt'], SOLVERS['angular_5pt'])),
+    **{name: SolverMode(solver.model, (solver,)) for name, solver in SOLVERS.items()},
+}
+
+
+def draw_hypotheses(problem: TwoViewProblem, mode: SolverMode, config: EstimatorConfig,
+                    order: NDArray[np.int64], seed: NDArray[np.uint64],
+                    enough: float, deadline: float) -> tuple[Solutions, int, bool]:
+    """Sample the solvers of a mode until a share `enough` of the matches are inliers of one.
+
+    `order` (M,): usable matches, best first. `seed` (1,): state of the random number generator,
+    updated in place. Sampling ends at the `deadline`, in the time of `time.perf_counter` [s].
+    Returns the best distinct hypotheses, best first, the number of samples, and whether solvers
+    were skipped, since one before them had enough inliers.
+    """
+    known = common.no_knowledge()
+    gravity1, gravity2 = problem.motion1.gravity, problem.motion2.gravity
+    has_gravity = gravity1 is not None and gravity2 is not None
+    if gravity1 is not None and gravity2 is not None:
+        known = known._replace(align1=common.gravity_alignment(gravity1),
+                               align2=common.gravity_alignment(gravity2))
+    if problem.rotation is not None:
+        known = known._replace(rotation=np.ascontiguousarray(problem.rotation), predicted=True)
+    sampling = Sampling(problem.points, order, (config.threshold * SCALES / problem.focal)**2,
+                        config.confidence, config.max_iterations)
+    # All addresses first, so that the first pair compiles the solvers of later pairs, too.
+    able = [(solver, solver.address) for solver in mode.solvers
+            if (known.predicted or not solver.needs_rotation)
+            and (has_gravity or not solver.needs_gravity)]
+    pool = Pool(np.zeros((POOL_SIZE, 3, 3)), np.zeros((POOL_SIZE, 9)),
+                np.full(POOL_SIZE, np.inf))
+    block = config.max_iterations if math.isinf(deadline) else _TIMED_BLOCK
+    samples = inliers = 0
+    solvers_skipped = False
+    for solver, address in able:
+        solvers_skipped = (inliers > enough * len(order)
+                           or (samples > 0 and time.perf_counter() >= deadline))
+        if solvers_skipped:
+            break
+        out = common.empty_solutions(solver.most_solutions)
+        drawn, new = 0, block
+        while new == block:
+            before = drawn
+            drawn, inliers = sample_hypotheses(
+                address, solver.sample_size, sampling, known, drawn, block, inliers, out, pool,
+                seed)
+            new = drawn - before if time.perf_counter() < deadline else 0
+        samples += drawn
+    found = np.argsort(pool.cost)[:np.isfinite(pool.cost).sum()]
+    return Solutions(pool.R[found], pool.x[found]), samples, solvers_skipped
+
+
+# -- Local optimisation: inlier selection and fits of the uniform model, shrinking threshold ------
+
+# Multiples of the inlier threshold: the angular model leaves up to 20 px at true inliers.
+SHRINKING = np.array([6.0, 3.0, 1.5, 1.0])
+# Gauss-Newton steps of a hypothesis at each of them.
+STEPS = 2
+
+
+@kernel
+def _truncated_cost(r: Array, valid: NDArray[np.bool_], threshold: float, sigma: float) -> float:
+    """MSAC cost of residuals (N,) in units of sigma."""
+    cost = 0.0
+    for i in range(r.shape[0]):
+        if valid[i]:
+            cost += min(r[i] * r[i], threshold * threshold)
+    return cost / (sigma * sigma)
+
+
+@kernel
+def _take_least(costs: Array) -> int:
+    """Index of the least cost, the first of equal ones, which becomes infinite."""
+    least = 0
+    for k in range(1, len(costs)):
+        if costs[k] < costs[least] or not costs[least] < math.inf:
+            least = k
+    costs[least] = math.inf
+    return least
+
+
+@kernel
+def optimise(matches: RayMatches, hypotheses: Solutions, prior: Priors, sigma: float,
+             threshold: float) -> tuple[TwoViewState, bool]:
+    """Fit the uniform model to each hypothesis; the one of the least MSAC cost, priors included.
+
+    The threshold shrinks from round to round, and each round keeps the better half. `sigma`,
+    `threshold`: noise of a match and inlier threshold [px]. Returns the state, and whether a
+    hypothesis has enough inliers.
+    """
+    # No test of depths before the sign is known: no parallax is above this noise.
+    unsure = RayMatches(matches.observations, matches.valid, 1e9)
+    states, r = [], []   # that remain, and their residuals
+    for k in range(len(hypotheses.R)):
+        state = priors.hypothesis_state(hypotheses.R[k], hypotheses.x[k])
+        r.append(sampson.residuals(matches.observations, state))
+        # The sign with its matches in front of the cameras; residuals change theirs with it.
+        near = sampson.within(r[k], unsure, state, SHRINKING[0] * threshold)
+        sign = sampson.cheirality_sign(matches.observations, near, state)
+        states.append(priors.signed(state, sign))
+    for scale in SHRINKING:
+        costs = np.full(len(states), math.inf)
+        # Wide selections hold outliers: their residuals are not pixel noise.
+        noise, bound = scale * sigma, scale * threshold
+        for k in range(len(states)):
+            use = sampson.within(r[k], matches, states[k], bound)
+            if use.sum() < 6:
+                continue
+            costs[k] = (_truncated_cost(r[k], matches.valid, bound, noise)
+                        + priors.prior_cost(states[k], prior))
+            state = gauss_newton(FitMatches(matches.observations, use.astype(np.float64), noise),
+                                 states[k], prior, int(STEPS))
+            errors = sampson.residuals(matches.observations, state)
+            cost = (_truncated_cost(errors, matches.valid, bound, noise)
+                    + priors.prior_cost(state, prior))
+            if cost < costs[k]:
+                states[k], r[k], costs[k] = state, errors, cost
+        good = (costs < math.inf).sum()
+        if good == 0:
+            return states[0], False
+        better = [_take_least(costs) for _ in range((good + 1) // 2)]
+        states, r = [states[k] for k in better], [r[k] for k in better]
+    return states[0], True
+
+
+# -- Distribution of the inliers' rays: do they determine a pose? ---------------------------------
+
+@kernel
+def correlation(observations: Array, use: NDArray[np.bool_], first: int, second: int) -> Array:
+    """``sum a b^T`` (3, 3) over the matches in `use` of two of their vectors, by column."""
+    out = np.zeros((3, 3))
+    for i in range(observations.shape[0]):
+        if use[i]:
+            for j in range(3):
+                for k in range(3):
+                    out[j, k] += observations[i, first + j] * observations[i, second + k]
+    return out
+
+
+def distinct_directions(observations: Array, use: NDArray[np.bool_], first: int,
+                        cell: float) -> int:
+    """Number of distinct rays, to `cell` [rad]: copies of one add no information."""
+    x, y = np.round(observations[use, first:first + 2].T / cell)
+    return len(np.unique(x + 1e6 * y))
+
+
+def distance_from_a_plane(observations: Array, use: NDArray[np.bool_], first: int) -> float:
+    """Root mean square distance [rad] of the rays from the best plane through the centre.
+
+    Small if the points lie in one place or, in the image, on one line.
+    """
+    scatter = correlation(observations, use, first, first) / use.sum()
+    return float(np.sqrt(max(np.linalg.eigvalsh(scatter)[0], 0.0)))

@@ -1,4 +1,4 @@
-"""The rolling-shutter Sampson error in pixels, its exact Jacobian, and the depths of a match.
+"""The rolling-shutter Sampson error in pixels, its exact Jacobian, depths, inliers and noise.
 
 Constraint (docs/conventions.md), with ``b = t - tau_1 d_1 + tau_2 d_2`` and ``h = R f_2``::
 
@@ -7,26 +7,27 @@ Constraint (docs/conventions.md), with ``b = t - tau_1 d_1 + tau_2 d_2`` and ``h
 
 Every scalar above is a triple product ``b . (p x h)``: of the ray f_1 or its derivative a by a
 pixel coordinate, with h or R times the derivative of f_2. Derivatives by the pixel include the
-distortion and the turn of the camera from row to row, so the error is in pixels of the raw image.
+distortion and the rotation of the camera from row to row: the error is in raw pixels.
 
 An observation row (20 floats) holds, for one match,
 ``f_1, df_1/du, df_1/dv, f_2, df_2/du, df_2/dv, tau_1, tau_2``.
 
-Matches are evaluated in blocks, each laid out so that neighbours of one quantity are neighbours in
-memory: the compiler then works on several matches at once. For that it must know the strides,
-hence the arrays of fixed shape and the forced inlining.
+Matches are evaluated in blocks with the values of one quantity contiguous in memory, which the
+compiler vectorises. For that it must know the strides, hence the arrays of fixed shape and the
+forced inlining.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.compiled import inlined_kernel, kernel, linked_kernel
-from rs_relpose_ros.estimator.state import PARAMETERS, TwoViewState
-from rs_relpose_ros.geometry.vectors import copy_vector, cross, dot, norm, rotated, tangent_basis
+from rs_relpose_ros.estimator.priors import PARAMETERS, TwoViewState
+from rs_relpose_ros.geometry import so3
+from rs_relpose_ros.jit import inlined_kernel, kernel
 
 Array = NDArray[np.float64]
 
@@ -40,16 +41,16 @@ def _cross(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]
 
 
 @inlined_kernel
-def _baselines(state: TwoViewState) -> Array:
-    """Coefficients (3, 3) of ``b = t - tau_1 d_1 + tau_2 d_2`` in 1, tau_1, tau_2."""
-    out = np.empty((3, 3))
+def _coefficients(state: TwoViewState) -> tuple[Array, Array, Array]:
+    """Of ``b = t - tau_1 d_1 + tau_2 d_2`` in 1, tau_1, tau_2 (3, 3), and `_rotation_series`."""
+    b = np.empty((3, 3))
     for k in range(3):
-        out[0, k], out[1, k], out[2, k] = state.t[k], -state.d1[k], state.d2[k]
-    return out
+        b[0, k], b[1, k], b[2, k] = state.t[k], -state.d1[k], state.d2[k]
+    return b, _rotation_series(state.dw1, np.eye(3)), _rotation_series(state.dw2, state.R)
 
 
 @inlined_kernel
-def _turns(rate: Array, R: Array) -> Array:
+def _rotation_series(rate: Array, R: Array) -> Array:
     """Coefficients (3, 3, 3) of ``Exp(w tau) R`` in 1, tau, tau^2: w is a gyro correction."""
     out = np.empty((3, 3, 3))
     for j in range(3):
@@ -62,28 +63,27 @@ def _turns(rate: Array, R: Array) -> Array:
 
 
 @inlined_kernel
-def _turned(turns, tau, x, y, z):  # type: ignore[no-untyped-def]
-    """A vector turned by the rotation of `_turns` at tau."""
+def _rotated(series, tau, x, y, z):  # type: ignore[no-untyped-def]
+    """A vector times the rotation of `_rotation_series` at tau."""
     s = tau * tau
     return (
-        (turns[0, 0, 0] + tau * turns[1, 0, 0] + s * turns[2, 0, 0]) * x
-        + (turns[0, 0, 1] + tau * turns[1, 0, 1] + s * turns[2, 0, 1]) * y
-        + (turns[0, 0, 2] + tau * turns[1, 0, 2] + s * turns[2, 0, 2]) * z,
-        (turns[0, 1, 0] + tau * turns[1, 1, 0] + s * turns[2, 1, 0]) * x
-        + (turns[0, 1, 1] + tau * turns[1, 1, 1] + s * turns[2, 1, 1]) * y
-        + (turns[0, 1, 2] + tau * turns[1, 1, 2] + s * turns[2, 1, 2]) * z,
-        (turns[0, 2, 0] + tau * turns[1, 2, 0] + s * turns[2, 2, 0]) * x
-        + (turns[0, 2, 1] + tau * turns[1, 2, 1] + s * turns[2, 2, 1]) * y
-        + (turns[0, 2, 2] + tau * turns[1, 2, 2] + s * turns[2, 2, 2]) * z)
+        (series[0, 0, 0] + tau * series[1, 0, 0] + s * series[2, 0, 0]) * x
+        + (series[0, 0, 1] + tau * series[1, 0, 1] + s * series[2, 0, 1]) * y
+        + (series[0, 0, 2] + tau * series[1, 0, 2] + s * series[2, 0, 2]) * z,
+        (series[0, 1, 0] + tau * series[1, 1, 0] + s * series[2, 1, 0]) * x
+        + (series[0, 1, 1] + tau * series[1, 1, 1] + s * series[2, 1, 1]) * y
+        + (series[0, 1, 2] + tau * series[1, 1, 2] + s * series[2, 1, 2]) * z,
+        (series[0, 2, 0] + tau * series[1, 2, 0] + s * series[2, 2, 0]) * x
+        + (series[0, 2, 1] + tau * series[1, 2, 1] + s * series[2, 2, 1]) * y
+        + (series[0, 2, 2] + tau * series[1, 2, 2] + s * series[2, 2, 2]) * z)
 
 
-@linked_kernel
+@kernel
 def _gather(observations: Array, weights: Array, first: int, block: Array) -> tuple[int, int]:
     """Fill `block` (21, BLOCK) with the matches that have a weight, from number `first` on.
 
-    The last row is for the roots of their weights. Returns the number from which to go on, and how
-    many matches there are. The rest of the block is zero: such a match has no residual and no
-    derivative.
+    The last row holds the roots of their weights. Returns the next number, and how many matches
+    there are. The rest of the block is zero, with zero residuals and derivatives.
     """
     count = 0
     while first < observations.shape[0] and count < BLOCK:
@@ -100,7 +100,7 @@ def _gather(observations: Array, weights: Array, first: int, block: Array) -> tu
 
 
 @inlined_kernel
-def _residual(o, i, baselines, turns1, turns2):  # type: ignore[no-untyped-def]
+def _residual(o, i, baselines, series1, series2):  # type: ignore[no-untyped-def]
     """Residual [px] of column i of a block, and the vectors that its derivative needs.
 
     They are b, f_1, h, p', h', where ``dr`` is the sum of the variations of the triple products
@@ -110,12 +110,12 @@ def _residual(o, i, baselines, turns1, turns2):  # type: ignore[no-untyped-def]
     bx = baselines[0, 0] + tau1 * baselines[1, 0] + tau2 * baselines[2, 0]
     by = baselines[0, 1] + tau1 * baselines[1, 1] + tau2 * baselines[2, 1]
     bz = baselines[0, 2] + tau1 * baselines[1, 2] + tau2 * baselines[2, 2]
-    fx, fy, fz = _turned(turns1, tau1, o[0, i], o[1, i], o[2, i])
-    ux, uy, uz = _turned(turns1, tau1, o[3, i], o[4, i], o[5, i])
-    vx, vy, vz = _turned(turns1, tau1, o[6, i], o[7, i], o[8, i])
-    hx, hy, hz = _turned(turns2, tau2, o[9, i], o[10, i], o[11, i])
-    hux, huy, huz = _turned(turns2, tau2, o[12, i], o[13, i], o[14, i])
-    hvx, hvy, hvz = _turned(turns2, tau2, o[15, i], o[16, i], o[17, i])
+    fx, fy, fz = _rotated(series1, tau1, o[0, i], o[1, i], o[2, i])
+    ux, uy, uz = _rotated(series1, tau1, o[3, i], o[4, i], o[5, i])
+    vx, vy, vz = _rotated(series1, tau1, o[6, i], o[7, i], o[8, i])
+    hx, hy, hz = _rotated(series2, tau2, o[9, i], o[10, i], o[11, i])
+    hux, huy, huz = _rotated(series2, tau2, o[12, i], o[13, i], o[14, i])
+    hvx, hvy, hvz = _rotated(series2, tau2, o[15, i], o[16, i], o[17, i])
     # h x b and b x f_1: the gradients of e by f_1 and by h.
     gx, gy, gz = _cross(hx, hy, hz, bx, by, bz)
     kx, ky, kz = _cross(bx, by, bz, fx, fy, fz)
@@ -136,28 +136,25 @@ def _residual(o, i, baselines, turns1, turns2):  # type: ignore[no-untyped-def]
 
 
 @inlined_kernel
-def _linearise(o, baselines, turns1, turns2, basis, rows):  # type: ignore[no-untyped-def]
-    """Derivatives and residuals of a block, times the roots of the weights.
-
-    `rows` (18, BLOCK): the residual last.
-    """
+def _linearise(o, baselines, series1, series2, basis, rows):  # type: ignore[no-untyped-def]
+    """Derivatives of a block in `rows` (18, BLOCK), residuals last, times the weights' roots."""
     for i in range(BLOCK):
         r, (bx, by, bz), (fx, fy, fz), (hx, hy, hz), (px, py, pz), (jx, jy, jz) = _residual(
-            o, i, baselines, turns1, turns2)
+            o, i, baselines, series1, series2)
         # by b: p' x h + f_1 x h'
         nx, ny, nz = _cross(px, py, pz, hx, hy, hz)
         mx, my, mz = _cross(fx, fy, fz, jx, jy, jz)
         nx, ny, nz = nx + mx, ny + my, nz + mz
-        # by a turn of the second rays: h x (b x p') + h' x (b x f_1)
+        # by a rotation of the second rays: h x (b x p') + h' x (b x f_1)
         sx, sy, sz = _cross(bx, by, bz, px, py, pz)
         rx, ry, rz = _cross(hx, hy, hz, sx, sy, sz)
         kx, ky, kz = _cross(bx, by, bz, fx, fy, fz)
         mx, my, mz = _cross(jx, jy, jz, kx, ky, kz)
         rx, ry, rz = rx + mx, ry + my, rz + mz
-        # by a turn of the first rays: one of all three vectors, b too, would change nothing
+        # by a rotation of the first rays: that of all three vectors, b too, changes nothing
         mx, my, mz = _cross(bx, by, bz, nx, ny, nz)
         wx, wy, wz = -rx - mx, -ry - my, -rz - mz
-        # All of a row is linear in one of n, r and w, or is the residual.
+        # Each entry of a row is linear in one of n, r and w, or is the residual.
         root = o[20, i]
         r, rx, ry, rz = root * r, root * rx, root * ry, root * rz
         nx, ny, nz, wx, wy, wz = root * nx, root * ny, root * nz, root * wx, root * wy, root * wz
@@ -172,12 +169,11 @@ def _linearise(o, baselines, turns1, turns2, basis, rows):  # type: ignore[no-un
         rows[17, i] = r
 
 
-@linked_kernel
+@kernel
 def residuals(observations: Array, state: TwoViewState) -> Array:
     """Signed Sampson errors (N,) [px] of observation rows (N, 20)."""
     n = observations.shape[0]
-    baselines = _baselines(state)
-    turns1, turns2 = _turns(state.dw1, np.eye(3)), _turns(state.dw2, state.R)
+    baselines, series1, series2 = _coefficients(state)
     block, errors = np.empty((21, BLOCK)), np.empty(BLOCK)
     everything = np.ones(n)
     out = np.empty(n)
@@ -185,8 +181,8 @@ def residuals(observations: Array, state: TwoViewState) -> Array:
     while first < n:
         following, count = _gather(observations, everything, first, block)
         for i in range(BLOCK):
-            errors[i] = _residual(block, i, baselines, turns1, turns2)[0]
-        copy_vector(errors[:count], out[first:])
+            errors[i] = _residual(block, i, baselines, series1, series2)[0]
+        so3.copy_vector(errors[:count], out[first:])
         first = following
     return out
 
@@ -195,37 +191,37 @@ def residuals(observations: Array, state: TwoViewState) -> Array:
 def jacobian(observations: Array, state: TwoViewState) -> Array:
     """Derivatives (N, 17) of the Sampson errors by the local parameters."""
     n = observations.shape[0]
-    baselines = _baselines(state)
-    turns1, turns2 = _turns(state.dw1, np.eye(3)), _turns(state.dw2, state.R)
-    basis = tangent_basis(state.t)
+    baselines, series1, series2 = _coefficients(state)
+    basis = so3.tangent_basis(state.t)
     block, rows = np.empty((21, BLOCK)), np.empty((PARAMETERS + 1, BLOCK))
     everything = np.ones(n)
     out = np.empty((n, PARAMETERS))
     first = 0
     while first < n:
         following, count = _gather(observations, everything, first, block)
-        _linearise(block, baselines, turns1, turns2, basis, rows)
-        out[first:following] = rows[:PARAMETERS, :count].T
+        _linearise(block, baselines, series1, series2, basis, rows)
+        for i in range(count):
+            for j in range(PARAMETERS):
+                out[first + i, j] = rows[j, i]
         first = following
     return out
 
 
-@linked_kernel
+@kernel
 def normal_equations(observations: Array, weights: Array,
                      state: TwoViewState) -> tuple[Array, Array, float]:
     """``J^T W J`` (17, 17), ``J^T W r`` (17,) and ``r^T W r`` with the weights (N,) of matches."""
-    baselines = _baselines(state)
-    turns1, turns2 = _turns(state.dw1, np.eye(3)), _turns(state.dw2, state.R)
-    basis = tangent_basis(state.t)
+    baselines, series1, series2 = _coefficients(state)
+    basis = so3.tangent_basis(state.t)
     block, rows = np.empty((21, BLOCK)), np.empty((PARAMETERS + 1, BLOCK))
-    # The residual as the last column of J: one product holds all three results. By BLAS, whose
-    # sums are in one order whoever calls; a block is too small for it to start threads.
+    # The residual as the last column of J: one product contains all three results. By BLAS, with
+    # a fixed order of its sums: a block is too small for threads.
     gram = np.zeros((PARAMETERS + 1, PARAMETERS + 1))
     product = np.empty((PARAMETERS + 1, PARAMETERS + 1))
     first = 0
     while first < observations.shape[0]:
         first, _ = _gather(observations, weights, first, block)
-        _linearise(block, baselines, turns1, turns2, basis, rows)
+        _linearise(block, baselines, series1, series2, basis, rows)
         np.dot(rows, rows.T, product)
         gram += product
     hessian = gram[:PARAMETERS, :PARAMETERS].copy()
@@ -238,17 +234,166 @@ def triangulated(observations: Array, i: int,
     """Depths of match i along both rays [baselines], its parallax [rad] and length of baseline.
 
     ``l_1 f_1 = l_2 h + b`` in the least-squares sense of its cross products with h and f_1, each
-    match with its own row times; depths are NaN where the rays are parallel.
+    match with its own row times; depths are NaN if the rays are parallel.
     """
     o = observations[i]
     tau1, tau2 = o[18], o[19]
     t, d1, d2 = state.t, state.d1, state.d2
     b = (t[0] - tau1 * d1[0] + tau2 * d2[0], t[1] - tau1 * d1[1] + tau2 * d2[1],
          t[2] - tau1 * d1[2] + tau2 * d2[2])
-    f, h = o[0:3], rotated(state.R, o[9:12])
-    n = cross(f, h)
-    n2 = dot(n, n)
-    baseline = norm(b)
+    f, h = o[0:3], so3.rotated(state.R, o[9:12])
+    n = so3.cross(f, h)
+    n2 = so3.dot(n, n)
+    baseline = so3.norm(b)
     if n2 < 1e-18:
         return math.nan, math.nan, 0.0, baseline
-    return dot(cross(b, h), n) / n2, dot(cross(b, f), n) / n2, math.sqrt(n2), baseline
+    return (so3.dot(so3.cross(b, h), n) / n2, so3.dot(so3.cross(b, f), n) / n2, math.sqrt(n2),
+            baseline)
+
+
+# -- Inliers of a state: by residuals and by depths -----------------------------------------------
+
+Flags = NDArray[np.bool_]
+
+# A depth is tested only if the parallax is this many times its noise.
+SIGNIFICANT_PARALLAX = 4.0
+# A match is an outlier if the logarithm of its depth is this many times as far from the median as
+# the quantile of one sigma on that side.
+DEPTH_GATE = 4.0
+DEPTH_QUANTILES = (0.16, 0.5, 0.84)
+# Least spread of the depths of a scene (log units): keeps the gate open on planar scenes.
+MIN_DEPTH_SPREAD = 0.25
+
+
+class RayMatches(NamedTuple):
+    """All matches of a pair."""
+
+    observations: Array   # (N, 20) rows as above
+    valid: Flags   # (N,) those with finite rays
+    angle_sigma: float   # noise of a ray [rad]
+
+
+@kernel
+def cheirality_sign(observations: Array, use: Flags, state: TwoViewState) -> float:
+    """+1 or -1: the sign of (t, d_1, d_2) with more of the matches in front of the cameras.
+
+    Matches are weighted with their parallax: the sign of a depth without parallax is noise.
+    """
+    vote = 0.0
+    for i in range(observations.shape[0]):
+        if use[i]:
+            depth1, depth2, _, _ = triangulated(observations, i, state)
+            if not math.isnan(depth1):
+                # Bounded: a match on the baseline has an arbitrarily large inverse depth.
+                vote += max(-1.0, min(1.0, 0.5 / depth1)) + max(-1.0, min(1.0, 0.5 / depth2))
+    return 1.0 if vote >= 0.0 else -1.0
+
+
+@kernel
+def count_behind(matches: RayMatches, use: Flags, state: TwoViewState) -> int:
+    """How many of the matches in `use` lie behind a camera, with a significant parallax."""
+    count = 0
+    for i in range(len(use)):
+        if use[i]:
+            depth1, depth2, parallax, _ = triangulated(matches.observations, i, state)
+            if (parallax >= SIGNIFICANT_PARALLAX * matches.angle_sigma
+                    and min(depth1, depth2) <= 0.0):
+                count += 1
+    return count
+
+
+@kernel
+def within(r: Array, matches: RayMatches, state: TwoViewState, threshold: float) -> Flags:
+    """Matches whose residuals `r` (N,) at `state` are below `threshold`, of plausible depths.
+
+    A random match within the epipolar band has a small residual, but lies behind a camera or far
+    from the others' depths.
+    """
+    n = len(r)
+    use = np.empty(n, dtype=np.bool_)
+    # Depths in units of the distance between the camera's places at the two rows; NaN: untested.
+    depths, known, count = np.full(n, np.nan), np.empty(n), 0
+    for i in range(n):
+        use[i] = matches.valid[i] and abs(r[i]) < threshold
+        if not use[i]:
+            continue
+        depth1, depth2, parallax, baseline = triangulated(matches.observations, i, state)
+        if not parallax >= SIGNIFICANT_PARALLAX * matches.angle_sigma:
+            continue
+        if depth1 <= 0.0 or depth2 <= 0.0:
+            use[i] = False
+            continue
+        depths[i] = known[count] = min(depth1, depth2) / baseline
+        count += 1
+    if count < 8:
+        return use
+    # Near and far side separately: a scene is denser far away, and its few near points, which
+    # resemble outliers, determine most of the translation.
+    known, last = known[:count], count - 1
+    near, centre, far = (math.log(so3.smallest(known, int(DEPTH_QUANTILES[0] * last))),
+                         math.log(so3.smallest(known, int(DEPTH_QUANTILES[1] * last))),
+                         math.log(so3.smallest(known, int(DEPTH_QUANTILES[2] * last))))
+    lowest = math.exp(centre - DEPTH_GATE * max(centre - near, MIN_DEPTH_SPREAD))
+    highest = math.exp(centre + DEPTH_GATE * max(far - centre, MIN_DEPTH_SPREAD))
+    for i in range(n):
+        if depths[i] < lowest or depths[i] > highest:
+            use[i] = False
+    return use
+
+
+@kernel
+def select_inliers(matches: RayMatches, state: TwoViewState, threshold: float) -> Flags:
+    """Matches within `threshold` [px] whose depths are plausible."""
+    return within(residuals(matches.observations, state), matches, state, threshold)
+
+
+# -- Noise of the matches, from their residuals: a mixture of two variances -----------------------
+
+# Matches of more noise than the rest: how many times as much, and their initial share.
+WORSE = 3.0
+FIRST_SHARE = 0.1
+# Number of matches as which the configured noise counts, and the prior that all are good.
+PRIOR_MATCHES = 10.0
+LIKELY_GOOD = 20.0
+# Iterations of expectation maximisation.
+EM_ROUNDS = 6
+# Degrees of freedom that the residuals usually lose to the fit: pose and observable velocities.
+FITTED = 11
+# Of a squared residual in variances: beyond it the exponential would overflow.
+LARGEST = 700.0
+
+
+@kernel
+def noise_mixture(r: Array, use: Flags, configured: float) -> tuple[Array, float]:
+    """Weights (N,) of the matches in `use` and the noise [px] of good ones, by their residuals.
+
+    Some tracks are worse than others: a share h has `WORSE` times the noise of the rest. Both are
+    found by expectation maximisation; the weight of a match is the mean of its inverse variance.
+    The configured sigma counts as ten matches.
+    """
+    weights = np.zeros(len(r))
+    count, squares = 0, 0.0
+    for i in range(len(r)):
+        if use[i]:
+            count += 1
+            squares += r[i] * r[i]
+            weights[i] = 1.0
+    freedom = PRIOR_MATCHES + max(count - FITTED, 0)
+    variance = (PRIOR_MATCHES * configured * configured + squares) / freedom
+    share = FIRST_SHARE
+    for _ in range(EM_ROUNDS):
+        squares, worse = 0.0, 0.0
+        for i in range(len(r)):
+            if use[i]:
+                r2 = r[i] * r[i] / variance
+                if not r2 < LARGEST:
+                    r2 = LARGEST
+                ratio = (share / (1.0 - share) / WORSE
+                         * math.exp(0.5 * r2 * (1.0 - 1.0 / (WORSE * WORSE))))
+                p = ratio / (1.0 + ratio)
+                worse += p
+                weights[i] = 1.0 - p * (1.0 - 1.0 / (WORSE * WORSE))
+                squares += weights[i] * r[i] * r[i]
+        variance = (PRIOR_MATCHES * configured * configured + squares) / freedom
+        share = (worse + 1.0) / (count + LIKELY_GOOD)
+    return weights, math.sqrt(variance)

@@ -1,33 +1,36 @@
 """The rolling-shutter camera: pixel <-> unit ray, and the time of a row.
 
-Camera frame: x right, y down, z forward. The **raw, distorted** row decides the row time; the
-point is undistorted, the row never is.
+Camera frame: x right, y down, z forward. The row time is that of the **raw, distorted** row: the
+point is undistorted, its row is not.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry.distortion.inverse import project_points, undistort_points
-from rs_relpose_ros.geometry.distortion.models import DISTORTION_MODELS, DistortionModel
-from rs_relpose_ros.geometry.rays import rays_with_jacobian
-from rs_relpose_ros.geometry.turning import project_turning
+from rs_relpose_ros.geometry import distortion, validate
+from rs_relpose_ros.geometry.distortion import DistortionModel
+from rs_relpose_ros.geometry.so3 import dot
+from rs_relpose_ros.jit import kernel
+
+Array = NDArray[np.float64]
 
 REFERENCE_ROWS = ('first', 'middle', 'last')
 READOUT_DIRECTIONS = ('down', 'up')
 
-# Far beyond any camera, and near enough that no square of a pixel or a ray overflows.
+# [px], far beyond any camera; squares of pixels and rays cannot overflow.
 _LARGEST_IMAGE = 1_000_000
 _FARTHEST_PIXEL = 1e9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RollingShutterCamera:
-    """A calibrated camera that reads its rows one after the other.
+    """A calibrated camera whose rows are read one after the other.
 
     Parameters
     ----------
@@ -45,7 +48,7 @@ class RollingShutterCamera:
     readout_direction : {'down', 'up'}
         Whether row 0 is read first ('down') or last ('up').
     reference_row : {'first', 'middle', 'last'}
-        The row from which row times count (rows 0, (height-1)/2, height-1): motion holds there,
+        The row from which row times count (rows 0, (height-1)/2, height-1): motion refers to it,
         and a relative pose relates the reference rows of its two frames.
     """
 
@@ -63,46 +66,24 @@ class RollingShutterCamera:
 
     def __post_init__(self) -> None:
         for name in ('width', 'height'):
-            value = getattr(self, name)
-            if not (1 <= value <= _LARGEST_IMAGE and int(value) == value):
-                raise InputError(f'{name} must be a positive number of pixels, at most '
-                                 f'{_LARGEST_IMAGE}, got {value!r}')
-        for name in ('fx', 'fy'):
-            value = getattr(self, name)
-            if not 1.0 / _FARTHEST_PIXEL <= value <= _FARTHEST_PIXEL:
-                raise InputError(f'{name} must be finite and > 0 px (within '
-                                 f'[{1.0 / _FARTHEST_PIXEL:g}, {_FARTHEST_PIXEL:g}]), '
-                                 f'got {value!r}')
-        for name in ('cx', 'cy'):
-            value = getattr(self, name)
-            if not abs(value) <= _FARTHEST_PIXEL:
-                raise InputError(f'{name} must be finite and within {_FARTHEST_PIXEL:g} px, '
-                                 f'got {value!r}')
-        if not (np.isfinite(self.readout_time) and 0.0 <= self.readout_time < 1.0):
+            validate.whole_number(name, getattr(self, name), 1, _LARGEST_IMAGE, 'px')
+        for name, least in (('fx', 1.0 / _FARTHEST_PIXEL), ('fy', 1.0 / _FARTHEST_PIXEL),
+                            ('cx', -_FARTHEST_PIXEL), ('cy', -_FARTHEST_PIXEL)):
+            validate.number(name, getattr(self, name), least, _FARTHEST_PIXEL, 'px')
+        if not 0.0 <= self.readout_time < 1.0:
             raise InputError(
-                'readout_time must lie in [0, 1) s (it is height times line delay; '
-                f'0 for a global shutter), got {self.readout_time!r}')
-        if self.readout_direction not in READOUT_DIRECTIONS:
-            raise InputError(f'readout_direction must be one of {READOUT_DIRECTIONS}, '
-                             f'got {self.readout_direction!r}')
-        if self.reference_row not in REFERENCE_ROWS:
-            raise InputError(
-                f'reference_row must be one of {REFERENCE_ROWS}, got {self.reference_row!r}')
-        if self.distortion_model not in DISTORTION_MODELS:
-            raise InputError(
-                f'distortion_model must be one of {tuple(DISTORTION_MODELS)}, '
-                f'got {self.distortion_model!r}')
-        coefficients = tuple(float(c) for c in self.distortion)
-        if not all(np.isfinite(coefficients)):
-            raise InputError(f'distortion must be finite, got {coefficients}')
+                'readout_time must be in [0, 1) s (height times line delay; 0 for a global '
+                f'shutter), got {self.readout_time!r}')
+        validate.choice('readout_direction', self.readout_direction, READOUT_DIRECTIONS)
+        validate.choice('reference_row', self.reference_row, REFERENCE_ROWS)
+        validate.choice('distortion_model', self.distortion_model, distortion.DISTORTION_MODELS)
+        coefficients = tuple(validate.array('distortion', self.distortion, ('N',)).tolist())
         legal = self._lens.coefficient_counts
         if coefficients and len(coefficients) not in legal:
             raise InputError(
                 f'distortion of model {self.distortion_model!r} must have one of {legal} '
                 f'coefficients, got {len(coefficients)}')
         object.__setattr__(self, 'distortion', coefficients)
-
-    # -- rows and time -----------------------------------------------------------------------
 
     @property
     def line_delay(self) -> float:
@@ -116,7 +97,7 @@ class RollingShutterCamera:
         return {'first': 0.0, 'middle': (self.height - 1) / 2, 'last': self.height - 1.0}[
             self.reference_row]
 
-    def row_times(self, rows: ArrayLike) -> NDArray[np.float64]:
+    def row_times(self, rows: ArrayLike) -> Array:
         """Row times ``tau = (row - reference row) * line_delay`` [s] of raw, distorted rows."""
         rows = np.asarray(rows, dtype=np.float64)
         return (rows - self.reference_row_index) * self.line_delay
@@ -127,10 +108,8 @@ class RollingShutterCamera:
         ends = self.row_times([0.0, self.height - 1.0])
         return float(ends.min()), float(ends.max())
 
-    # -- pixels and rays ---------------------------------------------------------------------
-
     @property
-    def camera_matrix(self) -> NDArray[np.float64]:
+    def camera_matrix(self) -> Array:
         """The 3x3 intrinsic matrix."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
@@ -139,54 +118,186 @@ class RollingShutterCamera:
         """Whether the model is a plain pinhole (``'equidistant'`` never is)."""
         return self._lens.is_pinhole_at_zero and not any(self.distortion)
 
-    def project(self, points: ArrayLike) -> NDArray[np.float64]:
+    def project(self, points: ArrayLike) -> Array:
         """Raw pixels (N, 2) of points (N, 3) in the camera frame; NaN behind the camera.
 
-        A single exposure instant: a moving camera's rows are the caller's business.
+        At one time: the motion during the readout is not modelled.
         """
         points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
-        distort, _ = self._lens.addresses
-        normalized = project_points(points, distort, self._lens.padded(self.distortion))
+        normalized = distortion.project_points(points, *self._lens.compiled(self.distortion))
         return normalized * (self.fx, self.fy) + (self.cx, self.cy)
 
-    def project_turning(self, rays: NDArray[np.float64], rows: NDArray[np.float64],
-                        rotations: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Raw pixels (N, 2) of rays (N, 3) seen while the camera turns; NaN where nowhere.
+    def project_rotating(self, rays: Array, rows: Array, rotations: Array) -> Array:
+        """Raw pixels (N, 2) of rays (N, 3) while the camera rotates; NaN where there is none.
 
-        `rotations` (K, 3, 3) take from the frame of the rays to the camera's at K rows spread
-        evenly from the first to the last one; `rows` (N,) are first guesses. Each ray is seen by
-        the row that it is projected to.
+        Parameters
+        ----------
+        rows : (N,) ndarray
+            First guesses of the rows.
+        rotations : (K, 3, 3) ndarray
+            From the frame of the rays to that of the camera, at K rows spread evenly from the
+            first to the last one.
         """
-        distort, _ = self._lens.addresses
-        return project_turning(rays, rows, rotations, self.height,
-                               (self.fx, self.fy, self.cx, self.cy), distort,
-                               self._lens.padded(self.distortion))
+        return project_rotating(rays, rows, rotations, self.height,
+                                (self.fx, self.fy, self.cx, self.cy),
+                                *self._lens.compiled(self.distortion))
 
-    def unproject(self, points: ArrayLike) -> NDArray[np.float64]:
+    def unproject(self, points: ArrayLike) -> Array:
         """Unit rays (N, 3) in the camera frame of raw pixels (N, 2).
 
         A pixel outside the region where the distortion can be inverted gives a row of NaN.
         """
         return self.unproject_with_jacobian(points)[0]
 
-    def unproject_with_jacobian(
-            self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def unproject_with_jacobian(self, points: ArrayLike) -> tuple[Array, Array]:
         """Unit rays (N, 3) and their derivatives (N, 3, 2) by the raw pixel coordinates u, v."""
         points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 2)
-        return rays_with_jacobian(*self._normalized(points))
-
-    def _normalized(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-        """Undistorted points (N, 2) at z = 1, and their derivatives (N, 2, 2) by the pixel."""
         normalized = (points - (self.cx, self.cy)) / (self.fx, self.fy)
         by_pixel = np.empty((len(points), 2, 2))
         if self.is_undistorted:
             by_pixel[:] = np.diag([1.0 / self.fx, 1.0 / self.fy])
         else:
-            normalized, inverse = undistort_points(normalized, *self._lens.addresses,
-                                                   self._lens.padded(self.distortion))
+            normalized, inverse = distortion.undistort_points(
+                normalized, self._lens.first_guess(normalized),
+                *self._lens.compiled(self.distortion))
             np.divide(inverse, (self.fx, self.fy), out=by_pixel)
-        return normalized, by_pixel
+        return rays_with_jacobian(normalized, by_pixel)
 
     @property
     def _lens(self) -> DistortionModel:
-        return DISTORTION_MODELS[self.distortion_model]
+        return distortion.DISTORTION_MODELS[self.distortion_model]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Intrinsics:
+    """Intrinsics of the full sensor, and which part of it is published at which binning.
+
+    A published pixel ``u`` covers `binning_x` sensor columns, and pixel centres lie at integer
+    coordinates, so ``u_sensor = x_offset + binning_x (u + 1/2) - 1/2``; the same for ``v``.
+    No message has the readout time, so it is not included.
+
+    Parameters
+    ----------
+    width, height, fx, fy, cx, cy, distortion_model, distortion
+        Of the full sensor, as in `RollingShutterCamera`.
+    x_offset, y_offset : int
+        Sensor pixel of the published image's corner.
+    binning_x, binning_y : int
+        Sensor columns and rows per published pixel.
+    image_width, image_height : int
+        Size of the published image [px].
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion_model: str = 'plumb_bob'
+    distortion: tuple[float, ...] = ()
+    x_offset: int = 0
+    y_offset: int = 0
+    binning_x: int = 1
+    binning_y: int = 1
+    image_width: int
+    image_height: int
+
+    def __post_init__(self) -> None:
+        self.global_shutter_camera()   # checks intrinsics and distortion
+        for name in ('image_width', 'image_height', 'binning_x', 'binning_y'):
+            validate.number(name, getattr(self, name), 1)
+        for axis, offset, binning, size, sensor in (
+                ('x', self.x_offset, self.binning_x, self.image_width, self.width),
+                ('y', self.y_offset, self.binning_y, self.image_height, self.height)):
+            if offset < 0 or offset + binning * size > sensor:
+                raise InputError(
+                    f'region of interest leaves the sensor in {axis}: offset {offset} and {size} '
+                    f'pixels of {binning} must lie within {sensor}')
+
+    def global_shutter_camera(self) -> RollingShutterCamera:
+        """Camera model of the full sensor with a readout time of 0."""
+        return RollingShutterCamera(
+            width=self.width, height=self.height, fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy,
+            distortion_model=self.distortion_model, distortion=self.distortion, readout_time=0.0)
+
+    def to_sensor(self, points: ArrayLike) -> Array:
+        """Sensor pixels (N, 2) of pixels (N, 2) of the published image."""
+        points = np.asarray(points, dtype=np.float64)
+        return ((points + 0.5) * (self.binning_x, self.binning_y)
+                + (self.x_offset, self.y_offset) - 0.5)
+
+    def to_image(self, points: ArrayLike) -> Array:
+        """Pixels (N, 2) of the published image of sensor pixels (N, 2)."""
+        points = np.asarray(points, dtype=np.float64)
+        return ((points + 0.5 - (self.x_offset, self.y_offset))
+                / (self.binning_x, self.binning_y) - 0.5)
+
+
+@kernel
+def rays_with_jacobian(normalized: Array, by_pixel: Array) -> tuple[Array, Array]:
+    """Unit rays (N, 3) through points (N, 2) at z = 1, and their derivatives (N, 3, 2).
+
+    `by_pixel` (N, 2, 2): derivatives of the points by the two variables of the result's last axis.
+    """
+    n = normalized.shape[0]
+    rays, jacobian = np.empty((n, 3)), np.empty((n, 3, 2))
+    for i in range(n):
+        x, y = normalized[i, 0], normalized[i, 1]
+        scale = 1.0 / math.sqrt(1.0 + x * x + y * y)
+        rays[i, 0], rays[i, 1], rays[i, 2] = x * scale, y * scale, scale
+        for k in range(2):
+            # m = n / |n| with n = (x, y, 1): dm = (dn - m (m . dn)) / |n|.
+            dx, dy = by_pixel[i, 0, k], by_pixel[i, 1, k]
+            along = rays[i, 0] * dx + rays[i, 1] * dy
+            jacobian[i, 0, k] = (dx - rays[i, 0] * along) * scale
+            jacobian[i, 1, k] = (dy - rays[i, 1] * along) * scale
+            jacobian[i, 2, k] = -rays[i, 2] * along * scale
+    return rays, jacobian
+
+
+@kernel
+def project_rotating(rays: Array, rows: Array, rotations: Array, height: int,
+                     intrinsics: tuple[float, float, float, float], distort: int,
+                     k: Array) -> Array:
+    """`RollingShutterCamera.project_rotating` with `intrinsics` fx, fy, cx, cy.
+
+    Row v images a ray if the orientation at the time of row v projects the ray into row v: a root
+    of ``projected_row(v) - v``, found by the secant method. Rotations are linear between their
+    rows, and beyond. `distort` is the address of the distortion's kernel, `k` its coefficients.
+    """
+    settled = 0.01   # largest distance of the assumed row from the projected one [px]
+    most_rounds = 12
+    nearest = 1e-9   # least depth in front of the camera
+    fx, fy, cx, cy = intrinsics
+    out, rotated, values = np.empty((len(rays), 2)), np.empty(3), np.empty(6)
+    per_row = (len(rotations) - 1) / max(height - 1.0, 1.0)
+    for n in range(len(rays)):
+        row, before, ahead, slope = rows[n], rows[n], 0.0, 0.0
+        u = v = math.nan
+        for step in range(most_rounds):
+            place = row * per_row
+            i = int(min(max(place, 0.0), len(rotations) - 2.0))
+            share = place - i
+            for j in range(3):
+                first, second = dot(rotations[i, j], rays[n]), dot(rotations[i + 1, j], rays[n])
+                rotated[j] = first + share * (second - first)
+            if not rotated[2] > nearest:
+                u = v = math.nan
+                break
+            x, y = rotated[0] / rotated[2], rotated[1] / rotated[2]
+            distortion.distort_at(distort, x, y, k, values)
+            u, v = cx + fx * values[0], cy + fy * values[1]
+            if abs(v - row) < settled:
+                break
+            if step == most_rounds - 1:
+                u = v = math.nan
+            # Derivative of the projected row by the assumed row.
+            if step > 0 and row != before:
+                slope = (v - ahead) / (row - before)
+            if not abs(slope) < 0.9:
+                slope = 0.0
+            before, ahead = row, v
+            row += (v - row) / (1.0 - slope)
+        out[n, 0], out[n, 1] = u, v
+    return out

@@ -1,4 +1,4 @@
-"""What the IMU says of one frame: how the camera turned while its rows were read, and gravity."""
+"""Motion by the IMU: rotation and gravity of one frame, acceleration between two frames."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.compiled import kernel
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry.so3 import exp_so3, log_so3, multiply
-from rs_relpose_ros.geometry.vectors import checked_vector, copy_matrix, copy_vector
+from rs_relpose_ros.geometry import validate
+from rs_relpose_ros.geometry.so3 import copy_matrix, copy_vector, exp_so3, log_so3, multiply
+from rs_relpose_ros.jit import kernel
 
 Array = NDArray[np.float64]
 
-
-# Far beyond any gyro [rad/s]; a larger number is no rate, and its products may overflow.
-_LARGEST_RATE = 1e4
-# Far beyond any frame [s]; products of longer times may overflow.
-_LONGEST = 1e6
-# Of row times against the gyro samples that must enclose them [s].
+# Far beyond any sensor: products of larger numbers may overflow.
+_LARGEST_RATE = 1e4   # [rad/s]
+_LONGEST = 1e6   # [s]
+_LARGEST = 1e4   # [m], [m/s], [m/s^2]
+_LARGEST_LEVER_ARM = 5.0   # [m]; more is a value in centimetres
+# Row times may lie outside of the gyro samples by this [s].
 _TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameMotion:
-    """Rotation during the read-out of one frame, and the direction of gravity.
+    """Rotation during the readout of one frame, and the direction of gravity.
 
-    The camera at row time tau is turned by ``Exp(w tau)`` against the reference row (constant
-    rate), or by the exact integral of the gyro when made by `from_gyro`.
+    Orientation of the camera at row time tau relative to the reference row: ``Exp(w tau)``
+    (constant rate), or the exact integral of the gyro (`from_gyro`).
 
     Parameters
     ----------
@@ -52,17 +52,13 @@ class FrameMotion:
         for name in ('knot_times', 'knot_rotations'):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name)))
-        object.__setattr__(self, 'angular_velocity',
-                           checked_vector('angular_velocity', self.angular_velocity))
-        if not np.abs(self.angular_velocity).max() <= _LARGEST_RATE:
-            raise InputError(f'angular_velocity must be within {_LARGEST_RATE:g} rad/s, '
-                             f'got {self.angular_velocity.tolist()}')
+        object.__setattr__(self, 'angular_velocity', validate.array(
+            'angular_velocity', self.angular_velocity, (3,), largest=_LARGEST_RATE, unit='rad/s'))
         if self.gravity is not None:
-            gravity = checked_vector('gravity', self.gravity)
-            if not 1e-6 < np.abs(gravity).max() < 1e6:
-                raise InputError(
-                    'gravity must have a direction (or be None where it is not known) and a '
-                    f'length between 1e-6 and 1e6, got {gravity.tolist()}')
+            gravity = validate.array('gravity', self.gravity, (3,), largest=1e6)
+            if not np.abs(gravity).max() > 1e-6:
+                raise InputError('gravity must have a length > 1e-6 (None if it is not known), '
+                                 f'got {gravity.tolist()}')
             object.__setattr__(self, 'gravity', gravity)
 
     @classmethod
@@ -73,44 +69,34 @@ class FrameMotion:
         Parameters
         ----------
         times : (K,) array_like
-            Instants [s] of the samples relative to the reference row's, strictly increasing; the
-            first and the last enclose 0 and every row time that will be asked for.
+            Times [s] of the samples from the time of the reference row, strictly increasing; the
+            first and the last enclose 0 and every row time that is used.
         angular_velocities : (K, 3) array_like
             Rates [rad/s] in the camera frame, bias removed.
         gravity : (3,) array_like, optional
             As in the class.
         """
-        times = np.ascontiguousarray(times, dtype=np.float64)
-        rates = np.ascontiguousarray(angular_velocities, dtype=np.float64)
-        if times.ndim != 1 or rates.shape != (len(times), 3) or len(times) < 2:
-            raise InputError('times and angular_velocities must have shapes (K,) and (K, 3) with '
-                             f'K >= 2, got {times.shape} and {rates.shape}')
-        if not (np.isfinite(times).all() and np.isfinite(rates).all()):
-            raise InputError('times and angular_velocities must be finite')
-        if np.abs(times).max() > _LONGEST:
-            raise InputError(f'times must be within {_LONGEST:g} s of the reference row, got up '
-                             f'to {np.abs(times).max():g} s')
-        steps = np.diff(times)
-        if not (steps > 0.0).all():
-            raise InputError('times must be strictly increasing')
+        times = validate.array('times', times, ('K',), largest=_LONGEST, unit='s')
+        rates = validate.array('angular_velocities', angular_velocities, (len(times), 3))
+        validate.number('number of times', len(times), 2)
+        validate.increasing('times', times)
         if not times[0] <= 0.0 <= times[-1]:
-            raise InputError('times must enclose 0, the reference row, '
+            raise InputError('times must enclose 0, the time of the reference row, '
                              f'got [{times[0]:.6f}, {times[-1]:.6f}] s')
+        steps = np.diff(times)
         # Rate linear between samples, to fourth order as in `imu.integration`.
-        mean_turns = 0.5 * (rates[1:] + rates[:-1]) * steps[:, None]
-        turns = Rotation.from_rotvec(
-            mean_turns + np.cross(rates[:-1], rates[1:]) * (steps**2 / 12.0)[:, None]).as_matrix()
+        angles = 0.5 * (rates[1:] + rates[:-1]) * steps[:, None]
+        step_rotations = Rotation.from_rotvec(
+            angles + np.cross(rates[:-1], rates[1:]) * (steps**2 / 12.0)[:, None]).as_matrix()
         rotations = np.empty((len(times), 3, 3))
         rotations[0] = np.eye(3)
-        for k, turn in enumerate(turns):
-            rotations[k + 1] = rotations[k] @ turn
-        span = times[-1] - times[0]
-        # As a mean over the rows: of one sample, the noise would be several times larger.
-        mean_rate = mean_turns.sum(axis=0) / span
+        for k, step in enumerate(step_rotations):
+            rotations[k + 1] = rotations[k] @ step
+        # The mean over the rows: one sample has several times its noise.
+        mean_rate = angles.sum(axis=0) / (times[-1] - times[0])
         unaligned = cls(mean_rate, None, times, rotations)
-        at_reference = unaligned.rotations([0.0])[0]
-        return cls(mean_rate, None if gravity is None else np.asarray(gravity, dtype=np.float64),
-                   times, at_reference.T @ rotations)
+        return cls(mean_rate, None if gravity is None else np.asarray(gravity), times,
+                   unaligned.rotations([0.0])[0].T @ rotations)
 
     def rotations(self, row_times: ArrayLike) -> Array:
         """Orientation (N, 3, 3) at row times (N,) [s], in the frame of the reference row.
@@ -118,7 +104,7 @@ class FrameMotion:
         Raises
         ------
         InputError
-            A row time lies outside the gyro samples: nothing is extrapolated.
+            A row time lies outside of the gyro samples: there is no extrapolation.
         """
         tau = np.ascontiguousarray(row_times, dtype=np.float64)
         if self.knot_times is None or self.knot_rotations is None:
@@ -133,18 +119,18 @@ class FrameMotion:
         return rotations
 
     def derotate(self, rays: ArrayLike, row_times: ArrayLike) -> Array:
-        """Rays (N, 3) measured at `row_times` (N,) [s], turned into the reference row's frame."""
+        """Rays (N, 3) of row times (N,) [s], rotated into the frame of the reference row."""
         rays = np.asarray(rays, dtype=np.float64)
         return np.einsum('nij,nj->ni', self.rotations(row_times), rays)
 
     def shifted(self, delay: float) -> FrameMotion:
         """The same motion with the reference row `delay` seconds later."""
-        turn = self.rotations([delay])[0]
-        moved = self.gravity if self.gravity is None else turn.T @ self.gravity
+        rotation = self.rotations([delay])[0]
+        moved = self.gravity if self.gravity is None else rotation.T @ self.gravity
         if self.knot_times is None or self.knot_rotations is None:
             return replace(self, gravity=moved)
         return replace(self, gravity=moved, knot_times=self.knot_times - delay,
-                       knot_rotations=turn.T @ self.knot_rotations)
+                       knot_rotations=rotation.T @ self.knot_rotations)
 
 
 @kernel
@@ -161,8 +147,8 @@ def rotations_between(knot_times: Array, knot_rotations: Array, times: Array,
                       after: NDArray[np.int64]) -> tuple[Array, bool]:
     """Orientations (N, 3, 3) at times (N,) within the knots, at a constant rate between two.
 
-    `after` (N,) tells the first knot after each time. Also whether the knots enclose all
-    times; beyond them nothing turns on.
+    `after` (N,): index of the first knot after each time. Also whether the knots enclose all
+    times; the orientation beyond them is that of the last knot.
     """
     out = np.empty((len(times), 3, 3))
     steps = np.empty((len(knot_times) - 1, 3))
@@ -176,6 +162,79 @@ def rotations_between(knot_times: Array, knot_rotations: Array, times: Array,
         time = min(max(times[i], knot_times[0]), knot_times[-1])
         k = min(max(after[i] - 1, 0), len(steps) - 1)
         fraction = (time - knot_times[k]) / (knot_times[k + 1] - knot_times[k])
-        turn = exp_so3(fraction * steps[k])
-        multiply(knot_rotations[k], turn, out[i])
+        multiply(knot_rotations[k], exp_so3(fraction * steps[k]), out[i])
     return out, covered
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InertialMotion:
+    """Preintegrated acceleration of the IMU between the reference rows of two frames.
+
+    All vectors are in the axes of camera 1 at its reference row. With the IMU's velocity v_1 at
+    that time and gravity subtracted from the specific force::
+
+        p_2 - p_1 = v_1 T + alpha        v_2 = v_1 + beta
+
+    Parameters
+    ----------
+    alpha : (3,) array_like
+        Acceleration, integrated twice [m].
+    beta : (3,) array_like
+        Acceleration, integrated once [m/s].
+    duration : float
+        T, from the first reference row to the second [s].
+    covariance : (6, 6) array_like
+        Of the errors of (alpha, beta): noise, bias, gravity and lever arm.
+    lever_arm : (3,) array_like
+        Position of the IMU in the camera frame [m].
+    acceleration1, acceleration2 : (3,) array_like, optional
+        The IMU's acceleration during the readout of each frame [m/s^2]; the mean ``beta / T`` by
+        default.
+
+    Raises
+    ------
+    InputError
+        A value of the wrong shape, not finite, or out of bounds.
+    """
+
+    alpha: Array
+    beta: Array
+    duration: float
+    covariance: Array
+    lever_arm: ArrayLike = (0.0, 0.0, 0.0)
+    acceleration1: Array | None = None
+    acceleration2: Array | None = None
+
+    def __post_init__(self) -> None:
+        validate.number('duration', self.duration, 1e-6, 1e6, 's')
+        for name, unit, largest in (
+                ('alpha', 'm', _LARGEST), ('beta', 'm/s', _LARGEST),
+                ('lever_arm', 'm', _LARGEST_LEVER_ARM), ('acceleration1', 'm/s^2', _LARGEST),
+                ('acceleration2', 'm/s^2', _LARGEST)):
+            value = getattr(self, name)
+            if value is None:
+                value = self.beta / self.duration
+            object.__setattr__(self, name, validate.array(
+                name, value, (3,), largest=largest, unit=unit))
+        object.__setattr__(self, 'covariance', validate.covariance(
+            'covariance', self.covariance, 6, largest=_LARGEST**2))
+
+    def shifted(self, delay: float, turn: Array) -> InertialMotion:
+        """The same motion between rows `delay` [s] later; camera 1 rotates by `turn` meanwhile.
+
+        With constant accelerations a_i during the readouts, ``v_i' = v_i + D a_i`` and
+        ``p_i' = p_i + D v_i + D^2 a_i / 2``.
+        """
+        a1, a2 = np.asarray(self.acceleration1), np.asarray(self.acceleration2)
+        change = a2 - a1
+        alpha = (self.alpha + delay * self.beta + 0.5 * delay**2 * change
+                 - delay * self.duration * a1)
+        beta = self.beta + delay * change
+        # An error of beta changes alpha, too.
+        jacobian = np.zeros((6, 6))
+        jacobian[:3, :3] = jacobian[3:, 3:] = turn.T
+        jacobian[:3, 3:] = delay * turn.T
+        covariance = jacobian @ self.covariance @ jacobian.T
+        return replace(self, alpha=turn.T @ alpha, beta=turn.T @ beta,
+                       covariance=0.5 * (covariance + covariance.T),
+                       acceleration1=turn.T @ a1, acceleration2=turn.T @ a2)

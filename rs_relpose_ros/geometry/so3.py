@@ -1,4 +1,10 @@
-"""Rotations: kernels for compiled code; everything else uses SciPy's ``Rotation``."""
+"""Vectors, rotations and order statistics for compiled code.
+
+Code outside of kernels uses SciPy's ``Rotation``. An argument of a small kernel is a tuple or an
+array (3,), such as the row ``rays[k]`` of an array of rays; a result is a tuple. Small kernels are
+inlined in their callers, without allocation. Every sum runs over x, y, z in this order, so that
+the bits are those of a sum that is written out.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +13,78 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.compiled import kernel
-from rs_relpose_ros.geometry.vectors import rotated_back
+from rs_relpose_ros.jit import kernel, small_kernel
 
 Array = NDArray[np.float64]
+Vector = tuple[float, float, float]
+
+STANDARD_GRAVITY = 9.80665   # [m/s^2]
+
+
+@small_kernel
+def dot(a: Vector | Array, b: Vector | Array) -> float:
+    """``a . b``."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@small_kernel
+def cross(a: Vector | Array, b: Vector | Array) -> Vector:
+    """``a x b``."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+@small_kernel
+def norm(v: Vector | Array) -> float:
+    """``|v|``; for vectors whose squares neither overflow nor vanish."""
+    return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+
+
+@small_kernel
+def copy_vector(source: Array, out: Array) -> None:
+    """``out[:] = source`` of (n,), of which Numba takes seconds to compile the error message."""
+    for i in range(len(source)):
+        out[i] = source[i]
+
+
+@small_kernel
+def copy_matrix(source: Array, out: Array) -> None:
+    """``out[:] = source`` of (n, m)."""
+    for i in range(source.shape[0]):
+        for j in range(source.shape[1]):
+            out[i, j] = source[i, j]
+
+
+@small_kernel
+def rotated(R: Array, v: Vector | Array) -> Vector:
+    """``R v``, of any matrix (3, 3)."""
+    return (R[0, 0] * v[0] + R[0, 1] * v[1] + R[0, 2] * v[2],
+            R[1, 0] * v[0] + R[1, 1] * v[1] + R[1, 2] * v[2],
+            R[2, 0] * v[0] + R[2, 1] * v[1] + R[2, 2] * v[2])
+
+
+@small_kernel
+def rotated_back(R: Array, v: Vector | Array) -> Vector:
+    """``R^T v``, of any matrix (3, 3)."""
+    return (R[0, 0] * v[0] + R[1, 0] * v[1] + R[2, 0] * v[2],
+            R[0, 1] * v[0] + R[1, 1] * v[1] + R[2, 1] * v[2],
+            R[0, 2] * v[0] + R[1, 2] * v[1] + R[2, 2] * v[2])
+
+
+@kernel
+def tangent_basis(t: Array) -> Array:
+    """Two orthonormal columns (3, 2) perpendicular to the unit vector `t`."""
+    basis, axis = np.empty((3, 2)), np.zeros(3)
+    # The axis least aligned with t keeps the cross product well conditioned.
+    k = 0
+    for i in (1, 2):
+        if abs(t[i]) < abs(t[k]):
+            k = i
+    axis[k] = 1.0
+    u = cross(t, axis)
+    length = norm(u)
+    basis[0, 0], basis[1, 0], basis[2, 0] = u[0] / length, u[1] / length, u[2] / length
+    basis[0, 1], basis[1, 1], basis[2, 1] = cross(t, basis[:, 0])
+    return basis
 
 
 @kernel
@@ -23,21 +97,27 @@ def rodrigues(theta2: float) -> tuple[float, float]:
 
 
 @kernel
+def _skew_series(v: Array, a: float, b: float) -> Array:
+    """``I + a [v]x + b [v]x^2`` (3, 3)."""
+    x, y, z = v[0], v[1], v[2]
+    out = np.empty((3, 3))
+    out[0, 0] = 1.0 - b * (y * y + z * z)
+    out[1, 1] = 1.0 - b * (x * x + z * z)
+    out[2, 2] = 1.0 - b * (x * x + y * y)
+    out[0, 1] = b * x * y - a * z
+    out[1, 0] = b * x * y + a * z
+    out[0, 2] = b * x * z + a * y
+    out[2, 0] = b * x * z - a * y
+    out[1, 2] = b * y * z - a * x
+    out[2, 1] = b * y * z + a * x
+    return out
+
+
+@kernel
 def exp_so3(v: Array) -> Array:
     """Rotation matrix of the rotation vector `v` (3,) [rad] (Rodrigues' formula)."""
-    x, y, z = v[0], v[1], v[2]
-    a, b = rodrigues(x * x + y * y + z * z)
-    rotation = np.empty((3, 3))
-    rotation[0, 0] = 1.0 - b * (y * y + z * z)
-    rotation[1, 1] = 1.0 - b * (x * x + z * z)
-    rotation[2, 2] = 1.0 - b * (x * x + y * y)
-    rotation[0, 1] = b * x * y - a * z
-    rotation[1, 0] = b * x * y + a * z
-    rotation[0, 2] = b * x * z + a * y
-    rotation[2, 0] = b * x * z - a * y
-    rotation[1, 2] = b * y * z - a * x
-    rotation[2, 1] = b * y * z + a * x
-    return rotation
+    a, b = rodrigues(dot(v, v))
+    return _skew_series(v, a, b)
 
 
 @kernel
@@ -67,11 +147,8 @@ def log_so3(rotation: Array) -> Array:
         q[k] = (rotation[k, i] + rotation[i, k]) / s
     if q[3] < 0.0:
         q = -q
-    sine = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
-    if sine < 1e-9:
-        factor = 2.0
-    else:
-        factor = 2.0 * math.atan2(sine, q[3]) / sine
+    sine = norm(q)   # of x, y, z
+    factor = 2.0 if sine < 1e-9 else 2.0 * math.atan2(sine, q[3]) / sine
     vector = np.empty(3)
     for i in range(3):
         vector[i] = factor * q[i]
@@ -81,31 +158,17 @@ def log_so3(rotation: Array) -> Array:
 @kernel
 def left_jacobian_so3(v: Array) -> Array:
     """Left Jacobian (3, 3) of SO(3): ``Exp(v + dv) = Exp(J dv) Exp(v)`` to first order."""
-    x, y, z = v[0], v[1], v[2]
-    theta2 = x * x + y * y + z * z
+    theta2 = dot(v, v)
     if theta2 < 1e-8:
-        b = 0.5 - theta2 / 24.0
-        c = 1.0 / 6.0 - theta2 / 120.0
-    else:
-        theta = math.sqrt(theta2)
-        b = (1.0 - math.cos(theta)) / theta2
-        c = (theta - math.sin(theta)) / (theta2 * theta)
-    jacobian = np.empty((3, 3))
-    jacobian[0, 0] = 1.0 - c * (y * y + z * z)
-    jacobian[1, 1] = 1.0 - c * (x * x + z * z)
-    jacobian[2, 2] = 1.0 - c * (x * x + y * y)
-    jacobian[0, 1] = c * x * y - b * z
-    jacobian[1, 0] = c * x * y + b * z
-    jacobian[0, 2] = c * x * z + b * y
-    jacobian[2, 0] = c * x * z - b * y
-    jacobian[1, 2] = c * y * z - b * x
-    jacobian[2, 1] = c * y * z + b * x
-    return jacobian
+        return _skew_series(v, 0.5 - theta2 / 24.0, 1.0 / 6.0 - theta2 / 120.0)
+    theta = math.sqrt(theta2)
+    return _skew_series(v, (1.0 - math.cos(theta)) / theta2,
+                        (theta - math.sin(theta)) / (theta2 * theta))
 
 
 @kernel
 def multiply(A: Array, B: Array, out: Array) -> None:
-    """Write ``A B`` of two matrices (3, 3) into a third one: for BLAS they are too small."""
+    """Write ``A B`` of two matrices (3, 3) into `out`; the matrices are too small for BLAS."""
     for i in range(3):
         out[i, 0], out[i, 1], out[i, 2] = rotated_back(B, A[i])  # row of A B: B^T a_i
 
@@ -116,10 +179,75 @@ def skew(v: Array) -> Array:
 
 
 def aligning_rotation(correlation: Array) -> Array:
-    """The rotation (3, 3) of least ``sum |a - R b|^2``, from ``sum a b^T`` (Wahba, Kabsch).
+    """Rotation R (3, 3) that minimises ``sum |a - R b|^2``, from ``sum a b^T`` (Wahba, Kabsch).
 
-    As SciPy's ``align_vectors``, which warns where the turn about one axis is arbitrary.
+    As SciPy's ``align_vectors``, without its warning if the rotation about one axis is arbitrary.
     """
     u, _, vt = np.linalg.svd(correlation)
     u[:, 2] *= np.linalg.det(u) * np.linalg.det(vt)
     return np.ascontiguousarray(u @ vt)
+
+
+# Order statistics: Numba's own sort takes seconds to compile.
+
+@kernel
+def smallest(values: Array, k: int) -> float:
+    """Element k of `values` (n,) in ascending order, by Hoare's *Find* (Comm. ACM 4, 1961).
+
+    `values`, free of NaN, are reordered: none before index k is larger, none after it smaller.
+    """
+    low, high = 0, len(values) - 1
+    while low < high:
+        pivot = values[(low + high) // 2]
+        i, j = low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while pivot < values[j]:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if j < k:
+            low = i
+        if k < i:
+            high = j
+    return values[k]
+
+
+@kernel
+def median(values: Array) -> float:
+    """Median of at least one value; `values`, free of NaN, are reordered."""
+    n = len(values)
+    upper = smallest(values, n // 2)
+    return upper if n % 2 == 1 else 0.5 * (smallest(values, n // 2 - 1) + upper)
+
+
+# Integration of a gyro on SO(3) with a rate that is linear between samples:
+#
+#     R_0 = I        R_{k+1} = R_k Exp(phi_k)
+#     phi_k = (w_k + w_{k+1}) dt / 2 + (w_k x w_{k+1}) dt^2 / 12
+#
+# Magnus expansion to fourth order (Blanes, Casas, Oteo and Ros, Physics Reports 470, 2009).
+
+@kernel
+def step_rotation(rate1: Array, rate2: Array, dt: float) -> Array:
+    """Rotation vector ``phi`` (3,) of a step of `dt` [s] between two rates (3,) [rad/s]."""
+    phi = np.empty(3)
+    commutator = cross(rate1, rate2)
+    for i in range(3):
+        phi[i] = 0.5 * (rate1[i] + rate2[i]) * dt + commutator[i] * dt * dt / 12.0
+    return phi
+
+
+@kernel
+def integrated_rotations(seconds: Array, rates: Array) -> Array:
+    """``R_k`` (K, 3, 3), sample k to the first; increasing times (K,), rates (K, 3) [rad/s]."""
+    rotations = np.empty((len(seconds), 3, 3))
+    rotations[0] = 0.0
+    rotations[0, 0, 0] = rotations[0, 1, 1] = rotations[0, 2, 2] = 1.0
+    for k in range(len(seconds) - 1):
+        phi = step_rotation(rates[k], rates[k + 1], seconds[k + 1] - seconds[k])
+        multiply(rotations[k], exp_so3(phi), rotations[k + 1])
+    return rotations

@@ -1,21 +1,30 @@
-"""Time: integer nanoseconds everywhere, and the one equation that gives a row its instant.
+"""Time: integer nanoseconds everywhere, and the equation of the time of a row.
 
     t_imu(row v) = stamp + time_offset + k (T - T_ref) + exposure_shift
                    + (v - v_stamp) * line_delay
 
 ``v_stamp`` is row 0, (height - 1) / 2 or height - 1 for a driver that stamps the first, middle or
 last row; ``exposure_shift`` is +exposure/2, 0 or -exposure/2 for a driver that stamps the start,
-middle or end of the exposure. k is ``time_offset_per_interval``: with automatic exposure, the
-middle of the exposure moves against the stamp as the interval T between frames changes
-(`FrameIntervals`).
+middle or end of the exposure. A row shows the mean of its exposure: its time is the middle, and
+the gyro is averaged over the exposure. k is ``time_offset_per_interval``: what the difference of
+stamp and middle of the exposure depends otherwise on the interval T between frames
+(`FrameIntervals`). The exposure is ``exposure_time``, or ``T - exposure_margin`` if a margin is
+given (automatic exposure in little light).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
-from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry.camera import RollingShutterCamera
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.geometry import validate
+from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
+from rs_relpose_ros.geometry.motion import FrameMotion
+
+Array = NDArray[np.float64]
 
 NANOSECONDS = 1_000_000_000
 
@@ -39,60 +48,82 @@ def exposure_shift(stamp_exposure: str, exposure_time: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class ImageClock:
-    """Where an image's rows lie on the IMU clock.
+    """Times of an image's rows on the IMU clock."""
 
-    Parameters
-    ----------
-    camera : RollingShutterCamera
-        Its ``reference_row`` is the row that the driver stamps.
-    time_offset : float
-        IMU clock minus camera clock [s]: ``t_imu = stamp + time_offset``.
-    stamp_exposure : {'start', 'middle', 'end'}
-        The instant of that row's exposure which the stamp marks.
-    exposure_time : float
-        Exposure of one row [s]; needed unless `stamp_exposure` is 'middle'.
-    offset_per_interval, reference_interval : float
-        k [s/s] and T_ref [s]: the offset of a frame is longer by ``k (T - T_ref)``.
-    """
-
-    camera: RollingShutterCamera
-    time_offset: float = 0.0
-    stamp_exposure: str = 'middle'
-    exposure_time: float = 0.0
-    offset_per_interval: float = 0.0
-    reference_interval: float = 0.0
+    camera: RollingShutterCamera   # its reference row is the one that the driver stamps
+    time_offset: float = 0.0   # [s] IMU clock minus camera clock
+    stamp_exposure: str = 'middle'   # time of that row's exposure which the stamp marks
+    exposure_time: float = 0.0   # [s] of one row
+    offset_per_interval: float = 0.0   # k [s/s]
+    reference_interval: float = 0.0   # T_ref [s]
+    exposure_margin: float = 0.0   # [s]; if not 0, the exposure is T less this
 
     def __post_init__(self) -> None:
-        if self.stamp_exposure not in STAMP_EXPOSURES:
-            raise InputError(
-                f'stamp_exposure must be one of {STAMP_EXPOSURES}, got {self.stamp_exposure!r}')
-        if not self.exposure_time >= 0.0:
-            raise InputError(f'exposure_time must be >= 0 s, got {self.exposure_time}')
+        validate.choice('stamp_exposure', self.stamp_exposure, STAMP_EXPOSURES)
+        validate.number('exposure_time', self.exposure_time, 0.0, unit='s')
 
     def reference_ns(self, stamp_ns: int, interval_ns: int | None = None) -> int:
-        """Instant of the reference row's mid-exposure on the IMU clock [ns].
-
-        `interval_ns`: T of the frame; None where it is not known, T_ref then.
-        """
-        offset = self.time_offset + exposure_shift(self.stamp_exposure, self.exposure_time)
+        """Time [ns] of the reference row's mid-exposure; T of the frame is T_ref if not known."""
+        offset = self.time_offset + exposure_shift(self.stamp_exposure, self.exposure(interval_ns))
         if interval_ns is not None:
             offset += self.offset_per_interval * (
                 interval_ns / NANOSECONDS - self.reference_interval)
         return stamp_ns + to_nanoseconds(offset)
 
-    def row_span_ns(self, stamp_ns: int, interval_ns: int | None = None) -> tuple[int, int]:
-        """Instants of the earliest and the latest row of the frame on the IMU clock [ns]."""
+    def exposure(self, interval_ns: int | None = None) -> float:
+        """Exposure of a row [s] of a frame of interval T, or T_ref if that is not known."""
+        if not self.exposure_margin:
+            return self.exposure_time
+        interval = self.reference_interval if interval_ns is None else interval_ns / NANOSECONDS
+        return max(interval - self.exposure_margin, 0.0)
+
+    def exposed_span_ns(self, stamp_ns: int, interval_ns: int | None = None) -> tuple[int, int]:
+        """Times at which the first row's exposure begins and the last one's ends [ns]."""
         reference = self.reference_ns(stamp_ns, interval_ns)
         earliest, latest = self.camera.row_time_span
-        return reference + to_nanoseconds(earliest), reference + to_nanoseconds(latest)
+        half = to_nanoseconds(0.5 * self.exposure(interval_ns))
+        return (reference + to_nanoseconds(earliest) - half,
+                reference + to_nanoseconds(latest) + half)
+
+
+class Sensor(NamedTuple):
+    """Camera model of the full sensor, place of the published image on it, and its clock.
+
+    `config.settings.sensor_model` builds it for a parameter set.
+    """
+
+    camera: RollingShutterCamera   # its reference row is the one that poses relate
+    intrinsics: Intrinsics
+    clock: ImageClock   # of that row
+    pose_row_delay: float = 0.0   # [s] from the stamped row to it
+
+    def derotated(self, points: Array, motion: FrameMotion) -> tuple[Array, Array]:
+        """Rays (N, 3) of pixels (N, 2) of a published image, and their row times (N,) [s]."""
+        pixels = self.intrinsics.to_sensor(points)
+        row_times = self.camera.row_times(pixels[:, 1])
+        return motion.derotate(self.camera.unproject(pixels), row_times), row_times
+
+    def project(self, rays: Array, row_times: Array, motion: FrameMotion) -> Array:
+        """Pixels (N, 2) of a published image where rays (N, 3) are observed; NaN outside of it.
+
+        The inverse of `derotated`. The row of a ray depends on its pixel, so `row_times` (N,) are
+        a first guess that is improved twice.
+        """
+        camera = self.camera
+        first, last = camera.row_time_span
+        for _ in range(2):
+            rotations = motion.rotations(np.clip(row_times, first, last))
+            pixels = camera.project(np.einsum('nji,nj->ni', rotations, rays))
+            row_times = np.where(np.isfinite(pixels[:, 1]), camera.row_times(pixels[:, 1]),
+                                 row_times)
+        return self.intrinsics.to_image(pixels)
 
 
 class FrameIntervals:
-    """Interval T of each frame to the one before; stamps that do not increase tell nothing.
+    """Interval T of each frame to the previous one; stamps that do not increase are ignored.
 
-    Where frames are missing in between, the last T is kept: a difference more than 1.5 times as
-    long as T is one, unless that before was as long, to a tenth of it: then the frame rate has
-    changed.
+    T is kept if frames are missing in between: the difference of the stamps exceeds 1.5 T. Two
+    such differences in a row that agree to a tenth are a new frame rate.
     """
 
     def __init__(self) -> None:
@@ -102,10 +133,10 @@ class FrameIntervals:
 
     def add(self, stamp_ns: int) -> int | None:
         """T of the frame of this stamp [ns]; None of the first one."""
-        if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
-            return self._interval_ns
         if self._stamp_ns is not None:
             difference, kept = stamp_ns - self._stamp_ns, self._interval_ns
+            if difference <= 0:
+                return kept
             # 2 d > 3 T and |d - d_before| > d / 10, in integers.
             missing = (kept is not None and 2 * difference > 3 * kept
                        and 10 * abs(difference - self._difference_ns) > difference)

@@ -1,166 +1,386 @@
-"""IMU history: takes samples in any order, answers for intervals, says when it cannot."""
+"""IMU samples of the last seconds: added in any order, queried by intervals and frames.
+
+`ImuSamples` stores them, `ImuBuffer` adds the causal filters of gyro bias and gravity, and
+`frame_imu` collects the share of one frame.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import Enum
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.config.imu import ImuConfig
+from rs_relpose_ros.config.settings import ImuConfig
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry.timing import to_nanoseconds
-from rs_relpose_ros.imu.bias import BiasTracker, GyroBias
-from rs_relpose_ros.imu.gravity import (
-    agreed_gravity,
-    GravityEstimate,
-    GravityFilter,
-    mean_gravity,
-    MEAN_WINDOW_NS,
-)
-from rs_relpose_ros.imu.integration import integrate_rotation
-from rs_relpose_ros.imu.samples import ImuSample
-from rs_relpose_ros.imu.series import Series
+from rs_relpose_ros.geometry.motion import FrameMotion
+from rs_relpose_ros.geometry.so3 import integrated_rotations, STANDARD_GRAVITY
+from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
+from rs_relpose_ros.imu import filters, integration
+from rs_relpose_ros.imu.filters import GravityEstimate, GyroBias
+from rs_relpose_ros.imu.integration import ForceSegment, FrameForce, FrameImu, GyroSegment
 
 Array = NDArray[np.float64]
+Stamps = NDArray[np.int64]
+Vector = tuple[float, float, float]
 
 
 class Coverage(Enum):
-    """Whether the buffer can answer for an interval."""
+    """Whether the samples cover an interval."""
 
     AVAILABLE = 'available'
     NOT_YET = 'not yet'
     NEVER = 'never'
 
 
+class Series:
+    """Stamped vectors (K, width) in the order of their stamps, in growing contiguous arrays.
+
+    `gap_ns`: largest step between samples that cover an interval.
+    """
+
+    def __init__(self, gap_ns: int, width: int = 3) -> None:
+        self._gap_ns = gap_ns
+        self._stamps, self._values = np.empty(256, dtype=np.int64), np.empty((256, width))
+        self._start = self._end = 0
+
+    @property
+    def stamps(self) -> Stamps:
+        """Stamps (K,) [ns], strictly increasing; a view until the next insertion."""
+        return self._stamps[self._start:self._end]
+
+    @property
+    def values(self) -> Array:
+        """Values (K, width); likewise a view."""
+        return self._values[self._start:self._end]
+
+    @property
+    def newest_ns(self) -> int | None:
+        """The last stamp; None without any."""
+        return int(self._stamps[self._end - 1]) if self._end > self._start else None
+
+    def insert(self, stamp_ns: int, value: tuple[float, ...] | None) -> bool:
+        """Insert in order; False for no value, and for a stamp that exists already."""
+        if value is None:
+            return False
+        stamps = self.stamps
+        position = len(stamps)
+        if position and stamp_ns <= stamps[-1]:
+            position = int(np.searchsorted(stamps, stamp_ns))
+            if stamps[position] == stamp_ns:
+                return False
+        if self._end == len(self._stamps):
+            values, size = self.values, max(256, 2 * len(stamps))
+            self._stamps = np.empty(size, dtype=np.int64)
+            self._values = np.empty((size, values.shape[1]))
+            self._start, self._end = 0, len(stamps)
+            self._stamps[:self._end], self._values[:self._end] = stamps, values
+        at = self._start + position
+        self._stamps[at + 1:self._end + 1] = self._stamps[at:self._end]
+        self._values[at + 1:self._end + 1] = self._values[at:self._end]
+        self._stamps[at], self._values[at] = stamp_ns, value
+        self._end += 1
+        return True
+
+    def prune(self, before_ns: int) -> None:
+        """Remove samples before `before_ns`, except the last of them, for interpolation."""
+        keep = int(np.searchsorted(self.stamps, before_ns, side='right')) - 1
+        if keep > 0:
+            self._start += keep
+
+    def between(self, start_ns: int, end_ns: int) -> tuple[Stamps, Array]:
+        """Stamps and values from `start_ns` to `end_ns`, both within the series.
+
+        The values at the two borders are interpolated; one entry where they are equal.
+        """
+        inner = slice(int(np.searchsorted(self.stamps, start_ns, side='right')),
+                      int(np.searchsorted(self.stamps, end_ns, side='left')))
+        borders = np.unique(np.array([start_ns, end_ns], dtype=np.int64))
+        values = np.array([self._interpolated(int(border)) for border in borders])
+        return (np.concatenate([borders[:1], self.stamps[inner], borders[1:]]),
+                np.concatenate([values[:1], self.values[inner], values[1:]]))
+
+    def _interpolated(self, at_ns: int) -> Array:
+        stamps, values = self.stamps, self.values
+        after = int(np.searchsorted(stamps, at_ns))
+        if stamps[after] == at_ns:
+            return values[after]
+        before = after - 1
+        fraction = (at_ns - stamps[before]) / (stamps[after] - stamps[before])
+        return np.asarray(values[before] + fraction * (values[after] - values[before]))
+
+    def enclosing(self, start_ns: int, end_ns: int) -> Stamps:
+        """Stamps within an interval, and one on either side of it."""
+        first = max(int(np.searchsorted(self.stamps, start_ns, side='right')) - 1, 0)
+        return self.stamps[first:int(np.searchsorted(self.stamps, end_ns)) + 1]
+
+    def coverage(self, start_ns: int, end_ns: int) -> Coverage:
+        """Whether the samples cover [start_ns, end_ns] without a gap."""
+        stamps = self.stamps
+        if len(stamps) == 0:
+            return Coverage.NOT_YET
+        if start_ns < stamps[0] or (np.diff(self.enclosing(start_ns, end_ns))
+                                    > self._gap_ns).any():
+            return Coverage.NEVER
+        return Coverage.NOT_YET if stamps[-1] < end_ns else Coverage.AVAILABLE
+
+
+@dataclass(frozen=True, slots=True)
+class Orientation:
+    """Orientation computed by the IMU itself, reduced to the direction of gravity."""
+
+    down: Vector   # unit direction of free fall in the IMU frame: minus the world's z (REP-103)
+    sigma: float   # [rad] per axis of that direction
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSample:
+    """Content of one message, in the IMU frame; None for a sensor that it does not contain."""
+
+    stamp_ns: int   # on the IMU clock
+    angular_velocity: Vector | None   # [rad/s]
+    linear_acceleration: Vector | None   # [m/s^2] specific force: 9.81 upwards at rest (REP-145)
+    orientation: Orientation | None = None   # only with a covariance in the message
+
+
 class AddResult(Enum):
-    """What became of a sample."""
+    """Outcome for a sample."""
 
     ADDED = 'added'
     DUPLICATE = 'duplicate'
     LATE = 'late'
 
 
-class ImuBuffer:
-    """Gyro and accelerometer of the last seconds, with causal filters of gravity and gyro bias.
+# Bounds of the mean length of the specific force over some seconds, in standard gravities: no
+# carrier accelerates for so long. In units of g it is 1 m/s^2, in mg or feet too large.
+_LIKELY_LENGTHS = (0.7, 1.4)
+# Consecutive samples that are bit-equal on one axis, close to the largest value there: the sensor
+# is at the end of its range, which is at least this many gravities.
+_CLIPPED_SAMPLES, _LEAST_RANGE = 3, 1.5
 
-    Gyro and accelerometer may come in one message or in two (RealSense). Equal samples in equal
-    order give bit-equal answers, however the queries interleave: the filters run sample by sample
-    over the sorted gyro, up to the instant that is asked for.
+
+def force_fault(forces: Array) -> str:
+    """Reason why the samples (K, 3) of the last seconds are unusable; empty if they are usable."""
+    if not len(forces):
+        return 'there is no accelerometer'
+    length = float(np.linalg.norm(forces, axis=1).mean())
+    low, high = (bound * STANDARD_GRAVITY for bound in _LIKELY_LENGTHS)
+    if not low <= length <= high:
+        return (f'the accelerometer reads {length:.3g} m/s^2 in the mean, not {STANDARD_GRAVITY}: '
+                'it must be specific force in m/s^2')
+    size = np.abs(forces)
+    equal = (forces[1:] == forces[:-1]) & (size[1:] >= np.maximum(
+        0.999 * size.max(axis=0), _LEAST_RANGE * STANDARD_GRAVITY))
+    run = np.lib.stride_tricks.sliding_window_view(equal, _CLIPPED_SAMPLES - 1, axis=0) \
+        if len(equal) >= _CLIPPED_SAMPLES - 1 else np.zeros((0, 3, 1), dtype=bool)
+    if run.all(axis=2).any():
+        return f'the accelerometer is clipped at {size.max():.3g} m/s^2'
+    return ''
+
+
+class ImuInterval(NamedTuple):
+    """Samples between two times: seconds (K,) from the first, rates and forces (K, 3), IMU frame.
+
+    At the stamps of either sensor, the other one interpolated.
     """
 
-    def __init__(self, config: ImuConfig) -> None:
-        self._config = config
-        self._told_bias = np.array(config.gyro_bias)
-        self._gap_ns = to_nanoseconds(config.max_imu_gap)
-        self._keep_ns = to_nanoseconds(config.imu_buffer_seconds)
+    seconds: Array
+    rates: Array
+    forces: Array
+
+    @property
+    def duration(self) -> float:
+        """From the first to the last sample [s]."""
+        return float(self.seconds[-1] - self.seconds[0])
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether gyro and accelerometer hardly vary."""
+        return filters.is_at_rest(self.rates, self.forces)
+
+    def mean_force(self, gyro_bias: Array) -> Array:
+        """Mean specific force (3,) in the axes of the last sample."""
+        rotations = integrated_rotations(self.seconds, np.ascontiguousarray(
+            self.rates - gyro_bias))
+        mean = np.einsum('kij,kj->i', rotations, self.forces) / len(self.forces)
+        return np.asarray(rotations[-1].T @ mean)
+
+
+# A step between samples of more than this many times the usual one: a sample may still arrive.
+_LATE_STEP = 1.5
+# Duration of the samples by which the accelerometer is tested: longer than a step of a walk.
+_TESTED_NS = 1_000_000_000
+
+
+class ImuSamples:
+    """Gyro and accelerometer samples, and orientations; both sensors in one message or in two.
+
+    `max_gap` [s]: largest distance of samples that cover an interval. Equal samples in any order
+    give bit-equal answers.
+    """
+
+    def __init__(self, max_gap: float) -> None:
+        self._gap_ns = to_nanoseconds(max_gap)
         self.clear()
 
     def clear(self) -> None:
-        """Forget everything."""
-        self._gyro, self._force, self._down = Series(), Series(), Series(4)
-        self._filter = GravityFilter(self._config)
-        self._bias = BiasTracker(self._config)
-        self._filtered_ns = self._pruned_ns = int(np.iinfo(np.int64).min)
-
-    @property
-    def newest_gyro_ns(self) -> int | None:
-        """Stamp of the newest gyro sample."""
-        return self._gyro.newest_ns
-
-    @property
-    def newest_force_ns(self) -> int | None:
-        """Stamp of the newest accelerometer sample."""
-        return self._force.newest_ns
+        """Remove all samples."""
+        # Rates, specific forces, and directions of gravity with their sigma.
+        self.gyro, self.force = Series(self._gap_ns), Series(self._gap_ns)
+        self._down = Series(self._gap_ns, 4)
 
     @property
     def newest_ns(self) -> int | None:
         """Newest stamp of any kind."""
-        return max((series.newest_ns for series in (self._gyro, self._force, self._down)
+        return max((series.newest_ns for series in (self.gyro, self.force, self._down)
                     if series.newest_ns is not None), default=None)
 
+    @property
+    def both_until_ns(self) -> int | None:
+        """Time up to which both sensors are known."""
+        gyro, force = self.gyro.newest_ns, self.force.newest_ns
+        return None if gyro is None or force is None else min(gyro, force)
+
+    @property
+    def fault(self) -> str:
+        """Fault of the accelerometer (`force_fault`); empty without one, or if not yet known."""
+        stamps = self.gyro.stamps
+        known = len(stamps) and stamps[-1] - stamps[0] >= _TESTED_NS
+        return force_fault(self.force.values) if known else ''
+
     def add(self, sample: ImuSample) -> AddResult:
-        """Store a sample; InputError where a value is not finite, and nothing is stored."""
+        """Store a sample; InputError if a value is not finite, and nothing is stored."""
         for name, value in (('angular_velocity', sample.angular_velocity),
                             ('linear_acceleration', sample.linear_acceleration)):
             if value is not None and not all(map(math.isfinite, value)):
                 raise InputError(f'IMU sample at {sample.stamp_ns} ns: {name} must be finite, '
                                  f'got {list(value)}')
         newest_ns, own = self.newest_ns, sample.orientation
-        newest = sample.stamp_ns if newest_ns is None else newest_ns
-        added = self._gyro.insert(sample.stamp_ns, sample.angular_velocity)
-        added |= self._force.insert(sample.stamp_ns, sample.linear_acceleration)
+        added = self.gyro.insert(sample.stamp_ns, sample.angular_velocity)
+        added |= self.force.insert(sample.stamp_ns, sample.linear_acceleration)
         if own is not None:
             added |= self._down.insert(sample.stamp_ns, (*own.down, own.sigma))
         if not added:
             return AddResult.DUPLICATE
-        # Pruned when a tenth is too old: a search per sample would cost more than the memory.
-        if newest - self._pruned_ns > self._keep_ns * 11 // 10:
-            self._pruned_ns = newest - self._keep_ns
-            self.prune(self._pruned_ns)
-        return AddResult.LATE if sample.stamp_ns < newest else AddResult.ADDED
+        late = newest_ns is not None and sample.stamp_ns < newest_ns
+        return AddResult.LATE if late else AddResult.ADDED
 
     def prune(self, before_ns: int) -> None:
-        """Forget what is older than `before_ns`."""
-        # The filters must have seen a sample before it is forgotten.
-        self._run_filters(before_ns)
-        for series in (self._gyro, self._force, self._down):
+        """Remove what is older than `before_ns`."""
+        for series in (self.gyro, self.force, self._down):
             series.prune(before_ns)
 
     def coverage(self, start_ns: int, end_ns: int) -> Coverage:
         """Whether the gyro covers [start_ns, end_ns] without a gap."""
-        return self._covered(self._gyro, start_ns, end_ns)
+        return self.gyro.coverage(start_ns, end_ns)
 
-    def _covered(self, series: Series, start_ns: int, end_ns: int) -> Coverage:
-        stamps = series.stamps
-        if len(stamps) == 0:
-            return Coverage.NOT_YET
-        if start_ns < stamps[0]:
-            return Coverage.NEVER
-        first = int(np.searchsorted(stamps, start_ns, side='right')) - 1
-        last = int(np.searchsorted(stamps, end_ns, side='left'))
-        within = stamps[first:last + 1]
-        if len(within) > 1 and int(np.diff(within).max()) > self._gap_ns:
-            return Coverage.NEVER
-        if last == len(stamps):
-            return Coverage.NOT_YET
-        return Coverage.AVAILABLE
+    def complete(self, start_ns: int, end_ns: int) -> bool:
+        """Whether all samples between two times seem to have arrived."""
+        until_ns = self.both_until_ns
+        if until_ns is None or until_ns < end_ns:
+            return False
+        for series in (self.gyro, self.force):
+            steps = np.diff(series.enclosing(start_ns, end_ns))
+            if not len(steps) or steps.max() > _LATE_STEP * np.median(np.diff(series.stamps)):
+                return False
+        return True
 
-    def angular_velocity(self, start_ns: int, end_ns: int) -> tuple[NDArray[np.int64], Array]:
-        """Gyro over an interval, its borders interpolated; one entry where they are equal.
+    def between(self, start_ns: int, end_ns: int) -> ImuInterval | None:
+        """Samples of both sensors from one time to a later one; None if one has a gap."""
+        sensors = self.gyro, self.force
+        if end_ns <= start_ns or any(series.coverage(start_ns, end_ns) is not Coverage.AVAILABLE
+                                     for series in sensors):
+            return None
+        (gyro_ns, rates), (force_ns, forces) = (s.between(start_ns, end_ns) for s in sensors)
+        return ImuInterval(*integration.at_common_times(
+            (gyro_ns - start_ns) / NANOSECONDS, rates,
+            (force_ns - start_ns) / NANOSECONDS, forces))
 
-        Stamps (K,) and rates (K, 3) [rad/s] in the IMU frame, `bias` of `end_ns` subtracted.
+    def up_to(self, end_ns: int, seconds: float) -> ImuInterval | None:
+        """Samples of both sensors of at most the last `seconds` before a time, if any."""
+        if self.both_until_ns is None:
+            return None
+        first = max(int(self.gyro.stamps[0]), int(self.force.stamps[0]))
+        return self.between(max(first, end_ns - to_nanoseconds(seconds)), end_ns)
+
+
+class ImuBuffer(ImuSamples):
+    """Samples of the last seconds, with causal filters of gravity and gyro bias.
+
+    Answers do not depend on the order of queries: the filters run sample by sample over the sorted
+    gyro, up to the requested time.
+    """
+
+    def __init__(self, config: ImuConfig) -> None:
+        self._config = config
+        self._configured_bias = np.array(config.gyro_bias)
+        self._keep_ns = to_nanoseconds(config.imu_buffer_seconds)
+        super().__init__(config.max_imu_gap)
+
+    def clear(self) -> None:
+        """Remove all samples and reset the filters."""
+        super().clear()
+        self._filter = filters.GravityFilter(self._config)
+        self._bias = filters.BiasTracker(self._config)
+        self._filtered_ns = self._pruned_ns = int(np.iinfo(np.int64).min)
+
+    def add(self, sample: ImuSample) -> AddResult:
+        """Store a sample; InputError if a value is not finite, and nothing is stored."""
+        result = super().add(sample)
+        # Pruned when a tenth is too old: a search per sample would cost more than the memory.
+        if sample.stamp_ns - self._pruned_ns > self._keep_ns * 11 // 10:
+            self._pruned_ns = sample.stamp_ns - self._keep_ns
+            self.prune(self._pruned_ns)
+        return result
+
+    def prune(self, before_ns: int) -> None:
+        """Remove what is older than `before_ns`."""
+        self._run_filters(before_ns)
+        super().prune(before_ns)
+
+    def angular_velocity(self, start_ns: int, end_ns: int,
+                         exposure: float = 0.0) -> tuple[Stamps, Array]:
+        """Gyro over an interval, its borders interpolated; one entry if they are equal.
+
+        Stamps (K,) and rates (K, 3) [rad/s] in the IMU frame, `bias` of `end_ns` subtracted; each
+        is the mean over `exposure` [s] about its stamp, as that of a row that is exposed so long.
         """
         if end_ns < start_ns:
             raise InputError(f'the interval must not end ({end_ns}) before it starts ({start_ns})')
-        if self.coverage(start_ns, end_ns) is not Coverage.AVAILABLE:
-            raise InputError(f'the gyro does not cover [{start_ns}, {end_ns}] ns: '
-                             f'{self.coverage(start_ns, end_ns).value}')
-        stamps_ns, rates = self._gyro.between(start_ns, end_ns)
+        half = to_nanoseconds(0.5 * exposure)
+        coverage = self.coverage(start_ns - half, end_ns + half)
+        if coverage is not Coverage.AVAILABLE:
+            raise InputError(f'the gyro does not cover [{start_ns - half}, {end_ns + half}] ns: '
+                             f'{coverage.value}')
+        stamps_ns, rates = self.gyro.between(start_ns, end_ns)
+        if half:
+            rates = integration.mean_rates(
+                *self.gyro.between(start_ns - half, end_ns + half), stamps_ns, exposure)
         return stamps_ns, rates - self.bias(end_ns).value
 
-    def specific_force(self, start_ns: int,
-                       end_ns: int) -> tuple[NDArray[np.int64], Array] | None:
-        """Accelerometer over an interval, its borders interpolated; None where it has a gap there.
+    def specific_force(self, start_ns: int, end_ns: int) -> tuple[Stamps, Array] | None:
+        """Accelerometer over an interval, its borders interpolated; None if it has a gap there.
 
         Stamps (K,) and specific forces (K, 3) [m/s^2] in the IMU frame.
         """
-        if self._covered(self._force, start_ns, end_ns) is not Coverage.AVAILABLE:
-            return None
-        return self._force.between(start_ns, end_ns)
+        available = self.force.coverage(start_ns, end_ns) is Coverage.AVAILABLE
+        return self.force.between(start_ns, end_ns) if available else None
 
     def recent_forces(self, until_ns: int) -> Array:
-        """Specific forces (K, 3) [m/s^2] of the last seconds up to an instant, IMU frame."""
-        stamps = self._force.stamps
-        # Half of the history: how much more is left depends on when it is asked for.
-        window = slice(int(np.searchsorted(stamps, until_ns - self._keep_ns // 2)),
-                       int(np.searchsorted(stamps, until_ns, side='right')))
-        return self._force.values[window]
+        """Specific forces (K, 3) [m/s^2] of the last seconds up to a time, IMU frame."""
+        # Half of the buffer, which is there independently of the time of the query.
+        return self._forces_between(until_ns - self._keep_ns // 2, until_ns)
+
+    def _forces_between(self, start_ns: int, end_ns: int) -> Array:
+        stamps = self.force.stamps
+        return self.force.values[int(np.searchsorted(stamps, start_ns)):
+                                  int(np.searchsorted(stamps, end_ns, side='right'))]
 
     def bias(self, at_ns: int) -> GyroBias:
-        """Bias of the gyro at an instant, from samples up to it; ask in the order of time."""
+        """Bias of the gyro at a time, from samples up to it; to be called in the order of time."""
         self._run_filters(at_ns)
         return self._bias.estimate(at_ns)
 
@@ -170,74 +390,122 @@ class ImuBuffer:
         See `integrate_rotation`.
         """
         stamps_ns, rates = self.angular_velocity(start_ns, end_ns)
-        return integrate_rotation(stamps_ns, rates, self._config, self.bias(end_ns).sigma)
+        return integration.integrate_rotation(stamps_ns, rates, self._config,
+                                              self.bias(end_ns).sigma)
 
     def gravity(self, at_ns: int) -> GravityEstimate | None:
-        """Direction of gravity at an instant that the gyro covers, from samples up to it.
+        """Direction of gravity at a time that the gyro covers, from samples up to it.
 
-        None where neither accelerometer nor orientation came, or where the gyro does not cover the
-        instant. Ask in the order of time: an instant before one that was asked for gets that one's
-        estimate, turned back by the gyro.
+        None without accelerometer and orientation, or if the gyro does not cover the time. To be
+        called in the order of time: for a time before that of an earlier call, the estimate of
+        that call, rotated back by the gyro.
         """
-        estimate = (self._mean_gravity(at_ns) if self._config.gravity_filter == 'mean'
-                    else self._filtered_gravity(at_ns))
+        if self._config.gravity_filter == 'mean':
+            estimate = filters.mean_gravity(
+                self._forces_between(at_ns - filters.MEAN_WINDOW_NS, at_ns))
+        else:
+            self._run_filters(at_ns)
+            estimate, stamp_ns = self._filter.estimate(), self._filter.stamp_ns
+            if estimate is not None and stamp_ns is not None:
+                estimate = self._propagated(estimate, stamp_ns, at_ns)
         if not self._config.use_imu_orientation:
             return estimate
-        return agreed_gravity(self._own_gravity(at_ns), estimate)
-
-    # -- inside ------------------------------------------------------------------------------
-
-    def _mean_gravity(self, at_ns: int) -> GravityEstimate | None:
-        stamps = self._force.stamps
-        window = slice(int(np.searchsorted(stamps, at_ns - MEAN_WINDOW_NS)),
-                       int(np.searchsorted(stamps, at_ns, side='right')))
-        return mean_gravity(self._force.values[window])
-
-    def _filtered_gravity(self, at_ns: int) -> GravityEstimate | None:
-        self._run_filters(at_ns)
-        estimate, stamp_ns = self._filter.estimate(), self._filter.stamp_ns
-        if estimate is None or stamp_ns is None:
-            return None
-        return self._turned(estimate, stamp_ns, at_ns)
+        return filters.agreed_gravity(self._own_gravity(at_ns), estimate)
 
     def _own_gravity(self, at_ns: int) -> GravityEstimate | None:
-        """Gravity from the last orientation message up to an instant; None where it is old."""
+        """Gravity from the last orientation message up to a time; None if it is old."""
         stamps = self._down.stamps
         last = int(np.searchsorted(stamps, at_ns, side='right')) - 1
         if last < 0 or at_ns - int(stamps[last]) > self._gap_ns:
             return None
         value = self._down.values[last]
-        return self._turned(GravityEstimate(value[:3], float(value[3])), int(stamps[last]), at_ns)
+        return self._propagated(GravityEstimate(value[:3], float(value[3])), int(stamps[last]),
+                                at_ns)
 
-    def _turned(self, estimate: GravityEstimate, from_ns: int,
-                to_ns: int) -> GravityEstimate | None:
-        """An estimate carried to another instant by the gyro; None where it has a gap."""
+    def _propagated(self, estimate: GravityEstimate, from_ns: int,
+                    to_ns: int) -> GravityEstimate | None:
+        """An estimate propagated to another time by the gyro; None if that has a gap."""
         start_ns, end_ns = sorted((from_ns, to_ns))
         if self.coverage(start_ns, end_ns) is not Coverage.AVAILABLE:
             return None
-        turn, _ = self.rotation(start_ns, end_ns)
-        return replace(estimate, direction=(turn.T if from_ns < to_ns else turn)
-                       @ estimate.direction)
+        R, _ = self.rotation(start_ns, end_ns)
+        return replace(estimate, direction=(R.T if from_ns < to_ns else R) @ estimate.direction)
 
     def _run_filters(self, until_ns: int) -> None:
-        """Filter the samples up to an instant that were not filtered yet."""
-        stamps = self._gyro.stamps
+        """Filter the samples up to a time that were not filtered yet."""
+        stamps = self.gyro.stamps
         first = int(np.searchsorted(stamps, self._filtered_ns, side='right'))
         last = int(np.searchsorted(stamps, until_ns, side='right'))
         if first < last:
-            rates, forces = self._gyro.values[first:last], self._forces_at(stamps[first:last])
+            rates, forces = self.gyro.values[first:last], self._forces_at(stamps[first:last])
             self._bias.run(stamps[first:last], rates, forces)
-            # With the configured bias only: the gravity filter estimates the rest by itself.
+            # With the configured bias only: the gravity filter estimates the rest.
             if self._config.gravity_filter == 'complementary':
-                self._filter.run(stamps[first:last], rates - self._told_bias, forces)
+                self._filter.run(stamps[first:last], rates - self._configured_bias, forces)
             self._filtered_ns = int(stamps[last - 1])
 
-    def _forces_at(self, stamps_ns: NDArray[np.int64]) -> Array:
-        """Latest specific forces (K, 3) not after these stamps; NaN where older than a gap."""
-        stamps = self._force.stamps
+    def _forces_at(self, stamps_ns: Stamps) -> Array:
+        """Latest specific forces (K, 3) not after these stamps; NaN if older than a gap."""
+        stamps = self.force.stamps
         forces = np.full((len(stamps_ns), 3), np.nan)
         k = np.searchsorted(stamps, stamps_ns, side='right') - 1
         fresh = k >= 0
         fresh[fresh] = stamps_ns[fresh] - stamps[k[fresh]] <= self._gap_ns
-        forces[fresh] = self._force.values[k[fresh]]
+        forces[fresh] = self.force.values[k[fresh]]
         return forces
+
+
+def frame_imu(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_cam_imu: Array,
+              previous_reference_ns: int | None = None, exposure: float = 0.0) -> FrameImu:
+    """The IMU's share of a frame from `buffer`; all times are on the IMU clock.
+
+    `span_ns`: begin of the first row's exposure and end of the last one's, which the buffer must
+    cover; `reference_ns` and `previous_reference_ns`: of the stamped rows of this frame and of the
+    one processed before; `exposure` [s]: of each row. ``v_cam = R_cam_imu v_imu``.
+    """
+    half = to_nanoseconds(0.5 * exposure)
+    start_ns, end_ns = span_ns = span_ns[0] + half, span_ns[1] - half   # of the rows' times
+    stamps_ns, rates = buffer.angular_velocity(start_ns, end_ns, exposure)
+    rates = rates @ R_cam_imu.T
+    if end_ns > start_ns:
+        motion = FrameMotion.from_gyro((stamps_ns - reference_ns) * 1e-9, rates)
+    else:
+        motion = FrameMotion(rates[0])
+    gravity_sigma = None
+    # Causal up to the last row, then propagated back to the stamped row.
+    estimate = buffer.gravity(end_ns)
+    if estimate is not None:
+        R = motion.rotations([(end_ns - reference_ns) * 1e-9])[0]
+        motion = replace(motion, gravity=R @ (R_cam_imu @ estimate.direction))
+        gravity_sigma = estimate.sigma
+    since_previous = None
+    if (previous_reference_ns is not None and previous_reference_ns < reference_ns
+            and buffer.coverage(previous_reference_ns - half, reference_ns + half)
+            is Coverage.AVAILABLE):
+        stamps_ns, rates = buffer.angular_velocity(previous_reference_ns, reference_ns, exposure)
+        bias = buffer.bias(reference_ns)
+        since_previous = GyroSegment(stamps_ns, rates @ R_cam_imu.T, R_cam_imu @ bias.value,
+                                     bias.sigma)
+    return FrameImu(motion, gravity_sigma, reference_ns, since_previous, exposure=exposure,
+                    force=_frame_force(buffer, span_ns, reference_ns, R_cam_imu, motion,
+                                       previous_reference_ns, estimate))
+
+
+def _frame_force(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_cam_imu: Array,
+                 motion: FrameMotion, previous_reference_ns: int | None,
+                 gravity: GravityEstimate | None) -> FrameForce | str:
+    """The accelerometer's share of a frame, or the reason why there is none."""
+    first_ns = span_ns[0] if previous_reference_ns is None else previous_reference_ns
+    if fault := force_fault(buffer.recent_forces(span_ns[1])):
+        return fault
+    within = buffer.specific_force(*span_ns)
+    before = buffer.specific_force(min(first_ns, reference_ns), reference_ns)
+    if within is None or before is None or gravity is None:
+        return 'the accelerometer has a gap'
+    stamps_ns, forces = within
+    seconds = (stamps_ns - reference_ns) * 1e-9
+    forces = np.einsum('kij,kj->ki', motion.rotations(seconds), forces @ R_cam_imu.T)
+    steps = np.diff(seconds, append=seconds[-1]) + np.diff(seconds, prepend=seconds[0])
+    mean = forces[0] if len(forces) == 1 else steps @ forces / steps.sum()
+    return FrameForce(mean, gravity.length, gravity.length_sigma,
+                      ForceSegment(before[0], before[1] @ R_cam_imu.T))

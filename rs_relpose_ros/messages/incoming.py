@@ -1,42 +1,39 @@
-"""Image, CameraInfo, IMU and pose messages to data.
+"""Image, CameraInfo, IMU and pose messages to data, and their way into the sequencer.
 
-Messages are read by field name only, so those of rclpy and of rosbags (ROS 2 and ROS 1) do alike.
-Nothing of a message is trusted: sizes are checked before memory is taken, and whatever cannot be
-used raises `InputError` with one sentence.
+Messages are read by field name only, those of rclpy and of rosbags (ROS 2 and ROS 1) alike. No
+field is trusted: sizes are checked before memory is allocated, and an unusable message raises
+`InputError`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
+from enum import Enum
+from functools import partial
 import math
+import re
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from rs_relpose_ros.config.intrinsics import pinhole_of_matrix
-from rs_relpose_ros.errors import InputError, MissingInputError
-from rs_relpose_ros.geometry.intrinsics import Intrinsics
-from rs_relpose_ros.geometry.timing import NANOSECONDS
-from rs_relpose_ros.images.encoded import (
+from rs_relpose_ros.config.settings import Parameters, pinhole_of_matrix
+from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
+from rs_relpose_ros.geometry.camera import Intrinsics
+from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
+from rs_relpose_ros.imu.buffer import ImuSample, Orientation
+from rs_relpose_ros.pipeline.sequencer import Refusal, Sequencer
+from rs_relpose_ros.tracking.images import (
     check_image_size,
     CompressedImage,
     EncodedImage,
     RawImage,
 )
-from rs_relpose_ros.imu.samples import ImuSample, Orientation
 
 # Largest values of an IMU: far above any sensor, far below an overflow of the filters.
 MAX_ANGULAR_VELOCITY = 1e3   # rad/s
 MAX_LINEAR_ACCELERATION = 1e4   # m/s^2
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PublishedImage:
-    """An image message: its header and the image, not decoded yet."""
-
-    stamp_ns: int
-    frame_id: str
-    image: EncodedImage
 
 
 class TruePose(NamedTuple):
@@ -53,26 +50,24 @@ def stamp_ns(header: Any) -> int:
 
 
 def time_ns(stamp: Any) -> int:
-    """Instant [ns] of a builtin_interfaces/Time."""
+    """Integer [ns] of a builtin_interfaces/Time."""
     seconds, nanoseconds = int(stamp.sec), int(stamp.nanosec)
     if seconds < 0 or not 0 <= nanoseconds < NANOSECONDS:
         raise InputError(f'stamp is out of range: {seconds} s and {nanoseconds} ns')
     return seconds * NANOSECONDS + nanoseconds
 
 
-def image_from_message(msg: Any) -> PublishedImage:
+def image_from_message(msg: Any) -> EncodedImage:
     """Image of a sensor_msgs/Image or CompressedImage; its `data` is a view of the message's.
 
-    Only the stamp is checked: what else may be wrong is found when the image is decoded.
+    Only the stamp is checked here; the other fields are checked when the image is decoded.
     """
     data = np.frombuffer(msg.data, dtype=np.uint8)
-    image: EncodedImage
+    stamp, frame_id = stamp_ns(msg.header), str(msg.header.frame_id)
     if hasattr(msg, 'format'):
-        image = CompressedImage(data, str(msg.format))
-    else:
-        image = RawImage(data, str(msg.encoding), int(msg.width), int(msg.height), int(msg.step),
-                         bool(msg.is_bigendian))
-    return PublishedImage(stamp_ns(msg.header), str(msg.header.frame_id), image)
+        return CompressedImage(data, str(msg.format), stamp, frame_id)
+    return RawImage(data, str(msg.encoding), int(msg.width), int(msg.height), int(msg.step),
+                    bool(msg.is_bigendian), stamp, frame_id)
 
 
 def pose_from_message(msg: Any) -> TruePose:
@@ -83,9 +78,9 @@ def pose_from_message(msg: Any) -> TruePose:
 
 
 def intrinsics_from_info(msg: Any) -> Intrinsics:
-    """Intrinsics of a sensor_msgs/CameraInfo, region of interest and binning honoured.
+    """Intrinsics of a sensor_msgs/CameraInfo with region of interest and binning.
 
-    MissingInputError where it has none.
+    MissingInputError if it has none.
     """
     k = [float(value) for value in info_field(msg, 'k')]
     if len(k) == 9 and k[0] == 0.0:
@@ -112,16 +107,16 @@ def intrinsics_from_info(msg: Any) -> Intrinsics:
 
 
 def info_field(msg: Any, name: str) -> Any:
-    """A field of a CameraInfo that ROS 1 writes in capitals."""
+    """A field of a CameraInfo that has a capital name in ROS 1."""
     return getattr(msg, name) if hasattr(msg, name) else getattr(msg, name.upper())
 
 
 def imu_sample_from_message(msg: Any, *, with_gyro: bool = True) -> ImuSample:
-    """Gyro and accelerometer of a sensor_msgs/Imu, each None where the message has no such sensor.
+    """Gyro and accelerometer of a sensor_msgs/Imu, each None if the message has no such sensor.
 
-    By REP-145 a covariance whose first element is -1 means that the sensor does not exist; drivers
-    that publish the two sensors apart leave the other vector zero, and an accelerometer that reads
-    exactly zero in all axes is taken for such. Not `with_gyro`: the topic is the accelerometer's.
+    By REP-145 a covariance whose first element is -1 means that the sensor does not exist. Drivers
+    with one topic per sensor leave the other vector zero, so an accelerometer that reads exactly
+    zero in all axes counts as absent. Not `with_gyro`: the topic is that of the accelerometer.
     """
     angular_velocity = linear_acceleration = None
     if with_gyro and msg.angular_velocity_covariance[0] != -1.0:
@@ -139,9 +134,9 @@ def imu_sample_from_message(msg: Any, *, with_gyro: bool = True) -> ImuSample:
 
 
 def _orientation(msg: Any) -> Orientation | None:
-    """Down in the IMU frame; None unless the covariance block says how good the orientation is.
+    """Down in the IMU frame; None without a usable orientation covariance.
 
-    All zeros, "unknown" by REP-145, is what drivers leave that compute none.
+    Drivers without an orientation leave all zeros, "unknown" by REP-145.
     """
     variance = max(float(msg.orientation_covariance[0]), float(msg.orientation_covariance[4]))
     q = msg.orientation
@@ -164,3 +159,289 @@ def _vector(name: str, vector: Any, largest: float) -> tuple[float, float, float
         raise InputError(f'{name} of an IMU message must be at most {largest:g}, '
                          f'got {list(values)}: is it in rad/s and m/s^2?')
     return values
+
+
+# -- Topics by role, live and offline -------------------------------------------------------------
+
+class Role(str, Enum):
+    """Role of a topic.
+
+    The value is the name of the topic that the node subscribes to, and of the field with the topic
+    of a bag in `rs_relpose_ros.bags.reader.SensorTopics`.
+    """
+
+    IMU = 'imu'
+    ACCEL = 'accel'   # of drivers with a topic of its own for the accelerometer
+    CAMERA_INFO = 'camera_info'
+    IMAGE = 'image'
+    TRUTH = 'truth'
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Message types that can have a role, and the function that reads a message."""
+
+    msgtypes: tuple[str, ...]
+    read: Callable[[Any], Any]
+
+
+PARTS: Mapping[Role, Part] = {
+    Role.IMU: Part(('sensor_msgs/msg/Imu',), imu_sample_from_message),
+    Role.ACCEL: Part(('sensor_msgs/msg/Imu',), partial(imu_sample_from_message, with_gyro=False)),
+    Role.CAMERA_INFO: Part(('sensor_msgs/msg/CameraInfo',), intrinsics_from_info),
+    Role.IMAGE: Part(('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'),
+                     image_from_message),
+    Role.TRUTH: Part(('geometry_msgs/msg/PoseStamped',), pose_from_message),
+}
+
+
+# Those of camera and IMU.
+SENSOR_ROLES = (Role.IMU, Role.ACCEL, Role.CAMERA_INFO, Role.IMAGE)
+
+
+def sensor_messages(bag: Any, topics: Any,
+                    roles: Collection[Role] = SENSOR_ROLES) -> Iterator[tuple[Role, Any]]:
+    """Messages of a `Bag` with one of the roles, as `BagMessage`, in bag order.
+
+    `topics` has a field for each role, None for a role without a topic (`SensorTopics`).
+    """
+    found = {topic.name: (role, topic) for role in reversed(Role)
+             if role in roles and (topic := getattr(topics, role.value)) is not None}
+    for message in bag.messages([topic for _, topic in found.values()]):
+        yield found[message.topic][0], message
+
+
+# -- Stuck and saturated sensors ------------------------------------------------------------------
+#
+# They repeat their values bit by bit, which noise never does. Repeated values with new stamps
+# would give wrong poses that look good.
+
+# Stride of the bytes of two images that are compared first: nearly always one of them differs.
+_STRIDE = 1009
+# Fewest equal samples of a stuck gyro: two or three of a slow one may be equal by chance.
+_FEWEST_SAMPLES = 4
+# Smallest range of a gyro [rad/s]: no product has less than 125 deg/s.
+_LEAST_RANGE = 2.0
+# Smallest value [rad/s] at which a driver or filter clips: it is the largest value so far, and
+# larger than the bias that a gyro of coarse resolution repeats at rest.
+_LEAST_CLIPPING = 0.2
+
+
+class StuckCamera:
+    """Compares each image, as it came, with the one before."""
+
+    def __init__(self) -> None:
+        self._previous: NDArray[np.uint8] | None = None
+        self._stamp_ns = 0
+
+    def problem(self, image: EncodedImage) -> str:
+        """Reason why an image is no new one; empty for none."""
+        previous, self._previous = self._previous, image.data
+        # A message that is delivered twice is no fault of the camera.
+        again, self._stamp_ns = image.stamp_ns == self._stamp_ns, image.stamp_ns
+        if (previous is not None and not again and len(previous) == len(image.data)
+                and np.array_equal(previous[::_STRIDE], image.data[::_STRIDE])
+                and np.array_equal(previous, image.data)):
+            return ('the image repeats the one before bit by bit: the camera or its driver is '
+                    'stuck, or the image is empty')
+        return ''
+
+
+class StuckGyro:
+    """Detects repeated gyro samples.
+
+    Repetitions are not used from the first one on: between equal values interpolation gives the
+    same, if they were true, and drivers that publish faster than the sensor measures do repeat.
+    After `longest` [s] repetitions are a fault; 0 accepts all.
+    """
+
+    def __init__(self, longest: float) -> None:
+        self._longest_ns = to_nanoseconds(longest)
+        self._values = [math.nan] * 3
+        self._largest = [0.0] * 3
+        self._since_ns = [0] * 3
+        self._counts = [0] * 3
+
+    def repeats(self, sample: ImuSample) -> bool:
+        """Whether this sample repeats the last one; InputError if that lasts too long."""
+        if sample.angular_velocity is None or self._longest_ns == 0:
+            return False
+        for axis, value in enumerate(sample.angular_velocity):
+            # After the clock was set back the time of repetition counts from here.
+            if value != self._values[axis] or sample.stamp_ns < self._since_ns[axis]:
+                self._values[axis], self._since_ns[axis] = value, sample.stamp_ns
+                self._counts[axis] = 0
+            self._counts[axis] += 1
+            self._largest[axis] = max(self._largest[axis], abs(value))
+        if min(self._counts) > 1:
+            if self._too_long(sample, max(self._since_ns), min(self._counts)):
+                raise InputError('the gyro repeats the same values bit by bit: it is stuck (set '
+                                 'stuck_gyro_time to 0 for a simulation without noise)')
+            return True
+        for name, value, largest, since_ns, count in zip(
+                'xyz', sample.angular_velocity, self._largest, self._since_ns, self._counts,
+                strict=True):
+            if count > 1 and abs(value) >= min(_LEAST_RANGE, max(_LEAST_CLIPPING, largest)):
+                if self._too_long(sample, since_ns, count):
+                    raise InputError(f'the {name} axis of the gyro repeats {value:.4g} rad/s bit '
+                                     'by bit: it is saturated')
+                return True
+        return False
+
+    def _too_long(self, sample: ImuSample, since_ns: int, count: int) -> bool:
+        return count >= _FEWEST_SAMPLES and sample.stamp_ns - since_ns > self._longest_ns
+
+
+# -- Into the sequencer, live and offline ---------------------------------------------------------
+
+# Most images that wait for the first CameraInfo, which may come before or after its image.
+_HELD_IMAGES = 4
+
+
+class Intake:
+    """Receives the messages of camera and IMU, and fills a sequencer; images stay encoded.
+
+    An image is combined with the last CameraInfo. If that is uncalibrated, or none came with the
+    first images, the intrinsics of `parameters` are used, if there are any. Only images with one
+    of the `chosen` stamps are handed over, all for None. Without parameters a stuck gyro is not
+    detected. Not thread-safe: one thread feeds it.
+    """
+
+    def __init__(self, sequencer: Sequencer, parameters: Parameters | None = None,
+                 chosen: Collection[int] | None = None) -> None:
+        self._sequencer = sequencer
+        self._chosen = chosen
+        self.intrinsics: Intrinsics | None = None   # the active ones
+        # Why the last CameraInfo cannot be used; empty if it can, or if none came.
+        self.camera_info_problem = ''
+        # Images so far, those that were not chosen, and the chosen stamps so far.
+        self.images = self.images_skipped = 0
+        self.stamps_found: set[int] = set()
+        self._camera_info: Any = None
+        configured = None if parameters is None else parameters.intrinsics
+        self._configured = configured if configured is not None and configured.given else None
+        self._use_configured = False
+        self._held: list[EncodedImage] = []   # wait for the first CameraInfo
+        self._camera = StuckCamera()
+        self._gyro = StuckGyro(0.0 if parameters is None else parameters.imu.stuck_gyro_time)
+
+    def receive(self, role: Role, message: Any) -> RsRelposeError | None:
+        """Hand a message over; the error of an unusable one, which the caller reports.
+
+        An unusable image is refused by the sequencer instead. After an unusable CameraInfo no
+        intrinsics are active, rather than outdated ones.
+        """
+        self.images += role is Role.IMAGE
+        try:
+            data = PARTS[role].read(message)
+            if role is Role.IMAGE:
+                self._add_image(data)
+            elif role is Role.CAMERA_INFO:
+                self._use(data)
+                self._camera_info = message
+            elif role is Role.ACCEL or not self._gyro.repeats(data):
+                self._sequencer.add_imu(data)
+        except RsRelposeError as error:
+            if role is Role.IMAGE:
+                self._sequencer.refuse(0, Refusal.BAD_IMAGE, str(error))
+                return None
+            if role is Role.CAMERA_INFO:
+                if self._configured is not None and isinstance(error, MissingInputError):
+                    self._use_parameters()
+                    return None
+                self._use(None, str(error))
+            return error
+        return None
+
+    def camera_info_of(self, intrinsics: Intrinsics) -> Any:
+        """The last CameraInfo; None if it has other intrinsics."""
+        return None if self._use_configured or intrinsics != self.intrinsics else self._camera_info
+
+    def finish(self) -> None:
+        """End of the input: no image waits for a CameraInfo any longer."""
+        if self._held:
+            self._use(None, configured=self._configured is not None)
+        self._sequencer.close()
+
+    def _use(self, intrinsics: Intrinsics | None, problem: str = '', *,
+             configured: bool = False) -> None:
+        """Use these intrinsics, or those of the parameters, from the images on that wait."""
+        self.intrinsics, self.camera_info_problem = intrinsics, problem
+        self._use_configured = configured
+        while self._held:
+            self._add_frame(self._held.pop(0))
+
+    def _use_parameters(self) -> None:
+        # The intrinsics are determined by the size of the next image.
+        self._use(self.intrinsics if self._use_configured else None, configured=True)
+
+    def _add_image(self, image: EncodedImage) -> None:
+        if self._chosen is not None:
+            if image.stamp_ns not in self._chosen:
+                self.images_skipped += 1
+                self._sequencer.pass_over(image.stamp_ns)
+                return
+            self.stamps_found.add(image.stamp_ns)
+        if self.intrinsics is not None or self._use_configured or self.camera_info_problem:
+            self._add_frame(image)
+            return
+        self._held.append(image)
+        if len(self._held) > _HELD_IMAGES:
+            if self._configured is not None:
+                self._use_parameters()
+            else:
+                self._add_frame(self._held.pop(0))
+
+    def _add_frame(self, image: EncodedImage) -> None:
+        try:
+            if self._use_configured and self._configured is not None:
+                size, last = image.size, self.intrinsics
+                if last is None or size != (last.image_width, last.image_height):
+                    self.intrinsics = self._configured.of_image(*size)
+        except InputError as error:
+            self._sequencer.refuse(image.stamp_ns, Refusal.BAD_IMAGE, str(error))
+            return
+        if self.intrinsics is None:
+            self._sequencer.refuse(
+                image.stamp_ns, Refusal.NO_CALIBRATION,
+                self.camera_info_problem or 'no CameraInfo came before or with the image')
+            return
+        # Compared before any image is dropped: after a gap a repeated image would pass as new.
+        problem = self._camera.problem(image)
+        if problem:
+            self._sequencer.refuse(image.stamp_ns, Refusal.BAD_IMAGE, problem)
+        else:
+            self._sequencer.add_frame(image, self.intrinsics)
+
+
+# -- Messages about bad input, grouped by reason --------------------------------------------------
+
+# Numbers differ between messages of one reason.
+_NUMBERS = re.compile(r'[-+]?\d[\d.e+-]*')
+# Most reasons that are distinguished: a source of ever new texts must not fill log or memory.
+MOST_REASONS = 64
+
+
+def reason_key(text: str) -> str:
+    """`text` without its numbers."""
+    return _NUMBERS.sub('#', text)
+
+
+class ReasonCounts:
+    """Counts messages by reason; the first message of each is kept."""
+
+    def __init__(self) -> None:
+        self._counts: dict[str, tuple[str, int]] = {}
+
+    def add(self, text: str) -> bool:
+        """Count a message; whether it is the first one of its reason."""
+        key = reason_key(text)
+        if key not in self._counts and len(self._counts) >= MOST_REASONS:
+            key, text = '', 'further reasons of other kinds'
+        first, count = self._counts.get(key, (text, 0))
+        self._counts[key] = first, count + 1
+        return count == 0
+
+    def most_common(self) -> dict[str, int]:
+        """The first messages with their counts, the most frequent first."""
+        return dict(sorted(self._counts.values(), key=lambda item: -item[1]))

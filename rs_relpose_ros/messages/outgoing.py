@@ -1,37 +1,39 @@
-"""Results to messages, for rclpy's classes and for those of rosbags alike.
+"""Results to messages, for the classes of rclpy and of rosbags alike.
 
-`types` gives the class of a message type name (``'geometry_msgs/msg/Pose'``), so that the node and
-the bag writer share these functions. All messages of a pair carry the stamp of the current image.
+`types` returns the class of a message type (``'geometry_msgs/msg/Pose'``). All messages of a pair
+have the stamp of the current image.
 """
 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from enum import auto, Enum
+import math
 import sys
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.estimator.result import RelativePose
-from rs_relpose_ros.front_end.pair import PairResult
-from rs_relpose_ros.geometry.intrinsics import Intrinsics
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.estimator.covariance import ImageInformation
+from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.timing import NANOSECONDS
-from rs_relpose_ros.health.findings import HealthState
-from rs_relpose_ros.images.encoded import Pixels
 from rs_relpose_ros.messages.incoming import info_field
-from rs_relpose_ros.messages.pair_status import PAIR_VALUES, TOPICS_KEY
+from rs_relpose_ros.pipeline.findings import FindingState
+from rs_relpose_ros.pipeline.pair import PAIR_METRICS, PairResult
+from rs_relpose_ros.tracking.images import Pixels
 
+Array = NDArray[np.float64]
 MessageTypes = Callable[[str], Any]
 
 _UINT32, _FLOAT32 = 6, 7   # sensor_msgs/PointField
 
-# The id comes last: `sensor_msgs_py.point_cloud2.read_points_numpy` reads only fields of the type
-# of the first.
+# Floats first: `sensor_msgs_py.point_cloud2.read_points_numpy` reads only fields of the type of
+# the first.
 MATCH_DTYPE = np.dtype([(name, '<f4') for name in (
     'u1', 'v1', 'u2', 'v2', 'tau1', 'tau2', 'x1', 'y1', 'z1', 'x2', 'y2', 'z2', 'x', 'y', 'z',
     'u1_gs', 'v1_gs', 'u2_gs', 'v2_gs')] + [('id', '<u4')])
@@ -40,7 +42,9 @@ MATCH_FIELDS = tuple(
     (name, int(offset), _UINT32 if name == 'id' else _FLOAT32)
     for name, (_, offset, *_) in (MATCH_DTYPE.fields or {}).items())
 
-# What the node publishes of a pair, in this order: topic and message type.
+# Queue length of a pair topic: three seconds at 30 Hz.
+PAIR_HISTORY = 100
+# Topics of a pair in the order of publication, and their types.
 PAIR_TOPICS = {
     'relative_pose': 'geometry_msgs/msg/PoseWithCovarianceStamped',
     'reference': 'sensor_msgs/msg/TimeReference',
@@ -49,69 +53,162 @@ PAIR_TOPICS = {
     'relative_rotation': 'sensor_msgs/msg/Imu',
     'pairs': 'diagnostic_msgs/msg/DiagnosticArray',
 }
-# Those of a pair with a pose only.
+# Published only for pairs with a pose.
 POSE_TOPICS = ('relative_pose', 'reference', 'velocity', 'matches')
-# A picture of a pair, for people.
 DEBUG_IMAGE = 'debug_image'
 
-# Of images that are turned; as image_transport's default.
+# Of derotated images; the default of image_transport.
 _JPEG_QUALITY = 95
-# Fields of sensor_msgs/RegionOfInterest with numbers.
+# Integer fields of sensor_msgs/RegionOfInterest.
 _REGION = ('x_offset', 'y_offset', 'height', 'width')
-
-# Least eigenvalue of a published covariance, as a share of the largest: that of a matrix of rank 5
-# is then not below 0 by rounding.
+# Lower bound of the eigenvalues of a published covariance, relative to the largest: those of a
+# matrix of rank 5 are then not negative by rounding.
 _LEAST_EIGENVALUE = 1e-14
 
 
-@dataclass(frozen=True, slots=True)
-class PairMessages:
-    """The messages of one pair, all of the same stamp; None where the pair has none.
+# Most characters of numbers in a text: the longest list has 66.
+_MOST_CHARACTERS = 2000
 
-    `pairs` is there for every pair, `relative_rotation` with every rotation, the others with every
-    pose: there is no message that says "none".
-    """
 
-    relative_pose: Any
-    reference: Any
-    velocity: Any
-    matches: Any
-    relative_rotation: Any
-    pairs: Any
+# -- ~/pairs: the keys of a status, for writing here and for reading in `published_pair` ---------
 
-    def by_topic(self) -> Iterator[tuple[str, Any]]:
-        """Topic and message of what is to be published, in the order of `PAIR_TOPICS`."""
-        for topic in PAIR_TOPICS:
-            message = getattr(self, topic)
-            if message is not None:
-                yield topic, message
+class Kind(Enum):
+    """Type of a value of ``~/pairs``; the text is empty if the value is unknown."""
+
+    TEXT = auto()
+    TIME = auto()   # timestamp [ns]
+    REAL = auto()
+    VECTOR = auto()   # 3 numbers
+    REALS = auto()   # any number of them
+
+
+class PairValue(NamedTuple):
+    """A key of the status of a pair; `field`: of `PublishedPair`, if it has the value."""
+
+    key: str
+    kind: Kind
+    of: Callable[[PairResult], Any]
+    field: str = ''
+
+    def text(self, pair: PairResult) -> str:
+        """The value in the message."""
+        value = self.of(pair)
+        if self.kind is Kind.REAL:
+            return number(value)
+        if self.kind in (Kind.VECTOR, Kind.REALS):
+            return '' if value is None else ' '.join(map(number, value))
+        return str(value)
+
+    def value(self, text: str) -> Any:
+        """The value of a text; unknown numbers are NaN. InputError if it is malformed."""
+        if self.kind is Kind.TEXT:
+            return text
+        if self.kind is Kind.TIME:
+            # At most the digits of an int64.
+            if not (text.isascii() and text.isdigit() and len(text) < 20):
+                raise InputError(
+                    f'{self.key} of ~/pairs must be a timestamp [ns], got {text[:40]!r}')
+            return int(text)
+        try:
+            values = [float(word) for word in text[:_MOST_CHARACTERS].split()]
+        except ValueError:
+            values = []
+        if text and not (values and all(map(math.isfinite, values))):
+            raise InputError(f'{self.key} of ~/pairs must be finite, got {text[:60]!r}')
+        if self.kind is Kind.REAL:
+            return values[0] if values else math.nan
+        if self.kind is Kind.VECTOR:
+            values = values or [math.nan] * 3
+            if len(values) != 3:
+                raise InputError(
+                    f'{self.key} of ~/pairs must be three numbers, got {text[:60]!r}')
+        return np.array(values)
+
+
+def _of_images(part: Callable[[ImageInformation], ArrayLike]) -> Callable[[PairResult], Any]:
+    def values(pair: PairResult) -> Array | None:
+        if pair.pose.images is None:
+            return None
+        numbers = np.atleast_1d(part(pair.pose.images))
+        return numbers if np.isfinite(numbers).all() else None
+    return values
+
+
+# `TOPICS_KEY` follows: the other topics of the pair.
+PAIR_VALUES = {value.key: value for value in (
+    PairValue('reference_stamp_ns', Kind.TIME, lambda pair: pair.reference_stamp_ns,
+              'reference_stamp_ns'),
+    PairValue('status', Kind.TEXT, lambda pair: pair.pose.status.value, 'status'),
+    PairValue('reason', Kind.TEXT, lambda pair: pair.pose.reason, 'reason'),
+    PairValue('model', Kind.TEXT, lambda pair: pair.pose.model),
+    *(PairValue(metric.name, Kind.REAL, metric.of) for metric in PAIR_METRICS),
+    PairValue('baseline_m', Kind.REAL, lambda pair: pair.pose.baseline, 'baseline'),
+    PairValue('baseline_log_sigma', Kind.REAL, lambda pair: pair.pose.baseline_log_sigma,
+              'baseline_log_sigma'),
+    PairValue('baseline_reason', Kind.TEXT, lambda pair: pair.pose.baseline_reason),
+    # Of the current camera in its own frame.
+    PairValue('linear_velocity_m_s', Kind.VECTOR, lambda pair: (
+        pair.pose.metric_velocity2 if math.isfinite(pair.pose.baseline) else None)),
+    # Times of the two stamped rows on the IMU's clock.
+    PairValue('reference_imu_ns', Kind.TIME, lambda pair: pair.reference_ns1, 'reference_imu_ns'),
+    PairValue('current_imu_ns', Kind.TIME, lambda pair: pair.reference_ns2, 'current_imu_ns'),
+    # `ImageInformation`: the estimate of the images without the priors of the IMU.
+    PairValue('image_row_s', Kind.REALS, _of_images(lambda images: images.row_time)),
+    PairValue('image_rotation_xyzw', Kind.REALS,
+              _of_images(lambda images: Rotation.from_matrix(images.R).as_quat())),
+    PairValue('image_direction', Kind.REALS, _of_images(lambda images: images.t)),
+    PairValue('image_velocities', Kind.REALS, _of_images(lambda images: images.velocities)),
+    PairValue('image_gradient', Kind.REALS, _of_images(lambda images: images.gradient)),
+    PairValue('image_information', Kind.REALS, _of_images(
+        lambda images: images.information[np.triu_indices(len(images.gradient))])),
+    PairValue('gyro_bias_rad_s', Kind.VECTOR, lambda pair: pair.gyro_bias, 'gyro_bias'),
+    PairValue('health', Kind.TEXT, lambda pair: pair.health.state.value, 'health'),
+    PairValue('health_findings', Kind.TEXT, lambda pair: pair.health.text),
+)}
+TOPICS_KEY = 'topics'
+
+
+# -- the messages of a pair ------------------------------------------------------------------
 
 
 def pair_messages(result: PairResult, types: MessageTypes,
-                  reference_frame: str = '') -> PairMessages:
-    """Messages of a pair.
+                  reference_frame: str = '') -> dict[str, Any]:
+    """Messages of a pair by topic, in the order of `PAIR_TOPICS`.
 
-    `reference_frame`: frame_id of relative pose and rotation; empty for
-    ``<camera frame>_reference``.
+    Every pair has `pairs`, every known rotation `relative_rotation`, every pose all of them: no
+    message stands for a missing value. `reference_frame`: frame_id of relative pose and rotation;
+    empty for ``<camera frame>_reference``.
     """
-    in_reference = header(result.stamp_ns, reference_frame or f'{result.frame_id}_reference',
-                          types)
-    messages: dict[str, Any] = dict.fromkeys(PAIR_TOPICS)
-    if result.pose:
-        messages |= _pose_messages(result, in_reference, types)
-    if result.pose.rotation_known:
-        messages['relative_rotation'] = _rotation_message(result.pose, in_reference, types)
-    messages['pairs'] = _pair_status_message(
-        result, [topic for topic, message in messages.items() if message is not None], types)
-    return PairMessages(**messages)
+    pose, stamp_ns = result.pose, result.stamp_ns
+    reference_frame = reference_frame or f'{result.frame_id}_reference'
+    messages = _pose_messages(result, reference_frame, types) if pose else {}
+    if pose.rotation_known:
+        # Errors of the rotation are about the axes of the reference camera, as in
+        # ``~/relative_pose``; the angular velocity is in the current camera's, as in
+        # ``~/velocity``.
+        messages['relative_rotation'] = imu_message(
+            stamp_ns, reference_frame, pose.angular_velocity2, None, types,
+            angular_velocity_covariance=published_covariance(pose.velocity_covariance[3:, 3:]),
+            orientation=quat_xyzw(pose.R),
+            orientation_covariance=published_covariance(pose.covariance[3:, 3:]))
+    values = [(value.key, value.text(result)) for value in PAIR_VALUES.values()]
+    values.append((TOPICS_KEY, ' '.join(messages)))
+    text = f'{pose.status.value}: {pose.reason}' if pose.reason else pose.status.value
+    if result.health.state is FindingState.WRONG:
+        level = 2
+    else:
+        level = 0 if pose and result.health.state is not FindingState.SUSPECT else 1
+    messages['pairs'] = diagnostics_message(stamp_ns, status_message(
+        level, 'keyframe pair', text, result.frame_id, values, types), types)
+    return messages
 
 
-def _pose_messages(result: PairResult, in_reference: Any, types: MessageTypes) -> dict[str, Any]:
+def _pose_messages(result: PairResult, reference_frame: str,
+                   types: MessageTypes) -> dict[str, Any]:
     """Messages of `POSE_TOPICS`."""
-    pose, in_camera = result.pose, header(result.stamp_ns, result.frame_id, types)
-    twist = types('geometry_msgs/msg/Twist')(
-        linear=_geometry('Vector3', pose.linear_velocity2, types),
-        angular=_geometry('Vector3', pose.angular_velocity2, types))
+    pose = result.pose
+    in_reference = header(result.stamp_ns, reference_frame, types)
+    in_camera = header(result.stamp_ns, result.frame_id, types)
     return {
         # The covariance needs no conversion: (dt, dtheta) with R_true = Exp(dtheta) R in camera 1
         # is ROS's order x, y, z and rotations about the fixed axes of the header's frame.
@@ -120,48 +217,17 @@ def _pose_messages(result: PairResult, in_reference: Any, types: MessageTypes) -
                 pose=_pose(pose.R, pose.t, types),
                 covariance=published_covariance(pose.covariance))),
         'reference': types('sensor_msgs/msg/TimeReference')(
-            header=in_camera, time_ref=time(result.reference_stamp_ns, types),
+            header=in_camera, time_ref=_time(result.reference_stamp_ns, types),
             source='reference_keyframe'),
         # Of the current camera: angular in rad/s, linear in baselines per second.
         'velocity': types('geometry_msgs/msg/TwistWithCovarianceStamped')(
-            header=in_camera, twist=types('geometry_msgs/msg/TwistWithCovariance')(
-                twist=twist, covariance=published_covariance(pose.velocity_covariance))),
-        'matches': matches_message(result, in_reference, types)}
+            header=in_camera, twist=twist_message(pose.linear_velocity2, pose.angular_velocity2,
+                                                  pose.velocity_covariance, types)),
+        'matches': _matches_message(result, in_reference, types)}
 
 
-def _rotation_message(pose: RelativePose, in_reference: Any, types: MessageTypes) -> Any:
-    """sensor_msgs/Imu: how the current camera is turned in the reference camera, and turns.
-
-    Errors of the rotation are about the axes of the header's frame, as in ``~/relative_pose``; the
-    angular velocity is in the camera's own axes, as in ``~/velocity``.
-    """
-    return types('sensor_msgs/msg/Imu')(
-        header=in_reference, orientation=_geometry('Quaternion', quat_xyzw(pose.R), types),
-        orientation_covariance=published_covariance(pose.covariance[3:, 3:]),
-        angular_velocity=_geometry('Vector3', pose.angular_velocity2, types),
-        angular_velocity_covariance=published_covariance(pose.velocity_covariance[3:, 3:]),
-        linear_acceleration=_geometry('Vector3', np.zeros(3), types),
-        # REP-145: there is no accelerometer.
-        linear_acceleration_covariance=np.array([-1.0, *[0.0] * 8]))
-
-
-def _pair_status_message(result: PairResult, others: Sequence[str], types: MessageTypes) -> Any:
-    """diagnostic_msgs/DiagnosticArray of one status; `others`: topics of the other messages."""
-    pose = result.pose
-    text = f'{pose.status.value}: {pose.reason}' if pose.reason else pose.status.value
-    values = [(value.key, value.text(result)) for value in PAIR_VALUES]
-    return diagnostics_message(result.stamp_ns, status_message(
-        _level(result), 'keyframe pair', text, result.frame_id,
-        [*values, (TOPICS_KEY, ' '.join(others))], types), types)
-
-
-def matches_message(result: PairResult, in_reference: Any, types: MessageTypes) -> Any:
-    """sensor_msgs/PointCloud2 of the inliers, fields as in `MATCH_DTYPE`.
-
-    Pixels of the published images, row times [s] against the stamped row, rays turned to it, the
-    landmark in the frame of the header, which is the reference camera [baselines], and pixels as
-    global shutters would see it at the stamped rows' instants.
-    """
+def _matches_message(result: PairResult, in_reference: Any, types: MessageTypes) -> Any:
+    """sensor_msgs/PointCloud2 of `inlier_records`, with landmarks in the frame of the header."""
     points = inlier_records(result)
     field_type = types('sensor_msgs/msg/PointField')
     fields = [field_type(name=name, offset=offset, datatype=datatype, count=1)
@@ -174,11 +240,93 @@ def matches_message(result: PairResult, in_reference: Any, types: MessageTypes) 
         is_dense=not np.isnan(points['x']).any())
 
 
-def pose_stamped_message(stamp_ns: int, frame_id: str, R: NDArray[np.float64],
-                         position: NDArray[np.float64], types: MessageTypes) -> Any:
-    """geometry_msgs/PoseStamped."""
+def inlier_records(result: PairResult) -> NDArray[np.void]:
+    """Inlier matches (N,) as records of `MATCH_DTYPE`.
+
+    Pixels of the published images, row times [s] from the stamped row, rays derotated to it, the
+    landmark in the reference camera [baselines], and the equivalent global-shutter pixels at the
+    times of the stamped rows.
+    """
+    inliers, found = result.pose.inliers, result.landmarks
+    assert found is not None, 'only pairs with a pose have inliers to publish'
+    records = np.empty(int(np.count_nonzero(inliers)), dtype=MATCH_DTYPE)
+    records['id'] = result.matches.track_ids[inliers]
+    for names, values in (
+            ('u1 v1', result.matches.points1), ('u2 v2', result.matches.points2),
+            ('tau1', result.row_times1[:, None]), ('tau2', result.row_times2[:, None]),
+            ('x1 y1 z1', result.rays1), ('x2 y2 z2', result.rays2), ('x y z', found.points),
+            ('u1_gs v1_gs', found.pixels1), ('u2_gs v2_gs', found.pixels2)):
+        for column, name in enumerate(names.split()):
+            records[name] = values[inliers, column]
+    return records
+
+
+# -- messages of any kind --------------------------------------------------------------------
+
+
+def header(stamp_ns: int, frame_id: str, types: MessageTypes) -> Any:
+    """std_msgs/Header."""
+    return types('std_msgs/msg/Header')(stamp=_time(stamp_ns, types), frame_id=frame_id)
+
+
+def geometry_message(name: str, values: ArrayLike, types: MessageTypes) -> Any:
+    """A message of geometry_msgs with the fields x, y, z and, of a quaternion, w."""
+    fields = dict(zip('xyzw', map(float, np.asarray(values)), strict=False))
+    return types(f'geometry_msgs/msg/{name}')(**fields)
+
+
+def pose_stamped_message(stamp_ns: int, frame_id: str, rotation: ArrayLike, position: ArrayLike,
+                         types: MessageTypes) -> Any:
+    """geometry_msgs/PoseStamped; `rotation`: a matrix (3, 3) or a quaternion x, y, z, w."""
     return types('geometry_msgs/msg/PoseStamped')(
-        header=header(stamp_ns, frame_id, types), pose=_pose(R, position, types))
+        header=header(stamp_ns, frame_id, types), pose=_pose(rotation, position, types))
+
+
+def transform_message(stamp_ns: int, frame_id: str, child_frame_id: str, rotation: ArrayLike,
+                      position: ArrayLike, types: MessageTypes) -> Any:
+    """geometry_msgs/TransformStamped from the pose of the child, as `pose_stamped_message`."""
+    pose = pose_stamped_message(stamp_ns, frame_id, rotation, position, types)
+    return types('geometry_msgs/msg/TransformStamped')(
+        header=pose.header, child_frame_id=child_frame_id,
+        transform=types('geometry_msgs/msg/Transform')(
+            translation=geometry_message('Vector3', position, types),
+            rotation=pose.pose.orientation))
+
+
+def twist_message(linear: ArrayLike, angular: ArrayLike, covariance: Array,
+                  types: MessageTypes) -> Any:
+    """geometry_msgs/TwistWithCovariance."""
+    return types('geometry_msgs/msg/TwistWithCovariance')(
+        twist=types('geometry_msgs/msg/Twist')(
+            linear=geometry_message('Vector3', linear, types),
+            angular=geometry_message('Vector3', angular, types)),
+        covariance=published_covariance(covariance))
+
+
+def imu_message(stamp_ns: int, frame_id: str, angular_velocity: ArrayLike | None,
+                linear_acceleration: ArrayLike | None, types: MessageTypes, *,
+                angular_velocity_covariance: Array | None = None,
+                linear_acceleration_covariance: Array | None = None,
+                orientation: ArrayLike | None = None,
+                orientation_covariance: Array | None = None) -> Any:
+    """sensor_msgs/Imu (REP-145).
+
+    Rates (3,) [rad/s] and specific force (3,) [m/s^2], +g up at rest, in the frame; None is an
+    absent measurement: the first element of its covariance is -1. Covariances have 9 elements;
+    None is unknown.
+    """
+    fields = {}
+    for name, kind, value, covariance in (
+            ('orientation', 'Quaternion', orientation, orientation_covariance),
+            ('angular_velocity', 'Vector3', angular_velocity, angular_velocity_covariance),
+            ('linear_acceleration', 'Vector3', linear_acceleration,
+             linear_acceleration_covariance)):
+        absent = (0.0, 0.0, 0.0, 1.0) if kind == 'Quaternion' else (0.0, 0.0, 0.0)
+        fields[name] = geometry_message(kind, absent if value is None else value, types)
+        fields[f'{name}_covariance'] = (
+            np.diag([-1.0, 0.0, 0.0]).ravel() if value is None
+            else np.zeros(9) if covariance is None else np.ravel(covariance))
+    return types('sensor_msgs/msg/Imu')(header=header(stamp_ns, frame_id, types), **fields)
 
 
 def image_message(stamp_ns: int, frame_id: str, pixels: Pixels, types: MessageTypes) -> Any:
@@ -193,7 +341,7 @@ def image_message(stamp_ns: int, frame_id: str, pixels: Pixels, types: MessageTy
 
 def compressed_image_message(stamp_ns: int, frame_id: str, pixels: Pixels, *, png: bool,
                              types: MessageTypes) -> Any:
-    """sensor_msgs/CompressedImage: a JPEG, or a PNG, which alone takes 16 bits."""
+    """sensor_msgs/CompressedImage: JPEG, or PNG, the only one for 16 bits."""
     values, name = pixels
     if name.startswith('rgb'):
         values = cv2.cvtColor(values, cv2.COLOR_RGBA2BGRA if name == 'rgba8'
@@ -201,26 +349,36 @@ def compressed_image_message(stamp_ns: int, frame_id: str, pixels: Pixels, *, pn
     kind = 'png' if png or values.dtype != np.uint8 else 'jpeg'
     _, data = cv2.imencode(f'.{kind}', values, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
                            if kind == 'jpeg' else [])
-    # As image_transport writes it.
+    # The format string of image_transport.
     text = f'{name}; {kind} compressed {"" if values.ndim == 2 else f"bgr{8 * values.itemsize}"}'
+    return encoded_image_message(stamp_ns, frame_id, data, types, text)
+
+
+def encoded_image_message(stamp_ns: int, frame_id: str, data: bytes | NDArray[np.uint8],
+                          types: MessageTypes,
+                          image_format: str = 'mono8; jpeg compressed ') -> Any:
+    """sensor_msgs/CompressedImage of JPEG or PNG data; `image_format` as of image_transport."""
     message_type = types('sensor_msgs/msg/CompressedImage')
-    return message_type(header=header(stamp_ns, frame_id, types), format=text,
-                        data=_byte_data(data, message_type))
+    return message_type(header=header(stamp_ns, frame_id, types), format=image_format,
+                        data=_byte_data(np.frombuffer(data, dtype=np.uint8), message_type))
 
 
-def camera_info_message(stamp_ns: int, frame_id: str, intrinsics: Intrinsics, published: Any,
-                        types: MessageTypes) -> Any:
-    """sensor_msgs/CameraInfo of intrinsics; all but the stamp as `published`, where that is given.
+def camera_info_message(stamp_ns: int, frame_id: str, camera: Intrinsics | RollingShutterCamera,
+                        published: Any, types: MessageTypes) -> Any:
+    """sensor_msgs/CameraInfo; all fields but the stamp are those of `published`, if there is one.
 
-    `published`: the CameraInfo that they are from, of ROS 1 or 2; None where parameters told them.
+    `published`: the CameraInfo of ROS 1 or 2 with these intrinsics; None: full sensor of `camera`.
+    The message has no field for the readout time.
     """
     if published is None:
-        told = intrinsics.global_shutter_camera()
+        model, binning, region = camera.distortion_model, (0, 0), dict.fromkeys(_REGION, 0)
+        pinhole = camera.global_shutter_camera() if isinstance(camera, Intrinsics) else camera
         p = np.zeros((3, 4))
-        p[:, :3] = told.camera_matrix
-        arrays = {'d': intrinsics.distortion, 'k': told.camera_matrix.ravel(),
-                  'r': np.eye(3).ravel(), 'p': p.ravel()}
-        model, binning, region = intrinsics.distortion_model, (0, 0), dict.fromkeys(_REGION, 0)
+        p[:, :3] = pinhole.camera_matrix
+        # Without distortion ROS writes five zeros.
+        d = camera.distortion or (0.0,) * (5 if model == 'plumb_bob' else 0)
+        arrays = {'d': d, 'k': pinhole.camera_matrix.ravel(), 'r': np.eye(3).ravel(),
+                  'p': p.ravel()}
     else:
         arrays = {name: info_field(published, name) for name in 'dkrp'}
         model = published.distortion_model
@@ -228,26 +386,10 @@ def camera_info_message(stamp_ns: int, frame_id: str, intrinsics: Intrinsics, pu
         region = {name: int(getattr(published.roi, name)) for name in _REGION}
         region['do_rectify'] = bool(published.roi.do_rectify)
     return types('sensor_msgs/msg/CameraInfo')(
-        header=header(stamp_ns, frame_id, types), height=intrinsics.height, width=intrinsics.width,
+        header=header(stamp_ns, frame_id, types), height=camera.height, width=camera.width,
         distortion_model=model, binning_x=binning[0], binning_y=binning[1],
         roi=types('sensor_msgs/msg/RegionOfInterest')(**{'do_rectify': False, **region}),
         **{name: np.array(values, dtype=np.float64) for name, values in arrays.items()})
-
-
-def inlier_records(result: PairResult) -> NDArray[np.void]:
-    """Inlier matches (N,) as records of `MATCH_DTYPE`."""
-    inliers, found = result.pose.inliers, result.landmarks
-    assert found is not None, 'only pairs with a pose have inliers to publish'
-    records = np.empty(int(np.count_nonzero(inliers)), dtype=MATCH_DTYPE)
-    records['id'] = result.matches.track_ids[inliers]
-    for names, values in (
-            ('u1 v1', result.matches.points1), ('u2 v2', result.matches.points2),
-            ('tau1', result.row_times1[:, None]), ('tau2', result.row_times2[:, None]),
-            ('x1 y1 z1', result.rays1), ('x2 y2 z2', result.rays2), ('x y z', found.points),
-            ('u1_gs v1_gs', found.pixels1), ('u2_gs v2_gs', found.pixels2)):
-        for column, name in enumerate(names.split()):
-            records[name] = values[inliers, column]
-    return records
 
 
 def diagnostics_message(stamp_ns: int, status: Any, types: MessageTypes) -> Any:
@@ -266,54 +408,16 @@ def status_message(level: int, name: str, text: str, hardware_id: str,
         hardware_id=hardware_id, values=[key_value(key=key, value=value) for key, value in values])
 
 
-def _level(result: PairResult) -> int:
-    """2: what was told is wrong; 1: it may be, or there is no pose; 0: all is well."""
-    if result.health.state is HealthState.WRONG:
-        return 2
-    return 0 if result.pose and result.health.state is not HealthState.SUSPECT else 1
-
-
-# -- parts -----------------------------------------------------------------------------------
-
-
-def time(stamp_ns: int, types: MessageTypes) -> Any:
-    """builtin_interfaces/Time of an instant [ns]."""
-    seconds, nanoseconds = divmod(int(stamp_ns), NANOSECONDS)
-    return types('builtin_interfaces/msg/Time')(sec=seconds, nanosec=nanoseconds)
-
-
-def header(stamp_ns: int, frame_id: str, types: MessageTypes) -> Any:
-    """std_msgs/Header."""
-    return types('std_msgs/msg/Header')(stamp=time(stamp_ns, types), frame_id=frame_id)
-
-
-def quat_xyzw(R: NDArray[np.float64]) -> NDArray[np.float64]:
+def quat_xyzw(R: Array) -> Array:
     """Quaternion (4,) x, y, z, w of a rotation matrix, with w >= 0."""
     quaternion = Rotation.from_matrix(R).as_quat()
     return quaternion if quaternion[3] >= 0.0 else -quaternion
 
 
-def _pose(R: NDArray[np.float64], position: NDArray[np.float64], types: MessageTypes) -> Any:
-    return types('geometry_msgs/msg/Pose')(
-        position=_geometry('Point', position, types),
-        orientation=_geometry('Quaternion', quat_xyzw(R), types))
+def published_covariance(covariance: Array) -> Array:
+    """A covariance (N, N) as in messages (N * N,): symmetric, without negative eigenvalues.
 
-
-def vector_message(values: NDArray[np.float64], types: MessageTypes) -> Any:
-    """geometry_msgs/Vector3."""
-    return _geometry('Vector3', values, types)
-
-
-def _geometry(name: str, values: NDArray[np.float64], types: MessageTypes) -> Any:
-    """geometry_msgs message with the fields x, y, z and, of a quaternion, w."""
-    fields = dict(zip('xyzw', map(float, values), strict=False))
-    return types(f'geometry_msgs/msg/{name}')(**fields)
-
-
-def published_covariance(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A covariance (N, N) as a message has it (N * N,): symmetric, no eigenvalue below 0.
-
-    By rounding one that is 0 may be below: that of the translation along itself.
+    Rounding may make an eigenvalue of 0 negative: that of the translation along itself.
     """
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     values = np.maximum(values, _LEAST_EIGENVALUE * values[-1])
@@ -321,8 +425,27 @@ def published_covariance(covariance: NDArray[np.float64]) -> NDArray[np.float64]
     return (0.5 * (whole + whole.T)).ravel()
 
 
+def number(value: float) -> str:
+    """Shortest text that reads back as the same number; empty for NaN."""
+    if isinstance(value, int):
+        return str(value)
+    return '' if math.isnan(value) else repr(float(value))
+
+
+def _time(stamp_ns: int, types: MessageTypes) -> Any:
+    seconds, nanoseconds = divmod(int(stamp_ns), NANOSECONDS)
+    return types('builtin_interfaces/msg/Time')(sec=seconds, nanosec=nanoseconds)
+
+
+def _pose(rotation: ArrayLike, position: ArrayLike, types: MessageTypes) -> Any:
+    quaternion = quat_xyzw(np.asarray(rotation)) if np.ndim(rotation) == 2 else rotation
+    return types('geometry_msgs/msg/Pose')(
+        position=geometry_message('Point', position, types),
+        orientation=geometry_message('Quaternion', quaternion, types))
+
+
 def _byte_data(values: NDArray[Any], message_type: Any) -> Any:
-    """Bytes in the container that is cheap: rclpy copies an ndarray element by element."""
+    """Bytes in the container of the message; rclpy copies an ndarray element by element."""
     if _is_rclpy(message_type):
         data = array('B')
         data.frombytes(values.tobytes())

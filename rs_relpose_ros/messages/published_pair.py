@@ -1,12 +1,13 @@
-"""The messages of a pair, as relpose_node publishes them, back to arrays.
+"""The messages of a pair, as published by relpose_node, back to arrays; pairs chained to a path.
 
-For who consumes the topics, live or from a bag. Messages are read by field name only, and nothing
-of them is trusted: what cannot be used raises `InputError` with one sentence.
+For subscribers and readers of bags. Messages are read by field name only, and nothing in them is
+trusted: an unusable one raises `InputError` with one line.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 import math
 from typing import Any
 
@@ -15,21 +16,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.estimator.image_information import ImageInformation
+from rs_relpose_ros.estimator.covariance import ImageInformation, POSE, ROTATION
+from rs_relpose_ros.estimator.result import depths_of_rays, Status
+from rs_relpose_ros.geometry import validate
+from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.messages.incoming import stamp_ns, time_ns
-from rs_relpose_ros.messages.outgoing import (
-    MATCH_DTYPE,
-    MATCH_FIELDS,
-    PAIR_TOPICS,
-    PairMessages,
-    POSE_TOPICS,
-)
-from rs_relpose_ros.messages.pair_status import PairStatus, TOPICS_KEY
+from rs_relpose_ros.messages.outgoing import MATCH_DTYPE, PAIR_TOPICS, PAIR_VALUES
 
 Array = NDArray[np.float64]
 
-# Fields of the landmark of a match.
-LANDMARK = ('x', 'y', 'z')
 # Largest deviation from 1 of the length of directions, quaternions and rays.
 _UNIT_TOLERANCE = 1e-3
 
@@ -41,18 +36,18 @@ class PublishedPair:
     Pose of the current camera in the reference camera, ``X1 = R X2 + t``, with the covariance of
     ``(dt, dtheta)``: ``t_true = t + dt`` and ``R_true = Exp(dtheta) R``, in camera 1. `matches`
     are the inliers: track ``id``, pixels ``u1 v1 u2 v2``, row times ``tau1 tau2`` [s], rays
-    ``x1 y1 z1 x2 y2 z2`` turned to the stamped row, landmarks ``x y z`` in the reference camera
-    [baselines], pixels ``u1_gs v1_gs u2_gs v2_gs`` as global shutters would see them at the
-    stamped rows' instants. What is not known is NaN, and there are no matches without a pose.
+    ``x1 y1 z1 x2 y2 z2`` derotated to the stamped row, landmarks ``x y z`` in the reference camera
+    [baselines], equivalent global-shutter pixels ``u1_gs v1_gs u2_gs v2_gs`` at the times of the
+    stamped rows. Unknown values are NaN; there are no matches without a pose.
     """
 
     reference_stamp_ns: int   # header stamp of the reference keyframe
     stamp_ns: int   # of the current image, as frame_id
     frame_id: str
-    reference_imu_ns: int   # instants of the two stamped rows on the IMU's clock
+    reference_imu_ns: int   # times of the two stamped rows on the IMU's clock
     current_imu_ns: int
     status: str   # as of `Status`
-    reason: str   # why there is no pose; empty where there is one
+    reason: str   # of a pair without a pose; else empty
     has_pose: bool
     R: Array   # (3, 3)
     t: Array   # (3,), of length 1: the scale of two views is not observable
@@ -63,8 +58,8 @@ class PublishedPair:
     baseline: float   # [m]
     baseline_log_sigma: float   # 1 sigma of its logarithm
     gyro_bias: Array   # (3,) [rad/s] that was removed, in the axes of the IMU
-    images: ImageInformation | None   # what the images alone say
-    health: str   # of what was told of camera and IMU, as of `HealthState`
+    images: ImageInformation | None   # estimate of the images alone
+    health: str   # consistency of the calibration, as of `FindingState`
     matches: NDArray[np.void]   # (N,), of MATCH_DTYPE
 
     def __bool__(self) -> bool:
@@ -73,130 +68,146 @@ class PublishedPair:
 
     @property
     def rotation_known(self) -> bool:
-        """Whether `R` is known; of every pose it is."""
+        """Whether `R` is known, as in every pose."""
         return bool(np.isfinite(self.R).all())
 
 
-@dataclass(slots=True)
-class _Waiting:
-    """Messages of a stamp, and the topics that its pair has; None until ``~/pairs`` tells."""
+class PairStatus:
+    """Status of a diagnostic_msgs/DiagnosticArray of ``~/pairs``: its values by key.
 
-    messages: dict[str, Any] = field(default_factory=dict)
-    topics: frozenset[str] | None = None
+    InputError if one is absent or malformed.
+    """
+
+    def __init__(self, pairs: Any) -> None:
+        if len(pairs.status) != 1:
+            raise InputError(f'~/pairs must have one status, got {len(pairs.status)}')
+        self.frame_id = str(pairs.status[0].hardware_id)
+        self._texts = {str(item.key): str(item.value) for item in pairs.status[0].values}
+
+    def __getitem__(self, key: str) -> Any:
+        """A value of `PAIR_VALUES`."""
+        return PAIR_VALUES[key].value(self._text(key))
+
+    def _text(self, key: str) -> str:
+        if key not in self._texts:
+            raise InputError(f'~/pairs must have the key {key}')
+        return self._texts[key]
+
+    def images(self) -> ImageInformation | None:
+        """The estimate of the images alone; None if there is none."""
+        gradient = self['image_gradient']
+        size = len(gradient)
+        if size == 0:
+            return None
+        row_times, xyzw, t, velocities, upper = (self[f'image_{name}'] for name in (
+            'row_s', 'rotation_xyzw', 'direction', 'velocities', 'information'))
+        rows = np.triu_indices(size)
+        has_direction = len(t) == 3 and len(velocities) == 6 and _is_unit(t)
+        if not ((size == ROTATION or (size == POSE and has_direction))
+                and len(upper) == len(rows[0])
+                and len(row_times) == 1 and abs(row_times[0]) < 1.0
+                and len(xyzw) == 4 and _is_unit(xyzw)):
+            raise InputError('image_information of ~/pairs and the other keys image_* must be of '
+                             f'{POSE} or {ROTATION} unknowns, got {size}')
+        H = np.zeros((size, size))
+        H[rows] = H.T[rows] = upper
+        if size == ROTATION:
+            t, velocities = np.full(3, math.nan), np.full(6, math.nan)
+        return ImageInformation(float(row_times[0]), Rotation.from_quat(xyzw).as_matrix(), t,
+                                velocities, H, gradient)
+
+    def topics(self) -> set[str]:
+        """Topics of the pair, ``~/pairs`` included."""
+        text = self._text(outgoing.TOPICS_KEY)
+        topics, with_rotation = set(text.split()), {'relative_rotation'}
+        if topics not in (set(), with_rotation, with_rotation.union(outgoing.POSE_TOPICS)):
+            raise InputError(f'{outgoing.TOPICS_KEY} of ~/pairs must name all others, '
+                             f'relative_rotation, or none, got {text[:100]!r}')
+        return topics | {'pairs'}
 
 
 class PairSynchronizer:
-    """Gathers the messages of a pair by their common stamp, in whatever order they come.
+    """Gathers the messages of a pair by their common stamp, in any order.
 
-    ``~/pairs``, which every pair has, tells which other messages there are: all of them, the
-    rotation, or none. At most `capacity` stamps wait for the rest of their messages; of more, the
-    one that was begun first is given up: where messages are lost, nothing piles up. `given_up`
-    counts them.
+    ``~/pairs``, which every pair has, lists its other topics. At most `capacity` stamps wait for
+    further messages; beyond it the oldest is dropped, so that lost messages do not accumulate.
+    `given_up` counts the dropped stamps.
     """
 
     def __init__(self, capacity: int = 10) -> None:
-        if capacity < 1:
-            raise InputError(f'capacity must be at least 1, got {capacity}')
-        self._capacity = capacity
-        self._waiting: dict[int, _Waiting] = {}
+        self._capacity = validate.number('capacity', capacity, 1)
+        self._waiting: dict[int, dict[str, Any]] = {}   # stamp -> messages by topic
         self.given_up = 0
 
     def add(self, topic: str, message: Any) -> PublishedPair | None:
-        """Take a message; the pair that it completes, if it does: with or without a pose.
+        """Add a message; return the pair that it completes, with or without a pose.
 
-        `topic` is one of `PAIR_TOPICS`, without ``~/``. InputError where the pair cannot be used,
-        or the stamp is out of range.
+        `topic` is one of `PAIR_TOPICS`, without ``~/``. InputError if the pair is unusable, or the
+        stamp is out of range.
         """
-        if topic not in PAIR_TOPICS:
-            raise InputError(f'topic must be one of {", ".join(PAIR_TOPICS)}, got {topic!r}')
+        validate.choice('topic', topic, PAIR_TOPICS)
         stamp = stamp_ns(message.header)
-        waiting = self._waiting.setdefault(stamp, _Waiting())
-        waiting.messages[topic] = message
-        if topic == 'pairs':
+        messages = self._waiting.setdefault(stamp, {})
+        messages[topic] = message
+        if 'pairs' in messages:
             try:
-                waiting.topics = _topics(pair_status(message))
+                topics = PairStatus(messages['pairs']).topics()
             except InputError:
                 del self._waiting[stamp]
                 raise
-        topics = waiting.topics
-        if topics is not None and topics <= waiting.messages.keys():
-            del self._waiting[stamp]
-            return published_pair(PairMessages(**{
-                name: waiting.messages[name] if name in topics else None
-                for name in PAIR_TOPICS}))
+            if topics <= messages.keys():
+                del self._waiting[stamp]
+                return published_pair({name: messages[name] for name in topics})
         if len(self._waiting) > self._capacity:
             del self._waiting[next(iter(self._waiting))]
             self.given_up += 1
         return None
 
 
-def published_pair(messages: PairMessages) -> PublishedPair:
-    """Arrays of the messages of one pair; InputError where something cannot be used."""
-    stamps = {name: stamp_ns(message.header) for name, message in messages.by_topic()}
+def published_pair(messages: Mapping[str, Any]) -> PublishedPair:
+    """Arrays of the messages of one pair by topic; InputError if any of them is unusable."""
+    stamps = {topic: stamp_ns(message.header) for topic, message in messages.items()}
     if len(set(stamps.values())) > 1:
         raise InputError(f'messages of one pair must have the same stamp, got {stamps}')
-    status = pair_status(messages.pairs)
-    topics = _topics(status)
+    status = PairStatus(messages['pairs'])
+    topics = status.topics()
     if stamps.keys() != topics:
-        raise InputError(f'~/pairs tells of {" ".join(sorted(topics))}, '
-                         f'but there are {" ".join(sorted(stamps))}')
-    reference = status.nanoseconds('reference_stamp_ns')
-    R, t = np.full((3, 3), math.nan), np.full(3, math.nan)
-    covariance, velocity_covariance = np.full((2, 6, 6), math.nan)
-    linear_velocity = angular_velocity = np.full(3, math.nan)
-    matches = np.empty(0, dtype=MATCH_DTYPE)
-    if messages.relative_pose is not None:
-        if time_ns(messages.reference.time_ref) != reference:
+        raise InputError(f'~/pairs lists {" ".join(sorted(topics))}, but there are '
+                         f'{" ".join(sorted(stamps))}')
+    fields = {value.field: status[key] for key, value in PAIR_VALUES.items() if value.field}
+    if 'relative_pose' in messages:
+        if time_ns(messages['reference'].time_ref) != fields['reference_stamp_ns']:
             raise InputError('~/reference and ~/pairs must name the same reference keyframe')
-        pose, twist = messages.relative_pose.pose, messages.velocity.twist
-        R = _rotation('~/relative_pose', pose.pose.orientation)
-        t = _unit('the position of ~/relative_pose', pose.pose.position, 'xyz')
-        covariance = _covariance('~/relative_pose', pose.covariance, 6)
-        linear_velocity = _velocity('the linear velocity of ~/velocity', twist.twist.linear)
-        angular_velocity = _velocity('the angular velocity of ~/velocity', twist.twist.angular)
-        velocity_covariance = _covariance('~/velocity', twist.covariance, 6)
-        matches = match_records(messages.matches)
-    elif messages.relative_rotation is not None:
-        imu, topic = messages.relative_rotation, '~/relative_rotation'
-        R = _rotation(topic, imu.orientation)
-        covariance[3:, 3:] = _covariance(topic, imu.orientation_covariance, 3)
-        angular_velocity = _velocity(f'the angular velocity of {topic}', imu.angular_velocity)
-        velocity_covariance[3:, 3:] = _covariance(topic, imu.angular_velocity_covariance, 3)
-    return PublishedPair(
-        reference_stamp_ns=reference, stamp_ns=stamps['pairs'],
-        frame_id=str(messages.pairs.status[0].hardware_id),
-        reference_imu_ns=status.nanoseconds('reference_imu_ns'),
-        current_imu_ns=status.nanoseconds('current_imu_ns'), status=status.text('status'),
-        reason=status.text('reason'), has_pose=messages.relative_pose is not None, R=R, t=t,
-        covariance=covariance, linear_velocity=linear_velocity, angular_velocity=angular_velocity,
-        velocity_covariance=velocity_covariance, baseline=status.real('baseline_m'),
-        baseline_log_sigma=status.real('baseline_log_sigma'),
-        gyro_bias=status.vector('gyro_bias_rad_s'),
-        images=status.images(), health=status.text('health'), matches=matches)
-
-
-def pair_status(pairs: Any) -> PairStatus:
-    """The status of a pair in a diagnostic_msgs/DiagnosticArray of ``~/pairs``."""
-    if len(pairs.status) != 1:
-        raise InputError(f'~/pairs must have one status, got {len(pairs.status)}')
-    return PairStatus({str(item.key): str(item.value) for item in pairs.status[0].values})
-
-
-def _topics(status: PairStatus) -> frozenset[str]:
-    """Topics that a pair has, ``~/pairs`` included."""
-    text = status.text(TOPICS_KEY)
-    topics = frozenset(text.split())
-    with_rotation = {'relative_rotation'}
-    if topics not in (set(), with_rotation, with_rotation | set(POSE_TOPICS)):
-        raise InputError(f'{TOPICS_KEY} of ~/pairs must name all others, relative_rotation, or '
-                         f'none, got {text[:100]!r}')
-    return topics | {'pairs'}
+        pose, twist = messages['relative_pose'].pose, messages['velocity'].twist
+        fields |= {
+            'R': _rotation('~/relative_pose', pose.pose.orientation),
+            't': _unit('the position of ~/relative_pose', pose.pose.position, 'xyz'),
+            'covariance': _covariance('~/relative_pose', pose.covariance, 6),
+            'linear_velocity': _velocity('the linear velocity of ~/velocity', twist.twist.linear),
+            'angular_velocity': _velocity('the angular velocity of ~/velocity',
+                                          twist.twist.angular),
+            'velocity_covariance': _covariance('~/velocity', twist.covariance, 6),
+            'matches': match_records(messages['matches'])}
+    else:
+        covariances = np.full((2, 6, 6), math.nan)
+        R, angular_velocity = np.full((3, 3), math.nan), np.full(3, math.nan)
+        if 'relative_rotation' in messages:
+            imu, topic = messages['relative_rotation'], '~/relative_rotation'
+            R = _rotation(topic, imu.orientation)
+            angular_velocity = _velocity(f'the angular velocity of {topic}', imu.angular_velocity)
+            covariances[:, 3:, 3:] = [_covariance(topic, block, 3) for block in (
+                imu.orientation_covariance, imu.angular_velocity_covariance)]
+        fields |= {'R': R, 't': np.full(3, math.nan), 'covariance': covariances[0],
+                   'linear_velocity': np.full(3, math.nan), 'angular_velocity': angular_velocity,
+                   'velocity_covariance': covariances[1], 'matches': np.empty(0, MATCH_DTYPE)}
+    return PublishedPair(stamp_ns=stamps['pairs'], images=status.images(),
+                         frame_id=status.frame_id, has_pose='relative_pose' in messages, **fields)
 
 
 def match_records(cloud: Any) -> NDArray[np.void]:
     """Records of MATCH_DTYPE (N,) of a sensor_msgs/PointCloud2; a view of the message's memory."""
     found = [(str(f.name), int(f.offset), int(f.datatype), int(f.count)) for f in cloud.fields]
-    wanted = [(name, offset, datatype, 1) for name, offset, datatype in MATCH_FIELDS]
+    wanted = [(name, offset, datatype, 1) for name, offset, datatype in outgoing.MATCH_FIELDS]
     if found != wanted or int(cloud.point_step) != MATCH_DTYPE.itemsize or cloud.is_bigendian:
         names = ' '.join(name[:20] for name, *_ in found[:20])
         raise InputError(
@@ -209,9 +220,9 @@ def match_records(cloud: Any) -> NDArray[np.void]:
         raise InputError(f'~/matches has {len(data)} bytes of data, but {int(cloud.width)}x'
                          f'{int(cloud.height)} points need {count * MATCH_DTYPE.itemsize}')
     records = data.view(MATCH_DTYPE)
-    # Of a match without a landmark x, y and z are NaN.
+    # A match without a landmark has NaN in x, y and z.
     far = np.isnan(records['x']) & np.isnan(records['y']) & np.isnan(records['z'])
-    if not all((np.isfinite(records[name]) | (far & (name in LANDMARK))).all()
+    if not all((np.isfinite(records[name]) | (far & (name in ('x', 'y', 'z')))).all()
                for name in MATCH_DTYPE.names or ()):
         raise InputError('~/matches must be finite')
     for view in '12':
@@ -223,27 +234,173 @@ def match_records(cloud: Any) -> NDArray[np.void]:
 
 def _unit(name: str, message: Any, axes: str) -> Array:
     values = np.array([getattr(message, axis) for axis in axes], dtype=np.float64)
-    # Written so that NaN fails it.
-    if not abs(math.hypot(*values) - 1.0) <= _UNIT_TOLERANCE:
+    if not _is_unit(values):
         raise InputError(f'{name} must have length 1, got {values.tolist()}')
     return values
 
 
+def _is_unit(values: Array) -> bool:
+    return abs(math.hypot(*values) - 1.0) <= _UNIT_TOLERANCE   # not NaN
+
+
 def _velocity(name: str, vector: Any) -> Array:
-    largest = 1e9   # [baselines/s, rad/s]: far above any camera, far below an overflow
-    values = np.array([vector.x, vector.y, vector.z], dtype=np.float64)
-    if not (np.abs(values) <= largest).all():
-        raise InputError(f'{name} must be at most {largest:g}, got {values.tolist()}')
-    return values
+    largest = 1e9   # [baselines/s, rad/s]: above any camera, below an overflow
+    return validate.array(name, [vector.x, vector.y, vector.z], (3,), largest=largest)
 
 
 def _covariance(topic: str, covariance: Any, size: int) -> Array:
-    values = np.array(covariance, dtype=np.float64)
-    if values.shape != (size * size,) or not np.isfinite(values).all():
-        raise InputError(f'the covariance of {topic} must be {size * size} finite figures')
+    values = validate.array(f'the covariance of {topic}', covariance, (size * size,))
     return values.reshape(size, size)
 
 
 def _rotation(topic: str, quaternion: Any) -> Array:
     unit = _unit(f'the orientation of {topic}', quaternion, 'xyzw')
     return np.asarray(Rotation.from_quat(unit).as_matrix())
+
+
+# -- relative poses chained to a path --------------------------------------------------------
+#
+# Two views do not determine the scale. The current camera of a pair is the reference of the next,
+# and many tracks are observed in both: the ratio of a point's distances there, in the one baseline
+# and in the other, is the ratio of the baselines. Errors accumulate as in any odometry.
+
+_AGAIN = 'the path restarts, at another scale'
+# Squared sine of the angle between two rays; they are parallel below it.
+_PARALLEL = 1e-18
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PathPose:
+    """A camera of the path, in the axes of the chain: those of its first camera."""
+
+    stamp_ns: int
+    R: Array   # (3, 3)
+    position: Array   # (3,), in baselines of the path's first pair with a pose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PathStep:
+    """Extension of the path by a pair: the current camera, if its position is known.
+
+    The first step of a new path also has its first camera; `new_path` is the reason of the new
+    path, with position and scale unrelated to the former. `scale_sigma` is from the scatter of the
+    tracks, without the errors of the two poses, which are common to all tracks.
+    """
+
+    poses: tuple[PathPose, ...]
+    new_path: str   # empty if the path continues, or none begins
+    new_axes: bool   # whether the axes are unrelated to the former, too
+    scale: float   # the pair's baseline, in baselines of the path's first; NaN without a pose
+    shared_tracks: int   # for the scale relative to the last pair with a pose
+    scale_sigma: float   # 1 sigma of that ratio, relative; NaN without one
+
+
+class PoseChain:
+    """Chains the pairs of one node, in the order of their stamps.
+
+    A pair with a rotation but no translation:
+
+    - `PURE_ROTATION`: the position is unchanged, and the path continues. The true movement, below
+      the noise of the matches, is missing from the path; the distances of the tracks, which
+      propagate the scale to the next pair with a pose, are assumed unchanged: the relative error
+      of the scale is the ratio of that movement to these distances.
+    - `LOW_PARALLAX`: the position is unknown. The path ends, and the next pair with a pose begins
+      one at another scale, in the same axes, since the rotation is known.
+
+    Without a rotation the axes end with the path. With fewer than `min_shared_tracks` the scale is
+    lost, and a new path begins.
+    """
+
+    def __init__(self, min_shared_tracks: int = 8) -> None:
+        self._min_shared_tracks = validate.number('min_shared_tracks', min_shared_tracks, 1)
+        # Of the last camera; None while rotation or position is unknown.
+        self._stamp_ns = 0
+        self._R: Array | None = None
+        self._position: Array | None = None
+        # Baseline of the last pair with a pose, None while the path has none; distances of the
+        # tracks from its current camera, in these baselines.
+        self._scale: float | None = None
+        self._distances: dict[int, float] = {}
+        # Of the next path: its reason, and whether its axes are new, too.
+        self._reason, self._new_axes = 'the first pair: a path begins', True
+
+    def add(self, pair: PublishedPair) -> PathStep:
+        """Append a pair, to the path or as the first of a new one."""
+        if self._R is not None and pair.reference_stamp_ns != self._stamp_ns:
+            self._lose_rotation(f'a pair is missing: {_AGAIN}')
+        if pair:
+            return self._add_pose(pair)
+        if pair.status == Status.PURE_ROTATION.value:
+            return self._step(pair, np.zeros(3))
+        if pair.rotation_known:
+            self._lose_position(f'a pair has no translation ({pair.status}): {_AGAIN}')
+            self._rotate(pair)
+        else:
+            self._lose_rotation(f'a pair has no rotation ({pair.status}): {_AGAIN}')
+        return PathStep((), '', False, math.nan, 0, math.nan)
+
+    def _add_pose(self, pair: PublishedPair) -> PathStep:
+        distances1, distances2 = track_distances(pair)
+        ratios = np.array([self._distances[track] / distances1[track]
+                           for track in distances1.keys() & self._distances.keys()])
+        if self._scale is not None and len(ratios) < self._min_shared_tracks:
+            self._lose_position(f'{len(ratios)} shared tracks, the scale needs '
+                                f'{self._min_shared_tracks}: {_AGAIN}')
+        self._distances = distances2
+        if self._scale is None:
+            self._scale = 1.0
+            return self._step(pair, pair.t, 1.0)
+        median = float(np.median(ratios))
+        self._scale *= median
+        # Median of normal deviates: sqrt(pi / 2) sigma / sqrt(n), sigma = 1.4826 MAD.
+        scatter = float(np.median(np.abs(ratios - median))) / median
+        return self._step(pair, self._scale * pair.t, self._scale, len(ratios),
+                          1.2533 * 1.4826 * scatter / len(ratios)**0.5)
+
+    def _step(self, pair: PublishedPair, movement: Array, scale: float = math.nan,
+              shared_tracks: int = 0, scale_sigma: float = math.nan) -> PathStep:
+        """Step by `movement` (3,), in the reference camera and the units of the path."""
+        start = np.eye(3) if self._R is None else self._R
+        poses, new_path, new_axes = [], '', False
+        if self._position is None:
+            self._position = np.zeros(3)
+            poses.append(PathPose(pair.reference_stamp_ns, start, self._position))
+            new_path, new_axes, self._new_axes = self._reason, self._new_axes, False
+        self._position = self._position + start @ movement
+        poses.append(PathPose(pair.stamp_ns, self._rotate(pair), self._position))
+        return PathStep(tuple(poses), new_path, new_axes, scale, shared_tracks, scale_sigma)
+
+    def _rotate(self, pair: PublishedPair) -> Array:
+        self._stamp_ns = pair.stamp_ns
+        self._R = pair.R if self._R is None else self._R @ pair.R
+        return self._R
+
+    def _lose_position(self, reason: str) -> None:
+        """End the path; the first reason since is that of the next one."""
+        if self._position is not None:
+            self._reason = reason
+        self._position = self._scale = None
+        self._distances = {}
+
+    def _lose_rotation(self, reason: str) -> None:
+        self._lose_position(reason)
+        self._R, self._new_axes = None, True
+
+
+def track_distances(pair: PublishedPair) -> tuple[dict[int, float], dict[int, float]]:
+    """Distances of the tracks from the reference and from the current camera [baselines], by id.
+
+    Each match has a baseline of its own, since the camera moves during the readout: (4) of
+    ``docs/conventions.md``, ``l_1 f_1 = l_2 R f_2 + t - tau_1 d_1 + tau_2 d_2``, by least squares,
+    with the velocity of the current camera for both. Tracks behind a camera or with parallel rays
+    are omitted.
+    """
+    m = pair.matches
+    f1 = np.stack([m[name] for name in ('x1', 'y1', 'z1')], axis=1).astype(np.float64)
+    f2 = np.stack([m[name] for name in ('x2', 'y2', 'z2')], axis=1).astype(np.float64) @ pair.R.T
+    tau = m['tau2'].astype(np.float64) - m['tau1']
+    baselines = pair.t + tau[:, None] * (pair.R @ pair.linear_velocity)
+    l1, l2, usable = depths_of_rays(f1, f2, baselines, _PARALLEL)
+    tracks = m['id'][usable].tolist()
+    return (dict(zip(tracks, l1[usable].tolist(), strict=True)),
+            dict(zip(tracks, l2[usable].tolist(), strict=True)))

@@ -1,20 +1,318 @@
-"""Checks of the images that a tracker gets."""
+"""Images as published, and the gray or colour arrays that they are decoded to.
+
+No field is trusted: sizes are checked before memory is allocated, and an unusable image raises
+`InputError`.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.errors import InputError
 
-Image = NDArray[np.uint8]
+# -- Brightness -----------------------------------------------------------------------------------
+
+# Percentiles of an image that become black and white, of every third pixel in both directions: an
+# odd stride samples all colours of a Bayer pattern.
+_ENDS = (0.5, 99.5)
+_STRIDE = 3
+# The range exceeds that of an image by this share on either side, so that the next ones fit. It is
+# chosen again for an image that leaves it or fills less than _LEAST_FILLED of it: a new range
+# changes the brightness of the tracked windows.
+_MARGIN = 0.25
+_LEAST_FILLED = 0.3
+# Smallest range, the number of gray levels: noise of a dark image is not stretched.
+_LEAST_RANGE = 255.0
+
+# An image is dark if this percentage of its pixels is below this gray level.
+_DARK_SHARE, _DARK_GRAY = 99.0, 32
+
+
+class GrayLevels:
+    """Range of one camera's 16-bit pixels that is mapped to gray (sensors fill 10 to 14 bits).
+
+    Depends only on the images and their order.
+    """
+
+    def __init__(self) -> None:
+        self._low = self._high = 0.0
+
+    def gray(self, pixels: NDArray[np.uint16]) -> NDArray[np.uint8]:
+        """Gray image (H, W) of the next image."""
+        low, high = np.percentile(pixels[::_STRIDE, ::_STRIDE], _ENDS)
+        if (low < self._low or high > self._high
+                or high - low < _LEAST_FILLED * (self._high - self._low) > _LEAST_RANGE):
+            spare = _MARGIN * (high - low)
+            self._low = max(low - spare, 0.0)
+            self._high = max(high + spare, self._low + _LEAST_RANGE)
+        scale = 255.0 / (self._high - self._low)
+        return np.asarray(np.clip((pixels - np.float32(self._low)) * np.float32(scale), 0.0, 255.0)
+                          .astype(np.uint8))
+
+
+def is_dark(image: NDArray[np.uint8]) -> bool:
+    """Whether almost no pixel of a gray image (H, W) is bright: night, a covered lens."""
+    return bool(np.percentile(image[::_STRIDE, ::_STRIDE], _DARK_SHARE) < _DARK_GRAY)
+
+
+# -- Size of a JPEG or PNG, from its header -------------------------------------------------------
+
+_PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
+_JPEG_SIGNATURE = b'\xff\xd8\xff'
+# Start-of-frame markers: all of 0xc0..0xcf but DHT, JPG and DAC.
+_START_OF_FRAME = frozenset(range(0xc0, 0xd0)) - {0xc4, 0xc8, 0xcc}
+# Markers without a length field: TEM and RST0 to RST7.
+_STANDALONE = frozenset({0x01, *range(0xd0, 0xd8)})
+# Most bytes after the end marker of a JPEG: cameras pad their files.
+_PADDING = 4096
+
+
+def encoded_image_size(data: NDArray[np.uint8]) -> tuple[int, int]:
+    """Width and height [px] in the header of a JPEG or PNG."""
+    start, end = data[:24].tobytes(), data[-_PADDING:].tobytes()
+    if start.startswith(_PNG_SIGNATURE):
+        if len(start) < 24 or start[12:16] != b'IHDR' or b'IEND' not in end:
+            raise InputError(f'PNG image of {len(data)} bytes is truncated or corrupt')
+        return int.from_bytes(start[16:20], 'big'), int.from_bytes(start[20:24], 'big')
+    if not start.startswith(_JPEG_SIGNATURE):
+        raise InputError(f'compressed image of {len(data)} bytes is neither JPEG nor PNG')
+    # The decoder would fill missing rows with gray and report no error.
+    if b'\xff\xd9' not in end:
+        raise InputError(f'JPEG image of {len(data)} bytes is truncated')
+    return _jpeg_size(data)
+
+
+def _jpeg_size(data: NDArray[np.uint8]) -> tuple[int, int]:
+    at = 2
+    while at + 9 <= len(data):
+        if data[at] != 0xff:
+            break
+        marker = int(data[at + 1])
+        if marker == 0xff:   # fill byte
+            at += 1
+        elif marker in _STANDALONE:
+            at += 2
+        elif marker in _START_OF_FRAME:
+            height = int(data[at + 5]) << 8 | int(data[at + 6])
+            width = int(data[at + 7]) << 8 | int(data[at + 8])
+            return width, height
+        else:
+            length = int(data[at + 2]) << 8 | int(data[at + 3])
+            if length < 2:
+                break
+            at += 2 + length
+    raise InputError(f'JPEG image of {len(data)} bytes has no frame header: it is corrupt')
+
+
+# -- Encodings ------------------------------------------------------------------------------------
+
+Bytes = NDArray[np.uint8]
+Image = NDArray[np.uint8]   # (H, W) gray
+
+# Largest side [px] and area [px^2] of an image: far above any camera, far below the memory.
+MAX_IMAGE_SIDE = 16384
+MAX_IMAGE_PIXELS = 64 * 1024 * 1024
+
+# Encoding -> (channels, conversion of OpenCV). '8UC3' has no order; it is read as by cv_bridge.
+_COLOR = {
+    'bgr8': (3, cv2.COLOR_BGR2GRAY),
+    '8UC3': (3, cv2.COLOR_BGR2GRAY),
+    'rgb8': (3, cv2.COLOR_RGB2GRAY),
+    'bgra8': (4, cv2.COLOR_BGRA2GRAY),
+    'rgba8': (4, cv2.COLOR_RGBA2GRAY),
+}
+# OpenCV names a Bayer pattern by the second row from its second pixel on, ROS from the corner.
+_BAYER = {
+    'bayer_rggb': cv2.COLOR_BayerBG2GRAY,
+    'bayer_bggr': cv2.COLOR_BayerRG2GRAY,
+    'bayer_gbrg': cv2.COLOR_BayerGR2GRAY,
+    'bayer_grbg': cv2.COLOR_BayerGB2GRAY,
+}
+# Packed YUV 4:2:2 -> which of two successive bytes is the luma.
+_PACKED_YUV = {'yuv422_yuy2': 0, 'yuyv': 0, 'yuv422': 1, 'uyvy': 1}
+# Planar YUV begins with the whole luma plane.
+_PLANAR_YUV = ('nv21', 'nv12', 'nv24', 'i420', 'yuv420')
+# One byte per pixel, row by row, from the first byte on: the gray image itself.
+_GRAY = ('mono8', '8UC1', *_PLANAR_YUV)
+
+# Names of the pixels of a PNG or JPEG file, by their type and number of channels.
+_ENCODED = {('uint8', 1): 'mono8', ('uint8', 3): 'bgr8', ('uint8', 4): 'bgra8',
+            ('uint16', 1): 'mono16', ('uint16', 3): 'bgr16', ('uint16', 4): 'bgra16'}
+
+# Two bytes per pixel, of which a camera may fill some bits only.
+_GRAY_16 = ('mono16', '16UC1')
+
+ENCODINGS = ('mono8', '8UC1', *_GRAY_16, *_COLOR, *(f'{name}8' for name in _BAYER),
+             *(f'{name}16' for name in _BAYER), *_PACKED_YUV, *_PLANAR_YUV)
+
+
+class Pixels(NamedTuple):
+    """An image (H, W) or (H, W, C), and its encoding as in sensor_msgs/Image."""
+
+    values: NDArray[Any]
+    encoding: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawImage:
+    """A sensor_msgs/Image, not decoded: `height` rows of `step` bytes each in `data` (K,)."""
+
+    data: Bytes
+    encoding: str
+    width: int
+    height: int
+    step: int
+    is_bigendian: bool
+    stamp_ns: int = 0   # this and frame_id: of the header
+    frame_id: str = ''
+
+    is_png: ClassVar[bool] = False
+
+    @classmethod
+    def of_gray(cls, image: Image, stamp_ns: int, frame_id: str = '') -> RawImage:
+        """A mono8 image of an array (H, W)."""
+        height, width = image.shape
+        return cls(np.ascontiguousarray(image).ravel(), 'mono8', width, height, width, False,
+                   stamp_ns, frame_id)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [px] by the header; not checked yet."""
+        return self.width, self.height
+
+    def decoded(self, levels: GrayLevels | None = None) -> Image:
+        """Gray image (H, W); a view of `data` for mono8 without padding.
+
+        `levels`: of the camera's images so far, for pixels of 16 bits; None: of this one.
+        """
+        levels, encoding = levels or GrayLevels(), self.encoding
+        if encoding in _GRAY:
+            return self._rows(1)
+        if encoding in _GRAY_16:
+            return levels.gray(self._two_bytes())
+        if encoding in _COLOR:
+            return np.asarray(cv2.cvtColor(self._colors(), _COLOR[encoding][1]), dtype=np.uint8)
+        if encoding in _PACKED_YUV:
+            return np.ascontiguousarray(self._rows(2)[:, _PACKED_YUV[encoding]::2])
+        if encoding in ENCODINGS:
+            return self._from_bayer(levels)
+        raise InputError(f'image encoding {encoding[:40]!r} is not known; '
+                         f'publish one of {", ".join(ENCODINGS)}')
+
+    def pixels(self, levels: GrayLevels | None = None) -> Pixels:
+        """The image in its own encoding; gray, as `decoded`, for Bayer and YUV."""
+        if self.encoding in _COLOR:
+            return Pixels(self._colors(), self.encoding)
+        if self.encoding in _GRAY_16:
+            return Pixels(self._two_bytes().astype(np.uint16), self.encoding)
+        return Pixels(self.decoded(levels), 'mono8')
+
+    def _from_bayer(self, levels: GrayLevels) -> Image:
+        if self.height < 3 or self.width < 3:
+            raise InputError(
+                f'a Bayer image must be at least 3x3, got {self.width}x{self.height}')
+        pattern = self.encoding.removesuffix('16').removesuffix('8')
+        mosaic = (levels.gray(self._two_bytes()) if self.encoding.endswith('16')
+                  else self._rows(1))
+        return np.asarray(cv2.cvtColor(mosaic, _BAYER[pattern]), dtype=np.uint8)
+
+    def _two_bytes(self) -> NDArray[np.uint16]:
+        """Pixels of 16 bits, in the byte order of the message."""
+        order = '>u2' if self.is_bigendian else '<u2'
+        return self._rows(2).view(order)
+
+    def _colors(self) -> NDArray[np.uint8]:
+        channels = _COLOR[self.encoding][0]
+        return self._rows(channels).reshape(self.height, self.width, channels)
+
+    def _rows(self, bytes_per_pixel: int) -> Bytes:
+        """Array (height, bytes of a row) of the data without padding; a view if there is none."""
+        check_image_size(self.width, self.height)
+        height, step, row_bytes = self.height, self.step, bytes_per_pixel * self.width
+        if step < row_bytes:
+            raise InputError(f'image step is {step} bytes, but a row of {self.width} px in '
+                             f'{self.encoding} has {row_bytes}')
+        needed = step * (height - 1) + row_bytes
+        if len(self.data) < needed:
+            raise InputError(
+                f'image has {len(self.data)} bytes of data, but {self.width}x{height} in '
+                f'{self.encoding} with step {step} needs {needed}')
+        return np.ascontiguousarray(np.lib.stride_tricks.as_strided(
+            self.data, shape=(height, row_bytes), strides=(step, 1), writeable=False))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CompressedImage:
+    """A sensor_msgs/CompressedImage: a JPEG or PNG file in `data` (K,), `encoding` its format."""
+
+    data: Bytes
+    encoding: str
+    stamp_ns: int = 0   # as of `RawImage`
+    frame_id: str = ''
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [px] by the file's header; not checked yet."""
+        return encoded_image_size(self.data)
+
+    @property
+    def is_png(self) -> bool:
+        """Whether it is a PNG file, which is lossless."""
+        return self.data[:len(_PNG_SIGNATURE)].tobytes() == _PNG_SIGNATURE
+
+    def decoded(self, levels: GrayLevels | None = None) -> Image:
+        """Gray image (H, W); `levels` as of `RawImage.decoded`."""
+        # EXIF orientation is ignored: rows must stay in the order of the readout.
+        image = self._decoded(cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+                              | cv2.IMREAD_ANYDEPTH)
+        if image.dtype == np.uint16:
+            return (levels or GrayLevels()).gray(image)
+        return np.asarray(image, dtype=np.uint8)
+
+    def pixels(self, levels: GrayLevels | None = None) -> Pixels:
+        """The image in colour or gray, 8 or 16 bits, as encoded; `levels` is not used."""
+        image = self._decoded(cv2.IMREAD_UNCHANGED)
+        channels = 1 if image.ndim == 2 else image.shape[2]
+        encoding = _ENCODED.get((image.dtype.name, channels))
+        if encoding is None:
+            raise InputError(f'compressed image has {channels} channels of {image.dtype.name}: '
+                             f'publish one of {", ".join(_ENCODED.values())}')
+        return Pixels(image, encoding)
+
+    def _decoded(self, flags: int) -> NDArray[Any]:
+        width, height = self.size
+        check_image_size(width, height)
+        try:
+            image = cv2.imdecode(self.data, flags)
+        except cv2.error:
+            image = None
+        if image is None or image.shape[:2] != (height, width):
+            raise InputError(
+                f'compressed image of {len(self.data)} bytes cannot be decoded: it is corrupt')
+        return np.asarray(image)
+
+
+EncodedImage = RawImage | CompressedImage
+
+
+def check_image_size(width: int, height: int) -> None:
+    """Raise InputError for an impossible size."""
+    if not (0 < width <= MAX_IMAGE_SIDE and 0 < height <= MAX_IMAGE_SIDE
+            and width * height <= MAX_IMAGE_PIXELS):
+        raise InputError(f'image size {width}x{height} is not usable: sides must be 1 to '
+                         f'{MAX_IMAGE_SIDE} px and the area at most {MAX_IMAGE_PIXELS} px')
 
 
 def checked(image: Image, shape: tuple[int, ...] | None) -> Image:
-    """`image` as a contiguous (H, W) array of uint8; InputError where it cannot be.
+    """The input of a tracker, as a contiguous (H, W) array of uint8; InputError if it is not.
 
-    Read-only, as the memory of a raw image is, so that kernels are compiled for that alone.
-    `shape` is that of the images before: a stream has one size.
+    Read-only, as the memory of a raw image is, so that kernels are compiled for one type only.
+    `shape` is that of the previous images: a stream has one size.
     """
     image = np.ascontiguousarray(image)
     if image.ndim != 2 or image.dtype != np.uint8 or image.size == 0:

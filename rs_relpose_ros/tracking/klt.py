@@ -1,46 +1,190 @@
-"""Corners followed from frame to frame, and at last compared with the reference keyframe."""
+"""Lucas-Kanade tracking of corners; alignment of their windows with the reference keyframe."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+import math
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.config.tracking import TrackingConfig
+from rs_relpose_ros.config.settings import TrackingConfig
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.tracking.alignment import aligned
-from rs_relpose_ros.tracking.brightness import brightness_table, with_brightness
-from rs_relpose_ros.tracking.corners import feature_rows, find_corners, keep_apart
+from rs_relpose_ros.tracking import features, windows
+from rs_relpose_ros.tracking.features import Matches
 from rs_relpose_ros.tracking.images import checked, Image
-from rs_relpose_ros.tracking.lucas_kanade import follow
-from rs_relpose_ros.tracking.matches import Matches, TrackIds
 
 Array = NDArray[np.float64]
 
-_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02)
-# Errors of a guess [px] that are found without a pyramid.
+# OpenCV's termination criteria: kind, steps, step [px].
+Criteria = tuple[int, int, float]
+
+# OpenCV's eigenvalues are those of Scharr gradients, 32 times the derivative, divided by 2^20.
+_SCHARR = 2.0**20 / 32.0**2
+# Search radius [px] of a window without a pyramid; one level more doubles it.
+_REACH = 4
+# Pixels around a window for derivatives, interpolation and rounding.
+_FRINGE = 3
+# Patches are cut out of images that are larger by this factor.
+_WORTH = 2.0
+# Termination criteria of OpenCV for tracking and for alignment.
+_TRACKING_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02)
+_ALIGNMENT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.005)
+# Errors of a guess [px] that are corrected without a pyramid.
 _NEAR = 2.0
-# Levels of the pyramid where the motion is predicted, and where the guesses of the last frame
-# were off by no more than half of _NEAR, but for a share.
+# Levels of the pyramid for a predicted motion, and if the guesses of the last frame were off by at
+# most half of _NEAR, except for a share.
 _EXPECTED_LEVELS, _NEAR_LEVELS, _MOST_FAR = 2, 1, 0.05
-# Share of tracks that may be lost before the search is repeated with all levels.
+# Share of lost tracks above which the search is repeated with all levels.
 _MOST_LOST = 0.15
-# Share from which on the prediction is not believed: a gyro in a wrong unit, or other axes.
+# Share of lost tracks above which the prediction is not used: a gyro in a wrong unit or axes.
 _HOPELESS = 0.5
+# Largest correction [px] of an alignment: drift is smaller.
+_LARGEST_CORRECTION = 3.0
+# Points of a window homography: more of them cost time and gain nothing.
+_FITTED = 100
+# Largest change of area of a window homography that is not degenerate.
+_LARGEST_STRETCH = 4.0
+
+
+class Flow(NamedTuple):
+    """Points tracked into a second image."""
+
+    points: Array   # (N, 2) in the second image
+    found: NDArray[np.bool_]   # (N,)
+    strength: Array   # (N,) [gray^2/px^2] least eigenvalue of each window's structure tensor
+
+
+def follow(image1: Image, image2: Image, points1: Array, guess: Array, side: int, levels: int,
+           criteria: Criteria) -> Flow:
+    """Points of `image2` near the `guess` (N, 2) that match `points1` (N, 2) of `image1`.
+
+    `side` [px] of the windows; `levels` of the pyramid, 1 for the original images only.
+    """
+    if not len(points1):
+        return Flow(points1, np.empty(0, dtype=bool), np.empty(0))
+    radius = patch_radius(side, _REACH)
+    if levels <= 2 and image1.size > _WORTH * len(points1) * (2 * radius + 1)**2:
+        if levels == 2:
+            # As in a pyramid: the coarse level gives the start of the fine one.
+            coarse = _near(cv2.pyrDown(image1), cv2.pyrDown(image2),  # type: ignore[arg-type]
+                           0.5 * points1, 0.5 * guess, side, radius, criteria)
+            guess = np.where(coarse.found[:, None], 2.0 * coarse.points, guess)
+        flow = _near(image1, image2, points1, guess, side, radius, criteria)
+    else:
+        flow = whole_images(image1, image2, points1, guess, side, levels, criteria)
+    return Flow(flow.points, flow.found & inside(image2, flow.points), flow.strength)
+
+
+def inside(image: Image, points: Array, margin: float = 0.0) -> NDArray[np.bool_]:
+    """Which of the points (N, 2) lie `margin` pixels within an image's outermost pixel centres."""
+    height, width = image.shape
+    within = (points >= margin) & (points <= (width - 1.0 - margin, height - 1.0 - margin))
+    return within[:, 0] & within[:, 1]
+
+
+def patch_radius(side: int, reach: int) -> int:
+    """Of patches in which windows of `side` can be followed over `reach` pixels."""
+    return side // 2 + reach + _FRINGE
+
+
+def whole_images(image1: Image, image2: Image, points1: Array, guess: Array, side: int,
+                 levels: int, criteria: Criteria) -> Flow:
+    """`follow` by OpenCV on whole images, over any distance."""
+    points2, status, eigenvalues = cv2.calcOpticalFlowPyrLK(
+        image1, image2, points1.astype(np.float32, order='C'),
+        guess.astype(np.float32, order='C'), winSize=(side, side), maxLevel=levels - 1,
+        criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW | cv2.OPTFLOW_LK_GET_MIN_EIGENVALS)
+    return Flow(np.asarray(points2, dtype=np.float64), np.asarray(status)[:, 0] == 1,
+                _SCHARR * np.asarray(eigenvalues, dtype=np.float64)[:, 0])
+
+
+def _near(image1: Image, image2: Image, points1: Array, guess: Array, side: int, radius: int,
+          criteria: Criteria) -> Flow:
+    """`follow` on patches, which end `_REACH` pixels from the guess."""
+    first, second = windows.cut(image1, points1, radius), windows.cut(image2, guess, radius)
+    flow = whole_images(first.image, second.image, points1 + first.shifts,
+                        guess + second.shifts, side, 1, criteria)
+    points2 = flow.points - second.shifts
+    near = (np.abs(points2 - guess) <= _REACH).all(axis=1)
+    return Flow(points2, flow.found & near, flow.strength)
+
+
+# -- Alignment removes the drift of a track: the error of one alignment is left. The current image
+# -- is resampled to the geometry of the reference, by a homography fitted to the tracks.
+
+
+def aligned(matches: Matches, reference: Image, current: Image,
+            config: TrackingConfig) -> tuple[Matches, NDArray[np.bool_]]:
+    """`matches` (N) with their second points aligned, and a mask (N,) of those that correlate."""
+    points1, points2, side = matches.points1, matches.points2, config.klt_window
+    radius = patch_radius(side, math.ceil(_LARGEST_CORRECTION))
+    jacobians = window_jacobians(points1, points2)
+    there = windows.cut_warped(current, points2, jacobians, radius, points1)
+    here = windows.cut(reference, points1, radius)
+    image = windows.with_brightness(
+        there.image, windows.brightness_table(reference, current, points1, points2, side))
+    start = points1 + here.shifts
+    flow = whole_images(here.image, image, start, start, side, 1, _ALIGNMENT_CRITERIA)
+    # From the pixels of the reference to those of the current image: p2 + J (x - p1).
+    correction = np.einsum('nij,nj->ni', jacobians, flow.points - start)
+    found = points2 + correction
+    correlation = windows.correlations(here.image, image, start, flow.points, side)
+    # Patches repeat the border of the image: a match there is not in the image.
+    good = (flow.found & inside(current, found, side // 4)
+            & (correlation >= config.min_correlation)
+            & (np.linalg.norm(correction, axis=1) <= _LARGEST_CORRECTION))
+    # At equal correlation a faint corner ranks behind a strong one.
+    quality = correlation * flow.strength / (flow.strength + config.feature_quality)
+    return replace(matches, points2=found, quality=quality), good
+
+
+def window_homography(points1: Array, points2: Array) -> Array:
+    """Homography (3, 3) from the first image to the second that fits the points (N, 2).
+
+    The identity if there are too few points or the fit is degenerate.
+    """
+    if len(points1) < 8:
+        return np.eye(3)
+    # Without a solution OpenCV returns None: an array without shape.
+    some = slice(None, None, -(-len(points1) // _FITTED))
+    H = np.asarray(cv2.findHomography(points1[some], points2[some], method=0)[0],
+                   dtype=np.float64)
+    if H.shape != (3, 3) or not np.isfinite(H).all():
+        return np.eye(3)
+    scale = points1 @ H[2, :2] + H[2, 2]
+    # Area of the image of a small window: det H / scale^3.
+    with np.errstate(all='ignore'):
+        area = np.linalg.det(H) / scale**3
+    if not ((area > 1.0 / _LARGEST_STRETCH) & (area < _LARGEST_STRETCH)).all():
+        return np.eye(3)
+    return H
+
+
+def window_jacobians(points1: Array, points2: Array) -> Array:
+    """Derivatives (N, 2, 2) of `window_homography` at points (N, 2).
+
+    A column for each axis of the first image.
+    """
+    H = window_homography(points1, points2)
+    homogeneous = np.column_stack([points1, np.ones(len(points1))]) @ H.T
+    depth = homogeneous[:, 2, None, None]
+    mapped = homogeneous[:, :2] / depth[:, 0]
+    return (H[:2, :2] - mapped[:, :, None] * H[2, :2]) / depth
 
 
 class KltTracker:
-    """Lucas-Kanade tracking of Shi-Tomasi corners; see `rs_relpose_ros.tracking.tracker.Tracker`.
+    """Lucas-Kanade tracking of Shi-Tomasi corners; see `rs_relpose_ros.tracking.features.Tracker`.
 
-    From frame to frame windows hardly change, so that tracks live long, but errors add up. When a
-    pair closes, `refined_matches` aligns each window with that of the reference keyframe.
+    From frame to frame windows hardly change, so that tracks are long, but errors add up. For a
+    keyframe pair `refined_matches` aligns each window with that of the reference keyframe.
     """
 
     def __init__(self, config: TrackingConfig) -> None:
         self._config = config
-        self._ids = TrackIds()
+        self._ids = features.TrackIds()
         self.reset()
 
     def reset(self) -> None:
@@ -48,7 +192,7 @@ class KltTracker:
         self._reference: Image | None = None
         self._current: Image | None = None
         self._matches = Matches.none()
-        # Motion of each track that the last prediction did not explain (parallax), per interval.
+        # Motion of each track beyond the last prediction (parallax), per interval.
         self._unexplained = np.empty((0, 2))
         self._started = 0
         self._guesses_near = False
@@ -73,7 +217,7 @@ class KltTracker:
 
     def track(self, image: Image, predicted: Array | None = None,
               interval: float = 1.0) -> Matches:
-        """Follow the corners into `image`, which then is the current one; see `Tracker.track`."""
+        """Follow the corners into `image`, the new current one; see `Tracker.track`."""
         if self._current is None:
             raise InputError('the tracker has no reference keyframe: call start() first')
         previous, points = self._current, self.points
@@ -81,24 +225,23 @@ class KltTracker:
         expected = predicted is not None or bool(self._unexplained.any())
         predicted = points if predicted is None else _usable(predicted, points, image.shape)
         guess = _usable(predicted + interval * self._unexplained, predicted, image.shape)
-        seen = with_brightness(current, brightness_table(
+        observed = windows.with_brightness(current, windows.brightness_table(
             previous, current, points, guess, self._config.klt_window))
         all_levels = self._config.klt_levels
         needed = _NEAR_LEVELS if self._guesses_near else _EXPECTED_LEVELS
         levels = min(needed, all_levels) if expected else all_levels
-        found, good = self._follow_and_return(previous, seen, points, guess, levels)
-        # Where many are lost the motion was not the expected one, where most are not even the
-        # predicted one.
+        found, good = self._follow_and_return(previous, observed, points, guess, levels)
+        # Many losses: the motion was not the expected one. Losses of most: nor the predicted one.
         for start, most, wanted in ((predicted, _MOST_LOST, levels < all_levels),
                                     (points, _HOPELESS, predicted is not points)):
             lost = ~good
             if wanted and np.count_nonzero(lost) > most * len(good):
                 found[lost], good[lost] = self._follow_and_return(
-                    previous, seen, points[lost], start[lost], all_levels)
+                    previous, observed, points[lost], start[lost], all_levels)
         off = found[good] - guess[good]
         far = np.count_nonzero((off**2).sum(axis=1) > (0.5 * _NEAR)**2)
         self._guesses_near = bool(far <= _MOST_FAR * len(off))
-        first, last = feature_rows(self._config, image.shape[0])
+        first, last = features.feature_rows(self._config, image.shape[0])
         good &= (found[:, 1] >= first) & (found[:, 1] <= last)
         self._set(replace(self._matches, points2=found), (found - predicted) / interval, good)
         self._current = current
@@ -106,7 +249,7 @@ class KltTracker:
         return self._matches
 
     def refined_matches(self) -> Matches:
-        """Matches whose windows were aligned with the reference's own."""
+        """Matches with windows aligned to those of the reference."""
         if (not self._refined and len(self._matches) and self._reference is not None
                 and self._current is not None and self._current is not self._reference):
             refined, good = aligned(self._matches, self._reference, self._current, self._config)
@@ -115,21 +258,21 @@ class KltTracker:
         return self._matches
 
     def promote(self) -> None:
-        """Make the current image the reference; tracks go on, new corners fill the gaps."""
+        """Make the current image the reference; tracks continue, new corners fill the gaps."""
         if self._current is None:
             raise InputError('the tracker has no current image: call start() first')
-        # Of tracks that ran together the oldest stays.
-        apart = keep_apart(self.points, 0.5 * self._config.min_feature_distance)
+        # Of tracks that merged the oldest is kept.
+        apart = features.keep_apart(self.points, 0.5 * self._config.min_feature_distance)
         kept = self.points[apart]
-        new = find_corners(self._current, kept, self._config.max_features - len(kept),
-                           self._config)
+        new = features.find_corners(self._current, kept, self._config.max_features - len(kept),
+                                    self._config)
         points = np.concatenate([kept, new])
         self._matches = Matches(
             np.concatenate([self._matches.track_ids[apart], self._ids.take(len(new))]),
             points, points, np.ones(len(points)))
         self._unexplained = np.concatenate([self._unexplained[apart], np.zeros_like(new)])
         self._started = len(points)
-        # The unexplained motion of new corners is not known.
+        # The parallax of new corners is not known.
         self._guesses_near = len(new) == 0
         self._reference = self._current
         self._refined = False
@@ -141,14 +284,15 @@ class KltTracker:
 
     def _follow_and_return(self, image1: Image, image2: Image, points1: Array, guess: Array,
                            levels: int) -> tuple[Array, NDArray[np.bool_]]:
-        """Points of `image2` that look like `points1` (N, 2), and which of them lead back."""
-        there = follow(image1, image2, points1, guess, self._config.klt_window, levels, _CRITERIA)
-        # The way back starts as far off as the way forth did: the guess must not be the answer.
+        """Points of `image2` that match `points1` (N, 2), and a mask of those tracked back."""
+        there = follow(image1, image2, points1, guess, self._config.klt_window, levels,
+                       _TRACKING_CRITERIA)
+        # The way back starts as far off as the way forth: the guess must not be the answer.
         offset = there.points - guess
         good = there.found.copy()
         good[good] = self._return(image2, image1, there.points[good], points1[good],
                                   offset[good], 1)
-        # Without a pyramid those come back that lie near; of the others some do, too.
+        # Without a pyramid near points are tracked back, and some of the far ones.
         far = there.found & ~good & (np.linalg.norm(offset, axis=1) > _NEAR)
         if levels > 1 and far.any():
             good[far] = self._return(image2, image1, there.points[far], points1[far],
@@ -157,15 +301,15 @@ class KltTracker:
 
     def _return(self, image2: Image, image1: Image, found: Array, points1: Array, offset: Array,
                 levels: int) -> NDArray[np.bool_]:
-        """Which of the `found` points lead back to `points1`, from a guess that is off as told."""
+        """Mask of the `found` points tracked back to `points1` from a guess off by `offset`."""
         back = follow(image2, image1, found, points1 + offset, self._config.klt_window, levels,
-                      _CRITERIA)
+                      _TRACKING_CRITERIA)
         error = np.linalg.norm(back.points - points1, axis=1)
         return back.found & (error <= self._config.forward_backward_threshold)
 
 
 def _usable(guess: Array, otherwise: Array, shape: tuple[int, ...]) -> Array:
-    """`guess` (N, 2) [px], `otherwise` where it is not finite or far outside of the image.
+    """`guess` (N, 2) [px], or `otherwise` for those not finite or far outside of the image.
 
     A gyro in a wrong unit predicts points anywhere, which overflow as pixels.
     """

@@ -1,0 +1,287 @@
+"""`rs_relpose benchmark odometry`: simulated walks and EuRoC's corners, against the truth.
+
+Tracks without images go through the whole front end; its pairs and the samples through the graph.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import io
+import math
+from pathlib import Path
+import tarfile
+import time
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_lab.experiments.harness import markdown_table, write_table
+from rs_relpose_lab.experiments.trust_rows import Configured
+from rs_relpose_lab.experiments.trust_runs import (
+    Arrival,
+    numbered_image,
+    Recording,
+    run,
+    Sightings,
+    simulated,
+    Source,
+    TrackNoise,
+    TRACKS,
+)
+from rs_relpose_lab.simulation import simulate, SimulationConfig
+from rs_relpose_lab.simulation.bag import intrinsics_of
+from rs_relpose_lab.simulation.scene import SCENES
+from rs_relpose_ros.bags.reader import IMAGE_DELAY, IMU_DELAY
+from rs_relpose_ros.config.settings import Parameters
+from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
+from rs_relpose_ros.imu.buffer import ImuSample
+from rs_relpose_ros.odometry.estimator import (
+    aligned,
+    OdometryEstimator,
+    path_of,
+    TrajectoryErrors,
+)
+from rs_relpose_ros.odometry.offline import draw_paths, follow
+from rs_relpose_ros.odometry.pair import KeyframePair, warm_up_odometry
+from rs_relpose_ros.odometry.states import Odometry
+from rs_relpose_ros.offline.truth import TrueTrajectory
+
+Array = NDArray[np.float64]
+
+# -- EuRoC's corners as tracks: a real global shutter with its IMU, and metric truth -----------
+#
+# Folder `euroc_imu_april_corners`: corners of an AprilGrid in 1439 images of the calibration
+# recording of the EuRoC MAV dataset, its IMU, and the camera's poses by PnP of each image's
+# corners. Its README names the origin.
+
+NAME = 'EuRoC imu_april'
+
+# Calibration of the dataset (cam0 of the VI-Sensor); the bias is fitted (README of the folder)
+# with a lens whose principal point fits these corners, 7 px off the given one.
+_CAMERA = RollingShutterCamera(
+    width=752, height=480, fx=458.654, fy=457.296, cx=367.215, cy=248.375,
+    distortion=(-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05, 0.0), readout_time=0.0)
+_BODY_FROM_CAMERA = np.array([
+    [0.0148655429818, -0.999880929698, 0.00414029679422, -0.0216401454975],
+    [0.999557249008, 0.0149672133247, 0.025715529948, -0.064676986768],
+    [-0.0257744366974, 0.00375618835797, 0.999660727178, 0.00981073058949]])
+_GYRO_BIAS = (-0.0016, 0.0250, 0.0777)
+_CORNERS = 144
+
+
+class _Corners(NamedTuple):
+    stamp_ns: int
+    ids: NDArray[np.int64]   # (N,) increasing
+    pixels: Array   # (N, 2)
+
+
+def read_euroc(folder: Path) -> tuple[Recording, TrueTrajectory]:
+    """The recording and its truth, the world being the target; MissingInputError without it."""
+    try:
+        with tarfile.open(folder / 'cam0_corners.tar.gz') as archive:
+            files = [archive.extractfile(member) for member in archive if member.isfile()]
+            found = [_corners(file.read().decode()) for file in files if file is not None]
+        imu = np.loadtxt(folder / 'imu0.csv', delimiter=',', comments='#', usecols=range(1, 7))
+        imu_ns = np.loadtxt(folder / 'imu0.csv', dtype=np.int64, delimiter=',', comments='#',
+                            usecols=0)
+        poses = np.loadtxt(folder / 'gt_pnp_cam0.csv', delimiter=',', skiprows=1,
+                           usecols=range(3, 10))
+        stamps = np.loadtxt(folder / 'gt_pnp_cam0.csv', dtype=np.int64, delimiter=',', skiprows=1,
+                            usecols=0)
+    except OSError as error:
+        raise MissingInputError(f"there are no corners of EuRoC's in {folder}: {error}") from error
+    frames = sorted((frame for frame in found if frame is not None),
+                    key=lambda frame: frame.stamp_ns)
+    R = Rotation.from_quat(poses[:, [1, 2, 3, 0]])   # X_cam = R X_target + t
+    truth = TrueTrajectory(stamps, -R.inv().apply(poses[:, 4:]), R.inv().as_quat())
+    C = _BODY_FROM_CAMERA[:, :3].T
+    configured = Configured({
+        'readout_time': 0.0, 'gyro_bias': _GYRO_BIAS,
+        'quat_cam_imu_xyzw': tuple(Rotation.from_matrix(C).as_quat().tolist()),
+        'imu_position': tuple((-C @ _BODY_FROM_CAMERA[:, 3]).tolist())}, intrinsics_of(_CAMERA))
+    zeros = np.zeros((_CORNERS, 2))
+    sightings = Sightings(
+        tuple(frame.ids for frame in frames), tuple(frame.pixels for frame in frames),
+        tuple(np.zeros_like(frame.pixels) for frame in frames), np.zeros(len(frames)), zeros,
+        zeros, TrackNoise(white=0.0))
+    delay_ns, shape = to_nanoseconds(IMAGE_DELAY), (_CAMERA.height, _CAMERA.width)
+    recording = Recording(
+        Source(NAME, TRACKS), configured, _CAMERA,
+        [Arrival(k, frame.stamp_ns, frame.stamp_ns + delay_ns) for k, frame in enumerate(frames)],
+        [ImuSample(int(ns), tuple(row[:3].tolist()), tuple(row[3:].tolist()))
+         for ns, row in zip(imu_ns, imu, strict=True)],
+        lambda number: numbered_image(number, shape), sightings, truth.relative_pose, imu_ns,
+        imu[:, :3] @ C.T)
+    return recording, truth
+
+
+def _corners(text: str) -> _Corners | None:
+    """Stamp, corners by number and pixels of an image's file; None without corners."""
+    lines = text.splitlines()[1:]
+    if not lines:
+        return None
+    table = np.loadtxt(io.StringIO('\n'.join(lines)), delimiter=',', ndmin=2)
+    ids = (4 * table[:, -2] + table[:, -1]).astype(np.int64)
+    order = np.argsort(ids)
+    return _Corners(int(lines[0].partition(',')[0]), ids[order], table[order, 5:7])
+
+
+# -- paths against the truth ------------------------------------------------------------------
+
+# Lengths of the walks [s].
+SHORT, LONG = 30.0, 300.0
+# Part of a path that is aligned before its end is compared [s].
+_ALIGNED = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class PathMetrics:
+    """Odometry of a recording.
+
+    `start`: seconds from the first pair to the first published keyframe. `step_nees`: mean of
+    the smoothed steps between keyframes, `live_nees`: median of the live positions against the
+    start, both in units of their covariances, by degrees of freedom; NaN where the truth has
+    errors of its own. `drift`: error of the end after the first 5 s are aligned, by the length of
+    the path [%]. `processor`: of one core, by the graph alone, without messages [%].
+    """
+
+    name: str
+    readout_ms: float
+    seconds: float
+    pairs: int
+    contradicting: int
+    lost: int
+    at_rest: bool
+    start: float
+    live: TrajectoryErrors
+    smoothed: TrajectoryErrors
+    step_nees: float
+    live_nees: float
+    drift: float
+    processor: float
+
+
+def walks(count: int, first_seed: int, seconds: float = SHORT, *, readout: float | None = None,
+          plan: str = '') -> list[SimulationConfig]:
+    """Recordings of hand-held walks; scenes alternate, readouts are spread from 12 to 35 ms.
+
+    Without a `plan`, they include standstills and pure rotations.
+    """
+    return [SimulationConfig(
+        seed=first_seed + k, scene=SCENES[k % len(SCENES)], duration=seconds, plan=plan,
+        readout_time=round(0.012 + 0.023 * k / max(count - 1, 1), 4) if readout is None
+        else readout) for k in range(count)]
+
+
+def on_walk(config: SimulationConfig) -> PathMetrics:
+    """Odometry of a simulated recording."""
+    simulation = simulate(config)
+    source = Source(f'{config.scene} {config.seed}' + (', in motion' if config.plan else ''),
+                    TRACKS, 'walk', config.scene, config.seed)
+    recording = simulated(source, simulation, TrackNoise(), np.random.default_rng(config.seed))
+    states = simulation.states(simulation.imu.stamps_ns)
+    truth = TrueTrajectory(simulation.imu.stamps_ns, states.position,
+                           Rotation.from_matrix(states.R_world_cam).as_quat())
+    return on_recording(recording, truth)
+
+
+def on_euroc(folder: Path, picture: Path) -> PathMetrics:
+    """Odometry of EuRoC's corners, and a picture of the path."""
+    recording, truth = read_euroc(folder)
+    return on_recording(recording, truth, exact=False, picture=picture)
+
+
+def on_recording(recording: Recording, truth: TrueTrajectory, *, exact: bool = True,
+                 picture: Path | None = None) -> PathMetrics:
+    """Odometry of a recording's pairs and samples; `exact`: whether the truth is."""
+    parameters = Parameters.from_mapping(recording.configured.values)
+    arrives = {arrival.stamp_ns: arrival.arrives_ns for arrival in recording.arrivals}
+    # A list, so that the time of the front end does not count.
+    pairs = [(arrives[pair.stamp_ns], KeyframePair.of_result(pair))
+             for pair, _ in run(recording, recording.configured)]
+    delay_ns = to_nanoseconds(IMU_DELAY)
+    samples = [(sample.stamp_ns + delay_ns, sample) for sample in recording.samples]
+    warm_up_odometry()
+    estimator = OdometryEstimator(parameters, keep=True)
+    started = time.thread_time()
+    live = follow(estimator, pairs, samples)
+    processor = time.thread_time() - started
+    smoothed = estimator.smoothed()
+    paths = {'live': path_of(live, truth), 'smoothed': path_of(smoothed, truth)}
+    errors = [path.errors for path in paths.values() if path.errors is not None]
+    if len(errors) < 2:
+        raise InputError(f'{recording.source.name}: odometry did not start')
+    if picture is not None:
+        draw_paths(paths, picture)
+    first = estimator.starts[0]
+    return PathMetrics(
+        recording.source.name, 1e3 * recording.camera.readout_time, recording.seconds,
+        len(pairs), estimator.counts['contradicting'], estimator.counts['lost'], first.at_rest,
+        first.seconds, errors[0], errors[1],
+        step_nees(estimator, truth) if exact else math.nan,
+        live_nees(live, smoothed[0], truth) if exact else math.nan, drift(live, truth),
+        100.0 * processor / recording.seconds)
+
+
+def step_nees(estimator: OdometryEstimator, truth: TrueTrajectory) -> float:
+    """Squared errors of the smoothed steps in units of their covariance; mean, by 3."""
+    found = []
+    for start_ns, end_ns, step in estimator.smoothed_steps():
+        known = truth.relative_pose(start_ns, end_ns)
+        if known is not None:
+            error = step.translation - known[1]
+            found.append(error @ np.linalg.solve(step.covariance, error) / 3.0)
+    return float(np.mean(found))
+
+
+def live_nees(live: Sequence[Odometry], first: Odometry, truth: TrueTrajectory) -> float:
+    """The same of live positions against the `first` one, smoothed, which is that of the truth."""
+    if not truth.covers(first.imu_ns):
+        return math.nan
+    R_path_truth = first.R @ truth.rotation(first.imu_ns).T
+    found = []
+    for pose in live:
+        if truth.covers(pose.imu_ns):
+            error = pose.position - first.position - R_path_truth @ (
+                truth.position(pose.imu_ns) - truth.position(first.imu_ns))
+            found.append(error @ np.linalg.solve(pose.pose_covariance[:3, :3], error) / 3.0)
+    return float(np.median(found))
+
+
+def drift(live: Sequence[Odometry], truth: TrueTrajectory) -> float:
+    """Error of the last position after the first 5 s are aligned, in % of the path."""
+    covered = [pose for pose in live if truth.covers(pose.imu_ns)]
+    places = np.array([pose.position for pose in covered])
+    true = np.array([truth.position(pose.imu_ns) for pose in covered])
+    early = [seconds_between(covered[0].imu_ns, pose.imu_ns) < _ALIGNED for pose in covered]
+    R, t, _ = aligned(places[early], true[early])
+    length = np.linalg.norm(np.diff(true, axis=0), axis=1).sum()
+    return float(100.0 * np.linalg.norm(R @ places[-1] + t - true[-1]) / length)
+
+
+def write_report(folder: Path, paths: Sequence[PathMetrics]) -> str:
+    """Write the metrics (CSV) and the report (Markdown), and return the latter."""
+    return write_table(folder, 'odometry', paths, markdown_table(
+        ('recording', 'readout [ms]', 'length [m]', 'started [s]', 'live: ATE [m]', 'scale [%]',
+         'over 1 m [%]', 'smoothed: ATE', 'scale', 'over 1 m', 'NEES of steps',
+         'of live positions', 'drift [%]', 'core [%]', 'left out'),
+        [(f'{p.name}, {p.seconds:.0f} s', f'{p.readout_ms:.1f}', f'{p.live.length_m:.1f}',
+          f'{p.start:.1f}' + (' at rest' if p.at_rest else ''), *_errors(p.live),
+          *_errors(p.smoothed), _known(p.step_nees), _known(p.live_nees), f'{p.drift:.3f}',
+          f'{p.processor:.1f}',
+          f'{p.contradicting} of {p.pairs}' + (f', lost {p.lost} times' if p.lost else ''))
+         for p in paths]))
+
+
+def _known(value: float) -> str:
+    return '-' if math.isnan(value) else f'{value:.2f}'
+
+
+def _errors(errors: TrajectoryErrors) -> tuple[str, str, str]:
+    return (f'{errors.ate_m:.3f}', f'{100.0 * errors.scale_error:+.2f}',
+            f'{errors.relative_translation_error_percent:.2f}')

@@ -1,0 +1,279 @@
+"""A hand-held walk as a trajectory: gait, sway and tremor, with stretches of simpler motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import itertools
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_lab.simulation.trajectory import Segment, Trajectory
+from rs_relpose_ros.errors import InputError
+
+Array = NDArray[np.float64]
+
+KINDS = ('walk', 'constant', 'still', 'rotate')
+
+CONTROL_SPACING = 0.03
+# Time [s] in which one kind of motion passes into the next: a ramp of the control points, three
+# further ones on either side because a point of the spline depends on several.
+_RAMP = 10 * CONTROL_SPACING
+_TRANSITION = _RAMP + 6 * CONTROL_SPACING
+
+EYE_HEIGHT = 1.6
+_ARENA_RADIUS = 1.3
+_STEP_FREQUENCY = 1.8
+
+# Amplitude [deg], frequency [Hz] and axis (yaw, pitch, roll) of the rotation: looking around,
+# sway at the stride's frequency, nodding at the step's, tremor. Scaled as a whole to the rate.
+_ROTATIONS = (
+    (16.0, 0.31, 0), (5.0, 0.73, 0), (2.0, 0.9, 0), (0.35, 3.7, 0),
+    (4.0, 0.43, 1), (1.2, 1.8, 1), (0.30, 4.3, 1),
+    (3.0, 0.37, 2), (1.8, 0.9, 2), (0.35, 3.1, 2),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Kinds of motion one after the other, each with its duration [s]."""
+
+    parts: tuple[tuple[str, float], ...]
+
+    @classmethod
+    def parse(cls, text: str) -> Plan:
+        """Plan of a text such as ``'walk:1.5,still:0.6'``."""
+        parts = []
+        for item in text.split(','):
+            kind, _, duration = item.strip().partition(':')
+            try:
+                seconds = float(duration)
+            except ValueError:
+                seconds = math.nan
+            if kind not in KINDS or not 0.0 < seconds < math.inf:
+                raise InputError(
+                    f'plan must be a list such as walk:1.5,still:0.6 of {", ".join(KINDS)} with '
+                    f'seconds > 0, got {item.strip()!r}')
+            parts.append((kind, seconds))
+        return cls(tuple(parts))
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator, duration: float) -> Plan:
+        """Walks, with each of the simpler motions once in 6 s, in an order that is drawn."""
+        parts: list[tuple[str, float]] = []
+        total = -_TRANSITION
+        while total < duration:
+            pause = [('still', 0.52), ('rotate', 0.52)]
+            blocks = [[('constant', 0.75)], pause[::rng.choice((1, -1))]]
+            rng.shuffle(blocks)
+            cycle = [('walk', 0.55), *blocks[0], ('walk', 0.55), *blocks[1], ('walk', 0.4)]
+            parts += cycle
+            total += sum(seconds + _TRANSITION for _, seconds in cycle)
+        return cls(tuple(parts))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Levels:
+    """How much of each ingredient acts at every control point, 0 to 1."""
+
+    travel: Array     # moving along the heading
+    gait: Array       # changes of heading, speed and height
+    rotation: Array   # the sinusoids of the angles
+    panning: Array    # even rotation about the vertical
+
+
+def hand_held(rng: np.random.Generator, start: float, end: float, plan: Plan, *, speed: float,
+              rotation_rate: float) -> Trajectory:
+    """Trajectory of `plan` from time 0, defined at least from `start` to `end` [s].
+
+    What lies before time 0 continues the plan's first part, what lies after its end the last one.
+    `speed` [m/s], `rotation_rate` [rad/s, root mean square]: while walking.
+    """
+    margin = 6 * CONTROL_SPACING
+    count = math.ceil((end - start + 2 * margin) / CONTROL_SPACING) + 1
+    times: Array = start - margin + CONTROL_SPACING * np.arange(count, dtype=np.float64)
+    segments = _segments(plan)
+    levels = _levels(times, segments)
+    return Trajectory(_walk(rng, times, levels, speed),
+                      _angles(rng, times, levels, rotation_rate),
+                      float(times[0]), CONTROL_SPACING, segments)
+
+
+def _segments(plan: Plan) -> tuple[Segment, ...]:
+    segments = []
+    begin = 0.0
+    for kind, duration in plan.parts:
+        segments.append(Segment(kind, begin, begin + duration))
+        begin += duration + _TRANSITION
+    return tuple(segments)
+
+
+def _levels(times: Array, segments: tuple[Segment, ...]) -> _Levels:
+    # A step function that changes in the middle of the transitions, smoothed by a window as wide
+    # as the ramp: inside a segment the levels are then constant, not nearly so.
+    borders = [(before.end + after.start) / 2
+               for before, after in itertools.pairwise(segments)]
+    half = round(_RAMP / 2 / CONTROL_SPACING)
+    padded = times[0] + CONTROL_SPACING * np.arange(-half, len(times) + half)
+    index = np.searchsorted(borders, padded)
+    window = np.hanning(2 * half + 3)[1:-1]
+    window /= window.sum()
+
+    def level(**by_kind: float) -> Array:
+        steps = np.array([by_kind.get(segment.kind, 0.0) for segment in segments])[index]
+        smooth: Array = np.convolve(steps, window, mode='valid')
+        # The weights add up to 1 only nearly.
+        return smooth.round(12)
+
+    return _Levels(travel=level(walk=1.0, constant=1.0), gait=level(walk=1.0),
+                   rotation=level(walk=1.0, rotate=1.0), panning=level(constant=1.0))
+
+
+def _walk(rng: np.random.Generator, times: Array, levels: _Levels, speed: float) -> Array:
+    """Control points (K, 3) of the position: an arc about the origin at eye height.
+
+    The camera looks along x on average; the arc starts sideways and passes through forward.
+    """
+    side = rng.choice((-1.0, 1.0))
+    heading = side * math.radians(rng.uniform(75.0, 105.0))
+    curvature = -side * math.radians(rng.uniform(8.0, 25.0))
+    swell, step, stride = rng.uniform(0.0, 2 * math.pi, 3)
+    position = np.array([-1.5 * math.cos(heading), -1.5 * math.sin(heading), EYE_HEIGHT])
+    positions = np.empty((len(times), 3))
+    for k, time in enumerate(times):
+        positions[k] = position
+        gait = levels.gait[k]
+        turn_rate = curvature
+        if math.hypot(position[0], position[1]) > _ARENA_RADIUS:
+            # Walk back towards the middle, by the shorter way.
+            homewards = math.atan2(-position[1], -position[0])
+            error = math.remainder(homewards - heading, 2 * math.pi)
+            turn_rate = math.radians(110.0) * math.tanh(2.0 * error)
+        heading += CONTROL_SPACING * gait * turn_rate
+        along = levels.travel[k] * speed * (
+            1.0 + 0.1 * gait * math.sin(2 * math.pi * 0.4 * time + swell))
+        across = gait * 0.12 * math.cos(math.pi * _STEP_FREQUENCY * time + stride)
+        # Two centimetres of bobbing, held near eye height.
+        climb = gait * (0.02 * 2 * math.pi * _STEP_FREQUENCY
+                        * math.cos(2 * math.pi * _STEP_FREQUENCY * time + step)
+                        + 0.8 * (EYE_HEIGHT - position[2]))
+        cosine, sine = math.cos(heading), math.sin(heading)
+        position = position + CONTROL_SPACING * np.array(
+            [along * cosine - across * sine, along * sine + across * cosine, climb])
+    # Clear of what stands around: the middle of the walk is the middle of the scene.
+    positions[:, :2] -= (positions[:, :2].min(axis=0) + positions[:, :2].max(axis=0)) / 2
+    return positions
+
+
+def _angles(rng: np.random.Generator, times: Array, levels: _Levels,
+            rotation_rate: float) -> Array:
+    """Control points (K, 3) of yaw, pitch and roll."""
+    amplitudes = np.array([amplitude for amplitude, _, _ in _ROTATIONS])
+    amplitudes = np.radians(amplitudes * rng.uniform(0.7, 1.3, len(_ROTATIONS)))
+    frequencies = np.array([frequency for _, frequency, _ in _ROTATIONS])
+    frequencies = frequencies * rng.uniform(0.85, 1.15, len(_ROTATIONS))
+    phases = rng.uniform(0.0, 2 * math.pi, len(_ROTATIONS))
+    rms = math.sqrt(float(((amplitudes * 2 * math.pi * frequencies) ** 2).sum() / 2))
+    amplitudes *= rotation_rate / rms
+    # The sinusoids run on a clock of their own that stops without rotation.
+    clock = CONTROL_SPACING * np.concatenate([[0.0], np.cumsum(levels.rotation[:-1])])
+    angles = np.zeros((len(times), 3))
+    for amplitude, frequency, phase, (_, _, axis) in zip(
+            amplitudes, frequencies, phases, _ROTATIONS, strict=True):
+        angles[:, axis] += amplitude * np.sin(2 * math.pi * frequency * clock + phase)
+    # Pans to and fro, so that the view stays where the scene is.
+    pan_rate = rng.choice((-1.0, 1.0)) * math.radians(rng.uniform(8.0, 15.0))
+    starts = np.flatnonzero((levels.panning[1:] > 0) & (levels.panning[:-1] == 0))
+    signs = (-1.0) ** np.searchsorted(starts, np.arange(len(times)))
+    pan = CONTROL_SPACING * pan_rate * signs * levels.panning
+    angles[:, 0] += np.concatenate([[0.0], np.cumsum(pan[:-1])])
+    angles[:, 1] += math.radians(rng.uniform(-2.0, 5.0))
+    return angles
+
+
+# -- A wheeled robot as a trajectory: it drives forward, stops, and rocks on its springs ---
+
+# Height of the camera [m], and distance from the middle of the scene at which the robot returns.
+_ROBOT_HEIGHT = 1.2
+# Yaw rates [rad/s]: of steering about, and largest of the way back to the middle.
+_WANDER_RATE, _HOMING_RATE = math.radians(18.0), math.radians(50.0)
+# Rocking of pitch and roll on the springs: natural frequency [Hz], damping, rms [rad].
+_SPRING_FREQUENCY, _DAMPING, _ROCKING = 1.4, 0.25, math.radians(0.7)
+# Lean [rad] per acceleration [m/s^2]: nose down in braking, outwards in a turn.
+_LEAN = math.radians(1.0)
+_HEAVE = 0.006
+# One stop in so many seconds; how long it takes, with braking and starting.
+_STOP_EVERY, _STOP = 9.0, 2.4
+
+
+def vehicle(rng: np.random.Generator, start: float, end: float, *, speed: float) -> Trajectory:
+    """Trajectory that is defined at least from `start` to `end` [s].
+
+    `speed` [m/s]: while it drives. The camera looks ahead; position and heading obey
+    ``p' = v (cos yaw, sin yaw)``.
+    """
+    margin = 6 * CONTROL_SPACING
+    count = math.ceil((end - start + 2 * margin) / CONTROL_SPACING) + 1
+    times: Array = start - margin + CONTROL_SPACING * np.arange(count, dtype=np.float64)
+    speeds = speed * _throttle(rng, times)
+    positions, yaw = _drive(rng, times, speeds, speed)
+    acceleration = np.gradient(speeds, CONTROL_SPACING)
+    sideways = speeds * np.gradient(yaw, CONTROL_SPACING)
+    # The road shakes a robot that drives, and only one that drives.
+    road = speeds / speed
+    pitch, roll, heave = (_spring(rng.standard_normal(count) * road) for _ in range(3))
+    positions[:, 2] += _HEAVE * heave
+    angles = np.column_stack([yaw, _ROCKING * pitch - _LEAN * acceleration,
+                              _ROCKING * roll + _LEAN * sideways])
+    angles[:, 1] += math.radians(rng.uniform(-1.0, 4.0))
+    return Trajectory(positions, angles, float(times[0]), CONTROL_SPACING, ())
+
+
+def _throttle(rng: np.random.Generator, times: Array) -> Array:
+    """Share (K,) of the full speed: swells, and ramps down to a stop and up again."""
+    swell = 1.0 - 0.2 * (1.0 + np.sin(2 * math.pi * 0.13 * times + rng.uniform(0, 2 * math.pi)))
+    since = (times + rng.uniform(-1.5, 0.0)) % _STOP_EVERY - 0.6 * _STOP_EVERY
+    inside = np.clip(since / _STOP, 0.0, 1.0)
+    # 1 outside of the stop, 0 in its middle third, cosines between.
+    stop = 0.5 - 0.5 * np.cos(math.pi * np.clip(3.0 * np.abs(inside - 0.5) - 0.5, 0.0, 1.0))
+    return np.asarray(swell * stop)
+
+
+def _drive(rng: np.random.Generator, times: Array, speeds: Array,
+           full: float) -> tuple[Array, Array]:
+    """Control points (K, 3) of the position and (K,) of the yaw."""
+    phases = rng.uniform(0.0, 2 * math.pi, 2)
+    wander = _WANDER_RATE * (np.sin(2 * math.pi * 0.11 * times + phases[0])
+                             + np.sin(2 * math.pi * 0.29 * times + phases[1]))
+    position = np.array([*rng.uniform(-1.0, 1.0, 2), _ROBOT_HEIGHT])
+    heading, steering = rng.uniform(-math.pi, math.pi), 0.0
+    positions, yaw = np.empty((len(times), 3)), np.empty(len(times))
+    for k, driven in enumerate(speeds):
+        positions[k], yaw[k] = position, heading
+        wanted = wander[k]
+        if math.hypot(position[0], position[1]) > _ARENA_RADIUS:
+            homewards = math.atan2(-position[1], -position[0])
+            wanted = _HOMING_RATE * math.tanh(2.0 * math.remainder(homewards - heading,
+                                                                   2 * math.pi))
+        # The wheels need 0.4 s to turn, and a robot that stands does not.
+        steering += CONTROL_SPACING / 0.4 * (wanted - steering)
+        heading += CONTROL_SPACING * steering * driven / full
+        position = position + CONTROL_SPACING * driven * np.array(
+            [math.cos(heading), math.sin(heading), 0.0])
+    positions[:, :2] -= (positions[:, :2].min(axis=0) + positions[:, :2].max(axis=0)) / 2
+    return positions, yaw
+
+
+def _spring(push: Array) -> Array:
+    """Answer (K,) of a damped spring to the road's pushes (K,), of about unit variance."""
+    w = 2 * math.pi * _SPRING_FREQUENCY
+    place, rate = 0.0, 0.0
+    places = np.empty(len(push))
+    # Variance of the place under white noise of density q: q / (4 damping w^3).
+    strength = math.sqrt(4.0 * _DAMPING * w**3 / CONTROL_SPACING)
+    for k, pushed in enumerate(push):
+        rate += CONTROL_SPACING * (strength * pushed - 2.0 * _DAMPING * w * rate - w * w * place)
+        place += CONTROL_SPACING * rate
+        places[k] = place
+    return places

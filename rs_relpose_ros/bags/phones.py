@@ -1,0 +1,455 @@
+"""Folders of Android loggers, each recognised by its files (`LOGGERS`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+import logging
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_ros.bags import convert
+from rs_relpose_ros.bags.convert import by_stamp, read_object, read_table, Recording, Row
+from rs_relpose_ros.bags.video import readout_of_milliseconds, readout_values, Video
+from rs_relpose_ros.config.files import SourcedValue
+from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.timing import NANOSECONDS
+from rs_relpose_ros.imu.buffer import ImuSample, Vector
+from rs_relpose_ros.messages.incoming import TruePose
+
+_MILLISECOND = 1e-6   # ns in ms
+
+_STAMP_ROW = SourcedValue('stamp_row', 'first', "Android's SENSOR_TIMESTAMP is that of the first "
+                          'row.')
+_TIME_OFFSET = SourcedValue(
+    'time_offset', 0.0, 'NOT KNOWN: as the logger stamps. On some phones camera and IMU differ by '
+    'tens of milliseconds; `rs_relpose calibrate` measures it.')
+
+_logger = logging.getLogger(__name__)
+
+
+def read_android(folder: Path) -> Recording:
+    """A recording of any of `LOGGERS`; MissingInputError if it is of none of them."""
+    for logger in LOGGERS:
+        if all((folder / name).exists() for name in logger.files):
+            return logger.read(folder)
+    known = '; '.join(f'{", ".join(logger.files)} ({logger.name})' for logger in LOGGERS)
+    raise MissingInputError(f'{folder} is of no known logger, by its files: {known}')
+
+
+# -- Parameters that loggers have in common -------------------------------------------------------
+
+def _title(folder: Path, details: str) -> str:
+    return (f'Parameters of relpose_node for {folder.name} (`rs_relpose convert android`)'
+            f'{details}.')
+
+
+def _axes(sensor_orientation: object = None) -> SourcedValue:
+    """Rotation from the phone's sensor axes to a back camera, from its SENSOR_ORIENTATION [deg].
+
+    The angle by which the image is rotated clockwise to be upright in the natural orientation of
+    the phone: x right, y up, z out of the screen. Most phones have 90.
+    """
+    angle = 90
+    source = 'ASSUMED: back camera with SENSOR_ORIENTATION {} deg, as most phones have it.'
+    if type(sensor_orientation) is int and abs(sensor_orientation) <= 360:
+        angle, source = sensor_orientation, "The camera's SENSOR_ORIENTATION, {} deg, as logged."
+    half = math.radians(angle) / 2.0
+    quaternion = (round(math.cos(half), 8), round(-math.sin(half), 8), 0.0, 0.0)
+    return SourcedValue('quat_cam_imu_xyzw', quaternion, source.format(angle))
+
+
+def _readout(skews_ns: Sequence[float], column: str) -> list[SourcedValue]:
+    """Median of the logged SENSOR_ROLLING_SHUTTER_SKEW [ns]; nothing if none is logged."""
+    if not skews_ns:
+        return []
+    reported = readout_of_milliseconds(float(np.median(skews_ns)) * _MILLISECOND, column)
+    return [] if reported is None else readout_values(
+        reported, f'Reported by the phone: median of {column}, which is that of the whole sensor: '
+        'less if the image is cropped at its top and bottom.')
+
+
+def _exposure(exposures_ns: Sequence[float]) -> list[SourcedValue]:
+    """What SENSOR_TIMESTAMP marks, with the median exposure [ns]; nothing if none is logged."""
+    median = float(np.median(exposures_ns)) / NANOSECONDS if exposures_ns else 0.0
+    if not 0.0 < median < 1.0:
+        return []
+    return [SourcedValue('stamp_exposure', 'start', "Android's SENSOR_TIMESTAMP is the start of "
+                         'the exposure.'),
+            SourcedValue('exposure_time', round(median, 9), 'Median of the logged exposures: '
+                         f'{min(exposures_ns) * _MILLISECOND:.2f} to '
+                         f'{max(exposures_ns) * _MILLISECOND:.2f} ms.')]
+
+
+def _camera_matrix(fx: float, fy: float, cx: float, cy: float, source: str) -> SourcedValue:
+    """Intrinsics that are no calibration: a parameter, and no CameraInfo."""
+    return SourcedValue('camera_matrix', (fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0), source)
+
+
+def _refuse_portrait(path: Path, width: int, height: int) -> None:
+    """Refuse images higher than wide: they were rotated, as no phone's sensor is."""
+    if height > width:
+        raise InputError(
+            f'{path} has images of {width}x{height}: they were rotated, and their rows are the '
+            "sensor's columns; record in the sensor's own orientation (landscape)")
+
+
+def _landscape_video(path: Path) -> Video:
+    video = Video(path)
+    _refuse_portrait(path, video.width, video.height)
+    return video
+
+
+def _optional_table(path: Path) -> list[Row]:
+    return read_table(path) if path.is_file() else []
+
+
+def _optional_object(path: Path) -> Mapping[str, Any]:
+    return read_object(path) if path.is_file() else {}
+
+
+def _reals(rows: list[Row], column: str) -> list[float]:
+    """Numbers of a column, without the rows in which it is absent, empty or 'null'."""
+    return [row.real(column) for row in rows if row.words.get(column, '') not in ('', 'null')]
+
+
+# -- Recordings of any logger as tables -----------------------------------------------------------
+
+_STAMPS = ('stamp_ns', 'timestamp_ns')
+
+
+def read_tables(folder: Path) -> Recording:
+    """Recordings of any logger as tables with a header line.
+
+    The files::
+
+        frames.csv   stamp_ns, file (a JPEG image; without it, the frames of the only video)
+        gyro.csv     stamp_ns,x,y,z   [rad/s]
+        accel.csv    stamp_ns,x,y,z   [m/s^2] specific force; may be absent
+
+    All stamps on one clock, the IMU in the phone's sensor axes; other columns are ignored.
+    """
+    gyro = by_stamp(ImuSample(_stamp(row), row.vector(*'xyz'), None)
+                    for row in read_table(folder / 'gyro.csv'))
+    accel = by_stamp(ImuSample(_stamp(row), None, row.vector(*'xyz'))
+                     for row in _optional_table(folder / 'accel.csv'))
+    return Recording(
+        None, _table_images(folder, read_table(folder / 'frames.csv')), gyro,
+        _title(folder, '. `rs_relpose calibrate` estimates readout time and focal length'),
+        (convert.COMPRESSED, _STAMP_ROW, _TIME_OFFSET, _axes()), accel=accel)
+
+
+def _stamp(row: Row) -> int:
+    return row.nanoseconds(next((name for name in _STAMPS if name in row.words), _STAMPS[0]))
+
+
+def _table_images(folder: Path, frames: list[Row]) -> tuple[convert.RecordedImage, ...]:
+    if 'file' in frames[0].words:
+        return tuple(convert.image_file(_stamp(row), convert.file_inside(folder, row, 'file'))
+                     for row in frames)
+    videos = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in ('.mp4', '.mov')]
+    if len(videos) != 1:
+        raise InputError(f'{frames[0].path} has no column file, and {folder} has {len(videos)} '
+                         'videos (.mp4, .mov): there must be one')
+    return _landscape_video(videos[0]).frames([_stamp(row) for row in frames], frames[0].path)
+
+
+# -- Recordings with a line of JSON for each event ------------------------------------------------
+
+_VIDEOS = ('data.mp4', 'data.mov', 'data.mkv')
+# Times can begin at any value, also below 0, where stamps cannot be.
+_START_NS = 1000 * NANOSECONDS
+# model -> its name here, and the possible numbers of its coefficients.
+_MODELS = {'pinhole': ('plumb_bob', (0, 3)), 'brown-conrady': ('plumb_bob', (0, 3, 4, 5, 8)),
+           'kannala-brandt4': ('equidistant', (4,))}
+
+
+def read_jsonl(folder: Path) -> Recording:
+    """Frames of the first camera, and the IMU, of Spectacular AI's recorders.
+
+    The format (github.com/SpectacularAI/docs, other/DATA_FORMAT.md)::
+
+        data.mp4 (or .mov, .mkv)   the frames
+        data.jsonl                 {"time": s, "number": n, "frames": [{"cameraInd": 0, ...}]}
+                                   {"time": s, "sensor": {"type": "gyroscope",
+                                   "values": [x, y, z]}} and accelerometer; rad/s, m/s^2
+        calibration.json           cameras: focalLengthX, ..., model, distortionCoefficients,
+                                   imuToCamera (4x4), imageWidth, imageHeight
+    """
+    times_ns, gyro, accel = _events(folder / 'data.jsonl')
+    path = next((folder / name for name in _VIDEOS if (folder / name).is_file()), None)
+    if path is None:
+        raise MissingInputError(f'{folder} has no video: {" or ".join(_VIDEOS)}')
+    video = _landscape_video(path)
+    camera, rotation = _calibration(folder / 'calibration.json', video)
+    return Recording(
+        camera, video.frames(times_ns, folder / 'data.jsonl'), gyro,
+        _title(folder, ': recorded as data.jsonl. `rs_relpose calibrate` estimates the readout '
+               'time'),
+        (convert.COMPRESSED, _STAMP_ROW, _TIME_OFFSET, rotation), accel=accel)
+
+
+def _events(path: Path) -> tuple[list[int], tuple[ImuSample, ...], tuple[ImuSample, ...]]:
+    """Stamps of the frames [ns] by their numbers, samples of gyro and accelerometer."""
+    frames: list[tuple[int, int]] = []
+    gyro: list[ImuSample] = []
+    accel: list[ImuSample] = []
+    for row in convert.read_lines(path):
+        sensor = row.words.get('sensor')
+        sensor = sensor if isinstance(sensor, dict) else {}
+        kind = sensor.get('type')
+        if 'frames' in row.words:
+            frames.append((row.integer('number'), row.seconds_as_nanoseconds('time', _START_NS)))
+        elif kind in ('gyroscope', 'accelerometer'):
+            values = sensor.get('values')
+            if not isinstance(values, list) or len(values) != 3:
+                raise row.error('values must be three numbers')
+            stamp_ns = row.seconds_as_nanoseconds('time', _START_NS)
+            vector = replace(row, words=dict(enumerate(values))).vector(0, 1, 2)
+            if kind == 'gyroscope':
+                gyro.append(ImuSample(stamp_ns, vector, None))
+            else:
+                accel.append(ImuSample(stamp_ns, None, vector))
+    return [stamp_ns for _, stamp_ns in sorted(frames)], by_stamp(gyro), by_stamp(accel)
+
+
+def _calibration(path: Path, video: Video) -> tuple[RollingShutterCamera | None, SourcedValue]:
+    """Camera and rotation from IMU to camera, if the file has them."""
+    if not path.is_file():
+        return None, _axes()
+    cameras = read_object(path).get('cameras')
+    if not isinstance(cameras, list) or not cameras or not isinstance(cameras[0], dict):
+        raise InputError(f'{path} must have a list of cameras')
+    try:
+        camera = _calibrated_camera(cameras[0], video.width, video.height)
+        matrix = cameras[0].get('imuToCamera', cameras[0].get('imuToCameraMatrix'))
+        if matrix is None:
+            return camera, _axes()
+        rotation = Rotation.from_matrix(np.asarray(matrix, dtype=np.float64)[:3, :3])
+    except (ArithmeticError, LookupError, TypeError, ValueError) as error:
+        raise InputError(f'{path}: {error}') from error
+    quaternion = tuple(round(float(value), 8) for value in rotation.as_quat())
+    return camera, SourcedValue('quat_cam_imu_xyzw', quaternion,
+                                'imuToCamera of calibration.json.')
+
+
+def _calibrated_camera(found: dict[str, Any], width: int, height: int) -> RollingShutterCamera:
+    model, counts = _MODELS[found['model']]
+    coefficients: Sequence[float] = found.get('distortionCoefficients') or ()
+    if len(coefficients) not in counts:
+        raise InputError(f'{found["model"]} has {len(coefficients)} coefficients')
+    if (found['imageWidth'], found['imageHeight']) != (width, height):
+        raise InputError(f'the calibration is for {found["imageWidth"]}x{found["imageHeight"]}, '
+                         f'but the video has {width}x{height}')
+    if model == 'plumb_bob' and len(coefficients) == 3:   # radial ones only
+        coefficients = (coefficients[0], coefficients[1], 0.0, 0.0, coefficients[2])
+    # Readout time 0: the format has none, and calibrate estimates it.
+    return RollingShutterCamera(
+        width=width, height=height, fx=found['focalLengthX'], fy=found['focalLengthY'],
+        cx=found['principalPointX'], cy=found['principalPointY'], distortion_model=model,
+        distortion=tuple(coefficients), readout_time=0.0)
+
+
+# -- MARS Logger ----------------------------------------------------------------------------------
+
+# How far the two clocks may drift apart during a recording [ns]; beyond it the phone slept.
+_MAX_DRIFT_NS = 1_000_000
+
+
+def read_mars(folder: Path) -> Recording:
+    """Frames of the movie with the logged stamps, and the IMU, of the MARS Logger.
+
+    github.com/OSUPCVLab/mobile-ar-sensor-logger; as the app writes them::
+
+        movie.mp4              the frames
+        frame_timestamps.txt   Frame timestamp[nanosec], and more: a line for each frame
+        gyro_accel.csv         Timestamp[nanosec],gx[rad/s],gy[rad/s],gz[rad/s],ax[m/s^2],...
+        movie_metadata.csv     Timestamp[nanosec],fx[px],fy[px],...,Exposure time[nanosec],...,
+                               Frame readout time[nanosec],...
+        edge_epochs.txt        clock of the camera's stamps, and both clocks at start and end
+    """
+    video = _landscape_video(folder / 'movie.mp4')
+    stamps = folder / 'frame_timestamps.txt'
+    shift_ns, clock = _clock(folder / 'edge_epochs.txt')
+    stamps_ns = [row.nanoseconds('Frame timestamp[nanosec]') + shift_ns
+                 for row in read_table(stamps)]
+    imu = by_stamp(ImuSample(row.nanoseconds('Timestamp[nanosec]'),
+                             row.vector(*(f'g{axis}[rad/s]' for axis in 'xyz')),
+                             row.vector(*(f'a{axis}[m/s^2]' for axis in 'xyz')))
+                   for row in read_table(folder / 'gyro_accel.csv'))
+    metadata = _optional_table(folder / 'movie_metadata.csv')
+    readout = 'Frame readout time[nanosec]'
+    return Recording(
+        None, video.frames(stamps_ns, stamps), imu,
+        _title(folder, ': recorded with the MARS Logger'),
+        (convert.COMPRESSED, *_readout(_reals(metadata, readout), readout),
+         *_exposure(_reals(metadata, 'Exposure time[nanosec]')),
+         *_nominal_focal_length(metadata, video), _STAMP_ROW,
+         SourcedValue('time_offset', 0.0, f'NOT KNOWN: {clock}. `rs_relpose calibrate` measures '
+                      'it.'), _axes()))
+
+
+def _nominal_focal_length(metadata: list[Row], video: Video) -> list[SourcedValue]:
+    fx, fy = (float(np.median(_reals(metadata, name) or [0.0])) for name in ('fx[px]', 'fy[px]'))
+    if min(fx, fy) <= 0.0:
+        return []
+    return [_camera_matrix(
+        fx, fy, (video.width - 1) / 2.0, (video.height - 1) / 2.0,
+        "A GUESS: the lens's nominal focal length as logged, principal point in the middle, no "
+        'distortion.')]
+
+
+def _clock(path: Path) -> tuple[int, str]:
+    """Difference from the camera's stamps to the IMU's clock [ns], and its description."""
+    unknown = 0, 'the clock of the camera is not logged'
+    if not path.is_file():
+        return unknown
+    with path.open(encoding='utf-8', errors='replace') as file:
+        if 'is SENSOR_INFO_TIMESTAMP_SOURCE_REALTIME' in file.readline(10_000):
+            return 0, 'camera and IMU have one clock, but its delays are not logged'
+    differences = [row.integer(2) for row in convert.read_rows(path, range(3), separator=None)]
+    if not differences:
+        return unknown
+    drift = max(differences) - min(differences)
+    if drift > _MAX_DRIFT_NS:
+        raise InputError(f'{path}: the clocks of camera and IMU drifted apart by '
+                         f'{drift * 1e-6:.1f} ms during the recording: the phone slept; record '
+                         'again')
+    return differences[0], ("the camera's clock is not the IMU's; its stamps were shifted by the "
+                            f'logged difference, {differences[0] * 1e-6:.3f} ms')
+
+
+# -- PoseCam --------------------------------------------------------------------------------------
+
+# From ARCore's camera (x right, y up, z backwards) to the optical frame (x right, y down).
+_GL_FROM_OPTICAL = Rotation.from_quat([1.0, 0.0, 0.0, 0.0])
+
+
+def read_posecam(folder: Path) -> Recording:
+    """Frames, IMU and, as ground truth, ARCore's poses of PoseCam: its format posecam-4 and later.
+
+    An Android app with ARCore. As its IMPLEMENTATION_README describes it::
+
+        poses.csv            frame_index,timestamp_ns,tx,ty,tz,qx,qy,qz,qw,tracking_state,image
+        frames/              INDEX_STAMP.jpg, as the sensor reads them, if `image` is saved
+        frame_metadata.csv   exposure_time_ns, rolling_shutter_skew_ns, ois_mode, ... of each row
+        imu.csv              timestamp_ns,sensor,x,y,z,bias_x,bias_y,bias_z: accel, gyro_uncal or
+                             gyro
+        intrinsics.json      fx, fy, cx, cy [px] by ARCore
+        device.json          camera: sensor_orientation_deg, timestamp_source, ...
+        manifest.json        pose_jumps, ...
+
+    Poses are ARCore's Camera.getPose: x right, y up, z backwards, in the world, at a frame's
+    stamp.
+    """
+    poses = read_table(folder / 'poses.csv')
+    images = tuple(
+        convert.image_file(row.nanoseconds('timestamp_ns'), folder / 'frames' / (
+            f'{row.nanoseconds("frame_index"):06d}_{row.nanoseconds("timestamp_ns")}.jpg'))
+        for row in poses if row.word('image') == 'saved')
+    gyro, accel, bias = _posecam_imu(folder / 'imu.csv')
+    metadata = _optional_table(folder / 'frame_metadata.csv')
+    if any(row.words.get('ois_mode') == '1' for row in metadata):
+        _logger.warning('%s: optical stabilisation was on: the focal point moves against the '
+                        'sensor, and the poses get worse; switch it off if the phone can',
+                        metadata[0].path)
+    skew = 'rolling_shutter_skew_ns'
+    camera = _optional_object(folder / 'device.json').get('camera')
+    return Recording(
+        None, images, gyro, _title(folder, ': recorded with PoseCam'),
+        (convert.COMPRESSED, *_readout(_reals(metadata, skew), skew),
+         *_exposure(_reals(metadata, 'exposure_time_ns')), _STAMP_ROW, _TIME_OFFSET,
+         _axes(camera.get('sensor_orientation_deg') if isinstance(camera, Mapping) else None),
+         *_intrinsics(folder / 'intrinsics.json'), *bias),
+        accel=accel, truth=_truth(poses, _jumps(folder / 'manifest.json')))
+
+
+def _posecam_imu(path: Path) -> tuple[tuple[ImuSample, ...], tuple[ImuSample, ...],
+                                      list[SourcedValue]]:
+    """Gyro, accelerometer, and the bias that the phone reports of an uncorrected gyro."""
+    gyro: list[ImuSample] = []
+    accel: list[ImuSample] = []
+    biases: list[Vector] = []
+    for row in read_table(path):
+        stamp_ns, kind = row.nanoseconds('timestamp_ns'), row.word('sensor')
+        value = row.vector(*'xyz')
+        if kind == 'accel':
+            accel.append(ImuSample(stamp_ns, None, value))
+        elif kind in ('gyro', 'gyro_uncal'):
+            gyro.append(ImuSample(stamp_ns, value, None))
+            if kind == 'gyro_uncal':
+                biases.append(row.vector('bias_x', 'bias_y', 'bias_z'))
+        else:
+            raise row.error(f'the sensor must be accel, gyro or gyro_uncal, got {kind[:40]!r}')
+    if not gyro:
+        raise MissingInputError(f'{path} has no samples of a gyro')
+    bias = [] if not biases else [
+        SourcedValue('gyro_bias', tuple(np.median(biases, axis=0).tolist()),
+                     'Median of the bias that the phone reports; the bag has raw rates.')]
+    return by_stamp(gyro), by_stamp(accel), bias
+
+
+def _truth(poses: list[Row], jumps: list[int]) -> tuple[TruePose, ...]:
+    """The longest sequence of tracked poses without a jump, after which the world is another."""
+    tracked = [row for row in poses if row.word('tracking_state') == 'TRACKING']
+    ends = np.searchsorted([row.nanoseconds('timestamp_ns') for row in tracked], sorted(jumps))
+    longest = max(np.split(np.arange(len(tracked)), ends), key=len)
+    if jumps:
+        _logger.warning('ARCore relocalised %d times: only the longest part between, of %d of '
+                        '%d poses, is used as ground truth', len(jumps), len(longest),
+                        len(tracked))
+    return tuple(_pose(tracked[number]) for number in longest)
+
+
+def _pose(row: Row) -> TruePose:
+    quaternion = [row.real(column) for column in ('qx', 'qy', 'qz', 'qw')]
+    length = math.hypot(*quaternion)
+    if abs(length - 1.0) > 1e-2:
+        raise row.error(f'the quaternion must have length 1, got {length:.3g}')
+    x, y, z, w = (Rotation.from_quat(quaternion) * _GL_FROM_OPTICAL).as_quat().tolist()
+    return TruePose(row.nanoseconds('timestamp_ns'), row.vector('tx', 'ty', 'tz'), (x, y, z, w))
+
+
+def _jumps(path: Path) -> list[int]:
+    """Stamps [ns] of the first frames after a jump of the poses."""
+    found = _optional_object(path).get('pose_jumps')
+    # Next to the list, whose name is not documented, are counts and thresholds.
+    jumps = [jump for values in (found.values() if isinstance(found, Mapping) else [found])
+             if isinstance(values, list) for jump in values if isinstance(jump, Mapping)]
+    stamps = [jump.get('timestamp_ns') for jump in jumps]
+    return [stamp for stamp in stamps if isinstance(stamp, int) and abs(stamp) < 2**63]
+
+
+def _intrinsics(path: Path) -> list[SourcedValue]:
+    if not path.is_file():
+        return []
+    found = read_object(path)
+    values = convert.finite_numbers([found.get(name) for name in ('fx', 'fy', 'cx', 'cy')], (4,))
+    if values is None:
+        raise InputError(f'{path} must have the numbers fx, fy, cx and cy')
+    width, height = found.get('width'), found.get('height')
+    if isinstance(width, int) and isinstance(height, int):
+        _refuse_portrait(path.with_name('frames'), width, height)
+    fx, fy, cx, cy = values.tolist()
+    return [_camera_matrix(fx, fy, cx, cy, "ARCore's intrinsics, without distortion.")]
+
+
+class Logger(NamedTuple):
+    """A logger, the files by which its folders are recognised, and its reader."""
+
+    name: str
+    files: tuple[str, ...]
+    read: Callable[[Path], Recording]
+
+
+LOGGERS = (
+    Logger('PoseCam', ('poses.csv', 'imu.csv', 'frames'), read_posecam),
+    Logger('MARS Logger', ('movie.mp4', 'frame_timestamps.txt', 'gyro_accel.csv'), read_mars),
+    Logger('data.jsonl', ('data.jsonl',), read_jsonl),
+    Logger('tables', ('frames.csv', 'gyro.csv'), read_tables),
+)

@@ -1,0 +1,219 @@
+"""Commands `replay`, `pairs` and `odometry`: poses from a bag into a folder."""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rs_relpose_ros.bags.reader import Bag, SensorTopics
+from rs_relpose_ros.cli.main import Command, FAILED
+from rs_relpose_ros.cli.options import add_run_arguments, run_on_bag, warn_unused
+from rs_relpose_ros.config.settings import Parameters
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.odometry import need_gtsam
+from rs_relpose_ros.offline.pairs import pairs_into, read_pairs
+from rs_relpose_ros.offline.replay import read_stamps, replay_into, ReplayOutcome
+from rs_relpose_ros.offline.tables import POSES
+from rs_relpose_ros.output_files import SUMMARY_FILE
+
+_MOST_REASONS = 5
+
+
+# -- replay ----------------------------------------------------------------------------------
+
+
+def _add_replay_arguments(parser: argparse.ArgumentParser) -> None:
+    add_run_arguments(parser, 'relpose')
+    parser.add_argument('--stamps', metavar='FILE', type=Path,
+                        help='use only the frames whose stamps [ns] are in FILE, one per line, as '
+                        'the parameter stamps_file of a live node wrote them: the poses are then '
+                        'equal to its poses, bit by bit')
+    parser.add_argument('--no-pictures', action='store_true', help='tables and summary only')
+    parser.add_argument('--bag', dest='with_bag', action='store_true',
+                        help="write the node's topics as an MCAP bag, too")
+
+
+def replay_bag(args: argparse.Namespace) -> tuple[Path, ReplayOutcome]:
+    """Replay and write the files of the command, into the folder that is returned."""
+    stamps = None if args.stamps is None else read_stamps(args.stamps)
+    return run_on_bag(
+        args, 'relpose', lambda folder, bag, topics, parameters: replay_into(
+            folder, bag, topics, parameters, stamps=stamps, pictures=not args.no_pictures,
+            with_bag=args.with_bag))
+
+
+def has_good_poses(outcome: ReplayOutcome) -> bool:
+    """Whether a pair has a pose, and no parameter is wrong."""
+    metrics = outcome.metrics
+    return bool(metrics['pairs']['answered']) and metrics['health']['state'] != 'wrong'
+
+
+def _replay(args: argparse.Namespace) -> int:
+    folder, outcome = replay_bag(args)
+    metrics = outcome.metrics
+    warn_unused(metrics['not_used'])
+    _print_replay(outcome)
+    print(f'in {folder}: {", ".join([*(path.name for path in outcome.files), SUMMARY_FILE])}')
+    return 0 if has_good_poses(outcome) else FAILED
+
+
+def _print_replay(outcome: ReplayOutcome) -> None:
+    metrics = outcome.metrics
+    pairs, frames = metrics['pairs'], metrics['frames']
+    refused = sum(frames['refused'].values()) + frames['failed']
+    print(f'{frames["processed"]} of {frames["in_bag"]} images processed'
+          + (f', {refused} refused' if refused else '')
+          + f' ({_text(metrics["timing"]["processing_per_frame_ms"], "ms per image")})')
+    print(f'{pairs["total"]} pairs, {pairs["answered"]} with a pose'
+          + ''.join(f', {count} {status}' for status, count in pairs['by_status'].items()
+                    if count and status != 'OK'))
+    if not pairs['total']:
+        print('no keyframe pair: the bag is shorter than a keyframe interval, or too few frames '
+              'could be used')
+    elif not pairs['answered']:
+        # The reason of suppressed poses follows with the findings.
+        reasons = sorted({record.pose.reason for record in outcome.records
+                          if record.status.value != 'WITHHELD'})
+        for reason in reasons[:_MOST_REASONS]:
+            print(f'no pose: {reason}')
+    _print_errors(metrics['errors_against_truth'])
+    if pairs['answered']:
+        medians = metrics['medians']
+        print(f'medians: {_text(medians["inliers"], "inliers")}, residual '
+              f'{_text(medians["residual_rms_px"], "px")}, rotation against the gyro '
+              f'{_text(medians["rotation_difference_to_gyro_deg"], "deg")}')
+        known = metrics['baselines']['known']
+        print(f'baseline in metres: of {known} of {pairs["answered"]} poses'
+              + (f', with a median sigma of '
+                 f'{100.0 * metrics["baselines"]["log_sigma_median"]:.0f} %' if known else ''))
+        for reason, count in metrics['baselines']['not_known'].items():
+            print(f'{reason} ({count} poses)')
+    _print_health(outcome)
+
+
+def _print_health(outcome: ReplayOutcome) -> None:
+    """A line for each inconsistent parameter, or else one for all parameters."""
+    health = outcome.health
+    for fault in health.faults:
+        print(fault.text)
+    if health.faults:
+        return
+    if not health.findings:
+        print('health: unknown: there was no pair to evaluate')
+        return
+    observed, unobserved = (', '.join(finding.quantity for finding in health.findings
+                                      if finding.observable is observable)
+                            for observable in (True, False))
+    if not unobserved:
+        print(f'health: ok ({observed} observed)')
+    else:
+        print(f'health: unknown: {unobserved} not observable in this motion'
+              + (f' ({observed} ok)' if observed else ''))
+
+
+def _print_errors(errors: Mapping[str, float] | None) -> None:
+    if errors:
+        print(f'against the ground truth (median, 90 %): rotation '
+              f'{errors["rotation_median_deg"]:.3g}, {errors["rotation_p90_deg"]:.3g} deg; '
+              f'direction of translation {errors["translation_median_deg"]:.3g}, '
+              f'{errors["translation_p90_deg"]:.3g} deg')
+
+
+def _text(value: Any, unit: str) -> str:
+    return f'no {unit}' if value is None else f'{value:.3g} {unit}'
+
+
+REPLAY = Command(
+    'Estimate relative poses from a bag (rosbag2 with SQLite3 or MCAP, compressed or not, or ROS '
+    '1) with the pipeline of relpose_node. Topics are found by type where that is unambiguous. '
+    'Writes relative_poses.csv, summary.json and pictures, and errors.csv if the bag contains '
+    "ground truth of the camera (geometry_msgs/PoseStamped of the optical frame, IMU's clock). "
+    'Translations are unit vectors. Reports configured parameters (axes, time_offset, ...) that '
+    'contradict images and IMU. Exit code 1: the bag was processed, but no pair has a pose, or '
+    'one of these parameters is wrong.', _add_replay_arguments, _replay)
+
+
+# -- pairs -----------------------------------------------------------------------------------
+
+
+def _add_pairs_arguments(parser: argparse.ArgumentParser) -> None:
+    add_run_arguments(parser, 'pairs')
+    parser.add_argument('--list', metavar='FILE', type=Path, required=True,
+                        help='the pairs (CSV): stamps of their images [ns]')
+
+
+def _pairs(args: argparse.Namespace) -> int:
+    pairs = read_pairs(args.list)
+
+    def work(folder: Path, bag: Bag, topics: SensorTopics,
+             parameters: Parameters) -> ReplayOutcome:
+        if args.list.resolve() == (folder / POSES.file).resolve():
+            raise InputError(f'the results would replace the list {args.list}: choose another '
+                             'directory with --out')
+        return pairs_into(folder, bag, topics, parameters, pairs)
+
+    folder, outcome = run_on_bag(args, 'pairs', work)
+    counts = outcome.metrics['pairs']
+    print(f'{counts["total"]} pairs, {counts["answered"]} with a pose')
+    reasons = Counter(record.pose.reason for record in outcome.records if not record.pose)
+    for reason, count in reasons.most_common(_MOST_REASONS):
+        print(f'no pose, {count} times: {reason}')
+    if len(reasons) > _MOST_REASONS:
+        print(f'{len(reasons) - _MOST_REASONS} more reasons: column reason of {POSES.file}')
+    _print_errors(outcome.metrics['errors_against_truth'])
+    print(f'in {folder}: {", ".join([*(path.name for path in outcome.files), SUMMARY_FILE])}')
+    return 0 if counts['answered'] else FAILED
+
+
+PAIRS = Command(
+    "Estimate the relative poses of chosen pairs of a bag's images, any distance apart: loop "
+    'closures, wide baselines. Images are matched by descriptors (SIFT, or ORB with --set '
+    'detector=orb). The list is a CSV file with the columns reference_stamp_ns (of the earlier '
+    'image) and stamp_ns; a relative_poses.csv of replay is one. Writes relative_poses.csv with '
+    'a row for each row of the list, in its order: the columns of replay and the reason of a pair '
+    'without a pose; summary.json; and errors.csv if the bag contains ground truth of the camera. '
+    'The configured parameters are used as they are: run check or replay first. Exit code 1: no '
+    'pair has a pose.', _add_pairs_arguments, _pairs)
+
+
+# -- odometry --------------------------------------------------------------------------------
+
+
+def _odometry(args: argparse.Namespace) -> int:
+    need_gtsam()
+    from rs_relpose_ros.odometry.offline import LIVE_FILE, odometry_into, PICTURE, SMOOTHED_FILE
+    folder, outcome = run_on_bag(args, 'odometry', odometry_into)
+    for text in outcome.warnings:
+        print(text)
+    metrics = outcome.metrics
+    pairs = metrics['pairs']
+    print(f'{metrics["keyframes"]} keyframes of {pairs["pairs"]} pairs over '
+          f'{metrics["length_m"]:.1f} m'
+          + (f', {pairs["contradicting"]} pairs rejected' if pairs['contradicting'] else '')
+          + (f', lost {len(metrics["lost"])} times' if metrics['lost'] else ''))
+    if metrics['health'] in ('suspect', 'wrong'):
+        print(f'health: {metrics["health"]}: "rs_relpose replay" reports the parameter')
+    for trajectory in ('live', 'smoothed'):
+        if errors := metrics[trajectory]:
+            print(f'{trajectory}, against the ground truth: ATE {errors["ate_m"]:.3f} m over '
+                  f'{errors["length_m"]:.1f} m, scale {100.0 * errors["scale_error"]:+.2f} %')
+    if not outcome.live:
+        print('odometry did not start: ' + (
+            outcome.blocking_reason
+            or 'it needs some seconds of motion, or standstill, and informative pairs'))
+        return FAILED
+    print(f'in {folder}: {LIVE_FILE}, {SMOOTHED_FILE}, {PICTURE}, {SUMMARY_FILE}')
+    return 0
+
+
+ODOMETRY = Command(
+    'Metric odometry from a bag: the relative poses of its keyframe pairs and its IMU in one '
+    'graph (gtsam, an extra), as in odometry_node. Writes trajectory.tum (live estimates of the '
+    "camera, z up, stamped with the image's middle row on the camera's clock), "
+    'trajectory_smoothed.tum (estimates from all data), summary.json and a picture; with errors '
+    'if the bag contains ground truth of the camera. The parameter imu_position should be '
+    'configured. Exit code 1: odometry did not start.',
+    lambda parser: add_run_arguments(parser, 'odometry'), _odometry)

@@ -1,0 +1,297 @@
+"""Commands `calibrate`, `check`, `convert` and `unroll`: recordings before the estimation."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+import json
+import logging
+from pathlib import Path
+import shutil
+import sys
+from typing import NamedTuple
+
+from rs_relpose_ros.bags import phones, video
+from rs_relpose_ros.bags.convert import Recording, write_bag
+from rs_relpose_ros.bags.reader import COMPRESSED_IMAGE, open_bag
+from rs_relpose_ros.bags.writer import refuse_existing
+from rs_relpose_ros.calibrate import result as calibration
+from rs_relpose_ros.calibrate.procedure import calibrate, read_recording
+from rs_relpose_ros.cli import options
+from rs_relpose_ros.cli.main import Command, FAILED, import_of
+from rs_relpose_ros.config import settings
+from rs_relpose_ros.config.files import read_parameters, write_parameters
+from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.distortion import DISTORTION_MODELS
+from rs_relpose_ros.offline.check import check_bag, CheckReport, choose_topics
+from rs_relpose_ros.offline.unroll import unroll
+from rs_relpose_ros.output_files import prepare_folder, refuse_unwritable
+
+_CALIBRATION_FILES = ('calibration.yaml', 'calibration.json', 'cost_over_readout.png')
+
+_logger = logging.getLogger(__name__)
+
+
+# -- calibrate -------------------------------------------------------------------------------
+
+
+def _add_calibrate_arguments(parser: argparse.ArgumentParser) -> None:
+    options.add_bag_argument(parser)
+    options.add_out_argument(parser, 'calibration')
+    parser.add_argument('--rows', metavar=('FIRST', 'LAST'), type=float, nargs=2,
+                        default=(0.0, 0.0), help='use only these image rows, such as those above '
+                        'a dashboard that moves with the camera')
+    parser.add_argument('--detector', choices=tuple(settings.TRACKERS),
+                        default=settings.TrackingConfig().detector,
+                        help='tracker that follows the points, as the parameter of the node '
+                        '(default: %(default)s)')
+    parser.add_argument('--max-offset', metavar='S', type=float,
+                        default=settings.CalibrationConfig().max_time_offset,
+                        help='bound of the clock offset [s] (default: %(default)s)')
+    parser.add_argument('--lens', metavar='MODEL', choices=tuple(DISTORTION_MODELS), nargs='?',
+                        const='plumb_bob', help='estimate focal length, first coefficient of the '
+                        'distortion of this model (default: plumb_bob) and principal point, also '
+                        'if the CameraInfo has a camera matrix without distortion')
+    for name, text in (('time', 'exposure of a row [s]'),
+                       ('margin', 'frame interval less exposure [s]')):
+        parser.add_argument(f'--exposure-{name}', metavar='S', type=float, default=0.0,
+                            help=f'{text}, if it is known')
+    options.add_topic_arguments(parser, 'image', 'camera_info', 'imu')
+
+
+def calibrate_bag(
+        args: argparse.Namespace) -> tuple[calibration.CalibrationResult, RollingShutterCamera]:
+    """Calibrate and write the files of the command."""
+    try:
+        tracking = settings.TrackingConfig(detector=args.detector, feature_rows=tuple(args.rows))
+        config = replace(settings.TRACKED_IN_IMAGES, max_time_offset=args.max_offset,
+                         exposure_time=args.exposure_time, exposure_margin=args.exposure_margin)
+    except InputError as error:   # names the settings: replaced by the options
+        text = str(error)
+        for name, option in (('feature_rows', '--rows'), ('max_time_offset', '--max-offset'),
+                             ('exposure_', '--exposure-')):
+            text = text.replace(name, option)
+        raise InputError(text) from None
+    folder = options.out_folder(args, 'calibration')
+    refuse_unwritable(folder)
+    with open_bag(args.bag) as bag:
+        topics = bag.find_topics(options.topic_options(args), needs_camera_info=False)
+        with options.image_progress(bag, topics.image, 'tracking'):
+            recording = read_recording(bag, topics, tracking)
+    if args.lens is not None:
+        recording = recording.with_unknown_lens(args.lens)
+    first, last = args.rows
+    if first >= recording.camera.height:
+        raise InputError(f'--rows {first:g} {last:g} leave nothing of an image of '
+                         f'{recording.camera.height} rows: give the first and the last to use')
+    options.warn_unused(recording.unused)
+    with options.progress_bar(100, '%', 'fitting') as bar:
+        result = calibrate(recording.tracks, recording.gyro, recording.camera,
+                           focal_known=recording.focal_known, config=config,
+                           progress=lambda share: bar.update(round(100 * share) - bar.n))
+    prepare_folder(folder, _CALIBRATION_FILES)
+    text = calibration.parameter_file(
+        result, f'Parameters of relpose_node from `rs_relpose calibrate {args.bag.name}`.',
+        camera=recording.camera, compressed=topics.image.msgtype == COMPRESSED_IMAGE,
+        feature_rows=tuple(args.rows))
+    parameters, metrics, curve = (folder / name for name in _CALIBRATION_FILES)
+    parameters.write_text(text, encoding='utf-8')
+    mapping = calibration.as_mapping(result, recording.camera)
+    metrics.write_text(json.dumps(mapping, indent=1) + '\n', encoding='utf-8')
+    calibration.draw_curve(result, curve)
+    return result, recording.camera
+
+
+def _calibrate(args: argparse.Namespace) -> int:
+    result, camera = calibrate_bag(args)
+    for line in calibration.report(result, camera):
+        print(line)
+    print(f'in {options.out_folder(args, "calibration")}: {", ".join(_CALIBRATION_FILES)}')
+    return 0 if result.complete else FAILED
+
+
+CALIBRATE = Command(
+    'Calibrate a rolling-shutter camera against its IMU from a bag (rosbag2 or ROS 1) alone, '
+    'without a target: readout time, camera-IMU time offset, rotation IMU to camera, gyro bias, '
+    'and the lens (focal length, first distortion coefficient, principal point) if the CameraInfo '
+    'has none (k[0] = 0) or is absent, or with --lens. Record at least '
+    '10 s of a static, textured scene with a short exposure; rotate the camera about all three '
+    'axes, 20 to 60 deg/s. Writes calibration.yaml (parameters of relpose_node), calibration.json '
+    'and cost_over_readout.png. Exit code 1: a parameter is not observable in this recording and '
+    'left out; the report describes the motion to record instead.', _add_calibrate_arguments,
+    _calibrate)
+
+
+# -- check -----------------------------------------------------------------------------------
+
+
+def _add_check_arguments(parser: argparse.ArgumentParser) -> None:
+    options.add_bag_argument(parser)
+    options.add_parameter_arguments(parser)
+    parser.add_argument('--json', action='store_true', help='print the report as JSON')
+    options.add_topic_arguments(parser, 'image', 'camera_info', 'imu', 'accel')
+
+
+def inspect_bag(args: argparse.Namespace) -> CheckReport:
+    """Check a bag, with a progress bar."""
+    parameters = read_parameters(args.params, args.set)
+    with open_bag(args.bag) as bag:
+        chosen = choose_topics(bag, options.topic_options(args))
+        messages = sum(topic.count for topic in chosen.all)
+        if parameters.sensor.missing() and chosen.image is not None:
+            messages *= 2   # the bag is read twice
+        with options.progress_bar(messages, 'message', options.bag_name(args.bag)) as bar:
+            bag.on_message = lambda _: bar.update()
+            return check_bag(bag, chosen, parameters)
+
+
+def _check(args: argparse.Namespace) -> int:
+    report = inspect_bag(args)
+    if args.json:
+        print(json.dumps(report.to_mapping(), indent=2, allow_nan=False))
+    else:
+        width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 100
+        for line in report.lines(max(width, 60)):
+            print(line)
+    return FAILED if report.failed else 0
+
+
+CHECK = Command(
+    'Check a bag (rosbag2 or ROS 1) for defects that degrade relative poses: topics, rates, gaps, '
+    'stamps, clocks, encodings, transport; and, by a test run of half a minute of it, axes, time '
+    'offset, readout time, bias, units, focal length and lens. Prints a line for each, with a '
+    'verdict (ok, unknown, warning, failure) and the suggested fix. Exit code 1: a defect makes '
+    'the estimation fail or its poses wrong.', _add_check_arguments, _check)
+
+
+# -- convert ---------------------------------------------------------------------------------
+
+
+class Source(NamedTuple):
+    """A format of recordings."""
+
+    help: str
+    path: str   # 'FILE' or 'FOLDER'
+    read: Callable[[Path, Path | None], Recording]   # path, lens profile
+    has_lens_profile: bool = False
+
+
+def _of_laboratory(reader: str) -> Callable[[Path, Path | None], Recording]:
+    """A reader of another package, found by name: the product does not depend on it."""
+    def read(folder: Path, _: Path | None) -> Recording:
+        module = import_of('rs_relpose_lab.datasets', 'public recordings need')
+        recording: Recording = getattr(module, reader)(folder)
+        return recording
+    return read
+
+
+SOURCES: Mapping[str, Source] = {
+    'video': Source(
+        'video of a camera that logs its IMU: GoPro, and others that telemetry-parser reads '
+        '(pip install telemetry-parser av). Recordings that the camera stabilised are refused.',
+        'FILE', video.read_video, has_lens_profile=True),
+    'android': Source(
+        "folder of a phone's logger, recognised by its files: " + '; '.join(
+            f'{logger.name} ({", ".join(logger.files)})' for logger in phones.LOGGERS),
+        'FOLDER', lambda folder, _: phones.read_android(folder)),
+    'realsense_rgb_rs': Source(
+        'colour camera, gyro and accelerometer of a RealSense, from '
+        'github.com/Zoltan3057/DM-VIO-dataset (imu.txt, frames.csv, camera.txt, images/)',
+        'FOLDER', _of_laboratory('read_realsense')),
+    'xiaomi_cc9_rs': Source(
+        'phone with gyro, from github.com/lhaippp/gyro-video-stabilization '
+        '(gyro.txt, framestamp.txt, images/)', 'FOLDER', _of_laboratory('read_xiaomi')),
+}
+
+
+def _add_convert_arguments(parser: argparse.ArgumentParser) -> None:
+    sources = parser.add_subparsers(dest='source', metavar='SOURCE', required=True)
+    for name, source in SOURCES.items():
+        one = sources.add_parser(name, help=source.help, description=source.help)
+        one.add_argument('path', metavar=source.path, type=Path, help='the recording')
+        one.add_argument('out_bag', metavar='OUT_BAG', type=Path,
+                         help='bag directory to create; OUT_BAG.yaml is written next to it')
+        if source.has_lens_profile:
+            one.add_argument(
+                '--lens-profile', metavar='PATH', type=Path,
+                help="Gyroflow's profile of the camera's mode (JSON), or a folder of them, such "
+                'as a checkout of github.com/gyroflow/lens_profiles: calibration of the lens, and '
+                'an initial value of the readout time if the file does not contain it')
+        one.set_defaults(lens_profile=None)
+
+
+def _convert(args: argparse.Namespace) -> int:
+    parameters = args.out_bag.with_name(args.out_bag.name + '.yaml')
+    refuse_existing(args.out_bag, parameters)
+    refuse_unwritable(args.out_bag.parent)
+    source = SOURCES[args.source]
+    if source.path == 'FOLDER' and not args.path.is_dir():
+        raise MissingInputError(f'there is no folder {args.path}')
+    recording = source.read(args.path, args.lens_profile)
+    with options.progress_bar(len(recording.images), 'image', args.out_bag.name) as bar:
+        write_bag(recording, args.out_bag, on_image=bar.update)
+    write_parameters(parameters, recording.title, recording.parameters)
+    size = sum(file.stat().st_size for file in args.out_bag.iterdir())
+    samples = len(recording.cropped(recording.imu)) + len(recording.cropped(recording.accel))
+    print(f'{args.out_bag}: {len(recording.images)} images, {samples} IMU samples'
+          + (f', {len(recording.truth)} true poses' if recording.truth else '')
+          + f', {size / 1e6:.1f} MB; parameters of the node: {parameters}')
+    if 'readout_time' not in {value.name for value in recording.parameters}:
+        print(f'the readout time is unknown: rs_relpose calibrate {args.out_bag}')
+    return 0
+
+
+CONVERT = Command(
+    'Convert a recording to a rosbag2 directory (MCAP) with /camera/image_raw/compressed, '
+    '/imu/data_raw (or /imu/gyro and /imu/accel if they have separate stamps), '
+    '/camera/camera_info if the camera is calibrated, and /ground_truth/pose if the recording '
+    'contains poses; and write OUT_BAG.yaml next to it: the parameters of relpose_node, each with '
+    'its source. Stamps and JPEG images are copied unchanged. "rs_relpose convert SOURCE --help" '
+    'describes a source.', _add_convert_arguments, _convert)
+
+
+# -- unroll ----------------------------------------------------------------------------------
+
+
+def _add_unroll_arguments(parser: argparse.ArgumentParser) -> None:
+    options.add_bag_argument(parser)
+    parser.add_argument('out_bag', metavar='OUT_BAG', type=Path,
+                        help='directory of the new bag; it must not exist, and appears when the '
+                        'bag is complete')
+    options.add_parameter_arguments(parser)
+    options.add_topic_arguments(parser, 'image', 'camera_info', 'imu', 'accel')
+
+
+def _unroll(args: argparse.Namespace) -> int:
+    refuse_existing(args.out_bag)
+    parameters = read_parameters(args.params, args.set, node='global_shutter_node')
+    options.check_parameters(parameters, args)
+    with open_bag(args.bag) as bag:
+        topics = bag.find_topics(options.topic_options(args),
+                                 needs_camera_info=not parameters.intrinsics.given)
+        with options.image_progress(bag, topics.image, options.bag_name(args.bag)):
+            report = unroll(bag, topics, parameters, args.out_bag)
+    for line in report.warnings:
+        _logger.warning('%s', line)
+    options.warn_unused(report.reasons, 'omitted')
+    omitted = report.images_in_bag - report.images
+    text = (f'{report.images} of {report.images_in_bag} images derotated'
+            + (f', {omitted} omitted' if omitted else ''))
+    if not report.images:
+        print(f'{text}; nothing was written')
+        return FAILED
+    print(f'{text}; the largest displacement of a pixel is {report.largest_shift:.1f} px')
+    print(f'{report.copied} messages of {report.topics_copied} other topics copied')
+    print(f'in {args.out_bag}')
+    return 0
+
+
+UNROLL = Command(
+    'Derotate every image of a bag (rosbag2 or ROS 1) by its gyro to the time of its middle row, '
+    'and write a bag (MCAP) for SLAM systems without a model of the rolling shutter: images and '
+    "CameraInfo on the same topics, stamped with the time of the middle row on the IMU's clock "
+    "(the time offset between camera and IMU is then 0), or on the camera's if the parameter "
+    'stamp_clock is camera. All other topics are copied bit by bit. Images that the gyro does not '
+    'cover are omitted. Exit code 1: no image could be derotated.', _add_unroll_arguments, _unroll)

@@ -1,0 +1,185 @@
+"""Parameter files in the format of ROS: read, and written with comments.
+
+``/**`` or a node's name, below it ``ros__parameters``, and below that the parameters.
+
+    python -m rs_relpose_ros.config.files config/relpose.yaml
+
+writes all parameters at their defaults, with descriptions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import contextlib
+from dataclasses import dataclass
+from pathlib import Path
+import sys
+import textwrap
+from typing import Any
+
+import yaml
+
+from rs_relpose_ros.config.declare import ANY_VALUE
+from rs_relpose_ros.config.settings import Parameters
+from rs_relpose_ros.errors import InputError, MissingInputError
+
+_NODE = 'relpose_node'
+# Parameters of every ROS node, without effect offline.
+_ROS_OWN = ('use_sim_time', 'start_type_description_service')
+# Largest file that is read [bytes]; a file of all parameters has 10,000.
+_MAX_BYTES = 1 << 20
+_COMMENT_WIDTH = 95
+
+
+@dataclass(frozen=True, slots=True)
+class SourcedValue:
+    """Value of a parameter and its source."""
+
+    name: str
+    value: float | str | tuple[float, ...]
+    source: str
+
+
+def read_parameters(path: Path | str | None, assignments: Sequence[str] = (),
+                    node: str = _NODE) -> Parameters:
+    """Parameters at their defaults, then from a file, then from ``NAME=VALUE`` assignments.
+
+    The file is one for ``ros2 run --params-file`` of `node`; the values of assignments are YAML,
+    such as ``gyro_bias=[0.01, 0, 0]``.
+
+    >>> read_parameters(None, ['readout_time=0.03', 'solver=angular_5pt']).sensor.readout_time
+    0.03
+    """
+    parameters = Parameters()
+    if path is not None:
+        values = _values(Path(path), node)
+        try:
+            parameters = parameters.updated(_converted(values))
+        except InputError as error:
+            raise InputError(f'{path}: {error}') from error
+    given = {}
+    for assignment in assignments:
+        name, separator, text = assignment.partition('=')
+        if not separator or not name:
+            raise InputError(f'--set must be NAME=VALUE, got {assignment!r}')
+        try:
+            given[name.strip()] = yaml.safe_load(text)
+        except (yaml.YAMLError, RecursionError):
+            raise InputError(f'--set {name}: the value {text!r} is not valid YAML') from None
+    return parameters.updated(_converted(given))
+
+
+def parameter_text(title: str, values: Sequence[SourcedValue]) -> str:
+    """Text of a parameter file with a title; each value has its source as a comment."""
+    lines = [*comment(title), '/**:', '  ros__parameters:']
+    for item in values:
+        lines += [*comment(item.source, '    '), f'    {item.name}: {yaml_text(item.value)}']
+    return '\n'.join(lines) + '\n'
+
+
+def write_parameters(path: Path, title: str, values: Sequence[SourcedValue]) -> None:
+    """Write `parameter_text` to a new file."""
+    try:
+        with path.open('x', encoding='utf-8') as file:
+            file.write(parameter_text(title, values))
+    except FileExistsError:
+        raise InputError(f'{path} already exists: remove it or choose another path') from None
+    except OSError as error:
+        raise InputError(f'cannot write {path}: {error.strerror}') from error
+
+
+def comment(text: str, indent: str = '') -> list[str]:
+    """Lines of a comment; none for an empty text."""
+    return textwrap.wrap(text, _COMMENT_WIDTH, initial_indent=f'{indent}# ',
+                         subsequent_indent=f'{indent}# ', break_long_words=False,
+                         break_on_hyphens=False)
+
+
+def yaml_text(value: Any) -> str:
+    """YAML of a bool, a number, a text without quotes, or a tuple of those."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return f"'{value}'"
+    if isinstance(value, tuple):
+        return f'[{", ".join(map(yaml_text, value))}]'
+    text = repr(value)
+    # 1e-05 is a text in YAML 1.1: a float needs a point.
+    return text.replace('e', '.0e') if 'e' in text and '.' not in text else text
+
+
+def _values(path: Path, wanted: str) -> dict[str, Any]:
+    """Flat values of a parameter file for the node `wanted`."""
+    if not path.is_file():
+        raise MissingInputError(f'the parameter file {path} does not exist')
+    if path.stat().st_size > _MAX_BYTES:
+        raise InputError(f'{path} is not a parameter file: it has more than {_MAX_BYTES} bytes')
+    try:
+        text = path.read_text(encoding='utf-8')
+        # Nested aliases expand without a limit; ROS does not support them either.
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
+            raise InputError(f'{path} has YAML aliases, which are not supported')
+        document = yaml.safe_load(text)
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f'{path} is not valid YAML: {error}') from error
+    if not isinstance(document, dict):
+        raise InputError(f'{path} is not a ROS parameter file: it must begin with "/**:" and '
+                         '"ros__parameters:"')
+    values: dict[str, Any] = {}
+    for node in document:
+        if node in ('/**', wanted) or str(node).endswith(f'/{wanted}'):
+            section = document[node]
+            inner = section.get('ros__parameters') if isinstance(section, dict) else None
+            if not isinstance(inner, dict):
+                raise InputError(f'{path}: {node!r} must have a section "ros__parameters:" with '
+                                 'names and values')
+            values |= {str(name): value for name, value in inner.items()
+                       if name not in _ROS_OWN and not str(name).startswith('qos_overrides')}
+    if not values:
+        raise InputError(f'{path} has no parameters of {wanted}: they must be below "/**:" or '
+                         f'"{wanted}:" and "ros__parameters:"')
+    return values
+
+
+def _converted(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Lists to tuples, and 1e-5 to a number, as in ROS (a text in PyYAML)."""
+    numbers = {name for name, _, declared in Parameters.declarations()
+               if declared.kind in (float, tuple)}
+
+    def converted(name: str, value: Any) -> Any:
+        if isinstance(value, list):
+            return tuple(converted(name, item) for item in value)
+        if isinstance(value, str) and name in numbers:
+            with contextlib.suppress(ValueError):
+                return float(value)
+        return value
+
+    return {name: converted(name, value) for name, value in values.items()}
+
+
+_HEAD = """\
+# Parameters of relpose_node, global_shutter_node and `--params` of the commands, each at its
+# default.
+# Generated by `python -m rs_relpose_ros.config.files config/relpose.yaml`; copy it and change the
+# copy. Parameters without a value have no default; the node reports the ones that it requires.
+# [live] can be changed while the node runs (`ros2 param set`).
+
+/**:
+  ros__parameters:
+"""
+
+
+def parameter_template() -> str:
+    """Text of a parameter file with all parameters at their defaults."""
+    lines = []
+    for name, default, declared in Parameters.declarations():
+        meaning = declared.description
+        if declared.legal not in ('finite', *ANY_VALUE.values()):
+            meaning += f': {declared.legal}'
+        lines += ['', *comment(meaning + ' [live]' * declared.live, '    '),
+                  f'    # {name}:' if default is None else f'    {name}: {yaml_text(default)}']
+    return _HEAD + '\n'.join(lines[1:]) + '\n'
+
+
+if __name__ == '__main__':
+    Path(sys.argv[1]).write_text(parameter_template(), encoding='utf-8')

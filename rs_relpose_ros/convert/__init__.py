@@ -1,1 +1,0 @@
-"""Public recordings in their own formats, to be converted to bags."""

@@ -1,0 +1,287 @@
+"""Covariance of a state and of a pose; information of the images alone.
+
+A Hessian H assumes independent residuals and priors with their configured sigmas. The sandwich
+``H^-1 S H^-1`` does not: S is the covariance of the gradient at the optimum (docs/estimator.md,
+"Covariance"). Its part of the matches is estimated from the gradients of image regions, its gyro
+part from the agreement of gyro and images.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.estimator import priors, sampson
+from rs_relpose_ros.estimator.fit import FitMatches, linearised, with_priors
+from rs_relpose_ros.estimator.priors import DW1, PARAMETERS, Priors, SCALE, THETA, TwoViewState
+from rs_relpose_ros.estimator.problem import PairState, TwoViewProblem
+from rs_relpose_ros.geometry import so3
+from rs_relpose_ros.jit import kernel
+from rs_relpose_ros.solvers.algebra import cholesky, newton_step
+
+Array = NDArray[np.float64]
+
+# Regions of the field that the matches cover: columns and rows.
+REGIONS = (4, 3)
+# Number of additional regions as which the Hessian's covariance of the gradient counts: that of
+# few image regions alone is noisy.
+HESSIAN_REGIONS = 8
+# Degrees of freedom as which the gyro's configured sigmas count, added to the disagreement's.
+PRIOR_FREEDOM = 1.0
+# If the gyro alone decides, it cannot disagree: this share of its variance keeps 0 / 0 defined.
+LEAST_DISAGREEMENT = 1e-3
+
+
+@kernel
+def sandwich(matches: FitMatches, state: TwoViewState, data_hessian: Array, hessian: Array,
+             covariance: Array, prior: Priors, gyro_error: Array) -> Array:
+    """``H^-1 S H^-1`` (n, n) at an optimum `state` with the Hessian H, `covariance` being H^-1.
+
+    `data_hessian` (n, n) is the matches' part of H. S is the sum of their covariance, of the
+    priors' part of H, and of the excess of the gyro's priors beyond their configured sigmas.
+    `gyro_error` (3, 3): covariance of errors of the gyro's rotation that are not in its prior.
+    """
+    ratio = gyro_variance_ratio(state, prior, covariance)
+    excess = np.zeros(hessian.shape)
+    information = prior.rotation_information
+    rotation = (ratio - 1.0) * information + information @ gyro_error @ information
+    for i in range(3):
+        for j in range(3):
+            excess[THETA + i, THETA + j] = rotation[i, j]
+    for i in range(DW1, PARAMETERS):
+        excess[i, i] = (ratio - 1.0) * prior.rate_weight
+    # If gyro and images disagree, either may be in error.
+    of_matches = max(ratio, 1.0) * score_of_matches(matches, state, data_hessian, hessian)
+    return covariance @ (of_matches + (hessian - data_hessian) + excess) @ covariance
+
+
+@kernel
+def scaled_like(covariance: Array, before: Array, after: Array) -> Array:
+    """``T C T^T`` with ``T before T^T = after``: C scaled as `before` is to `after`.
+
+    T is lower triangular. C is returned unchanged if one of the two others is singular.
+    """
+    n = len(covariance)
+    L_before, L_after, T = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
+    if not (cholesky(before, L_before) and cholesky(after, L_after)):
+        return covariance
+    for i in range(n):
+        for j in range(i, -1, -1):   # T L_before = L_after
+            value = L_after[i, j]
+            for k in range(j + 1, i + 1):
+                value -= T[i, k] * L_before[k, j]
+            T[i, j] = value / L_before[j, j]
+    return T @ covariance @ T.T
+
+
+@kernel
+def score_of_matches(matches: FitMatches, state: TwoViewState, data_hessian: Array,
+                     hessian: Array) -> Array:
+    """Covariance of the matches' gradient, by image regions g and by the Hessian.
+
+    By regions, from their gradients s_g and Hessians H_g::
+
+        sum_g u_g u_g^T,   u_g = (s_g + (I - H_g H^-1)^-1 s_g) / 2
+
+    The fit has adapted to each region, so s_g is too small; the gradient there of a fit without
+    it, ``(I - H_g H^-1)^-1 s_g``, is too large. For independent residuals the mean of the two is
+    right to first order in H_g (as CR2: Bell and McCaffrey, Survey Methodology 28, 2002).
+    """
+    regions = _regions(matches)
+    weight = 1.0 / (matches.sigma * matches.sigma)
+    n = len(hessian)
+    total, rest, factor = np.zeros((n, n)), np.empty((n, n)), np.zeros((n, n))
+    score = np.zeros(n)
+    filled, cost = 0, 0.0
+    for g in range(REGIONS[0] * REGIONS[1]):
+        use = regions == g
+        if not use.any():
+            continue
+        filled += 1
+        own, gradient, squares = sampson.normal_equations(
+            matches.observations, use * matches.weights, state)
+        cost += weight * squares
+        so3.copy_matrix(hessian, rest)
+        for i in range(PARAMETERS):
+            score[i] = weight * gradient[i]
+            for j in range(PARAMETERS):
+                rest[i, j] -= weight * own[i, j]
+        adjusted = score
+        if cholesky(rest, factor):
+            # (I - H_g H^-1)^-1 s = H (H - H_g)^-1 s
+            adjusted = 0.5 * (score - hessian @ newton_step(factor, score))
+        for i in range(n):
+            for j in range(n):
+                total[i, j] += adjusted[i] * adjusted[j]
+    # Noise by the residuals alone, without the configured sigma: (units of sigma)^2.
+    variance = (1.0 + cost) / (1.0 + max(matches.weights.sum() - sampson.FITTED, 0.0))
+    share = filled / (filled + HESSIAN_REGIONS)
+    return share * total + (1.0 - share) * variance * data_hessian
+
+
+@kernel
+def _regions(matches: FitMatches) -> NDArray[np.int64]:
+    """Region number of each match (N,), by its first ray; -1 for those that are not used."""
+    n = len(matches.weights)
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for i in range(n):
+        if matches.weights[i] > 0.0:
+            for k in range(2):
+                low[k] = min(low[k], matches.observations[i, k])
+                high[k] = max(high[k], matches.observations[i, k])
+    regions = np.full(n, -1)
+    for i in range(n):
+        if matches.weights[i] > 0.0:
+            number = 0
+            for k in range(2):
+                share = (matches.observations[i, k] - low[k]) / max(high[k] - low[k], 1e-12)
+                number = REGIONS[k] * number + min(int(REGIONS[k] * share), REGIONS[k] - 1)
+            regions[i] = number
+    return regions
+
+
+@kernel
+def gyro_variance_ratio(state: TwoViewState, prior: Priors, covariance: Array) -> float:
+    """Variance of the gyro, as estimated from one pair, by the configured one.
+
+    ``(1 + chi2) / (1 + freedom)`` at an optimum of covariance C (17, 17), with::
+
+        chi2 = theta^T (Lambda^-1 - C_theta)^-1 theta + (|dw_1|^2 + |dw_2|^2) / s_w^2
+
+    theta is the rotation from the gyro's; ``Lambda^-1 - C_theta`` is its covariance, and the rates
+    have ``6 - tr(C_w) / s_w^2`` degrees of freedom, if gyro and images are both right.
+    """
+    chi2, freedom = 0.0, 0.0
+    if prior.rotation_information[0, 0] > 0.0:
+        theta = so3.log_so3(state.R @ prior.rotation.T)
+        away = ((1.0 + LEAST_DISAGREEMENT) * priors.inverse(prior.rotation_information)
+                - covariance[:3, :3])
+        chi2 += (theta * (priors.inverse(away) @ theta)).sum()
+        freedom += 3.0
+    chi2 += prior.rate_weight * ((state.dw1**2).sum() + (state.dw2**2).sum())
+    freedom += 6.0
+    for i in range(DW1, PARAMETERS):
+        freedom -= prior.rate_weight * covariance[i, i]
+    return (PRIOR_FREEDOM + chi2) / (PRIOR_FREEDOM + max(freedom, 0.0))
+
+
+def local_covariance(matches: FitMatches, state: TwoViewState, prior: Priors) -> Array:
+    """Covariance (17, 17) of the local parameters from the regularised Hessian."""
+    hessian, gradient, _ = with_priors(linearised(matches, state), state, prior)
+    local = priors.inverse(hessian)
+    # Error of a state that is not the optimum: about this step.
+    step = local @ gradient
+    return np.asarray(local + np.outer(step, step))
+
+
+def pair_state(problem: TwoViewProblem, state: TwoViewState, log_scale: float,
+               local: Array) -> PairState:
+    """The state in each camera's own frame, with its covariance.
+
+    `log_scale`: of the velocities, the logarithm of the baseline if that is in metres. `local`
+    (n, n): covariance of the local parameters ``(theta, tangent, d_1, d_2, dw_1, dw_2)``, in frame
+    1, and of `log_scale` if it is unknown.
+    """
+    jacobian = np.zeros((19, len(local)))
+    jacobian[0:3, 3:5] = so3.tangent_basis(state.t)
+    jacobian[3:6, 0:3] = np.eye(3)
+    jacobian[6:9, 5:8] = np.eye(3)
+    # v_2 = R^T d_2, w_2 = w + R^T dw_2: they rotate with the error of R.
+    jacobian[9:12, 8:11] = state.R.T
+    jacobian[9:12, 0:3] = state.R.T @ so3.skew(state.d2)
+    jacobian[12:15, 11:14] = np.eye(3)
+    jacobian[15:18, 14:17] = state.R.T
+    if len(local) > SCALE:
+        jacobian[18, SCALE] = 1.0
+    w1 = problem.motion1.angular_velocity + state.dw1
+    w2 = problem.motion2.angular_velocity + state.R.T @ state.dw2
+    return PairState(state.R, state.t, state.d1, state.R.T @ state.d2, w1, w2, log_scale,
+                     jacobian @ local @ jacobian.T)
+
+
+# -- Information of the images alone, in canonical form: without the priors of the IMU ------------
+#
+# A fit minimises ``D(x) + P(x)``, D being the matches' cost and P that of the inertial priors. A
+# graph that combines pairs with the IMU's samples must not count P twice and needs D alone. About
+# the fit, for a small deviation e of the pose::
+#
+#     2 D = e^T H e + 2 g^T e + constant        g = -(half gradient of P) at an optimum
+#
+# H may be singular: a global shutter does not observe velocities. The prior of the gyro's rate
+# during the readout stays in it: without, rays have no common row.
+
+# Deviations of a pose with velocities, and of a rotation alone.
+POSE, ROTATION = DW1, 3
+# Share of the largest eigenvalue below which a direction counts as not observable.
+_RANK = 1e-12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageInformation:
+    """Cost ``e^T H e + 2 g^T e`` of deviations e from a pose, by the images alone.
+
+    ``e = (theta, s, v_1 - d_1, v_2 - d_2)``, in the axes of camera 1: ``R_true = Exp(theta) R``,
+    ``t_true`` along ``t + B s`` with ``B = tangent_basis(t)``, and the velocities of the two
+    cameras [baselines per second]; or ``e = theta``. All of it between the **middle** rows, with
+    which the direction hardly depends on the velocities.
+    """
+
+    row_time: float   # [s] of the middle row, after the stamped one
+    R: Array   # (3, 3) R_1^T R_2
+    t: Array   # (3,) unit direction; NaN of a rotation alone
+    velocities: Array   # (6,) d_1, d_2, in camera 1; NaN likewise
+    information: Array   # (11, 11) or (3, 3) H
+    gradient: Array   # (11,) or (3,) g
+
+    def of_rotation(self) -> ImageInformation:
+        """The same of the rotation alone, the rest eliminated."""
+        if len(self.gradient) == ROTATION:
+            return self
+        H, g, k = self.information, self.gradient, ROTATION
+        # Scaled, so that the rank does not depend on units.
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(H)[k:], np.finfo(float).tiny))
+        rest = np.linalg.pinv(H[k:, k:] * np.outer(scale, scale), rcond=_RANK, hermitian=True)
+        gain = H[:k, k:] @ (rest * np.outer(scale, scale))
+        reduced = H[:k, :k] - gain @ H[k:, :k]
+        return ImageInformation(self.row_time, self.R, np.full(3, np.nan), np.full(6, np.nan),
+                                0.5 * (reduced + reduced.T), g[:k] - gain @ g[k:])
+
+
+def image_information(matches: FitMatches, state: TwoViewState, prior: Priors,
+                      row_time: float) -> ImageInformation:
+    """Of the matches of a fit, with the rates' part of its `prior` only."""
+    H, g = _of_pose(matches, state, prior)
+    return ImageInformation(row_time, state.R, state.t, np.concatenate([state.d1, state.d2]),
+                            H, g)
+
+
+@kernel
+def _of_pose(matches: FitMatches, state: TwoViewState, prior: Priors) -> tuple[Array, Array]:
+    """Information (11, 11) and gradient (11,) of the pose, the rates eliminated."""
+    data = linearised(matches, state)
+    H, g = data.hessian, data.gradient
+    # With the errors by image regions instead of those of the Hessian: H S^-1 H.
+    S = score_of_matches(matches, state, H, with_priors(data, state, prior)[0])
+    floor = _RANK * (np.trace(S) + 6.0 * prior.rate_weight)
+    for i in range(3):
+        g[DW1 + i] += prior.rate_weight * state.dw1[i]
+        g[priors.DW2 + i] += prior.rate_weight * state.dw2[i]
+    for i in range(DW1, PARAMETERS):
+        H[i, i] += prior.rate_weight
+        S[i, i] += prior.rate_weight
+    for i in range(PARAMETERS):
+        S[i, i] += floor
+    weighted = H @ priors.inverse(S)
+    H, g = weighted @ H, weighted @ g
+    gain = H[:POSE, POSE:].copy() @ priors.inverse(H[POSE:, POSE:].copy())
+    reduced = H[:POSE, :POSE] - gain @ H[POSE:, :POSE].copy()
+    return 0.5 * (reduced + reduced.T), g[:POSE] - gain @ g[POSE:]
+
+
+def rotation_information(R: Array, information: Array, prior: Array, theta: Array,
+                         row_time: float) -> ImageInformation:
+    """Of a fit of a rotation alone with a `prior` (3, 3) at the distance `theta` (3,)."""
+    return ImageInformation(row_time, R, np.full(3, np.nan), np.full(6, np.nan),
+                            information - prior, -(prior @ theta))

@@ -1,0 +1,279 @@
+"""Joint maximum-a-posteriori fit of the uniform model: Sampson errors and IMU priors.
+
+Minimises ``sum r_i^2 / s^2`` plus the terms of `priors` over a `TwoViewState`, by
+Levenberg-Marquardt with the exact Jacobian (the Sampson denominator included: treating it as
+constant converges to another point). Besides: the paper's alternating refinement, and the fit of a
+rotation alone.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_ros.estimator import priors, sampson
+from rs_relpose_ros.estimator.priors import PARAMETERS, Priors, SCALE, TwoViewState
+from rs_relpose_ros.geometry import so3
+from rs_relpose_ros.jit import kernel
+from rs_relpose_ros.solvers.algebra import cholesky, newton_step
+
+Array = NDArray[np.float64]
+
+# Damping of the first step, as a share of the diagonal of the Hessian.
+FIRST_DAMPING = 1e-4
+# A fit ends if a step gains less than this share of 1 + cost (chi-square).
+LEAST_GAIN = 1e-7
+
+
+class FitMatches(NamedTuple):
+    """The matches of a fit."""
+
+    observations: Array   # (N, 20)
+    weights: Array   # (N,) 0 to 1
+    sigma: float   # noise [px] of a match of weight 1
+
+
+class DataTerm(NamedTuple):
+    """The objective about one state without priors, so that fits with other priors share it."""
+
+    hessian: Array
+    gradient: Array
+    cost: float
+
+
+@kernel
+def linearised(matches: FitMatches, state: TwoViewState) -> DataTerm:
+    """Hessian (17, 17), half gradient (17,) and cost of the matches about `state`."""
+    hessian, gradient, squares = sampson.normal_equations(
+        matches.observations, matches.weights, state)
+    weight = 1.0 / (matches.sigma * matches.sigma)
+    return DataTerm(hessian * weight, gradient * weight, squares * weight)
+
+
+@kernel
+def with_priors(data: DataTerm, state: TwoViewState,
+                prior: Priors) -> tuple[Array, Array, float]:
+    """Hessian (n, n), half gradient (n,) and cost of the whole objective at `state`."""
+    n = priors.unknowns(prior)
+    hessian, gradient = np.zeros((n, n)), np.zeros(n)
+    so3.copy_vector(data.gradient, gradient)
+    so3.copy_matrix(data.hessian, hessian)
+    cost = data.cost + priors.add_priors(state, prior, hessian, gradient)
+    return hessian, gradient, cost
+
+
+@kernel
+def fit(matches: FitMatches, start: TwoViewState, data: DataTerm, prior: Priors,
+        iterations: int) -> tuple[TwoViewState, float, DataTerm, float, Array]:
+    """Levenberg-Marquardt from `start`, about which `data` is, and the scale of `prior`.
+
+    Returns the state, the logarithm of the velocities' scale, the data term about that state, and
+    the cost and Hessian (n, n) of the whole objective.
+    """
+    state, n = start, priors.unknowns(prior)
+    damping = FIRST_DAMPING
+    hessian, gradient, cost = with_priors(data, state, prior)
+    damped = np.empty((n, n))
+    factor = np.zeros((n, n))
+    for _ in range(iterations):
+        so3.copy_matrix(hessian, damped)
+        for i in range(n):
+            damped[i, i] += damping * hessian[i, i] + 1e-12
+        if not cholesky(damped, factor):
+            damping = max(damping * 10.0, 1e-6)
+            if damping > 1e8:
+                break
+            continue
+        step = newton_step(factor, gradient)
+        # Expected gain of the step (Newton's decrement).
+        if -(gradient * step).sum() < LEAST_GAIN * (1.0 + abs(cost)):
+            break
+        candidate, candidate_prior = priors.moved(state, step), prior
+        if n > SCALE:
+            velocity = prior.velocity
+            candidate_prior = priors.at_scale(prior, velocity.log_scale + step[SCALE],
+                                              velocity.centre, velocity.freedom)
+        # Most steps are accepted: their derivatives cost little more than the residuals alone.
+        next_data = linearised(matches, candidate)
+        next_hessian, next_gradient, next_cost = with_priors(next_data, candidate, candidate_prior)
+        if next_cost <= cost:
+            state, data, prior = candidate, next_data, candidate_prior
+            hessian, gradient, cost = next_hessian, next_gradient, next_cost
+            damping = max(damping * 0.1, 1e-9)
+        else:
+            damping *= 10.0
+            if not damping < 1e8:
+                break
+    return state, prior.velocity.log_scale, data, cost, hessian
+
+
+@kernel
+def gauss_newton(matches: FitMatches, start: TwoViewState, prior: Priors,
+                 steps: int) -> TwoViewState:
+    """The state after some Gauss-Newton steps from `start`, without a test of the cost."""
+    state = start
+    factor = np.zeros((PARAMETERS, PARAMETERS))
+    for _ in range(steps):
+        hessian, gradient, _ = with_priors(linearised(matches, state), state, prior)
+        for i in range(PARAMETERS):
+            hessian[i, i] += FIRST_DAMPING * hessian[i, i] + 1e-12
+        if not cholesky(hessian, factor):
+            break
+        state = priors.moved(state, newton_step(factor, gradient))
+    return state
+
+
+# -- Refinement of the paper (its section 'Refinement'), as a selectable mode ---------------------
+#
+# Alternates between the rotation and ``(t, d_1, d_2)``: minimises the squared Sampson errors plus
+# ``l_t (|t| - 1)^2 + l_d (|d_1|^2 + |d_2|^2)``.
+
+# The paper gives no values; residuals here are in units of the pixel noise.
+TRANSLATION_WEIGHT = 1e3
+VELOCITY_WEIGHT = 1e-2
+ALTERNATIONS = 10
+
+
+def refine_alternating(observations: Array, inliers: NDArray[np.bool_], start: TwoViewState,
+                       pixel_sigma: float, velocities: bool = True) -> TwoViewState:
+    """Refine a state on its inliers by alternation; gyro corrections stay unchanged.
+
+    `observations` (N, 20), `pixel_sigma` [px]: noise of a match. Without `velocities`,
+    ``d_1 = d_2 = 0`` (angular and global models).
+    """
+    used = np.ascontiguousarray(observations[inliers])
+    state, cost = start, np.inf
+    for _ in range(ALTERNATIONS):
+        previous = cost
+        state, cost = _with_translation_refined(
+            used, _with_rotation_refined(used, state, pixel_sigma), pixel_sigma, velocities)
+        if previous - cost < 1e-6 * cost:
+            break
+    scale = float(np.linalg.norm(state.t))
+    return state._replace(t=state.t / scale, d1=state.d1 / scale, d2=state.d2 / scale)
+
+
+def _with_rotation_refined(used: Array, state: TwoViewState, sigma: float) -> TwoViewState:
+    def rotated(theta: Array) -> TwoViewState:
+        return state._replace(R=np.ascontiguousarray(
+            Rotation.from_rotvec(theta).as_matrix() @ state.R))
+
+    # At Exp(theta) R the local derivative is by another rotation on the left, J(theta) dtheta.
+    found = least_squares(
+        lambda theta: sampson.residuals(used, rotated(theta)) / sigma, np.zeros(3), method='lm',
+        jac=lambda theta: (sampson.jacobian(used, rotated(theta))[:, :3]
+                           @ so3.left_jacobian_so3(theta) / sigma))
+    return rotated(found.x)
+
+
+def _with_translation_refined(used: Array, state: TwoViewState, sigma: float,
+                              velocities: bool) -> tuple[TwoViewState, float]:
+    def placed(x: Array) -> TwoViewState:
+        d = x[3:] if velocities else np.zeros(6)
+        return state._replace(t=x[:3].copy(), d1=d[:3].copy(), d2=d[3:].copy())
+
+    def errors(x: Array) -> Array:
+        return np.concatenate([
+            sampson.residuals(used, placed(x)) / sigma,
+            [np.sqrt(TRANSLATION_WEIGHT) * (np.linalg.norm(x[:3]) - 1.0)],
+            np.sqrt(VELOCITY_WEIGHT) * x[3:]])
+
+    def derivatives(x: Array) -> Array:
+        at, length = placed(x), float(np.linalg.norm(x[:3]))
+        unit = x[:3] / length
+        full = sampson.jacobian(used, at._replace(
+            t=unit, d1=at.d1 / length, d2=at.d2 / length)) / length
+        by_d1, by_d2 = full[:, 5:8], full[:, 8:11]
+        # The error does not change with a common scale of (t, d_1, d_2): Euler's relation gives
+        # the radial derivative from the others.
+        radial = -(by_d1 @ at.d1 + by_d2 @ at.d2) / length
+        by_t = full[:, 3:5] @ so3.tangent_basis(unit).T + radial[:, None] * unit
+        by_d = np.hstack([by_d1, by_d2]) if velocities else np.zeros((len(full), 6))
+        jacobian = np.zeros((len(full) + 7, 9))
+        jacobian[:-7] = np.hstack([by_t, by_d]) / sigma
+        jacobian[-7, :3] = np.sqrt(TRANSLATION_WEIGHT) * unit
+        jacobian[-6:, 3:] = np.sqrt(VELOCITY_WEIGHT) * np.eye(6)
+        return jacobian
+
+    start = np.concatenate([state.t, state.d1, state.d2])
+    least = least_squares(errors, start, jac=derivatives, method='lm')
+    return placed(least.x), float(least.cost)
+
+
+# -- Rotation alone: a robust fit with the gyro's prior -------------------------------------------
+
+ROTATION_ITERATIONS = 12
+
+
+@kernel
+def transfer_errors(observations: Array, use: NDArray[np.bool_], R: Array,
+                    focal: float) -> Array:
+    """``|f_1 - R f_2|`` [px] of the matches in `use`: their residual motion after a rotation."""
+    out = np.empty(use.sum())
+    count = 0
+    for i in range(observations.shape[0]):
+        if use[i]:
+            total = 0.0
+            for j in range(3):
+                value = observations[i, j]
+                for k in range(3):
+                    value -= R[j, k] * observations[i, 9 + k]
+                total += value * value
+            out[count] = focal * math.sqrt(total)
+            count += 1
+    return out
+
+
+@kernel
+def fit_rotation(observations: Array, valid: NDArray[np.bool_], start: Array, prior: Priors,
+                 focal: float, sigma: float) -> tuple[Array, Array]:
+    """Rotation (3, 3) and the information (3, 3) of its error in frame 1.
+
+    Iteratively reweighted (Cauchy, scale 2 sigma); the prior on the rotation is the gyro's.
+    """
+    R = start.copy()
+    information = np.zeros((3, 3))
+    factor = np.zeros((3, 3))
+    # Noise of two coordinates in each of two images.
+    weight = focal * focal / (2.0 * sigma * sigma)
+    scale2 = 4.0
+    for _ in range(ROTATION_ITERATIONS):
+        hessian = prior.rotation_information.copy()
+        gradient = prior.rotation_information @ so3.log_so3(R @ prior.rotation.T)
+        for i in range(observations.shape[0]):
+            if not valid[i]:
+                continue
+            o = observations[i]
+            hx = R[0, 0] * o[9] + R[0, 1] * o[10] + R[0, 2] * o[11]
+            hy = R[1, 0] * o[9] + R[1, 1] * o[10] + R[1, 2] * o[11]
+            hz = R[2, 0] * o[9] + R[2, 1] * o[10] + R[2, 2] * o[11]
+            dx, dy, dz = o[0] - hx, o[1] - hy, o[2] - hz
+            w = weight / (1.0 + weight * (dx * dx + dy * dy + dz * dz) / scale2)
+            # d(f_1 - h) = -theta x h: gradient -(h x (f_1 - h)), Hessian |h|^2 I - h h^T
+            gradient[0] -= w * (hy * dz - hz * dy)
+            gradient[1] -= w * (hz * dx - hx * dz)
+            gradient[2] -= w * (hx * dy - hy * dx)
+            hessian[0, 0] += w * (hy * hy + hz * hz)
+            hessian[1, 1] += w * (hx * hx + hz * hz)
+            hessian[2, 2] += w * (hx * hx + hy * hy)
+            hessian[0, 1] -= w * hx * hy
+            hessian[0, 2] -= w * hx * hz
+            hessian[1, 2] -= w * hy * hz
+        hessian[1, 0], hessian[2, 0], hessian[2, 1] = hessian[0, 1], hessian[0, 2], hessian[1, 2]
+        # The rotation about rays that all coincide is not observable: a floor above rounding.
+        floor = 1e-9 * (1.0 + hessian[0, 0] + hessian[1, 1] + hessian[2, 2])
+        for i in range(3):
+            hessian[i, i] += floor
+        information = hessian
+        if not cholesky(hessian, factor):
+            break
+        step = newton_step(factor, gradient)
+        R = so3.exp_so3(step) @ R
+        if np.abs(step).max() < 1e-7:
+            break
+    return R, information

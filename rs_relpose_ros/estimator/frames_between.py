@@ -1,0 +1,358 @@
+"""The frames between the two of a pair: their tracks and IMU data, and the pose from all of them.
+
+Starts at the two-view estimate, whose inliers it uses; `adjustment` has the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.config.settings import EstimatorConfig, MOTIONS
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.estimator import adjustment
+from rs_relpose_ros.estimator.adjustment import (
+    ACCELERATION,
+    Adjusted,
+    BIAS,
+    LOG_SCALE,
+    MOST_ACCELERATIONS,
+    PathPriors,
+    PathState,
+    TANGENT,
+    Tracks,
+)
+from rs_relpose_ros.estimator.result import depths_of_rays, RelativePose
+from rs_relpose_ros.estimator.velocity import CORRELATION_TIME, span_of_scales
+from rs_relpose_ros.geometry import validate
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
+from rs_relpose_ros.geometry.so3 import exp_so3, log_so3, skew, tangent_basis
+from rs_relpose_ros.jit import kernel
+
+Array = NDArray[np.float64]
+
+# Error of gravity and accelerometer together, 1 sigma per axis [m/s^2]: a camera in motion does
+# not measure its tilt better.
+_GRAVITY_SIGMA = 1.0
+# Least noise of the gyro's rotation [rad/sqrt(s)].
+_LEAST_WALK = 5e-4
+# Degrees of freedom as which the configured noise of a match counts.
+_SIGMA_FREEDOM = 10.0
+# Least number of inliers that a frame between must have.
+_LEAST_TRACKS = 10
+# Sine squared of the parallax below which the distance of a track starts at a small value.
+_PARALLEL, _FAR = 1e-8, 1e-2
+_LARGEST_PIXEL = 1e6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class IntermediateFrame:
+    """A frame between the two of a pair.
+
+    Parameters
+    ----------
+    points : (N, 2) array_like
+        Raw pixels, a row for each match of the pair; NaN where it was not tracked.
+    motion : FrameMotion
+        Angular velocity at its reference row.
+    interval : float
+        Seconds from the first frame's reference row to its own.
+    relative_rotation, relative_rotation_covariance : (3, 3) array_like, optional
+        ``R_1^T R`` of its reference row by the gyro, as for the second frame.
+    inertial : InertialMotion, optional
+        From the first frame to this one, with the gravity that the second frame's has.
+
+    Raises
+    ------
+    InputError
+        A value of the wrong shape, or not finite.
+    """
+
+    points: Array
+    motion: FrameMotion
+    interval: float
+    relative_rotation: Array | None = None
+    relative_rotation_covariance: Array | None = None
+    inertial: InertialMotion | None = None
+
+    def __post_init__(self) -> None:
+        points = np.asarray(self.points, dtype=np.float64)
+        validate.array('points of a frame between', np.nan_to_num(points, nan=0.0, posinf=np.inf),
+                       ('N', 2), largest=_LARGEST_PIXEL, unit='px')
+        object.__setattr__(self, 'points', np.ascontiguousarray(points))
+        validate.number('interval of a frame between', self.interval, 1e-6, 1e6, 's')
+        if (self.relative_rotation is None) != (self.relative_rotation_covariance is None):
+            raise InputError('relative_rotation and relative_rotation_covariance of a frame '
+                             'between go together: give both or neither')
+        if self.relative_rotation is not None:
+            assert self.relative_rotation_covariance is not None
+            object.__setattr__(self, 'relative_rotation', validate.rotations(
+                'relative_rotation of a frame between', self.relative_rotation))
+            object.__setattr__(self, 'relative_rotation_covariance', validate.covariance(
+                'relative_rotation_covariance of a frame between',
+                self.relative_rotation_covariance, 3, rounding=1e-12))
+        if self.inertial is not None and not math.isclose(
+                self.inertial.duration, self.interval, abs_tol=1e-6):
+            raise InputError('the interval of a frame between must equal the duration of its '
+                             f'inertial, got {self.interval:.9g} and '
+                             f'{self.inertial.duration:.9g} s')
+
+
+def check(between: Sequence[IntermediateFrame], points1: Array,
+          interval: float | None) -> float | None:
+    """`interval` [s]; InputError unless the frames fit it and the matches `points1` (N, 2)."""
+    if not between:
+        return interval
+    if interval is None:
+        raise InputError('between requires interval (or inertial) of the second frame')
+    before = 0.0
+    for frame in between:
+        if len(frame.points) != len(points1):
+            raise InputError('points of a frame between must have a row for each match, '
+                             f'{points1.shape}, got {frame.points.shape}')
+        if not before < frame.interval < interval:
+            raise InputError('intervals of the frames between must increase and be less than '
+                             f'interval = {interval:.9g} s, got {frame.interval:.9g} after '
+                             f'{before:.9g} s')
+        before = frame.interval
+    return interval
+
+
+class _View(NamedTuple):
+    """A frame of the pair, first and last ones included; rotation by the gyro."""
+
+    points: Array   # (N, 2) px, of the inliers
+    motion: FrameMotion
+    interval: float
+    rotation: Array
+    covariance: Array
+    inertial: InertialMotion | None
+
+    @classmethod
+    def of(cls, frame: IntermediateFrame, inliers: NDArray[np.bool_]) -> _View | None:
+        """None without the gyro's rotation."""
+        if frame.relative_rotation is None or frame.relative_rotation_covariance is None:
+            return None
+        return cls(frame.points[inliers], frame.motion, frame.interval, frame.relative_rotation,
+                   frame.relative_rotation_covariance, frame.inertial)
+
+
+def refined(pose: RelativePose, points1: Array, motion1: FrameMotion, second: tuple[Any, ...],
+            between: Sequence[IntermediateFrame], camera: RollingShutterCamera,
+            config: EstimatorConfig) -> RelativePose:
+    """The pose from all frames, or that of two views with `frames_reason`.
+
+    `points1` (N, 2), `motion1`: of the first frame; `second`: the second one of the pair, as
+    arguments of `IntermediateFrame`.
+    """
+    if not (pose and between):
+        return pose
+    if config.refinement != 'map' or pose.model in ('linear', 'global'):
+        return replace(pose, frames_reason='solver or refinement are for two views')
+    last = _View.of(IntermediateFrame(*second), pose.inliers)
+    if last is None:
+        return replace(pose, frames_reason='there is no rotation by the gyro')
+    views = [_View(points1[pose.inliers], motion1, 0.0, np.eye(3), np.zeros((3, 3)), None)]
+    for frame in between:
+        view = _View.of(frame, pose.inliers)
+        if view is not None and np.isfinite(view.points[:, 0]).sum() >= _LEAST_TRACKS:
+            views.append(view)
+    if len(views) == 1:
+        return replace(pose, frames_reason='no frame between has a rotation by the gyro and '
+                       f'{_LEAST_TRACKS} inliers of the pair')
+    views.append(last)
+    path = _Path.of(views)
+    tracks = _tracks(views, path, camera)
+    priors = _priors(views, path, config)
+    adjusted = adjustment.adjust(
+        tracks, priors, _start(pose, views, tracks, priors),
+        min(max(pose.residual_rms, 0.1 * config.pixel_sigma), config.pixel_sigma),
+        _SIGMA_FREEDOM)
+    if not (np.isfinite(adjusted.covariance).all()
+            and np.median(adjusted.state.inverse_distances) > 0.0):
+        return replace(pose, frames_reason='the adjustment of all frames does not converge')
+    return _result(pose, adjusted, tracks, path, len(views))
+
+
+class _Path(NamedTuple):
+    """Acceleration of the IMU between the views, where all of them have it."""
+
+    known: bool
+    lever_arm: Array   # (3,) [m]
+    alphas: Array   # (V, 3) integrated twice up to the reference row of each view [m]
+    betas: Array   # (V, 3) once [m/s]
+    accelerations: Array   # (V, 3) during the readout [m/s^2]
+    chord: Array   # (3,) displacement of the camera by it, up to the last view [m]
+    ends: tuple[Array, Array]   # (3,) velocities of the camera by it at the two ends [m/s]
+
+    @classmethod
+    def of(cls, views: Sequence[_View]) -> _Path:
+        zero = np.zeros(3)
+        motions = [view.inertial for view in views[1:]]
+        given = [motion for motion in motions if motion is not None]
+        if len(given) < len(motions):
+            none = np.zeros((len(views), 3))
+            return cls(False, zero, none, none, none, zero, (zero, zero))
+        arm, R = np.asarray(given[-1].lever_arm), views[-1].rotation
+        start, end = views[0].motion.angular_velocity, views[-1].motion.angular_velocity
+        return cls(
+            True, arm, np.array([zero, *(motion.alpha for motion in given)]),
+            np.array([zero, *(motion.beta for motion in given)]),
+            np.array([given[-1].acceleration1, *(motion.acceleration2 for motion in given)]),
+            given[-1].alpha - (R @ arm - arm),
+            (-np.cross(start, arm), given[-1].beta - R @ np.cross(end, arm)))
+
+
+def _tracks(views: Sequence[_View], path: _Path, camera: RollingShutterCamera) -> Tracks:
+    """Observations of the inliers."""
+    points = np.array([view.points for view in views])
+    shape = points.shape[:2]
+    rays, jacobian = camera.unproject_with_jacobian(points.reshape(-1, 2))
+    rays, jacobian = rays.reshape(*shape, 3), jacobian.reshape(*shape, 3, 2)
+    # The gyro covers the rows of the image only.
+    used = (np.isfinite(rays).all(axis=2) & (points[..., 1] >= 0.0)
+            & (points[..., 1] <= camera.height - 1.0))
+    rows = np.where(used, points[..., 1], camera.reference_row_index)
+    rotations = np.array([view.rotation for view in views])
+    tracks = Tracks(np.zeros((*shape, 3)), np.zeros((*shape, 2, 3)), camera.row_times(rows),
+                    np.zeros((*shape, 3)), used, rotations, views[-1].interval)
+    for v, view in enumerate(views):
+        _fill(tracks, v, rays[v], jacobian[v], view.motion.rotations(tracks.times[v]),
+              camera.line_delay * view.motion.angular_velocity, view.interval, path.alphas[v],
+              path.betas[v], path.accelerations[v], path.lever_arm, path.chord)
+    return tracks
+
+
+@kernel
+def _fill(tracks: Tracks, v: int, rays: Array, jacobian: Array, rotations: Array,
+          row_rotation: Array, interval: float, alpha: Array, beta: Array, acceleration: Array,
+          arm: Array, chord: Array) -> None:
+    """Fill the observations of view v: derotated rays, and the displacement by the IMU.
+
+    `rotations` (N, 3, 3) of the rows, `row_rotation` (3,) from one row to the next [rad].
+    """
+    R, J, turned = tracks.rotations[v], np.empty((3, 2)), np.empty(3)
+    for i in range(len(rays)):
+        if not tracks.used[v, i]:
+            continue
+        E, tau = rotations[i], tracks.times[v, i]
+        for x in range(3):
+            tracks.rays[v, i, x] = (E[x, 0] * rays[i, 0] + E[x, 1] * rays[i, 1]
+                                    + E[x, 2] * rays[i, 2])
+            turned[x] = E[x, 0] * arm[0] + E[x, 1] * arm[1] + E[x, 2] * arm[2]
+            for m in range(2):
+                J[x, m] = (E[x, 0] * jacobian[i, 0, m] + E[x, 1] * jacobian[i, 1, m]
+                           + E[x, 2] * jacobian[i, 2, m])
+        ray = tracks.rays[v, i]
+        for x in range(3):   # one row further down, the camera has rotated on
+            a, b = (x + 1) % 3, (x + 2) % 3
+            J[x, 1] += row_rotation[a] * ray[b] - row_rotation[b] * ray[a]
+        # Pseudo-inverse of the (3, 2) derivative: (J^T J)^-1 J^T.
+        uu = uv = vv = 0.0
+        for x in range(3):
+            uu += J[x, 0] * J[x, 0]
+            uv += J[x, 0] * J[x, 1]
+            vv += J[x, 1] * J[x, 1]
+        determinant = uu * vv - uv * uv
+        time = interval + tau
+        for x in range(3):
+            tracks.to_pixels[v, i, 0, x] = (vv * J[x, 0] - uv * J[x, 1]) / determinant
+            tracks.to_pixels[v, i, 1, x] = (uu * J[x, 1] - uv * J[x, 0]) / determinant
+            lever = R[x, 0] * turned[0] + R[x, 1] * turned[1] + R[x, 2] * turned[2] - arm[x]
+            tracks.moved[v, i, x] = (
+                alpha[x] + tau * beta[x] + 0.5 * tau * tau * acceleration[x] - lever
+                - time / tracks.duration * chord[x])
+        tracks.times[v, i] = time
+
+
+def _priors(views: Sequence[_View], path: _Path,
+            config: EstimatorConfig) -> PathPriors:
+    """Priors of the path, of the gyro's bias and of its rotations."""
+    times = np.array([view.interval for view in views[1:]])
+    # Of integrated white noise and a constant bias, as in the covariances n t + b t^2.
+    variances = np.array([np.trace(view.covariance) / 3.0 for view in views[1:]])
+    first, last = variances[0] / times[0], variances[-1] / times[-1]
+    of_bias = max((last - first) / (times[-1] - times[0]), 1e-10)
+    walk = max(first - of_bias * times[0], 0.0) + _LEAST_WALK**2
+    # Errors of the stamps, of the first frame for all others.
+    rates = np.array([view.rotation @ view.motion.angular_velocity for view in views])
+    covariance = np.kron(walk * np.minimum.outer(times, times), np.eye(3))
+    covariance += np.kron(np.ones((len(times), len(times))),
+                          config.stamp_sigma**2 * np.outer(rates[0], rates[0]))
+    for k, rate in enumerate(rates[1:]):
+        block = slice(3 * k, 3 * k + 3)
+        covariance[block, block] += config.stamp_sigma**2 * np.outer(rate, rate)
+    lowest, highest = span_of_scales(config.motion, views[-1].interval)
+    variances = (np.array([_GRAVITY_SIGMA**2]) if path.known else
+                 _of_carrier(MOTIONS[config.motion].acceleration, views[-1].interval))
+    return PathPriors(-0.5 * (lowest + highest), 12.0 / (highest - lowest)**2, 1.0 / of_bias,
+                      1.0 / variances, np.linalg.inv(covariance))
+
+
+def _of_carrier(sigma: float, interval: float) -> Array:
+    """Variances (K,) of the Legendre coefficients of an exponentially correlated acceleration."""
+    x, weights = np.polynomial.legendre.leggauss(16)
+    order = np.arange(MOST_ACCELERATIONS)
+    to_coefficients = (order[:, None] + 0.5) * weights * np.polynomial.legendre.legvander(
+        x, MOST_ACCELERATIONS - 1).T
+    correlation = np.exp(-0.5 * interval * np.abs(x[:, None] - x) / CORRELATION_TIME)
+    return np.asarray(sigma**2 * np.diag(to_coefficients @ correlation @ to_coefficients.T))
+
+
+def _start(pose: RelativePose, views: Sequence[_View], tracks: Tracks,
+           priors: PathPriors) -> PathState:
+    """The state of the two-view estimate."""
+    T = tracks.duration
+    off = log_so3(np.ascontiguousarray(pose.R @ tracks.rotations[-1].T))
+    # Half of the rotation's error to the bias, half to the noise.
+    rotations = np.outer([view.interval / T for view in views], 0.5 * off)
+    depths, _, near = depths_of_rays(
+        tracks.rays[0], tracks.rays[-1] @ pose.R.T, np.tile(pose.t, (tracks.used.shape[1], 1)),
+        _PARALLEL)
+    log_scale = -math.log(pose.baseline) if math.isfinite(pose.baseline) else priors.log_scale
+    accelerations = len(priors.acceleration_weights)
+    return PathState(pose.t.copy(), log_scale, 0.5 * off / T, np.zeros((accelerations, 3)),
+                     rotations,
+                     tracks.rays[0].copy(),
+                     np.where(near, 1.0 / np.where(near, depths, 1.0), _FAR))
+
+
+def _result(pose: RelativePose, adjusted: Adjusted, tracks: Tracks, path: _Path,
+            views: int) -> RelativePose:
+    """The two-view result with the pose, its covariance and the velocities of all frames."""
+    state, C, T = adjusted.state, adjusted.covariance, tracks.duration
+    n, k = len(C), math.exp(state.log_scale)
+    R = exp_so3(T * state.bias + state.rotations[-1]) @ tracks.rotations[-1]
+    by_state = np.zeros((6, n))
+    by_state[:3, TANGENT:LOG_SCALE] = tangent_basis(state.t)
+    by_state[3:, BIAS:BIAS + 3], by_state[3:, -3:] = T * np.eye(3), np.eye(3)
+    # p' at both ends, in the axes of camera 1.
+    moved1, moved2 = (velocity - path.chord / T for velocity in path.ends)
+    # B_j' at both ends.
+    bend1, bend2 = T * np.array([[-0.5, 1.0 / 6.0, 0.0], [0.5, 1.0 / 6.0, 0.0]])[
+        :, :len(state.accelerations)]
+    velocity1 = state.t / T + k * (moved1 + bend1 @ state.accelerations)
+    velocity2 = state.t / T + k * (moved2 + bend2 @ state.accelerations)
+    by_velocity = np.zeros((3, n))
+    by_velocity[:, TANGENT:LOG_SCALE] = tangent_basis(state.t) / T
+    by_velocity[:, LOG_SCALE] = velocity2 - state.t / T
+    by_velocity[:, ACCELERATION:ACCELERATION + 3 * len(bend2)] = k * np.kron(bend2, np.eye(3))
+    by_velocity += skew(velocity2) @ by_state[3:]   # R^T p' rotates with the error of R
+    by_velocity = R.T @ by_velocity
+    velocity_covariance = pose.velocity_covariance.copy()
+    velocity_covariance[:3] = velocity_covariance[:, :3] = 0.0
+    velocity_covariance[:3, :3] = by_velocity @ C @ by_velocity.T
+    known = path.known and math.isfinite(pose.baseline)
+    return replace(
+        pose, R=R, t=state.t, covariance=by_state @ C @ by_state.T, linear_velocity1=velocity1,
+        linear_velocity2=R.T @ velocity2, velocity_covariance=velocity_covariance,
+        baseline=1.0 / k if known else pose.baseline,
+        baseline_log_sigma=(math.sqrt(C[LOG_SCALE, LOG_SCALE]) if known
+                            else pose.baseline_log_sigma),
+        frames=views, pixel_sigma=adjusted.sigma)

@@ -1,0 +1,143 @@
+"""Checks of arguments: an InputError names the parameter, what is legal and the value given.
+
+A function returns the checked value: numbers as they are, arrays as a contiguous copy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+import math
+import sys
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rs_relpose_ros.errors import InputError
+
+Array = NDArray[np.float64]
+Number = TypeVar('Number', int, float)
+
+_FLOAT_MAX = sys.float_info.max
+# Largest deviation of R^T R from the identity, and of a covariance matrix from its transpose
+# (relative to its largest element), that is rounding.
+_ROUNDING_ROTATION = 1e-6
+_ROUNDING_SYMMETRY = 1e-9
+
+
+def legal_range(low: float, high: float, unit: str = '') -> str:
+    """The numbers from `low` to `high`, in words."""
+    unit = f' {unit}'.rstrip()
+    if low == -math.inf:
+        return f'finite{unit}' if high == math.inf else f'<= {high:g}{unit} and finite'
+    return f'>= {low:g}{unit} and finite' if high == math.inf else f'in [{low:g}, {high:g}]{unit}'
+
+
+def number(name: str, value: Number, low: float = -math.inf, high: float = math.inf,
+           unit: str = '') -> Number:
+    """A finite number in [low, high]."""
+    if not _is_within(value, low, high):
+        raise InputError(f'{name} must be {legal_range(low, high, unit)}, got {value!r}')
+    return value
+
+
+def whole_number(name: str, value: int, low: float, high: float = math.inf,
+                 unit: str = '') -> int:
+    """A whole number in [low, high]."""
+    if not (_is_within(value, low, high) and int(value) == value):
+        raise InputError(
+            f'{name} must be a whole number, {legal_range(low, high, unit)}, got {value!r}')
+    return value
+
+
+def _is_within(value: Any, low: float, high: float) -> bool:
+    try:
+        return bool(low <= value <= high and abs(value) < math.inf)
+    except (TypeError, ValueError):   # no number
+        return False
+
+
+def choice(name: str, value: str, choices: Collection[str]) -> str:
+    """One of some names."""
+    if value not in tuple(choices):
+        raise InputError(f'{name} must be one of {", ".join(choices)}, got {value!r}')
+    return value
+
+
+def array(name: str, value: ArrayLike | None, shape: tuple[int | str, ...], *,
+          largest: float = _FLOAT_MAX, unit: str = '') -> Array:
+    """Finite numbers of a shape, none of a magnitude beyond `largest` [`unit`].
+
+    `shape`: sizes, and names such as 'N' of sizes that may be any, 0 too.
+    """
+    try:
+        checked = np.array(value, dtype=np.float64, order='C')
+    except (TypeError, ValueError):
+        raise InputError(f'{name} must be an array of numbers, got {value!r}') from None
+    if checked.ndim != len(shape) or any(
+            isinstance(size, int) and size != found
+            for size, found in zip(shape, checked.shape, strict=True)):
+        comma = ',' if len(shape) == 1 else ''
+        raise InputError(f'{name} must have shape ({", ".join(map(str, shape))}{comma}), '
+                         f'got {checked.shape}')
+    legal = np.abs(checked) <= largest   # not NaN
+    if not legal.all():
+        place = np.unravel_index(np.argmin(legal), legal.shape)
+        text = 'finite' if largest == _FLOAT_MAX else f'finite and within {largest:g} {unit}'
+        raise InputError(f'{name} must be {text.rstrip()}, got {checked[place]} '
+                         f'at {[int(k) for k in place]}')
+    return checked
+
+
+def unit_vectors(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> Array:
+    """Directions of any length but zero, brought to unit length along the last axis."""
+    vectors = array(name, value, shape)
+    largest = np.abs(vectors).max(axis=-1, keepdims=True, initial=0.0)
+    if not (largest > 0.0).all():
+        raise InputError(f'{name} must not hold a zero vector, which has no direction')
+    # Divided by the largest element first, lengths neither overflow nor vanish.
+    vectors /= largest
+    vectors /= np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors
+
+
+def unit_length(name: str, value: ArrayLike, tolerance: float) -> None:
+    """Raise InputError unless a vector (N,) has length 1."""
+    length = float(np.linalg.norm(value))
+    if not abs(length - 1.0) < tolerance:
+        raise InputError(f'{name} must have length 1, got {value!r} of length {length:.4f}')
+
+
+def rotations(name: str, value: ArrayLike | None,
+              shape: tuple[int | str, ...] = (3, 3)) -> Array:
+    """A rotation matrix (3, 3), or several of them (K, 3, 3)."""
+    # Bounded first, so that the product cannot overflow.
+    R = array(name, value, shape, largest=2.0)
+    if not ((np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)) < _ROUNDING_ROTATION).all()
+            and (np.linalg.det(R) > 0.0).all()):
+        raise InputError(f'{name} must be a rotation matrix (orthonormal, determinant +1), '
+                         f'got {R.tolist()}')
+    return R
+
+
+def covariance(name: str, value: ArrayLike, size: int, *, largest: float = _FLOAT_MAX,
+               unit: str = '', rounding: float = 1e-9) -> Array:
+    """A symmetric matrix (size, size) without eigenvalues below ``-rounding``."""
+    matrix = array(name, value, (size, size), largest=largest, unit=unit)
+    asymmetry = np.abs(matrix - matrix.T).max()
+    if asymmetry > _ROUNDING_SYMMETRY * max(1.0, np.abs(matrix).max()) \
+            or np.linalg.eigvalsh(matrix)[0] < -rounding:
+        raise InputError(f'{name} must be a covariance matrix (symmetric, no negative '
+                         f'eigenvalue), got {matrix.tolist()}')
+    return matrix
+
+
+def increasing(name: str, values: NDArray[Any]) -> None:
+    """Raise InputError unless the values (N,) increase strictly."""
+    if values.ndim != 1:
+        raise InputError(f'{name} must have shape (N,), got {values.shape}')
+    rises = values[1:] > values[:-1]
+    if not rises.all():
+        k = int(np.argmin(rises))
+        raise InputError(f'{name} must be strictly increasing, got {values[k + 1]} after '
+                         f'{values[k]} at [{k + 1}]')

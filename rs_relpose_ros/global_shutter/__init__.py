@@ -1,1 +1,0 @@
-"""Images as if all rows had been seen at once, turned by the gyro to the middle row."""

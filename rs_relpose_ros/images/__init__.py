@@ -1,1 +1,0 @@
-"""Published images as data: encodings, headers of compressed ones, decoding."""

@@ -1,1 +1,0 @@
-"""The live node; the only sub-package that imports rclpy."""

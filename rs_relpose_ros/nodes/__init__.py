@@ -1,0 +1,1 @@
+"""The live nodes; the only folder that imports rclpy."""

@@ -1,0 +1,436 @@
+"""Statistics of the nodes: the fields of /diagnostics, log lines, files with a line per frame."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+import threading
+import time
+from typing import NamedTuple, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry.timing import NANOSECONDS
+from rs_relpose_ros.messages.incoming import MOST_REASONS, reason_key, Role
+from rs_relpose_ros.pipeline.findings import Assessment, FindingState, NOT_EVALUATED
+from rs_relpose_ros.pipeline.monitor import Applied, Tracked
+from rs_relpose_ros.pipeline.pair import Frame, PAIR_METRICS, PairResult
+from rs_relpose_ros.pipeline.sequencer import Refusal, SequencerCounts
+
+# -- Reasons for no results or few images ---------------------------------------------------------
+
+# Time without a result [s] after which the reason is logged.
+PATIENCE = 5.0
+# Share of the images whose refusal is the reason for no result.
+_MOST = 0.8
+# Images per CameraInfo below which images are lost: drivers publish one CameraInfo for each.
+_LOST = 0.7
+# With its default transports Fast DDS loses best-effort messages above this size [bytes], which do
+# not fit into its segment of shared memory.
+_BIG = 512 * 1024
+_COMPRESSED = '/compressed'
+
+
+@dataclass(frozen=True, slots=True)
+class Silence:
+    """Inputs since the last result, or since the start."""
+
+    seconds: float = 0.0
+    images: int = 0
+    refused: Mapping[Refusal, int] = field(default_factory=dict)
+    failure: str = ''   # reason of the last pair or frame without a result
+
+
+class Reason(NamedTuple):
+    """`kind`: logged once while it stays; `text`: the log line."""
+
+    kind: str
+    text: str
+
+
+def why_no_image(image: str, published: Collection[str]) -> Reason:
+    """Reason for no image on a topic; `published`: image topics that have a publisher."""
+    kind = f'no image on {image}'
+    twin = (image.removesuffix(_COMPRESSED) if image.endswith(_COMPRESSED)
+            else image + _COMPRESSED)
+    if image in published:
+        fix = 'it has a publisher: does its quality of service match, and does the driver run?'
+    elif twin in published:
+        transport = 'compressed' if twin.endswith(_COMPRESSED) else 'raw'
+        fix = f'only {twin} is published: set image_transport:={transport}'
+    elif published:
+        fix = (f'these topics with images have publishers: {", ".join(sorted(published))}; '
+               'remap image')
+    else:
+        fix = 'no topic with images has a publisher: is the camera driver running?'
+    return Reason(kind, f'{kind} for {PATIENCE:g} s; {fix}')
+
+
+def why_nothing(silence: Silence) -> Reason:
+    """Reason for no result although images come."""
+    refused = sum(silence.refused.values())
+    if refused >= _MOST * silence.images:
+        refusal = max(silence.refused, key=lambda kind: silence.refused[kind])
+        return Reason(f'refused: {refusal.value}', (
+            f'nothing for {PATIENCE:g} s: {refused} of {silence.images} images were refused, '
+            f'{silence.refused[refusal]} of them as {refusal.value}'))
+    if silence.failure:
+        return Reason(silence.failure.partition(':')[0],
+                      f'nothing for {PATIENCE:g} s; the last reason: {silence.failure}')
+    return Reason('nothing', f'nothing came of {silence.images} images in {PATIENCE:g} s')
+
+
+class LostImages:
+    """Detects lost large images from the numbers of messages per second."""
+
+    def __init__(self) -> None:
+        self._totals: deque[tuple[int, int]] = deque(maxlen=round(PATIENCE) + 1)
+
+    def add(self, images: int, camera_infos: int, size: int) -> str:
+        """Add the totals after another second; a warning if images are lost, else ''.
+
+        `size` is that of an image [bytes].
+        """
+        self._totals.append((images, camera_infos))
+        first_images, first_infos = self._totals[0]
+        images, camera_infos = images - first_images, camera_infos - first_infos
+        if (len(self._totals) < PATIENCE + 1 or size < _BIG or images >= _LOST * camera_infos
+                or images == 0):
+            return ''
+        return (f'{images / PATIENCE:.0f} images a second of {size / 1e6:.1f} MB come, and '
+                f'{camera_infos / PATIENCE:.0f} CameraInfo: Fast DDS loses big messages. Give the '
+                'driver and this node the shipped profile, FASTRTPS_DEFAULT_PROFILES_FILE='
+                '$(ros2 pkg prefix --share rs_relpose_ros)/config/fastdds.xml; ros2 launch '
+                'rs_relpose_ros relpose.launch.py does it for the node')
+
+
+# -- Fields of /diagnostics -----------------------------------------------------------------------
+
+OK, WARN, ERROR = 0, 1, 2
+
+# Numbers of the latest results and frames over which latency and time per frame are taken.
+_RECENT_RESULTS = 300
+_RECENT_FRAMES = 900
+# Time without a message [s] after which an input counts as missing.
+SILENCE = 2.0
+# Topics of the nodes in the order of /diagnostics, and the key of unusable messages.
+TOPICS = (Role.IMAGE, Role.CAMERA_INFO, Role.IMU, Role.ACCEL)
+INVALID = 'invalid'
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """A diagnostic status: level, text, and the fields in their order."""
+
+    level: int
+    text: str
+    values: tuple[tuple[str, str], ...]
+    silence: Silence   # ends with a result
+
+
+# Counters of `SequencerCounts`.
+_COUNTERS = ('imu_samples', 'imu_gaps', 'imu_repeated', 'imu_late', 'clock_jumps')
+
+
+def _ms(seconds: float) -> str:
+    return f'{1e3 * seconds:.2f}'
+
+
+def _vector(values: NDArray[np.float64]) -> str:
+    return ' '.join(f'{value:.5f}' for value in values)
+
+
+# Tracked calibration and applied corrections, to be compared with the parameters.
+_TRACKED: dict[str, Callable[[Tracked, Applied], str]] = {
+    'tracked_gyro_bias_rad_s': lambda tracked, _: _vector(tracked.gyro_bias),
+    'tracked_gyro_bias_sigma_rad_s': lambda tracked, _: _vector(tracked.gyro_bias_sigma),
+    'tracked_time_offset_ms': lambda tracked, _: _ms(tracked.time_offset),
+    'tracked_time_offset_sigma_ms': lambda tracked, _: _ms(tracked.time_offset_sigma),
+    'applied_time_offset_ms': lambda _, applied: _ms(applied.time_offset),
+    'tracked_readout_time_ms': lambda tracked, _: _ms(tracked.readout_time),
+    'tracked_readout_time_sigma_ms': lambda tracked, _: _ms(tracked.readout_time_sigma),
+    'applied_readout_time_ms': lambda _, applied: _ms(applied.readout_time)}
+
+
+class FrameStatistics(ABC):
+    """Fields that every node has, thread-safe; a subclass adds those of its results.
+
+    `clock`: monotonic [ns]; set by tests.
+    """
+
+    # States without results, and with a configured parameter that is wrong.
+    idle, wrong = 'not working', 'told wrong'
+    last = 'last_failure'   # key of the last failure
+
+    def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._latencies: deque[float] = deque(maxlen=_RECENT_RESULTS)
+        self._failures = 0
+        self._last_failure = ''
+        self._since_ns = clock()
+        self._counted: Counter[str] = Counter()
+        self._refused: Counter[Refusal] = Counter()
+        self._frame_times: deque[float] = deque(maxlen=_RECENT_FRAMES)
+        self._busy_ns = 0
+        self._results = self._results_reported = 0
+        self.start()
+
+    def start(self) -> None:
+        """The subscriptions are made: silence is measured from here."""
+        with self._lock:
+            self._silent_since = (self._clock(), self._counted[Role.IMAGE], self._refused)
+
+    def add_frame(self, taken_ns: int) -> None:
+        """Count a frame that was `taken_ns` (monotonic clock), after its publication."""
+        spent_ns = self._clock() - taken_ns
+        with self._lock:
+            self._frame_times.append(spent_ns / NANOSECONDS)
+            self._busy_ns += spent_ns
+
+    def add_failure(self, reason: str) -> None:
+        """Count a frame whose processing failed."""
+        with self._lock:
+            self._failures += 1
+            self._last_failure = reason
+
+    def report(self, inputs: Counter[str], counts: SequencerCounts | None, *, problem: str,
+               missing: tuple[str, ...]) -> Report:
+        """The state since the last report.
+
+        `inputs` are the numbers of messages so far, by role, and of the invalid ones. `counts` is
+        None while no frame is processed; `problem` is the reason for that, or empty; `missing` are
+        names of missing parameters and inputs.
+        """
+        now_ns = self._clock()
+        with self._lock:
+            elapsed = max((now_ns - self._since_ns) / NANOSECONDS, 1e-3)
+            before, self._since_ns, self._counted = self._counted, now_ns, inputs
+            refused = Counter({} if counts is None else counts.refused)
+            dropped, self._refused = refused - self._refused, refused
+            busy, self._busy_ns = self._busy_ns / NANOSECONDS / elapsed, 0
+            level, text = self._evaluate(problem, dropped)
+            values: dict[str, object] = {
+                'state': self.idle if problem else {
+                    OK: 'ok', WARN: 'degraded', ERROR: self.wrong}[level],
+                'missing': ', '.join(missing)}
+            for role in TOPICS:
+                rate = (inputs[role] - before[role]) / elapsed
+                values[f'{role.value}_rate_hz'] = f'{rate:.1f}'
+            values['frames_received'] = counts.frames if counts else inputs[Role.IMAGE]
+            values['frames_processed'] = counts.frames_taken if counts else 0
+            for kind in Refusal:
+                values[f'frames_refused_{kind.value}'] = refused[kind]
+            values['frames_failed'] = self._failures
+            values['messages_invalid'] = inputs[INVALID]
+            for name in _COUNTERS:
+                values[name] = getattr(counts, name, 0)
+            values.update(self._values())
+            for name, seconds in (('latency', self._latencies), ('frame_time', self._frame_times)):
+                values[f'{name}_p50_ms'], values[f'{name}_p99_ms'] = _milliseconds(seconds)
+            values['worker_busy_percent'] = f'{100.0 * busy:.0f}'
+            values[self.last] = self._last_failure
+            silence = self._silence(now_ns, inputs[Role.IMAGE], refused)
+        return Report(level, text, tuple((name, str(value)) for name, value in values.items()),
+                      silence)
+
+    def _silence(self, now_ns: int, images: int, refused: Counter[Refusal]) -> Silence:
+        # Without an image there can be no result.
+        if self._results > self._results_reported or images == self._silent_since[1]:
+            self._results_reported = self._results
+            self._silent_since = (now_ns, images, refused)
+        since_ns, images_before, refused_before = self._silent_since
+        return Silence((now_ns - since_ns) / NANOSECONDS, images - images_before,
+                       refused - refused_before, self._last_failure)
+
+    def _evaluate(self, problem: str, dropped: Counter[Refusal]) -> tuple[int, str]:
+        if problem:
+            return ERROR, problem
+        level, text = self._evaluate_results()
+        if level == ERROR or not dropped:
+            return level, text
+        kinds = ', '.join(f'{count} {kind.value}' for kind, count in dropped.most_common())
+        why = ': the worker is too slow for the camera' if dropped[Refusal.OVERLOAD] else ''
+        return WARN, f'{dropped.total()} frames were not used since the last report ({kinds}){why}'
+
+    def _published(self, ready_ns: int) -> None:
+        """Add the latency of a result with all data at `ready_ns`; call it under the lock."""
+        self._results += 1
+        self._latencies.append((self._clock() - ready_ns) / NANOSECONDS)
+
+    # -- results of a node (called under the lock) ---------------------------------------------
+
+    @abstractmethod
+    def _evaluate_results(self) -> tuple[int, str]:
+        """Level and text while frames are processed; ERROR if a parameter is wrong."""
+
+    @abstractmethod
+    def _values(self) -> dict[str, object]:
+        """Fields of the results."""
+
+
+def _milliseconds(seconds: Collection[float]) -> tuple[str, str]:
+    """Median and 99th percentile; empty without values."""
+    if not seconds:
+        return '', ''
+    median, p99 = 1e3 * np.percentile(list(seconds), (50, 99))
+    return f'{median:.1f}', f'{p99:.1f}'
+
+
+class Statistics(FrameStatistics):
+    """Fields of relpose_node; thread-safe."""
+
+    idle, last = 'not estimating', 'last_reason_no_pose'
+
+    def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
+        super().__init__(clock)
+        self._pairs = self._poses = 0
+        self._last_pair: PairResult | None = None
+        self._last_pose: PairResult | None = None
+
+    def add_pair(self, result: PairResult, ready_ns: int) -> None:
+        """Count a pair right after its publication; its data were complete at `ready_ns`."""
+        with self._lock:
+            self._pairs += 1
+            self._last_pair = result
+            if result.pose:
+                self._poses += 1
+                self._last_pose = result
+                self._published(ready_ns)
+            else:
+                self._last_failure = f'{result.pose.status.value}: {result.pose.reason}'
+
+    def _evaluate_results(self) -> tuple[int, str]:
+        last = self._last_pair
+        if last is None:
+            return OK, 'no keyframe pair yet'
+        if last.health.faults:
+            worst = last.health.faults[0]
+            return ERROR if worst.state is FindingState.WRONG else WARN, worst.text
+        if not last.pose:
+            return WARN, f'no pose of the last pair: {self._last_failure}'
+        return OK, f'estimating: {self._poses} poses of {self._pairs} pairs'
+
+    def _values(self) -> dict[str, object]:
+        last, pose = self._last_pair, self._last_pose
+        tracked = dict.fromkeys(_TRACKED, '')
+        if last is not None and last.tracked is not None and last.tracked.pairs:
+            tracked = {name: text(last.tracked, last.applied) for name, text in _TRACKED.items()}
+        return {
+            'pairs': self._pairs, 'poses': self._poses,
+            **{metric.name: metric.text(last) for metric in PAIR_METRICS},
+            'model': pose.pose.model if pose else '',
+            **tracked,
+            'health': (NOT_EVALUATED if last is None else last.health).state.value,
+            'health_findings': (NOT_EVALUATED if last is None else last.health).text}
+
+
+# -- Files with a line per frame ------------------------------------------------------------------
+
+COLUMNS = ('stamp_ns', 'ready_ns', 'taken_ns', 'done_ns', 'cpu_ns', 'outcome')
+
+
+def opened(parameter: str, path: str) -> TextIO:
+    """File of the parameter of this name, written line by line; InputError if it cannot be."""
+    try:
+        return Path(path).open('w', buffering=1, encoding='ascii')
+    except OSError as error:
+        raise InputError(f'{parameter} {path} cannot be written: {error.strerror}') from error
+
+
+class FrameTimings:
+    """Writes the file of the parameter `timings_file`; to be used by the worker thread.
+
+    For each frame: its stamp; on the monotonic clock the times `ready` and `taken` (as in `Frame`)
+    and `done` (after publication); processor time of the thread since the frame before; the status
+    of its keyframe pair, or ``none``.
+    """
+
+    def __init__(self, path: str) -> None:
+        self._file = opened('timings_file', path)
+        self._file.write(','.join(COLUMNS) + '\n')
+        self._spent_ns = 0
+
+    def start(self) -> None:
+        """The processor time until now belongs to no frame."""
+        self._spent_ns = time.thread_time_ns()
+
+    def add(self, frame: Frame[PairResult]) -> None:
+        """Write a frame; call it right after its result was published."""
+        done_ns, spent_ns = time.monotonic_ns(), time.thread_time_ns()
+        outcome = 'none' if frame.result is None else frame.result.pose.status.value
+        self._file.write(f'{frame.stamp_ns},{frame.ready_ns},{frame.taken_ns},{done_ns},'
+                         f'{spent_ns - self._spent_ns},{outcome}\n')
+        self._spent_ns = spent_ns
+
+    def close(self) -> None:
+        """No more frames."""
+        self._file.close()
+
+
+# -- Log lines once per reason, repetitions now and then with their number ------------------------
+
+class ReasonLog:
+    """Passes a text to `write` unless one of its kind came in the last `period` [s]; thread-safe.
+
+    `clock`: monotonic [s]; set by tests.
+    """
+
+    def __init__(self, write: Callable[[str], object], period: float = 30.0,
+                 clock: Callable[[], float] = time.monotonic) -> None:
+        self._write = write
+        self._period = period
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._last: dict[str, tuple[float, int]] = {}
+
+    def __call__(self, text: str, kind: str = '') -> None:
+        """Log `text`, or count it; without a `kind`, texts that differ in numbers share one."""
+        kind = kind or reason_key(text)
+        now = self._clock()
+        with self._lock:
+            if kind not in self._last and len(self._last) >= MOST_REASONS:
+                kind, text = '', 'further problems of other kinds (see /diagnostics)'
+            last = self._last.get(kind)
+            if last is not None and now - last[0] < self._period:
+                self._last[kind] = (last[0], last[1] + 1)
+                return
+            self._last[kind] = (now, 0)
+        repeated = f' ({last[1]} more since the last such line)' if last and last[1] else ''
+        self._write(text + repeated)
+
+
+# -- Log of the calibration consistency -----------------------------------------------------------
+
+class HealthLog:
+    """Logs findings after each pair; at most a line per parameter and period of the logs."""
+
+    def __init__(self, info: ReasonLog, warn: ReasonLog, error: ReasonLog) -> None:
+        self._info, self._warn, self._error = info, warn, error
+        self._reported_faults = False
+
+    def __call__(self, health: Assessment, *, withhold: bool) -> None:
+        """Log the findings of a pair; `withhold`: whether inconsistent poses are suppressed."""
+        faults = health.faults
+        if faults:
+            # Numbers and lesser faults change from pair to pair, the worst parameter hardly.
+            text, kind = '; '.join(fault.text for fault in faults), faults[0].quantity
+            if health.is_gross:
+                # A gross error has a fix of its own, unlike the first small steps.
+                kind += ', gross'
+            if health.state is FindingState.WRONG:
+                self._error(f'{text}; ' + (
+                    'poses are suppressed: withhold_when_wrong: false publishes them all the same'
+                    if withhold else
+                    'poses are published all the same, as withhold_when_wrong is false'), kind)
+            else:
+                self._warn(text, kind)
+        elif self._reported_faults:
+            self._info(f'health is {health.state.value}: no configured parameter is suspect or '
+                       'wrong any more')
+        self._reported_faults = bool(faults)

@@ -1,0 +1,208 @@
+"""odometry_node: metric odometry from the pairs of relpose_node and the IMU."""
+
+from __future__ import annotations
+
+from collections import deque
+from functools import partial
+from typing import Any
+
+from rclpy.clock import Clock, ClockType
+from rclpy.qos import QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from std_srvs.srv import Trigger
+
+from rs_relpose_ros.errors import InputError, RsRelposeError
+from rs_relpose_ros.messages import outgoing
+from rs_relpose_ros.messages.incoming import PARTS, Role
+from rs_relpose_ros.nodes import inputs
+from rs_relpose_ros.nodes.inputs import message_class
+from rs_relpose_ros.nodes.parameters import legal_qos
+from rs_relpose_ros.nodes.sensor_node import run_node, StoppableNode
+from rs_relpose_ros.odometry import need_gtsam
+from rs_relpose_ros.odometry.pair import KeyframePair, warm_up_odometry
+from rs_relpose_ros.odometry.states import ContinuousPath
+
+NAME = 'odometry_node'
+
+# Topic of the pairs, below the node's namespace.
+_PAIRS = 'relpose_node/pairs'
+_IMU_DEPTH, _DEPTH = 2000, 50
+# Lowest rate at which the IMU is read [Hz]; the published rate may be lower.
+_LEAST_RATE = 10.0
+# Newest keyframes of ~/path, and its period for drawing [s].
+_PATH_LENGTH, _PATH_PERIOD = 3000, 1.0
+# Reports (one a second) without a message after which a topic counts as silent.
+_SILENCE = 2
+# Time without a sample after which the IMU is silent [s].
+_SILENT_IMU = 0.25
+# Level of diagnostic_msgs/DiagnosticStatus by state.
+_LEVELS = {'starting': 0, 'tracking': 0, 'uncertain': 1, 'lost': 2}
+_DESCRIPTION = (
+    'Metric odometry: the keyframe pairs of relpose_node and the IMU in one graph (gtsam).\n\n'
+    f'subscribes: {_PAIRS}, imu, accel\n'
+    'publishes:  ~/odometry, ~/keyframes, ~/path, /diagnostics, /tf with publish_odometry_tf\n'
+    'service:    ~/reset')
+
+
+class OdometryNode(StoppableNode):
+    """Feeds pairs and samples to an `OdometryEstimator` and publishes its keyframes."""
+
+    def __init__(self) -> None:
+        super().__init__(NAME)
+        need_gtsam()
+        from rs_relpose_ros.odometry.estimator import OdometryEstimator
+        warm_up_odometry()
+        parameters = self._settings.current
+        self._config = parameters.odometry
+        self._estimator = OdometryEstimator(parameters)
+        self._continuous = ContinuousPath(self._estimator)
+        self._newest_ns = 0   # of the samples, on the IMU clock
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._sample_at = self._steady.now()
+        self._path: deque[Any] = deque(maxlen=_PATH_LENGTH)
+        self._transforms = (inputs.transform_broadcaster(self, 'publish_odometry_tf')
+                            if self._config.publish_odometry_tf else None)
+        with legal_qos():
+            self._open_topics()
+        self.create_service(Trigger, '~/reset', self._reset)
+        steady, rate = self._steady, self._config.odometry_rate
+        if rate > 0.0:
+            self.create_timer(1.0 / rate, self._publish_propagated, clock=steady)
+        if rate < _LEAST_RATE:
+            self.create_timer(1.0 / _LEAST_RATE, self._read_sensors, clock=steady)
+        self.create_timer(_PATH_PERIOD, self._publish_path, clock=steady)
+        self.create_timer(1.0, self._report, clock=steady)
+        self._info(f'ready: {" and ".join(self._silent)}')
+
+    def _open_topics(self) -> None:
+        overridable = QoSOverridingOptions.with_default_policies
+        pairs_type = message_class('diagnostic_msgs/msg/DiagnosticArray')
+        self._odometry, self._keyframes = (self.create_publisher(
+            message_class('nav_msgs/msg/Odometry'), topic, QoSProfile(depth=_DEPTH),
+            qos_overriding_options=overridable()) for topic in ('~/odometry', '~/keyframes'))
+        self._path_topic = self.create_publisher(message_class('nav_msgs/msg/Path'), '~/path', 1)
+        self._diagnostics = self.create_publisher(pairs_type, '/diagnostics', 10)
+        self.create_subscription(
+            pairs_type, _PAIRS, self._on_pair, QoSProfile(depth=outgoing.PAIR_HISTORY),
+            qos_overriding_options=overridable())
+        # Read as often as odometry is published: an IMU would wake the process for each sample.
+        self._sensors = [inputs.PolledSubscription(
+            self, message_class(PARTS[role].msgtypes[0]), role.value,
+            inputs.best_effort(_IMU_DEPTH), partial(self._on_sample, role), lambda: False,
+            qos_overriding_options=overridable()) for role in (Role.IMU, Role.ACCEL)]
+        self._pairs, self._imu = map(self.resolve_topic_name, (_PAIRS, Role.IMU.value))
+        # Reports since the last message, by topic.
+        self._silent = {self._pairs: 0, self._imu: 0}
+
+    def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Restart at the origin; counters stay."""
+        self._estimator.reset()
+        self._continuous.reset()
+        self._path.clear()
+        response.success, response.message = True, 'restarting with the next pair'
+        return response
+
+    def _on_pair(self, message: Any) -> None:
+        self._silent[self._pairs] = 0
+        try:
+            self._estimator.add_pair(KeyframePair.of_message(message))
+        except RsRelposeError as error:
+            self._warn(str(error))
+            return
+        self._read_sensors()
+
+    def _on_sample(self, role: Role, message: Any) -> None:
+        if role is Role.IMU:
+            self._silent[self._imu] = 0
+        try:
+            sample = PARTS[role].read(message)
+            self._estimator.add_imu(sample)
+        except InputError as error:
+            self._warn(str(error))
+            return
+        if role is Role.IMU:
+            self._newest_ns, self._sample_at = sample.stamp_ns, self._steady.now()
+
+    def _publish_propagated(self) -> None:
+        """Publish the newest keyframe, propagated by the IMU, before the next pair takes time."""
+        for subscription in self._sensors:
+            subscription.drain()
+        self._publish(self._newest_ns)
+        self._read_sensors()
+
+    def _read_sensors(self) -> None:
+        for subscription in self._sensors:
+            subscription.drain()
+        for keyframe in self._estimator.take(most=1):
+            self._keyframes.publish(self._message(keyframe))
+            self._path.append(self._pose(keyframe))
+            if self._config.odometry_rate == 0.0:
+                self._publish(keyframe.imu_ns)
+        silent = (self._steady.now() - self._sample_at).nanoseconds * 1e-9
+        if silent > _SILENT_IMU:
+            self._estimator.imu_is_silent(silent)
+        for warning in self._estimator.warnings():
+            self._info(warning)
+
+    def _pose(self, odometry: Any) -> Any:
+        return outgoing.pose_stamped_message(odometry.stamp_ns, self._config.odometry_frame,
+                                             odometry.R, odometry.position, message_class)
+
+    def _message(self, odometry: Any) -> Any:
+        pose = self._pose(odometry)
+        return message_class('nav_msgs/msg/Odometry')(
+            header=pose.header, child_frame_id=odometry.frame_id,
+            pose=message_class('geometry_msgs/msg/PoseWithCovariance')(
+                pose=pose.pose,
+                covariance=outgoing.published_covariance(odometry.pose_covariance)),
+            # In the axes of the camera.
+            twist=outgoing.twist_message(odometry.velocity, odometry.angular_velocity,
+                                         odometry.velocity_covariance, message_class))
+
+    def _publish(self, imu_ns: int) -> None:
+        """Publish the state at a time, if it is known and newer than the last one."""
+        odometry = self._continuous.at(imu_ns)
+        if odometry is None:
+            return
+        self._odometry.publish(self._message(odometry))
+        if self._transforms is not None:
+            self._transforms.sendTransform(outgoing.transform_message(
+                odometry.stamp_ns, self._config.odometry_frame, odometry.frame_id,
+                odometry.R, odometry.position, message_class))
+
+    def _publish_path(self) -> None:
+        if self._path and self._path_topic.get_subscription_count():
+            self._path_topic.publish(message_class('nav_msgs/msg/Path')(
+                header=self._path[-1].header, poses=list(self._path)))
+
+    def _report(self) -> None:
+        estimator = self._estimator
+        level, state = _LEVELS[estimator.state.value], estimator.state.value
+        if estimator.reason:
+            state = f'{state}: {estimator.reason}'
+        if blocking_reason := estimator.blocking_reason:
+            level, state = 2, f'not started: {blocking_reason}'
+            self._warn(state)
+        for topic in self._silent:
+            self._silent[topic] += 1
+        silent = [f'{topic} for {reports - 1} s' for topic, reports in self._silent.items()
+                  if reports > _SILENCE]
+        if silent:
+            level, state = 2, f'no message on {" and ".join(silent)}'
+        values = [('state', estimator.state.value), ('reason', estimator.reason), *(
+            (name.replace(' ', '_'), str(estimator.counts[name])) for name in (
+                'pairs', 'contradicting', 'late', 'without images', 'dropped', 'lost',
+                'calibration contradicted')), *(
+            (name, ' '.join(f'{value:.3f}' for value in vector)) for name, vector in zip(
+                ('imu_position', 'imu_position_sigma'), estimator.imu_position, strict=True))]
+        if estimator.starts:
+            started = estimator.starts[-1]
+            values += [('started', 'at rest' if started.at_rest else 'in motion'),
+                       ('start_scale_sigma', f'{started.scale_sigma:.3f}')]
+        self._diagnostics.publish(outgoing.diagnostics_message(
+            self.get_clock().now().nanoseconds, outgoing.status_message(
+                level, f'{self.get_fully_qualified_name()}: odometry', state, self._pairs,
+                values, message_class), message_class))
+
+
+main = partial(run_node, OdometryNode, NAME, _DESCRIPTION)

@@ -1,0 +1,424 @@
+"""Base of the nodes: inputs, the worker thread, diagnostics, start and end of the process."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+import argparse
+from collections import Counter
+from collections.abc import Callable, Sequence
+import gc
+import logging
+import os
+import sys
+import threading
+import time
+import traceback
+from typing import Any, ClassVar, NoReturn, TextIO
+
+from diagnostic_msgs.msg import DiagnosticArray
+import rclpy
+from rclpy.clock import Clock, ClockType
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+from std_srvs.srv import Trigger
+
+from rs_relpose_ros.config.settings import Parameters
+from rs_relpose_ros.errors import RsRelposeError
+from rs_relpose_ros.geometry.timing import NANOSECONDS
+from rs_relpose_ros.messages import outgoing
+from rs_relpose_ros.messages.incoming import Intake, PARTS, Role
+from rs_relpose_ros.nodes import diagnostics
+from rs_relpose_ros.nodes import parameters as ros_parameters
+from rs_relpose_ros.nodes.diagnostics import PATIENCE, ReasonLog, SILENCE
+from rs_relpose_ros.nodes.inputs import message_class, SensorInputs, SHUT_DOWN
+from rs_relpose_ros.pipeline.pair import Frame
+from rs_relpose_ros.pipeline.pipeline import FrameFailed, FrameLoop, Outcome
+from rs_relpose_ros.pipeline.sequencer import FrameRefused, Refusal
+
+# -- A node as a process --------------------------------------------------------------------------
+
+class StoppableNode(Node):
+    """A node of `run_node` with log lines and parameters; it may have threads of its own.
+
+    An illegal parameter raises InputError.
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        # A line of code each: rclpy raises if one line logs at two severities.
+        logger = self.get_logger()
+        self._info = ReasonLog(lambda text: logger.info(text))
+        self._warn = ReasonLog(lambda text: logger.warning(text))
+        self._error = ReasonLog(lambda text: logger.error(text))
+        self._settings = ros_parameters.NodeParameters(self, self._on_parameters)
+        for warning in ros_parameters.unknown_overrides(self):
+            self._warn(warning)
+
+    def _on_parameters(self, parameters: Parameters) -> None:
+        """A live parameter was set."""
+
+    def stop(self) -> bool:
+        """End its threads; whether they ended. Called before `destroy_node`."""
+        return True
+
+
+def run_node(make: Callable[[], StoppableNode], name: str, description: str,
+             arguments: Sequence[str] | None = None,
+             on_started: Callable[[Callable[[], object]], object] = lambda stop: None) -> int:
+    """Run a node until it is stopped; its exit code: 0, or 2 for an illegal parameter.
+
+    `description` is that of its ``--help``; `on_started` gets the function that stops the node,
+    for any thread, before the node is made.
+    """
+    given = sys.argv if arguments is None else [name, *arguments]
+    logger = rclpy.logging.get_logger(name)
+    try:
+        own = remove_ros_args(given)
+    except rclpy_implementation.RCLInvalidROSArgsError as error:
+        # rcl appends the names of its source files.
+        logger.fatal(str(error).split(', at /')[0].strip())
+        return 2
+    _help(name, description).parse_args(own[1:])
+    rclpy.init(args=list(given), signal_handler_options=SignalHandlerOptions.NO)
+    executor, stopped = SingleThreadedExecutor(), threading.Event()
+    on_started(lambda: executor.create_task(stopped.set))
+    node: StoppableNode | None = None
+    try:
+        node = make()
+        executor.add_node(node)
+        while not stopped.is_set():
+            executor.spin_once()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass   # of a caller that has not blocked the signals, or has ended the context
+    except RsRelposeError as error:
+        logger.fatal(str(error))
+        return 2
+    finally:
+        if node is not None:
+            if not node.stop():
+                # The thread compiles or loads kernels, which cannot be interrupted.
+                leave(0)
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+def _help(name: str, description: str) -> argparse.ArgumentParser:
+    lines = ['parameters (set them with --ros-args -p NAME:=VALUE or --params-file FILE):']
+    for parameter, default, declared in Parameters.declarations():
+        shown = 'no default' if default is None else f'default {default!r}'
+        lines.append(f'  {parameter}: {declared.description}. {declared.legal}; {shown}'
+                     f'{"; live" if declared.live else ""}')
+    return argparse.ArgumentParser(
+        prog=name, formatter_class=argparse.RawDescriptionHelpFormatter, description=description,
+        epilog='\n'.join(lines))
+
+
+def leave(code: int) -> NoReturn:
+    """End the process at once, with all output written.
+
+    Threads of the package, OpenCV or the middleware that still run while the interpreter and the
+    libraries shut down can abort it.
+    """
+    logging.shutdown()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
+# -- The worker thread ----------------------------------------------------------------------------
+
+# Longest wait for a frame [s] before the thread checks whether it is to end.
+_STEP_TIMEOUT = 0.1
+
+
+class Worker(threading.Thread):
+    """Compiles the kernels, then steps the loop until it is stopped; errors never end it.
+
+    `consume` gets each outcome in this thread, an error of `warm_up` as a `FrameFailed` while
+    `warm` is not set; then the thread ends.
+    """
+
+    def __init__(self, loop: FrameLoop[Any], warm_up: Callable[[], object],
+                 consume: Callable[[Outcome[Any]], object]) -> None:
+        # A daemon: a thread that compiles cannot be stopped, and must not delay the exit.
+        super().__init__(name='frame_worker', daemon=True)
+        self.warm = threading.Event()   # the kernels are compiled or loaded
+        self._loop = loop
+        self._warm_up = warm_up
+        self._consume = consume
+        self._stopping = threading.Event()
+
+    def stop(self, timeout: float) -> bool:
+        """End the thread and wait for it; whether it ended in time."""
+        self._stopping.set()
+        self._loop.sequencer.close()
+        self.join(timeout)
+        return not self.is_alive()
+
+    def run(self) -> None:
+        """Work until `stop`."""
+        try:
+            self._warm_up()
+        except Exception as error:  # noqa: BLE001 - the node shows it; a silent thread is worse
+            self._consume(FrameFailed(None, error))
+            return
+        self.warm.set()
+        while not self._stopping.is_set():
+            outcome = self._loop.step(_STEP_TIMEOUT)
+            if outcome is None:
+                continue
+            try:
+                self._consume(outcome)
+            except Exception as error:  # noqa: BLE001 - logged with its traceback by the node
+                self._consume(FrameFailed(None, error))
+
+
+# -- A node with camera and IMU -------------------------------------------------------------------
+
+# Time [s] for the worker to end: a frame takes less, compiling takes longer.
+_JOIN_TIMEOUT = 0.4
+# Time [s] of a start above which kernels are being compiled, not loaded from the cache.
+_REPORT_COMPILING = 4.0
+
+
+class SensorNode(StoppableNode):
+    """A node that works on the frames of a camera with an IMU; its states: docs/architecture.md.
+
+    Callbacks convert little and fill the sequencer; one worker thread does the rest.
+    """
+
+    # Name of the work on `/diagnostics`.
+    task: ClassVar[str]
+
+    def __init__(self, name: str, statistics: diagnostics.FrameStatistics) -> None:
+        super().__init__(name)
+        self._frame_statistics = statistics
+        self._stamps: TextIO | None = None   # of the frames that were processed or failed
+        self._loop: FrameLoop[Any] | None = None
+        self._inputs: SensorInputs | None = None
+        self._worker: Worker | None = None
+        self._lost_images, self._reported_silence = diagnostics.LostImages(), ''
+        # For diagnostics and time-outs, which must run although /clock may not advance.
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        with ros_parameters.legal_qos():
+            self._open_outputs(self._settings.current)
+        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self.create_service(Trigger, '~/reset', self._reset)
+        self._cannot_start = self._why_it_cannot_start()
+        if self._cannot_start:
+            self._error(self._cannot_start)
+        else:
+            self._start()
+        self.create_timer(1.0, self._report, clock=self._steady)
+
+    @abstractmethod
+    def _open_outputs(self, parameters: Parameters) -> None:
+        """Make the publishers."""
+
+    @abstractmethod
+    def _make_loop(self, parameters: Parameters) -> FrameLoop[Any]:
+        """The loop that the worker drives."""
+
+    @abstractmethod
+    def _warm_up(self) -> None:
+        """Compile or load the kernels of the loop; by the worker."""
+
+    @abstractmethod
+    def _on_processed(self, frame: Frame[Any]) -> None:
+        """Publish the result of a frame; by the worker."""
+
+    def _on_ready(self) -> None:
+        """Do what needs the subscriptions, which have just been made."""
+
+    # -- start and stop ----------------------------------------------------------------------
+
+    def _why_it_cannot_start(self) -> str:
+        """The fault of parameters or topics; empty for none."""
+        idle, missing = self._frame_statistics.idle, self._settings.current.sensor.missing()
+        if missing:
+            return (f'{idle}: {" and ".join(missing)} must be given as parameter: see '
+                    'config/relpose.yaml, and start again')
+        topic = self.resolve_topic_name('image')
+        if 'image_rect' in topic:
+            return (f'{idle}: {topic} is a rectified image, whose rows have no single '
+                    'timestamp; remap image to the raw one')
+        return ''
+
+    def _start(self) -> None:
+        parameters = self._settings.current
+        self._loop = self._make_loop(parameters)
+        self._intake = Intake(self._loop.sequencer, parameters)
+        self._worker = Worker(self._loop, self._warm_up, self._consume)
+        self._worker.start()
+        self._started_ns = time.monotonic_ns()
+        # No subscription before the kernels are loaded: the first frames would be dropped.
+        self._warm_timer = self.create_timer(0.02, self._subscribe_when_warm, clock=self._steady)
+
+    def _subscribe_when_warm(self) -> None:
+        assert self._worker is not None and self._loop is not None
+        if not self._worker.warm.is_set():
+            if time.monotonic_ns() - self._started_ns > _REPORT_COMPILING * NANOSECONDS:
+                self._info('compiling kernels, as the build has none for this machine: this start '
+                           'takes a minute or two, later ones some seconds')
+            return
+        self.destroy_timer(self._warm_timer)
+        with ros_parameters.legal_qos():
+            inputs = SensorInputs(
+                self, self._intake, self._loop.sequencer.waits_for_imu,
+                self._settings.current.pair.image_transport, self._error)
+        for warning in ros_parameters.unknown_qos_overrides(self):
+            self._warn(warning)
+        # Objects that exist by now are permanent: the garbage collector need not scan them.
+        gc.collect()
+        gc.freeze()
+        self._inputs = inputs
+        self._frame_statistics.start()
+        self._on_ready()
+        image, camera_info, imu, _ = inputs.topics.values()
+        self.get_logger().info(f'ready: {image}, {camera_info} and {imu}')
+
+    def stop(self) -> bool:
+        """End the worker; whether it ended. Called before `destroy_node`."""
+        return self._worker is None or self._worker.stop(_JOIN_TIMEOUT)
+
+    def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Restart tracking; intrinsics and counters are kept."""
+        response.success = self._loop is not None
+        response.message = self._cannot_start
+        if self._loop is not None:
+            self._loop.sequencer.reset()
+            response.message = 'restarting with the next frame'
+        return response
+
+    def _on_parameters(self, parameters: Parameters) -> None:
+        if self._loop is not None:
+            self._loop.parameters = parameters
+
+    # -- outcomes of frames (in the worker thread) ---------------------------------------------
+
+    def _consume(self, outcome: Outcome[Any]) -> None:
+        if isinstance(outcome, FrameRefused):
+            self._log_refused(outcome)
+            return
+        if self._stamps is not None and outcome.stamp_ns is not None:
+            self._stamps.write(f'{outcome.stamp_ns}\n')
+        if isinstance(outcome, Frame):
+            try:
+                self._on_processed(outcome)
+            except SHUT_DOWN:
+                if self.context.ok():   # otherwise the node is being shut down
+                    raise
+            self._frame_statistics.add_frame(outcome.taken_ns)
+            return
+        assert self._worker is not None
+        warning = ('a frame failed and tracking restarts with the next one'
+                   if self._worker.warm.is_set() else 'the kernels cannot be compiled')
+        self._frame_statistics.add_failure(f'{warning}: {outcome.reason}')
+        error = outcome.error
+        if isinstance(error, RsRelposeError):
+            self._error(f'{warning}: {error}')
+        else:
+            text = ''.join(traceback.format_exception(error))
+            self._error(f'{warning}: {type(error).__name__}: {error}\n{text}')
+
+    def _log_refused(self, refused: FrameRefused) -> None:
+        if refused.refusal is Refusal.NO_CALIBRATION:
+            return   # logged by `_missing_input`
+        if refused.refusal is Refusal.NO_IMU:
+            # A gap of 0.3 s between IMU messages: the sensor has stopped.
+            if self._inputs is not None and self._inputs.silent(Role.IMU, 0.3):
+                return   # logged by `_missing_input` after `SILENCE`
+            self._warn(f'a frame was not used: {refused.reason}; is '
+                       f'{self.resolve_topic_name("imu")} published, with a gyro, and are its '
+                       'stamps on the clock of the images (time_offset)?')
+        else:
+            self._warn(f'a frame was not used ({refused.refusal.value}): {refused.reason}')
+
+    # -- diagnostics -------------------------------------------------------------------------
+
+    def _report(self) -> None:
+        problem, missing = self._problem()
+        counts: Counter[str] = Counter() if self._inputs is None else self._inputs.counts.copy()
+        report = self._frame_statistics.report(
+            counts, None if self._loop is None else self._loop.sequencer.counts(),
+            problem=problem, missing=missing)
+        status = outgoing.status_message(
+            report.level, f'{self.get_fully_qualified_name()}: {self.task}', report.text,
+            self._image_topic(), report.values, message_class)
+        self._diagnostics.publish(outgoing.diagnostics_message(
+            self.get_clock().now().nanoseconds, status, message_class))
+        if self._inputs is not None:
+            self._log_silence(self._inputs, report.silence, problem)
+            lost = self._lost_images.add(
+                counts[Role.IMAGE], counts[Role.CAMERA_INFO], self._inputs.image_bytes)
+            if lost:
+                self._warn(lost)
+
+    def _log_silence(self, inputs: SensorInputs, silence: diagnostics.Silence,
+                     problem: str) -> None:
+        """Log the reason for no result, once while it stays the same."""
+        if inputs.silent(Role.IMAGE, PATIENCE):
+            kind, text = diagnostics.why_no_image(self._image_topic(), self._topics_with_images())
+        elif silence.seconds < PATIENCE:
+            self._reported_silence = ''
+            return
+        elif problem:
+            return   # which is logged anyway
+        else:
+            kind, text = diagnostics.why_nothing(silence)
+        if kind != self._reported_silence:
+            self._reported_silence = kind
+            self._warn(f'{self._frame_statistics.idle}: {text}')
+
+    def _topics_with_images(self) -> list[str]:
+        """Topics of other nodes, without pictures of pairs."""
+        own = f'{self.get_fully_qualified_name()}/'
+        images = set(PARTS[Role.IMAGE].msgtypes)
+        return [name for name, types in self.get_topic_names_and_types()
+                if images.intersection(types) and not name.startswith(own)
+                and not name.endswith(f'/{outgoing.DEBUG_IMAGE}') and self.count_publishers(name)]
+
+    def _image_topic(self) -> str:
+        """The subscribed one, with its transport."""
+        return (self.resolve_topic_name('image') if self._inputs is None
+                else self._inputs.topics[Role.IMAGE])
+
+    def _problem(self) -> tuple[str, tuple[str, ...]]:
+        """The current reason for no result, and the names of missing parameters or inputs."""
+        if self._cannot_start:
+            return self._cannot_start, tuple(self._settings.current.sensor.missing())
+        assert self._worker is not None
+        if not self._worker.is_alive():
+            return f'{self._frame_statistics.idle}: the worker ended, see the log', ()
+        if self._inputs is None:
+            return 'starting: kernels are compiled or loaded', ()
+        return self._missing_input(self._inputs)
+
+    def _missing_input(self, inputs: SensorInputs) -> tuple[str, tuple[str, ...]]:
+        """The missing input; logged, unless the driver is probably not running yet."""
+        idle = self._frame_statistics.idle
+        image, camera_info, imu, _ = inputs.topics.values()
+        missing = tuple(topic for role, topic in inputs.topics.items()
+                        if role is not Role.ACCEL and inputs.silent(role))
+        if self._intake.camera_info_problem:
+            return f'{idle}: {self._intake.camera_info_problem}', ('calibration',)
+        # Without any image the driver is probably not running: a status, but no log line.
+        if image in missing:
+            return f'{idle}: no image on {image} for {SILENCE:g} s', missing
+        # Configured intrinsics are used once some images have waited for a CameraInfo in vain.
+        configured = self._settings.current.intrinsics.given
+        if self._intake.intrinsics is None and camera_info in missing and not configured:
+            text = (f'{idle}: no CameraInfo on {camera_info}; remap camera_info to the '
+                    'topic of the driver, which must publish a calibration, or give '
+                    'camera_matrix')
+        elif imu in missing:
+            text = (f'{idle}: no IMU message on {imu} for {SILENCE:g} s; remap imu to '
+                    'the topic of the driver')
+        else:
+            return '', ()
+        self._error(text)
+        return text, missing

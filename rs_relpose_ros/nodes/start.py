@@ -1,0 +1,57 @@
+"""Entry of the console scripts: a signal ends the node quietly, also while it still imports.
+
+Imports nothing heavy itself. SIGINT and SIGTERM are blocked in all threads, and one thread waits
+for them. rclpy's own handlers are not used: they end the context in a thread of their own while
+the main thread destroys the node, which has crashed the process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+import importlib
+import os
+import signal
+import sys
+import threading
+from typing import NoReturn
+
+from rs_relpose_ros.blas_threads import use_one_blas_thread
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+_stop: Callable[[], object] | None = None   # ends the spinning of the node
+
+
+def start(node: str) -> NoReturn:
+    """Run the `main` of a node's module, and end the process with its exit code."""
+    # Before any thread is made: threads inherit it.
+    signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
+    threading.Thread(target=_wait_for_signal, name='signals', daemon=True).start()
+    use_one_blas_thread()
+    from rs_relpose_ros.nodes.sensor_node import leave
+    run = importlib.import_module(f'rs_relpose_ros.nodes.{node}').main
+    leave(run(on_started=_on_started))
+
+
+def _on_started(stop: Callable[[], object]) -> None:
+    global _stop
+    _stop = stop
+
+
+def _wait_for_signal() -> None:
+    """Wait for the first signal; later ones stay blocked, as ros2 launch sends Ctrl-C twice."""
+    signal.sigwait(_SIGNALS)
+    if _stop is None:
+        # Nothing was begun that would need an end.
+        os._exit(0)
+    _stop()
+
+
+# Entries of the console scripts.
+relpose_node = partial(start, 'relpose_node')
+global_shutter_node = partial(start, 'global_shutter_node')
+odometry_node = partial(start, 'odometry_node')
+
+if __name__ == '__main__':
+    start(sys.argv.pop(1))

@@ -1,0 +1,629 @@
+"""Metric odometry from pairs and IMU samples, keyframe by keyframe; free of ROS.
+
+The same live and offline: the result depends on pairs and samples, not on the order of their
+arrival within `_LATE_NS`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.config.settings import Parameters
+from rs_relpose_ros.geometry.so3 import (
+    aligning_rotation,
+    exp_so3,
+    skew,
+    STANDARD_GRAVITY,
+)
+from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, to_nanoseconds
+from rs_relpose_ros.imu.buffer import Coverage, ImuInterval, ImuSample, ImuSamples
+from rs_relpose_ros.messages.incoming import StuckGyro
+from rs_relpose_ros.messages.outgoing import quat_xyzw
+from rs_relpose_ros.odometry.graph import (
+    ARM,
+    GraphError,
+    KeyframeGraph,
+    KeyframeState,
+    POSE,
+    Step,
+    VELOCITY,
+)
+from rs_relpose_ros.odometry.pair import KeyframePair
+from rs_relpose_ros.odometry.states import (
+    JUMP_NS,
+    Odometry,
+    OdometryState,
+    StartReport,
+    StateInterval,
+)
+from rs_relpose_ros.offline.truth import TrueTrajectory
+
+Array = NDArray[np.float64]
+
+# Largest delay of a message.
+_LATE_NS = 100_000_000
+# Largest number of pairs that wait; the IMU bridges older ones, so that a slow machine keeps up.
+_MOST_WAITING = 10
+# Largest age of a usable pair while tracking [s], and in intervals of recent pairs; period of the
+# test [ns].
+_OVERDUE, _OVERDUE_INTERVALS, _WATCH_NS = 0.3, 1.5, 50_000_000
+# Time in which the deviations of pairs are averaged [ns].
+_RECENT_NS = 1_000_000_000
+# Times within this belong to one keyframe: a tracked readout time moves the middle row.
+_SAME_NS = 1_000_000
+# Samples that determine gravity at a start [s].
+_GRAVITY_WINDOW = 1.0
+# 1 sigma of that direction for a moving body [rad].
+_MOVING_TILT = 0.1
+# 1 sigma of the velocity at a start at rest and in motion [m/s], per axis; of its free heading and
+# position [rad, m].
+_REST_VELOCITY, _ANY_VELOCITY, _GAUGE_SIGMA = 0.01, 3.0, 1e-4
+# Largest 1 sigma of the logarithm of a baseline that starts a graph, and the initial speed without
+# one [m/s]: pairs of a global shutter have no baseline.
+_START_LOG_SIGMA, _GUESSED_SPEED = 0.7, 1.0
+# Innovation of a contradicting pair, in units of recent ones, and chi squared per degree of
+# freedom of a wrong start.
+_CONTRADICTING, _WRONG_START = 4.0, 3.0
+# Longest propagation of a lost path by the IMU [s]; largest delay of a pair behind its samples.
+_LONGEST_PROPAGATED, _LONGEST_DELAY = 10.0, 10.0
+# Longest start [s]; then a new one begins.
+_LONGEST_START = 4.0
+_GAP = 'the IMU has a gap'
+# 1 sigma of an unknown acceleration [m/s^2] and rate [rad/s], of a body whose IMU had a gap.
+_UNKNOWN_ACCELERATION, _UNKNOWN_RATE = 3.0, 1.0
+# 1 sigma of the position of the IMU if none is configured, and the least one [m].
+_UNKNOWN_ARM, _LEAST_ARM_SIGMA = 0.15, 1e-4
+# Fewest pairs that determine the scale of a start in motion.
+_LEAST_PAIRS = 4
+
+
+class _PathEnd(NamedTuple):
+    """End of a path: rotation of the body (None: any heading), position [m], sigmas."""
+
+    R: Array | None
+    position: Array
+    heading_sigma: float
+    position_sigma: float
+
+
+@dataclass(slots=True, eq=False)
+class _Run:
+    """A graph since its start."""
+
+    graph: KeyframeGraph
+    path_end: _PathEnd   # of the path before
+    at_rest: bool
+    first_ns: int
+    observed_ns: int   # of the newest pair that was used
+    # Times of the newest keyframe, or with `keep` of all: camera clock, IMU clock.
+    stamps: deque[tuple[int, int]]
+    frame_id: str
+    # Variances of position and heading at the newest pair that was used.
+    variances: tuple[float, float] = (0.0, 0.0)
+    # Of recent pairs: times, innovations (chi squared by degrees of freedom) and intervals [s].
+    recent: deque[tuple[int, float, float]] = field(default_factory=lambda: deque(maxlen=20))
+    pairs: int = 0
+    published: bool = False
+    path: int = 0   # number of earlier starts
+
+    @property
+    def newest_ns(self) -> int:
+        """Time of the newest keyframe on the IMU clock."""
+        return self.stamps[-1][1]
+
+
+class OdometryEstimator:
+    """Turns samples and pairs into keyframes, which `take` returns.
+
+    `keep`: whether all of them are kept for `smoothed`.
+    """
+
+    def __init__(self, parameters: Parameters, *, keep: bool = False) -> None:
+        self._config, self._imu = parameters.odometry, parameters.imu
+        lever, sigma = np.array(parameters.imu.imu_position), parameters.imu.imu_position_sigma
+        self._R_cam_body = parameters.sensor.R_cam_imu
+        # Position of the camera on the body with its covariance, as known at the next start.
+        self._arm = -self._R_cam_body.T @ lever
+        self._arm_covariance = max(sigma, _LEAST_ARM_SIGMA if lever.any() else _UNKNOWN_ARM
+                                   )**2 * np.eye(3)
+        self._first_R: Array | None = None   # of the body at the first start: the origin
+        self._samples = ImuSamples(parameters.imu.max_imu_gap)
+        self._gyro = StuckGyro(parameters.imu.stuck_gyro_time)
+        self._keep = keep
+        self._waiting: dict[int, KeyframePair] = {}
+        self._run: _Run | None = None
+        self._last_run: _Run | None = None   # its end is the start of the next path
+        self._runs: list[_Run] = []
+        self._last_ns: int | None = None
+        self._row_ns = 0   # from the stamped to the middle row
+        self._offset_ns = self._watched_ns = 0   # of the camera's clock from that of the IMU
+        self.state, self.reason = OdometryState.STARTING, 'no pair with a pose yet'
+        self.intervals: list[StateInterval] = []   # with `keep`
+        self.corrections = 0   # number of changes to the newest keyframe
+        self.starts: list[StartReport] = []
+        # Numbers of pairs and runs by outcome.
+        self.counts: Counter[str] = Counter()
+        self._warnings: list[str] = []
+        if not lever.any():
+            self._warnings.append(f'imu_position is zero: it is estimated, from {_UNKNOWN_ARM} m '
+                                  'of uncertainty; a measured one is better')
+
+    @property
+    def waiting(self) -> bool:
+        """Whether a pair waits for samples."""
+        return bool(self._waiting)
+
+    @property
+    def blocking_reason(self) -> str:
+        """Fault of the accelerometer that prevents a start; empty for none."""
+        return self._samples.fault if self.state is OdometryState.STARTING else ''
+
+    def add_imu(self, sample: ImuSample) -> None:
+        """Add a sample; InputError for a stuck gyro."""
+        newest = self._samples.both_until_ns
+        if newest is not None and sample.stamp_ns < newest - JUMP_NS:
+            self._end('the clock of the IMU was set back', newest)
+            self._watched_ns = 0
+            self._samples.clear()
+            self._waiting, self._last_ns = {}, None
+        if not self._gyro.repeats(sample):
+            self._samples.add(sample)
+            self._samples.prune(sample.stamp_ns - to_nanoseconds(
+                max(_LONGEST_PROPAGATED, self._config.max_coast) + _LONGEST_DELAY))
+        if sample.stamp_ns >= self._watched_ns + _WATCH_NS:
+            self._watched_ns = sample.stamp_ns
+            try:
+                self._watch(sample.stamp_ns)
+            except GraphError as error:
+                self._end(str(error), sample.stamp_ns)
+
+    def imu_is_silent(self, seconds: float) -> None:
+        """Tell that no sample has come for some time; the next ones decide whether it is a gap."""
+        run = self._run
+        if run is not None and run.published:
+            self._change(OdometryState.LOST, f'no message of the IMU for {seconds:.2f} s',
+                         self._watched_ns)
+
+    def add_pair(self, pair: KeyframePair) -> None:
+        """Add a pair; one without information is only counted."""
+        self.counts['pairs'] += 1
+        if pair.images is None and not pair.contradiction:
+            self.counts['without images'] += 1
+            return
+        if pair.images is not None:
+            self._row_ns = to_nanoseconds(pair.images.row_time)
+        # Keyframes are at the middle rows, also for pairs without information.
+        pair = pair.later(self._row_ns)
+        if self._last_ns is not None and pair.current_ns <= self._last_ns:
+            self.counts['late'] += 1
+            return
+        self._waiting[pair.current_ns] = pair
+        if len(self._waiting) > _MOST_WAITING:
+            del self._waiting[min(self._waiting)]
+            self.counts['dropped'] += 1
+
+    def reset(self) -> None:
+        """Forget the path: the next start is at the origin."""
+        self._run = self._last_run = self._first_R = None
+        self._waiting = {}
+        self._change(OdometryState.STARTING, 'reset', self._watched_ns)
+
+    def warnings(self) -> list[str]:
+        """Messages for the log since the last call."""
+        warnings, self._warnings = self._warnings, []
+        return warnings
+
+    def take(self, *, end: bool = False, most: int | None = None) -> list[Odometry]:
+        """Finished keyframes, of at most `most` pairs; with `end`, no more input follows."""
+        out = []
+        taken = 0
+        while self._waiting and taken != most:
+            taken += 1
+            pair = self._waiting[min(self._waiting)]
+            if not (end or self._ready(pair)):
+                break
+            del self._waiting[pair.current_ns]
+            self._last_ns = pair.current_ns
+            try:
+                found = self._process(pair)
+            except GraphError as error:
+                found = None
+                self._end(str(error), pair.current_ns)
+            if found is not None:
+                out.append(found)
+        return out
+
+    def propagated(self, imu_ns: int) -> Odometry | None:
+        """The newest keyframe propagated by the IMU to a time; None without one."""
+        run = self._run
+        if run is None or not run.published or self.state is OdometryState.LOST:
+            return None
+        interval = self._samples.between(run.newest_ns, imu_ns)
+        if interval is None:
+            return None
+        stamp_ns = run.stamps[-1][0] + imu_ns - run.newest_ns
+        return self._odometry(run, run.graph.propagated(interval), interval.rates[-1], stamp_ns,
+                              imu_ns)
+
+    def smoothed(self) -> list[Odometry]:
+        """All keyframes, given all measurements; needs `keep`.
+
+        A run with an unsolvable graph is left out, with a warning.
+        """
+        out = []
+        for run in self._runs:
+            try:
+                states = run.graph.smoothed()
+            except GraphError as error:
+                self._warnings.append(f'not smoothed: {len(run.stamps)} keyframes: {error}')
+                continue
+            out += [self._odometry(run, state, np.full(3, math.nan), *stamps)
+                    for state, stamps in zip(states, run.stamps, strict=True)]
+        return out
+
+    def smoothed_steps(self) -> list[tuple[int, int, Step]]:
+        """Steps between consecutive keyframes, with both times on the IMU clock."""
+        return [(start, end, step) for run in self._runs
+                for ((_, start), (_, end)), step in zip(
+                    pairwise(run.stamps), run.graph.smoothed_steps(), strict=True)]
+
+    # -- pairs -------------------------------------------------------------------------------
+
+    def _ready(self, pair: KeyframePair) -> bool:
+        """Whether no late sample can change the outcome of a pair."""
+        newest = self._samples.both_until_ns
+        if newest is None or newest < pair.current_ns:
+            return False
+        if newest >= pair.current_ns + _LATE_NS:
+            return True
+        return (self._run is not None and abs(pair.reference_ns - self._run.newest_ns) < _SAME_NS
+                and self._samples.complete(pair.reference_ns, pair.current_ns))
+
+    def _process(self, pair: KeyframePair) -> Odometry | None:
+        self._offset_ns = pair.stamp_ns - pair.current_ns
+        if pair.contradiction:
+            self._end(pair.contradiction, pair.current_ns)
+            self._change(OdometryState.LOST, pair.contradiction, pair.current_ns)
+            self.counts['calibration contradicted'] += 1
+            return None
+        if self._run is not None and pair.reference_ns < self._run.newest_ns - _SAME_NS:
+            self.counts['late'] += 1   # the IMU bridges it
+            return None
+        run = self._continued(pair)
+        if run is None:
+            run = self._run = self._new_run(pair)
+        if run is None:
+            return None
+        interval = self._samples.between(run.newest_ns, pair.current_ns)
+        if interval is None:
+            self._end(_GAP, pair.current_ns)
+            return None
+        at_rest = pair.is_pure_rotation and interval.at_rest
+        # Pairs that deviate together are wrong together: their covariance is too small by that.
+        recent = [innovation for at_ns, innovation, _ in run.recent
+                  if at_ns > pair.current_ns - _RECENT_NS]
+        inflation = max(1.0, float(np.mean(recent or [1.0])))
+        gate = inflation * _CONTRADICTING if run.published else math.inf
+        innovation = run.graph.add(interval, pair, at_rest, inflation=inflation, gate=gate)
+        run.stamps.append((pair.stamp_ns, pair.current_ns))
+        run.recent.append((pair.current_ns, min(innovation, _CONTRADICTING), interval.duration))
+        if innovation > gate:
+            self.counts['contradicting'] += 1
+            self.corrections += 1
+            if seconds_between(run.observed_ns, pair.current_ns) > self._config.max_coast:
+                self._end(f'no usable pair for {self._config.max_coast:g} s', pair.current_ns)
+                return None
+        else:
+            run.observed_ns, run.pairs = pair.current_ns, run.pairs + 1
+            run.variances = _variances(run.graph.newest)
+            if run.published:
+                self._change(OdometryState.TRACKING, '', pair.current_ns)
+        if not run.published and not self._known(run):
+            return None
+        self.corrections += 1
+        return self._odometry(run, run.graph.newest, interval.rates[-1], pair.stamp_ns,
+                              pair.current_ns)
+
+    def _continued(self, pair: KeyframePair) -> _Run | None:
+        """The run with a keyframe at the pair's reference; None if it has ended."""
+        run = self._run
+        if run is None or abs(run.newest_ns - pair.reference_ns) < _SAME_NS:
+            return run
+        if seconds_between(run.observed_ns, pair.reference_ns) > self._config.max_coast:
+            self._end(f'no usable pair for {self._config.max_coast:g} s', pair.reference_ns)
+            return None
+        interval = self._samples.between(run.newest_ns, pair.reference_ns)
+        if interval is None:
+            self._end(_GAP, pair.reference_ns)
+            return None
+        # A pair is missing: the IMU bridges it.
+        run.graph.add(interval, None, at_rest=False)
+        offset = pair.current_ns - pair.stamp_ns
+        run.stamps.append((pair.reference_ns - offset, pair.reference_ns))
+        return run
+
+    def _watch(self, imu_ns: int) -> None:
+        """Change the state where pairs are overdue, sigmas have grown or samples are missing."""
+        run = self._run
+        if run is None or not run.published:
+            return
+        until_ns = imu_ns - _LATE_NS
+        if until_ns > run.newest_ns and any(
+                series.coverage(run.newest_ns, until_ns) is Coverage.NEVER
+                for series in (self._samples.gyro, self._samples.force)):
+            self._end(_GAP, imu_ns)
+            return
+        age = seconds_between(run.observed_ns, imu_ns)
+        usual = max((seconds for *_, seconds in run.recent), default=0.0)
+        if age <= max(_OVERDUE, _OVERDUE_INTERVALS * usual):
+            return
+        self._change(OdometryState.UNCERTAIN, f'no usable pair for {age:.2f} s', imu_ns)
+        interval = self._samples.between(run.newest_ns, until_ns)
+        if self._waiting or interval is None:
+            return
+        if age > self._config.max_coast:
+            self._end(f'no usable pair for {self._config.max_coast:g} s', imu_ns)
+            return
+        now = _variances(run.graph.propagated(interval))
+        position, heading = (math.sqrt(max(new - old, 0.0))
+                             for new, old in zip(now, run.variances, strict=True))
+        if position > self._config.max_position_sigma:
+            self._end(f'the position is known to {position:.2f} m', imu_ns)
+        elif heading > self._config.max_heading_sigma:
+            self._end(f'the heading is known to {heading:.2f} rad', imu_ns)
+
+    # -- start and end -----------------------------------------------------------------------
+
+    def _new_run(self, pair: KeyframePair) -> _Run | None:
+        """A run that starts at the pair's reference; None if the pair cannot start one."""
+        interval = self._samples.between(pair.reference_ns, pair.current_ns)
+        before = self._samples.up_to(pair.reference_ns, _GRAVITY_WINDOW)
+        if pair.images is None or interval is None:
+            return None
+        at_rest = pair.is_pure_rotation and interval.at_rest
+        if not at_rest and not pair.has_direction:
+            return None
+        moving = (pair.baseline * pair.images.velocities[:3]
+                  if pair.baseline_log_sigma < _START_LOG_SIGMA
+                  else _GUESSED_SPEED * pair.images.t)
+        bias = np.where(np.isfinite(pair.gyro_bias), pair.gyro_bias, self._imu.gyro_bias)
+        rate = interval.rates[0] - bias
+        if at_rest or before is None or before.duration < interval.duration:
+            # Rotated back by the gyro over the interval.
+            back = ImuInterval(interval.seconds, -interval.rates[::-1], interval.forces[::-1])
+            force = back.mean_force(-bias)
+        else:
+            force = before.mean_force(bias)
+        path_end = self._path_end_at(pair.reference_ns)
+        R = _levelled(force, path_end)
+        C = self._R_cam_body
+        velocity = np.zeros(3) if at_rest else R @ (C.T @ moving - np.cross(rate, self._arm))
+        tilt = self._imu.accel_bias_sigma / STANDARD_GRAVITY if at_rest else _MOVING_TILT
+        covariance = np.diag(np.square(
+            [_GAUGE_SIGMA] * 6 + [_REST_VELOCITY if at_rest else _ANY_VELOCITY] * 3
+            + [self._imu.accel_bias_sigma] * 3 + [self._imu.gyro_bias_sigma] * 3 + [0.0] * 3))
+        covariance[:3, :3] = R.T @ np.diag(np.square([tilt, tilt, _GAUGE_SIGMA])) @ R
+        covariance[ARM, ARM] = self._arm_covariance
+        start = KeyframeState(R, path_end.position, velocity, bias, np.zeros(3), self._arm,
+                              covariance)
+        graph = KeyframeGraph(start, interval.rates[0], C, self._imu, self._config,
+                              keep=self._keep)
+        self._first_R = R if self._first_R is None else self._first_R
+        offset = pair.current_ns - pair.stamp_ns
+        stamps = deque([(pair.reference_ns - offset, pair.reference_ns)],
+                       maxlen=None if self._keep else 1)
+        return _Run(graph, path_end, at_rest, pair.reference_ns, pair.reference_ns, stamps,
+                    pair.frame_id)
+
+    def _path_end_at(self, imu_ns: int) -> _PathEnd:
+        """End of the last path, propagated by the IMU to a time."""
+        run = self._last_run
+        if run is None:
+            return _PathEnd(None, np.zeros(3), 0.0, 0.0)
+        seconds, state = seconds_between(run.newest_ns, imu_ns), run.graph.newest
+        interval = self._samples.between(run.newest_ns, imu_ns)
+        # Uncertainty of earlier losses remains.
+        earlier = run.path_end
+        variance = earlier.position_sigma**2 + earlier.heading_sigma**2 * float(
+            ((state.position - earlier.position)[:2]**2).sum()) / 3.0
+        turned = moved = 0.0
+        if interval is not None and seconds <= _LONGEST_PROPAGATED:
+            state = run.graph.propagated(interval)
+        elif abs(seconds) > _SAME_NS / NANOSECONDS:   # else the keyframe itself: no gap
+            # On at the same velocity.
+            turned = _UNKNOWN_RATE * abs(seconds)
+            moved = 0.5 * _UNKNOWN_ACCELERATION * seconds**2
+            state = replace(state, position=state.position + seconds * state.velocity)
+            variance += seconds**2 * float(np.trace(state.covariance[VELOCITY, VELOCITY])) / 3.0
+        of_position, of_heading = _variances(state)
+        return _PathEnd(
+            state.R, state.position,
+            min(math.hypot(earlier.heading_sigma, math.sqrt(of_heading), turned), math.pi),
+            math.sqrt(variance + of_position / 3.0 + moved**2))
+
+    def _known(self, run: _Run) -> bool:
+        """Whether the scale of a starting run is known."""
+        seconds = seconds_between(run.first_ns, run.newest_ns)
+        sigma = run.graph.scale_sigma()
+        if self.state is OdometryState.STARTING:
+            self.reason = (f'the speed is known to {100.0 * sigma:.0f} % of '
+                           f'{100.0 * self._config.max_scale_sigma:.0f} %: it needs motion that '
+                           'changes its speed, or standstill')
+        if run.at_rest or run.pairs >= _LEAST_PAIRS:
+            if run.graph.misfit() > _WRONG_START:
+                self.counts['wrong starts'] += 1
+                self._run = None
+                return False
+            if sigma < self._config.max_scale_sigma:
+                run.published = True
+                self.starts.append(StartReport(run.at_rest, run.newest_ns, seconds, sigma))
+                run.path = len(self.starts) - 1
+                if self._keep:
+                    self._runs.append(run)
+                self._change(
+                    OdometryState.TRACKING,
+                    f'started {"at rest" if run.at_rest else "in motion"} after {seconds:.1f} s, '
+                    f'the scale is known to {100.0 * sigma:.1f} %', run.newest_ns)
+                return True
+        if seconds > _LONGEST_START:
+            self._run = None
+        return False
+
+    def _end(self, reason: str, imu_ns: int) -> None:
+        """End the run; the next one continues from its end."""
+        run, self._run = self._run, None
+        if run is not None and run.published:
+            self.counts['lost'] += 1
+            self._last_run = run
+            newest = run.graph.newest
+            self._arm, self._arm_covariance = newest.arm, newest.covariance[ARM, ARM]
+            self._change(OdometryState.LOST, reason, imu_ns)
+
+    def _change(self, state: OdometryState, reason: str, imu_ns: int) -> None:
+        """Enter a state; a message and an interval where it is another one."""
+        self.reason = reason
+        if state is self.state:
+            return
+        self.state = state
+        self._warnings.append(f'{state.value}: {reason}' if reason else state.value)
+        at_ns = imu_ns + self._offset_ns
+        if self._keep:
+            if self.intervals:
+                # Of a pair that is older than the samples by which the state before was entered.
+                at_ns = max(at_ns, self.intervals[-1].begin_ns)
+                self.intervals[-1] = self.intervals[-1]._replace(end_ns=at_ns)
+            self.intervals.append(StateInterval(state, reason, at_ns, None))
+
+    # -- results -----------------------------------------------------------------------------
+
+    @property
+    def imu_position(self) -> tuple[Array, Array]:
+        """Position of the IMU in the camera frame with 1 sigma per axis [m], as estimated."""
+        C, arm, covariance = self._R_cam_body, self._arm, self._arm_covariance
+        if self._run is not None:
+            newest = self._run.graph.newest
+            arm, covariance = newest.arm, newest.covariance[ARM, ARM]
+        return -C @ arm, np.sqrt(np.diag(C @ covariance @ C.T))
+
+    def _odometry(self, run: _Run, state: KeyframeState, rate: Array, stamp_ns: int,
+                  imu_ns: int) -> Odometry:
+        C, c, first_R = self._R_cam_body, state.arm, self._first_R
+        assert first_R is not None
+        rate = rate - state.gyro_bias
+        # The camera is at the origin at first: p + (R - R_first) c, in the world.
+        to_world, to_twist = np.zeros((6, 18)), np.zeros((3, 18))
+        to_world[:3, :3], to_world[:3, 3:6] = -state.R @ skew(c), state.R
+        to_world[3:, :3], to_world[:3, ARM] = state.R, state.R - first_R
+        R = state.R @ C.T
+        to_twist[:, :3], to_twist[:, VELOCITY] = C @ skew(state.R.T @ state.velocity), R.T
+        to_twist[:, ARM] = C @ skew(rate)
+        velocity = np.zeros((6, 6))
+        velocity[:3, :3] = to_twist @ state.covariance @ to_twist.T
+        velocity[3:, 3:] = self._imu.gyro_noise_density**2 * 100.0 * np.eye(3)
+        # A later start has position and heading from the end of the path before.
+        position, up = state.position + (state.R - first_R) @ c, np.array([0.0, 0.0, 1.0])
+        by_heading = run.path_end.heading_sigma * np.concatenate([
+            np.cross(up, position - run.path_end.position), up])
+        covariance = to_world @ state.covariance @ to_world.T + np.outer(by_heading, by_heading)
+        covariance[:3, :3] += run.path_end.position_sigma**2 * np.eye(3)
+        return Odometry(
+            stamp_ns, imu_ns, run.frame_id, run.path, R, position, covariance,
+            R.T @ (state.velocity + state.R @ np.cross(rate, c)), C @ rate, velocity)
+
+
+def _variances(state: KeyframeState) -> tuple[float, float]:
+    """Variances of the position (its length) and of the heading."""
+    up, covariance = state.R[2], state.covariance[POSE, POSE]
+    return float(np.trace(covariance[3:, 3:])), float(up @ covariance[:3, :3] @ up)
+
+
+def _levelled(force: Array, path_end: _PathEnd) -> Array:
+    """Rotation (3, 3) from the body to the world, by the specific force at rest."""
+    up = force / np.linalg.norm(force)
+    # The smallest rotation that takes it upwards, then one about z to the last heading.
+    turn = skew(np.cross(up, [0.0, 0.0, 1.0]))
+    R = (np.eye(3) + turn + turn @ turn / (1.0 + up[2]) if up[2] > -0.999
+         else np.diag([1.0, -1.0, -1.0]))
+    if path_end.R is not None:
+        M = path_end.R @ R.T
+        R = exp_so3(np.array([0.0, 0.0, math.atan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1])])) @ R
+    return np.asarray(R)
+
+
+# Path length of relative errors [m].
+_SEGMENT = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class TrajectoryErrors:
+    """Errors of positions after the best rigid alignment, without scale."""
+
+    ate_m: float   # root mean square distance
+    scale_error: float   # of the best similarity, less 1
+    relative_translation_error_percent: float   # median over segments of 1 m
+    length_m: float   # of the true path
+
+
+class ComparedPath(NamedTuple):
+    """Positions (N, 3) at times [ns]; with errors, aligned with the true ones that cover them."""
+
+    imu_ns: Sequence[int]
+    positions: Array
+    truth: Array | None = None
+    errors: TrajectoryErrors | None = None
+
+
+def write_tum(path: Path, trajectory: Sequence[Odometry]) -> None:
+    """Lines ``seconds x y z qx qy qz qw``, seconds being those of the stamps."""
+    with path.open('w', encoding='ascii') as file:
+        for pose in trajectory:
+            values = [*pose.position, *quat_xyzw(pose.R)]
+            file.write(f'{pose.stamp_ns // 10**9}.{pose.stamp_ns % 10**9:09d} '
+                       + ' '.join(f'{value:.9f}' for value in values) + '\n')
+
+
+def aligned(positions: Array, truth: Array) -> tuple[Array, Array, float]:
+    """R (3, 3), t (3,) of ``truth = R positions + t``, and the best scale of the positions.
+
+    S. Umeyama, *Least-squares estimation of transformation parameters between two point
+    patterns*, PAMI 13(4), 1991.
+    """
+    mean, true_mean = positions.mean(axis=0), truth.mean(axis=0)
+    a, b = positions - mean, truth - true_mean
+    correlation = b.T @ a
+    R = aligning_rotation(correlation)
+    return R, true_mean - R @ mean, float((R * correlation).sum() / (a**2).sum())
+
+
+def path_of(trajectory: Sequence[Odometry], truth: TrueTrajectory | None) -> ComparedPath:
+    """Positions of a trajectory; compared with the ground truth if it covers 4 poses or more."""
+    covered = [pose for pose in trajectory if truth is not None and truth.covers(pose.imu_ns)]
+    if truth is None or len(covered) < 4:
+        return ComparedPath([pose.imu_ns for pose in trajectory],
+                            np.array([pose.position for pose in trajectory]).reshape(-1, 3))
+    positions = np.array([pose.position for pose in covered])
+    true = np.array([truth.position(pose.imu_ns) for pose in covered])
+    R, t, scale = aligned(positions, true)
+    moved = positions @ R.T + t
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(true, axis=0), axis=1))])
+    relative = []
+    for i, pose in enumerate(covered):
+        j = int(np.searchsorted(way, way[i] + _SEGMENT))
+        if j == len(covered):
+            break
+        known = truth.relative_pose(pose.imu_ns, covered[j].imu_ns)
+        if known is not None and covered[j].path == pose.path:
+            step = pose.R.T @ (covered[j].position - pose.position)
+            relative.append(float(np.linalg.norm(step - known[1])) / float(way[j] - way[i]))
+    return ComparedPath([pose.imu_ns for pose in covered], moved, true, TrajectoryErrors(
+        float(np.sqrt(((moved - true) ** 2).sum(axis=1).mean())), scale - 1.0,
+        100.0 * float(np.median(relative)) if relative else math.nan, float(way[-1])))

@@ -1,0 +1,190 @@
+"""A keyframe pair as a measurement of two bodies with a camera: residuals and derivatives.
+
+Free of gtsam, for graphs of other libraries.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.estimator.covariance import ImageInformation
+from rs_relpose_ros.estimator.result import Status
+from rs_relpose_ros.geometry.so3 import log_so3, norm, tangent_basis
+from rs_relpose_ros.imu.buffer import ImuInterval
+from rs_relpose_ros.jit import kernel
+from rs_relpose_ros.messages.incoming import stamp_ns
+from rs_relpose_ros.messages.published_pair import PairStatus
+from rs_relpose_ros.pipeline.findings import FindingState
+from rs_relpose_ros.pipeline.pair import PairResult
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframePair:
+    """A keyframe pair as a measurement of two camera poses, at the stamped rows."""
+
+    stamp_ns: int   # of the current image, on the clock of the camera
+    reference_ns: int   # of both images, on the IMU clock
+    current_ns: int
+    frame_id: str
+    status: str
+    images: ImageInformation | None   # of the images alone; None without information
+    baseline: float   # [m]; NaN if unknown
+    baseline_log_sigma: float
+    gyro_bias: Array   # (3,) [rad/s] active, IMU frame; NaN if unknown
+    contradiction: str   # finding against the calibration that ends a path; empty for none
+
+    @classmethod
+    def of_result(cls, pair: PairResult) -> KeyframePair:
+        """From a pair of the front end."""
+        pose = pair.pose
+        bias = np.full(3, math.nan) if pair.gyro_bias is None else pair.gyro_bias
+        return cls(pair.stamp_ns, pair.reference_ns1,
+                   pair.reference_ns2, pair.frame_id, pose.status.value, pose.images,
+                   pose.baseline, pose.baseline_log_sigma, bias,
+                   _contradiction(pair.health.state.value, pair.health.text))
+
+    @classmethod
+    def of_message(cls, pairs: Any) -> KeyframePair:
+        """From a message on ``~/pairs``; InputError if it is unusable."""
+        status = PairStatus(pairs)
+        return cls(stamp_ns(pairs.header), status['reference_imu_ns'], status['current_imu_ns'],
+                   status.frame_id, status['status'], status.images(), status['baseline_m'],
+                   status['baseline_log_sigma'], status['gyro_bias_rad_s'],
+                   _contradiction(status['health'], status['health_findings']))
+
+    def later(self, delay_ns: int) -> KeyframePair:
+        """The same for rows that are read `delay_ns` later."""
+        return replace(self, stamp_ns=self.stamp_ns + delay_ns,
+                       reference_ns=self.reference_ns + delay_ns,
+                       current_ns=self.current_ns + delay_ns)
+
+    @property
+    def is_pure_rotation(self) -> bool:
+        """Whether the images have no translation."""
+        return self.status == Status.PURE_ROTATION.value
+
+    @property
+    def has_direction(self) -> bool:
+        """Whether the images determine the direction of motion."""
+        return self.images is not None and bool(np.isfinite(self.images.t).all())
+
+
+def _contradiction(state: str, findings: str) -> str:
+    """The finding that ends a path: a parameter is wrong, or the accelerometer is contradicted.
+
+    Pairs continue without the accelerometer, but a path has no other source of scale.
+    """
+    for finding in findings.split('; '):
+        if finding.startswith(f'accel_axes {FindingState.SUSPECT.value}:') or \
+                finding.partition(' ')[2].startswith(f'{FindingState.WRONG.value}:'):
+            return finding
+    return 'the calibration is wrong' if state == FindingState.WRONG.value else ''
+
+
+# Residuals of a pair and their derivatives. Unknowns are pose and velocity of the body (the IMU)
+# at both times; the camera has the rotation ``v_cam = C v_body`` and the position c in the body.
+# With camera poses (R_k, p_k), ``u`` the direction and b the length of ``q = R_1^T (p_2 - p_1)``,
+# the deviations are::
+#
+#     theta = Log(R_1^T R_2 R^T),  s = B^T u / (t . u),  R_1^T v_k / b - d_k
+#
+# as of `rs_relpose_ros.estimator.covariance`, R, t, d_k being the measured ones.
+
+# Shortest baseline [m] with a direction.
+_LEAST_BASELINE = 1e-4
+
+
+class Mounting(NamedTuple):
+    """Camera on a body: ``v_cam = R v_body``, `position` of the camera in the body [m]."""
+
+    R: Array
+    position: Array
+
+
+class BodyState(NamedTuple):
+    """Body in the world: ``R`` (3, 3) from its axes, position [m], velocity [m/s], rate [rad/s].
+
+    The rate is in the axes of the body.
+    """
+
+    R: Array
+    position: Array
+    velocity: Array
+    rate: Array
+
+
+@kernel
+def _skew(v: Array) -> Array:
+    """``_skew(a) @ b = a x b``."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+@kernel
+def deviations(first: BodyState, second: BodyState, mounting: Mounting, R: Array, t: Array,
+               velocities: Array) -> tuple[Array, Array]:
+    """Deviations (11,) of a measured pair, and their derivatives (11, 21).
+
+    With respect to small rotations and translations of the first body (in its axes), its velocity
+    (in the world), the same for the second body, and the position of the camera in the body. All
+    arrays are contiguous.
+    """
+    C, c = mounting.R, mounting.position
+    arm = _skew(c)
+    back = C @ first.R.T
+    R12 = back @ second.R @ C.T
+    R12C = R12 @ C
+    q = back @ (second.position + second.R @ c - first.position - first.R @ c)
+    b = max(norm(q), _LEAST_BASELINE)
+    u = q / b
+    dq = np.zeros((3, 21))
+    dq[:, 0:3], dq[:, 3:6] = _skew(q) @ C + C @ arm, -C
+    dq[:, 9:12], dq[:, 12:15], dq[:, 18:21] = -R12C @ arm, R12C, R12C - C
+    db = u @ dq
+    e, by = np.empty(11), np.zeros((11, 21))
+    e[0:3] = log_so3(R12 @ R.T)
+    by[0:3, 0:3], by[0:3, 9:12] = -C, R12C
+    B, along = tangent_basis(t), t @ u
+    # More than 90 deg from the measured direction the tangent is undefined: the sine instead.
+    along = along if along > 0.1 else 1.0
+    du = (dq - np.outer(u, db)) / b
+    e[3:5] = B.T @ u / along
+    by[3:5] = (B.T @ du - np.outer(e[3:5], t @ du)) / along
+    for k in range(2):
+        body = first if k == 0 else second
+        # The lever arm rotates with the body.
+        swing = _skew(body.rate) @ c
+        w = back @ (body.velocity + body.R @ swing)
+        own, rows = 9 * k, slice(5 + 3 * k, 8 + 3 * k)
+        e[rows] = w / b - velocities[3 * k:3 * k + 3]
+        by[rows, 0:3] += _skew(w) @ C
+        by[rows, own:own + 3] -= (C if k == 0 else R12C) @ _skew(swing)
+        by[rows, own + 6:own + 9] = back
+        by[rows, 18:21] = (C if k == 0 else R12C) @ _skew(body.rate)
+        by[rows] = (by[rows] - np.outer(w / b, db)) / b
+    return e, by
+
+
+def square_root(information: Array, gradient: Array) -> tuple[Array, Array]:
+    """A (k, n) and a (k,) with ``|A e + a|^2 = e^T H e + 2 g^T e`` and a constant.
+
+    Directions that H does not observe are left out.
+    """
+    values, vectors = np.linalg.eigh(information)
+    observed = values > 1e-10 * max(values[-1], 1e-300)
+    roots = np.sqrt(values[observed])
+    return roots[:, None] * vectors[:, observed].T, (vectors[:, observed].T @ gradient) / roots
+
+
+def warm_up_odometry() -> None:
+    """Compile (or load from the cache) the kernels of odometry: a made-up pair, an IMU at rest."""
+    eye, z = np.eye(3), np.array([0.0, 0.0, 1.0])
+    first, second = (BodyState(eye, k * z, z, np.zeros(3)) for k in range(2))
+    deviations(first, second, Mounting(eye, np.zeros(3)), eye, z, np.zeros(6))
+    ImuInterval(np.arange(2.0), np.zeros((2, 3)), np.ones((2, 3))).mean_force(np.zeros(3))

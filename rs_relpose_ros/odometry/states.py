@@ -1,0 +1,111 @@
+"""States of the odometry, as published: with their reasons, at increasing times, without steps.
+
+Free of gtsam.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum
+import math
+from typing import NamedTuple, TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
+from rs_relpose_ros.geometry.timing import seconds_between
+
+if TYPE_CHECKING:
+    from rs_relpose_ros.odometry.estimator import OdometryEstimator
+
+Array = NDArray[np.float64]
+
+# A larger step back of the stamps is a clock that was set back.
+JUMP_NS = 1_000_000_000
+# Time constant in which corrections are blended in [s].
+_BLENDING = 0.3
+
+
+class OdometryState(str, Enum):
+    """State of the odometry, as published."""
+
+    STARTING = 'starting'
+    TRACKING = 'tracking'
+    UNCERTAIN = 'uncertain'   # on the IMU alone
+    LOST = 'lost'   # until the next start
+
+
+class StateInterval(NamedTuple):
+    """A state with its reason; times on the camera's clock, None for a state that is not over."""
+
+    state: OdometryState
+    reason: str
+    begin_ns: int
+    end_ns: int | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Odometry:
+    """The camera in a metric world with z up, at a time."""
+
+    stamp_ns: int   # on the camera's clock, as image stamps
+    imu_ns: int   # the same time on the IMU clock
+    frame_id: str   # of the camera
+    path: int   # number of earlier starts in the same world
+    R: Array   # (3, 3) from the camera
+    position: Array   # (3,) [m]
+    pose_covariance: Array   # (6, 6) of (position, rotation), in the axes of the world
+    velocity: Array   # (3,) of the camera, in its axes [m/s]
+    angular_velocity: Array   # (3,) of the camera, in its axes [rad/s]
+    velocity_covariance: Array   # (6, 6) of the two
+
+
+@dataclass(frozen=True, slots=True)
+class StartReport:
+    """A start of the odometry."""
+
+    at_rest: bool
+    imu_ns: int
+    seconds: float   # since its first pair
+    scale_sigma: float   # relative
+
+
+class ContinuousPath:
+    """States of an estimator at increasing times, without steps: corrections are blended in.
+
+    What is not blended in yet is part of the covariance.
+    """
+
+    def __init__(self, estimator: OdometryEstimator) -> None:
+        self._estimator = estimator
+        self._corrections, self._offset = 0, np.zeros(6)   # position, rotation; in the world
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin another path."""
+        self._last: Odometry | None = None
+
+    def at(self, imu_ns: int) -> Odometry | None:
+        """The state at a time; None without one, and if the time is not new."""
+        estimator, last = self._estimator, self._last
+        if last is not None and last.imu_ns - JUMP_NS < imu_ns <= last.imu_ns:
+            return None
+        state = estimator.propagated(imu_ns)
+        if state is None:
+            return None
+        if last is None or last.path != state.path or imu_ns < last.imu_ns:
+            self._offset = np.zeros(6)
+        else:
+            if estimator.corrections != self._corrections:
+                before = estimator.propagated(last.imu_ns)
+                self._offset = np.zeros(6) if before is None else np.concatenate([
+                    last.position - before.position, log_so3(last.R @ before.R.T)])
+            self._offset = self._offset * math.exp(
+                -seconds_between(last.imu_ns, imu_ns) / _BLENDING)
+        self._corrections = estimator.corrections
+        self._last = replace(
+            state, position=state.position + self._offset[:3],
+            R=exp_so3(self._offset[3:]) @ state.R,
+            pose_covariance=state.pose_covariance + np.outer(self._offset, self._offset))
+        return self._last

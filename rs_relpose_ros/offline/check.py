@@ -1,0 +1,618 @@
+"""The check of a bag: choose topics, read it once, report findings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+import math
+import textwrap
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rs_relpose_ros.bags import reader
+from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics, Topic
+from rs_relpose_ros.calibrate.observations import frame_times, Varying
+from rs_relpose_ros.calibrate.start import axes_text, nearest_axis_map
+from rs_relpose_ros.config.settings import Parameters, sensor_model
+from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.geometry.so3 import STANDARD_GRAVITY
+from rs_relpose_ros.messages.incoming import PARTS, Role, sensor_messages
+from rs_relpose_ros.offline import check_sample
+from rs_relpose_ros.offline.check_sample import Completion, SampleRun
+from rs_relpose_ros.offline.check_streams import Chosen, Inertial, Scan, Stamps
+from rs_relpose_ros.pipeline.assessment import not_evaluated
+from rs_relpose_ros.pipeline.findings import (
+    Assessment,
+    BY_NAME,
+    Finding,
+    FindingState,
+    NOT_EVALUATED,
+    QUANTITIES,
+)
+
+OK, UNKNOWN, SUSPECT, WRONG = FindingState
+
+
+class Case(NamedTuple):
+    """State and fix if a condition holds; `more` follows the message of the finding."""
+
+    holds: bool
+    state: FindingState
+    fix: str = ''
+    more: str = ''
+
+
+def by_case(name: str, message: str, measured: Mapping[str, Any], *cases: Case) -> Finding:
+    """Finding by the first of the `cases` that holds; OK if none does."""
+    for case in cases:
+        if case.holds:
+            return Finding(name, case.state, message + case.more, case.fix, measured=measured)
+    return Finding(name, OK, message, measured=measured)
+
+
+@dataclass(frozen=True, slots=True)
+class CheckReport:
+    """All findings of one bag."""
+
+    bag: str
+    findings: tuple[Finding, ...]
+
+    @property
+    def failed(self) -> bool:
+        """Whether something would make the estimation fail."""
+        return any(finding.state is WRONG for finding in self.findings)
+
+    def lines(self, width: int = 100) -> list[str]:
+        """The report as text of at most `width` columns."""
+        names = max(len(finding.quantity) for finding in self.findings)
+        lines = []
+        for finding in self.findings:
+            head = f'{finding.state.verdict:<8} {finding.quantity:<{names}}  '
+            text = finding.message + (f' -> {finding.fix}' if finding.fix else '')
+            lines += textwrap.wrap(text, width, initial_indent=head,
+                                   subsequent_indent=' ' * len(head), break_on_hyphens=False)
+        states = [finding.state for finding in self.findings]
+        counts = [f'{states.count(state)} {state.verdict}' for state in FindingState]
+        lines.append(f'{self.bag}: {", ".join(counts)}')
+        return lines
+
+    def to_mapping(self) -> dict[str, Any]:
+        """The report as data for JSON."""
+        return {'bag': self.bag, 'failed': self.failed,
+                'findings': [finding.as_check_json() for finding in self.findings]}
+
+
+def choose_topics(bag: Bag, names: Mapping[str, str]) -> Chosen:
+    """The topics to read: as `Bag.find_topics`, but None for those that are absent.
+
+    InputError or MissingInputError if several topics are possible, or one of `names` does not
+    exist.
+    """
+    try:
+        topics = bag.find_topics(names, needs_camera_info=False)
+    except (InputError, MissingInputError) as error:
+        # A wrong name is an error of the user; an absent or rectified topic is a finding.
+        chosen = Chosen(_first(bag, names, Role.IMAGE), _first(bag, names, Role.CAMERA_INFO),
+                        _first(bag, names, Role.IMU))
+        there = {topic.name.lstrip('/') for topic in bag.topics if topic.count}
+        absent = isinstance(error, MissingInputError) and all(
+            name.lstrip('/') in there for name in names.values() if name)
+        if not absent and 'image_rect' not in (chosen.image.name if chosen.image else ''):
+            raise
+        return chosen
+    return Chosen(topics.image, topics.camera_info, topics.imu, topics.accel)
+
+
+def _first(bag: Bag, names: Mapping[str, str], role: Role) -> Topic | None:
+    name = names.get(role.value, '').lstrip('/')
+    return next((topic for topic in bag.topics
+                 if topic.msgtype in PARTS[role].msgtypes and topic.count
+                 and name in ('', topic.name.lstrip('/'))), None)
+
+
+def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
+    """Read the chosen topics of an open bag, and report on them and on the parameters.
+
+    The bag is read twice if readout time or axes are missing, which a calibration then estimates
+    first, or if the front end fails on them. InputError if the bag is damaged.
+    """
+    images = chosen.image.count if chosen.image else 0
+    scan = Scan(images, parameters.intrinsics, no_camera_info=chosen.camera_info is None)
+    completion, sample, topics = Completion(parameters, None, ''), None, None
+    if chosen.image is not None and chosen.imu is not None:
+        topics = SensorTopics(chosen.image, chosen.camera_info, chosen.imu, chosen.accel, None)
+        completion = check_sample.completed(bag, topics, parameters)
+        if not completion.parameters.sensor.missing():
+            sample = SampleRun(images, completion.parameters)
+
+    def scanned() -> Iterator[tuple[Role, BagMessage]]:
+        for role, message in sensor_messages(bag, chosen):
+            scan.add(role, message)
+            yield role, message
+
+    if sample is None:
+        for _ in scanned():
+            pass
+    else:
+        sample.run(scanned())
+    findings = [_topics(bag, chosen, parameters), _parameters(parameters)]
+    if chosen.image is not None:
+        findings += image_findings(scan, chosen.image, bag.reliability(chosen.image), parameters)
+    if chosen.imu is not None:
+        findings += imu_findings(scan, bag.reliability(chosen.imu), parameters)
+    if topics is not None:
+        if sample is not None and sample.is_lost and completion.found is None:
+            completion = check_sample.recalibrated(bag, topics, completion)
+        findings += joint_findings(scan, sample, completion, parameters)
+    return CheckReport(str(bag.path), tuple(findings))
+
+
+def _topics(bag: Bag, chosen: Chosen, parameters: Parameters) -> Finding:
+    roles = chosen._asdict()
+    measured = {role: topic.name if topic else None for role, topic in roles.items()}
+    needed = ['image', 'imu'] if parameters.intrinsics.given else ['image', 'camera_info', 'imu']
+    absent = [role for role in needed if roles[role] is None]
+    if not absent:
+        return by_case('topics', ', '.join(f'{topic.name} ({topic.count})'
+                                           for topic in chosen.all), measured)
+    there = ', '.join(map(str, bag.topics)) or 'no topics at all'
+    return Finding('topics', WRONG, f'no {" and no ".join(absent)} topic; the bag has {there}',
+                   'record images (raw or compressed), their CameraInfo and a sensor_msgs/Imu '
+                   'with gyro', measured=measured)
+
+
+def _parameters(parameters: Parameters) -> Finding:
+    sensor, missing = parameters.sensor, parameters.sensor.missing()
+    if missing:
+        return Finding('parameters', SUSPECT, f'{" and ".join(missing)} not configured',
+                       'the node needs them: add --params FILE, or estimate them from a recording '
+                       'with "rs_relpose calibrate"', measured={'missing': missing})
+    nearest = axes_text(nearest_axis_map(sensor.R_cam_imu))
+    return by_case('parameters', f'readout_time {1e3 * (sensor.readout_time or 0.0):.1f} ms, '
+                   f'time_offset {1e3 * sensor.time_offset:.1f} ms, quat_cam_imu_xyzw (about '
+                   f'{nearest})', {'missing': [], 'nearest': nearest})
+
+
+# -- Images and their calibration -------------------------------------------------------------
+
+# Fast DDS with its default transports loses best-effort messages above this [bytes].
+_LARGE_MESSAGE = 512 * 1024
+# Below this [Hz] tracks are lost and keyframes lie far apart.
+_SLOW = 8.0
+_MISSED_SHARE = 0.05
+# First stamps, enough to distinguish jitter from automatic exposure.
+_MOST_STAMPS = 1000
+# Fix of stamps that do not increase.
+_NO_STEP = 'record longer, and correct the stamps of the driver'
+
+
+def image_findings(scan: Scan, topic: Topic, reliability: str,
+                   parameters: Parameters) -> list[Finding]:
+    """Findings on the images, their CameraInfo and their transport."""
+    stamps_ns = np.unique(scan.image_stamps.ns[:_MOST_STAMPS])
+    varying = frame_times(stamps_ns).varying if len(stamps_ns) > 2 else Varying.UNCLEAR
+    return [*_encoding(scan, topic, parameters), _rate(scan.image_stamps),
+            stamp_finding('image stamps', scan.image_stamps, 'the camera', varying),
+            _calibration(scan), _transport(scan, topic, reliability)]
+
+
+def stamp_finding(name: str, stamps: Stamps, of: str,
+                  varying: Varying = Varying.JITTER) -> Finding:
+    """Order and evenness of stamps; `varying`: why their intervals differ."""
+    repeated, backwards = int((stamps.steps == 0.0).sum()), int((stamps.steps < 0.0).sum())
+    jitter, furthest_back = stamps.jitter, abs(float(stamps.steps.min(initial=0.0)))
+    measured = {'jitter_s': jitter, 'repeated': repeated, 'backwards': backwards,
+                'furthest_back_s': furthest_back,
+                'delay_s': stamps.delay if stamps.count else None}
+    if not stamps.interval > 0.0:
+        return Finding(name, WRONG, f'{stamps.count} message(s), no two of increasing stamps',
+                       _NO_STEP, measured=measured)
+    text, unordered = f'jitter {1e3 * jitter:.2f} ms', repeated + backwards
+    if unordered:
+        text += (f', {repeated} repeated, {backwards} back in time (by up to {furthest_back:.3f} '
+                 's)')
+    return by_case(
+        name, text, measured,
+        Case(unordered > 0.2 * stamps.count, WRONG,
+             f'have the driver of {of} stamp each message with its own time'),
+        Case(furthest_back > 1.0, SUSPECT, 'the clock was set back or the bag has two '
+             'recordings: the node restarts there; record with a steady clock'),
+        Case(unordered > 0, SUSPECT,
+             'these messages are not used: look for two publishers on the topic'),
+        Case(jitter <= max(0.2 * stamps.interval, 1e-3), OK),
+        Case(varying is Varying.EXPOSURE, OK, 'the time offset follows it: estimate '
+             'time_offset_per_interval with "rs_relpose calibrate", or fix the exposure',
+             ', over many frames each, as by automatic exposure'),
+        Case(varying is Varying.JITTER, SUSPECT, 'probably times of arrival: have '
+             f'{of} stamp in hardware, or at the interrupt'),
+        Case(True, SUSPECT, f'verify the stamps of {of}',
+             ', neither as by times of arrival nor as by automatic exposure'))
+
+
+def _encoding(scan: Scan, topic: Topic, parameters: Parameters) -> list[Finding]:
+    sizes = ', '.join(f'{width}x{height}' for width, height in scan.sizes)
+    found = by_case(
+        'images', f'{sizes} {", ".join(scan.encodings)}'.strip(),
+        {'encodings': dict(scan.encodings), 'bad_images': scan.bad_images,
+         'sizes': [list(size) for size in scan.sizes]},
+        Case(scan.bad_images > 0, SUSPECT if scan.sizes else WRONG,
+             'publish original images of a known encoding, or JPEG or PNG',
+             f'; {scan.bad_images} cannot be used: {scan.problems.get(Role.IMAGE)}'),
+        Case('image_rect' in topic.name, WRONG, 'record the original (raw) images: rectified rows '
+             'have no common time', f'; {topic.name} is rectified'),
+        Case(len(scan.sizes) > 1, SUSPECT,
+             'keep the resolution; the readout time changes with it', ': the size changes'))
+    compressed = topic.msgtype == reader.COMPRESSED_IMAGE
+    if compressed == (parameters.pair.image_transport == 'compressed'):
+        return [found]
+    right = 'compressed' if compressed else 'raw'
+    return [found, Finding('transport', SUSPECT, f'the images are {right}',
+                           f'set image_transport: {right} for the live node (replay detects it)',
+                           measured={'image_transport': right})]
+
+
+def _rate(stamps: Stamps) -> Finding:
+    name, interval, duration = 'image rate', stamps.interval, stamps.duration
+    if not interval > 0.0:
+        return Finding(name, WRONG, f'{stamps.count} image(s) of different stamps or fewer',
+                       'record at least some seconds', measured={'count': stamps.count})
+    # Each longer step hides frames; 1.5 of a step occurs even with automatic exposure.
+    gaps, longest = stamps.longer_than(1.7 * interval)
+    missed = max(round(duration / interval) - stamps.count + 1, 0) if gaps else 0
+    text = f'{1.0 / interval:.1f} Hz, {stamps.count} in {duration:.1f} s'
+    if gaps:
+        text += f', about {missed} missed in {gaps} gaps, the longest {longest:.2f} s'
+    return by_case(
+        name, text, {'rate_hz': 1.0 / interval, 'count': stamps.count, 'duration_s': duration,
+                     'gaps': gaps, 'longest_step_s': longest, 'missed': missed},
+        Case(1.0 / interval < _SLOW, SUSPECT, f'record at {_SLOW:g} Hz or more: points are lost '
+             'between frames that are far apart'),
+        Case(missed > _MISSED_SHARE * stamps.count, SUSPECT, 'images are lost in transport: use '
+             'config/fastdds.xml, compressed images, or a faster disk'))
+
+
+def _calibration(scan: Scan) -> Finding:
+    name, intrinsics = 'calibration', scan.intrinsics
+    if intrinsics is None:
+        return Finding(name, WRONG, scan.problems.get(Role.CAMERA_INFO, 'no CameraInfo'),
+                       'calibrate the camera (camera_calibration, OpenCV) and have its driver '
+                       'publish the CameraInfo, or set camera_matrix: "rs_relpose calibrate" '
+                       'estimates its focal length', measured={})
+    size = intrinsics.image_width, intrinsics.image_height
+    other = next(iter(scan.sizes), size) if size not in scan.sizes else size
+    straight = intrinsics.global_shutter_camera().is_undistorted
+    wide = intrinsics.width > 2.0 * intrinsics.fx   # more than 90 deg
+    return by_case(
+        name, f'{intrinsics.width}x{intrinsics.height}, f {intrinsics.fx:.1f} '
+        f'{intrinsics.fy:.1f} px, {intrinsics.distortion_model}'
+        + (' by camera_matrix' if scan.by_parameters else ''),
+        {'fx': intrinsics.fx, 'fy': intrinsics.fy,
+         'distortion_model': intrinsics.distortion_model, 'different': scan.calibrations},
+        Case(other != size, WRONG, 'publish the CameraInfo of this resolution, region of interest '
+             'and binning included', f': for images of {size[0]}x{size[1]}, but they are '
+             f'{other[0]}x{other[1]}'),
+        Case(straight and wide, SUSPECT, 'correct for a simulated or a rectifying camera only: '
+             'otherwise calibrate it', ' without distortion'),
+        Case(straight, OK, '', ' without distortion'),
+        Case(scan.calibrations > 1, SUSPECT, 'keep zoom and focus: each change restarts tracks',
+             f'; it changes {scan.calibrations - 1} times'))
+
+
+def _transport(scan: Scan, topic: Topic, reliability: str) -> Finding:
+    size = scan.largest_image
+    offered = f'recorded as {reliability}' if reliability else 'reliability not recorded'
+    return by_case(
+        'live transport', f'{topic.name} {offered}, up to {size / 1e3:.0f} kB per image',
+        {'largest_bytes': size, 'reliability': reliability or None},
+        Case(size > _LARGE_MESSAGE, SUSPECT, 'live, Fast DDS loses most images above 512 KiB with '
+             'its default transports: start driver and node with '
+             'FASTRTPS_DEFAULT_PROFILES_FILE=.../config/fastdds.xml, or use image_transport: '
+             'compressed'),
+        Case(True, OK, '', '; the node subscribes best effort, which matches both'))
+
+
+# -- Gyro and accelerometer -------------------------------------------------------------------
+
+_SLOW_IMU = 80.0
+# Mean length of the specific force that is consistent with hand-held motion [m/s^2].
+_PLAUSIBLE_FORCE = (9.4, 10.8)
+# No hand and no drone rotates so fast in the median [rad/s]; degrees per second do.
+_FASTEST_MEDIAN = 8.0
+
+
+def imu_findings(scan: Scan, reliability: str, parameters: Parameters) -> list[Finding]:
+    """Findings on the IMU by itself."""
+    if not len(scan.inertial.rates):
+        problem = scan.problems.get(Role.IMU, 'all messages mark the gyro as absent')
+        return [Finding('gyro', WRONG, f'no gyro: {problem}', 'choose a topic that has '
+                        'angular_velocity with --imu-topic', measured={})]
+    return [_imu_rate(scan, reliability, parameters),
+            stamp_finding('imu stamps', scan.imu_stamps, 'the IMU'), _gyro(scan.inertial),
+            _bias(scan.inertial, parameters), _accelerometer(scan.inertial)]
+
+
+def _imu_rate(scan: Scan, reliability: str, parameters: Parameters) -> Finding:
+    name, stamps, gap = 'imu rate', scan.imu_stamps, parameters.imu.max_imu_gap
+    interval = stamps.interval
+    if not interval > 0.0:
+        return Finding(name, WRONG, f'{stamps.count} message(s), no two of increasing stamps',
+                       _NO_STEP, measured={})
+    gaps, longest = stamps.longer_than(gap)
+    text = (f'{1.0 / interval:.0f} Hz, {stamps.count} in {stamps.duration:.1f} s, longest '
+            f'step {1e3 * longest:.1f} ms')
+    if reliability:
+        text += f', recorded as {reliability}'
+    return by_case(
+        name, text, {'rate_hz': 1.0 / interval, 'count': stamps.count, 'gaps': gaps,
+                     'longest_step_s': longest, 'unusable': scan.bad_imu,
+                     'reliability': reliability or None},
+        Case(interval > gap, WRONG, f'steps longer than max_imu_gap = {gap:g} s are not '
+             'interpolated: raise the rate to 100 Hz or more'),
+        Case(scan.bad_imu > 0, SUSPECT, 'correct the driver',
+             f'; {scan.bad_imu} messages cannot be used: {scan.problems.get(Role.IMU)}'),
+        Case(gaps > 0, SUSPECT, "frames in a gap are refused: give the IMU's subscription a "
+             'deeper queue, or record on the machine of the driver',
+             f'; {gaps} gaps above {1e3 * gap:.0f} ms'),
+        Case(1.0 / interval < _SLOW_IMU, SUSPECT,
+             'publish 200 Hz or more, which resolves the rotation of a hand within one readout'))
+
+
+def _gyro(inertial: Inertial) -> Finding:
+    rates = np.linalg.norm(inertial.rates, axis=1)
+    median, high = float(np.median(rates)), float(np.percentile(rates, 95))
+    return by_case(
+        'gyro', f'median {math.degrees(median):.1f} deg/s, 95 % {math.degrees(high):.1f} deg/s',
+        {'median_rad_s': median, 'p95_rad_s': high},
+        Case(float(np.ptp(inertial.rates, axis=0).max()) == 0.0, WRONG,
+             'the sensor is stuck or not read: correct its driver', '; all samples are equal'),
+        Case(median > _FASTEST_MEDIAN, WRONG, 'these are degrees per second: sensor_msgs/Imu '
+             'requires rad/s, so correct the driver', f' if {median:.0f} were rad/s'))
+
+
+def _bias(inertial: Inertial, parameters: Parameters) -> Finding:
+    configured, sigma = parameters.imu.gyro_bias, parameters.imu.gyro_bias_sigma
+    name, rest = 'gyro at rest', inertial.rest()
+    if rest is None:
+        return Finding(name, UNKNOWN, 'not measured: the IMU is never at rest here',
+                       'to measure it, keep the camera at rest for some seconds',
+                       measured={'at_rest_rad_s': None})
+    listed = [round(float(value), 5) for value in rest.value]
+    off = float(np.abs(rest.value - np.array(configured)).max())
+    return by_case(
+        name, f'mean at rest {listed} rad/s (+- {rest.sigma:.4f})',
+        {'at_rest_rad_s': listed, 'sigma_rad_s': rest.sigma},
+        Case(off > 4.0 * math.hypot(sigma, rest.sigma), SUSPECT, f'set gyro_bias: {listed} if the '
+             'camera was at rest there (a slow constant rate is similar)',
+             f', gyro_bias is {list(np.array(configured))} +- {sigma:g}'))
+
+
+def _accelerometer(inertial: Inertial) -> Finding:
+    name, forces = 'gravity', inertial.forces
+    if not len(forces):
+        return by_case(
+            name, 'no accelerometer', {'mean_length_m_s2': None,
+                                       'orientations': inertial.orientations},
+            Case(inertial.orientations > 0, OK, '', ', but an orientation'),
+            Case(True, SUSPECT, "poses are less accurate without: choose the accelerometer's "
+                 'topic with --accel-topic (node: remap accel)'))
+    length = float(np.linalg.norm(forces, axis=1).mean())
+    text = f'|acc| {length:.2f} m/s^2 in the mean'
+    if inertial.orientations:
+        text += f', and {inertial.orientations} orientations with covariance'
+    return by_case(
+        name, text, {'mean_length_m_s2': length, 'mean_m_s2': forces.mean(axis=0).tolist(),
+                     'orientations': inertial.orientations},
+        Case(abs(length - 1.0) < 0.15, WRONG, 'these are g: sensor_msgs/Imu requires m/s^2, so '
+             'correct the driver, or set use_gravity: false'),
+        Case(length < 0.5 * STANDARD_GRAVITY, WRONG, 'publish the accelerometer as measured '
+             '(REP-145), or set use_gravity: false', ': gravity is removed'),
+        Case(not _PLAUSIBLE_FORCE[0] <= length <= _PLAUSIBLE_FORCE[1], SUSPECT, 'calibrate the '
+             'accelerometer (bias, scale), or set use_gravity: false', ', not near 9.81'))
+
+
+# -- Images and gyro together -----------------------------------------------------------------
+
+# Stamps of the two sensors that differ by more in their delay are of different clocks [s].
+_SAME_CLOCK = 0.5
+# Matches of a pair in the median that give no estimate, and that are few.
+_NO_MATCHES, _FEW_MATCHES = 15, 30
+# Readout time that is assumed if none is known [s].
+_EXAMPLE_READOUT = 0.030
+# Displacement below the noise of matches, and one that spoils a global-shutter pose [px].
+_NO_EFFECT, _STRONG_EFFECT = 1.0, 4.0
+# Sigmas beyond which a deviation is certain, whether it matters for poses or not; and how many
+# times the largest sigma of an observable one it may reach before poses are wrong.
+_CERTAIN, _GROSS = 4.0, 3.0
+_MEASURE = 'measure it with "rs_relpose calibrate"'
+_READOUT = frozenset(('readout_time', 'readout_direction'))
+# Quantities by the parameters that set them.
+_SET_BY = {'quat_cam_imu_xyzw': 'axes', 'readout_time': 'readout_time'}
+
+
+def joint_findings(scan: Scan, sample: SampleRun | None, completion: Completion,
+                   parameters: Parameters) -> list[Finding]:
+    """Findings on both sensors together.
+
+    `sample` is None if `completion` could not find missing `parameters`.
+    """
+    health = NOT_EVALUATED if sample is None else _with_calibration(sample, scan, completion)
+    found = [_overlap(scan, parameters)]
+    if sample is not None:
+        found += [_pairs(sample, health), _texture(sample, health)]
+    reason = completion.problem if sample is None else 'too few pairs of images were estimated'
+    missing = {_SET_BY[name] for name in parameters.sensor.missing()}
+    found += [_not_configured(name, completion, scan) for name in sorted(missing)]
+    found += [finding for finding in quantity_findings(health, reason)
+              if finding.quantity not in missing]
+    effect = _effect(scan, health, completion.parameters)
+    return found if effect is None else [*found, effect]
+
+
+def _overlap(scan: Scan, parameters: Parameters) -> Finding:
+    """Whether the gyro covers the images in time, as stamped."""
+    name, images, imu = 'clocks', scan.image_stamps, scan.imu_stamps
+    if not images.count or not imu.count:
+        return Finding(name, WRONG, 'no stamps to compare', 'correct the topics above',
+                       measured={})
+    offset_ns = round(parameters.sensor.time_offset * 1e9)
+    image_ns, imu_ns = images.ns + offset_ns, imu.ns
+    common = int(min(image_ns.max(), imu_ns.max()) - max(image_ns.min(), imu_ns.min())) * 1e-9
+    delay, imu_delay = images.delay, imu.delay
+    apart = delay - imu_delay
+    measured = {'common_s': common, 'image_delay_s': delay, 'imu_delay_s': imu_delay}
+    if common <= 0.0 or abs(apart + parameters.sensor.time_offset) > max(
+            _SAME_CLOCK, 0.5 * images.duration):
+        return Finding(name, WRONG, f'images and IMU are stamped {abs(apart):.3f} s apart',
+                       'use one clock for both drivers (ROS time, not time since boot), or set '
+                       f'time_offset: {apart:.3f} if the difference is constant',
+                       measured=measured)
+    return by_case(
+        name, f'{common:.1f} s in common; recorded {1e3 * delay:.0f} ms (images) and '
+        f'{1e3 * imu_delay:.0f} ms (IMU) after their stamps', measured,
+        Case(common < 0.8 * images.duration, SUSPECT, "images outside of the IMU's time are "
+             'refused: start the IMU first and stop it last'),
+        Case(abs(apart) > _SAME_CLOCK, SUSPECT,
+             'the delays differ: verify that both stamp the time of measurement'))
+
+
+def _pairs(sample: SampleRun, health: Assessment) -> Finding:
+    pairs, posed = len(sample.matches), sample.poses
+    reason = next(iter((sample.poseless if pairs else sample.reasons).most_common()),
+                  'too few images were processed')
+    return by_case(
+        'pairs', f'{pairs} pairs in {sample.frames} images, {posed} with a pose',
+        {'images': sample.frames, 'pairs': pairs, 'poses': posed},
+        Case(sample.is_refused, WRONG, 'hardly any image can be used: correct the reason',
+             f': {reason}'),
+        Case(not posed, UNKNOWN, '', f': {reason}'),
+        Case(sample.few_poses and health.state is WRONG, SUSPECT,
+             'correct the parameters that are wrong, below', f'; without: {reason}'),
+        Case(sample.few_poses, SUSPECT, 'translate the camera more; if it does move, a '
+             'parameter is too far off to be observable: measure all with "rs_relpose calibrate"',
+             f'; without: {reason}'))
+
+
+def _texture(sample: SampleRun, health: Assessment) -> Finding:
+    if not sample.matches:
+        return Finding('texture', UNKNOWN, 'not measured: there is no pair of images', measured={})
+    median = float(np.median(sample.matches))
+    poor = float(np.mean(np.array(sample.matches) < _FEW_MATCHES))
+    few = median < _NO_MATCHES or poor > 0.3
+    return by_case(
+        'texture', f'{median:.0f} matches per pair in the median',
+        {'median_matches': median, 'poor_share': poor},
+        Case(few and health.state is WRONG, UNKNOWN, 'check again with correct parameters: points '
+             'are predicted with the gyro'),
+        Case(median < _NO_MATCHES, WRONG,
+             'record a textured scene, in focus, with an exposure below 10 ms'),
+        Case(few, SUSPECT, 'more light, more texture or slower motion',
+             f', fewer than {_FEW_MATCHES} in {100 * poor:.0f} %'))
+
+
+# -- Configured parameters --------------------------------------------------------------------
+
+
+def _with_calibration(sample: SampleRun, scan: Scan, completion: Completion) -> Assessment:
+    """Findings of the sample; if it is lost, the parameters that a calibration contradicts."""
+    found, health = completion.found, sample.health
+    # No calibration finds another unit, nor axes that no rotation corrects.
+    beyond = any(fault.quantity == 'gyro_unit'
+                 or (fault.quantity == 'axes' and fault.estimated is None)
+                 for fault in health.faults)
+    if found is None or scan.intrinsics is None or beyond or not sample.is_lost:
+        return health
+    wrong = check_sample.contradicted(found, completion.parameters.sensor,
+                         sensor_model(scan.intrinsics, completion.parameters.sensor))
+    if not wrong:
+        return health
+    named = {finding.quantity for finding in wrong}
+    if not named.isdisjoint(_READOUT):
+        named |= _READOUT
+    unknown = {one.quantity: one for one in not_evaluated(named, wrong[0].quantity)}
+    return Assessment((*wrong, *(unknown.get(one.quantity, one) for one in health.findings
+                                 if one.quantity not in named)))
+
+
+def quantity_findings(health: Assessment, reason: str) -> Iterator[Finding]:
+    """Findings on the quantities, by the sample; `reason`: why there are none."""
+    for finding in health.findings:
+        state = _state(finding)
+        yield replace(finding, state=state, fix='; '.join(filter(None, (
+            finding.fix, _MEASURE if state is not finding.state is OK else
+            'check again afterwards: a large deviation hides others' if state is WRONG else ''))))
+    if not health.findings:
+        for quantity in QUANTITIES:
+            yield Finding(quantity.name, UNKNOWN, f'not measured: {reason}', unit=quantity.unit)
+
+
+def _state(finding: Finding) -> FindingState:
+    """State of a parameter by itself: a certain deviation counts even if no pose suffers."""
+    if finding.configured is None or finding.estimated is None or finding.sigma is None or abs(
+            finding.estimated - finding.configured) < _CERTAIN * finding.sigma:
+        return finding.state
+    quantity = BY_NAME.get('readout_time' if finding.quantity in _READOUT else finding.quantity)
+    if finding.state is WRONG or (quantity is not None and quantity.deviation(finding)
+                                  > _GROSS * quantity.observable):
+        return WRONG
+    return SUSPECT
+
+
+def _not_configured(name: str, completion: Completion, scan: Scan) -> Finding:
+    """A parameter that is not configured, by the calibration."""
+    found, quantity = completion.found, BY_NAME[name]
+    unknown = Finding(name, UNKNOWN, f'not configured, and not estimated: {completion.problem}',
+                      _MEASURE, unit=quantity.unit)
+    if found is None:
+        return unknown
+    estimate = found.rotation if name == 'axes' else found.readout_time
+    if not estimate.observable:
+        return replace(unknown, message=f'not configured, and not observable: {estimate.remark}')
+    if name == 'readout_time':
+        size = abs(estimate.value)
+        return replace(unknown, message=(
+            f'not configured; estimated {quantity.with_sigma(size, estimate.sigma)}'
+            + (', the last row first' if estimate.value < 0.0 else '')),
+            estimated=size, sigma=estimate.sigma, observable=True)
+    text = (f'quat_cam_imu_xyzw not configured; nearest map {axes_text(found.axis_map)}, '
+            f'{math.degrees(found.rotation.value):.1f} deg from it')
+    if len(scan.inertial.forces):
+        down = -found.R_cam_imu @ scan.inertial.forces.mean(axis=0)
+        axis = int(np.argmax(np.abs(down)))
+        sides = (('left', 'right'), ('top', 'bottom'), ('back', 'front'))[axis]
+        text += f'; gravity points to the {sides[int(down[axis] > 0.0)]} of the image'
+    return replace(unknown, message=text)
+
+
+# -- Rolling shutter --------------------------------------------------------------------------
+
+
+def _effect(scan: Scan, health: Assessment, parameters: Parameters) -> Finding | None:
+    """Displacement of the last row relative to the first by rotation alone [px]."""
+    name, intrinsics, inertial = 'rolling shutter', scan.intrinsics, scan.inertial
+    if intrinsics is None or not len(inertial.rates):
+        return None
+    configured = parameters.sensor.readout_time
+    found = {finding.quantity: finding for finding in health.findings}.get('readout_time')
+    readout, source, state = configured, '', OK
+    if found is not None and found.estimated is not None and _state(found) in (SUSPECT, WRONG):
+        readout, source = found.estimated, ' as estimated'
+    elif configured is None:
+        readout, source, state = _EXAMPLE_READOUT, ' (assumed; set readout_time)', UNKNOWN
+    elif configured == 0.0:
+        return by_case(name, 'global shutter (readout_time 0)', {'readout_s': 0.0},
+                       Case(found is not None and found.state is OK, OK, '',
+                            ': no method needs to model rows'),
+                       Case(True, UNKNOWN, '', ', which this recording does not confirm'))
+    assert readout is not None
+    rest = inertial.rest()
+    bias = np.array(parameters.imu.gyro_bias) if rest is None else rest.value
+    rates = np.linalg.norm(inertial.rates - bias, axis=1)
+    median, high = (readout * intrinsics.fx * float(np.percentile(rates, p)) for p in (50, 95))
+    method = ('is sufficient' if high < _NO_EFFECT else
+              'is not sufficient' if median > _STRONG_EFFECT else 'loses accuracy')
+    return by_case(name, f'rotation displaces the last row by {median:.1f} px relative to the '
+                   f'first in the median, {high:.1f} px at 95 %, at a readout time of '
+                   f'{1e3 * readout:.1f} ms{source}: a global-shutter method {method}',
+                   {'readout_s': readout, 'median_px': median, 'p95_px': high},
+                   Case(True, state))

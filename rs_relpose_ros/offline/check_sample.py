@@ -1,0 +1,249 @@
+"""Samples of a recording for `check`: through the front end, and through a calibration.
+
+The front end runs with the parameters as configured; a calibration completes parameters that are
+missing, and replaces those that are too far off for the front end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+import math
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics
+from rs_relpose_ros.calibrate.procedure import calibrate, read_recording
+from rs_relpose_ros.calibrate.result import CalibrationResult
+from rs_relpose_ros.config.settings import (
+    Parameters,
+    SensorConfig,
+    TRACKED_IN_IMAGES,
+    TrackingConfig,
+)
+from rs_relpose_ros.errors import InputError, RsRelposeError
+from rs_relpose_ros.geometry.timing import NANOSECONDS, Sensor, to_nanoseconds
+from rs_relpose_ros.messages.incoming import Intake, ReasonCounts, Role, stamp_ns
+from rs_relpose_ros.offline.replay import MessageRefused, outcomes
+from rs_relpose_ros.pipeline import findings
+from rs_relpose_ros.pipeline.findings import Assessment, BY_NAME, Finding, FindingState
+from rs_relpose_ros.pipeline.pair import Frame, PairResult
+from rs_relpose_ros.pipeline.pipeline import FrontEnd
+from rs_relpose_ros.pipeline.warm_up import warm_up
+
+# Parts of consecutive images, evenly over the recording: three times 10 s at 30 Hz; and images of
+# a calibration.
+_PARTS, _PART_IMAGES, _CALIBRATED_IMAGES = 3, 300, 600
+# A part is evaluated by its last pair, and by those so long after its first one: fewer pairs are
+# easily misled.
+_SETTLED_NS = to_nanoseconds(10.0)
+# Pairs so far apart are of two parts.
+_APART_NS = to_nanoseconds(3.0)
+# Share of the images below which hardly any was used.
+_FEW_USED = 0.1
+# Share of the pairs that have a pose if the camera moves and is correctly configured.
+_MOST_POSED = 0.7
+# Quantities whose large deviations are detected, but not measured.
+_FAR_OFF = frozenset(('axes', 'time_offset', 'image_geometry'))
+# Largest number of images that wait for the gyro: if the clocks differ it never comes.
+_MOST_WAITING = 64
+# Sigmas beyond which a calibration contradicts the configuration, and least differences [rad, s].
+_CERTAIN = 4.0
+_LEAST_ANGLE, _LEAST_TIME = math.radians(5.0), 8e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Completion:
+    """Parameters with the estimates of those that are not configured."""
+
+    parameters: Parameters
+    found: CalibrationResult | None   # None if none was needed, or possible
+    problem: str   # reason why a parameter is still missing
+
+
+def _calibrated(bag: Bag, topics: SensorTopics, parameters: Parameters) -> CalibrationResult:
+    """Calibration without initial values, of images in the middle of the recording."""
+    tracking, images = parameters.tracking, topics.image.count
+    first = max(images - _CALIBRATED_IMAGES, 0) // 2
+    recording = read_recording(
+        bag, topics, TrackingConfig(detector=tracking.detector,
+                                    feature_rows=tracking.feature_rows),
+        images=range(first, first + min(images, _CALIBRATED_IMAGES)))
+    return calibrate(recording.tracks, recording.gyro, recording.camera,
+                     focal_known=recording.focal_known, config=TRACKED_IN_IMAGES)
+
+
+def completed(bag: Bag, topics: SensorTopics, parameters: Parameters) -> Completion:
+    """`parameters` with estimates of readout time and axes, if these are missing."""
+    missing = parameters.sensor.missing()
+    if not missing:
+        return Completion(parameters, None, '')
+    try:
+        found = _calibrated(bag, topics, parameters)
+    except InputError as error:
+        return Completion(parameters, None, str(error))
+    readout, problem = found.readout_time, ''
+    values: dict[str, Any] = {}
+    for name, estimate, settings in (
+            ('quat_cam_imu_xyzw', found.rotation, {'quat_cam_imu_xyzw': found.quat_cam_imu_xyzw}),
+            ('readout_time', readout, {
+                'readout_time': abs(readout.value),
+                'readout_direction': 'up' if readout.value < 0.0 else 'down'})):
+        if name in missing and estimate.observable:
+            values.update(settings)
+        elif name in missing:
+            problem = problem or estimate.remark
+    return Completion(parameters.updated(values), found, problem)
+
+
+def recalibrated(bag: Bag, topics: SensorTopics, completion: Completion) -> Completion:
+    """The same with a calibration; unchanged if the recording permits none."""
+    try:
+        return replace(completion, found=_calibrated(bag, topics, completion.parameters))
+    except InputError:
+        return completion
+
+
+def contradicted(found: CalibrationResult, sensor: SensorConfig,
+                 model: Sensor) -> tuple[Finding, ...]:
+    """Parameters that are far from the calibration `found`; `model` as configured.
+
+    None if it has no time offset: images and gyro are independent.
+    """
+    if not found.time_offset.observable:
+        return ()
+    readout, camera = found.readout_time, model.camera
+    angle = float(Rotation.from_matrix(found.R_cam_imu @ sensor.R_cam_imu.T).magnitude())
+    # Of the stamped row; the calibration has that of row 0, at the median interval.
+    share = camera.reference_row_index / camera.height
+    off = found.time_offset.value + share * readout.value - model.clock.reference_ns(
+        0, to_nanoseconds(found.frame_interval)) / NANOSECONDS
+    signed = camera.line_delay * camera.height
+    axes_sigma = float(found.rotation_sigma.max())
+    offset_sigma = math.hypot(found.time_offset.sigma, share * readout.sigma)
+    by_readout = _contradiction('readout_time', abs(signed), abs(readout.value), readout.sigma)
+    if np.sign(readout.value) * np.sign(signed) < 0.0:
+        by_readout = replace(
+            by_readout, quantity='readout_direction', estimated=-abs(readout.value),
+            message=f'{by_readout.message}, in the opposite direction',
+            fix=f'set readout_direction: {"up" if readout.value < 0.0 else "down"}')
+    return tuple(finding for apart, sigma, least, finding in (
+        (angle, axes_sigma, _LEAST_ANGLE, _contradiction(
+            'axes', 0.0, math.degrees(angle), math.degrees(axes_sigma),
+            findings.rounded(found.quat_cam_imu_xyzw))),
+        (off, offset_sigma, _LEAST_TIME, _contradiction(
+            'time_offset', sensor.time_offset, sensor.time_offset + off, offset_sigma)),
+        (readout.value - signed, readout.sigma, _LEAST_TIME, by_readout),
+    ) if abs(apart) > max(_CERTAIN * sigma, least))
+
+
+def _contradiction(name: str, configured: float, estimated: float, sigma: float,
+                   setting: object = None) -> Finding:
+    quantity = BY_NAME[name]
+    return Finding(name, FindingState.WRONG,
+                   'by a calibration: ' + quantity.compared(estimated, sigma, configured),
+                   quantity.fix.format(estimated if setting is None else setting),
+                   configured, estimated, sigma, quantity.unit, True)
+
+
+def _part_of(images: int, part: int) -> range:
+    """Indices of the images of a part of a recording of so many `images`, 0 to 2."""
+    if images <= _PARTS * _PART_IMAGES:
+        return range(part * images // _PARTS, (part + 1) * images // _PARTS)
+    first = part * (images - _PART_IMAGES) // (_PARTS - 1)
+    return range(first, first + _PART_IMAGES)
+
+
+class SampleRun:
+    """Parts of a recording of so many `images` through the front end.
+
+    Parameters are used as configured: nothing is tracked, nothing is suppressed.
+    """
+
+    def __init__(self, images: int, parameters: Parameters) -> None:
+        warm_up(parameters.estimator)
+        configured = parameters.updated({
+            'withhold_when_wrong': False, 'track_time_offset': False,
+            'track_readout_time': False})
+        self._front_end = FrontEnd(configured, offline=True)
+        self._intake = Intake(self._front_end.sequencer, configured)
+        self._parts = tuple(_part_of(images, part) for part in range(_PARTS))
+        self._before = findings.NOT_EVALUATED   # of the settled parts
+        self._last: PairResult | None = None
+        self._part_since_ns = 0
+        self.frames = self._handed = self._done = 0
+        self.reasons = ReasonCounts()   # of frames that were not used
+        self.matches: list[int] = []   # of each pair
+        self.poses = 0
+        self.poseless = ReasonCounts()   # reasons of pairs without a pose
+
+    def run(self, source: Iterable[tuple[Role, BagMessage]]) -> None:
+        """Process the messages of the bag; those that cannot be used are counted."""
+        for outcome in outcomes(self._front_end, self._intake, self._chosen(source)):
+            if isinstance(outcome, MessageRefused):
+                self.reasons.add(str(outcome.error))
+                continue
+            self._done += 1
+            if not isinstance(outcome, Frame):
+                self.reasons.add(outcome.reason)
+                continue
+            self.frames += 1
+            if outcome.result is not None:
+                self._add_pair(outcome.result)
+
+    @property
+    def health(self) -> Assessment:
+        """Of each quantity the worst finding of all parts."""
+        if self._last is None:
+            return self._before
+        return findings.worst_of(self._before, self._last.health)
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether hardly any image could be used."""
+        return self.frames < _FEW_USED * self._handed
+
+    @property
+    def few_poses(self) -> bool:
+        """Whether many pairs have no pose."""
+        return self.poses < _MOST_POSED * len(self.matches)
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether a deviation may be too large to be estimated from pairs."""
+        if not self.matches:
+            return False
+        off = {fault.quantity for fault in self.health.faults}
+        return bool(off & _FAR_OFF) or self.few_poses
+
+    def _chosen(self, source: Iterable[tuple[Role, BagMessage]],
+                ) -> Iterator[tuple[Role, BagMessage]]:
+        """The messages without the images that belong to no part."""
+        index = -1
+        for role, message in source:
+            if role is Role.IMAGE:
+                index += 1
+                if not any(index in part for part in self._parts) or (
+                        self._handed - self._done >= _MOST_WAITING):
+                    try:
+                        self._front_end.sequencer.pass_over(stamp_ns(message.message.header))
+                    except RsRelposeError as error:
+                        self.reasons.add(str(error))
+                    continue
+                self._handed += 1
+            yield role, message
+
+    def _add_pair(self, pair: PairResult) -> None:
+        self.matches.append(len(pair.matches))
+        if pair.pose:
+            self.poses += 1
+        else:
+            self.poseless.add(pair.pose.reason)
+        last = self._last
+        if last is None or not 0 <= pair.stamp_ns - last.stamp_ns < _APART_NS:
+            self._before, self._part_since_ns = self.health, pair.stamp_ns
+        self._last = pair
+        if pair.stamp_ns - self._part_since_ns >= _SETTLED_NS:
+            self._before = self.health

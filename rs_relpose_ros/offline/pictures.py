@@ -1,0 +1,261 @@
+"""Pictures of a replay: matches of a pair, errors and residuals over time, orientation.
+
+They are drawn on canvases of their own, without matplotlib's global state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import cycle
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullFormatter
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_ros.estimator.result import Status
+from rs_relpose_ros.geometry.timing import seconds_between
+from rs_relpose_ros.offline.tables import PairRecord, rotation_sigmas, translation_sigmas
+from rs_relpose_ros.offline.truth import PairErrors, rotation_angle, TrueTrajectory
+from rs_relpose_ros.output_files import BLUE, GREEN, ORANGE, RED, save_picture
+from rs_relpose_ros.pipeline.pair import PairResult
+
+Array = NDArray[np.float64]
+
+_COLORMAP = 'plasma'
+_DPI = 110
+
+
+def draw_replay(paths: Sequence[Path], records: Sequence[PairRecord], shown: PairResult,
+                truth: TrueTrajectory | None) -> list[Path]:
+    """Draw matches of one pair, errors (with ground truth), residuals and rotation; the files."""
+    matches, errors, residuals, rotation = paths
+    draw_matches(shown, matches)
+    draw_residuals(records, residuals)
+    draw_rotation(records, rotation, truth)
+    if truth is None:
+        return [matches, residuals, rotation]
+    draw_errors(records, errors)
+    return [matches, errors, residuals, rotation]
+
+
+def draw_matches(result: PairResult, path: Path) -> None:
+    """Both images of a pair with its matches, coloured by row time; needs the pair's images."""
+    assert result.image1 is not None and result.image2 is not None
+    inliers = _inliers(result)
+    height, width = result.image1.shape
+    tau1, tau2 = 1e3 * result.row_times1, 1e3 * result.row_times2
+    row_times = np.concatenate([tau1, tau2, [0.0]])
+    norm = Normalize(row_times.min(), max(row_times.max(), row_times.min() + 1e-3))
+    picture = Figure(figsize=(13.0, 0.75 + 6.1 * height / width), dpi=_DPI, layout='constrained')
+    left, right = picture.subplots(1, 2)
+    _image(left, result.image1, 'reference keyframe: inliers, coloured by their row time')
+    _image(right, result.image2,
+           'current image: the same, with their displacement since the keyframe')
+    points1, points2 = result.matches.points1, result.matches.points2
+    paths = LineCollection(list(np.stack([points1[inliers], points2[inliers]], axis=1)),
+                           cmap=_COLORMAP, norm=norm, linewidths=1.3)
+    paths.set_array(tau2[inliers])
+    right.add_collection(paths)
+    for axes, points, tau in ((left, points1, tau1), (right, points2, tau2)):
+        axes.scatter(*points[inliers].T, c=tau[inliers], cmap=_COLORMAP, norm=norm, s=16,
+                     edgecolors='black', linewidths=0.4)
+        axes.scatter(*points[~inliers].T, marker='x', color='cyan', s=26, linewidths=1.4,
+                     label=f'outliers ({np.count_nonzero(~inliers)})')
+    if not inliers.all():
+        right.legend(loc='lower right', framealpha=0.9, fontsize=9)
+    picture.colorbar(ScalarMappable(norm, _COLORMAP), ax=[left, right], shrink=0.8, pad=0.01,
+                     label='row time, from the stamped row [ms]')
+    picture.suptitle(_pair_title(result, int(inliers.sum())), fontsize=12)
+    save_picture(picture, path)
+
+
+def draw_errors(records: Sequence[PairRecord], path: Path,
+                baselines: Mapping[str, Sequence[PairErrors | None]] | None = None) -> None:
+    """Errors against the ground truth over time, with the estimated sigmas.
+
+    `baselines`: errors of other methods, by name, of the pairs with a pose.
+    """
+    picture = _over_time(2, 'errors of the relative poses against the ground truth')
+    start_ns = records[0].reference_ns1
+    known = [(r, r.errors) for r in records if r.pose and r.errors is not None]
+    begins, ends = _spans([r for r, _ in known], start_ns)
+    # Root of the mean square length of a 3-vector and a 2-vector with these sigmas.
+    series = (('rotation_error', rotation_sigmas, 'rotation error [deg]'),
+              ('translation_error', translation_sigmas, 'translation direction\nerror [deg]'))
+    for axis, (name, sigmas_of, label) in zip(picture.axes, series, strict=True):
+        if known:
+            values = [getattr(e, name) for _, e in known]
+            sigmas = [np.degrees(np.linalg.norm(sigmas_of(r.pose.covariance))) for r, _ in known]
+            axis.hlines(sigmas, begins, ends, color=ORANGE, linewidth=2.2,
+                        label='1 sigma, as estimated')
+            axis.plot(0.5 * (begins + ends), values, 'o', color=BLUE, markersize=5, label='error')
+            _median_line(axis, values, f'median error {np.median(values):.2g} deg')
+            for (method, errors), color, marker in zip(
+                    (baselines or {}).items(), cycle((RED, GREEN)), cycle('+x12'), strict=False):
+                others = [np.nan if e is None else getattr(e, name) for e in errors]
+                axis.plot(0.5 * (begins + ends), others, marker, color=color, markersize=6,
+                          label=f'{method}:\nmedian {np.nanmedian(others):.2g} deg')
+            axis.set_yscale('log')
+            axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
+            axis.yaxis.set_minor_formatter(NullFormatter())
+        axis.set_ylabel(label)
+        _shade_no_pose(axis, records, start_ns)
+    _save_over_time(picture, path)
+
+
+def draw_residuals(records: Sequence[PairRecord], path: Path) -> None:
+    """Metrics without ground truth: residuals, inliers, rotation against the gyro."""
+    picture = _over_time(3, 'residuals of the relative poses')
+    start_ns = records[0].reference_ns1
+    known = [r.metrics for r in records if r.pose]
+    begins, ends = _spans([r for r in records if r.pose], start_ns)
+    series = (
+        ([f['residual_rms_px'] for f in known], 'residual of inliers,\nrms [px]'),
+        ([100.0 * f['inlier_ratio'] for f in known], 'inliers [%]'),
+        ([f['rotation_difference_to_gyro_deg'] for f in known],
+         'rotation: images\nagainst gyro [deg]'))
+    for axis, (values, label) in zip(picture.axes, series, strict=True):
+        finite = [value for value in values if np.isfinite(value)]
+        if finite:
+            axis.plot(0.5 * (begins + ends), values, 'o', color=BLUE, markersize=4)
+            _median_line(axis, finite, f'median {np.median(finite):.3g}')
+        axis.set_ylabel(label)
+        axis.set_ylim(bottom=0.0, top=None if '%' not in label else 105.0)
+        _shade_no_pose(axis, records, start_ns)
+    _save_over_time(picture, path)
+
+
+def draw_rotation(records: Sequence[PairRecord], path: Path,
+                  truth: TrueTrajectory | None = None) -> None:
+    """Rotation accumulated over the pairs, against the ground truth or else the gyro."""
+    unknown = np.full((3, 3), np.nan)
+    gyro = [unknown if r.gyro_rotation is None else r.gyro_rotation for r in records]
+    # A pair without a rotation is bridged by the gyro, and its span is shaded.
+    chains = {'estimated': _accumulated([g if np.isnan(r.pose.R).any() else r.pose.R
+                                         for r, g in zip(records, gyro, strict=True)]),
+              'gyro alone': _accumulated(gyro)}
+    against = 'gyro alone'
+    if truth is not None:
+        poses = [truth.relative_pose(r.reference_ns1, r.reference_ns2) for r in records]
+        against = 'ground truth'
+        chains[against] = _accumulated([unknown if pose is None else pose[0] for pose in poses])
+    start_ns = records[0].reference_ns1
+    times = [0.0, *_spans(records, start_ns)[1]]
+    picture = _over_time(2, 'orientation against the first keyframe: the rotations of the pairs, '
+                         'chained')
+    above, below = picture.axes
+    # Rotation vectors (N, 3) [deg].
+    estimated, reference = (np.degrees([
+        Rotation.from_matrix(R).as_rotvec() if np.isfinite(R).all() else np.full(3, np.nan)
+        for R in chains[name]]) for name in ('estimated', against))
+    for column, color in enumerate((BLUE, RED, GREEN)):
+        above.plot(times, estimated[:, column], 'o-', color=color, markersize=3, linewidth=1.6,
+                   label=f'{"xyz"[column]} ({("right", "down", "forward")[column]})')
+        above.plot(times, reference[:, column], '--', color='black', linewidth=1.0,
+                   label=against if column == 2 else None)
+    above.set_ylabel('rotation vector, axes of\nthe camera [deg]')
+    for (name, chain), color in zip(chains.items(), (BLUE, ORANGE), strict=False):
+        if name != against:
+            angles = [rotation_angle(R.T @ R_against)
+                      for R, R_against in zip(chain, chains[against], strict=True)]
+            below.plot(times, angles, 'o-', color=color, markersize=3, linewidth=1.4,
+                       label=f'{name} against {against}')
+    below.set_ylabel('difference, accumulated\n[deg]')
+    below.set_title('drift of the chain: errors of pairs accumulate, as in any odometry',
+                    fontsize=9, loc='left')
+    below.set_ylim(bottom=0.0)
+    _shade_no_pose(below, [r for r in records if np.isnan(r.pose.R).any()], start_ns,
+                   'no rotation: gyro instead')
+    _save_over_time(picture, path)
+
+
+def _inliers(result: PairResult) -> NDArray[np.bool_]:
+    """Mask over the matches; empty for a pair that failed early."""
+    inliers = result.pose.inliers
+    if len(inliers) == len(result.matches.points1):
+        return inliers
+    return np.zeros(len(result.matches.points1), dtype=bool)
+
+
+def _pair_title(result: PairResult, inliers: int) -> str:
+    text = (f'{inliers} inliers of {len(result.matches.points1)} matches over '
+            f'{1e3 * result.interval:.0f} ms')
+    pose = result.pose
+    if np.isfinite(pose.R).all():
+        text += f', rotation {np.degrees(Rotation.from_matrix(pose.R).magnitude()):.2f} deg'
+    if pose:
+        x, y, z = pose.t
+        text += f', direction of translation ({x:+.2f}, {y:+.2f}, {z:+.2f})'
+        return text + f', residual {pose.residual_rms:.2f} px'
+    return f'{text}: {pose.status.value}'
+
+
+def _image(axes: Axes, image: NDArray[np.uint8], title: str) -> None:
+    height, width = image.shape
+    # Contrast stretched to the content, the brightest third unused, so that marks are visible.
+    low, high = np.percentile(image, [1.0, 99.0])
+    axes.imshow(image, cmap='gray', vmin=low, vmax=low + 1.4 * max(high - low, 1.0),
+                interpolation='antialiased')
+    axes.set_title(title, fontsize=10)
+    axes.set_xlim(-0.5, width - 0.5)
+    axes.set_ylim(height - 0.5, -0.5)
+    axes.set_xlabel('column [px]', fontsize=9)
+    axes.set_ylabel('row [px]', fontsize=9)
+    axes.tick_params(labelsize=8)
+
+
+def _over_time(count: int, title: str) -> Figure:
+    picture = Figure(figsize=(10.5, 0.9 + 2.1 * count), dpi=_DPI, layout='constrained')
+    for axis in picture.subplots(count, 1, sharex=True):
+        axis.grid(True, which='major', color='0.88')
+        axis.set_axisbelow(True)
+    picture.suptitle(title, fontsize=12)
+    return picture
+
+
+def _save_over_time(picture: Figure, path: Path) -> None:
+    for axis in picture.axes:
+        axis.legend(loc='upper left', bbox_to_anchor=(1.0, 1.0), fontsize=9)
+    picture.axes[-1].set_xlabel('time since the first keyframe [s]')
+    save_picture(picture, path)
+
+
+def _median_line(axis: Axes, values: Sequence[float], label: str) -> None:
+    axis.axhline(float(np.median(values)), color=BLUE, linestyle='--', linewidth=1.0, label=label)
+
+
+def _shade_no_pose(axis: Axes, records: Sequence[PairRecord], start_ns: int,
+                   label: str = '') -> None:
+    """Spans of the pairs without a pose, one entry of the legend per status."""
+    labelled = set()
+    hatches = {Status.PURE_ROTATION: '', Status.LOW_PARALLAX: '..', Status.WITHHELD: 'xx'}
+    for record in records:
+        if record.pose:
+            continue
+        text = label or f'no pose: {record.status.value}'
+        (begin,), (end,) = _spans([record], start_ns)
+        axis.axvspan(begin, end, facecolor='0.6', alpha=0.35, edgecolor='0.3', linewidth=0.0,
+                     hatch=hatches.get(record.status, '//'),
+                     label=None if text in labelled else text)
+        labelled.add(text)
+
+
+def _spans(records: Sequence[PairRecord], start_ns: int) -> tuple[Array, Array]:
+    """Times (N,) of the reference rows of both frames of the pairs [s]."""
+    return (np.array([seconds_between(start_ns, r.reference_ns1) for r in records]),
+            np.array([seconds_between(start_ns, r.reference_ns2) for r in records]))
+
+
+def _accumulated(rotations: Sequence[Array]) -> list[Array]:
+    """Products (3, 3) of the rotations, from the identity; NaN after an unknown one."""
+    products = [np.eye(3)]
+    for rotation in rotations:
+        products.append(products[-1] @ rotation)
+    return products

@@ -1,0 +1,321 @@
+"""A bag through the pipeline of the live node: the same sequencer, conversion and estimator.
+
+`outcomes` feeds any source to a frame loop; `Replay` makes pairs of a bag, `replay_into` writes
+them into a folder.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+import logging
+from pathlib import Path
+import time
+from typing import Any, TypeVar
+
+import numpy as np
+
+from rs_relpose_ros.bags.convert import read_rows
+from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics
+from rs_relpose_ros.bags.writer import BagWriter, refuse_existing
+from rs_relpose_ros.config.settings import Parameters
+from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
+from rs_relpose_ros.estimator.result import Status
+from rs_relpose_ros.geometry.camera import Intrinsics
+from rs_relpose_ros.messages.incoming import Intake, PARTS, ReasonCounts, Role, sensor_messages
+from rs_relpose_ros.messages.outgoing import pair_messages, PAIR_TOPICS
+from rs_relpose_ros.offline import tables
+from rs_relpose_ros.offline.tables import ERRORS, median, PairRecord, POSES
+from rs_relpose_ros.offline.truth import TrueTrajectory
+from rs_relpose_ros.output_files import prepare_folder, SUMMARY_FILE
+from rs_relpose_ros.pipeline.findings import Assessment, NOT_EVALUATED, worst_of
+from rs_relpose_ros.pipeline.pair import Frame, PAIR_METRICS, PairResult
+from rs_relpose_ros.pipeline.pipeline import FrameFailed, FrameLoop, FrontEnd, Outcome
+from rs_relpose_ros.pipeline.sequencer import FrameRefused
+from rs_relpose_ros.pipeline.warm_up import warm_up
+
+BAG_FOLDER = 'relpose_bag'
+PICTURES = ('matches.png', 'errors.png', 'residuals.png', 'rotation.png')
+
+_logger = logging.getLogger(__name__)
+
+Result = TypeVar('Result')
+
+
+@dataclass(frozen=True, slots=True)
+class MessageRefused:
+    """An unusable message."""
+
+    role: Role
+    topic: str
+    error: RsRelposeError
+    stamp_ns: None = None   # it belongs to no frame
+
+    @property
+    def reason(self) -> str:
+        """Topic and message of the error."""
+        return f'{self.topic}: {self.error}'
+
+    def raise_without_intrinsics(self) -> None:
+        """Raise the error of a CameraInfo: without intrinsics no frame can be used."""
+        if self.role is Role.CAMERA_INFO:
+            raise type(self.error)(self.reason) from self.error
+
+
+def outcomes(loop: FrameLoop[Result], intake: Intake, source: Iterable[tuple[Role, BagMessage]],
+             ) -> Iterator[Outcome[Result] | MessageRefused]:
+    """Feed a source to the end, and yield what becomes of each frame, as soon as it is known."""
+    for role, message in source:
+        error = intake.receive(role, message.message)
+        if error is not None:
+            yield MessageRefused(role, message.topic, error)
+        while (outcome := loop.step()) is not None:
+            yield outcome
+    intake.finish()
+    while (outcome := loop.step()) is not None:
+        yield outcome
+
+
+def need_sensor_parameters(parameters: Parameters, fix: str = '') -> None:
+    """Raise MissingInputError for required parameters that no message contains."""
+    if missing := parameters.sensor.missing():
+        fix = fix or f'use --params FILE or --set {missing[0]}=...: see config/relpose.yaml'
+        raise MissingInputError(f'parameter {" and ".join(missing)} must be given; {fix}')
+
+
+def unused_reason(outcome: FrameRefused | FrameFailed | MessageRefused) -> str:
+    """Reason why a frame or message was not used, with its kind."""
+    kind = f'{outcome.refusal.value}: ' if isinstance(outcome, FrameRefused) else ''
+    return kind + outcome.reason
+
+
+@dataclass(slots=True)
+class ReplayCounts:
+    """Counts that the sequencer does not have, and wall times [s]."""
+
+    invalid_messages: int = 0
+    failed_frames: int = 0
+    pairs: int = 0
+    seconds: float = 0.0   # of the whole, without compilation
+    processing_seconds: float = 0.0   # of it, in tracking and estimation
+    first_ns: int = 0   # bag time of the first message
+    last_ns: int = 0   # and of the last one so far
+
+
+class Replay:
+    """One run over an open bag; iterate over `pairs`, then read `counts` and `reasons`.
+
+    With `stamps` only these frames are handed over, as those that a live node processed.
+    `keep_images`: whether pairs have their images.
+    """
+
+    def __init__(self, bag: Bag, topics: SensorTopics, parameters: Parameters, *,
+                 stamps: frozenset[int] | None = None, keep_images: bool = False) -> None:
+        need_sensor_parameters(parameters)
+        self._bag, self._topics, self._stamps = bag, topics, stamps
+        self._front_end = FrontEnd(parameters, offline=True, keep_images=keep_images)
+        self.sequencer = self._front_end.sequencer
+        self.intake = Intake(self.sequencer, parameters, stamps)
+        self.counts = ReplayCounts()
+        # Unused frames and messages, by the first message of each reason.
+        self.reasons = ReasonCounts()
+
+    def pairs(self) -> Iterator[PairResult]:
+        """Run over the bag, and yield every pair; `counts.last_ns` is then its bag time.
+
+        Raises if the bag is damaged, its camera is not calibrated, or no frame could be used.
+        """
+        warm_up(self._front_end.parameters.estimator)
+        started = time.perf_counter()
+        for outcome in outcomes(self._front_end, self.intake, self._messages()):
+            if isinstance(outcome, Frame):
+                self.counts.processing_seconds += outcome.seconds
+                if outcome.result is not None:
+                    self.counts.pairs += 1
+                    yield outcome.result
+                continue
+            if isinstance(outcome, MessageRefused):
+                if not self.sequencer.counts().frames_taken:
+                    outcome.raise_without_intrinsics()
+                self.counts.invalid_messages += 1
+            self.counts.failed_frames += isinstance(outcome, FrameFailed)
+            reason = unused_reason(outcome)
+            if self.reasons.add(reason):
+                _logger.info('not used: %s', reason)
+        self.counts.seconds = time.perf_counter() - started
+        self._check_outcome()
+
+    def _messages(self) -> Iterator[tuple[Role, BagMessage]]:
+        for role, message in sensor_messages(self._bag, self._topics):
+            self.counts.first_ns = self.counts.first_ns or message.bag_time_ns
+            self.counts.last_ns = message.bag_time_ns
+            yield role, message
+
+    def _check_outcome(self) -> None:
+        if self._stamps is not None:
+            absent = len(self._stamps - self.intake.stamps_found)
+            if absent == len(self._stamps):
+                raise InputError(f'none of the {absent} chosen stamps is the stamp of an image on '
+                                 f'{self._topics.image.name}')
+            if absent:
+                _logger.warning('%d of the %d chosen stamps are not in the bag', absent,
+                                len(self._stamps))
+        reason = next(iter(self.reasons.most_common()), None)
+        if reason is not None and (not self.sequencer.counts().frames_taken
+                                   or (self.counts.failed_frames and not self.counts.pairs)):
+            raise InputError(f'no frame of {self._bag.path} could be used: {reason}')
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReplayOutcome:
+    """Results of a replay, or of a list of pairs.
+
+    `metrics`: content of summary.json without provenance; `health`: the worst finding of each
+    configured parameter; `files`: written so far (tables, bag and pictures); `intrinsics`:
+    active at the end.
+    """
+
+    records: list[PairRecord]
+    metrics: dict[str, Any]
+    health: Assessment
+    files: list[Path]
+    intrinsics: Intrinsics | None
+
+
+def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parameters, *,
+                stamps: frozenset[int] | None = None, pictures: bool = True,
+                with_bag: bool = False,
+                on_pair: Callable[[PairResult], object] = lambda pair: None) -> ReplayOutcome:
+    """Run `bag` through the pipeline and write tables, pictures and a bag into `folder`.
+
+    Files of an earlier run in `folder` are replaced; it is created if necessary. `stamps`
+    are those of `Replay`; `with_bag`: whether to write the node's topics as a bag.
+    `on_pair` is called with each pair, which has its images if `pictures` are drawn.
+    """
+    run = Replay(bag, topics, parameters, stamps=stamps, keep_images=pictures)
+    truth = read_truth(bag, topics)
+    out_bag = folder / BAG_FOLDER
+    if with_bag:
+        refuse_existing(out_bag)
+    prepare_folder(folder, (POSES.file, ERRORS.file, SUMMARY_FILE, *PICTURES))
+    records: list[PairRecord] = []
+    shown: PairResult | None = None
+    last, health = None, NOT_EVALUATED
+    written = (POSES,) if truth is None else (POSES, ERRORS)
+    with ExitStack() as stack:
+        write_record = stack.enter_context(tables.table_writer(folder, written))
+        writer = stack.enter_context(BagWriter(out_bag)) if with_bag else None
+        for pair in run.pairs():
+            records.append(PairRecord.of(pair, truth))
+            last, health = pair, worst_of(health, pair.health)
+            write_record(records[-1])
+            if writer is not None:
+                messages = pair_messages(pair, writer.type, parameters.pair.reference_frame)
+                for topic, message in messages.items():
+                    writer.write(f'/relpose_node/{topic}', PAIR_TOPICS[topic], message,
+                                 run.counts.last_ns)
+            on_pair(pair)
+            if pictures and (shown is None or _picture_rank(pair) > _picture_rank(shown)):
+                shown = pair
+    files = [folder / table.file for table in written] + [out_bag] * with_bag
+    if shown is not None:
+        # Imports Matplotlib, which takes a second.
+        from rs_relpose_ros.offline.pictures import draw_replay
+        files += draw_replay([folder / name for name in PICTURES], records, shown, truth)
+    return ReplayOutcome(records, _summary(records, run, last, health), health, files,
+                         run.intake.intrinsics)
+
+
+def _picture_rank(pair: PairResult) -> tuple[bool, float]:
+    """Larger for the better picture: with a pose, many inliers and much parallax."""
+    return bool(pair.pose), float(pair.pose.inliers.sum() * pair.parallax)
+
+
+def _summary(records: list[PairRecord], run: Replay, last: PairResult | None,
+             health: Assessment) -> dict[str, Any]:
+    """Content of summary.json; medians are over the pairs with a pose, null without any."""
+    answered = [record for record in records if record.pose]
+    counts, sequencer = run.counts, run.sequencer.counts()
+    seconds, taken = counts.processing_seconds, sequencer.frames_taken
+    return {
+        'pairs': pair_counts(records),
+        'frames': {
+            'in_bag': run.intake.images,
+            'not_among_stamps': run.intake.images_skipped,
+            'processed': taken,
+            'refused': {refusal.value: n for refusal, n in sequencer.refused.items()},
+            'failed': counts.failed_frames,
+        },
+        'imu': {
+            'samples': sequencer.imu_samples,
+            'gaps': sequencer.imu_gaps,
+            'repeated': sequencer.imu_repeated,
+            'late': sequencer.imu_late,
+            'clock_jumps': sequencer.clock_jumps,
+        },
+        'tracked': _tracked(last),
+        'health': health.as_json(),
+        'invalid_messages': counts.invalid_messages,
+        'not_used': run.reasons.most_common(),
+        'medians': {metric.name: median([record.metrics[metric.name] for record in answered])
+                    for metric in PAIR_METRICS},
+        'baselines': tables.baselines(answered),
+        'errors_against_truth': tables.errors_against_truth(answered),
+        'timing': {
+            'bag_s': (counts.last_ns - counts.first_ns) * 1e-9,
+            'wall_s': counts.seconds,
+            'frame_rate_hz': taken / seconds if seconds > 0.0 else None,
+            'processing_per_frame_ms': 1e3 * seconds / taken if taken else None,
+            'estimate_median_ms': median([1e3 * record.pose.duration for record in records]),
+        },
+    }
+
+
+def pair_counts(records: list[PairRecord]) -> dict[str, Any]:
+    """Numbers of pairs for summary.json."""
+    by_status = Counter(record.status for record in records)
+    return {'total': len(records), 'answered': sum(bool(record.pose) for record in records),
+            'by_status': {status.value: by_status[status] for status in Status}}
+
+
+def _tracked(last: PairResult | None) -> dict[str, Any] | None:
+    if last is None or last.tracked is None or not last.tracked.pairs:
+        return None
+    tracked, applied = last.tracked, last.applied
+    return {
+        'gyro_bias_rad_s': tracked.gyro_bias.tolist(),
+        'gyro_bias_sigma_rad_s': tracked.gyro_bias_sigma.tolist(),
+        'time_offset_s': tracked.time_offset,
+        'time_offset_sigma_s': tracked.time_offset_sigma,
+        'applied_s': applied.time_offset,
+        'readout_time_s': tracked.readout_time,
+        'readout_time_sigma_s': tracked.readout_time_sigma,
+        'applied_readout_time_s': applied.readout_time,
+    }
+
+
+def read_truth(bag: Bag, topics: SensorTopics) -> TrueTrajectory | None:
+    """Ground truth of the camera; None if the bag has none."""
+    if topics.truth is None:
+        return None
+    poses = [PARTS[role].read(message.message)
+             for role, message in sensor_messages(bag, topics, (Role.TRUTH,))]
+    try:
+        return TrueTrajectory([pose.stamp_ns for pose in poses],
+                              np.array([pose.position for pose in poses]),
+                              np.array([pose.quat_xyzw for pose in poses]))
+    except InputError as error:
+        raise InputError(f'{topics.truth.name}: {error}') from error
+
+
+def read_stamps(path: Path | str) -> frozenset[int]:
+    """Stamps of frames, one integer [ns] per line, as the node's `stamps_file` contains them.
+
+    A table of poses is refused: the frames between keyframes affect the tracks as well.
+    """
+    stamps = frozenset(row.nanoseconds(0) for row in read_rows(Path(path), range(1)))
+    if not stamps:
+        raise InputError(f'{path} has no stamps')
+    return stamps

@@ -1,0 +1,207 @@
+"""Records of pairs, their rows in the tables, and ``summary.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, ExitStack
+import csv
+from dataclasses import dataclass, field, fields
+import json
+import math
+from pathlib import Path
+import platform
+from typing import Any, NamedTuple
+
+import cv2
+import numba
+import numpy as np
+from numpy.typing import NDArray
+import scipy
+
+from rs_relpose_ros.bags.reader import SensorTopics
+from rs_relpose_ros.config.settings import Parameters
+from rs_relpose_ros.estimator.result import RelativePose, Status
+from rs_relpose_ros.messages.incoming import ReasonCounts
+from rs_relpose_ros.messages.outgoing import number, published_covariance, quat_xyzw
+from rs_relpose_ros.offline.truth import median_and_p90, PairErrors, TrueTrajectory
+from rs_relpose_ros.pipeline.pair import PAIR_METRICS, PairResult
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairRecord:
+    """A pair without its matches and images."""
+
+    reference_stamp_ns: int
+    stamp_ns: int
+    pose: RelativePose
+    # The rest is unknown for a pair that was not estimated.
+    reference_ns1: int = 0   # as in `PairResult`
+    reference_ns2: int = 0
+    gyro_rotation: Array | None = None
+    metrics: Mapping[str, float] = field(default_factory=dict)   # `PAIR_METRICS` by name
+    errors: PairErrors | None = None   # also None without ground truth
+
+    @classmethod
+    def of(cls, result: PairResult, truth: TrueTrajectory | None = None) -> PairRecord:
+        """Record of a pair, with its errors if there is ground truth."""
+        pose, ns1, ns2 = result.pose, result.reference_ns1, result.reference_ns2
+        return cls(result.reference_stamp_ns, result.stamp_ns, pose, ns1, ns2,
+                   result.gyro_rotation,
+                   {metric.name: metric.of(result) for metric in PAIR_METRICS},
+                   None if truth is None else truth.errors(pose.R, pose.t, ns1, ns2))
+
+    @property
+    def status(self) -> Status:
+        """Status of the pose."""
+        return self.pose.status
+
+
+# -- tables ----------------------------------------------------------------------------------
+
+
+class Table(NamedTuple):
+    """A CSV file, its columns, and the row of a record; no row for None."""
+
+    file: str
+    columns: tuple[str, ...]
+    row: Callable[[PairRecord], list[str] | None]
+
+
+def _pose_row(record: PairRecord) -> list[str]:
+    """Unknown values are empty: a rotation may be known without a translation.
+
+    Floats are written so that they read back bit-equal.
+    """
+    pose, matches = record.pose, number(record.metrics.get('matches', math.nan))
+    stamps = [str(record.reference_stamp_ns), str(record.stamp_ns)]
+    if not pose.rotation_known:
+        return [*stamps, *[''] * 13, matches, '', pose.status.value, '', '']
+    # As published: of the pose, or of the rotation alone.
+    covariance, known = np.full((6, 6), math.nan), slice(0 if pose else 3, 6)
+    published = published_covariance(pose.covariance[known, known])
+    covariance[known, known] = published.reshape(covariance[known, known].shape)
+    values = [*pose.t, *quat_xyzw(pose.R), *translation_sigmas(covariance),
+              *rotation_sigmas(covariance)]
+    return [*stamps, *map(number, values), number(record.metrics['inliers']), matches, pose.model,
+            pose.status.value, number(pose.baseline), number(pose.baseline_log_sigma)]
+
+
+POSES = Table('relative_poses.csv', (
+    'reference_stamp_ns', 'stamp_ns', 'tx', 'ty', 'tz', 'qx', 'qy', 'qz', 'qw', 'sigma_t1',
+    'sigma_t2', 'sigma_rx', 'sigma_ry', 'sigma_rz', 'inliers', 'matches', 'model', 'status',
+    'baseline_m', 'baseline_log_sigma'), _pose_row)
+
+
+def _error_row(record: PairRecord) -> list[str] | None:
+    """No row for a pair that was not estimated; empty errors outside of the ground truth."""
+    if not record.metrics:
+        return None
+    errors = record.errors
+    # PURE_ROTATION has a rotation, but is no pose.
+    values = [''] * 4 if errors is None else [number(value) for value in (
+        errors.baseline, errors.rotation, errors.rotation_error, errors.translation_error)]
+    return [str(record.reference_stamp_ns), str(record.stamp_ns),
+            number(record.metrics['interval_s']), *values, record.status.value]
+
+
+ERRORS = Table('errors.csv', (
+    'reference_stamp_ns', 'stamp_ns', 'interval_s', 'baseline_m', 'rotation_deg',
+    'rotation_error_deg', 'translation_error_deg', 'status'), _error_row)
+
+
+@contextmanager
+def table_writer(folder: Path, tables: Sequence[Table]) -> Iterator[Callable[[PairRecord], None]]:
+    """Create the files of tables; the result appends a record to all of them.
+
+    A row is complete in its file even if the process ends after it.
+    """
+    with ExitStack() as stack:
+        writers = [csv.writer(stack.enter_context(
+            (folder / table.file).open('w', buffering=1, newline='', encoding='ascii')),
+            lineterminator='\n') for table in tables]
+
+        def write(record: PairRecord) -> None:
+            for table, writer in zip(tables, writers, strict=True):
+                row = table.row(record)
+                if row is not None:
+                    assert len(row) == len(table.columns)
+                    writer.writerow(row)
+
+        for table, writer in zip(tables, writers, strict=True):
+            writer.writerow(table.columns)
+        yield write
+
+
+def translation_sigmas(covariance: Array) -> tuple[float, float]:
+    """1 sigma of the translation direction [rad], larger and smaller axis.
+
+    The covariance (6, 6) of (dt, dtheta) has no variance along t, so two of three axes remain. NaN
+    without a translation.
+    """
+    if np.isnan(covariance[0, 0]):
+        return math.nan, math.nan
+    variances = np.linalg.eigvalsh(covariance[:3, :3])
+    larger, smaller = np.sqrt(np.maximum(variances[[2, 1]], 0.0))
+    return float(larger), float(smaller)
+
+
+def rotation_sigmas(covariance: Array) -> tuple[float, float, float]:
+    """1 sigma of the rotation about the axes x, y, z of camera 1 [rad]."""
+    x, y, z = np.sqrt(np.maximum(np.diag(covariance)[3:], 0.0))
+    return float(x), float(y), float(z)
+
+
+# -- summary.json ----------------------------------------------------------------------------
+
+
+def write_summary(path: Path, metrics: dict[str, Any], *, bag: Path, topics: SensorTopics,
+                  parameters: Parameters, command: Sequence[str], package_version: str) -> None:
+    """Write metrics and their provenance as JSON, which has no NaN."""
+    by_role = {one.name: getattr(topics, one.name) for one in fields(topics)}
+    summary = {
+        'bag': str(bag),
+        'topics': {role: topic and topic.name for role, topic in by_role.items()},
+        **metrics,
+        'parameters': parameters.to_mapping(),
+        'command': list(command),
+        'versions': {'rs_relpose_ros': package_version, 'python': platform.python_version(),
+                     'numpy': np.__version__, 'scipy': scipy.__version__,
+                     'opencv': cv2.__version__, 'numba': numba.__version__},
+    }
+    path.write_text(json.dumps(summary, indent=2, allow_nan=False) + '\n', encoding='utf-8')
+
+
+def baselines(answered: Sequence[PairRecord]) -> dict[str, Any]:
+    """Number of poses with a metric baseline, its median sigma, and the reasons of the others."""
+    known = [record.pose.baseline_log_sigma for record in answered
+             if not record.pose.baseline_reason]
+    reasons = ReasonCounts()
+    for record in answered:
+        if record.pose.baseline_reason:
+            reasons.add(record.pose.baseline_reason)
+    return {'known': len(known), 'log_sigma_median': median(known),
+            'not_known': reasons.most_common()}
+
+
+def errors_against_truth(answered: Sequence[PairRecord]) -> dict[str, Any] | None:
+    """Medians and 90th percentiles of the errors; None without ground truth."""
+    errors = [record.errors for record in answered if record.errors is not None]
+    if not errors:
+        return None
+    metrics: dict[str, Any] = {'pairs': len(errors)}
+    for name in ('rotation', 'translation'):
+        values = [getattr(error, f'{name}_error') for error in errors]
+        metrics[f'{name}_median_deg'], metrics[f'{name}_p90_deg'] = map(
+            _finite, median_and_p90(values))
+    return {**metrics, 'baseline_median_m': median([error.baseline for error in errors])}
+
+
+def median(values: Sequence[float]) -> float | None:
+    """Median of the finite values; None without any."""
+    return _finite(median_and_p90(values)[0])
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

@@ -1,0 +1,120 @@
+"""Errors of relative poses against the ground truth of a camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, Slerp
+
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
+
+Array = NDArray[np.float64]
+
+# Largest interval of two poses for an interpolation.
+_MAX_GAP_NS = to_nanoseconds(0.2)
+_MIN_POSES = 4
+
+
+@dataclass(frozen=True, slots=True)
+class PairErrors:
+    """True motion of a pair and the errors of its estimate; unknown values are NaN."""
+
+    baseline: float   # true distance of the two positions [m]
+    rotation: float   # true angle [deg]
+    rotation_error: float   # angle of R_estimated^T R_true [deg]
+    translation_error: float   # angle between the directions of translation [deg], 0 to 180
+
+
+class TrueTrajectory:
+    """Camera poses in the world, interpolated: SLERP and a cubic spline of the position.
+
+    Stamps (K,) on the IMU clock, positions (K, 3) [m], and rotations of the camera's optical
+    frame in the world as quaternions (K, 4).
+    """
+
+    def __init__(self, stamps_ns: ArrayLike, positions: ArrayLike, quats_xyzw: ArrayLike) -> None:
+        stamps = np.asarray(stamps_ns, dtype=np.int64)
+        order = np.argsort(stamps, kind='stable')
+        order = order[np.append(True, np.diff(stamps[order]) > 0)] if len(order) else order
+        positions = np.asarray(positions, dtype=np.float64).reshape(-1, 3)[order]
+        quats = np.asarray(quats_xyzw, dtype=np.float64).reshape(-1, 4)[order]
+        if len(order) < _MIN_POSES:
+            raise InputError(f'the ground truth has {len(order)} poses of distinct stamps; at '
+                             f'least {_MIN_POSES} are needed')
+        norms = np.linalg.norm(quats, axis=1)
+        if not (np.isfinite(positions).all() and np.isfinite(quats).all()
+                and (np.abs(norms - 1.0) < 1e-2).all()):
+            raise InputError('the ground truth has a pose that is not finite, or whose quaternion '
+                             'has not the length 1')
+        self._stamps = stamps[order]
+        # Seconds since the first pose: absolute stamps do not fit into a float.
+        seconds = (self._stamps - self._stamps[0]) / NANOSECONDS
+        self._position = CubicSpline(seconds, positions)
+        self._rotation = Slerp(seconds, Rotation.from_quat(quats))
+
+    def covers(self, at_ns: int) -> bool:
+        """Whether there are poses close enough before and after a time."""
+        after = int(np.searchsorted(self._stamps, at_ns))
+        if after == len(self._stamps):
+            return False
+        if self._stamps[after] == at_ns:
+            return True
+        return after > 0 and bool(
+            self._stamps[after] - self._stamps[after - 1] <= _MAX_GAP_NS)
+
+    def position(self, at_ns: int) -> Array:
+        """Position (3,) [m] at a time that the poses cover."""
+        return np.asarray(self._position((at_ns - self._stamps[0]) / NANOSECONDS))
+
+    def rotation(self, at_ns: int) -> Array:
+        """R (3, 3) from the camera to the world, likewise."""
+        return np.asarray(self._rotation((at_ns - self._stamps[0]) / NANOSECONDS).as_matrix())
+
+    def relative_pose(self, ns1: int, ns2: int) -> tuple[Array, Array] | None:
+        """R (3, 3) and t (3,) [m] with ``X1 = R X2 + t``; None outside of the ground truth."""
+        if not (self.covers(ns1) and self.covers(ns2)):
+            return None
+        seconds = (np.array([ns1, ns2], dtype=np.int64) - self._stamps[0]) / NANOSECONDS
+        R1, R2 = self._rotation(seconds).as_matrix()
+        p1, p2 = self._position(seconds)
+        return R1.T @ R2, R1.T @ (p2 - p1)
+
+    def errors(self, R: Array, t: Array, ns1: int, ns2: int) -> PairErrors | None:
+        """Errors of an estimate, which may have NaN; None outside of the ground truth."""
+        truth = self.relative_pose(ns1, ns2)
+        if truth is None:
+            return None
+        R_true, t_true = truth
+        return PairErrors(
+            baseline=float(np.linalg.norm(t_true)), rotation=rotation_angle(R_true),
+            rotation_error=rotation_angle(R.T @ R_true),
+            translation_error=direction_angle(t, t_true))
+
+
+def rotation_angle(R: Array) -> float:
+    """Angle of a rotation matrix [deg]; NaN for NaN."""
+    if not np.isfinite(R).all():
+        return float('nan')
+    return float(np.degrees(Rotation.from_matrix(R).magnitude()))
+
+
+def direction_angle(a: Array, b: Array) -> float:
+    """Angle between two vectors [deg]; NaN if one is NaN or zero."""
+    if not (np.linalg.norm(a) > 0.0 and np.linalg.norm(b) > 0.0):
+        return float('nan')
+    # The arc cosine loses digits at small angles.
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), np.dot(a, b))))
+
+
+def median_and_p90(values: Sequence[float]) -> tuple[float, float]:
+    """Median and 90th percentile of the finite values; NaN without any."""
+    finite = np.asarray(values, dtype=np.float64)
+    finite = finite[np.isfinite(finite)]
+    if not len(finite):
+        return float('nan'), float('nan')
+    return float(np.median(finite)), float(np.percentile(finite, 90))

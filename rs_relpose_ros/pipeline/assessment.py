@@ -1,0 +1,383 @@
+"""Assessment of the configured parameters: which one is inconsistent, by how much, what to do.
+
+A deviation is *suspect* if it is certain (more than `_CERTAIN` sigmas) and moves the pose by a
+sigma of a correctly configured pose, *wrong* if it moves the pose out of its covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_ros.config.settings import SensorConfig
+from rs_relpose_ros.estimator.priors import inverse, log_determinant
+from rs_relpose_ros.geometry.camera import REFERENCE_ROWS, RollingShutterCamera
+from rs_relpose_ros.geometry.so3 import exp_so3
+from rs_relpose_ros.pipeline import findings
+from rs_relpose_ros.pipeline.findings import BIAS, Finding, FindingState, OFFSET, Quantity
+from rs_relpose_ros.pipeline.recursion import Calibration, PRIOR_INFORMATION, PRIOR_SIGMA
+from rs_relpose_ros.pipeline.rotations import RotationComparison
+
+Array = NDArray[np.float64]
+
+# Sigmas beyond which a deviation is certain.
+_CERTAIN = 4.0
+# Shift of the pose in its own sigmas (Mahalanobis) that matters, and that leaves its covariance.
+_MATTERS, _OUTSIDE = 1.0, 3.0
+# Axes and unit are wrong if a correction leaves less than this share of the images' rotation.
+_EXPLAINED_AT_BEST = 0.5
+# Images over gyro beyond which only another unit is consistent with the scale (deg/s: 0.017).
+_UNIT_FACTOR = 5.0
+# Rotation of the gyro [rad] after which images must agree, and the share that may remain.
+_LONG_ROTATION, _INDEPENDENT = 2.0, 0.85
+# Rotations within this [rad] of half a turn about an axis of the image also are flipped images.
+_HALF_TURN = 0.6
+# Quantile of the pairs' shifts that decides whether a deviation matters: pairs of little motion
+# hide it.
+_OBSERVABLE_IN = 0.9
+# Sigmas within which a parameter that was configured with a sigma is as configured.
+_AS_CONFIGURED = 3.0
+# Gain in chi-square beyond which there is no doubt.
+_LARGEST_GAIN = 100.0
+# Most inconsistent quantities: traces of a gross error need some, too.
+_MOST_QUANTITIES = 4
+# Chi-square by which an alternative hypothesis may fit less, and still fits as well.
+_AS_GOOD = 4.0
+# Part of the configured distortion that rectified images have at most.
+_LITTLE_OF = 0.25
+# Deviations that move the pose by less than this share of the largest shift are not evaluated:
+# a gross error leaves traces in all quantities.
+_TRACE = 0.34
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Configured:
+    """Parameters with which the pairs were estimated."""
+
+    sensor: SensorConfig
+    camera: RollingShutterCamera
+    gyro_bias: Array   # (3,) parameter [rad/s]
+    gyro_bias_sigma: float
+    active: Array   # (11,) deviations applied already: tracked parameters, bias at rest
+
+    @property
+    def direction(self) -> float:
+        """1 if row 0 is configured to be read first, -1 if it is the last."""
+        return 1.0 if self.sensor.readout_direction == 'down' else -1.0
+
+
+class Effect(NamedTuple):
+    """Shift of a pair's pose by deviations, or of its rotation alone if it has no translation."""
+
+    shift: Array   # (5 or 3, 11) in sigmas of a correctly configured pose
+    # (6 or 3, 11) in the published sigmas, which may include the disagreement
+    claimed_shift: Array
+
+
+# Deviations of each quantity, and the log-determinant of their prior.
+_PRIORS = tuple((quantity.part, -2.0 * float(np.log(PRIOR_SIGMA[quantity.part]).sum()))
+                for quantity in findings.QUANTITIES)
+
+
+class Inconsistency(NamedTuple):
+    """A quantity whose deviation is consistent with the pairs."""
+
+    quantity: Quantity
+    deviation: Array   # (11,) from the active values; of this quantity alone
+    sigma: Array   # (11,)
+    certainty: float   # in sigmas
+    # Of the pose, Mahalanobis: in sigmas of a correctly configured one, of the pairs that it
+    # moves most, and in published sigmas, in the median.
+    shift: float
+    claimed_shift: float
+    alternative: Inconsistency | None = None   # hypothesis that fits the pairs as well
+
+    def matters(self, configured: Configured) -> bool:
+        """Whether it moves the pose by its sigma, and exceeds the configured sigma."""
+        beyond = np.abs(self.deviation[BIAS]) > _AS_CONFIGURED * configured.gyro_bias_sigma
+        return self.shift > _MATTERS and (self.quantity.part != BIAS or bool(beyond.any()))
+
+
+def find_inconsistencies(estimated: Calibration, effects: Sequence[Effect],
+                         active: Array) -> list[Inconsistency]:
+    """The fewest deviations that fit the pairs, by forward selection; the strongest first.
+
+    A fit of all quantities would distribute a deviation of one among all that few pairs cannot
+    distinguish. A quantity alone gains ``b_k^T S_kk^-1 b_k`` in chi-square; the one of the largest
+    gain is selected, and the others are evaluated on the remainder. If none is certain, one that
+    is certain jointly with all others is selected. An alternative hypothesis is kept if it fits as
+    well as the only quantity.
+    """
+    if not estimated.pairs:
+        return []
+    jointly = np.abs(estimated.c - active) / estimated.sigma
+    found: list[tuple[Quantity, float]] = []
+    alternative: tuple[Quantity, float] | None = None
+    together = sigma = np.zeros(findings.DEVIATIONS)
+    selected = np.zeros(findings.DEVIATIONS, dtype=bool)
+    while len(found) < _MOST_QUANTITIES:
+        left = estimated.b - estimated.S @ (active + together)
+        alone = sorted(((quantity, _certainty_alone(quantity, estimated, left, selected))
+                        for quantity in findings.QUANTITIES if not selected[quantity.part].any()),
+                       key=lambda item: -item[1])
+        quantity, certainty = alone[0]
+        if certainty < _CERTAIN:
+            quantity, certainty = max(
+                ((quantity, float(jointly[quantity.part].max())) for quantity, _ in alone),
+                key=lambda item: item[1])
+        elif not found and certainty**2 - alone[1][1]**2 < _AS_GOOD:
+            alternative = alone[1]
+        if certainty < _CERTAIN:
+            break
+        found.append((quantity, certainty))
+        selected[quantity.part] = True
+        together, sigma = _solved(estimated, selected, active)
+    inconsistent = [_inconsistency(quantity, together, sigma, certainty, effects)
+                    for quantity, certainty in found]
+    if alternative is not None and len(found) == 1:
+        instead = np.zeros(findings.DEVIATIONS, dtype=bool)
+        instead[alternative[0].part] = True
+        inconsistent[0] = inconsistent[0]._replace(alternative=_inconsistency(
+            alternative[0], *_solved(estimated, instead, active), alternative[1], effects))
+    return inconsistent
+
+
+def undetermined(estimated: Calibration, active: Array) -> Array:
+    """Second moment (11, 11) of undetected deviations, by the odds that there is one.
+
+    Before the first pair these are even, and each quantity as likely. Consistent pairs lower the
+    odds of a quantity as they lower its sigma against its prior P; others raise them (Bayes
+    factor; Kass and Raftery, JASA 1995)::
+
+        odds_k = (|Sigma_k| / |P_k|)^1/2 exp(b_k^T Sigma_k b_k / 2),  Sigma_k = (S_kk + P_k^-1)^-1
+    """
+    odds = 0.0
+    posterior = estimated.S / estimated.scatter + PRIOR_INFORMATION
+    left = (estimated.b - estimated.S @ active) / estimated.scatter
+    for part, of_prior in _PRIORS:
+        information = np.ascontiguousarray(posterior[part, part])
+        gain = min(float(left[part] @ inverse(information) @ left[part]), _LARGEST_GAIN)
+        odds += math.exp(0.5 * (of_prior - log_determinant(information) + gain)) / len(_PRIORS)
+    off = estimated.c - active
+    return (estimated.undetermined + off[:, None] * off) * odds / (1.0 + odds)
+
+
+def _solved(estimated: Calibration, selected: NDArray[np.bool_],
+            active: Array) -> tuple[Array, Array]:
+    """Deviations (11,) from the active values if only those `selected` differ; 1 sigma each."""
+    together, sigma = np.zeros(findings.DEVIATIONS), np.zeros(findings.DEVIATIONS)
+    covariance = inverse(estimated.S[np.ix_(selected, selected)])
+    together[selected] = covariance @ (estimated.b - estimated.S @ active)[selected]
+    sigma[selected] = np.sqrt(estimated.misfit * np.diag(covariance))
+    return together, sigma
+
+
+def _certainty_alone(quantity: Quantity, estimated: Calibration, left: Array,
+                     selected: NDArray[np.bool_]) -> float:
+    """Deviation in sigmas if only this quantity and those `selected` are free."""
+    part = quantity.part
+    S = estimated.S[part, part] + PRIOR_INFORMATION[part, part]
+    if selected.any():
+        cross = estimated.S[part][:, selected]
+        S = S - cross @ inverse(estimated.S[np.ix_(selected, selected)]) @ cross.T
+    of_part = left[part] / S[0] if len(S) == 1 else np.linalg.solve(S, left[part])
+    gain = float(left[part] @ of_part) / estimated.misfit
+    # A vector gains more by chance.
+    return math.sqrt(max(gain - 2.0 * (part.stop - part.start - 1), 0.0))
+
+
+def _inconsistency(quantity: Quantity, together: Array, sigma: Array, certainty: float,
+                   effects: Sequence[Effect]) -> Inconsistency:
+    def length(shifts: list[Array], quantile: float) -> float:
+        return float(np.quantile([np.linalg.norm(s) for s in shifts], quantile)) if shifts else 0.0
+
+    deviation = np.zeros(findings.DEVIATIONS)
+    deviation[quantity.part] = together[quantity.part]
+    return Inconsistency(quantity, deviation, sigma, certainty,
+                         length([effect.shift @ deviation for effect in effects], _OBSERVABLE_IN),
+                         length([effect.claimed_shift @ deviation for effect in effects], 0.5))
+
+
+def assess(estimated: Calibration, inconsistent: list[Inconsistency],
+           rotations: RotationComparison | None, configured: Configured) -> findings.Assessment:
+    """Findings on all quantities; `inconsistent`: by `find_inconsistencies`."""
+    gross = tuple(_gross_errors(rotations, configured))
+    if gross:
+        # Poses of wrong axes or units do not determine the other quantities.
+        return findings.Assessment(gross + not_evaluated(
+            {finding.quantity for finding in gross}, gross[0].quantity))
+    largest = max((one.shift for one in inconsistent), default=0.0)
+    faults = {one.quantity.name: one for one in inconsistent
+              if one.matters(configured) and one.shift > _TRACE * largest}
+    faults |= {one.alternative.quantity.name: one.alternative for one in faults.values()
+               if one.alternative is not None}
+    alternatives = ' or '.join(faults) if any(one.alternative for one in faults.values()) else ''
+    found: list[Finding] = []
+    for quantity in findings.QUANTITIES:
+        part = quantity.part
+        if quantity.name in faults:
+            found += _fault_findings(faults[quantity.name], configured, alternatives)
+        elif float(estimated.sigma[part].max()) > quantity.observable:
+            found.append(_unknown(quantity, 'not observable in this motion, or too few pairs'))
+        elif faults:
+            found.append(_unknown(
+                quantity, 'not evaluated while another parameter is inconsistent'))
+        else:
+            found.append(_values(quantity, (estimated.c - configured.active)[part],
+                                 estimated.sigma[part], configured)[0])
+    return findings.Assessment(tuple(found))
+
+
+def not_evaluated(named: set[str], wrong: str) -> tuple[Finding, ...]:
+    """Findings on the quantities that are not `named`, while another one is `wrong`."""
+    return tuple(_unknown(quantity, f'not evaluated while {wrong} is wrong')
+                 for quantity in findings.QUANTITIES if quantity.name not in named)
+
+
+def _unknown(quantity: Quantity, reason: str) -> Finding:
+    return Finding(quantity.name, FindingState.UNKNOWN, reason, unit=quantity.unit)
+
+
+def _fault_findings(one: Inconsistency, configured: Configured,
+                    alternatives: str) -> Iterator[Finding]:
+    """Findings on an inconsistent quantity; `alternatives`: hypotheses that fit as well."""
+    quantity = one.quantity
+    sure = one.claimed_shift * (1.0 - 2.0 / one.certainty)
+    state = FindingState.WRONG if sure > _OUTSIDE else FindingState.SUSPECT
+    consistent, setting = _values(quantity, one.deviation[quantity.part],
+                                  one.sigma[quantity.part], configured)
+    estimated = consistent.estimated
+    assert estimated is not None and consistent.sigma is not None
+    found = replace(consistent, state=state)
+    if quantity.name == 'readout_time' and estimated < 0.0:
+        other = 'up' if configured.sensor.readout_direction == 'down' else 'down'
+        yield replace(found, quantity='readout_direction', fix=f'set readout_direction: {other}',
+                      message='rows are read in the opposite direction, in '
+                      + quantity.with_sigma(-estimated, consistent.sigma))
+        return
+    fix = quantity.fix.format(setting)
+    # Tracking, if it is off, starts from the parameter.
+    if quantity.tracking and not getattr(configured.sensor, quantity.tracking) and (
+            abs(estimated - (getattr(configured.sensor, quantity.name) or 0.0)) < quantity.reach):
+        fix += f', or {quantity.tracking}: true'
+    if alternatives:
+        fix += f' (ambiguous: {alternatives})'
+    yield replace(found, fix=fix,
+                  message=f'{found.message} (shifts the pose by {one.shift:.1f} sigmas)')
+    if quantity.name == 'time_offset':
+        yield from _another_row(one, state, configured)
+    if quantity.name == 'distortion' and found.configured and (
+            abs(estimated) < _LITTLE_OF * abs(found.configured)):
+        yield _fault('image_geometry', 'hardly any distortion left in the images: they may be '
+                     'rectified', 'subscribe to the original images', state)
+
+
+def _another_row(one: Inconsistency, state: FindingState,
+                 configured: Configured) -> Iterator[Finding]:
+    """Another stamped row, if it is equivalent to the same offset."""
+    camera, deviation = configured.camera, one.deviation[OFFSET]
+    for name in REFERENCE_ROWS:
+        row = replace(camera, reference_row=name).reference_row_index
+        makes = (camera.reference_row_index - row) * camera.line_delay
+        if name != camera.reference_row and abs(deviation - makes) < 2.0 * one.sigma[OFFSET]:
+            yield _fault('stamp_row', f'stamps of the {name} row are equivalent to this offset',
+                         f'set stamp_row: {name}', state)
+
+
+def _fault(quantity: str, message: str, fix: str, state: FindingState = FindingState.WRONG,
+           configured: float | None = None, estimated: float | None = None,
+           unit: str = '') -> Finding:
+    return Finding(quantity, state, message, fix, configured, estimated, None, unit, True)
+
+
+# -- Values of a quantity from its deviation -------------------------------------------------
+
+
+def _values(quantity: Quantity, left: Array, sigmas: Array,
+            configured: Configured) -> tuple[Finding, object]:
+    """A consistent finding with the values of a quantity, and the value to set.
+
+    `left`: deviation from the active values; of a vector, the most certain component is reported.
+    """
+    camera, sensor = configured.camera, configured.sensor
+    worst = int(np.argmax(np.abs(left) / sigmas))
+    sigma, setting = float(sigmas[worst]), None
+    values: dict[str, ArrayLike] = {   # active ones, in the unit of the quantity
+        'axes': 0.0, 'time_offset': sensor.time_offset + float(configured.active[OFFSET]),
+        'readout_time': camera.readout_time,
+        'gyro_bias': configured.gyro_bias + configured.active[BIAS], 'gyro_scale': 1.0,
+        'focal_length': camera.fx, 'distortion': (*camera.distortion, 0.0)[0]}
+    active = np.atleast_1d(np.asarray(values[quantity.name], dtype=np.float64))
+    estimated = active + left
+    if quantity.name == 'axes':
+        estimated = np.degrees([float(np.linalg.norm(left))])
+        sigma *= math.degrees(1.0)
+        setting = findings.rounded(
+            Rotation.from_matrix(exp_so3(left) @ sensor.R_cam_imu).as_quat())
+    elif quantity.name == 'readout_time':   # the deviation is that of the signed one
+        estimated = active + configured.direction * left
+    elif quantity.name == 'gyro_bias':
+        setting = findings.rounded(estimated)
+    elif quantity.name == 'focal_length':   # the deviation is that of its inverse
+        estimated = active / (1.0 + left)
+        sigma *= float(estimated[0])
+    component = worst if len(active) > 1 else 0
+    value = float(estimated[component])
+    return Finding(quantity.name, FindingState.OK, quantity.compared(estimated, sigma, active), '',
+                   float(active[component]), value, sigma, quantity.unit,
+                   True), value if setting is None else setting
+
+
+# -- Gross errors ----------------------------------------------------------------------------
+
+
+def _gross_errors(rotations: RotationComparison | None,
+                  configured: Configured) -> Iterator[Finding]:
+    """Axes, unit and flips, from the rotations of images and gyro."""
+    if rotations is None:
+        return
+    explained = min(rotations.left_at_best, rotations.left_mirrored)
+    if explained < _EXPLAINED_AT_BEST:
+        if rotations.scale * _UNIT_FACTOR < 1.0 or rotations.scale > _UNIT_FACTOR:
+            yield _fault('gyro_unit', f'images rotate {rotations.scale:.3g} times as far as the '
+                         'gyro', 'publish rad/s, which is pi / 180 = 0.0175 times deg/s',
+                         configured=1.0, estimated=rotations.scale)
+        if rotations.is_left_handed or rotations.is_turned:
+            yield from _wrong_axes(rotations, configured)
+    elif rotations.by_gyro > _LONG_ROTATION and min(
+            explained, rotations.left_of_all) > _INDEPENDENT:
+        # Of a constant rate only noise is left once it is removed.
+        for name in ('image_geometry', 'time_offset'):
+            yield _fault(name, 'images and gyro rotate independently of each other', 'verify that '
+                         'the IMU is that of this camera, that both stamp by one clock, and that '
+                         'electronic stabilisation is off')
+
+
+def _wrong_axes(rotations: RotationComparison, configured: Configured) -> Iterator[Finding]:
+    R_cam_imu = configured.sensor.R_cam_imu
+    if rotations.is_left_handed:
+        # Usually a single sign in the axes of the IMU itself.
+        signs = np.diag(R_cam_imu.T @ rotations.reflection @ R_cam_imu)
+        axis = 'xyz'[int(np.argmin(signs))] if sorted(signs)[1] > 0.7 > -0.7 > min(signs) else ''
+        yield _fault('axes', 'the axes of the gyro are left-handed: '
+                     + (f'wrong sign of {axis}' if axis else 'wrong sign of one or of all axes'),
+                     'correct the driver (no quat_cam_imu_xyzw corrects a sign)')
+        return
+    angle, Q = rotations.angle, rotations.rotation
+    xyzw = findings.rounded(Rotation.from_matrix(Q @ R_cam_imu).as_quat(), 3)
+    yield _fault('axes', f'rotation axes of the images are {math.degrees(angle):.0f} deg from '
+                 f'those of the gyro by quat_cam_imu_xyzw; about {xyzw} fits', 'refine it with '
+                 '"rs_relpose calibrate" (a static transform with parent imu holds the inverse)',
+                 configured=0.0, estimated=math.degrees(angle), unit='deg')
+    if abs(angle - math.pi) < _HALF_TURN:
+        axis_of = np.abs(np.linalg.eigh(Q + Q.T)[1][:, -1])
+        if float(axis_of.max()) > math.cos(_HALF_TURN):
+            flip = 'upside down' if axis_of[2] == axis_of.max() else 'mirrored'
+            yield _fault('image_geometry', f'alternatively, the images are {flip}',
+                         'publish them as the sensor provides them')

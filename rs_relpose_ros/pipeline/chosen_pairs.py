@@ -1,0 +1,151 @@
+"""Relative poses of chosen frames, however far apart: loop closures, wide baselines.
+
+Frames are matched by descriptors, without tracks in between. The IMU derotates the rows of each
+frame and gives gravity; the gyro between the frames is used unless it has a gap. The interval
+constrains the velocities only of frames that are close to each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+from functools import reduce
+from typing import Any
+
+from rs_relpose_ros.config.settings import Parameters, sensor_model
+from rs_relpose_ros.errors import InputError, RsRelposeError
+from rs_relpose_ros.imu.buffer import frame_imu, ImuBuffer
+from rs_relpose_ros.imu.integration import FrameImu
+from rs_relpose_ros.pipeline import pair
+from rs_relpose_ros.pipeline.pair import Frame, PairResult
+from rs_relpose_ros.pipeline.pipeline import Processor
+from rs_relpose_ros.tracking.features import DescriptorTracker
+
+
+def view_frame(frame: Frame[Any], imu: ImuBuffer, parameters: Parameters,
+               since: Frame[Any] | None = None) -> Frame[Any]:
+    """A frame with its IMU data, to be related to others by `estimate_wide_pair`.
+
+    Parameters
+    ----------
+    frame : Frame
+    imu : ImuBuffer
+        Must cover the readout; frames are to be given in the order of time.
+    parameters : Parameters
+        Those of camera and IMU.
+    since : Frame, optional
+        An earlier result: if the buffer extends back to it, the gyro between is kept, too.
+
+    Returns
+    -------
+    Frame
+        A copy with `imu`.
+
+    Raises
+    ------
+    InputError
+        The gyro does not cover the frame.
+    """
+    clock = sensor_model(frame.intrinsics, parameters.sensor).clock
+    return replace(frame, imu_data=frame_imu(
+        imu, clock.exposed_span_ns(frame.stamp_ns), clock.reference_ns(frame.stamp_ns),
+        parameters.sensor.R_cam_imu, None if since is None else since.imu.reference_ns,
+        clock.exposure()))
+
+
+def estimate_wide_pair(first: Frame[Any], second: Frame[Any],
+                       parameters: Parameters) -> PairResult:
+    """The relative pose of two frames, matched by descriptors.
+
+    Parameters
+    ----------
+    first, second : Frame
+        Of `view_frame`, in the order of time, of one camera with one calibration.
+    parameters : Parameters
+        `detector` chooses the descriptors; SIFT if it is klt.
+
+    Returns
+    -------
+    PairResult
+        Its `pose` is falsy, with `status` and `reason`, if none can be estimated.
+
+    Raises
+    ------
+    InputError
+        The frames are in the wrong order, have no IMU data, or their intrinsics differ.
+    """
+    if second.stamp_ns <= first.stamp_ns:
+        raise InputError('the second frame must be later than the first: exchange them')
+    if second.intrinsics != first.intrinsics:
+        raise InputError('the intrinsics changed between the two frames: one calibration must '
+                         'hold for both')
+    sensor = sensor_model(first.intrinsics, parameters.sensor)
+    tracking = parameters.tracking   # KLT has no descriptors
+    tracker = DescriptorTracker(replace(tracking, detector='sift') if tracking.detector == 'klt'
+                                else tracking)
+    tracker.start(first.image)
+    matches = tracker.track(second.image)
+    # The second frame's gyro may begin at another one.
+    segment, gyro = second.imu.since_previous, None
+    if segment is not None and segment.stamps_ns[0] == first.imu.reference_ns:
+        gyro = pair.GyroRotation.of(second.imu, parameters.imu)
+    inertial, interval = pair.inertial_of(first, second, gyro, second.imu, parameters), None
+    if pair.interval_of(first, second) <= parameters.keyframes.max_keyframe_interval:
+        interval = pair.interval_of(first, second)
+    elif not isinstance(inertial, str):
+        inertial = 'the frames are further apart than max_keyframe_interval'
+    pose = pair.estimate_pair(first, second, matches, sensor, gyro, inertial, parameters,
+                              interval=interval)
+    rays1, rays2 = (
+        pair.DerotatedRays.from_points(matches.track_ids, points, sensor, frame.imu.motion)
+        for points, frame in ((matches.points1, first), (matches.points2, second)))
+    return pair.pair_result(first, second, matches, rays1, rays2, pose, gyro, sensor, parameters)
+
+
+# Of the earlier and of the later image of a pair [ns].
+Stamps = tuple[int, int]
+
+
+class ChosenPairs(Processor[dict[Stamps, PairResult | str]]):
+    """Estimates the `wanted` pairs: results by their stamps, or the reasons for none.
+
+    Frames are kept until the last of their pairs, and the IMU data of all frames since the oldest
+    of them.
+    """
+
+    def __init__(self, wanted: Collection[Stamps]) -> None:
+        self._wanted = frozenset(wanted)
+        self._last: dict[int, int] = {}
+        for first_ns, second_ns in self._wanted:
+            self._last[first_ns] = max(second_ns, self._last.get(first_ns, second_ns))
+        self._frames: dict[int, Frame[Any]] = {}   # by stamp
+        self._imus: dict[int, FrameImu] = {}
+
+    def reset(self) -> None:
+        """Forget the frames so far."""
+        self._frames.clear()
+        self._imus.clear()
+
+    def process(self, frame: Frame[Any],
+                parameters: Parameters) -> dict[Stamps, PairResult | str] | None:
+        """The pairs of this frame with earlier ones."""
+        current_ns = frame.stamp_ns
+        self._imus[current_ns] = frame.imu
+        pairs = {(first_ns, current_ns): self._pair(first_ns, frame, parameters)
+                 for first_ns in self._frames if (first_ns, current_ns) in self._wanted}
+        self._frames[current_ns] = frame
+        self._frames = {stamp_ns: one for stamp_ns, one in self._frames.items()
+                        if self._last.get(stamp_ns, 0) > current_ns}
+        oldest_ns = min(self._frames, default=current_ns)
+        self._imus = {stamp_ns: one for stamp_ns, one in self._imus.items()
+                      if stamp_ns > oldest_ns}
+        return pairs or None
+
+    def _pair(self, first_ns: int, second: Frame[Any], parameters: Parameters) -> PairResult | str:
+        """Of an earlier frame and the current one."""
+        second = replace(second, imu_data=reduce(pair.joined, [
+            imu for stamp_ns, imu in self._imus.items() if stamp_ns > first_ns]))
+        try:
+            return estimate_wide_pair(self._frames[first_ns], second, parameters)
+        except RsRelposeError as error:
+            return str(error)

@@ -1,0 +1,215 @@
+"""Derotated images: every row rotated by the gyro to the time of the middle row.
+
+The ray m of a pixel in row v is rotated by
+
+    m_mid = R_mid^T R(tau) m,    tau = (v - v_ref) * line_delay,
+
+R(tau) being the orientation of the camera at row time tau. The map has the opposite direction,
+from the pixel of the derotated image to that of the original one: K^-1, undistort,
+R(tau)^T R_mid, distort, K, with tau of the row of the original pixel. The translation during the
+readout is not corrected: the gyro does not measure it, and its effect depends on depth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+import math
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.config.settings import Parameters, sensor_model
+from rs_relpose_ros.geometry import timing
+from rs_relpose_ros.geometry.camera import Intrinsics
+from rs_relpose_ros.geometry.motion import FrameMotion
+from rs_relpose_ros.geometry.timing import Sensor, to_nanoseconds
+from rs_relpose_ros.pipeline.pair import Frame
+from rs_relpose_ros.pipeline.pipeline import FrameLoop, Pipeline, Processor
+from rs_relpose_ros.pipeline.warm_up import made_up_frames, MADE_UP_SENSOR, warm_up_pipeline
+from rs_relpose_ros.tracking.images import GrayLevels, Pixels
+
+# Pixels from node to node of the grid on which the map is exact; linear in between. At 3 rad/s
+# and a focal length of 450 px that is within 0.015 px (16 px: 0.04).
+_STEP = 8
+# Rows of the image that are mapped at once, a multiple of the step.
+_BAND = 64
+# Orientations over the readout; linear in between, to 1e-7 rad at 3 rad/s.
+_ORIENTATIONS = 129
+
+
+class RowMap(NamedTuple):
+    """A map for one motion, as its nodes."""
+
+    nodes: NDArray[np.float32]   # (rows, columns, 2) original pixels, NaN outside of the lens
+    width: int   # of the image
+    height: int
+    shift: float   # [px] largest difference of a coordinate of a node and its source
+
+    @property
+    def complete(self) -> bool:
+        """Whether every node has a source."""
+        return not np.isnan(self.nodes).any()
+
+    def bands(self) -> Iterator[tuple[slice, NDArray[np.float32]]]:
+        """Bands of rows of the image and their sources (N, W, 2), for `cv2.remap`.
+
+        A band fits into the processor's cache; a whole map would not.
+        """
+        for top in range(0, self.height, _BAND):
+            bottom = min(top + _BAND, self.height)
+            nodes = self.nodes[top // _STEP:math.ceil(bottom / _STEP) + 2]
+            band = cv2.resize(nodes, (nodes.shape[1] * _STEP, nodes.shape[0] * _STEP),
+                              interpolation=cv2.INTER_LINEAR)
+            yield slice(top, bottom), np.asarray(
+                band[_STEP:_STEP + bottom - top, _STEP:_STEP + self.width])
+
+
+class MiddleRow:
+    """Maps of one camera; images are those that its `Intrinsics` publish.
+
+    `delay` [s]: from the camera's reference row to the middle row of the published image.
+    """
+
+    def __init__(self, sensor: Sensor) -> None:
+        self.sensor = sensor
+        camera, intrinsics = sensor.camera, sensor.intrinsics
+        sizes = intrinsics.image_height, intrinsics.image_width
+        # cv2.resize puts node k at pixel (k + 1/2) step - 1/2; one node more on each side, so that
+        # all pixels lie between nodes.
+        down, across = ((np.arange(math.ceil(size / _STEP) + 2) - 0.5) * _STEP - 0.5
+                        for size in sizes)
+        self._shape = len(down), len(across)
+        self._nodes = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+        pixels = intrinsics.to_sensor(self._nodes)
+        self._rays = camera.unproject(pixels)
+        self._rows = np.ascontiguousarray(pixels[:, 1])   # of the sensor
+        _, middle = intrinsics.to_sensor([[0.0, 0.5 * (sizes[0] - 1)]])[0]
+        self.delay = float(camera.row_times(middle))
+
+    def map(self, motion: FrameMotion) -> RowMap:
+        """Where the pixels come from, for a motion relative to the reference row of the camera."""
+        camera, intrinsics = self.sensor.camera, self.sensor.intrinsics
+        # From the middle row's frame to that of each of some rows: R(tau)^T R_mid.
+        rows = np.linspace(0.0, camera.height - 1.0, _ORIENTATIONS)
+        turns = np.einsum('nji,jk->nik', motion.rotations(camera.row_times(rows)),
+                          motion.rotations([self.delay])[0])
+        nodes = intrinsics.to_image(camera.project_rotating(self._rays, self._rows, turns))
+        shift = np.nanmax(np.abs(nodes - self._nodes), initial=0.0)
+        return RowMap(nodes.reshape(*self._shape, 2).astype(np.float32), intrinsics.image_width,
+                      intrinsics.image_height, float(shift))
+
+
+# -- Derotated frames ---------------------------------------------------------------------------
+
+_BORDERS = {'replicate': cv2.BORDER_REPLICATE, 'black': cv2.BORDER_CONSTANT}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GlobalShutterFrame:
+    """A frame as of a global shutter at the time of the middle row."""
+
+    stamp_ns: int   # time of the middle row, on the clock of the parameter stamp_clock
+    original: Pixels
+    original_stamp_ns: int   # of its header
+    frame_id: str
+    intrinsics: Intrinsics
+    is_png: bool   # whether the original came as a PNG
+    map: RowMap
+    border: str   # of `_BORDERS`
+    applied_offset_ns: int   # tracked time offset in the stamp, beyond the parameter's
+
+    def image(self) -> Pixels:
+        """The derotated image, in the encoding of the original."""
+        values, border = self.original.values, _BORDERS[self.border]
+        complete, derotated = self.map.complete, np.empty_like(values)
+        for rows, sources in self.map.bands():
+            # None, as the types forbid: OpenCV 5 takes an empty second map for one.
+            derotated[rows] = cv2.remap(values, sources, None,  # type: ignore[call-overload]
+                                        cv2.INTER_LINEAR, borderMode=border)
+            if not complete:
+                derotated[rows][np.isnan(sources[..., 0])] = 0
+        return Pixels(derotated, self.original.encoding)
+
+    def mask(self) -> Pixels:
+        """255 for pixels with a source in the original image, 0 for the border."""
+        width, height = self.map.width, self.map.height
+        mask = np.empty((height, width), dtype=np.uint8)
+        for rows, sources in self.map.bands():
+            u, v = sources[..., 0], sources[..., 1]
+            mask[rows] = np.where((u >= 0.0) & (u <= width - 1.0) & (v >= 0.0)
+                                  & (v <= height - 1.0), 255, 0)
+        return Pixels(mask, 'mono8')
+
+
+class Unroller(Processor[GlobalShutterFrame]):
+    """Derotates frames.
+
+    With `track_time_offset` or `track_readout_time` the frames also pass through the pipeline of
+    relpose_node, after they are published, and its tracked corrections are applied here.
+    """
+
+    def __init__(self) -> None:
+        self._pipeline: Pipeline | None = None
+        self._levels = GrayLevels()
+        self._due: tuple[Frame[Any], Parameters] | None = None   # for the pipeline
+        self._middle: MiddleRow | None = None
+
+    def prepare(self) -> None:
+        """Let the pipeline track the last frame."""
+        due, self._due = self._due, None
+        if due is not None and self._pipeline is not None:
+            self._pipeline.process(*due)
+            self.applied = self._pipeline.applied
+
+    def reset(self) -> None:
+        """Forget the frames so far: tracking restarts with the next one."""
+        self._due = None
+        if self._pipeline is not None:
+            self._pipeline.reset()
+
+    def process(self, frame: Frame[Any], parameters: Parameters) -> GlobalShutterFrame:
+        """The derotated frame."""
+        self.prepare()
+        sensor, imu = parameters.sensor, frame.imu
+        assert frame.encoded is not None
+        # Once started it is kept: corrections that are no longer applied are taken back by steps.
+        if self._pipeline is None and (sensor.track_time_offset or sensor.track_readout_time):
+            self._pipeline = Pipeline(parameters)
+        model = sensor_model(frame.intrinsics, sensor, self.applied.readout_time)
+        if self._middle is None or self._middle.sensor != model:
+            self._middle = MiddleRow(model)
+        if self._pipeline is not None:
+            # The gray image of relpose_node, bit by bit.
+            self._due = replace(frame, image=frame.encoded.decoded(self._levels), encoded=None,
+                                encoding='mono8'), parameters
+        reference_ns = imu.reference_ns
+        if parameters.global_shutter.stamp_clock == 'camera':
+            reference_ns = frame.stamp_ns + to_nanoseconds(
+                timing.exposure_shift(sensor.stamp_exposure, imu.exposure)
+                + model.pose_row_delay)
+        return GlobalShutterFrame(
+            reference_ns + to_nanoseconds(self._middle.delay),
+            Pixels(frame.image, frame.encoding), frame.stamp_ns, frame.frame_id, frame.intrinsics,
+            frame.encoded.is_png, self._middle.map(imu.motion), parameters.global_shutter.border,
+            imu.applied_offset_ns)
+
+
+def unrolling_loop(parameters: Parameters, *,
+                   offline: bool = False) -> FrameLoop[GlobalShutterFrame]:
+    """The loop that derotates frames."""
+    return FrameLoop(parameters, Unroller(), offline=offline, colors=True)
+
+
+def warm_up_unroller(parameters: Parameters) -> None:
+    """Compile (or load from the cache) the kernels of a run by unrolling made-up frames."""
+    sensor = parameters.sensor
+    if sensor.track_time_offset or sensor.track_readout_time:
+        warm_up_pipeline(parameters)
+    parameters = parameters.updated({
+        **MADE_UP_SENSOR, 'track_time_offset': False, 'track_readout_time': False})
+    for frame in made_up_frames(unrolling_loop(parameters, offline=True)):
+        assert frame.result is not None
+        frame.result.image()

@@ -1,0 +1,196 @@
+"""The consistency monitor: follows the configured parameters over frames and pairs."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from rs_relpose_ros.config.settings import SensorConfig
+from rs_relpose_ros.estimator.result import RelativePose, Status
+from rs_relpose_ros.estimator.velocity import InertialEvidence
+from rs_relpose_ros.pipeline import assessment, findings, recursion
+from rs_relpose_ros.pipeline.assessment import Configured, Effect, Inconsistency
+from rs_relpose_ros.pipeline.findings import Assessment, BIAS, DEVIATIONS, OFFSET, READOUT
+from rs_relpose_ros.pipeline.recursion import Calibration, Recursion
+from rs_relpose_ros.pipeline.rotations import AccelerationSums, RotationSums
+
+Array = NDArray[np.float64]
+
+# Latest pairs whose shift by a deviation is evaluated.
+_EFFECTS = 30
+# Largest deviations about which a pair is linearised: lens and readout must stay possible.
+_LARGEST = np.array([0.5] * 3 + [0.06, 0.1] + [0.2] * 3 + [0.3, 0.45, 0.6])
+
+
+class ConsistencyMonitor:
+    """Compares the configuration with frames and pairs in the order of time.
+
+    Live and in replay, results are equal bit by bit.
+    """
+
+    def __init__(self) -> None:
+        self.rotations = RotationSums()
+        self._recursion = Recursion()
+        self.acceleration = AccelerationSums()
+        self._on_poses: deque[Effect] = deque(maxlen=_EFFECTS)
+        self._on_rotations: deque[Effect] = deque(maxlen=_EFFECTS)
+        self.latest: recursion.PairInformation | None = None   # of the last pair
+        self._inconsistent: list[Inconsistency] = []
+        self._wrong_configuration = False   # by the last pair
+        self.health, self.calibration = findings.NOT_EVALUATED, recursion.NOTHING_ESTIMATED
+
+    def add_acceleration(self, stamp_ns: int, evidence: InertialEvidence) -> None:
+        """Add the evidence of a pair about the accelerometer, before the pair itself."""
+        # Velocities of a wrong configuration are no evidence.
+        if not self._wrong_configuration:
+            self.acceleration.add(stamp_ns, evidence)
+
+    def add_pair(self, stamp_ns: int, data: recursion.PairData | None, pose: RelativePose,
+                 configured: Configured) -> RelativePose:
+        """Add a pair and assess all quantities; return the pose with a consistent covariance.
+
+        `data` is None if the pair has no rotation or no gyro.
+        """
+        self.latest = None
+        if data is not None:
+            try:
+                pose = self._add(stamp_ns, data, pose, configured)
+            except np.linalg.LinAlgError:
+                # A pair without rank has no information on the calibration; its pose is kept.
+                self._inconsistent = []
+        self.health = assessment.assess(self.calibration, self._inconsistent,
+                                        self.rotations.compared(), configured)
+        self._wrong_configuration = bool(self.health.faults)
+        if self._wrong_configuration:
+            self.acceleration.clear()
+        if (finding := self.acceleration.finding()) is not None:
+            self.health = Assessment((*self.health.findings, finding))
+        return pose
+
+    def _add(self, stamp_ns: int, data: recursion.PairData, pose: RelativePose,
+             configured: Configured) -> RelativePose:
+        active = about = configured.active
+        if self._inconsistent:
+            # The effect of an inconsistent quantity is evaluated at its estimate: where poses are
+            # off already, a little more or less may hardly move them.
+            about = np.asarray(active + np.clip(self._deviation(), -_LARGEST, _LARGEST))
+        information = self._recursion.add(stamp_ns, data, active, about)
+        if information is None:
+            return pose
+        self.latest = information
+        self.calibration = self._recursion.solved()
+        (self._on_poses if pose else self._on_rotations).append(_effect(information, pose))
+        # A deviation may be so large that no pair has a pose.
+        self._inconsistent = assessment.find_inconsistencies(
+            self.calibration, self._on_poses or self._on_rotations, active)
+        by_deviation = information.pose_by_deviation
+        shift = by_deviation @ self._deviation()
+        # The inconsistency, and deviations that the pairs so far have not excluded.
+        doubt = np.outer(shift, shift) + (
+            by_deviation @ assessment.undetermined(self.calibration, active) @ by_deviation.T)
+        pose = replace(pose, covariance=pose.covariance + doubt)
+        # The effect of an inconsistent parameter on the baseline is not known.
+        return pose.without_baseline('baseline not known: a configured parameter is inconsistent '
+                                     '(see health)') if shift.any() and pose else pose
+
+    def _deviation(self) -> Array:
+        """(11,) from the active values, of all inconsistent quantities."""
+        return sum((one.deviation for one in self._inconsistent), np.zeros(DEVIATIONS))
+
+
+def suppressed(pose: RelativePose, health: Assessment) -> RelativePose:
+    """The pose without its values, and the reason, if these are outside of their covariance."""
+    if health.state is not findings.FindingState.WRONG or not np.isfinite(pose.R).all():
+        return pose
+    return RelativePose(
+        status=Status.WITHHELD, reason=health.faults[0].text,
+        inliers=pose.inliers, model=pose.model, iterations=pose.iterations,
+        residual_rms=pose.residual_rms, duration=pose.duration)
+
+
+def _effect(information: recursion.PairInformation, pose: RelativePose) -> Effect:
+    rows, claimed = slice(3, None), pose.covariance[3:, 3:]
+    shift = information.shift_by_deviation[:3]
+    if pose:
+        # t is a direction: along itself it has no variance, and nothing moves it there.
+        along = np.concatenate([pose.t, np.zeros(3)])
+        rows, claimed = slice(None), pose.covariance + np.outer(along, along)
+        shift = information.shift_by_deviation
+    return Effect(shift, solve_triangular(
+        np.linalg.cholesky(claimed), information.pose_by_deviation[rows], lower=True))
+
+
+# -- Tracked parameters, applied in small steps ---------------------------------------------
+
+# 1 sigma [s] below which an estimate is applied.
+_APPLIED_SIGMA = 2e-3
+# Largest changes of the applied values [s per pair].
+_OFFSET_STEP, _READOUT_STEP = 1e-3, 5e-4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracked:
+    """Parameters as estimated after the pairs so far."""
+
+    gyro_bias: Array   # (3,) [rad/s], IMU frame; the whole bias, not its deviation
+    gyro_bias_sigma: Array
+    time_offset: float   # [s] IMU clock minus camera clock, as the parameter of this name
+    time_offset_sigma: float
+    readout_time: float   # [s] as the parameter; negative where rows are read the other way
+    readout_time_sigma: float
+    pairs: int
+
+    @classmethod
+    def of(cls, estimated: Calibration, configured: Configured) -> Tracked:
+        """Absolute values: configured plus estimated deviation.
+
+        The offset is the one that is consistent at the middle row, with the active readout time.
+        """
+        along = np.zeros(len(estimated.c))
+        along[OFFSET], along[READOUT] = 1.0, recursion.middle_share(configured.camera)
+        offset = configured.sensor.time_offset + float(along @ estimated.c)
+        signed = configured.camera.line_delay * configured.camera.height   # active
+        readout = signed - configured.active[READOUT] + estimated.c[READOUT]
+        return cls(configured.gyro_bias + estimated.c[BIAS], estimated.sigma[BIAS],
+                   offset - along[READOUT] * float(configured.active[READOUT]),
+                   math.sqrt(float(along @ estimated.covariance @ along)),
+                   float(readout) * configured.direction, float(estimated.sigma[READOUT]),
+                   estimated.pairs)
+
+
+@dataclass(frozen=True, slots=True)
+class Applied:
+    """Deviations applied to the next frames, in addition to the parameters."""
+
+    time_offset: float = 0.0   # [s]
+    readout_time: float = 0.0   # [s]
+    # [s] before the first and after the last configured row that the IMU must cover, too: a
+    # longer readout time is applied to an earlier keyframe.
+    margin: float = 0.0
+
+    def moved(self, estimated: Tracked, sensor: SensorConfig) -> Applied:
+        """One step towards the estimate, or back to zero if the parameter is not tracked."""
+        offset = readout = 0.0
+        if sensor.track_time_offset:
+            known = estimated.time_offset_sigma < _APPLIED_SIGMA
+            offset = estimated.time_offset - sensor.time_offset if known else self.time_offset
+        if sensor.track_readout_time:
+            configured = sensor.readout_time or 0.0
+            known = estimated.readout_time_sigma < _APPLIED_SIGMA
+            readout = max(estimated.readout_time, 0.0) - configured if known else self.readout_time
+        # At most the rows that the frames so far cover.
+        readout = min(self.margin, _stepped(self.readout_time, readout, findings.LARGEST_READOUT,
+                                            _READOUT_STEP))
+        ahead = _READOUT_STEP if sensor.track_readout_time else 0.0
+        return Applied(_stepped(self.time_offset, offset, findings.LARGEST_OFFSET, _OFFSET_STEP),
+                       readout, max(readout + ahead, 0.0))
+
+
+def _stepped(value: float, target: float, largest: float, step: float) -> float:
+    target = min(max(target, -largest), largest)
+    return value + min(max(target - value, -step), step)

@@ -1,0 +1,377 @@
+"""Frames and pairs of them: the camera model, rays, the measurements of a pair, its result.
+
+The same functions serve keyframe pairs, whose corners were tracked (`pipeline.py`), and chosen
+frames at any interval (`chosen_pairs.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+import math
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.config.settings import ImuConfig, KeyframeConfig, Parameters
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.estimator import velocity
+from rs_relpose_ros.estimator.estimate import estimate_relative_pose
+from rs_relpose_ros.estimator.frames_between import IntermediateFrame
+from rs_relpose_ros.estimator.problem import build_problem
+from rs_relpose_ros.estimator.result import Landmarks, landmarks, RelativePose, Status
+from rs_relpose_ros.geometry.camera import Intrinsics
+from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
+from rs_relpose_ros.geometry.so3 import aligning_rotation, cross, median, norm, rotated
+from rs_relpose_ros.geometry.timing import seconds_between, Sensor, to_nanoseconds
+from rs_relpose_ros.imu import integration
+from rs_relpose_ros.imu.integration import FrameImu, GyroSegment
+from rs_relpose_ros.jit import kernel
+from rs_relpose_ros.pipeline.findings import Assessment, NOT_EVALUATED
+from rs_relpose_ros.pipeline.monitor import Applied, Tracked
+from rs_relpose_ros.tracking.features import Matches
+from rs_relpose_ros.tracking.images import EncodedImage, is_dark
+
+Array = NDArray[np.float64]
+
+
+Result = TypeVar('Result')
+
+
+# -- Frames ------------------------------------------------------------------------------------
+
+@dataclass(slots=True, eq=False)
+class Frame(Generic[Result]):
+    """A decoded image with its IMU data, and, once it has been processed, the result.
+
+    Raises InputError if the image does not have the size of the intrinsics.
+    """
+
+    stamp_ns: int   # of the header
+    image: NDArray[Any]   # (H, W) gray, as published: not rectified, not resized
+    frame_id: str
+    intrinsics: Intrinsics
+    imu_data: FrameImu | None = None
+    # For derotated images, whose `image` is (H, W) or (H, W, C) in its own encoding.
+    encoding: str = 'mono8'
+    encoded: EncodedImage | None = None
+    restart: bool = False   # time jumped since the frame before: tracks belong to another time
+    # On the monotonic clock, 0 offline: arrival of the image or of the IMU sample behind its last
+    # row, the later of the two; begin of the decoding.
+    ready_ns: int = 0
+    taken_ns: int = 0
+    seconds: float = 0.0   # wall time of the processing
+    result: Result | None = None
+
+    def __post_init__(self) -> None:
+        if self.encoded is None and (self.image.dtype != np.uint8 or self.image.ndim != 2):
+            raise InputError('image must be (H, W) of uint8, '
+                             f'got {self.image.shape} of {self.image.dtype}')
+        height, width = self.image.shape[:2]
+        expected = self.intrinsics.image_height, self.intrinsics.image_width
+        if (height, width) != expected:
+            raise InputError(
+                f'image is {width}x{height}, but its CameraInfo is for '
+                f'{expected[1]}x{expected[0]}: publish a CameraInfo of the same size (region of '
+                'interest and binning included)')
+
+    @property
+    def imu(self) -> FrameImu:
+        """Its IMU data; InputError if there are none yet."""
+        if self.imu_data is None:
+            raise InputError('the frame has no IMU data yet: see view_frame')
+        return self.imu_data
+
+
+# -- Pairs ---------------------------------------------------------------------------------
+
+def is_keyframe(config: KeyframeConfig, *, parallax: float, interval: float, frames: int,
+                tracked_fraction: float) -> bool:
+    """Whether the current frame creates a keyframe pair: enough parallax, or time is up.
+
+    Since the reference keyframe: median parallax of the matches after derotation [px], interval
+    [s], number of frames, and share of the keyframe's features that are still tracked.
+    """
+    return (parallax >= config.min_keyframe_parallax
+            or tracked_fraction < config.min_tracked_fraction
+            or interval >= config.max_keyframe_interval
+            or frames >= config.max_keyframe_frames)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairResult:
+    """Estimate of one keyframe pair with its matches."""
+
+    # Of the reference keyframe's and the current image's pose rows, on the camera's clock: their
+    # header stamps, or those of their middle rows (`pose_row`).
+    reference_stamp_ns: int
+    stamp_ns: int
+    reference_ns1: int   # the same times on the IMU clock
+    reference_ns2: int
+    frame_id: str   # of the current image
+    interval: float   # [s] between the two reference times
+    pose: RelativePose   # its inliers are a mask over `matches`
+    matches: Matches   # pixels of the published images
+    row_times1: Array   # (N,) [s] from the stamped row
+    row_times2: Array
+    rays1: Array   # (N, 3) unit, derotated by the gyro to the stamped row
+    rays2: Array
+    parallax: float   # [px] median after derotation
+    landmarks: Landmarks | None = None   # of the matches; None without a pose
+    gyro_rotation: Array | None = None   # (3, 3) R_1^T R_2 integrated from the gyro
+    # (3,) [rad] rotation by the images alone against the gyro's; None without either
+    images_against_gyro: Array | None = None
+    health: Assessment = NOT_EVALUATED   # this, tracked and applied: as after this pair
+    tracked: Tracked | None = None
+    applied: Applied = field(default_factory=Applied)
+    gyro_bias: Array | None = None   # (3,) [rad/s] that was removed, IMU frame
+    image1: NDArray[np.uint8] | None = None   # both only if the front end keeps images
+    image2: NDArray[np.uint8] | None = None
+
+    @property
+    def inlier_ratio(self) -> float:
+        """Share of the matches that are inliers; 0 without matches."""
+        inliers = np.count_nonzero(self.pose.inliers)
+        return inliers / len(self.matches) if len(self.matches) else 0.0
+
+    @property
+    def gyro_difference(self) -> float:
+        """Angle between the rotations by gyro and by images alone [deg]; NaN without either."""
+        if self.images_against_gyro is None:
+            return math.nan
+        return math.degrees(float(np.linalg.norm(self.images_against_gyro)))
+
+
+class PairMetric(NamedTuple):
+    """A published field of every pair; NaN is shown as an empty text."""
+
+    name: str   # with the unit; the key on /diagnostics and among the medians of summary.json
+    of: Callable[[PairResult], float]
+    digits: int   # after the point, on /diagnostics
+
+    def text(self, pair: PairResult | None) -> str:
+        """As on /diagnostics."""
+        value = math.nan if pair is None else self.of(pair)
+        return '' if math.isnan(value) else f'{value:.{self.digits}f}'
+
+
+# The one list for topics, /diagnostics and files.
+PAIR_METRICS = (
+    PairMetric('matches', lambda pair: len(pair.matches), 0),
+    PairMetric('inliers', lambda pair: int(np.count_nonzero(pair.pose.inliers)), 0),
+    PairMetric('inlier_ratio', lambda pair: pair.inlier_ratio, 3),
+    PairMetric('parallax_px', lambda pair: pair.parallax, 1),
+    PairMetric('residual_rms_px', lambda pair: pair.pose.residual_rms, 2),
+    PairMetric('pixel_sigma_px', lambda pair: pair.pose.pixel_sigma, 3),
+    PairMetric('interval_s', lambda pair: pair.interval, 3),
+    PairMetric('rotation_difference_to_gyro_deg', lambda pair: pair.gyro_difference, 3),
+)
+
+
+# -- Rays of tracked points -----------------------------------------------------------------
+
+Ids = NDArray[np.uint32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DerotatedRays:
+    """Points of one image with their derotated rays."""
+
+    track_ids: Ids   # (N,)
+    points: Array   # (N, 2) pixels of the published image
+    rays: Array   # (N, 3) unit, in the camera frame of the stamped row
+    row_times: Array   # (N,) [s] from the stamped row
+
+    @classmethod
+    def from_points(cls, track_ids: Ids, points: Array, sensor: Sensor,
+                    motion: FrameMotion) -> DerotatedRays:
+        """Rays of points (N, 2) of a published image."""
+        return cls(track_ids, points, *sensor.derotated(points, motion))
+
+    def of(self, track_ids: Ids) -> DerotatedRays | None:
+        """Those of some of the tracks, in the same order; None if one is missing."""
+        rows = _positions(self.track_ids, track_ids)
+        if len(rows) < len(track_ids):
+            return None
+        if len(rows) == len(self.track_ids):
+            return self
+        return DerotatedRays(self.track_ids[rows], self.points[rows], self.rays[rows],
+                             self.row_times[rows])
+
+
+@kernel
+def _positions(ids: Ids, wanted: Ids) -> NDArray[np.int64]:
+    """Positions of `wanted` among the ids, up to the first one that is not there in order."""
+    found = np.empty(len(wanted), dtype=np.int64)
+    k = 0
+    for i in range(len(wanted)):
+        while k < len(ids) and ids[k] != wanted[i]:
+            k += 1
+        if k == len(ids):
+            return found[:i]
+        found[i] = k
+        k += 1
+    return found
+
+
+@kernel
+def median_parallax(rays1: Array, rays2: Array, rotation: Array) -> float:
+    """Median of ``|f_1 x R f_2|`` [about rad] of unit rays (N, 3), ``R = R_1^T R_2`` (3, 3).
+
+    Rays of NaN do not count; 0 if there are no others.
+    """
+    values = np.empty(len(rays1))
+    count = 0
+    for i in range(len(rays1)):
+        value = norm(cross(rays1[i], rotated(rotation, rays2[i])))
+        if not math.isnan(value):
+            values[count] = value
+            count += 1
+    return median(values[:count]) if count else 0.0
+
+
+# -- Measurements of a pair, given to the estimator -----------------------------------------
+
+# Largest 1 sigma of the gravity direction that the estimator accepts [rad].
+_LARGEST_GRAVITY_SIGMA = 1.5
+_LACK_OF_MATCHES = (Status.TOO_FEW_MATCHES, Status.NO_CONSENSUS)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GyroRotation:
+    """``R_1^T R_2`` of two frames by the gyro, its covariance, and the integrated samples."""
+
+    rotation: Array
+    covariance: Array
+    segment: GyroSegment
+
+    @classmethod
+    def of(cls, imu: FrameImu, config: ImuConfig) -> GyroRotation:
+        """Rotation since the frame before, if there was no gap."""
+        segment = imu.since_previous
+        assert segment is not None
+        return cls(*integration.integrate_rotation(
+            segment.stamps_ns, segment.angular_velocities, config, segment.bias_sigma), segment)
+
+
+def interval_of(first: Frame[Any], second: Frame[Any]) -> float:
+    """Seconds between the stamped rows of two frames."""
+    return seconds_between(first.imu.reference_ns, second.imu.reference_ns)
+
+
+def joined(before: FrameImu, imu: FrameImu) -> FrameImu:
+    """IMU data of the second of two consecutive frames, with gyro and force since `before`'s."""
+    if before.since_previous is None or imu.since_previous is None:
+        return replace(imu, since_previous=None)
+    force = imu.force
+    if not isinstance(force, str):
+        force = before.force if isinstance(before.force, str) else replace(
+            force, since_previous=before.force.since_previous.joined(force.since_previous))
+    return replace(imu, since_previous=before.since_previous.joined(imu.since_previous),
+                   force=force)
+
+
+def inertial_of(first: Frame[Any], second: Frame[Any], gyro: GyroRotation | None, since: FrameImu,
+                parameters: Parameters) -> InertialMotion | str:
+    """Motion of a pair by the accelerometer, or the reason why it is not known.
+
+    `gyro` and the force of `since` extend from frame to frame.
+    """
+    if not parameters.pair.use_accelerometer:
+        return 'use_accelerometer is false'
+    if not parameters.pair.use_gyro_rotation:
+        # The gyro rotates the specific force.
+        return 'use_gyro_rotation is false'
+    if gyro is None:
+        return 'the gyro has a gap'
+    if isinstance(since.force, str):
+        return since.force
+    return integration.inertial_motion(gyro.segment, since.force.since_previous, first.imu,
+                                       second.imu, parameters.imu)
+
+
+def estimate_pair(first: Frame[Any], second: Frame[Any], matches: Matches, sensor: Sensor,
+                  gyro: GyroRotation | None, inertial: InertialMotion | str,
+                  parameters: Parameters, *, interval: float | None, stamp_sigma: float = 0.0,
+                  between: Sequence[IntermediateFrame] = ()) -> RelativePose:
+    """The relative pose of two frames from all that is known of them.
+
+    `interval` [s]: None if it does not constrain the velocities.
+    `stamp_sigma` [s]: scatter of the stamps, used if it is larger than the parameter.
+    `between`: the frames between the two.
+    """
+    configured = gyro if parameters.pair.use_gyro_rotation else None
+    motion1, motion2, gravity_sigma = _with_gravity(first.imu, second.imu, parameters)
+    pose = estimate_relative_pose(
+        sensor.intrinsics.to_sensor(matches.points1), sensor.intrinsics.to_sensor(matches.points2),
+        sensor.camera, motion1, motion2,
+        relative_rotation=None if configured is None else configured.rotation,
+        relative_rotation_covariance=None if configured is None else configured.covariance,
+        interval=interval,
+        config=replace(parameters.estimator, gravity_sigma=gravity_sigma, stamp_sigma=max(
+            parameters.estimator.stamp_sigma, stamp_sigma)),
+        quality=matches.quality,
+        inertial=None if isinstance(inertial, str) else inertial,
+        between=() if configured is None or interval is None else between,
+        rng=np.random.default_rng([parameters.pair.seed, first.stamp_ns, second.stamp_ns]))
+    if isinstance(inertial, str):
+        pose = pose.without_baseline(f'baseline not known: {inertial}')
+    if pose.status in _LACK_OF_MATCHES and is_dark(second.image):
+        pose = replace(pose, reason=f'the image is dark: {pose.reason}')
+    return pose
+
+
+def evidence_without(pose: RelativePose, first: Frame[Any], second: Frame[Any], sensor: Sensor,
+                     gyro: GyroRotation, inertial: InertialMotion,
+                     parameters: Parameters) -> velocity.InertialEvidence | None:
+    """Consistency of the images with an acceleration that was not used; None if not known."""
+    if pose.images is None:
+        return None
+    nothing, interval = np.empty((0, 2)), interval_of(first, second)
+    problem = build_problem(nothing, nothing, sensor.camera, first.imu.motion, second.imu.motion,
+                            gyro.rotation, gyro.covariance)
+    motion = parameters.estimator.motion
+    expected, _ = velocity.expected_velocities(problem, motion, interval, inertial)
+    return velocity.inertial_evidence(problem, pose.images, motion, interval, expected)
+
+
+def parallax_of(rays1: DerotatedRays, rays2: DerotatedRays, gyro: GyroRotation | None,
+                sensor: Sensor) -> float:
+    """Median parallax [px] of matched rays after derotation."""
+    rotation = aligning_rotation(rays1.rays.T @ rays2.rays) if gyro is None else gyro.rotation
+    return sensor.camera.fx * median_parallax(rays1.rays, rays2.rays, rotation)
+
+
+def pair_result(first: Frame[Any], second: Frame[Any], matches: Matches, rays1: DerotatedRays,
+                rays2: DerotatedRays, pose: RelativePose, gyro: GyroRotation | None,
+                sensor: Sensor, parameters: Parameters) -> PairResult:
+    """The pair with its pose and the values derived from it."""
+    later_ns, points = to_nanoseconds(sensor.pose_row_delay), None
+    if pose:
+        points = landmarks(pose, rays1.rays, rays2.rays, rays1.row_times, rays2.row_times,
+                           sensor.camera)
+        to_image = sensor.intrinsics.to_image   # pixels of the published images
+        points = points._replace(pixels1=to_image(points.pixels1),
+                                 pixels2=to_image(points.pixels2))
+    return PairResult(
+        reference_stamp_ns=first.stamp_ns + later_ns,
+        stamp_ns=second.stamp_ns + later_ns,
+        reference_ns1=first.imu.reference_ns, reference_ns2=second.imu.reference_ns,
+        frame_id=second.frame_id, interval=interval_of(first, second), pose=pose,
+        matches=matches, row_times1=rays1.row_times, row_times2=rays2.row_times,
+        rays1=rays1.rays, rays2=rays2.rays, parallax=parallax_of(rays1, rays2, gyro, sensor),
+        landmarks=points,
+        gyro_rotation=None if gyro is None else gyro.rotation,
+        gyro_bias=None if gyro is None else parameters.sensor.R_cam_imu.T @ gyro.segment.bias)
+
+
+def _with_gravity(imu1: FrameImu, imu2: FrameImu,
+                  parameters: Parameters) -> tuple[FrameMotion, FrameMotion, float]:
+    """Motions with gravity, both or none, and the sigma of gravity for the estimator."""
+    sigma1, sigma2 = imu1.gravity_sigma, imu2.gravity_sigma
+    configured = parameters.estimator.gravity_sigma
+    if not parameters.pair.use_gravity or sigma1 is None or sigma2 is None:
+        return replace(imu1.motion, gravity=None), replace(imu2.motion, gravity=None), configured
+    # One sigma for both frames: that of the filter where it is larger than the parameter.
+    return imu1.motion, imu2.motion, min(max(configured, sigma1, sigma2), _LARGEST_GRAVITY_SIGMA)

@@ -1,0 +1,346 @@
+"""The loop over frames, and the pipeline that tracks them and estimates keyframe pairs."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+import time
+from typing import Any, Generic
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.config.settings import Parameters, sensor_model
+from rs_relpose_ros.errors import MissingInputError, RsRelposeError
+from rs_relpose_ros.estimator.result import RelativePose
+from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
+from rs_relpose_ros.geometry.so3 import log_so3
+from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, Sensor
+from rs_relpose_ros.imu.integration import FrameImu, rotation_sensitivity
+from rs_relpose_ros.pipeline import findings, pair
+from rs_relpose_ros.pipeline.assessment import Configured
+from rs_relpose_ros.pipeline.between import TrackHistory
+from rs_relpose_ros.pipeline.monitor import Applied, ConsistencyMonitor, suppressed, Tracked
+from rs_relpose_ros.pipeline.pair import DerotatedRays, Frame, GyroRotation, PairResult, Result
+from rs_relpose_ros.pipeline.recursion import PairData
+from rs_relpose_ros.pipeline.rotations import rotation_of_rays
+from rs_relpose_ros.pipeline.sequencer import FrameRefused, SCATTER_FRAMES, Sequencer, stamp_sigma
+from rs_relpose_ros.tracking.features import make_tracker, Matches, Tracker
+
+Array = NDArray[np.float64]
+
+# Number of points, of the longest tracks, and of frames over which the rotation of the images is
+# compared with the gyro.
+_ROTATION_POINTS, _ROTATION_FRAMES = 120, 3
+# Reason for a pair without the accelerometer.
+_CONTRADICTED = 'images and accelerometer contradict each other (see health)'
+
+
+@dataclass(slots=True, eq=False)
+class _RotationStart:
+    """An image that later ones are compared with, and the gyro's rotation since."""
+
+    stamp_ns: int
+    ids: NDArray[np.uint32]   # (N,) of tracks
+    rays: Array   # (N, 3) as measured
+    by_gyro: Array = field(default_factory=lambda: np.eye(3))
+    frames: int = 0
+
+
+class Processor(Generic[Result]):
+    """Works on frames in the order of their stamps, in one thread."""
+
+    applied = Applied()   # tracked corrections for the next frame
+
+    def prepare(self) -> None:
+        """Work ahead of the next frame; `process` does it if it has not been called."""
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Forget the frames so far."""
+
+    @abstractmethod
+    def process(self, frame: Frame[Any], parameters: Parameters) -> Result | None:
+        """Result of a frame, or None."""
+
+
+class Pipeline(Processor[PairResult]):
+    """Tracks frames against a reference keyframe and estimates the pose of each keyframe pair.
+
+    Parameters that may change while running (declared `live`) are not kept: `process` gets the
+    current ones with each frame. With `keep_images` results contain the two images. `tracker`:
+    instead of that of the parameters.
+    """
+
+    def __init__(self, parameters: Parameters, keep_images: bool = False,
+                 tracker: Tracker | None = None) -> None:
+        missing = parameters.sensor.missing()
+        if missing:
+            raise MissingInputError('parameters are missing: ' + ', '.join(missing))
+        self._keep_images = keep_images
+        self._tracker = make_tracker(parameters.tracking) if tracker is None else tracker
+        self._monitor = ConsistencyMonitor()
+        self._sensor: Sensor | None = None
+        self._readout = 0.0   # [s] of its camera, beyond the parameter
+        self._stamps_ns: deque[int] = deque(maxlen=SCATTER_FRAMES)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the reference keyframe: tracking restarts with the next frame."""
+        self._tracker.reset()
+        self._stamps_ns.clear()
+        self._reference: Frame[Any] | None = None
+        self._previous: Frame[Any] | None = None
+        self._since: FrameImu | None = None   # of the last frame, since the reference
+        self._frames = 0   # since the reference
+        self._reference_rays: DerotatedRays | None = None
+        self._current_rays: DerotatedRays | None = None
+        self._rotation: _RotationStart | None = None
+        self._promotion_due = False
+
+    def process(self, frame: Frame[Any], parameters: Parameters) -> PairResult | None:
+        """Track `frame`; the estimate of the keyframe pair that it creates, or None.
+
+        Frames come in the order of their stamps. Tracking restarts with a frame whose intrinsics
+        differ from the last one's, or that follows a gap of the gyro.
+        """
+        self.prepare()
+        sensor = sensor_model(frame.intrinsics, parameters.sensor, self.applied.readout_time)
+        if self._sensor is None or frame.intrinsics != self._sensor.intrinsics:
+            self.reset()
+            self._monitor = ConsistencyMonitor()
+        if sensor != self._sensor:
+            self._current_rays = None   # their row times are those of the camera before
+        self._sensor, self._readout, imu = sensor, self.applied.readout_time, frame.imu
+        self._stamps_ns.append(frame.stamp_ns)
+        reference, previous = self._reference, self._previous
+        # Without the gyro tracks are not predicted, and wrong ones that agree by chance pass.
+        if reference is None or previous is None or imu.since_previous is None:
+            self._tracker.start(frame.image)
+            self._restart_from(frame)
+            return None
+        self._frames += 1
+        rotation = GyroRotation.of(imu, parameters.imu).rotation
+        predicted = self._predicted(previous.imu.motion, imu.motion, rotation, sensor)
+        matches = self._tracker.track(frame.image, predicted, seconds_between(
+            previous.stamp_ns, frame.stamp_ns))
+        self._previous = frame
+        self._since = imu if self._since is None else pair.joined(self._since, imu)
+        gyro = GyroRotation.of(self._since, parameters.imu)
+        self._history.add(imu, gyro, matches)
+        rays1, rays2 = self._derotate(matches, reference.imu.motion, imu.motion, sensor)
+        keyframe = pair.is_keyframe(
+            parameters.keyframes, parallax=pair.parallax_of(rays1, rays2, gyro, sensor),
+            interval=pair.interval_of(reference, frame), frames=self._frames,
+            tracked_fraction=self._tracker.tracked_fraction)
+        self._compare_rotations(frame.stamp_ns, matches, rotation, sensor, keyframe)
+        if not keyframe:
+            return None
+        result = self._pair(reference, frame, gyro, sensor, parameters)
+        self._restart_from(frame)
+        self._promotion_due = True
+        return result
+
+    def prepare(self) -> None:
+        """Search new corners in a keyframe, after its pair is published."""
+        if self._promotion_due:
+            self._promotion_due = False
+            self._tracker.promote()
+
+    def _restart_from(self, frame: Frame[Any]) -> None:
+        self._reference = self._previous = frame
+        self._history = TrackHistory(frame.imu)
+        self._since = self._reference_rays = None
+        self._frames = 0
+
+    # -- rays and rotations --------------------------------------------------------------------
+
+    def _predicted(self, previous: FrameMotion, current: FrameMotion, rotation: Array,
+                   sensor: Sensor) -> Array | None:
+        """Predicted pixels (N, 2) of the tracker's points in the current image, by the gyro.
+
+        `rotation` (3, 3): ``R_1^T R_2`` since the previous image. None for a tracker without
+        points.
+        """
+        points = self._tracker.points
+        if not len(points):
+            return None
+        known = self._current_rays
+        if known is not None and np.array_equal(known.points, points):
+            rays, row_times = known.rays, known.row_times
+        else:
+            rays, row_times = sensor.derotated(points, previous)
+        # f_2 = R^T f_1 for R = R_1^T R_2, in rows.
+        return sensor.project(rays @ rotation, row_times, current)
+
+    def _derotate(self, matches: Matches, motion1: FrameMotion, motion2: FrameMotion,
+                  sensor: Sensor) -> tuple[DerotatedRays, DerotatedRays]:
+        """Rays of matches in the reference and in the current image, which are kept."""
+        # In the reference image points do not move: their rays are kept while they are tracked.
+        known = self._reference_rays
+        first = None if known is None else known.of(matches.track_ids)
+        if first is None:
+            first = DerotatedRays.from_points(matches.track_ids, matches.points1, sensor, motion1)
+        second = DerotatedRays.from_points(matches.track_ids, matches.points2, sensor, motion2)
+        self._reference_rays, self._current_rays = first, second
+        return first, second
+
+    def _compare_rotations(self, stamp_ns: int, matches: Matches, by_gyro: Array, sensor: Sensor,
+                           keyframe: bool) -> None:
+        """Compare the rotation of the images over some frames with that of the gyro.
+
+        `by_gyro` (3, 3): since the previous image.
+        """
+        before = self._rotation
+        if before is not None:
+            before.by_gyro, before.frames = before.by_gyro @ by_gyro, before.frames + 1
+            # If tracks are lost, pairs are created early, and few tracks live longer.
+            if not keyframe and before.frames < _ROTATION_FRAMES:
+                return
+        ids = matches.track_ids[:_ROTATION_POINTS]
+        rays = sensor.camera.unproject(
+            sensor.intrinsics.to_sensor(matches.points2[:_ROTATION_POINTS]))
+        if before is not None:
+            _, old, new = np.intersect1d(before.ids, ids, assume_unique=True, return_indices=True)
+            by_images = rotation_of_rays(before.rays[old], rays[new])
+            if by_images is not None:
+                self._monitor.rotations.add(stamp_ns, seconds_between(before.stamp_ns, stamp_ns),
+                                            by_images, log_so3(before.by_gyro))
+        self._rotation = _RotationStart(stamp_ns, ids, rays)
+
+    # -- one pair ----------------------------------------------------------------------------
+
+    def _pair(self, reference: Frame[Any], frame: Frame[Any], gyro: GyroRotation, sensor: Sensor,
+              parameters: Parameters) -> PairResult:
+        """The pair with its pose as assessed; updates the tracked corrections."""
+        matches, monitor = self._tracker.refined_matches(), self._monitor
+        pose = self._estimated(reference, frame, matches, gyro, sensor, parameters)
+        measurement, segment, to_sensor = None, gyro.segment, sensor.intrinsics.to_sensor
+        if np.isfinite(pose.R).all():
+            measurement = PairData(
+                to_sensor(matches.points1), to_sensor(matches.points2), sensor.camera,
+                reference.imu.motion, frame.imu.motion, pair.interval_of(reference, frame), pose.R,
+                pose.t, gyro.rotation, gyro.covariance, rotation_sensitivity(
+                    segment.stamps_ns, segment.angular_velocities, parameters.imu),
+                (segment.angular_velocities[0], segment.angular_velocities[-1]),
+                parameters.sensor.R_cam_imu, parameters.estimator.gyro_sigma)
+        bias, active = np.array(parameters.imu.gyro_bias), np.zeros(findings.DEVIATIONS)
+        configured = Configured(parameters.sensor, sensor.camera, bias,
+                                parameters.imu.gyro_bias_sigma, active)
+        active[findings.OFFSET] = frame.imu.applied_offset_ns / NANOSECONDS
+        active[findings.READOUT] = configured.direction * self._readout
+        active[findings.BIAS] = parameters.sensor.R_cam_imu.T @ segment.bias - bias
+        pose = monitor.add_pair(frame.stamp_ns, measurement, pose, configured)
+        tracked = Tracked.of(monitor.calibration, configured)
+        self.applied = self.applied.moved(tracked, parameters.sensor)
+        if parameters.pair.withhold_when_wrong:
+            pose = suppressed(pose, monitor.health)
+        rays1, rays2 = self._derotate(matches, reference.imu.motion, frame.imu.motion, sensor)
+        latest = monitor.latest
+        return replace(
+            pair.pair_result(reference, frame, matches, rays1, rays2, pose, gyro, sensor,
+                             parameters),
+            images_against_gyro=None if latest is None else latest.images_against_gyro,
+            health=monitor.health, tracked=tracked, applied=self.applied,
+            image1=reference.image if self._keep_images else None,
+            image2=frame.image if self._keep_images else None)
+
+    def _estimated(self, reference: Frame[Any], frame: Frame[Any], matches: Matches,
+                   gyro: GyroRotation, sensor: Sensor, parameters: Parameters) -> RelativePose:
+        """The pose, without the accelerometer if the images contradict it."""
+        since, history, sigma = self._since, self._history, stamp_sigma(self._stamps_ns)
+        assert since is not None
+
+        def estimate(inertial: InertialMotion | str) -> RelativePose:
+            return pair.estimate_pair(
+                reference, frame, matches, sensor, gyro, inertial, parameters,
+                interval=pair.interval_of(reference, frame), stamp_sigma=sigma,
+                between=history.between(matches, sensor, since, inertial))
+
+        inertial = pair.inertial_of(reference, frame, gyro, since, parameters)
+        if isinstance(inertial, str):
+            return estimate(inertial)
+        acceleration = self._monitor.acceleration
+        used = acceleration.uses(None)
+        pose = estimate(inertial if used else _CONTRADICTED)
+        evidence = pose.inertial_evidence if used else pair.evidence_without(
+            pose, reference, frame, sensor, gyro, inertial, parameters)
+        if evidence is not None:
+            self._monitor.add_acceleration(frame.stamp_ns, evidence)
+            if used and not acceleration.uses(evidence):
+                pose = estimate(_CONTRADICTED)
+        return pose
+
+
+# -- The loop over frames -------------------------------------------------------------------------
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameFailed:
+    """A frame with an error in its processing: the processor restarts with the next one."""
+
+    stamp_ns: int | None   # None if no frame had been taken yet
+    error: Exception   # of the package (`RsRelposeError`), or, live, a programming error
+
+    @property
+    def reason(self) -> str:
+        """Message of the error."""
+        return str(self.error)
+
+
+Outcome = Frame[Result] | FrameRefused | FrameFailed
+
+
+class FrameLoop(Generic[Result]):
+    """Takes frames from its sequencer and lets a processor work on them.
+
+    Nodes, replay and warm-up fill `sequencer`, from any thread, and call `step`, from one.
+    `parameters` may be replaced from any thread and are active from the next step on: no object
+    called by `step` keeps a value that may change while running. `offline`, `colors` and `clock`
+    are those of `Sequencer`. Offline, programming errors leave `step`; live they are an outcome.
+    """
+
+    def __init__(self, parameters: Parameters, processor: Processor[Result], *,
+                 offline: bool = False, colors: bool = False,
+                 clock: Callable[[], int] = time.monotonic_ns) -> None:
+        self.parameters = parameters
+        self.sequencer = Sequencer(parameters, offline=offline, colors=colors, clock=clock)
+        self._processor = processor
+        self._offline = offline
+
+    def step(self, timeout: float = 0.0) -> Outcome[Result] | None:
+        """The next frame with its result; None if none is ready within `timeout` seconds."""
+        stamp_ns: int | None = None
+        processor = self._processor
+        try:
+            if not self._offline:
+                # The result of the step before is published: no subscriber waits meanwhile.
+                processor.prepare()
+            frame = self.sequencer.take(timeout)
+            if not isinstance(frame, Frame):
+                return frame
+            stamp_ns = frame.stamp_ns
+            if frame.restart:
+                processor.reset()
+            started = time.perf_counter()
+            frame.result = processor.process(frame, self.parameters)
+            frame.seconds = time.perf_counter() - started
+            # Between two frames, so that the offset of a frame depends only on those before it.
+            self.sequencer.apply(processor.applied)
+            return frame
+        except Exception as error:
+            processor.reset()
+            if self._offline and not isinstance(error, RsRelposeError):
+                raise
+            return FrameFailed(stamp_ns, error)
+
+
+class FrontEnd(FrameLoop[PairResult]):
+    """The loop that makes keyframe pairs; arguments as of `FrameLoop` and `Pipeline`."""
+
+    def __init__(self, parameters: Parameters, *, offline: bool = False,
+                 keep_images: bool = False, tracker: Tracker | None = None,
+                 clock: Callable[[], int] = time.monotonic_ns) -> None:
+        super().__init__(parameters, Pipeline(parameters, keep_images, tracker), offline=offline,
+                         clock=clock)

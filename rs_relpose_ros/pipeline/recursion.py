@@ -1,0 +1,435 @@
+"""Recursive calibration from frame pairs, the unknowns of each pair eliminated.
+
+Residuals r of a pair (Sampson errors of the matches, the gyro's rotation, priors of velocities
+and rates) depend on its state x and on the deviations c of `findings`::
+
+    r + J_x dx + J_c dc,    H = J_x^T W J_x,    C = J_x^T W J_c
+    S = J_c^T W J_c - C^T H^-1 C,    b = C^T H^-1 J_x^T W r - J_c^T W r
+
+(Schur complement), so that ``sum S c = sum b`` over many pairs is the calibration that fits all.
+Deviations shift the pose by ``dx = -H^-1 C c``. Over the pairs of the last seconds
+``(sum S_p + P^-1) c = sum b_p`` with a wide prior P, so that deviations that are not observable
+stay zero, with their prior sigma. The inverse Hessian is widened by the misfit of the scores
+``g_p = b_p - S_p c`` of the pairs (sandwich; White, Econometrica 1982), axis by axis: about the
+solution, since about zero they contain the very deviation to be estimated.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from rs_relpose_ros.estimator import priors
+from rs_relpose_ros.estimator.fit import FitMatches, gauss_newton
+from rs_relpose_ros.estimator.priors import inverse, PARAMETERS, TANGENT, THETA, TwoViewState
+from rs_relpose_ros.estimator.problem import build_problem, observed, TwoViewProblem
+from rs_relpose_ros.estimator.sampson import jacobian, residuals
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.motion import FrameMotion
+from rs_relpose_ros.geometry.so3 import exp_so3, log_so3, median, skew, tangent_basis
+from rs_relpose_ros.geometry.timing import to_nanoseconds
+from rs_relpose_ros.imu.integration import RotationSensitivity
+from rs_relpose_ros.jit import kernel
+from rs_relpose_ros.pipeline.findings import (
+    AXES,
+    BIAS,
+    DEVIATIONS,
+    FOCAL,
+    OFFSET,
+    READOUT,
+    SCALE,
+)
+
+Array = NDArray[np.float64]
+
+# Sigma of the velocities about the mean one [baselines per second].
+_VELOCITY_SIGMA = 1.0
+# Residuals of this many sigmas have half the weight of small ones (Cauchy).
+_CAUCHY_SIGMAS = 2.4
+# Least noise of matches [px], and of the gyro's rotation between two frames [rad].
+_LEAST_SIGMA = 0.05
+_LEAST_ROTATION_SIGMA = 1e-5
+# Largest number of matches, evenly over those of the pair: more add cost and little information.
+_MOST_MATCHES = 120
+# Step of numerical derivatives: far below the noise of a residual, far above rounding.
+_STEP = 1e-5
+# Steps of a new fit of a pair.
+_NEW_STEPS = 3
+# Of a state: rotation and direction of translation.
+_POSE = np.r_[THETA:THETA + 3, TANGENT:TANGENT + 2]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairData:
+    """Matches and motion of one pair, as configured, and the pose estimated from them."""
+
+    points1: Array   # (N, 2) pixels of the sensor
+    points2: Array
+    camera: RollingShutterCamera
+    motion1: FrameMotion   # about the stamped row
+    motion2: FrameMotion
+    interval: float   # [s]
+    R: Array   # (3, 3) as estimated, between the stamped rows
+    t: Array   # (3,) NaN where there is none
+    gyro_rotation: Array   # (3, 3) between the stamped rows
+    gyro_covariance: Array   # (3, 3) of that, as in the estimate
+    gyro_sensitivity: RotationSensitivity   # of that
+    rates: tuple[Array, Array]   # (3,) at the two stamped rows [rad/s]
+    R_cam_imu: Array
+    gyro_sigma: float   # [rad/s] of the rate within a frame
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairInformation:
+    """Information of a pair on the calibration."""
+
+    S: Array   # (11, 11)
+    b: Array   # (11,)
+    pose_by_deviation: Array   # (6, 11) of (dt, dtheta) in camera 1, first order
+    # (5, 11) the same in sigmas of a correctly configured pose, whitened; rotation in the first 3.
+    shift_by_deviation: Array
+    images_against_gyro: Array   # (3,) [rad] Log of the rotation by images alone and R_gyro^T
+
+
+def pair_information(pair: PairData, active: Array, about: Array) -> PairInformation | None:
+    """Information of a pair, linearised about the deviations `about` (11,).
+
+    The deviations `active` (11,) are applied to the data of the pair already. About others the
+    pair is fitted again, since its estimate followed the active ones. None if there are too few
+    matches.
+    """
+    at, step = about - active, math.ceil(len(pair.points1) / _MOST_MATCHES) or 1
+    pair = replace(pair, camera=_lens(pair.camera, *at[FOCAL:]),
+                   points1=pair.points1[::step], points2=pair.points2[::step])
+    noise = pair.gyro_sensitivity.noise + _LEAST_ROTATION_SIGMA**2 * np.eye(3)
+    problem = build_problem(pair.points1, pair.points2, pair.camera, pair.motion1, pair.motion2,
+                            pair.gyro_rotation, noise)
+    keep = problem.valid
+    if np.count_nonzero(keep) < PARAMETERS:
+        return None
+    assert problem.rotation is not None and problem.rotation_information is not None
+    observations = np.ascontiguousarray(problem.observations[keep])
+    D, rows = _gyro(pair), _Rows.of(pair, problem, keep)
+    rotation, information = problem.rotation, problem.rotation_information
+    state = _state(pair, problem, observations)
+    if at.any():
+        rotation = exp_so3(D @ at) @ rotation
+        observations = rows.displaced(observations, at)
+    prior = priors.Priors(np.zeros(3), np.zeros(3), 0.0, 0.0, pair.gyro_sigma**-2,
+                          np.ascontiguousarray(rotation), information,
+                          priors.isotropic(_VELOCITY_SIGMA, 1.0 / pair.interval))
+    # Without a translation there is no estimate about which a pair could be linearised.
+    if at.any() or not np.isfinite(pair.t).all():
+        r = np.abs(residuals(observations, state))
+        state = gauss_newton(FitMatches(observations, (r < 4.0 * np.median(r)).astype(float),
+                                        _noise(r)), state, prior, _NEW_STEPS)
+    r = residuals(observations, state)
+    sigma = _noise(r)
+    weights = 1.0 / (1.0 + (r / (_CAUCHY_SIGMAS * sigma)) ** 2) / sigma**2
+    J_x = jacobian(observations, state)
+    J_c = np.hstack([rows.derivatives(observations, state, r),
+                     _by_lens(pair, problem, rows, keep, at, state, r)])
+    # The gyro's rotation: theta = Log(R R_gyro^T), which R_gyro rotated by D c makes smaller.
+    theta = log_so3(np.ascontiguousarray(state.R @ rotation.T))
+    H, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
+    priors.add_priors(state, prior, H, gradient)
+    weighted = J_x.T * weights
+    H += weighted @ J_x
+    gradient += weighted @ r
+    C = weighted @ J_c
+    C[THETA:THETA + 3] -= information @ D
+    solved = inverse(H) @ np.column_stack([C, gradient])
+    S = (J_c.T * weights) @ J_c + D.T @ information @ D - C.T @ solved[:, :-1]
+    b = C.T @ solved[:, -1] - (J_c.T * weights) @ r + D.T @ (information @ theta)
+    S = 0.5 * (S + S.T)
+    shifts = _shifts(pair, problem, state, H.copy(), C, D)
+    # The rotation by the images: the step without the gyro's prior.
+    H[THETA:THETA + 3, THETA:THETA + 3] -= information
+    gradient[THETA:THETA + 3] -= information @ theta
+    rotation_step = np.asarray(-(inverse(H) @ gradient)[THETA:THETA + 3])
+    return PairInformation(S, b + S @ about, *shifts, theta + rotation_step)
+
+
+def _shifts(pair: PairData, problem: TwoViewProblem, state: TwoViewState, H: Array, C: Array,
+            D: Array) -> tuple[Array, Array]:
+    """Shift of the estimated pose by deviations, (6, 11), and whitened, (5, 11).
+
+    With the prior of the estimate for the gyro's rotation; H and C are changed.
+    """
+    assert problem.rotation_information is not None
+    prior_information = np.linalg.inv(pair.gyro_covariance)
+    H[THETA:THETA + 3, THETA:THETA + 3] += prior_information - problem.rotation_information
+    C[THETA:THETA + 3] += (problem.rotation_information - prior_information) @ D
+    covariance = inverse(H)
+    moved = _at_stamped_row(pair, problem, state, -covariance @ C)
+    spread = np.linalg.cholesky(covariance[_POSE[:, None], _POSE])
+    # In the axes of the stamped row.
+    to_stamped = problem.motion1.rotations([problem.reference_row_time])[0].T
+    by_deviation = np.vstack([to_stamped @ tangent_basis(state.t) @ moved[TANGENT:TANGENT + 2],
+                              to_stamped @ moved[THETA:THETA + 3]])
+    return by_deviation, solve_triangular(spread, moved[_POSE], lower=True)
+
+
+def _noise(r: Array) -> float:
+    """Sigma of the matches [px] from their residuals."""
+    return max(1.4826 * median(np.abs(r)), _LEAST_SIGMA)
+
+
+def _state(pair: PairData, problem: TwoViewProblem, observations: Array) -> TwoViewState:
+    """The estimate at the middle rows, at constant velocity."""
+    delay = problem.reference_row_time
+    R = np.ascontiguousarray(problem.motion1.rotations([delay])[0] @ pair.R
+                             @ problem.motion2.rotations([delay])[0].T)
+    t = pair.t
+    if not np.isfinite(t).all():
+        # The direction nearest to all epipolar planes.
+        normals = np.cross(observations[:, :3], observations[:, 9:12] @ R.T)
+        t = np.ascontiguousarray(np.linalg.eigh(normals.T @ normals)[1][:, 0])
+    velocity = t / pair.interval
+    return TwoViewState(R, t, velocity, velocity.copy(), np.zeros(3), np.zeros(3))
+
+
+def _at_stamped_row(pair: PairData, problem: TwoViewProblem, state: TwoViewState,
+                    moved: Array) -> Array:
+    """Moved states (17, 11) at the middle row, with its movement relative to the stamped row.
+
+    A longer readout time delays the middle row, by D = share c, but not the stamped one:
+    ``t = Exp(w_1 D) t_middle, R = Exp(w_1 D) R_middle Exp(w_2 D)^T``; w in middle-row axes.
+    """
+    to_middle = problem.motion1.rotations([problem.reference_row_time])[0]
+    share, rate1 = middle_share(pair.camera), to_middle @ pair.rates[0]
+    rate2 = to_middle @ (pair.gyro_rotation @ pair.rates[1])
+    moved = moved.copy()
+    moved[TANGENT:TANGENT + 2, READOUT] += share * (tangent_basis(state.t).T @ skew(rate1)
+                                                    @ state.t)
+    moved[THETA:THETA + 3, READOUT] += share * (rate1 - rate2)
+    return moved
+
+
+def _lens(camera: RollingShutterCamera, focal: float, distortion: float) -> RollingShutterCamera:
+    """The camera with deviations of FOCAL and DISTORTION."""
+    if not (focal or distortion):
+        return camera
+    coefficients = list(camera.distortion) or [0.0] * 4
+    coefficients[0] += distortion
+    return replace(camera, fx=camera.fx / (1.0 + focal), fy=camera.fy / (1.0 + focal),
+                   distortion=tuple(coefficients) if any(coefficients) else camera.distortion)
+
+
+def _gyro(pair: PairData) -> Array:
+    """Left derivative (3, 11) of the gyro's rotation between the middle rows, by deviations."""
+    D = np.zeros((3, DEVIATIONS))
+    D[:, AXES] = np.eye(3) - pair.gyro_rotation
+    D[:, OFFSET] = pair.gyro_rotation @ pair.rates[1] - pair.rates[0]
+    D[:, READOUT] = middle_share(pair.camera) * D[:, OFFSET]
+    D[:, BIAS] = -pair.gyro_sensitivity.by_rate @ pair.R_cam_imu
+    D[:, SCALE] = pair.gyro_sensitivity.by_scale
+    return D
+
+
+def _by_lens(pair: PairData, problem: TwoViewProblem, rows: _Rows, keep: NDArray[np.bool_],
+             at: Array, state: TwoViewState, r: Array) -> Array:
+    """Derivatives (N, 2) of the residuals by FOCAL and by DISTORTION.
+
+    Rays and their derivatives by the pixel change together: with smaller rays alone, residuals in
+    pixels would shrink with a longer focal length.
+    """
+    columns, points1, points2 = [], pair.points1[keep], pair.points2[keep]
+    for focal, distortion in ((_STEP, 0.0), (0.0, _STEP)):
+        observations = observed(
+            points1, points2, _lens(pair.camera, focal, distortion), problem.motion1,
+            problem.motion2)
+        if at.any():
+            observations = rows.displaced(observations, at)
+        columns.append((residuals(observations, state) - r) / _STEP)
+    return np.stack(columns, axis=1)
+
+
+class _Rows(NamedTuple):
+    """Derivatives of observations within a frame by deviations."""
+
+    turns: Array   # (2, N, 3, 9) of a ray from its row to the middle one, on its left
+    shares: Array   # (2, N) signed share of the readout after the middle row
+
+    @classmethod
+    def of(cls, pair: PairData, problem: TwoViewProblem, keep: NDArray[np.bool_]) -> _Rows:
+        camera, n = pair.camera, np.count_nonzero(keep)
+        turns, shares = np.empty((2, n, 3, FOCAL)), np.empty((2, n))
+        for k, (points, motion) in enumerate(((pair.points1, problem.motion1),
+                                              (pair.points2, problem.motion2))):
+            shares[k] = (points[keep, 1] - 0.5 * (camera.height - 1)) / camera.height
+            turn, tau = turns[k], problem.observations[keep, 18 + k]
+            rate, along = motion.angular_velocity, tau[:, None, None]
+            later = tau[:, None] * _acceleration(motion, camera.row_time_span)
+            # Exp(c) A Exp(-c) for the small rotation A = Exp(w tau): c x (w tau)
+            turn[:, :, AXES] = -along * skew(rate)
+            turn[:, :, OFFSET] = later
+            turn[:, :, READOUT] = shares[k][:, None] * rate + middle_share(camera) * later
+            turn[:, :, BIAS] = -along * pair.R_cam_imu
+            turn[:, :, SCALE] = tau[:, None] * rate
+        return cls(turns, shares)
+
+    def displaced(self, observations: Array, at: Array) -> Array:
+        """Observations (N, 20) with the deviations `at`, except those of the lens."""
+        out = np.empty_like(observations)
+        _displace(observations, self.turns @ at[:FOCAL], self.shares * at[READOUT], out)
+        return out
+
+    def derivatives(self, observations: Array, state: TwoViewState, r: Array) -> Array:
+        """Derivatives (N, 9) of the residuals by all deviations except those of the lens."""
+        n = len(observations)
+        out = np.empty((FOCAL * n, 20))
+        for c in range(FOCAL):
+            _displace(observations, _STEP * self.turns[..., c],
+                      _STEP * self.shares * (c == READOUT), out[c * n:(c + 1) * n])
+        return (residuals(out, state).reshape(FOCAL, n) - r).T / _STEP
+
+
+def middle_share(camera: RollingShutterCamera) -> float:
+    """Rows from the stamped to the middle one, as a share of the readout: 0.5, 0 or -0.5."""
+    return (0.5 * (camera.height - 1) - camera.reference_row_index) / camera.height
+
+
+def _acceleration(motion: FrameMotion, span: tuple[float, float]) -> Array:
+    """Angular acceleration [rad/s^2]: of the second half of the readout against its first."""
+    half = 0.5 * (span[1] - span[0])
+    if half <= 0.0 or motion.knot_times is None:
+        return np.zeros(3)
+    first, last = motion.rotations([-half, half])
+    forward, backward = log_so3(last), -log_so3(first)
+    return np.asarray((forward - backward) / half**2)
+
+
+@kernel
+def _displace(observations: Array, turns: Array, delays: Array, out: Array) -> None:
+    """Observations with rays rotated on the left by `turns` (2, N, 3), rows later by `delays`."""
+    for i in range(observations.shape[0]):
+        for image in range(2):
+            out[i, 18 + image] = observations[i, 18 + image] + delays[image, i]
+            turn = turns[image, i]
+            for base in range(9 * image, 9 * image + 9, 3):
+                for k in range(3):
+                    p, q = (k + 1) % 3, (k + 2) % 3
+                    out[i, base + k] = (observations[i, base + k]
+                                        + turn[p] * observations[i, base + q]
+                                        - turn[q] * observations[i, base + p])
+
+
+# -- Sums over pairs ---------------------------------------------------------------------------
+
+# Pairs of the last seconds, at most so many.
+WINDOW_NS = to_nanoseconds(20.0)
+MOST_PAIRS = 100
+# Older pairs that are linearised again with each new one, and distance in sigmas of the prior
+# within which that changes nothing.
+_AGAIN, _NEAR = 3, 0.02
+# Sigmas of n pairs are widened by (n + 6) / n: few scores scatter less than they should. Share of
+# a pair's sigma that is common to all pairs, and not reduced by averaging: blur, the tracker's
+# bias, a lens that the model does not fit.
+_FEW_PAIRS, _SHARED = 6, 0.25
+# Deviations before the first pair, 1 sigma: rad, s, s, rad/s, -, -, -.
+PRIOR_SIGMA = np.array([0.2] * 3 + [0.05, 0.03] + [0.1] * 3 + [0.2, 0.3, 0.5])
+PRIOR_INFORMATION = np.diag(PRIOR_SIGMA**-2.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """Estimated deviations from the configuration."""
+
+    c: Array   # (11,)
+    covariance: Array   # (11, 11)
+    undetermined: Array   # (11, 11) the same without common errors: reduced by more pairs
+    S: Array   # (11, 11) and (11,): sums of the pairs, without a prior
+    b: Array
+    scatter: float   # variance of the scores over that by S: 1 where residuals are independent
+    misfit: float   # the same with common errors
+    pairs: int
+
+    @property
+    def sigma(self) -> Array:
+        """(11,) 1 sigma."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+
+NOTHING_ESTIMATED = Calibration(
+    np.zeros(DEVIATIONS), np.diag(PRIOR_SIGMA**2), np.diag(PRIOR_SIGMA**2),
+    np.zeros((DEVIATIONS, DEVIATIONS)), np.zeros(DEVIATIONS), 1.0, 1.0, 0)
+
+
+class _Entry(NamedTuple):
+    """A pair and its linearisation."""
+
+    stamp_ns: int
+    data: PairData
+    active: Array   # (11,)
+    about: Array   # (11,)
+    information: PairInformation
+
+
+class Recursion:
+    """The pairs of the last seconds."""
+
+    def __init__(self) -> None:
+        self._pairs: deque[_Entry] = deque(maxlen=MOST_PAIRS)
+
+    def clear(self) -> None:
+        """Forget all pairs."""
+        self._pairs.clear()
+
+    def add(self, stamp_ns: int, data: PairData, active: Array,
+            about: Array) -> PairInformation | None:
+        """Add a pair, in the order of time; an earlier stamp restarts.
+
+        It is linearised about the deviations `about` (11,), which differ from those `active`
+        once a quantity is inconsistent. Some of the older pairs are linearised there, too, the
+        furthest first. Returns the information of the pair, None if it has none.
+        """
+        if self._pairs and stamp_ns < self._pairs[-1].stamp_ns:
+            self.clear()
+        information = pair_information(data, active, about)
+        if information is None or not np.isfinite(information.S).all():
+            return None
+        if self._pairs:
+            self._relinearise(about)
+        self._pairs.append(_Entry(stamp_ns, data, active, about, information))
+        while self._pairs[0].stamp_ns < stamp_ns - WINDOW_NS:
+            self._pairs.popleft()
+        return information
+
+    def _relinearise(self, about: Array) -> None:
+        apart = np.linalg.norm(
+            (np.array([pair.about for pair in self._pairs]) - about) / PRIOR_SIGMA, axis=1)
+        for k in np.argsort(apart, kind='stable')[::-1][:_AGAIN]:
+            if apart[k] < _NEAR:
+                break
+            pair = self._pairs[k]
+            information = pair_information(pair.data, pair.active, about)
+            if information is not None:
+                self._pairs[k] = pair._replace(about=about, information=information)
+
+    def solved(self) -> Calibration:
+        """The calibration that fits all pairs."""
+        n = len(self._pairs)
+        if not n:
+            return NOTHING_ESTIMATED
+        S = np.array([pair.information.S for pair in self._pairs])
+        b = np.array([pair.information.b for pair in self._pairs])
+        # Scaled by the prior: the deviations have different units.
+        scale = PRIOR_SIGMA
+        hessian = S.sum(axis=0) * np.outer(scale, scale) + np.eye(DEVIATIONS)
+        covariance = inverse(hessian) * np.outer(scale, scale)
+        c = covariance @ b.sum(axis=0)
+        scores = b - S @ c
+        sandwich = covariance @ (scores.T @ scores) @ covariance
+        ratios = np.maximum(np.diag(sandwich) / np.diag(covariance), 1.0) * (
+            (n + _FEW_PAIRS) / n) ** 2
+        shared, scatter = 1.0 + _SHARED**2 * n, float(np.median(ratios))
+        undetermined = covariance * np.sqrt(np.outer(ratios, ratios))
+        return Calibration(c, shared * undetermined, undetermined, S.sum(axis=0), b.sum(axis=0),
+                           scatter, shared * scatter, n)

@@ -1,0 +1,237 @@
+"""Rotation by images alone against the gyro, and accelerometer against images.
+
+The comparison of rotations uses no prior and no pose, so that it holds for any error of axes,
+unit or sign of the gyro. Rotation vectors over some frames, ``theta`` by images and ``phi`` by
+gyro in the camera frame as configured, are summed in ``M = sum theta phi^T``; the rotation Q that
+maximises ``trace(Q^T M)`` aligns them (Kabsch 1976). A constant rate is removed from both first:
+a bias of the gyro, and a steady translation, which is similar to a rotation of the images.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.estimator.velocity import InertialEvidence
+from rs_relpose_ros.geometry.so3 import aligning_rotation, log_so3, median
+from rs_relpose_ros.geometry.timing import to_nanoseconds
+from rs_relpose_ros.jit import kernel
+from rs_relpose_ros.pipeline.findings import Finding, FindingState
+from rs_relpose_ros.pipeline.recursion import MOST_PAIRS, WINDOW_NS
+
+Array = NDArray[np.float64]
+
+# Fewer rays give no rotation.
+_LEAST_RAYS = 12
+# Rotations of the last seconds, at most so many.
+_WINDOW_NS = to_nanoseconds(8.0)
+_MOST_ROTATIONS = 160
+# Number of rotations, and sum of their angles [rad], that a comparison needs.
+_FEWEST, _LEAST_ANGLE = 5, 0.15
+# Sums of squares of a constant rate, by rounding alone.
+_NO_ROTATION = 1e-30
+# Rotation of axes [rad] that the recursive calibration does not reach.
+_LARGE_ANGLE = 1.0
+# Logarithm of a ratio of likelihoods that is certain, errors of neighbours being alike.
+_LOG_LIKELIHOOD = 20.0
+
+
+def rotation_of_rays(rays1: Array, rays2: Array) -> Array | None:
+    """Rotation vector (3,) of ``R_1^T R_2`` that aligns unit rays (N, 3) best.
+
+    Translation is not modelled: rays that move most have the least weight (Cauchy weights about
+    the median). None if there are too few rays.
+    """
+    finite = np.isfinite(rays1 + rays2).all(axis=1)
+    if np.count_nonzero(finite) < _LEAST_RAYS:
+        return None
+    first, second = rays1[finite], rays2[finite]
+    rotation = aligning_rotation(first.T @ second)
+    return log_so3(aligning_rotation(_correlation(first, second, rotation)))
+
+
+@kernel
+def _correlation(rays1: Array, rays2: Array, rotation: Array) -> Array:
+    """``sum w a b^T`` (3, 3) of rays (N, 3); weights w by residuals of `rotation`."""
+    n = len(rays1)
+    squares, out = np.zeros(n), np.zeros((3, 3))
+    for i in range(n):
+        for j in range(3):
+            off = rays1[i, j]
+            for k in range(3):
+                off -= rotation[j, k] * rays2[i, k]
+            squares[i] += off * off
+    limit = max(median(squares.copy()), 1e-12)
+    for i in range(n):
+        weight = 1.0 / (1.0 + squares[i] / limit)
+        for j in range(3):
+            for k in range(3):
+                out[j, k] += weight * rays1[i, j] * rays2[i, k]
+    return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RotationComparison:
+    """Images and gyro over the last seconds.
+
+    Shares ``left_*`` are those of the images' rotation (sum of squares) that remain after the
+    gyro's is rotated and scaled: 0 if nothing remains, 1 or more if both are independent.
+    """
+
+    left_as_configured: float   # no rotation
+    left_of_all: float   # no rotation, and no constant rate removed
+    left_at_best: float   # `rotation`
+    left_mirrored: float   # the best reflection: a gyro with left-handed axes
+    rotation: Array   # (3, 3) Q: the true gyro is Q times the configured one
+    reflection: Array   # (3, 3) the best one
+    scale: float   # images over gyro, after `rotation`
+    by_gyro: float   # [rad] sum of the angles
+    count: int
+
+    @property
+    def is_turned(self) -> bool:
+        """Whether axes are interchanged: `rotation` is large, and better for certain."""
+        return self.angle > _LARGE_ANGLE and self._certain(
+            self.left_as_configured, self.left_at_best)
+
+    @property
+    def is_left_handed(self) -> bool:
+        """Whether a reflection fits the images better than any rotation, for certain.
+
+        If all rotations are about two axes both fit equally.
+        """
+        return self._certain(self.left_at_best, self.left_mirrored)
+
+    def _certain(self, left: float, left_instead: float) -> bool:
+        """Whether the second hypothesis is better, by the ratio of the likelihoods.
+
+        Normal errors of unknown variance; a rotation has three components.
+        """
+        ratio = max(left, 1e-9) / max(left_instead, 1e-9)
+        return 1.5 * self.count * math.log(ratio) > _LOG_LIKELIHOOD
+
+    @property
+    def angle(self) -> float:
+        """Of `rotation` [rad]."""
+        return float(np.linalg.norm(log_so3(self.rotation)))
+
+
+class RotationSums:
+    """The rotations of the last seconds."""
+
+    def __init__(self) -> None:
+        # Arguments of `add`.
+        self._rotations: deque[tuple[int, float, Array, Array]] = deque(maxlen=_MOST_ROTATIONS)
+
+    def clear(self) -> None:
+        """Forget all rotations."""
+        self._rotations.clear()
+
+    def add(self, stamp_ns: int, interval: float, by_images: Array, by_gyro: Array) -> None:
+        """Add rotation vectors (3,) over the same `interval` [s], in the order of time."""
+        if self._rotations and stamp_ns < self._rotations[-1][0]:
+            self.clear()
+        self._rotations.append((stamp_ns, interval, by_images, by_gyro))
+        while self._rotations[0][0] < stamp_ns - _WINDOW_NS:
+            self._rotations.popleft()
+
+    def compared(self) -> RotationComparison | None:
+        """The comparison; None if there are too few or too small rotations."""
+        if len(self._rotations) < _FEWEST:
+            return None
+        _, intervals, theta, phi = (
+            np.array(column) for column in zip(*self._rotations, strict=True))
+        by_images = float(np.linalg.norm(theta, axis=1).sum())
+        by_gyro = float(np.linalg.norm(phi, axis=1).sum())
+        if max(by_images, by_gyro) < _LEAST_ANGLE or by_gyro < 1e-3 * _LEAST_ANGLE:
+            return None
+        left_of_all = _left(float((theta * phi).sum()), theta, phi)
+        theta, phi = _unsteady(theta, intervals), _unsteady(phi, intervals)
+        M = theta.T @ phi
+        U, singular, Vt = np.linalg.svd(M)
+        handed = math.copysign(1.0, float(np.linalg.det(U @ Vt)))
+        rotation = np.ascontiguousarray((U * (1.0, 1.0, handed)) @ Vt)
+        trace = float(singular[0] + singular[1] + handed * singular[2])
+        mirrored = float(singular[0] + singular[1] - handed * singular[2])
+        return RotationComparison(
+            _left(float(np.trace(M)), theta, phi), left_of_all, _left(trace, theta, phi),
+            _left(mirrored, theta, phi), rotation,
+            np.ascontiguousarray((U * (1.0, 1.0, -handed)) @ Vt),
+            trace / max(float((phi**2).sum()), _NO_ROTATION), by_gyro,
+            len(self._rotations))
+
+
+def _left(trace: float, theta: Array, phi: Array) -> float:
+    """Share of the rotations `theta` (N, 3) that remains after Q `phi`, by trace(Q^T M).
+
+    ``min over s of sum |theta - s Q phi|^2 / sum |theta|^2``; a negative scale is worse.
+    """
+    power = float((theta**2).sum()) * float((phi**2).sum())
+    return 1.0 - trace * abs(trace) / max(power, _NO_ROTATION)
+
+
+def _unsteady(rotations: Array, intervals: Array) -> Array:
+    """Rotations (N, 3) over intervals (N,) [s] without the constant rate that fits best."""
+    rate = intervals @ rotations / (intervals @ intervals)
+    return np.asarray(rotations - np.outer(intervals, rate))
+
+
+# -- Accelerometer against images, by the pairs of the last seconds -------------------------------
+
+# Largest weight of a pair: one with misleading matches must not decide alone.
+_LARGEST = 3.0
+# Logarithm of a Bayes factor that is certain, errors of neighbours being alike.
+_CERTAIN = 10.0
+
+
+class AccelerationSums:
+    """Sums of the log Bayes factors of the measured acceleration and of its opposite."""
+
+    def __init__(self) -> None:
+        self._pairs: deque[tuple[int, float, float]] = deque(maxlen=MOST_PAIRS)
+
+    def clear(self) -> None:
+        """Forget all pairs."""
+        self._pairs.clear()
+
+    def add(self, stamp_ns: int, evidence: InertialEvidence) -> None:
+        """Add a pair, in the order of time; an earlier stamp restarts."""
+        if self._pairs and stamp_ns < self._pairs[-1][0]:
+            self.clear()
+        configured, opposite = (max(-_LARGEST, min(value, _LARGEST)) for value in evidence)
+        self._pairs.append((stamp_ns, configured, opposite))
+        while self._pairs[0][0] < stamp_ns - WINDOW_NS:
+            self._pairs.popleft()
+
+    def uses(self, evidence: InertialEvidence | None) -> bool:
+        """Whether a pair of such evidence uses the accelerometer; None: not known yet."""
+        return not self.contradicts and (evidence is None or evidence.configured > -_LARGEST)
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether no acceleration, or the opposite one, is more consistent with the images."""
+        configured, opposite = self._sums()
+        return max(opposite, 0.0) - configured > _CERTAIN
+
+    def finding(self) -> Finding | None:
+        """On the axes of the accelerometer; None if the pairs do not determine it."""
+        configured, opposite = self._sums()
+        if self.contradicts:
+            fix = ('reverse its sign: at rest a specific force of +9.8 m/s^2 points up'
+                   if opposite > _CERTAIN else 'correct the driver: the axes differ from those of '
+                   'the gyro, or the data are of another IMU')
+            return Finding('accel_axes', FindingState.SUSPECT, 'accelerometer inconsistent with '
+                           f'the images (log-likelihood {configured:+.0f}), not used until both '
+                           'agree', fix, observable=True)
+        if configured > _CERTAIN:
+            return Finding('accel_axes', FindingState.OK, 'accelerometer consistent with the '
+                           f'images (log-likelihood {configured:+.0f})', observable=True)
+        return None
+
+    def _sums(self) -> tuple[float, float]:
+        return (sum(configured for _, configured, _ in self._pairs),
+                sum(opposite for _, _, opposite in self._pairs))

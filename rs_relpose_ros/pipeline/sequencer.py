@@ -1,0 +1,433 @@
+"""Pairs frames with their IMU data: a frame is released once the IMU covers its last row.
+
+The live node and the replay use the same object. Live, the queue is bounded and the oldest frame
+is dropped if the worker is too slow; offline no frame is dropped and no clock is read. Every frame
+that is not released is counted by its `Refusal`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+import threading
+import time
+from typing import Any
+
+import numpy as np
+
+from rs_relpose_ros.config.settings import Parameters, sensor_model
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry import timing
+from rs_relpose_ros.geometry.camera import Intrinsics
+from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, to_nanoseconds
+from rs_relpose_ros.imu.buffer import AddResult, Coverage, frame_imu, ImuBuffer, ImuSample
+from rs_relpose_ros.pipeline.monitor import Applied
+from rs_relpose_ros.pipeline.pair import Frame
+from rs_relpose_ros.tracking.images import EncodedImage, GrayLevels
+
+# A stamp further behind the newest one [ns] is a bag that restarts, not a late message.
+CLOCK_JUMP_NS = NANOSECONDS
+# Number of consecutive stamps behind the newest, each newer than the one before, that indicate a
+# clock that was set back by less than that: messages out of order come alone.
+_BACK_FRAMES = 3
+_BACK_SAMPLES = 20
+# Most frames that wait for the worker: bounds the latency of an overloaded node.
+MAILBOX_FRAMES = 5
+# Most frames that wait for the IMU: bounds the memory.
+WAITING_FRAMES = 16
+# Longest time [ns] that a frame waits for the IMU.
+MAX_IMU_WAIT_NS = NANOSECONDS
+# Delay [ns] behind the gyro above which an accelerometer on its own topic counts as stopped:
+# frames no longer wait for it.
+_ACCELEROMETER_STALE_NS = NANOSECONDS // 10
+# Most refusals that are kept until they are taken; the counters lose none.
+_REFUSALS_KEPT = 256
+_IMU_GAP = 'the gyro does not cover the readout of the frame: it has a gap there, or begins later'
+
+
+class Refusal(str, Enum):
+    """Kind of reason for which a frame was not processed."""
+
+    OVERLOAD = 'overload'
+    NO_IMU = 'no_imu'
+    IMU_GAP = 'imu_gap'
+    DUPLICATE = 'duplicate'
+    OUT_OF_ORDER = 'out_of_order'
+    CLOCK_JUMP = 'clock_jump'
+    RESET = 'reset'
+    BAD_IMAGE = 'bad_image'
+    NO_CALIBRATION = 'no_calibration'
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRefused:
+    """A frame that was not processed."""
+
+    stamp_ns: int
+    refusal: Refusal
+    reason: str
+
+
+@dataclass(slots=True)
+class SequencerCounts:
+    """Numbers of frames and IMU samples since the start."""
+
+    frames: int = 0
+    frames_taken: int = 0
+    refused: Counter[Refusal] = field(default_factory=Counter)
+    imu_samples: int = 0
+    imu_gaps: int = 0
+    clock_jumps: int = 0
+    imu_repeated: int = 0   # samples with the stamp of an earlier one, dropped
+    imu_late: int = 0   # samples that came after a younger one, sorted in
+
+
+@dataclass(slots=True, eq=False)
+class QueuedFrame:
+    """An image that waits for the IMU or for the worker, not decoded."""
+
+    image: EncodedImage
+    intrinsics: Intrinsics
+    start_ns: int   # begin and end of exposure on the IMU clock, without a tracked offset
+    end_ns: int
+    reference_ns: int   # of the stamped row
+    exposure: float   # of a row [s]
+    received_ns: int   # on the monotonic clock
+    generation: int
+    ready_ns: int | None = None   # None until the IMU covers its last row
+
+
+class _BackwardStamps:
+    """Distinguishes stamps of a clock that was set back from those of late messages."""
+
+    def __init__(self, patience: int) -> None:
+        self._patience = patience
+        self._last_ns, self._count = 0, 0
+
+    def add(self, stamp_ns: int, newest_ns: int | None) -> bool:
+        """Whether this stamp ends a run of stamps that only a clock set back can produce."""
+        if newest_ns is None or stamp_ns >= newest_ns:
+            self._count = 0
+            return False
+        self._count = self._count + 1 if self._count and stamp_ns > self._last_ns else 1
+        self._last_ns = stamp_ns
+        if self._count < self._patience:
+            return False
+        self._count = 0
+        return True
+
+
+class Sequencer:
+    """Thread-safe queue of frames and IMU samples; its states: ``docs/architecture.md``.
+
+    Offline every frame is kept until the IMU covers it or the input is closed. Take the frames
+    that are ready after each message: the IMU history is only `imu_buffer_seconds` long. With
+    `colors` images are decoded in their own encoding. `clock`: monotonic [ns]; set by tests.
+    """
+
+    def __init__(self, parameters: Parameters, *, offline: bool = False, colors: bool = False,
+                 clock: Callable[[], int] = time.monotonic_ns) -> None:
+        self._parameters = parameters
+        self._R_cam_imu = parameters.sensor.R_cam_imu
+        self._offline = offline
+        self._colors, self._levels = colors, GrayLevels()
+        self._now: Callable[[], int] = (lambda: 0) if offline else clock
+        self._max_gap_ns = to_nanoseconds(parameters.imu.max_imu_gap)
+        # Longest interval of frames that the gyro is integrated over. The history that is left
+        # depends on when a frame is taken; half of it is left in any case, so that live and replay
+        # agree.
+        self._longest_interval_ns = to_nanoseconds(0.5 * parameters.imu.imu_buffer_seconds)
+        self._changed = threading.Condition()
+        self._closed = False
+        self._buffer = ImuBuffer(parameters.imu)
+        self._samples_back = _BackwardStamps(_BACK_SAMPLES)
+        self._queue: deque[QueuedFrame] = deque()
+        self._refusals: deque[FrameRefused] = deque(maxlen=None if offline else _REFUSALS_KEPT)
+        self._frames_back = _BackwardStamps(_BACK_FRAMES)
+        self._last_stamp_ns: int | None = None
+        self._intervals = timing.FrameIntervals()
+        self._previous_ns: int | None = None   # reference time of the frame taken before
+        # Tracked corrections.
+        self._offset_ns = self._margin_ns = 0
+        # Number of jumps in time: when frames came, and as they are taken.
+        self._generation = 0
+        self._taken_generation = 0
+        self._counts = SequencerCounts()
+
+    # -- input -------------------------------------------------------------------------------
+
+    def add_imu(self, sample: ImuSample) -> None:
+        """Store an IMU sample; InputError if it is unusable, and nothing is stored."""
+        has_gyro, stamp_ns = sample.angular_velocity is not None, sample.stamp_ns
+        with self._changed:
+            buffer = self._buffer
+            set_back = has_gyro and self._samples_back.add(stamp_ns, buffer.gyro.newest_ns)
+            newest_ns = buffer.newest_ns
+            if newest_ns is not None and (set_back or stamp_ns < newest_ns - CLOCK_JUMP_NS):
+                self._jump('IMU stamps jumped back by '
+                           f'{seconds_between(stamp_ns, newest_ns):.3f} s')
+                buffer.clear()
+            before_ns = buffer.gyro.newest_ns
+            added = buffer.add(sample)
+            counts = self._counts
+            counts.imu_samples += 1
+            counts.imu_repeated += added is AddResult.DUPLICATE
+            if has_gyro and before_ns is not None:
+                # Of two topics one is always behind; late is a gyro sample behind another one.
+                counts.imu_late += added is AddResult.LATE and stamp_ns < before_ns
+                counts.imu_gaps += stamp_ns - before_ns > self._max_gap_ns
+            self._update_queue()
+
+    def add_frame(self, image: EncodedImage, intrinsics: Intrinsics) -> None:
+        """Add an image to the queue, or refuse it for its stamp."""
+        stamp_ns = image.stamp_ns
+        with self._changed:
+            self._counts.frames += 1
+            clock = sensor_model(intrinsics, self._parameters.sensor).clock
+            if not self._accepts(stamp_ns, clock.exposed_span_ns(stamp_ns)[1]):
+                return
+            self._last_stamp_ns = stamp_ns
+            # Of all frames that come, also of those refused later: live as in replay.
+            interval_ns = self._intervals.add(stamp_ns)
+            self._queue.append(QueuedFrame(
+                image, intrinsics, *clock.exposed_span_ns(stamp_ns, interval_ns),
+                clock.reference_ns(stamp_ns, interval_ns), clock.exposure(interval_ns),
+                received_ns=self._now(), generation=self._generation))
+            self._update_queue()
+
+    def pass_over(self, stamp_ns: int) -> None:
+        """Register a frame that is left out on purpose: it determines the next one's interval."""
+        with self._changed:
+            self._intervals.add(stamp_ns)
+
+    def refuse(self, stamp_ns: int, refusal: Refusal, reason: str) -> None:
+        """Count a frame that could not even be added."""
+        with self._changed:
+            self._counts.frames += 1
+            self._refuse(stamp_ns, refusal, reason)
+
+    def waits_for_imu(self) -> bool:
+        """Whether the newest frame still needs IMU samples."""
+        with self._changed:
+            return bool(self._queue) and self._queue[-1].ready_ns is None
+
+    def reset(self) -> None:
+        """Drop all frames and the IMU history; tracking restarts with the next frame."""
+        with self._changed:
+            self._restart(Refusal.RESET, 'a reset was requested')
+            self._buffer.clear()
+
+    def close(self) -> None:
+        """End of the input: `take` returns the frames that are left, then None."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    # -- output ------------------------------------------------------------------------------
+
+    def apply(self, applied: Applied) -> None:
+        """Set the tracked corrections of the frames that are taken from now on.
+
+        Call it between `take` and `take`, from the thread that calls these: then the IMU data of a
+        frame depend only on the frames before it, live as well as offline.
+        """
+        with self._changed:
+            self._offset_ns = to_nanoseconds(applied.time_offset)
+            self._margin_ns = to_nanoseconds(applied.margin)
+
+    def take(self, timeout: float = 0.0) -> Frame[Any] | FrameRefused | None:
+        """The next frame in the order of stamps, or a refusal, or None after `timeout` seconds.
+
+        The image is decoded outside of the lock.
+        """
+        with self._changed:
+            # Offline nothing comes while one waits.
+            deadline_ns = self._now() + (0 if self._offline else round(timeout * NANOSECONDS))
+            while (head := self._decided_head()) is None:
+                now_ns, until_ns = self._now(), deadline_ns
+                if self._closed or now_ns >= deadline_ns:
+                    return None
+                if self._queue:
+                    until_ns = min(until_ns, self._queue[0].received_ns + MAX_IMU_WAIT_NS)
+                self._changed.wait(max(until_ns - now_ns, 0) / NANOSECONDS)
+        if isinstance(head, FrameRefused):
+            return head
+        image, taken_ns = head.image, self._now()
+        try:
+            values, encoding = image.pixels(self._levels) if self._colors else (
+                image.decoded(self._levels), 'mono8')
+            frame: Frame[Any] = Frame(
+                image.stamp_ns, values, image.frame_id, head.intrinsics, encoding=encoding,
+                encoded=image if self._colors else None, ready_ns=head.ready_ns or 0,
+                taken_ns=taken_ns)
+        except InputError as error:
+            with self._changed:
+                return self._counted(image.stamp_ns, Refusal.BAD_IMAGE, str(error))
+        with self._changed:
+            # Stamps may have jumped meanwhile, and the buffer then belongs to another time.
+            if (head.generation != self._generation
+                    or self._buffer.coverage(*self._span(head)) is not Coverage.AVAILABLE):
+                return self._counted(
+                    frame.stamp_ns, Refusal.CLOCK_JUMP,
+                    'stamps jumped while the frame was decoded: its gyro samples are lost')
+            reference_ns, previous_ns = head.reference_ns + self._offset_ns, self._previous_ns
+            if previous_ns is not None and reference_ns - previous_ns > self._longest_interval_ns:
+                previous_ns = None
+            frame.imu_data = replace(
+                frame_imu(self._buffer, self._span(head), reference_ns, self._R_cam_imu,
+                          previous_ns, head.exposure), applied_offset_ns=self._offset_ns)
+            frame.restart = self._taken_generation != self._generation
+            self._previous_ns, self._taken_generation = reference_ns, self._generation
+            self._counts.frames_taken += 1
+            return frame
+
+    def counts(self) -> SequencerCounts:
+        """A snapshot of the counters."""
+        with self._changed:
+            return replace(self._counts, refused=self._counts.refused.copy())
+
+    # -- queue (all below are called under the lock) --------------------------------------------
+
+    def _decided_head(self) -> QueuedFrame | FrameRefused | None:
+        """The oldest refusal, or the oldest frame if it is ready or must be refused."""
+        if self._refusals:
+            return self._refusals.popleft()
+        if not self._queue:
+            return None
+        head = self._queue[0]
+        start_ns, end_ns = self._span(head)
+        # A tracked offset may have moved a frame that was ready.
+        coverage = (self._buffer.coverage(start_ns, end_ns)
+                    if head.ready_ns is not None and self._imu_reaches(end_ns)
+                    else Coverage.NOT_YET)
+        if coverage is Coverage.AVAILABLE:
+            return self._queue.popleft()
+        if coverage is Coverage.NEVER:
+            refusal, reason = Refusal.IMU_GAP, _IMU_GAP
+        elif self._closed:
+            refusal, reason = Refusal.NO_IMU, 'the gyro ends before the last row of the frame'
+        elif not self._offline and self._now() >= head.received_ns + MAX_IMU_WAIT_NS:
+            refusal, reason = Refusal.NO_IMU, (
+                'no gyro sample that covers the last row of the frame came within '
+                f'{MAX_IMU_WAIT_NS / NANOSECONDS:g} s')
+        else:
+            return None
+        self._queue.popleft()
+        return self._counted(head.image.stamp_ns, refusal, reason)
+
+    def _update_queue(self) -> None:
+        """Mark the frames that the IMU covers by now, and keep the queue within its bounds."""
+        now_ns = self._now()
+        ready = 0
+        for queued in tuple(self._queue):
+            if queued.ready_ns is None:
+                if not self._imu_reaches(self._span(queued)[1]):
+                    break
+                if self._buffer.coverage(queued.start_ns, queued.end_ns) is Coverage.NEVER:
+                    # Refused at once: it must not count as a frame that waits for the worker.
+                    self._queue.remove(queued)
+                    self._refuse(queued.image.stamp_ns, Refusal.IMU_GAP, _IMU_GAP)
+                    continue
+                queued.ready_ns = now_ns
+            ready += 1
+        if not self._offline:
+            for _ in range(ready - MAILBOX_FRAMES):
+                self._refuse(self._queue.popleft().image.stamp_ns, Refusal.OVERLOAD,
+                             'the worker was too slow, newer frames wait')
+            while len(self._queue) > WAITING_FRAMES:
+                self._refuse(self._queue.popleft().image.stamp_ns, Refusal.NO_IMU,
+                             f'{WAITING_FRAMES} newer frames wait for the gyro')
+        if ready:
+            self._changed.notify()
+
+    def _span(self, queued: QueuedFrame) -> tuple[int, int]:
+        """Times of its first and last row, with the corrections tracked by now."""
+        return (queued.start_ns + self._offset_ns - self._margin_ns,
+                queued.end_ns + self._offset_ns + self._margin_ns)
+
+    def _imu_reaches(self, end_ns: int) -> bool:
+        """Whether gyro and accelerometer, which may have a topic each, have come to a time."""
+        gyro_ns, force_ns = self._buffer.gyro.newest_ns, self._buffer.force.newest_ns
+        if gyro_ns is None or gyro_ns < end_ns:
+            return False
+        # Gravity must not depend on which of two topics came first.
+        return (force_ns is None or force_ns >= end_ns
+                or gyro_ns - force_ns > _ACCELEROMETER_STALE_NS)
+
+    # -- refusals and jumps of a clock -------------------------------------------------------
+
+    def _accepts(self, stamp_ns: int, end_ns: int) -> bool:
+        """Whether a frame of this stamp is added to the queue; if not, it has been refused.
+
+        A stamp that only a clock set back can produce is accepted: time restarts with it.
+        """
+        last_ns = self._last_stamp_ns
+        set_back = self._frames_back.add(stamp_ns, last_ns)
+        if last_ns is None or stamp_ns > last_ns:
+            return True
+        if stamp_ns == last_ns:
+            self._refuse(stamp_ns, Refusal.DUPLICATE, 'a frame of this stamp came before')
+            return False
+        back = seconds_between(stamp_ns, last_ns)
+        if not set_back and last_ns - stamp_ns <= CLOCK_JUMP_NS:
+            self._refuse(stamp_ns, Refusal.OUT_OF_ORDER,
+                         f'the frame is {back:.3f} s older than the one before')
+            return False
+        self._jump(f'image stamps jumped back by {back:.3f} s')
+        # The IMU may have jumped already, and then has the samples of this frame. After a small
+        # step back it may hold samples of two times at once.
+        newest_ns = self._buffer.newest_ns
+        if set_back or (newest_ns is not None and newest_ns > end_ns + CLOCK_JUMP_NS):
+            self._buffer.clear()
+        return True
+
+    def _counted(self, stamp_ns: int, refusal: Refusal, reason: str) -> FrameRefused:
+        self._counts.refused[refusal] += 1
+        return FrameRefused(stamp_ns, refusal, reason)
+
+    def _refuse(self, stamp_ns: int, refusal: Refusal, reason: str) -> None:
+        self._refusals.append(self._counted(stamp_ns, refusal, reason))
+        self._changed.notify()
+
+    def _jump(self, reason: str) -> None:
+        self._counts.clock_jumps += 1
+        self._restart(Refusal.CLOCK_JUMP, reason)
+
+    def _restart(self, refusal: Refusal, reason: str) -> None:
+        """Refuse all frames in the queue: they belong to the time before."""
+        self._generation += 1
+        while self._queue:
+            self._refuse(self._queue.popleft().image.stamp_ns, refusal, reason)
+        self._last_stamp_ns = self._previous_ns = None
+        self._intervals = timing.FrameIntervals()
+
+
+# -- Scatter of image stamps about an even rhythm: phones stamp some ms early or late -------------
+
+SCATTER_FRAMES = 32
+# Intervals below this quantile of all contain no lost frame.
+_WHOLE = 0.25
+# A larger scatter, as a share of the interval, is a camera without a rhythm.
+_LARGEST_SHARE = 0.1
+
+
+def stamp_sigma(stamps_ns: Sequence[int]) -> float:
+    """1 sigma of a stamp [s]; 0 for fewer than three stamps.
+
+    Intervals d_i of stamps, corrected for lost frames, change by
+    ``d_i+1 - d_i = e_i+2 - 2 e_i+1 + e_i`` for errors e of the stamps: six times their variance.
+    A change of the rhythm, as by auto exposure, affects one of these differences only; hence their
+    mean magnitude and not their variance.
+    """
+    intervals = np.diff(np.array(stamps_ns)) / NANOSECONDS
+    if len(intervals) < 2:
+        return 0.0
+    period = float(np.quantile(intervals, _WHOLE, method='lower'))
+    if not period > 0.0:
+        return 0.0
+    changes = np.diff(intervals - np.round(intervals / period) * period)
+    # Mean magnitude of a normal variable: sqrt(2 / pi) sigma.
+    sigma = float(np.sqrt(np.pi / 2.0) * np.abs(changes).mean() / np.sqrt(6.0))
+    return min(sigma, _LARGEST_SHARE * period)

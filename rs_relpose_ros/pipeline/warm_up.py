@@ -1,0 +1,135 @@
+"""Compilation (or loading from the cache) of the kernels of a run before its first frame.
+
+    python -m rs_relpose_ros.pipeline.warm_up
+
+fills the cache on two cores, in one to two minutes: the first run then starts at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+import gc
+import multiprocessing
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.config.settings import EstimatorConfig, Parameters
+from rs_relpose_ros.estimator.estimate import estimate_relative_pose, Estimation
+from rs_relpose_ros.estimator.frames_between import IntermediateFrame
+from rs_relpose_ros.estimator.problem import build_problem
+from rs_relpose_ros.estimator.sampling import MODES
+from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
+from rs_relpose_ros.geometry.motion import FrameMotion
+from rs_relpose_ros.geometry.timing import NANOSECONDS
+from rs_relpose_ros.imu.buffer import ImuSample
+from rs_relpose_ros.pipeline.pair import Frame, Result
+from rs_relpose_ros.pipeline.pipeline import FrameLoop, FrontEnd
+from rs_relpose_ros.solvers.common import Solutions
+from rs_relpose_ros.tracking.images import RawImage
+
+Array = NDArray[np.float64]
+
+_WIDTH, _HEIGHT = 320, 240
+# With distortion, so that its kernels are compiled, too.
+_INTRINSICS = Intrinsics(width=_WIDTH, height=_HEIGHT, fx=250.0, fy=250.0, cx=159.5, cy=119.5,
+                         image_width=_WIDTH, image_height=_HEIGHT,
+                         distortion_model='plumb_bob', distortion=(-0.02, 0.01, 0.0, 0.0))
+# What would keep made-up frames from being processed is replaced by these.
+MADE_UP_SENSOR = {'readout_time': 0.02, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0],
+                  'time_offset': 0.0, 'stamp_exposure': 'middle'}
+
+
+def warm_up(config: EstimatorConfig | None = None) -> None:
+    """Compile (or load from the cache) every kernel of an estimate with `config`."""
+    points1, points2, camera, motion = _sideways()
+    rotation, covariance = np.eye(3), 1e-4 * np.eye(3)
+    halfway = IntermediateFrame(0.5 * (points1 + points2), motion, 0.1, rotation, covariance)
+    estimate_relative_pose(points1, points2, camera, motion, motion, rotation, covariance, 0.2,
+                           config=config, between=[halfway])
+
+
+def warm_up_pipeline(parameters: Parameters) -> None:
+    """Run the pipeline over a few made-up frames, once with all of the IMU, once with its gyro.
+
+    Detector, solver and filters are those of `parameters`.
+    """
+    parameters = parameters.updated({**MADE_UP_SENSOR, 'feature_rows': [0.0, 0.0],
+                                     'max_keyframe_frames': 1})
+    warm_up(parameters.estimator)   # with a frame between
+    for with_force in (True, False):
+        list(made_up_frames(FrontEnd(parameters, offline=True), with_force))
+
+
+def made_up_frames(loop: FrameLoop[Result], with_force: bool = True) -> Iterator[Frame[Result]]:
+    """A few made-up frames, as processed by an offline loop."""
+    images, frame_ns = list(_images()), NANOSECONDS // 30
+    force = (0.0, -9.81, 0.0) if with_force else None
+    for stamp_ns in range(0, (len(images) + 3) * frame_ns, NANOSECONDS // 200):
+        loop.sequencer.add_imu(ImuSample(NANOSECONDS + stamp_ns, (0.01, 0.02, 0.03), force))
+    for k, image in enumerate(images, start=1):
+        loop.sequencer.add_frame(RawImage.of_gray(image, NANOSECONDS + k * frame_ns), _INTRINSICS)
+        outcome = loop.step()
+        assert isinstance(outcome, Frame), outcome
+        yield outcome
+
+
+def _images() -> Iterator[NDArray[np.uint8]]:
+    """A far wall behind a near one, from a camera that moves and then stops."""
+    noise = np.random.default_rng(0).integers(0, 256, (2, _HEIGHT, _WIDTH), dtype=np.uint8)
+    far, near = (cv2.normalize(cv2.GaussianBlur(layer, (0, 0), 2.0), np.empty_like(layer), 0, 255,
+                               cv2.NORM_MINMAX) for layer in noise)
+    for shift in (0, 4, 8, 8):
+        image = np.roll(far, -shift, axis=1)
+        image[80:160] = np.roll(near, -3 * shift, axis=1)[80:160]
+        yield image
+
+
+def _estimation() -> Estimation:
+    points1, points2, camera, motion = _sideways()
+    problem = build_problem(points1, points2, camera, motion, motion, np.eye(3),
+                            1e-4 * np.eye(3))
+    return Estimation(problem, MODES['auto'], EstimatorConfig(), np.arange(len(points1)),
+                      np.zeros(1, dtype=np.uint64), None)
+
+
+def _sideways() -> tuple[Array, Array, RollingShutterCamera, FrameMotion]:
+    """Matches of a camera that moves to its right, for the warm-up."""
+    rng = np.random.default_rng(0)
+    camera = RollingShutterCamera(width=640, height=480, fx=450.0, fy=450.0, cx=319.5, cy=239.5,
+                                  readout_time=0.03)
+    motion = FrameMotion(np.array([0.0, 0.1, 0.0]), gravity=np.array([0.0, 1.0, 0.0]))
+    world = rng.uniform([-4.0, -3.0, 4.0], [4.0, 3.0, 12.0], (100, 3))
+    return camera.project(world), camera.project(world - [0.5, 0.0, 0.0]), camera, motion
+
+
+def fill_cache() -> None:
+    """Compile the kernels of the default parameters, on two cores, one process each.
+
+    Other solvers are compiled when they are chosen.
+    """
+    rarely = 100_000   # collections of garbage, which syntax trees do not become: a tenth faster
+    with ProcessPoolExecutor(1, multiprocessing.get_context('spawn'), gc.set_threshold,
+                             (rarely,)) as pool:
+        other_half = pool.submit(_warm_up_estimate)
+        gc.set_threshold(rarely)
+        for solver in MODES[EstimatorConfig().solver].solvers:
+            assert solver.address
+        # No pair has that many matches: everything but the estimate.
+        warm_up_pipeline(Parameters.from_mapping({'min_inliers': 10_000}))
+        other_half.result()
+    warm_up_pipeline(Parameters())
+
+
+def _warm_up_estimate() -> None:
+    """Compile an estimate: all steps but the first, then sampling."""
+    _estimation().refine(Solutions(np.eye(3)[None], np.eye(1, 9)))
+    # By then the other process has compiled the solvers, which are most of it.
+    _estimation().sample()
+    warm_up()
+
+
+if __name__ == '__main__':
+    fill_cache()

@@ -1,0 +1,156 @@
+"""The table of minimal solvers, and its solvers as Python functions with checked arguments.
+
+All solve ``(f_1 x R f_2) . (t - tau_1 d_1 + tau_2 d_2) = 0`` (docs/conventions.md, equation 4),
+with ``d_1 = v_1`` and ``d_2 = R v_2``, and differ in the rays, in the velocities that they solve
+for and in the known part of R. To add a solver: write its kernel, and its row here.
+
+References
+----------
+C.-R. Lee and K.-J. Yoon, *Inertial-aided Rolling Shutter Relative Pose Estimation*, sections
+'Minimal Algorithms' and 'Solver'.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry import validate
+from rs_relpose_ros.solvers import angular, common, uniform
+from rs_relpose_ros.solvers.common import Knowledge, Model, Sample, Solver
+
+Array = NDArray[np.float64]
+
+UNIFORM = Model('uniform', derotated=True, velocities=True)
+LINEAR = Model('linear', derotated=False, velocities=True)
+ANGULAR = Model('angular', derotated=True, velocities=False)
+GLOBAL = Model('global', derotated=False, velocities=False)
+
+SOLVERS = {solver.name: solver for solver in (
+    Solver('uniform_9pt', 9, UNIFORM, uniform.solve_gravity_9pt, uniform.MAX_9PT,
+           'Uniform 9-point algorithm: gravity and angular velocity known.', needs_gravity=True),
+    Solver('uniform_11pt', 11, UNIFORM, uniform.solve_uniform_11pt, uniform.MAX_11PT,
+           'Uniform 11-point algorithm: angular velocity known.', starts_from_rotation=True),
+    Solver('linear_9pt', 9, LINEAR, uniform.solve_gravity_9pt, uniform.MAX_9PT,
+           'Linear 9-point algorithm: gravity known, no angular velocity.', needs_gravity=True),
+    Solver('angular_5pt', 5, ANGULAR, angular.solve_5pt, angular.MAX_5PT,
+           'Angular 5-point algorithm: angular velocity known, no linear velocity.'),
+    Solver('angular_3pt', 3, ANGULAR, angular.solve_angular_3pt, angular.MAX_3PT,
+           'Angular 3-point algorithm: gravity and angular velocity known, no linear velocity.',
+           needs_gravity=True),
+    Solver('global_5pt', 5, GLOBAL, angular.solve_5pt, angular.MAX_5PT,
+           "Global-shutter 5-point algorithm, the paper's baseline."),
+)}
+
+# No solver of the public table: it does not estimate the rotation.
+GYRO_2PT = Solver('gyro_2pt', 2, ANGULAR, common.solve_gyro_2pt, 1,
+                  'Gyro 2-point algorithm: rotation known, no linear velocity.',
+                  needs_rotation=True)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MinimalSolution:
+    """One real solution of a minimal problem: ``X_1 = R X_2 + t`` with ``|t| = 1``.
+
+    Attributes
+    ----------
+    R : (3, 3) ndarray
+        ``R_1^T R_2``, between the two frames' reference rows.
+    t : (3,) ndarray
+        Unit direction of ``R_1^T (p_2 - p_1)``.
+    v1, v2 : (3,) ndarray
+        Linear velocities, each in its own camera's frame [baselines per second]; zero for a model
+        without velocities.
+    """
+
+    R: Array
+    t: Array
+    v1: Array
+    v2: Array
+
+
+class MinimalSolver(Protocol):
+    """Signature of the solvers."""
+
+    __name__: str
+
+    def __call__(self, rays1: ArrayLike, rays2: ArrayLike, tau1: ArrayLike, tau2: ArrayLike, *,
+                 gravity1: ArrayLike | None = None, gravity2: ArrayLike | None = None,
+                 start_rotations: ArrayLike | None = None) -> list[MinimalSolution]:
+        """Solve one minimal sample of n matches.
+
+        Parameters
+        ----------
+        rays1, rays2 : (n, 3) array_like
+            Rays, each in its own camera's frame, of any length but zero; as measured for
+            `linear_9pt` and `global_5pt`, derotated by the gyro for all others.
+        tau1, tau2 : (n,) array_like
+            Row times [s] relative to the reference row.
+        gravity1, gravity2 : (3,) array_like
+            Direction of free fall in each camera's frame at the reference row, of any length; used
+            by `uniform_9pt`, `linear_9pt` and `angular_3pt`.
+        start_rotations : (K, 3, 3) array_like
+            Rotations from which `uniform_11pt` starts: the gyro's prediction, or those of
+            `angular_5pt`.
+
+        Returns
+        -------
+        list of MinimalSolution
+            All real solutions; of `uniform_11pt` the distinct solutions that it reaches. Of
+            (t, v1, v2) and its negative, which solve the same equations, the one with more of the
+            points in front of both cameras, at the positions of the cameras at their rows.
+
+        Raises
+        ------
+        InputError
+            A wrong shape, a value that is not finite, a zero vector, a start that is not a
+            rotation, or a missing argument that the solver uses.
+        """
+
+
+def as_function(row: Solver) -> MinimalSolver:
+    """The solver of a row as a pure function."""
+    def solve(rays1: ArrayLike, rays2: ArrayLike, tau1: ArrayLike, tau2: ArrayLike, *,
+              gravity1: ArrayLike | None = None, gravity2: ArrayLike | None = None,
+              start_rotations: ArrayLike | None = None) -> list[MinimalSolution]:
+        n = row.sample_size
+        sample = Sample(validate.unit_vectors('rays1', rays1, (n, 3)),
+                        validate.unit_vectors('rays2', rays2, (n, 3)),
+                        validate.array('tau1', tau1, (n,)), validate.array('tau2', tau2, (n,)))
+        known = common.no_knowledge()
+        if row.needs_gravity:
+            known = known._replace(align1=_alignment('gravity1', gravity1),
+                                   align2=_alignment('gravity2', gravity2))
+        if not row.starts_from_rotation:
+            return list(_solutions(row, sample, known))
+        found: list[MinimalSolution] = []
+        for start in validate.rotations('start_rotations', start_rotations, ('K', 3, 3)):
+            # |R - R'| = 2 sqrt(2) |sin(angle / 2)|: two starts of one solution agree to 1e-7 rad.
+            found.extend(s for s in _solutions(
+                row, sample, known._replace(rotation=start, predicted=True))
+                if all(np.linalg.norm(s.R - other.R) > np.sqrt(2.0) * 1e-7 for other in found))
+        return found
+
+    solve.__name__ = solve.__qualname__ = row.name
+    solve.__doc__ = (f'{row.summary}\n\n    Of {row.sample_size} matches; arguments and result as '
+                     f'in `MinimalSolver`.\n\n    {row.solve.__doc__}')
+    return solve
+
+
+def _alignment(name: str, gravity: ArrayLike | None) -> Array:
+    if gravity is None:
+        raise InputError(f'{name} must be given to this solver: the direction of free fall (3,) '
+                         'in the camera frame')
+    return common.gravity_alignment(validate.unit_vectors(name, gravity, (3,)))
+
+
+def _solutions(row: Solver, sample: Sample, known: Knowledge) -> Iterator[MinimalSolution]:
+    out = common.empty_solutions(row.most_solutions)
+    for k in range(common.run_solver(row.address, sample, known, out)):
+        t, d1, d2 = out.x[k].reshape(3, 3)   # without velocities zero
+        yield MinimalSolution(out.R[k], t, d1, out.R[k].T @ d2)

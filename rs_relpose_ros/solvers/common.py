@@ -1,0 +1,322 @@
+"""Common parts of the minimal solvers: signature, cheirality, gravity, columns of the model.
+
+A solver is a kernel that is called by its address: the robust loop is compiled once, and a solver
+only when it is used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.geometry.so3 import copy_matrix, cross, dot, norm, rotated, rotated_back
+from rs_relpose_ros.jit import kernel, KernelInterface
+
+Array = NDArray[np.float64]
+
+
+class Sample(NamedTuple):
+    """A minimal sample of n matches.
+
+    `f1`, `f2` (n, 3): unit rays, each in its own camera's frame, as measured or derotated by the
+    gyro (`Model.derotated`). `tau1`, `tau2` (n,): row times [s] relative to the reference row.
+    """
+
+    f1: Array
+    f2: Array
+    tau1: Array
+    tau2: Array
+
+
+class Knowledge(NamedTuple):
+    """Known quantities besides the matches; `Solver` has the ones that a solver uses.
+
+    `align1`, `align2` (3, 3): rotations of each camera's gravity onto +z (`gravity_alignment`).
+    `rotation` (3, 3): a predicted R, if `predicted`.
+    """
+
+    align1: Array
+    align2: Array
+    rotation: Array
+    predicted: bool
+
+
+class Solutions(NamedTuple):
+    """Rotations R (K, 3, 3), and x (K, 9): ``t`` (unit), ``d_1, d_2`` in frame 1."""
+
+    R: Array
+    x: Array
+
+
+def empty_solutions(most: int) -> Solutions:
+    """Space for `most` solutions; their velocities are zero."""
+    return Solutions(np.empty((most, 3, 3)), np.zeros((most, 9)))
+
+
+def no_knowledge() -> Knowledge:
+    """Neither gravity nor a predicted rotation."""
+    return Knowledge(np.eye(3), np.eye(3), np.eye(3), False)
+
+
+class Model(NamedTuple):
+    """Model of a solver: rays derotated by the gyro or not, with linear velocities or without."""
+
+    name: str
+    derotated: bool
+    velocities: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Solver:
+    """A row of the table of solvers."""
+
+    name: str
+    sample_size: int   # matches of a minimal sample
+    model: Model
+    # Kernel that writes all solutions, the sign of t by the majority of the points; their number.
+    solve: Callable[[Sample, Knowledge, Solutions], int]
+    most_solutions: int
+    summary: str   # first line of its documentation; the rest is that of `solve`
+    needs_gravity: bool = False   # both alignments of `Knowledge`
+    needs_rotation: bool = False   # the predicted rotation of `Knowledge`
+    starts_from_rotation: bool = False   # iterative, with `Knowledge.rotation` as first guess
+
+    @property
+    def address(self) -> int:
+        """Address of the compiled kernel, for `solve_at`; compiles it on first use."""
+        return _INTERFACE.address(self.solve)
+
+
+_INTERFACE = KernelInterface(
+    numba.int64, Sample(*np.empty((2, 1, 3)), *np.empty((2, 1))), no_knowledge(),
+    empty_solutions(1))
+# In compiled code: solve_at(address, sample, known, out).
+solve_at: Callable[[int, Sample, Knowledge, Solutions], int] = _INTERFACE.call
+
+
+@kernel
+def run_solver(address: int, sample: Sample, known: Knowledge, out: Solutions) -> int:
+    """Write the solutions of one sample to `out`; their number."""
+    return solve_at(address, sample, known, out)
+
+
+@kernel
+def cheirality_votes(sample: Sample, R: Array, x: Array) -> tuple[int, int]:
+    """Number of points in front of both cameras for ``x = (t, d_1, d_2)`` (9,), and for ``-x``.
+
+    Each point is triangulated from the positions of the cameras at its own rows:
+    ``lambda_1 f_1 - lambda_2 R f_2 = b = t - tau_1 d_1 + tau_2 d_2`` in the least-squares sense.
+    """
+    front = 0
+    behind = 0
+    for k in range(sample.f1.shape[0]):
+        f1, h = sample.f1[k], rotated(R, sample.f2[k])
+        tau1, tau2 = sample.tau1[k], sample.tau2[k]
+        b = (x[0] + (tau2 * x[6] - tau1 * x[3]), x[1] + (tau2 * x[7] - tau1 * x[4]),
+             x[2] + (tau2 * x[8] - tau1 * x[5]))
+        along1, along2, cosine = dot(f1, b), dot(h, b), dot(f1, h)
+        # Both depths times sin^2 of the angle between the rays.
+        depth1 = along1 - cosine * along2
+        depth2 = cosine * along1 - along2
+        if depth1 > 0.0 and depth2 > 0.0:
+            front += 1
+        elif depth1 < 0.0 and depth2 < 0.0:
+            behind += 1
+    return front, behind
+
+
+@kernel
+def point_forward(sample: Sample, R: Array, x: Array) -> None:
+    """Give `x` (9,) the sign with more points in front of both cameras."""
+    front, behind = cheirality_votes(sample, R, x)
+    if behind > front:
+        for i in range(9):
+            x[i] = 0.0 - x[i]  # not -x: a velocity of zero stays +0
+
+
+# Gravity as two degrees of freedom of the relative rotation: with ``A_i g_i = z`` for the unit
+# gravity directions g_i of the two cameras,
+#
+#     R = A_1^T Rz(psi) A_2
+#
+# has one unknown angle psi. The paper has ``R = R(phi_2, theta_2)^T R(psi) R(phi_1, theta_1)``
+# (section 'Gravity and Angular Velocity Measurements'), for the inverse R and a vertical along y.
+
+class AlignedRays(NamedTuple):
+    """Rays in frames with gravity on z, the second rotated so that solutions cluster about yaw 0.
+
+    `a`, `b` (n, 3): ``A_1 f_1`` and ``Rz(centre) A_2 f_2``. `centre` [rad]: to be added to their
+    yaw. `zoom`: rms distance of a and b, about the width of the cluster.
+    """
+
+    a: Array
+    b: Array
+    centre: float
+    zoom: float
+
+
+@kernel
+def gravity_alignment(gravity: Array) -> Array:
+    """Smallest rotation (3, 3) of `gravity` (3,), of any length, onto +z."""
+    length = norm(gravity)
+    x, y, z = gravity[0] / length, gravity[1] / length, gravity[2] / length
+    horizontal2 = x * x + y * y
+    A = np.zeros((3, 3))
+    if z < 0.0 and horizontal2 < 1e-30:
+        # Opposite to z: every half turn about a horizontal axis is a solution.
+        A[0, 0], A[1, 1], A[2, 2] = 1.0, -1.0, -1.0
+        return A
+    # 1 / (1 + z), without cancellation near z = -1.
+    k = 1.0 / (1.0 + z) if z >= 0.0 else (1.0 - z) / horizontal2
+    A[0, 0], A[0, 1], A[0, 2] = 1.0 - k * x * x, -k * x * y, -x
+    A[1, 0], A[1, 1], A[1, 2] = -k * x * y, 1.0 - k * y * y, -y
+    A[2, 0], A[2, 1], A[2, 2] = x, y, z
+    return A
+
+
+@kernel
+def rotation_from_yaw(psi: float, known: Knowledge, R: Array) -> None:
+    """Write ``A_1^T Rz(psi) A_2`` into `R` (3, 3)."""
+    c, s = math.cos(psi), math.sin(psi)
+    A2 = known.align2
+    for j in range(3):
+        aligned = (c * A2[0, j] - s * A2[1, j], s * A2[0, j] + c * A2[1, j], A2[2, j])
+        column = rotated_back(known.align1, aligned)
+        for i in range(3):
+            R[i, j] = column[i]
+
+
+@kernel
+def normals_at_yaw(rays: AlignedRays, c: float, s: float, normals: Array,
+                   derivatives: Array) -> None:
+    """Write epipolar normals ``n = a x h`` (n, 3) with ``h = Rz(psi) b``, and ``dn / dpsi``.
+
+    `c`, `s`: cosine and sine of psi. Normals are in the aligned frame, ``A_1 (f_1 x R f_2)``.
+    """
+    for k in range(rays.a.shape[0]):
+        a, b = rays.a[k], rays.b[k]
+        h = (c * b[0] - s * b[1], s * b[0] + c * b[1], b[2])
+        n = cross(a, h)
+        # dh / dpsi = (-h_y, h_x, 0)
+        dn = (-a[2] * h[0], -a[2] * h[1], a[0] * h[0] + a[1] * h[1])
+        for i in range(3):
+            normals[k, i], derivatives[k, i] = n[i], dn[i]
+
+
+@kernel
+def align_rays(sample: Sample, known: Knowledge) -> AlignedRays:
+    """Rotate gravity onto z, and the rays of the second camera onto those of the first.
+
+    The normals ``a x Rz(psi) b`` of distant points all nearly vanish at the true yaw, so that the
+    zeros of their determinants cluster there, within about the parallax. The centre of the cluster
+    is about ``argmax sum a . Rz(psi) b``. The zoom is in [1e-3, 1].
+    """
+    count = sample.f1.shape[0]
+    a, b = np.empty((count, 3)), np.empty((count, 3))
+    along, across = 0.0, 0.0
+    for k in range(count):
+        a_k, b_k = rotated(known.align1, sample.f1[k]), rotated(known.align2, sample.f2[k])
+        for i in range(3):
+            a[k, i], b[k, i] = a_k[i], b_k[i]
+        along += a_k[0] * b_k[0] + a_k[1] * b_k[1]
+        across += a_k[1] * b_k[0] - a_k[0] * b_k[1]
+    length = math.sqrt(along * along + across * across)
+    c, s = (along / length, across / length) if length > 0.0 else (1.0, 0.0)
+    total = 0.0
+    for k in range(count):
+        b[k, 0], b[k, 1] = c * b[k, 0] - s * b[k, 1], s * b[k, 0] + c * b[k, 1]
+        total += (a[k, 0] - b[k, 0]) ** 2 + (a[k, 1] - b[k, 1]) ** 2 + (a[k, 2] - b[k, 2]) ** 2
+    zoom = min(max(math.sqrt(total / count), 1e-3), 1.0)
+    return AlignedRays(a, b, math.atan2(s, c), zoom)
+
+
+# The nine columns of the uniform and linear models, well conditioned. A row of the paper's
+# ``A x = 0`` is ``[n, -tau_1 n, tau_2 n]`` with ``n = f_1 x R f_2`` and ``x = (t, d_1, d_2)``
+# (docs/conventions.md, equation 4). Matched points are in similar rows, and row times are 1e-2 s:
+# these three blocks are nearly parallel and badly scaled. The kernels therefore use
+#
+#     t - tau_1 d_1 + tau_2 d_2 = y_1 + p y_2 + q y_3
+#     p = (tau_1 - m) / s_p,    q = (tau_2 - tau_1) / s_q
+#
+# with the mean row time m and p, q of size 1; the two sets of columns span the same space for any
+# rotation: determinants differ by a constant factor, solutions by a linear map
+# (`translation_and_velocities`).
+
+class RowTimeFactors(NamedTuple):
+    """p, q (n,), the mean row time m [s] and the scales s_p, s_q [s].
+
+    `observable` is False for equal row times, from which velocities are not observable.
+    """
+
+    p: Array
+    q: Array
+    m: float
+    s_p: float
+    s_q: float
+    observable: bool
+
+
+@kernel
+def row_time_factors(sample: Sample) -> RowTimeFactors:
+    """Factors of a sample; p and q are not scaled if velocities are not observable."""
+    tau1, tau2 = sample.tau1, sample.tau2
+    n = tau1.shape[0]
+    m = 0.0
+    for k in range(n):
+        m += tau1[k] / n
+    p, q = np.empty(n), np.empty(n)
+    s_p, s_q = 0.0, 0.0
+    for k in range(n):
+        p[k] = tau1[k] - m
+        q[k] = tau2[k] - tau1[k]
+        s_p = max(s_p, abs(p[k]))
+        s_q = max(s_q, abs(q[k]))
+    # Velocity and translation are not distinguishable for closer row times [s].
+    least = 1e-12
+    observable = least < s_p < math.inf and least < s_q < math.inf
+    if observable:
+        for k in range(n):
+            p[k] /= s_p
+            q[k] /= s_q
+    return RowTimeFactors(p, q, m, s_p, s_q, observable)
+
+
+@kernel
+def translation_and_velocities(y: Array, factors: RowTimeFactors, x: Array) -> bool:
+    """``x = (t, d_1, d_2)`` with ``|t| = 1`` from `y` (9,); False if t vanishes."""
+    norm2 = 0.0
+    for i in range(3):
+        difference = y[3 + i] / factors.s_p  # d_2 - d_1
+        x[6 + i] = y[6 + i] / factors.s_q
+        x[3 + i] = x[6 + i] - difference
+        x[i] = y[i] - factors.m * difference
+        norm2 += x[i] * x[i]
+    # |y| = 1: a translation of this size is rounding.
+    if not norm2 > 1e-20:
+        return False
+    scale = 1.0 / math.sqrt(norm2)
+    for i in range(9):
+        x[i] *= scale
+    return True
+
+
+@kernel
+def solve_gyro_2pt(sample: Sample, known: Knowledge, out: Solutions) -> int:
+    """Rotation known: t is perpendicular to the normals ``n = f_1 x R f_2`` of both matches."""
+    R = known.rotation
+    n1 = cross(sample.f1[0], rotated(R, sample.f2[0]))
+    n2 = cross(sample.f1[1], rotated(R, sample.f2[1]))
+    t = cross(n1, n2)
+    length = norm(t)
+    if not length > 1e-14:
+        return 0
+    copy_matrix(R, out.R[0])
+    for i in range(3):
+        out.x[0, i] = t[i] / length
+    return 1

@@ -1,0 +1,265 @@
+"""Windows around points: patches in one small image, their correlation and their exposure.
+
+OpenCV's Lucas-Kanade prepares a whole image for a few hundred windows. On a mosaic of patches its
+cost does not depend on the size of the image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_relpose_ros.geometry.so3 import median
+from rs_relpose_ros.jit import kernel
+from rs_relpose_ros.tracking.images import Image
+
+Array = NDArray[np.float64]
+Map = NDArray[np.float32]
+
+# Beyond any image, and small enough for integers [px].
+_FARTHEST = 1e6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Patches:
+    """Square patches of one image."""
+
+    image: Image   # patch by patch, in rows
+    # (N, 2), row k added to a point [px] near the centre of patch k gives its place in `image`
+    shifts: Array
+
+    def __post_init__(self) -> None:
+        self.image.flags.writeable = False   # as images are: see `images.checked`
+
+
+def cut(image: Image, points: Array, radius: int) -> Patches:
+    """Patches of ``2 radius + 1`` pixels around points (N, 2), the border repeated."""
+    centres = np.rint(np.clip(points, -_FARTHEST, _FARTHEST)).astype(np.int64)
+    side = 2 * radius + 1
+    shape, corners = _layout(len(points), side)
+    # The unused places of the last row are not read, hence not initialised.
+    mosaic = np.empty(shape, dtype=np.uint8)
+    _copy(image, centres - radius, side, corners, mosaic)
+    return Patches(mosaic, (corners + radius - centres).astype(np.float64))
+
+
+def cut_warped(image: Image, points: Array, jacobians: Array, radius: int,
+               points1: Array) -> Patches:
+    """Patches of this image, resampled to the geometry of another one.
+
+    Pixel x of patch k, in the other image, has the value of this image at ``points + J (x -
+    points1)`` for `points` (N, 2) here, `points1` (N, 2) there and `jacobians` (N, 2, 2).
+    """
+    centres = np.rint(np.clip(points1, -_FARTHEST, _FARTHEST)).astype(np.int64)
+    side = 2 * radius + 1
+    shape, corners = _layout(len(points), side)
+    # Pixels outside the patches are not read, but need valid coordinates.
+    x, y = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
+    _maps(points, jacobians, centres - points1, side, corners, x, y)
+    mosaic: Image = cv2.remap(  # type: ignore[assignment]
+        image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return Patches(mosaic, (corners + radius - centres).astype(np.float64))
+
+
+def _layout(count: int, side: int) -> tuple[tuple[int, int], NDArray[np.int64]]:
+    """Height and width of an image for so many patches, and their upper left corners (N, 2)."""
+    columns = max(math.isqrt(max(count - 1, 0)) + 1, 1)
+    k = np.arange(count)
+    corners = side * np.column_stack([k % columns, k // columns])
+    return (side * max(-(-count // columns), 1), side * columns), corners
+
+
+@kernel
+def _copy(image: Image, first: NDArray[np.int64], side: int, corners: NDArray[np.int64],
+          mosaic: Image) -> None:
+    height, width = image.shape
+    rows, columns = mosaic.shape
+    pixels, target = image.reshape(height * width), mosaic.reshape(rows * columns)
+    for k in range(len(first)):
+        left, top = first[k, 0], first[k, 1]
+        at = corners[k, 1] * columns + corners[k, 0]
+        if left >= 0 and top >= 0 and left + side <= width and top + side <= height:
+            # Indices that cannot be negative: rows are copied many bytes at a time.
+            source, to = np.uint64(top * width + left), np.uint64(at)
+            for _ in range(side):
+                for j in range(np.uint64(side)):
+                    target[to + j] = pixels[source + j]
+                source += np.uint64(width)
+                to += np.uint64(columns)
+        else:
+            for i in range(side):
+                line = image[min(max(top + i, 0), height - 1)]
+                for j in range(side):
+                    target[at + i * columns + j] = line[min(max(left + j, 0), width - 1)]
+
+
+@kernel
+def _maps(points: Array, jacobians: Array, offsets: Array, side: int,
+          corners: NDArray[np.int64], x: Map, y: Map) -> None:
+    """Where patch k is sampled: ``point + J (offset + d)``, d whole pixels from its centre."""
+    radius = side // 2
+    for k in range(len(points)):
+        a, c = np.float32(jacobians[k, 0, 0]), np.float32(jacobians[k, 1, 0])
+        column, row = corners[k, 0], corners[k, 1]
+        for i in range(side):
+            across, down = offsets[k, 0] - radius, offsets[k, 1] + i - radius
+            x0 = np.float32(points[k, 0] + jacobians[k, 0, 0] * across
+                            + jacobians[k, 0, 1] * down)
+            y0 = np.float32(points[k, 1] + jacobians[k, 1, 0] * across
+                            + jacobians[k, 1, 1] * down)
+            xs, ys = x[row + i, column:column + side], y[row + i, column:column + side]
+            for j in range(side):
+                xs[j] = x0 + a * np.float32(j)
+                ys[j] = y0 + c * np.float32(j)
+
+
+@kernel
+def _squares(image: Image, points: Array, side: int) -> Image:
+    """Squares (N, side, side) of pixels from `points` (N, 2), whole numbers, on."""
+    first, corners = np.empty(points.shape, np.int64), np.zeros(points.shape, np.int64)
+    for k in range(len(points)):
+        first[k, 0], first[k, 1], corners[k, 1] = int(points[k, 0]), int(points[k, 1]), k * side
+    out = np.empty((len(points) * side, side), dtype=np.uint8)
+    _copy(image, first, side, corners, out)
+    return out.reshape(len(points), side, side)
+
+
+# -- Correlation: vectorised by column, since in one running sum each addition waits for the last.
+# -- Rows are padded to the width of vector registers; sums leave the padding out.
+
+Window = NDArray[np.float32]
+
+# Numbers of 32 bits in a vector register of AVX2.
+_LANES = 8
+
+
+@kernel
+def correlations(image1: Image, image2: Image, points1: Array, points2: Array,
+                 side: int) -> Array:
+    """Normalised cross-correlation (N,) of the windows around matched points (N, 2).
+
+    Zero where one of the windows is flat; the border is repeated.
+    """
+    padded = -(-side // _LANES) * _LANES
+    window1 = np.zeros((side, padded), dtype=np.float32)
+    window2 = np.zeros((side, padded), dtype=np.float32)
+    power1, power2 = np.empty(padded, dtype=np.float32), np.empty(padded, dtype=np.float32)
+    product = np.empty(padded, dtype=np.float32)
+    count, pixels = points1.shape[0], side * side
+    result = np.zeros(count)
+    whole1, whole2 = np.floor(points1), np.floor(points2)
+    squares1 = _squares(image1, whole1 - side // 2, padded + 1)
+    squares2 = _squares(image2, whole2 - side // 2, padded + 1)
+    for k in range(count):
+        total1 = _sample(squares1[k], points1[k] - whole1[k], window1, power1)
+        total2 = _sample(squares2[k], points2[k] - whole2[k], window2, power2)
+        mean1, mean2 = np.float32(total1 / pixels), np.float32(total2 / pixels)
+        power1[:], power2[:], product[:] = 0.0, 0.0, 0.0
+        for i in range(side):
+            row1, row2 = window1[i], window2[i]
+            for j in range(padded):
+                off1, off2 = row1[j] - mean1, row2[j] - mean2
+                power1[j] += off1 * off1
+                power2[j] += off2 * off2
+                product[j] += off1 * off2
+        total1, total2 = _total(power1, side), _total(power2, side)
+        # The variance of a flat window is rounding.
+        if total1 > 1e-6 * pixels and total2 > 1e-6 * pixels:
+            result[k] = _total(product, side) / math.sqrt(total1 * total2)
+    return result
+
+
+@kernel
+def _sample(square: Image, shift: Array, window: Window, by_column: Window) -> float:
+    """Fill the `window` (side, padded) from a square of pixels, shifted by part of a pixel.
+
+    The sum of its pixels is returned, that of its columns written to `by_column` (padded,).
+    """
+    side, padded = window.shape
+    dx, dy = shift[0], shift[1]
+    # Weights of the four pixels around a sample: the same for all, as they lie on a grid.
+    w00, w01, w10, w11 = (np.float32((1.0 - dx) * (1.0 - dy)), np.float32(dx * (1.0 - dy)),
+                          np.float32((1.0 - dx) * dy), np.float32(dx * dy))
+    by_column[:] = 0.0
+    for i in range(side):
+        above, below, row = square[i], square[i + 1], window[i]
+        above1, below1 = above[1:], below[1:]
+        for j in range(padded):
+            value = (w00 * np.float32(above[j]) + w01 * np.float32(above1[j])
+                     + w10 * np.float32(below[j]) + w11 * np.float32(below1[j]))
+            row[j] = value
+            by_column[j] += value
+    return _total(by_column, side)
+
+
+@kernel
+def _total(by_column: Window, side: int) -> float:
+    """Sum of the first `side` columns."""
+    total = 0.0
+    for j in range(side):
+        total += by_column[j]
+    return total
+
+
+# -- Exposure: Lucas-Kanade assumes constant brightness, which automatic exposure changes.
+
+# Smaller changes of exposure are not compensated: the second rounding to whole gray levels costs
+# more than it gains at faint texture (a RealSense recording: half the cost of 0.03 and 3).
+_LEAST_GAIN, _LEAST_OFFSET = 0.1, 10.0
+
+
+def brightness_table(image1: Image, image2: Image, points1: Array, points2: Array,
+                     side: int) -> Image | None:
+    """Gray level of the first image for each one of the second (256,); None if they agree.
+
+    Windows of `side` pixels around matches (N, 2) are compared in the original images:
+    interpolation smooths the noise and with it the contrast.
+    """
+    if not len(points1):
+        return None
+    mean1, contrast1 = _statistics(image1, points1, side)
+    mean2, contrast2 = _statistics(image2, points2, side)
+    textured = contrast2 > 0.0
+    if not textured.any():
+        return None
+    # Medians over the windows.
+    gain = median(contrast1[textured] / contrast2[textured])
+    offset = median(mean1 - gain * mean2)
+    if abs(gain - 1.0) < _LEAST_GAIN and abs(offset) < _LEAST_OFFSET:
+        return None
+    return np.clip(np.round(gain * np.arange(256.0) + offset), 0.0, 255.0).astype(np.uint8)
+
+
+def with_brightness(image: Image, table: Image | None) -> Image:
+    """`image` mapped through a table of `brightness_table`; read-only, as all images."""
+    if table is None:
+        return image
+    changed: Image = cv2.LUT(image, table)  # type: ignore[assignment]
+    changed.flags.writeable = False
+    return changed
+
+
+@kernel
+def _statistics(image: Image, points: Array, side: int) -> tuple[Array, Array]:
+    """Mean and standard deviation (N,) of the windows around `points` (N, 2), of whole pixels."""
+    pixels, windows = side * side, _squares(image, np.rint(points) - side // 2, side)
+    mean, deviation = np.empty(len(points)), np.empty(len(points))
+    for k in range(len(points)):
+        total, squares = np.int64(0), np.int64(0)
+        for i in range(side):
+            row = windows[k, i]
+            # Integers of 32 bits, which are summed many at a time.
+            row_total, row_squares = np.uint32(0), np.uint32(0)
+            for j in range(side):
+                value = np.uint32(row[j])
+                row_total += value
+                row_squares += value * value
+            total += np.int64(row_total)
+            squares += np.int64(row_squares)
+        mean[k] = total / pixels
+        deviation[k] = math.sqrt(max(squares / pixels - mean[k] * mean[k], 0.0))
+    return mean, deviation

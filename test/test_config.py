@@ -1,0 +1,152 @@
+"""The shipped configuration: parameter template, Fast DDS profile, launch file."""
+
+from __future__ import annotations
+
+import ast
+from importlib.metadata import distribution
+import py_compile
+import re
+from xml.etree import ElementTree
+
+from conftest import ROOT
+import pytest
+import yaml
+
+from rs_relpose_lab.live.processes import node_process, Process
+from rs_relpose_ros.config.files import parameter_template, read_parameters
+from rs_relpose_ros.config.settings import Parameters, SensorConfig
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.nodes import relpose_node as node_module
+
+CONFIG = ROOT / 'config'
+LAUNCH_FILE = ROOT / 'launch' / 'relpose.launch.py'
+NAMESPACE = '{http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles}'
+
+
+def test_template_is_up_to_date():
+    assert (CONFIG / 'relpose.yaml').read_text(encoding='utf-8') == parameter_template(), (
+        'run python -m rs_relpose_ros.config.files config/relpose.yaml')
+
+
+def test_template_holds_every_parameter_at_its_default():
+    text = parameter_template()
+    values = yaml.safe_load(text)['/**']['ros__parameters']
+    for name, default, _ in Parameters.declarations():
+        if default is None:
+            assert f'# {name}:' in text
+            assert name not in values
+        else:
+            assert values.pop(name) == (list(default) if isinstance(default, tuple) else default)
+    assert values == {}
+    assert read_parameters(CONFIG / 'relpose.yaml') == Parameters()
+    assert max(map(len, text.splitlines())) <= 99
+
+
+@pytest.mark.live
+def test_help_lists_the_legal_values_of_every_kind(capsys):
+    with pytest.raises(SystemExit):
+        node_module.main(['--help'])
+    printed = capsys.readouterr().out
+    assert re.search(r'^  track_time_offset: .*\. true or false; default False', printed, re.M)
+    assert re.search(r'^  stamps_file: .*\. text; default', printed, re.M)
+    for name, _, declared in Parameters.declarations():
+        assert f'  {name}: {declared.description}' in printed
+
+
+def test_node_accepts_the_template(ros_domain_id):
+    """Rcl's own YAML parser reads it as ours does."""
+    with node_process(CONFIG / 'relpose.yaml') as node:
+        node.wait_for('readout_time and quat_cam_imu_xyzw must be given')
+        assert 'there is no parameter' not in node.output
+
+
+def test_profile_has_room_for_big_images():
+    profiles = ElementTree.parse(CONFIG / 'fastdds.xml').getroot()
+    assert profiles.tag == f'{NAMESPACE}profiles'
+    [shared] = [t for t in profiles.iter(f'{NAMESPACE}transport_descriptor')
+                if t.findtext(f'{NAMESPACE}type') == 'SHM']
+    message, segment = (int(shared.findtext(f'{NAMESPACE}{name}'))
+                        for name in ('maxMessageSize', 'segment_size'))
+    assert message > 1920 * 1080 * 3
+    # As many images in flight as the node's queue is deep.
+    assert segment >= 10 * 1920 * 1080 * 3
+    [participant] = profiles.iter(f'{NAMESPACE}participant')
+    assert participant.get('is_default_profile') == 'true'
+
+
+@pytest.mark.live
+def test_profile_loses_no_big_image(ros_domain_id, monkeypatch):
+    """1920x1080 bgr8 at 30 Hz; with the default transports most of them are lost."""
+    monkeypatch.setenv('FASTRTPS_DEFAULT_PROFILES_FILE', str(CONFIG / 'fastdds.xml'))
+    script, count = ROOT / 'test' / 'big_images.py', 90
+    # A queue of five is a sixth of a second: a busy machine may stop a process for longer.
+    for _ in range(4):
+        with Process(str(script), 'receive', str(count)) as receiver:
+            receiver.wait_for('ready')
+            with Process(str(script), 'send', str(count)) as sender:
+                assert sender.wait() == 0, sender.output
+            assert receiver.wait() == 0, receiver.output
+            lost = count - int(receiver.output.split()[-1])
+        if lost == 0:
+            return
+    pytest.fail(f'{lost} of {count} images were lost')
+
+
+def call_in(tree, name):
+    """The one call of a function."""
+    [call] = [call for call in ast.walk(tree) if isinstance(call, ast.Call)
+              and isinstance(call.func, ast.Name) and call.func.id == name]
+    return call
+
+
+def test_launch_file_remaps_what_the_node_subscribes_to():
+    py_compile.compile(str(LAUNCH_FILE), doraise=True, cfile=None)
+    tree = ast.parse(LAUNCH_FILE.read_text(encoding='utf-8'))
+    keywords = {keyword.arg: keyword.value for keyword in call_in(tree, 'Node').keywords}
+    assert ast.literal_eval(keywords['package']) == 'rs_relpose_ros'
+    assert ast.unparse(keywords['executable']) == 'executable'
+    [arguments] = [part.value for part in tree.body if isinstance(part, ast.Assign)
+                   and ast.unparse(part.targets[0]) == 'ARGUMENTS']
+    defaults = {ast.literal_eval(name): ast.unparse(value.elts[0])
+                for name, value in zip(arguments.keys, arguments.values, strict=True)}
+    assert defaults['executable'] == "'relpose_node'"
+    remapped = [ast.literal_eval(pair.elts[0]) for pair in keywords['remappings'].elts]
+    assert remapped == ['image', 'camera_info', 'imu', 'accel']
+
+
+def test_launch_file_uses_the_profile_unless_the_user_has_one():
+    default = call_in(ast.parse(LAUNCH_FILE.read_text(encoding='utf-8')), 'EnvironmentVariable')
+    assert ast.unparse(default.args[0]) == 'PROFILE'
+    [path] = [keyword.value for keyword in default.keywords if keyword.arg == 'default_value']
+    assert "'config', 'fastdds.xml'" in ast.unparse(path)
+    assert (CONFIG / 'fastdds.xml').is_file()
+
+
+@pytest.mark.parametrize(('name', 'nodes'), [
+    ('global_shutter', 'global_shutter_node'),
+    ('relpose_and_global_shutter', 'relpose_node,global_shutter_node'),
+    ('odometry', 'relpose_node,odometry_node')])
+def test_launch_files_of_other_nodes_include_that_of_relpose_node(name, nodes):
+    path = ROOT / 'launch' / f'{name}.launch.py'
+    py_compile.compile(str(path), doraise=True, cfile=None)
+    texts = [node.value for node in ast.walk(ast.parse(path.read_text(encoding='utf-8')))
+             if isinstance(node, ast.Constant)]
+    assert LAUNCH_FILE.name in texts
+    scripts = {entry.name for entry in distribution('rs_relpose_ros').entry_points}
+    assert nodes in texts
+    assert set(nodes.split(',')) <= scripts
+
+
+@pytest.mark.parametrize('path', sorted((ROOT / 'launch').glob('*.py')), ids=lambda p: p.stem)
+def test_launch_file_describes_its_arguments(path):
+    pytest.importorskip('launch_ros', reason='launch is not in the wheels, only on ROS machines')
+    names: dict[str, object] = {}
+    exec(compile(path.read_text(encoding='utf-8'), str(path), 'exec'), names)  # noqa: S102
+    description = names['generate_launch_description']()
+    described = {argument.name for argument in description.get_launch_arguments()}
+    assert {'camera_namespace', 'params_file', 'fastdds_profile'} <= described
+
+
+def test_an_exposure_is_given_once():
+    with pytest.raises(InputError, match='exposure_time or exposure_margin'):
+        SensorConfig(exposure_time=0.01, exposure_margin=0.008)

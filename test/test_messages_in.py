@@ -1,0 +1,525 @@
+"""Message conversion, with rclpy's classes and with those of rosbags."""
+
+from __future__ import annotations
+
+import struct
+from types import SimpleNamespace
+from typing import Any
+import zlib
+
+import cv2
+import message_builders as build
+import numpy as np
+import pytest
+
+from rs_relpose_ros.config.settings import ImuConfig, IntrinsicsConfig, Parameters
+from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.imu.buffer import ImuSample
+from rs_relpose_ros.messages import incoming
+from rs_relpose_ros.messages.incoming import Intake, Role, StuckCamera, StuckGyro
+from rs_relpose_ros.pipeline.sequencer import Refusal, Sequencer
+from rs_relpose_ros.tracking.images import CompressedImage, GrayLevels
+
+# Luma of ITU-R BT.601.
+WEIGHTS = np.array([0.299, 0.587, 0.114])
+
+
+RGB = np.random.default_rng(0).integers(0, 256, (7, 10, 3), dtype=np.uint8)
+GRAY = np.ascontiguousarray(RGB[:, :, 0])
+
+
+def padded(rows: np.ndarray, padding: int) -> tuple[bytes, int]:
+    """Bytes of an array of rows with `padding` bytes of garbage after each, and the step."""
+    flat = rows.reshape(len(rows), -1).view(np.uint8)
+    filled = np.concatenate([flat, np.full((len(rows), padding), 0xaa, np.uint8)], axis=1)
+    return filled.tobytes(), filled.shape[1]
+
+
+def packed_yuv(luma_at: int) -> tuple[bytes, int]:
+    packed = np.full((7, 10, 2), 128, np.uint8)
+    packed[:, :, luma_at] = GRAY
+    return packed.tobytes(), 20
+
+
+# -- images ----------------------------------------------------------------------------------
+
+
+def decoded(message: object) -> np.ndarray:
+    return incoming.image_from_message(message).decoded()
+
+
+@build.both_types
+@pytest.mark.parametrize('padding', [0, 3])
+@pytest.mark.parametrize(('encoding', 'order'), [
+    ('rgb8', [0, 1, 2]), ('bgr8', [2, 1, 0]), ('rgba8', [0, 1, 2, 0]), ('bgra8', [2, 1, 0, 0])])
+def test_color_becomes_luma(types, encoding, order, padding):
+    data, step = padded(np.ascontiguousarray(RGB[:, :, order]), padding)
+    gray = decoded(build.image(types, 10, 7, encoding, data, step=step))
+    assert gray.dtype == np.uint8
+    np.testing.assert_allclose(gray, RGB @ WEIGHTS, atol=0.51)
+
+
+@build.both_types
+@pytest.mark.parametrize(('encoding', 'data', 'step'), [
+    ('mono8', *padded(GRAY, 0)), ('mono8', *padded(GRAY, 5)),
+    ('mono8', padded(GRAY, 5)[0][:-5], 15),   # the last row needs no padding
+    # Planar: luma first.
+    *((encoding, GRAY.tobytes() + bytes(35), 10) for encoding in ('nv12', 'nv21', 'i420')),
+    *((encoding, *packed_yuv(luma_at)) for encoding, luma_at in (
+        ('yuv422_yuy2', 0), ('yuyv', 0), ('yuv422', 1), ('uyvy', 1)))])
+def test_luma_is_used_as_it_is(types, encoding, data, step):
+    np.testing.assert_array_equal(
+        decoded(build.image(types, 10, 7, encoding, data, step=step)), GRAY)
+
+
+@build.both_types
+@pytest.mark.parametrize(('order', 'is_bigendian'), [('<u2', 0), ('>u2', 1)])
+@pytest.mark.parametrize('encoding', ['mono16', '16UC1'])
+def test_16_bits_honour_byte_order(types, order, is_bigendian, encoding):
+    values = np.arange(0, 60000, 25, dtype=np.uint16).reshape(40, 60)
+    data, step = padded(values.astype(order), 2)
+    gray = decoded(
+        build.image(types, 60, 40, encoding, data, step=step, is_bigendian=is_bigendian))
+    slope, offset = np.polyfit(values.ravel(), gray.ravel(), 1)
+    assert 170 < gray.max() - gray.min() <= 255
+    np.testing.assert_allclose(gray, slope * values + offset, atol=1.5)
+
+
+def texture(low: float, high: float) -> np.ndarray:
+    return np.random.default_rng(3).uniform(low, high, (120, 160)).astype(np.uint16)
+
+
+@pytest.mark.parametrize(('low', 'high'), [
+    (0, 1023), (0, 4095), (100, 16383), (0, 65535), (29_800, 30_400)])
+def test_16_bits_are_scaled_to_their_content(low, high):
+    gray = GrayLevels().gray(texture(low, high))
+    assert 120 < int(gray.max()) - int(gray.min()) <= 255
+    # Few pixels are clipped.
+    assert np.isin(gray, (0, 255)).mean() < 0.02
+    # Dark images remain dark.
+    assert GrayLevels().gray(texture(0, 20)).max() <= 25
+
+
+def test_the_range_of_16_bits_is_kept_while_the_content_fits():
+    levels, pixels = GrayLevels(), texture(1000, 3000)
+    first = levels.gray(pixels)
+    # Automatic exposure, a little darker: the same range, so the image is darker, too.
+    darker = levels.gray((pixels * 0.9).astype(np.uint16))
+    assert first.mean() - darker.mean() > 10
+    np.testing.assert_array_equal(levels.gray(pixels), first)
+    # Ten times as bright: black and white are chosen again, and so they are on the way back.
+    bright = levels.gray(pixels * 10)
+    assert bright.mean() == pytest.approx(first.mean(), abs=3)
+    np.testing.assert_array_equal(levels.gray(pixels), first)
+
+
+@build.both_types
+def test_messages_of_16_bits_use_the_given_range(types):
+    levels, bright, dark = GrayLevels(), texture(0, 4000), texture(0, 3000)
+    first, second = (incoming.image_from_message(build.image(
+        types, 160, 120, 'mono16', pixels.astype('<u2').tobytes(), step=320)).decoded(levels)
+        for pixels in (bright, dark))
+    assert second.mean() < first.mean() - 20
+    png = cv2.imencode('.png', bright)[1].tobytes()
+    np.testing.assert_array_equal(decoded(build.compressed(types, png)), first)
+
+
+@build.both_types
+@pytest.mark.parametrize('bits', [8, 16])
+@pytest.mark.parametrize('pattern', ['rggb', 'bggr', 'gbrg', 'grbg'])
+def test_bayer_patterns_have_their_colors(types, pattern, bits):
+    # Red and blue differ: exchanged, the luma would be 96 instead of 124.
+    level = {'r': 200, 'g': 100, 'b': 50}
+    tile = np.array([level[c] for c in pattern], dtype=np.uint8).reshape(2, 2)
+    mosaic = np.tile(tile, (4, 5))
+    raw = mosaic if bits == 8 else mosaic.astype('<u2') * 256
+    gray = decoded(build.image(
+        types, 10, 8, f'bayer_{pattern}{bits}', raw.tobytes(), step=10 * bits // 8))
+    luma = WEIGHTS @ [200, 100, 50]
+    # Of 16 bits, black and white are a quarter of the range beyond the content.
+    expected = luma if bits == 8 else (luma - 12.5) * 255 / 225
+    np.testing.assert_allclose(gray[2:-2, 2:-2], expected, atol=1.5)
+
+
+@pytest.mark.parametrize(('change', 'expected'), [
+    ({'encoding': '32FC1'}, "'32FC1' is not known; publish one of mono8"),
+    ({'encoding': 'bayer_rggb12'}, "'bayer_rggb12' is not known"),
+    ({'width': 0}, 'size 0x7'),
+    ({'height': 0}, 'size 10x0'),
+    ({'width': 2**32 - 1, 'height': 2**32 - 1, 'step': 2**32 - 1}, 'size .* is not usable'),
+    ({'width': 16384, 'height': 16384, 'step': 16384}, 'size .* is not usable'),
+    ({'width': 8192, 'height': 8192, 'step': 8192}, '70 bytes of data, but 8192x8192'),
+    ({'step': 9}, 'step is 9 bytes, but a row .* has 10'),
+    ({'step': 2**32 - 1}, '70 bytes of data'),
+    ({'height': 8}, '70 bytes of data, but 10x8 .* needs 80'),
+    ({'encoding': 'bgr8'}, 'step is 10 bytes, but a row .* has 30'),
+    ({'encoding': 'mono16'}, 'step is 10 bytes, but a row .* has 20'),
+])
+def test_unusable_image_is_refused(change, expected):
+    fields = {'width': 10, 'height': 7, 'encoding': 'mono8', 'step': 10, **change}
+    with pytest.raises(InputError, match=expected):
+        decoded(build.image(build.rosbags_types, data=bytes(70), **fields))
+
+
+@build.both_types
+@pytest.mark.parametrize('extension', ['.jpg', '.png'])
+def test_compressed_image_is_decoded(types, extension):
+    ramp = np.tile(np.arange(64, dtype=np.uint8) * 3, (48, 1))
+    data = cv2.imencode(extension, ramp)[1].tobytes()
+    gray = decoded(build.compressed(types, data))
+    np.testing.assert_allclose(gray, ramp, atol=4 if extension == '.jpg' else 0)
+
+
+def test_trailing_bytes_and_an_orientation_tag_change_nothing():
+    """Drivers append bytes; the rows stay those of the sensor, whose times they have."""
+    # An Exif segment that requests a rotation by 90 degrees (orientation 6).
+    tiff = struct.pack('<2sHIHHHIHHI', b'II', 42, 8, 1, 0x0112, 3, 1, 6, 0, 0)
+    segment = b'Exif\0\0' + tiff
+    plain = build.jpeg(np.zeros((48, 64), np.uint8))
+    data = plain[:2] + b'\xff\xe1' + struct.pack('>H', len(segment) + 2) + segment + plain[2:]
+    assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE).shape == (64, 48)
+    for variant in (data, plain + bytes(100)):
+        assert decoded(build.compressed(build.rosbags_types, variant)).shape == (48, 64)
+
+
+def png_of_size(width: int, height: int) -> bytes:
+    chunk = b'IHDR' + struct.pack('>IIBBBBB', width, height, 8, 0, 0, 0, 0)
+    end = b'IEND'
+    return (b'\x89PNG\r\n\x1a\n' + struct.pack('>I', 13) + chunk
+            + struct.pack('>I', zlib.crc32(chunk)) + struct.pack('>I', 0) + end
+            + struct.pack('>I', zlib.crc32(end)))
+
+
+JPEG = build.jpeg(np.random.default_rng(1).integers(0, 256, (48, 64), dtype=np.uint8))
+
+
+@pytest.mark.parametrize(('data', 'expected'), [
+    (b'', '0 bytes is neither JPEG nor PNG'),
+    (b'GIF89a' + bytes(100), '106 bytes is neither JPEG nor PNG'),
+    (JPEG[:len(JPEG) // 2], 'is truncated'),
+    (JPEG[:3], 'is truncated'),
+    (b'\xff\xd8\xff\xd9', 'has no frame header'),
+    (b'\xff\xd8\xff\xe0\x00\x00' + bytes(20) + b'\xff\xd9', 'has no frame header'),
+    (JPEG[:24] + b'\xff\xd9', 'has no frame header'),
+    # Decoded, it would take 1.8 GB.
+    (JPEG.replace(b'\x00\x30\x00\x40', b'\xa8\xca\xa8\xca', 1), 'size 43210x43210'),
+    (png_of_size(2**31 - 1, 2**31 - 1), 'size 2147483647x2147483647'),
+    (png_of_size(64, 48), 'is corrupt'),
+    (png_of_size(64, 48)[:30], 'truncated'),
+])
+def test_unusable_compressed_image_is_refused(data, expected):
+    with pytest.raises(InputError, match=expected):
+        decoded(build.compressed(build.rosbags_types, data))
+
+
+# -- calibration -----------------------------------------------------------------------------
+
+
+@build.both_types
+def test_calibration_of_the_full_sensor(types):
+    calibration = incoming.intrinsics_from_info(build.camera_info(types))
+    assert (calibration.fx, calibration.fy, calibration.cx, calibration.cy) == (
+        450.0, 451.0, 319.5, 239.5)
+    assert (calibration.image_width, calibration.image_height) == (640, 480)
+    points = np.array([[0.0, 0.0], [12.25, 400.5]])
+    np.testing.assert_array_equal(calibration.to_sensor(points), points)
+
+
+@build.both_types
+def test_region_and_binning_shift_rows(types):
+    calibration = incoming.intrinsics_from_info(build.camera_info(
+        types, roi=(100, 60, 400, 300), binning=(2, 2)))
+    assert (calibration.image_width, calibration.image_height) == (200, 150)
+    # The first published pixel covers sensor pixels 100 and 101: its centre lies between them.
+    np.testing.assert_array_equal(
+        calibration.to_sensor([[0.0, 0.0], [199.0, 149.0]]), [[100.5, 60.5], [498.5, 358.5]])
+    points = np.random.default_rng(0).uniform(0, 150, (20, 2))
+    np.testing.assert_allclose(
+        calibration.to_image(calibration.to_sensor(points)), points, atol=1e-12)
+
+
+@build.both_types
+@pytest.mark.parametrize(('model', 'count'), [
+    ('plumb_bob', 0), ('plumb_bob', 4), ('plumb_bob', 5), ('plumb_bob', 8),
+    ('rational_polynomial', 8), ('equidistant', 4)])
+def test_known_distortion(types, model, count):
+    coefficients = tuple(0.001 * (i + 1) for i in range(count))
+    calibration = incoming.intrinsics_from_info(
+        build.camera_info(types, model=model, d=coefficients))
+    assert (calibration.distortion_model, calibration.distortion) == (model, coefficients)
+
+
+def test_capital_fields_of_ros_1():
+    new = build.camera_info(build.rosbags_types)
+    old = SimpleNamespace(
+        header=new.header, height=480, width=640, distortion_model='plumb_bob', D=new.d, K=new.k,
+        binning_x=0, binning_y=0, roi=new.roi)
+    assert incoming.intrinsics_from_info(old) == incoming.intrinsics_from_info(new)
+
+
+UNCALIBRATED = {'k': (0.0,) * 9}
+
+
+@pytest.mark.parametrize(('change', 'expected'), [
+    (UNCALIBRATED, 'uncalibrated'),
+    ({'model': 'double_sphere', 'd': (0.1, 0.2)}, "'double_sphere'"),
+    ({'d': (0.1,) * 6}, 'got 6'),
+    ({'d': (0.1,) * 1000}, '1000 coefficients'),
+    ({'d': (float('nan'),) * 5}, 'distortion must be finite'),
+    ({'k': (-450.0, 0, 320, 0, 450, 240, 0, 0, 1)}, 'fx must be'),
+    ({'k': (float('inf'), 0, 320, 0, 450, 240, 0, 0, 1)}, 'must be finite'),
+    ({'k': (450.0, 3.0, 320, 0, 450, 240, 0, 0, 1)}, r'must be \[fx 0 cx'),
+    ({'width': 0}, 'size 0x480'),
+    ({'roi': (400, 0, 400, 300)}, 'leaves the sensor in x'),
+    ({'roi': (0, 400, 400, 300)}, 'leaves the sensor in y'),
+    ({'binning': (1000, 1)}, 'image_width must be >= 1'),
+])
+def test_unusable_calibration_is_refused(change, expected):
+    # Only a missing one is replaced by the parameters.
+    error = MissingInputError if change is UNCALIBRATED else InputError
+    with pytest.raises(error, match=expected):
+        incoming.intrinsics_from_info(build.camera_info(build.rosbags_types, **change))
+
+
+# -- IMU -------------------------------------------------------------------------------------
+
+
+@build.both_types
+@pytest.mark.parametrize(('change', 'gyro', 'force'), [
+    ({}, (0.1, 0.2, 0.3), (0.0, 0.0, 9.8)),
+    ({'accelerometer_covariance': -1.0}, (0.1, 0.2, 0.3), None),
+    ({'accelerometer': (0.0,) * 3}, (0.1, 0.2, 0.3), None),
+    ({'gyro_covariance': -1.0}, None, (0.0, 0.0, 9.8)),
+    ({'gyro': (0.0,) * 3}, (0.0,) * 3, (0.0, 0.0, 9.8))])   # a gyro at rest is a sensor
+def test_absent_sensors_are_none(types, change, gyro, force):
+    stamp_ns = 1_700_000_000_123_456_789
+    message = build.imu(types, stamp_ns, **change)
+    assert incoming.imu_sample_from_message(message) == ImuSample(stamp_ns, gyro, force)
+    if force:
+        assert incoming.imu_sample_from_message(message, with_gyro=False) == ImuSample(
+            stamp_ns, None, force)
+
+
+@pytest.mark.parametrize(('change', 'expected'), [
+    ({'gyro': (float('nan'), 0.0, 0.0)}, 'angular_velocity .* finite'),
+    ({'gyro': (0.0, -1e308, 0.0)}, 'angular_velocity .* at most 1000'),
+    ({'accelerometer': (0.0, 0.0, 2e4)}, 'linear_acceleration .* at most'),
+    ({'accelerometer': (0.0, float('inf'), 0.0)}, 'linear_acceleration .* finite'),
+    ({'gyro_covariance': -1.0, 'accelerometer_covariance': -1.0}, 'neither gyro nor accel'),
+])
+def test_unusable_imu_is_refused(change, expected):
+    with pytest.raises(InputError, match=expected):
+        incoming.imu_sample_from_message(build.imu(build.rosbags_types, 0, **change))
+
+
+def test_impossible_stamp_is_refused():
+    header = build.header(build.rosbags_types, 0)
+    header.stamp.nanosec = 1_000_000_000
+    with pytest.raises(InputError, match='out of range'):
+        incoming.stamp_ns(header)
+
+
+# -- intake ----------------------------------------------------------------------------------
+
+PIXELS = np.random.default_rng(5).integers(0, 256, (480, 640), dtype=np.uint8)
+CONFIGURED = IntrinsicsConfig(
+    camera_matrix=(400.0, 0.0, 320.0, 0.0, 401.0, 241.0, 0.0, 0.0, 1.0),
+    distortion_coefficients=(0.1, -0.2, 0.0, 0.0))
+
+
+class Fed:
+    """An intake that has received the IMU of the first second, and its sequencer."""
+
+    def __init__(self, configured: IntrinsicsConfig | None = None) -> None:
+        self.sequencer = Sequencer(Parameters.from_mapping({
+            'readout_time': 0.02, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0]}), offline=True)
+        self.intake = Intake(self.sequencer, None if configured is None else Parameters(
+            intrinsics=configured, imu=ImuConfig(stuck_gyro_time=0.0)))
+        for stamp_ns in range(0, 10**9, 5_000_000):
+            self.intake.receive(Role.IMU, build.imu(build.rosbags_types, stamp_ns))
+
+    def info(self, **change: Any) -> Exception | None:
+        return self.intake.receive(
+            Role.CAMERA_INFO, build.camera_info(build.rosbags_types, **change))
+
+    def images(self, *numbers: int, height: int = 480) -> None:
+        """Images at tenths of a second, no two alike."""
+        for k in numbers:
+            self.intake.receive(Role.IMAGE, build.gray_image(
+                build.rosbags_types, np.roll(PIXELS[:height], k), stamp_ns=k * 10**8))
+
+    def taken(self) -> list[Any]:
+        """Frames and refusals since the last call."""
+        return list(iter(self.sequencer.take, None))
+
+
+@pytest.fixture
+def fed() -> Fed:
+    return Fed()
+
+
+def assert_refused(item: Any, refusal: Refusal, stamp_ns: int, reason: str) -> None:
+    assert (item.refusal, item.stamp_ns) == (refusal, stamp_ns)
+    assert reason in item.reason
+
+
+def test_image_before_its_camera_info_is_kept(fed):
+    fed.images(5)
+    assert fed.taken() == []
+    fed.info()
+    [frame] = fed.taken()
+    np.testing.assert_array_equal(frame.image, np.roll(PIXELS, 5))
+    assert frame.frame_id == 'camera'
+
+
+def test_images_without_camera_info_are_refused(fed):
+    fed.images(*range(6))
+    fed.intake.finish()
+    refused = fed.taken()
+    assert len(refused) == 6
+    for k, item in enumerate(refused):
+        assert_refused(item, Refusal.NO_CALIBRATION, k * 10**8, 'no CameraInfo')
+
+
+def test_no_outdated_calibration_is_used(fed):
+    fed.info()
+    assert isinstance(fed.info(**UNCALIBRATED), MissingInputError)
+    assert 'uncalibrated' in fed.intake.camera_info_problem
+    fed.images(1)
+    [refused] = fed.taken()
+    assert_refused(refused, Refusal.NO_CALIBRATION, 10**8, 'uncalibrated')
+
+
+def test_configured_intrinsics_replace_those_that_are_missing():
+    fed = Fed(CONFIGURED)
+    assert fed.info(**UNCALIBRATED) is None
+    assert fed.intake.camera_info_problem == ''
+    fed.images(1, 2)
+    for number, frame in enumerate(fed.taken(), start=1):
+        assert frame.stamp_ns == number * 10**8
+        assert frame.intrinsics == CONFIGURED.of_image(640, 480) == fed.intake.intrinsics
+    # A calibration that comes later has priority, and is not used any more once it is withdrawn.
+    for change, fx in (({}, 450.0), (UNCALIBRATED, 400.0)):
+        fed.info(**change)
+        fed.images(3 + bool(change))
+        assert fed.taken()[0].intrinsics.fx == fx
+    # An unusable one is no missing one.
+    assert isinstance(fed.info(model='bananas'), InputError)
+    fed.images(5)
+    [refused] = fed.taken()
+    assert_refused(refused, Refusal.NO_CALIBRATION, 5 * 10**8, 'bananas')
+
+
+def test_without_a_camera_info_the_first_images_wait_for_one():
+    fed = Fed(CONFIGURED)
+    fed.images(1, 2, 3, 4)
+    assert fed.taken() == [] and fed.intake.intrinsics is None
+    fed.images(5)
+    assert [frame.intrinsics.fy for frame in fed.taken()] == [401.0] * 5
+    # Each image has its own size.
+    fed.images(6, height=240)
+    [frame] = fed.taken()
+    assert frame.intrinsics == CONFIGURED.of_image(640, 240)
+    fed.intake.receive(
+        Role.IMAGE, build.compressed(build.rosbags_types, b'none', stamp_ns=7 * 10**8))
+    [refused] = fed.taken()
+    assert_refused(refused, Refusal.BAD_IMAGE, 7 * 10**8, 'neither JPEG nor PNG')
+    # A recording that ends before.
+    fed = Fed(CONFIGURED)
+    fed.images(1, 2)
+    fed.intake.finish()
+    assert len(fed.taken()) == 2
+
+
+def test_unusable_images_are_refused(fed):
+    """Of another size, or with a stamp out of range."""
+    fed.info()
+    fed.images(1, height=240)
+    image = build.gray_image(build.rosbags_types, PIXELS)
+    image.header.stamp.nanosec = 10**9
+    fed.intake.receive(Role.IMAGE, image)
+    fed.images(2)
+    # The last one was not queued.
+    by_stamp = {item.stamp_ns: item for item in fed.taken()}
+    assert_refused(by_stamp[10**8], Refusal.BAD_IMAGE, 10**8, '640x240')
+    assert_refused(by_stamp[0], Refusal.BAD_IMAGE, 0, 'out of range')
+    assert by_stamp[2 * 10**8].image.shape == (480, 640)
+    assert fed.sequencer.counts().refused == {Refusal.BAD_IMAGE: 2}
+
+
+# -- stuck sensors -----------------------------------------------------------------------------
+
+NOISE = np.random.default_rng(0).normal(size=40)
+
+
+def used(values: list[tuple[float, float, float]], step_ms: int = 5,
+         longest: float = 0.025) -> list[str]:
+    """For each sample 'used', '' if it repeats the last one, or the error."""
+    gyro, out = StuckGyro(longest), []
+    for k, value in enumerate(values):
+        try:
+            repeats = gyro.repeats(ImuSample(k * step_ms * 10**6, value, None))
+            out.append('' if repeats else 'used')
+        except InputError as error:
+            out.append(str(error))
+    return out
+
+
+def test_a_gyro_that_repeats_itself_is_stuck():
+    found = used([(0.01, 0.02, 0.3)] * 8 + [(0.01, 0.02, 0.31)])
+    # 25 ms are tolerated.
+    assert found[:6] == ['used', *[''] * 5]
+    assert all('it is stuck' in text for text in found[6:8])
+    assert found[8] == 'used'
+    assert 'it is stuck' in used([(0.0, 0.0, 0.0)] * 8)[-1]
+
+
+def test_a_gyro_at_the_end_of_its_range_is_saturated():
+    found = used([(-4.36, x, y) for x, y in NOISE[:16].reshape(8, 2)])
+    assert found[1] == ''
+    assert 'x axis' in found[-1] and found[-1].endswith('it is saturated')
+
+
+def test_a_gyro_that_is_clipped_below_any_range_is_saturated():
+    """Detected because it repeats the largest value so far."""
+    rng = np.random.default_rng(0)
+    rates = np.clip(1.3 * np.sin(np.linspace(0.0, 12.0, 240)), -0.7, 0.7)
+    found = used([(x, y, z) for (x, y), z in zip(rng.normal(size=(240, 2)), rates, strict=True)])
+    clipped = np.flatnonzero(np.abs(rates) == 0.7)
+    assert 100 < len(clipped) < 180
+    # The first of each stretch is true.
+    firsts = clipped[np.diff(clipped, prepend=-2) > 1]
+    assert [k for k, text in enumerate(found) if text != 'used'] == sorted(
+        set(clipped.tolist()) - set(firsts.tolist()))
+    assert any('z axis' in text and 'saturated' in text for text in found)
+
+
+@pytest.mark.parametrize(('values', 'options', 'count'), [
+    # Coarse values that are not the largest, and a bias at rest that is.
+    ([(1.0, -1.0, NOISE[0]), *((0.8, -0.8, z) for z in NOISE)], {}, 41),
+    ([(0.15, -0.15, z) for z in NOISE], {}, 40),
+    # A robot in the plane, and a coarse gyro at rest.
+    ([(0.0, 0.0, z) for z in NOISE], {}, 40),
+    ([(0.001, -0.001, z) for z in NOISE], {}, 40),
+    # Drivers that are faster than their sensor.
+    ([(z, z, z) for z in NOISE for _ in range(5)], {'step_ms': 1}, 40),
+    ([(z, z, z) for z in NOISE for _ in range(2)], {'step_ms': 20}, 40),
+    # Not to be detected.
+    ([(0.0, 0.0, 0.0)] * 100, {'longest': 0.0}, 100)])
+def test_sensors_may_repeat_values(values, options, count):
+    found = used(values, **options)
+    assert found.count('used') == count
+    assert set(found) <= {'used', ''}
+
+
+def test_an_image_that_repeats_the_one_before():
+    camera = StuckCamera()
+    pixels = np.random.default_rng(0).integers(0, 256, 8000, dtype=np.uint8)
+    other = pixels.copy()
+    other[5050] ^= 1
+    repeats = [bool(camera.problem(CompressedImage(data, 'jpeg', stamp)))
+               for stamp, data in enumerate((
+                   pixels, pixels.copy(), other, other, pixels[:4000], pixels))]
+    assert repeats == [False, True, False, True, False, False]
+    # The same message once more.
+    assert camera.problem(CompressedImage(pixels.copy(), 'jpeg', 5)) == ''

@@ -1,0 +1,820 @@
+"""Consistency monitor: its parts, wrong parameters one by one, and tracked parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+import itertools
+import json
+import math
+import re
+import time
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.config.files import read_parameters
+from rs_relpose_ros.config.settings import EstimatorConfig, ImuConfig, Parameters
+from rs_relpose_ros.estimator.estimate import estimate_relative_pose
+from rs_relpose_ros.estimator.result import Status
+from rs_relpose_ros.estimator.velocity import InertialEvidence
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.motion import FrameMotion
+from rs_relpose_ros.imu.integration import integrate_rotation, rotation_sensitivity
+from rs_relpose_ros.messages import incoming
+from rs_relpose_ros.messages.incoming import Intake, Role, sensor_messages
+from rs_relpose_ros.nodes.sensor_node import Worker
+from rs_relpose_ros.offline.replay import read_truth, Replay
+from rs_relpose_ros.pipeline import findings, recursion
+from rs_relpose_ros.pipeline.assessment import assess, Configured, Effect, find_inconsistencies
+from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState, worst_of
+from rs_relpose_ros.pipeline.monitor import Applied, ConsistencyMonitor, Tracked
+from rs_relpose_ros.pipeline.pair import Frame
+from rs_relpose_ros.pipeline.pipeline import FrameFailed, FrontEnd
+from rs_relpose_ros.pipeline.recursion import pair_information, PairData, Recursion
+from rs_relpose_ros.pipeline.rotations import AccelerationSums, rotation_of_rays, RotationSums
+
+AXES, OFFSET, READOUT, BIAS = findings.AXES, findings.OFFSET, findings.READOUT, findings.BIAS
+SCALE, FOCAL, DISTORTION = findings.SCALE, findings.FOCAL, findings.DISTORTION
+DEVIATIONS = findings.DEVIATIONS
+MS = 1_000_000
+NONE = np.zeros(DEVIATIONS)
+R_CAM_IMU = Rotation.from_euler('xyz', [90, 0, 30], degrees=True)
+CAMERA = RollingShutterCamera(
+    width=640, height=480, fx=420.0, fy=420.0, cx=318.0, cy=242.0, readout_time=0.03,
+    distortion=(-0.12, 0.03, 0.0, 0.0))
+PARAMETERS = Parameters.from_mapping({
+    'readout_time': 0.03, 'time_offset': 0.004, 'quat_cam_imu_xyzw': tuple(R_CAM_IMU.as_quat())})
+# Small deviations: rad, s, s, rad/s, -, -, -.
+SMALL = np.array([3e-3] * 3 + [2e-3, 2e-3] + [3e-3] * 3 + [0.01, 0.01, 0.01])
+CONFIGURED = Configured(PARAMETERS.sensor, CAMERA, np.zeros(3), 0.003, NONE)
+
+
+def deviation(**values):
+    """(11,) of quantities by name."""
+    c = np.zeros(DEVIATIONS)
+    for name, value in values.items():
+        c[getattr(findings, name.upper())] = value
+    return c
+
+
+# -- exact pairs: an image is exposed by search, without derivatives of the monitor -------------
+
+
+# A camera that shakes while it flies past points; positions in metres.
+RNG, TIMES = np.random.default_rng(0), np.arange(-1.0, 6.0, 0.4)
+ORIENTATION = RotationSpline(TIMES, Rotation.from_rotvec(0.12 * RNG.normal(size=(len(TIMES), 3))))
+VELOCITY = np.array([0.9, 0.3, 0.4])
+POINTS = RNG.uniform([-4, -3, 4], [9, 4, 14], (900, 3))
+
+
+def exposed(camera, start):
+    """Pixels (N, 2) of a frame whose stamped row is exposed at `start` [s], and if it is."""
+    tau = np.zeros(len(POINTS))
+    for _ in range(8):   # a row rotates the camera by far less than a row
+        local = ORIENTATION(start + tau).inv().apply(POINTS - (start + tau)[:, None] * VELOCITY)
+        pixels = camera.project(local)
+        tau = np.clip(np.nan_to_num(camera.row_times(pixels[:, 1])), -0.1, 0.1)
+    inside = (pixels >= 2).all(axis=1) & (pixels <= [637, 477]).all(axis=1)
+    return pixels, inside & (local[:, 2] > 1.0)
+
+
+def gyro(start, end, c):
+    """Times (K,) [ns], and the rates of the gyro (K, 3), in camera axes as configured."""
+    stamps_ns = np.round(np.linspace(start, end, 2 + int((end - start) * 1e3)) * 1e9)
+    in_imu = (Rotation.from_rotvec(c[AXES]) * R_CAM_IMU).inv().apply(
+        ORIENTATION(1e-9 * stamps_ns, 1))
+    return stamps_ns.astype(np.int64), R_CAM_IMU.apply((in_imu + c[BIAS]) / (1.0 + c[SCALE]))
+
+
+def deviating(camera, c):
+    """The camera with the deviations `c` of lens and readout."""
+    signed = camera.line_delay * camera.height + c[READOUT]
+    first, *others = camera.distortion
+    return replace(camera, fx=camera.fx / (1.0 + c[FOCAL]), fy=camera.fy / (1.0 + c[FOCAL]),
+                   distortion=(first + c[DISTORTION], *others), readout_time=abs(signed),
+                   readout_direction='down' if signed >= 0.0 else 'up')
+
+
+def pair_data(start, end, c, camera=CAMERA):
+    """A pair of frames whose images have the deviations `c` from their configuration."""
+    true = deviating(camera, c)
+    places = [exposed(true, stamp + c[OFFSET]) for stamp in (start, end)]
+    estimated = np.flatnonzero(places[0][1] & places[1][1])[:120]
+    assert len(estimated) > 80
+    earliest, latest = camera.row_time_span
+    motions = []
+    for stamp in (start, end):
+        stamps_ns, rates = gyro(stamp + earliest - 1e-3, stamp + latest + 1e-3, c)
+        motions.append(FrameMotion.from_gyro(1e-9 * stamps_ns - stamp, rates))
+    stamps_ns, rates = gyro(start, end, c)
+    rotation, covariance = integrate_rotation(stamps_ns, rates, ImuConfig(), 3e-3)
+    first, second = (ORIENTATION(stamp + c[OFFSET]) for stamp in (start, end))
+    t = first.inv().apply(VELOCITY)
+    return PairData(
+        places[0][0][estimated], places[1][0][estimated], camera, *motions, end - start,
+        (first.inv() * second).as_matrix(), t / np.linalg.norm(t), rotation, covariance,
+        rotation_sensitivity(stamps_ns, rates, ImuConfig()), (rates[0], rates[-1]),
+        R_CAM_IMU.as_matrix(), 0.01)
+
+
+def flight(c, pairs=9, camera=CAMERA):
+    return [pair_data(0.4 * k, 0.4 * k + 0.3, c, camera) for k in range(pairs)]
+
+
+def solved(pairs, active, about):
+    found = [pair_information(pair, active, about) for pair in pairs]
+    return np.linalg.solve(sum(one.S for one in found), sum(one.b for one in found))
+
+
+@pytest.mark.parametrize('signs', [*np.eye(DEVIATIONS), [1, -1, 1, 1, -1, 1, 1, -1, 1, -1, 1]],
+                         ids=[*map(str, range(DEVIATIONS)), 'all'])
+def test_a_scene_exposed_with_deviations_is_solved_to_them(signs):
+    """Noise-free; about the solution again, since a pair is not linear in it."""
+    c = SMALL * signs
+    pairs = flight(c)
+    first = solved(pairs, NONE, NONE)
+    found = solved(pairs, NONE, first)
+    # Shaking within a readout is known to first order only, which bias and lens do not rotate.
+    exact = not (c[:BIAS.start].any() or c[SCALE])
+    np.testing.assert_allclose(found / SMALL, signs, atol=0.015 if exact else 0.15)
+    # Active deviations are added.
+    np.testing.assert_allclose(solved(pairs, 0.5 * c, 0.5 * c) - 0.5 * c, first, rtol=1e-9)
+
+
+@pytest.mark.parametrize('row', ['first', 'middle', 'last'])
+@pytest.mark.parametrize('k', [OFFSET, READOUT, FOCAL])
+def test_a_deviation_shifts_the_pose_as_a_new_estimate(row, k):
+    """The same noise in both: the wrong parameter is the only difference."""
+    camera = replace(CAMERA, reference_row=row)
+    c = SMALL * (np.arange(DEVIATIONS) == k)
+    noise = 0.3 * np.random.default_rng(1).normal(size=(2, 120, 2))
+
+    def estimated(start, deviation):
+        pair = pair_data(start, start + 0.3, deviation, camera)
+        n = len(pair.points1)
+        pair = replace(pair, points1=pair.points1 + noise[0, :n],
+                       points2=pair.points2 + noise[1, :n])
+        return pair, estimate_relative_pose(
+            pair.points1, pair.points2, camera, pair.motion1, pair.motion2, pair.gyro_rotation,
+            pair.gyro_covariance, pair.interval, EstimatorConfig(pixel_sigma=0.3))
+
+    def off(pair, pose):
+        turn = Rotation.from_matrix(pose.R @ pair.R.T).as_rotvec()
+        return np.concatenate([pose.t - pair.t, turn])
+
+    for start in (0.4, 1.2, 2.0):
+        right, wrong = estimated(start, NONE), estimated(start, -c)
+        pair, pose = right
+        configured = pair_information(replace(pair, R=pose.R, t=pose.t), NONE, NONE)
+        moved, expected = off(*wrong) - off(*right), configured.pose_by_deviation @ c
+        apart = np.linalg.norm(moved[3:] - expected[3:])
+        assert apart < 0.45 * np.linalg.norm(moved[3:]) + 1e-4
+        sigma = math.sqrt(np.trace(pose.covariance[:3, :3]))
+        assert np.linalg.norm(moved[:3] - expected[:3]) < sigma
+
+
+def test_the_rotation_of_the_images_does_not_follow_the_gyro():
+    """Half a degree of the gyro's rotation is observed, though it is a prior of the pose."""
+    pair = pair_data(0.4, 0.7, NONE)
+    turn = np.array([0.006, -0.004, 0.005])
+    off = replace(pair, gyro_rotation=Rotation.from_rotvec(-turn).as_matrix() @ pair.gyro_rotation)
+    estimated = pair_information(off, NONE, NONE).images_against_gyro
+    np.testing.assert_allclose(estimated, turn, atol=1e-3)
+    few = replace(pair, points1=pair.points1[:12], points2=pair.points2[:12])
+    assert pair_information(few, NONE, NONE) is None
+
+
+def test_derivative_by_the_rates_by_finite_differences():
+    stamps = np.arange(0, 500 * MS, 5 * MS)
+    t = stamps[:, None] * 1e-9
+    rates = np.array([1.5, 1.8, 1.2]) * np.sin(t * [3.1, 2.3, 4.7] + [0.3, 1.1, 2.0])
+    by_rate = rotation_sensitivity(stamps, rates, ImuConfig()).by_rate
+    for axis in range(3):
+        step = 1e-5 * np.eye(3)[axis]
+        more, _ = integrate_rotation(stamps, rates + step, ImuConfig(), 0.0)
+        less, _ = integrate_rotation(stamps, rates - step, ImuConfig(), 0.0)
+        np.testing.assert_allclose(
+            Rotation.from_matrix(more @ less.T).as_rotvec() / 2e-5, by_rate[:, axis], atol=1e-5)
+    assert not np.allclose(by_rate, 0.5 * np.eye(3), atol=0.01)
+
+
+# -- the pairs of the last seconds ---------------------------------------------------------------
+
+
+def recursion_of(pairs, stamps_ns):
+    sums = Recursion()
+    for stamp_ns, pair in zip(stamps_ns, pairs, strict=True):
+        assert sums.add(stamp_ns, pair, NONE, NONE) is not None
+    return sums
+
+
+def test_pairs_leave_the_window_and_an_earlier_stamp_restarts():
+    pair = pair_data(0.4, 0.7, NONE)
+    sums = recursion_of([pair] * 5, range(0, 5000 * MS, 1000 * MS))
+    assert sums.solved().pairs == 5
+    for stamp_ns, left in ((22_500 * MS, 3), (10_000 * MS, 1)):
+        sums.add(stamp_ns, pair, NONE, NONE)
+        assert sums.solved().pairs == left
+    sums.clear()
+    assert sums.solved() is recursion.NOTHING_ESTIMATED
+    np.testing.assert_array_equal(recursion.NOTHING_ESTIMATED.sigma, recursion.PRIOR_SIGMA)
+
+
+def test_estimates_are_within_their_small_sigma():
+    c = deviation(offset=0.006, focal=-0.02)
+    estimated = recursion_of(flight(c), range(0, 3600 * MS, 400 * MS)).solved()
+    assert estimated.sigma[OFFSET] < 4e-3 and estimated.sigma[FOCAL] < 0.02
+    assert (np.abs(estimated.c - c) < 4.0 * estimated.sigma).all()
+    assert (estimated.sigma <= 2.0 * recursion.PRIOR_SIGMA).all()
+
+
+def test_older_pairs_are_linearised_again_at_a_deviation():
+    pairs = flight(deviation(focal=0.15))
+    sums = recursion_of(pairs[:5], range(0, 2000 * MS, 400 * MS))
+    errors = [abs(sums.solved().c[FOCAL] - 0.15)]
+    for k, pair in enumerate(pairs[5:], start=5):
+        sums.add(400 * MS * k, pair, NONE, deviation(focal=sums.solved().c[FOCAL]))
+    errors.append(abs(sums.solved().c[FOCAL] - 0.15))
+    assert errors[1] < min(3e-3, 0.5 * errors[0])
+
+
+# -- rotations of images and gyro ----------------------------------------------------------------
+
+
+def rotations(Q, scale=1.0, size=0.05, count=40, seed=0, weights=(1.0, 1.0, 1.0), noise=1e-3):
+    """Images rotate by `scale` times Q times the gyro's rotation, about axes by `weights`."""
+    rng, sums = np.random.default_rng(seed), RotationSums()
+    for k in range(count):
+        by_gyro = size * rng.normal(size=3) * weights
+        sums.add(100 * MS * k, 0.1,
+                 scale * np.asarray(Q) @ by_gyro + noise * rng.normal(size=3), by_gyro)
+    return sums
+
+
+def faults_of(sums):
+    """Gross errors by rotations alone."""
+    return assess(recursion.NOTHING_ESTIMATED, [], sums.compared(), CONFIGURED).faults
+
+
+@pytest.mark.parametrize(('rotvec', 'scale', 'size'), [
+    ([0.0, 0.0, 0.0], 1.0, 0.05), ([1.0, -1.5, 0.4], math.radians(1.0), 3.0)])
+def test_rotated_axes_and_another_unit_are_found(rotvec, scale, size):
+    Q = Rotation.from_rotvec(rotvec)
+    compared = rotations(Q.as_matrix(), scale, size=size).compared()
+    rotated = any(rotvec)
+    assert compared.left_at_best < 0.05
+    assert (compared.left_as_configured > 0.7) == compared.is_turned == rotated
+    assert (Rotation.from_matrix(compared.rotation) * Q.inv()).magnitude() < 0.05
+    assert compared.scale == pytest.approx(scale, rel=0.02)
+    assert not compared.is_left_handed
+
+
+@pytest.mark.parametrize('rotating', [True, False])
+def test_a_gyro_with_little_more_than_its_bias(rotating):
+    """Rates 57 times too small are found beneath a bias; a camera on a rail rotates as little."""
+    rng, sums, stamp_ns = np.random.default_rng(2), RotationSums(), 0
+    for interval in 0.033 * rng.integers(1, 4, 60):
+        stamp_ns += round(1e9 * interval)
+        by_images = 0.4 * interval * rng.normal(size=3)
+        by_gyro = math.radians(1.0) * by_images if rotating else 1e-4 * rng.normal(size=3)
+        sums.add(stamp_ns, interval, by_images, by_gyro + interval * np.array([0.02, -0.01, 0.01]))
+    faults = faults_of(sums)
+    assert [fault.quantity for fault in faults] == (['gyro_unit'] if rotating else [])
+    if rotating:
+        assert faults[0].estimated == pytest.approx(math.degrees(1.0), rel=0.02)
+
+
+def test_a_steady_translation_is_no_rotation():
+    """It is similar to a constant rate of the images, without information on the axes."""
+    rng, sums = np.random.default_rng(5), RotationSums()
+    steady, drift = np.array([0.0, 0.15, 0.0]), np.array([0.0, -0.25, 0.07])   # [rad/s]
+    for k, spread in enumerate([0.01] * 12 + [1e-4] * 40):   # it sways, then moves steadily
+        by_gyro = 0.1 * steady + spread * rng.normal(size=3)
+        sums.add(100 * MS * k, 0.1, by_gyro + 0.1 * drift + 1e-3 * rng.normal(size=3), by_gyro)
+    assert not faults_of(sums)
+
+
+@pytest.mark.parametrize('noise', [0.0, 1e-5])
+@pytest.mark.parametrize('still', [True, False])
+def test_a_constant_rate(noise, still):
+    """A turntable is consistent; still images of a rotating gyro are not of its camera."""
+    rng, sums = np.random.default_rng(5), RotationSums()
+    steady = 0.125 * np.array([0.0, 0.5, 0.0])   # in 1/8 s, exact in binary
+    for k in range(60):
+        sums.add(125 * MS * k, 0.125, (not still) * steady + 1e-3 * rng.normal(size=3),
+                 steady + noise * rng.normal(size=3))
+    assert [fault.quantity for fault in faults_of(sums)] == (
+        ['image_geometry', 'time_offset'] if still else [])
+
+
+@pytest.mark.parametrize('axis', range(3))
+def test_left_handed_axes_are_no_rotation(axis):
+    """One sign of the IMU's own axes, though translation hides a third of the rotation."""
+    signs, R = np.ones(3), R_CAM_IMU.as_matrix()
+    signs[axis] = -1.0
+    sums = rotations(R @ np.diag(signs) @ R.T, count=80, noise=0.035)
+    assert sums.compared().is_left_handed
+    fault, = faults_of(sums)
+    assert fault.quantity == 'axes'
+    assert f'wrong sign of {"xyz"[axis]}' in fault.message
+    # About one axis both fit equally.
+    assert not rotations(np.eye(3), weights=[0.0, 1.0, 0.0]).compared().is_left_handed
+
+
+def test_axes_are_wrong_though_most_rotation_is_about_their_axis():
+    """Half a turn about the vertical leaves the yaw of a vehicle as it is."""
+    sums = rotations(np.diag([-1.0, 1.0, -1.0]), weights=[0.15, 1.0, 0.15])
+    assert sums.compared().left_as_configured < 0.3
+    assert 'axes' in {fault.quantity for fault in faults_of(sums)}
+
+
+def test_too_little_rotation_is_not_compared():
+    assert rotations(np.eye(3), size=1e-3, count=20).compared() is None
+    assert rotations(np.eye(3), count=4).compared() is None
+    sums = rotations(np.eye(3))
+    sums.add(0, 0.1, np.ones(3), np.ones(3))   # time went back
+    assert sums.compared() is None
+
+
+def test_rotation_of_rays_withstands_near_points():
+    rng = np.random.default_rng(0)
+    rays = rng.normal(size=(60, 3)) * [0.3, 0.3, 0.0] + [0.0, 0.0, 1.0]
+    turn = Rotation.from_rotvec([0.03, -0.02, 0.05])
+    later = turn.inv().apply(rays)
+    later[:8] += [0.1, 0.0, 0.0]
+    unit = [a / np.linalg.norm(a, axis=1)[:, None] for a in (rays, later)]
+    np.testing.assert_allclose(rotation_of_rays(*unit), turn.as_rotvec(), atol=3e-3)
+    unit[0][:50] = np.nan
+    assert rotation_of_rays(*unit) is None
+
+
+# -- assessment ----------------------------------------------------------------------------------
+
+
+def calibration(c, sigma, coupled=0.0):
+    """Of the deviations c; OFFSET and READOUT are alike by `coupled`."""
+    correlation = np.eye(DEVIATIONS)
+    correlation[OFFSET, READOUT] = correlation[READOUT, OFFSET] = coupled
+    S = correlation / np.outer(sigma, sigma)
+    covariance = np.linalg.inv(S + np.diag(recursion.PRIOR_SIGMA**-2.0))
+    return recursion.Calibration(np.asarray(c), covariance, covariance, S, S @ c, 1.0, 1.0, 20)
+
+
+SIGMA = np.array([1e-3] * 3 + [5e-4, 1e-3] + [1e-3] * 3 + [5e-3, 5e-3, 0.01])
+# Ten sigmas of a deviation turn a pose by its own sigma.
+EFFECT = Effect(*(np.vstack([np.zeros((n - 1, DEVIATIONS)), 0.1 / SIGMA]) for n in (5, 6)))
+
+
+def assessed(estimated, effect=EFFECT, configured=CONFIGURED):
+    return assess(estimated, find_inconsistencies(estimated, [effect], NONE), None, configured)
+
+
+@pytest.mark.parametrize(('c', 'coupled', 'named'), [
+    # Not distributed among similar quantities.
+    (deviation(offset=0.01), 0.95, {'time_offset'}),
+    (deviation(offset=0.01, readout=-0.008), 0.6, {'time_offset', 'readout_time'}),
+    (3.0 * deviation(focal=SIGMA[FOCAL]), 0.0, set())])   # not certain
+def test_the_fewest_deviations_are_found_and_solved_together(c, coupled, named):
+    found = find_inconsistencies(calibration(c, SIGMA, coupled), [EFFECT], NONE)
+    assert {one.quantity.name for one in found} == named
+    if named:
+        np.testing.assert_allclose(sum(one.deviation for one in found), c, atol=1e-9)
+    if len(named) == 1:
+        assert found[0].shift == pytest.approx(2.0, rel=0.01)   # 20 sigmas
+    # Active deviations are no inconsistency.
+    assert not find_inconsistencies(calibration(c, SIGMA), [EFFECT], c)
+    assert not find_inconsistencies(recursion.NOTHING_ESTIMATED, [], NONE)
+
+
+@pytest.mark.parametrize('correlation, named', [
+    (0.999, {'time_offset', 'readout_time'}), (0.8, {'time_offset'})])
+def test_an_alternative_hypothesis_that_fits_as_well_is_named(correlation, named):
+    faults = assessed(calibration(deviation(offset=0.01), SIGMA, correlation)).faults
+    assert {fault.quantity for fault in faults} == named
+    assert all(('time_offset or readout_time' in fault.fix) is (len(named) > 1)
+               for fault in faults)
+
+
+@pytest.mark.parametrize('size, row', [(-0.015, 'middle'), (-0.03, 'last'), (-0.02, None)])
+def test_an_offset_that_is_equivalent_to_another_stamped_row(size, row):
+    faults = assessed(calibration(deviation(offset=size), SIGMA)).faults
+    assert [fault.fix for fault in faults if fault.quantity == 'stamp_row'] == (
+        [f'set stamp_row: {row}'] if row else [])
+    assert {fault.quantity for fault in faults} - {'stamp_row'} == {'time_offset'}
+
+
+@pytest.mark.parametrize('size, state', [
+    (0.0, 'ok'), (2.5e-3, 'ok'), (0.01, 'suspect'), (0.03, 'wrong')])
+def test_the_state_follows_the_shift_of_the_pose(size, state):
+    health = assessed(calibration(deviation(offset=size), SIGMA))
+    assert health.state is FindingState(state)
+    finding, = (one for one in health.findings if one.quantity == 'time_offset')
+    assert (finding.configured, finding.estimated) == (0.004, pytest.approx(0.004 + size))
+    if state != 'ok':
+        assert health.faults == (finding,)
+        assert f'set time_offset: {0.004 + size:.4f}' in finding.fix
+
+
+@pytest.mark.parametrize('quantity, size, on, offered', [
+    ('offset', -0.03, False, True), ('offset', -0.03, True, False),
+    ('offset', -0.06, False, False),
+    ('readout', 0.008, False, True), ('readout', 0.008, True, False),
+    ('readout', 0.02, False, False)])
+def test_tracking_is_suggested_if_it_is_off_and_reaches_the_estimate(quantity, size, on, offered):
+    tracking = {'offset': 'track_time_offset', 'readout': 'track_readout_time'}[quantity]
+    fault = assessed(calibration(deviation(**{quantity: size}), SIGMA),
+                     Effect(2.0 * EFFECT.shift, 2.0 * EFFECT.claimed_shift),
+                     replace(CONFIGURED, sensor=sensor(**{tracking: on}))).faults[0]
+    assert (f'{tracking}: true' in fault.fix) is offered
+
+
+def test_messages_have_no_negative_zero():
+    configured = replace(CONFIGURED, sensor=sensor(time_offset=0.0),
+                         gyro_bias=np.array([0.0, -1e-7, 0.0]))
+    health = assessed(calibration(deviation(offset=-1e-6), SIGMA), configured=configured)
+    assert health.state is FindingState.OK
+    assert not re.search(r'-0\.0*(\D|$)', health.text)
+
+
+def test_gross_errors_leave_the_other_quantities_unknown():
+    turned = rotations(Rotation.from_rotvec([1.5, 0.0, 0.0]).as_matrix()).compared()
+    health = assess(calibration(deviation(offset=0.03), SIGMA), [], turned, CONFIGURED)
+    assert [finding.quantity for finding in health.faults] == ['axes']
+    assert {finding.state for finding in health.findings[1:]} == {FindingState.UNKNOWN}
+
+
+def finding(quantity, state, estimated=1.0, sigma=0.1):
+    return Finding(quantity, state, 'a', 'b', 0.5, estimated, sigma, 's', True)
+
+
+OK, UNKNOWN, SUSPECT, WRONG = FindingState
+
+
+def test_the_worst_of_a_run():
+    run = findings.NOT_EVALUATED
+    assert run.state is UNKNOWN
+    for states in ((UNKNOWN, OK), (OK, SUSPECT), (UNKNOWN, WRONG), (OK, SUSPECT)):
+        run = worst_of(run, Assessment(tuple(map(finding, 'ab', states))))
+    assert {one.quantity: one.state for one in run.findings} == {'a': OK, 'b': WRONG}
+    assert run.state is WRONG
+    later = worst_of(run, Assessment((finding('b', WRONG, 2.0),)))
+    assert later.faults[0].estimated == 2.0
+    both = Assessment((finding('a', SUSPECT), finding('b', WRONG)))
+    assert both.faults[0].quantity == 'b'
+    assert json.loads(json.dumps(both.as_json()))['findings'][0] == {
+        'figure': 'a', 'told': 0.5, 'seen': 1.0, 'sigma': 0.1, 'unit': 's', 'observable': True,
+        'state': 'suspect', 'sentence': 'a: b'}
+
+
+def test_traces_of_a_gross_error_are_left_out_of_a_run():
+    small = Assessment((finding('gyro_bias', WRONG), finding('focal_length', OK)))
+    gross = Assessment((finding('axes', WRONG, sigma=None), finding('gyro_bias', UNKNOWN)))
+    assert not small.is_gross and gross.is_gross
+    run = worst_of(worst_of(small, gross), gross)
+    assert [(f.quantity, f.state) for f in run.faults] == [('axes', WRONG)]
+    # Later findings count.
+    assert [f.quantity for f in worst_of(run, small).faults] == ['axes', 'gyro_bias']
+
+
+# -- tracked parameters --------------------------------------------------------------------------
+
+
+def tracked(offset=0.0, sigma=1e-3, readout=0.03):
+    return Tracked(np.zeros(3), np.ones(3), offset, sigma, readout, sigma, 10)
+
+
+def sensor(**values):
+    return replace(PARAMETERS.sensor, **values)
+
+
+def run_of(applied, estimate, configured, count):
+    """Applied values, the first and those after each of some pairs."""
+    run = [applied]
+    for _ in range(count):
+        run.append(run[-1].moved(estimate, configured))
+    return run
+
+
+def test_the_offset_is_applied_in_small_steps_and_taken_back():
+    on = sensor(track_time_offset=True)
+    run = run_of(Applied(), tracked(0.012), on, 12)
+    assert run[1].time_offset == pytest.approx(1e-3)
+    assert np.diff([one.time_offset for one in run]).max() <= 1e-3 + 1e-12
+    assert run[-1] == Applied(pytest.approx(0.008))
+    # An uncertain estimate keeps it; without tracking it returns to zero.
+    assert run[-1].moved(tracked(0.5, 3e-3), on) == run[-1]
+    back = run_of(run[-1], tracked(0.012), sensor(), 8)
+    assert back[-1].time_offset == pytest.approx(0.0, abs=1e-12)
+    assert run_of(back[-1], tracked(-0.2), on, 80)[-1].time_offset == -0.05
+
+
+@pytest.mark.parametrize('configured, estimated, reached', [
+    (0.03, 0.034, 0.004), (0.03, 0.025, -0.005), (0.03, 0.06, 0.01), (0.03, -0.03, -0.01),
+    (0.004, -0.002, -0.004)])   # not negative
+def test_the_readout_is_applied_as_far_as_frames_cover_it(configured, estimated, reached):
+    on = sensor(track_readout_time=True, readout_time=configured)
+    run = run_of(Applied(), tracked(readout=estimated), on, 25)
+    assert run[-1].readout_time == pytest.approx(reached)
+    assert run[-1].moved(tracked(readout=0.5, sigma=3e-3), on) == run[-1]
+    run += run_of(run[-1], tracked(readout=estimated), sensor(readout_time=configured), 25)
+    assert run[-1] == Applied()
+    readouts = np.array([one.readout_time for one in run])
+    assert np.abs(np.diff(readouts)).max() <= 5e-4 + 1e-12
+    # A pair has the readout time of its last frame, and an earlier keyframe.
+    margins = np.array([one.margin for one in run])
+    assert (readouts[1:] <= np.minimum(margins[:-1], margins[1:]) + 1e-12).all()
+
+
+@pytest.mark.parametrize('direction, sign', [('down', 1.0), ('up', -1.0)])
+def test_tracked_values_are_those_of_the_parameters(direction, sign):
+    """The offset is that of the middle row, with the active readout time: 2 ms more."""
+    camera = replace(CAMERA, readout_direction=direction, readout_time=0.032)
+    active = deviation(readout=sign * 0.002)
+    configured = Configured(sensor(readout_direction=direction), camera, np.full(3, 0.1), 0.003,
+                            active)
+    c = deviation(offset=0.004, readout=sign * 0.006)
+    c[BIAS] = 0.01, 0.02, 0.03
+    estimated = Tracked.of(calibration(c, SIGMA), configured)
+    share = 0.5 * 479 / 480   # the stamped row is row 0
+    assert estimated.readout_time == pytest.approx(0.036)
+    assert estimated.time_offset == pytest.approx(0.004 + 0.004 + share * sign * 0.004)
+    np.testing.assert_allclose(estimated.gyro_bias, [0.11, 0.12, 0.13])
+    assert estimated.time_offset_sigma == pytest.approx(math.hypot(5e-4, 0.5e-3), rel=0.02)
+
+
+def test_pairs_that_contradict_the_accelerometer():
+    sums, stamps = AccelerationSums(), itertools.count(0, 1000 * MS)
+    # Number of pairs of such evidence, and a part of the fix then; None: no finding yet.
+    for pairs, evidence, fix in (
+            (3, (-50.0, -80.0), None),   # one pair does not decide, however strong
+            (1, (-50.0, 0.5), 'correct the driver'), (7, (-1.0, 3.0), 'reverse its sign'),
+            (25, (1.0, -1.0), '')):   # and back, with the data
+        for _ in range(pairs):
+            sums.add(next(stamps), InertialEvidence(*evidence))
+        found = sums.finding()
+        assert sums.contradicts is bool(fix)
+        assert (found is None) if fix is None else fix in found.fix
+    assert found.state is OK
+
+
+# -- wrong parameters, end to end: the bundled bag ------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Wrong:
+    """An error of the configuration, and the finding that it must have."""
+
+    name: str
+    quantities: str   # either is right
+    parameters: tuple[str, ...] = ()
+    change: tuple[Role, object] | None = None   # of messages
+    estimated: float | None = None   # true value of the quantity, in its unit
+    tolerance: float = 0.0
+    stamps_late: float = 0.0   # [s] the IMU clock, as configured, minus that of the truth
+    pairs: int | None = None   # end of the run
+
+
+UNCHANGED = np.eye(3)
+
+
+def camera_with(**factors):
+    """Intrinsics times some factors; of a tuple, 0 is none."""
+    return Role.CAMERA_INFO, lambda configured: replace(configured, **{
+        name: factor * getattr(configured, name) for name, factor in factors.items()})
+
+
+def imu_with(axes=UNCHANGED, gyro=1.0, late=0.0, force=UNCHANGED):
+    """All samples: v' = axes v, rates times `gyro`, stamps `late` seconds later.
+
+    `force` (3, 3): factor of the accelerometer.
+    """
+    def changed(sample):
+        rate, specific = sample.angular_velocity, sample.linear_acceleration
+        return replace(
+            sample, stamp_ns=sample.stamp_ns + round(1e9 * late),
+            angular_velocity=None if rate is None else tuple(gyro * axes @ np.array(rate)),
+            linear_acceleration=None if specific is None else tuple(
+                force @ axes @ np.array(specific)))
+    return Role.IMU, changed
+
+
+CYCLED = np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]])
+ROTATED = Rotation.from_rotvec(np.radians([2.0, -1.7, 1.5]))
+FAST = [
+    Wrong('offset', 'time_offset', ('time_offset=0.01',), None, 0.0, 2e-4, stamps_late=0.01),
+    # Far from the configuration a pair is not linear: more are needed.
+    Wrong('late', 'time_offset', (), imu_with(late=0.03), 0.03, 1e-3, pairs=26),
+    Wrong('no readout', 'readout_time', ('readout_time=0.0',), None, 0.03, 1e-3, pairs=14),
+    Wrong('up', 'readout_direction', ('readout_direction=up',), None, -0.03, 1e-3, pairs=14),
+    Wrong('bias', 'gyro_bias', ('gyro_bias=[0.06,0,0]', 'track_gyro_bias=false'), None, 0.010885,
+          5e-4, pairs=8),
+    # No pose before it is detected: each pair is LOW_PARALLAX.
+    Wrong('axes cycled', 'axes', (), imu_with(CYCLED), pairs=26),
+    Wrong('axes by 3 deg', 'axes', (), imu_with(ROTATED.as_matrix()),
+          math.degrees(ROTATED.magnitude()), 0.1, pairs=14),
+    Wrong('gyro 0.95', 'gyro_scale', (), imu_with(gyro=1.0 / 0.95), 0.95, 3e-3, pairs=14),
+    Wrong('K 1.3', 'focal_length', (), camera_with(fx=1.3, fy=1.3), 450.0, 5.0, pairs=12),
+    Wrong('acceleration, other sign', 'accel_axes', (), imu_with(force=-UNCHANGED)),
+]
+LONG = [
+    Wrong('readout twice', 'readout_time', ('readout_time=0.06',), None, 0.03, 1e-3, pairs=12),
+    Wrong('accelerometer cycled', 'accel_axes', (), imu_with(force=CYCLED)),
+    # Poses are published with the covariance of the deviation.
+    Wrong('offset by 40 ms', 'time_offset', ('time_offset=0.04',), None, 0.0, 3e-3,
+          stamps_late=0.04),
+    Wrong('readout half', 'readout_time', ('readout_time=0.015',), None, 0.03, 1e-3),
+    Wrong('K 0.97', 'focal_length', (), camera_with(fx=0.97, fy=0.97), 450.0, 5.0),
+    Wrong('no distortion', 'distortion', (), camera_with(distortion=0)),
+    # Certain after 2.1 s; until then a bias is reported.
+    Wrong('axes negated', 'axes', (), imu_with(np.diag([-1.0, -1.0, 1.0])), pairs=29),
+    Wrong('left-handed', 'axes', (), imu_with(np.diag([1.0, 1.0, -1.0]))),
+    Wrong('deg/s', 'gyro_unit gyro_scale', (), imu_with(gyro=math.degrees(1.0)), pairs=60),
+]
+
+
+def replayed(bag_path, *assignments, pairs=None, stamps=None):
+    """Results of the pairs, and the true trajectory."""
+    parameters = read_parameters(bag_path.with_name('hand_held.yaml'), assignments)
+    with open_bag(bag_path) as bag:
+        topics = bag.find_topics()
+        truth = read_truth(bag, topics)
+        run = Replay(bag, topics, parameters, stamps=stamps)
+        return list(itertools.islice(run.pairs(), pairs)), truth
+
+
+def beyond_covariance(result, truth, late_ns):
+    """Squared errors in sigmas of R (3 dof) and t (2 dof), over what one in 10000 exceeds."""
+    pose = result.pose
+    R, t = truth.relative_pose(result.reference_ns1 - late_ns, result.reference_ns2 - late_ns)
+    turn = Rotation.from_matrix(R @ pose.R.T).as_rotvec()
+    across = np.linalg.svd(pose.t[None])[2][1:]   # of t: a direction
+    off = across @ (t / np.linalg.norm(t))
+    return (turn @ np.linalg.solve(pose.covariance[3:, 3:], turn) / 21.1,
+            off @ np.linalg.solve(across @ pose.covariance[:3, :3] @ across.T, off) / 18.4)
+
+
+@pytest.mark.parametrize('case', [
+    *FAST, *(pytest.param(case, marks=pytest.mark.long) for case in LONG)],
+    ids=lambda case: case.name)
+def test_a_wrong_parameter_is_reported_by_its_name(bundled_bag, monkeypatch, case):
+    if case.change is not None:
+        role, change = case.change
+        part = incoming.PARTS[role]
+        monkeypatch.setitem(incoming.PARTS, role, incoming.Part(
+            part.msgtypes, lambda message: change(part.read(message))))
+    results, truth = replayed(bundled_bag, *case.parameters, pairs=case.pairs)
+    flagged = [k for k, result in enumerate(results) if result.health.faults]
+    assert flagged, 'no finding'
+    named = [[fault.quantity for fault in results[k].health.faults] for k in (flagged[0], -1)]
+    right = set(case.quantities.split())
+    assert any(len(names) <= 2 and right & set(names) for names in named), named
+    if case.estimated is not None:
+        fault = next(fault for fault in results[flagged[-1]].health.faults
+                     if fault.quantity in right)
+        assert fault.estimated == pytest.approx(case.estimated,
+                                                abs=4.0 * fault.sigma + case.tolerance)
+    for k, result in enumerate(results):
+        state, pose = result.health.state, result.pose
+        if state is FindingState.WRONG:
+            assert not pose
+            assert result.health.faults[0].text == pose.reason or (
+                pose.status is not Status.WITHHELD)
+        if pose and k >= flagged[0]:
+            assert max(beyond_covariance(result, truth, round(1e9 * case.stamps_late))) < 1.0, k
+
+
+@pytest.fixture(scope='module')
+def correct(bundled_bag):
+    return replayed(bundled_bag)[0]
+
+
+def test_correctly_configured_nothing_is_found(correct):
+    assert not any(result.health.faults for result in correct)
+    assert correct[-1].health.state is FindingState.OK
+
+
+def test_correct_poses_are_as_without_the_monitor(bundled_bag, correct, monkeypatch):
+    monkeypatch.setattr(ConsistencyMonitor, 'add_pair',
+                        lambda self, stamp_ns, data, pose, configured: pose)
+    without, _ = replayed(bundled_bag)
+    assert len(without) == len(correct)
+    for a, b in zip(without, correct, strict=True):
+        assert (a.pose.status, a.pose.reason) == (b.pose.status, b.pose.reason)
+        for name in ('R', 't'):
+            assert np.array_equal(getattr(a.pose, name), getattr(b.pose, name), equal_nan=True)
+    # Before the first pair nothing is verified; later it is.
+    wider = [np.trace(b.pose.covariance[3:, 3:]) / np.trace(a.pose.covariance[3:, 3:])
+             for a, b in zip(without, correct, strict=True) if a.pose]
+    assert min(wider) >= 1.0
+    assert wider[0] > 4.0
+    assert max(wider[10:]) < 1.2
+
+
+def estimated_pairs(c, count):
+    """Pairs of a flight with their estimated poses, as the monitor gets them."""
+    for k, pair in enumerate(flight(c, count)):
+        yield 400 * MS * k, pair, estimate_relative_pose(
+            pair.points1, pair.points2, pair.camera, pair.motion1, pair.motion2,
+            pair.gyro_rotation, pair.gyro_covariance, pair.interval, EstimatorConfig())
+
+
+@pytest.mark.parametrize('c', [deviation(focal=-0.03), deviation(readout=0.004)],
+                         ids=['focal', 'readout'])
+def test_a_pose_is_within_its_covariance_before_a_deviation_is_detected(c):
+    """From the first pair on, with the configured rotation of the gyro, and without a fault."""
+    monitor, alone, within = ConsistencyMonitor(), 0.0, 0.0
+    for stamp_ns, pair, pose in estimated_pairs(c, 6):
+        off = Rotation.from_matrix(pose.R @ pair.R.T).as_rotvec()
+        alone = max(alone, off @ np.linalg.solve(pose.covariance[3:, 3:], off))
+        pose = monitor.add_pair(stamp_ns, replace(pair, R=pose.R, t=pose.t), pose, CONFIGURED)
+        within = max(within, off @ np.linalg.solve(pose.covariance[3:, 3:], off))
+    assert alone > 14.2
+    assert within < 14.2
+
+
+def test_a_deviation_so_large_that_no_pair_has_a_translation():
+    monitor = ConsistencyMonitor()
+    for stamp_ns, pair, pose in estimated_pairs(deviation(focal=-0.08), 12):
+        rotation = pose.without_translation(Status.LOW_PARALLAX, 'none')
+        monitor.add_pair(stamp_ns, replace(pair, R=pose.R, t=rotation.t), rotation, CONFIGURED)
+    assert {fault.quantity for fault in monitor.health.faults} == {'focal_length'}
+
+
+# -- tracked parameters, on the bundled bag ------------------------------------------------------
+
+
+# Parameters, and what is estimated and applied at the end, with the largest errors of both.
+@pytest.mark.parametrize(('assignments', 'name', 'estimated', 'applied', 'errors', 'sigmas'), [
+    # The bag was written with a bias of (0.011, -0.007, 0.005) rad/s, an offset of 0, and a
+    # readout time of 30 ms.
+    (('time_offset=0.01', 'gyro_bias=[0.0, 0.0, 0.0]', 'gyro_bias_sigma=0.01',
+      'track_time_offset=true'), 'time_offset', 0.0, -0.01, 1e-3, 1.2),
+    # Pairs from before the readout time was applied must not keep it as configured.
+    pytest.param(('readout_time=0.027', 'track_readout_time=true'), 'readout_time', 0.03, 0.003,
+                 5e-4, 1.0, marks=pytest.mark.long),
+    # 0.51 ms off with OpenCV 4.6.
+    (('readout_time=0.034', 'track_readout_time=true'), 'readout_time', 0.03, -0.004, 6e-4, 1.0)])
+def test_wrong_parameters_are_tracked(bundled_bag, assignments, name, estimated, applied, errors,
+                                      sigmas):
+    last = replayed(bundled_bag, *assignments)[0][-1]
+    assert np.abs(last.tracked.gyro_bias - [0.011, -0.007, 0.005]).max() < 1e-3
+    assert getattr(last.tracked, name) == pytest.approx(estimated, abs=errors)
+    assert abs(getattr(last.tracked, name) - estimated) / sigmas < getattr(
+        last.tracked, f'{name}_sigma') < 1e-3
+    assert getattr(last.applied, name) == pytest.approx(applied, abs=errors)
+    assert last.health.state is FindingState.OK
+
+
+def test_live_and_replay_agree_while_tracking(bundled_bag):
+    """Frames are lost at random, as live; the replay of the processed ones has equal bits."""
+    settings = ('time_offset=0.01', 'readout_time=0.027', 'track_time_offset=true',
+                'track_readout_time=true')
+    front_end = FrontEnd(read_parameters(bundled_bag.with_name('hand_held.yaml'), settings))
+    sequencer = front_end.sequencer
+    processed, failed = [], []
+    worker = Worker(front_end, lambda: None, lambda outcome: (
+        processed if isinstance(outcome, Frame) else failed).append(outcome))
+    worker.start()
+    assert worker.warm.wait(60.0)
+    intake, rng, images = Intake(sequencer), np.random.default_rng(5), 0
+    with open_bag(bundled_bag) as bag:
+        for role, message in sensor_messages(bag, bag.find_topics()):
+            if role is not Role.IMAGE:
+                intake.receive(role, message.message)
+            elif rng.random() > 0.1:
+                images += 1
+                intake.receive(role, message.message)
+                # Sometimes behind, sometimes ahead of the worker.
+                while len(processed) < images - rng.integers(1, 4):
+                    time.sleep(0.002)
+                    if sequencer.counts().refused:
+                        break
+    while worker.is_alive() and len(processed) < images - sum(
+            sequencer.counts().refused.values()) - 1:
+        time.sleep(0.05)
+    assert worker.stop(30.0)
+    assert not any(isinstance(outcome, FrameFailed) for outcome in failed)
+    live = [frame.result for frame in processed if frame.result is not None]
+    assert live[-1].applied.time_offset < -0.005
+    assert live[-1].applied.readout_time > 0.001
+    again, _ = replayed(bundled_bag, *settings, pairs=len(live), stamps=frozenset(
+        frame.stamp_ns for frame in processed))
+    assert len(again) == len(live)
+    for a, b in zip(live, again, strict=True):
+        assert (a.reference_stamp_ns, a.stamp_ns) == (b.reference_stamp_ns, b.stamp_ns)
+        for name in ('R', 't', 'covariance'):
+            assert np.array_equal(getattr(a.pose, name), getattr(b.pose, name), equal_nan=True)
+        assert a.applied == b.applied
+        assert a.health == b.health
+
+
+def test_a_pair_without_rank_costs_no_pose(bundled_bag, monkeypatch):
+    def without_rank(*_: object) -> None:
+        raise np.linalg.LinAlgError('Singular matrix')
+
+    monkeypatch.setattr('rs_relpose_ros.pipeline.recursion.pair_information', without_rank)
+    results, _ = replayed(bundled_bag, pairs=8)
+    assert all(result.pose for result in results)
+    assert results[-1].health.state is FindingState.UNKNOWN
