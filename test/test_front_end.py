@@ -342,8 +342,8 @@ def test_the_walk_of_one_image_is_short(recorded, parameters):
     assert next(iter(walk)) == ('nodes/inputs.py', 'SensorInputs._on_image')
     assert walk['pipeline/sequencer.py', 'Sequencer.take']
     assert walk['messages/outgoing.py', 'pair_messages']
-    assert sum(walk.values()) <= 15
-    assert len(walk) <= 32
+    assert sum(walk.values()) <= 10
+    assert len(walk) <= 23
 
 
 # -- derotated rays and their parallax ------------------------------------------------------------

@@ -18,7 +18,7 @@ from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.messages import incoming
 from rs_relpose_ros.messages.incoming import Intake, Role, StuckCamera, StuckGyro
 from rs_relpose_ros.pipeline.sequencer import Refusal, Sequencer
-from rs_relpose_ros.tracking.images import CompressedImage, GrayLevels
+from rs_relpose_ros.tracking.images import GrayLevels
 
 # Luma of ITU-R BT.601.
 WEIGHTS = np.array([0.299, 0.587, 0.114])
@@ -517,9 +517,9 @@ def test_an_image_that_repeats_the_one_before():
     pixels = np.random.default_rng(0).integers(0, 256, 8000, dtype=np.uint8)
     other = pixels.copy()
     other[5050] ^= 1
-    repeats = [bool(camera.problem(CompressedImage(data, 'jpeg', stamp)))
+    repeats = [bool(camera.problem(stamp, data))
                for stamp, data in enumerate((
                    pixels, pixels.copy(), other, other, pixels[:4000], pixels))]
     assert repeats == [False, True, False, True, False, False]
     # The same message once more.
-    assert camera.problem(CompressedImage(pixels.copy(), 'jpeg', 5)) == ''
+    assert camera.problem(5, pixels.copy()) == ''

@@ -352,8 +352,8 @@ def test_debug_images_show_pairs(session):
 def poses_with_references(node: Node, known: tuple[int, int]) -> list[tuple[Any, set[int]]]:
     """Poses since `known`, each with the references of its stamp.
 
-    Stamps repeat themselves, as the bag is played again: a pose may have several references. It has
-    none where the node was killed, or was not discovered yet, between the two messages.
+    Stamps repeat themselves, as the bag is played again: a pose may have several references. It
+    has none where the node was killed, or not discovered yet, between the two messages.
     """
     begins: dict[int, set[int]] = {}
     for reference in node.references[known[1]:]:

@@ -234,14 +234,14 @@ class StuckCamera:
         self._previous: NDArray[np.uint8] | None = None
         self._stamp_ns = 0
 
-    def problem(self, image: EncodedImage) -> str:
+    def problem(self, stamp_ns: int, data: NDArray[np.uint8]) -> str:
         """Reason why an image is no new one; empty for none."""
-        previous, self._previous = self._previous, image.data
+        previous, self._previous = self._previous, data
         # A message that is delivered twice is no fault of the camera.
-        again, self._stamp_ns = image.stamp_ns == self._stamp_ns, image.stamp_ns
-        if (previous is not None and not again and len(previous) == len(image.data)
-                and np.array_equal(previous[::_STRIDE], image.data[::_STRIDE])
-                and np.array_equal(previous, image.data)):
+        again, self._stamp_ns = stamp_ns == self._stamp_ns, stamp_ns
+        if (previous is not None and not again and len(previous) == len(data)
+                and np.array_equal(previous[::_STRIDE], data[::_STRIDE])
+                and np.array_equal(previous, data)):
             return ('the image repeats the one before bit by bit: the camera or its driver is '
                     'stuck, or the image is empty')
         return ''
@@ -407,7 +407,7 @@ class Intake:
                 self.camera_info_problem or 'no CameraInfo came before or with the image')
             return
         # Compared before any image is dropped: after a gap a repeated image would pass as new.
-        problem = self._camera.problem(image)
+        problem = self._camera.problem(image.stamp_ns, image.data)
         if problem:
             self._sequencer.refuse(image.stamp_ns, Refusal.BAD_IMAGE, problem)
         else:

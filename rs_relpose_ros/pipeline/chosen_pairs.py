@@ -89,13 +89,13 @@ def estimate_wide_pair(first: Frame[Any], second: Frame[Any],
     segment, gyro = second.imu.since_previous, None
     if segment is not None and segment.stamps_ns[0] == first.imu.reference_ns:
         gyro = pair.GyroRotation.of(second.imu, parameters.imu)
-    inertial, interval = pair.inertial_of(first, second, gyro, second.imu, parameters), None
-    if pair.interval_of(first, second) <= parameters.keyframes.max_keyframe_interval:
-        interval = pair.interval_of(first, second)
-    elif not isinstance(inertial, str):
+    inertial = pair.inertial_of(first.imu, second.imu, gyro, second.imu, parameters)
+    interval = pair.interval_of(first.imu, second.imu)
+    near = interval <= parameters.keyframes.max_keyframe_interval
+    if not near and not isinstance(inertial, str):
         inertial = 'the frames are further apart than max_keyframe_interval'
     pose = pair.estimate_pair(first, second, matches, sensor, gyro, inertial, parameters,
-                              interval=interval)
+                              interval=interval if near else None)
     rays1, rays2 = (
         pair.DerotatedRays.from_points(matches.track_ids, points, sensor, frame.imu.motion)
         for points, frame in ((matches.points1, first), (matches.points2, second)))
