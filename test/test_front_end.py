@@ -301,7 +301,7 @@ def walk_of_a_pair(recorded: list[Any], parameters: Parameters) -> dict[tuple[st
 
     node, loop = MagicMock(), FrontEnd(parameters, keep_images=True, clock=lambda: 0)
     node.create_subscription.return_value.handle.take_message.return_value = None
-    inputs = SensorInputs(node, Intake(loop.sequencer, parameters), lambda: False, 'compressed',
+    inputs = SensorInputs(node, Intake(loop.sequencer, parameters), 'compressed',
                           pytest.fail)
     relpose = MagicMock(spec=RelposeNode, _outputs=PairPublishers(node, parameters.pair),
                         _settings=MagicMock(current=parameters), _statistics=Statistics(),

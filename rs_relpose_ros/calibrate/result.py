@@ -130,12 +130,11 @@ _BLUE, _ORANGE = '#0072B2', '#E69F00'
 _MS = 1e3
 
 
-def report(result: CalibrationResult, camera: RollingShutterCamera) -> list[str]:
-    """Lines for a reader: each quantity with its 1 sigma and its observability."""
+def quantities(result: CalibrationResult,
+               camera: RollingShutterCamera) -> list[tuple[str, str, Estimate]]:
+    """Each quantity: its name, its value with 1 sigma in words, and its estimate."""
     readout, focal = result.readout_time, result.focal_factor
     slope, jitter = result.offset_by_interval, result.offset_by_jitter
-    rates = ', '.join(f'{axis} {np.degrees(rate):.1f}'
-                      for axis, rate in zip(AXES, result.rotation_rates, strict=True))
     sigmas = ', '.join(f'{np.degrees(sigma):.3f}' for sigma in result.rotation_sigma)
     rows = [('readout time', _shown('readout_time', readout, abs(readout.value))
              + (', read upwards' if readout.value < 0.0 else ''), readout),
@@ -173,12 +172,19 @@ def report(result: CalibrationResult, camera: RollingShutterCamera) -> list[str]
              f'coefficient of {camera.distortion_model})'), result.radial),
             ('principal point', (f'{column.value:.1f} +- {column.sigma:.1f}, {row.value:.1f} +- '
              f'{row.sigma:.1f} px'), column)]
+    return rows
+
+
+def report(result: CalibrationResult, camera: RollingShutterCamera) -> list[str]:
+    """Lines for a reader: each quantity with its 1 sigma and its observability."""
+    rates = ', '.join(f'{axis} {np.degrees(rate):.1f}'
+                      for axis, rate in zip(AXES, result.rotation_rates, strict=True))
     return [
         (f'{result.frames} frames, {result.pairs} pairs, {result.matches} matches; '
          f'{100 * result.inlier_ratio:.0f} % inliers, noise of a match '
          f'{result.pixel_sigma:.2f} px'),
         f'rotation of the camera, rms [deg/s]: {rates}', f'shutter: {_shutter_text(result)}',
-        *(f'{name}: {text} [{_state(of)}]' for name, text, of in rows),
+        *(f'{name}: {text} [{_state(of)}]' for name, text, of in quantities(result, camera)),
         'quaternion x y z w: ' + ', '.join(f'{v:.6f}' for v in result.quat_cam_imu_xyzw),
         *(f'note: {warning}' for warning in result.warnings)]
 

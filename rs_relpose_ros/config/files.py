@@ -52,9 +52,9 @@ def read_parameters(path: Path | str | None, assignments: Sequence[str] = (),
     """
     parameters = Parameters()
     if path is not None:
-        values = _values(Path(path), node)
+        values = file_values(Path(path), node)
         try:
-            parameters = parameters.updated(_converted(values))
+            parameters = parameters.updated(values)
         except InputError as error:
             raise InputError(f'{path}: {error}') from error
     given = {}
@@ -108,7 +108,7 @@ def yaml_text(value: Any) -> str:
     return text.replace('e', '.0e') if 'e' in text and '.' not in text else text
 
 
-def _values(path: Path, wanted: str) -> dict[str, Any]:
+def file_values(path: Path, wanted: str = _NODE) -> dict[str, Any]:
     """Flat values of a parameter file for the node `wanted`."""
     if not path.is_file():
         raise MissingInputError(f'the parameter file {path} does not exist')
@@ -116,11 +116,19 @@ def _values(path: Path, wanted: str) -> dict[str, Any]:
         raise InputError(f'{path} is not a parameter file: it has more than {_MAX_BYTES} bytes')
     try:
         text = path.read_text(encoding='utf-8')
+    except UnicodeDecodeError as error:
+        raise InputError(f'{path} is not valid YAML: {error}') from error
+    return text_values(text, str(path), wanted)
+
+
+def text_values(text: str, path: str, wanted: str = _NODE) -> dict[str, Any]:
+    """The same from the text of a file."""
+    try:
         # Nested aliases expand without a limit; ROS does not support them either.
         if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
             raise InputError(f'{path} has YAML aliases, which are not supported')
         document = yaml.safe_load(text)
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+    except (yaml.YAMLError, RecursionError) as error:
         raise InputError(f'{path} is not valid YAML: {error}') from error
     if not isinstance(document, dict):
         raise InputError(f'{path} is not a ROS parameter file: it must begin with "/**:" and '
@@ -138,7 +146,7 @@ def _values(path: Path, wanted: str) -> dict[str, Any]:
     if not values:
         raise InputError(f'{path} has no parameters of {wanted}: they must be below "/**:" or '
                          f'"{wanted}:" and "ros__parameters:"')
-    return values
+    return _converted(values)
 
 
 def _converted(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -353,6 +353,10 @@ class Intake:
             return error
         return None
 
+    def waits_for_imu(self) -> bool:
+        """Whether a frame needs samples that have not been received yet."""
+        return self._sequencer.waits_for_imu()
+
     def camera_info_of(self, intrinsics: Intrinsics) -> Any:
         """The last CameraInfo; None if it has other intrinsics."""
         return None if self._use_configured or intrinsics != self.intrinsics else self._camera_info

@@ -6,6 +6,7 @@ from abc import abstractmethod
 import argparse
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 import gc
 import logging
 import os
@@ -13,7 +14,7 @@ import sys
 import threading
 import time
 import traceback
-from typing import Any, ClassVar, NoReturn, TextIO
+from typing import Any, ClassVar, NoReturn, TextIO, TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticArray
 import rclpy
@@ -23,20 +24,27 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from rs_relpose_ros.config.settings import Parameters
-from rs_relpose_ros.errors import RsRelposeError
+from rs_relpose_ros.calibrate import stored
+from rs_relpose_ros.calibrate.stored import Calibrated, Progress
+from rs_relpose_ros.config.files import text_values
+from rs_relpose_ros.config.settings import ImuConfig, IntrinsicsConfig, Parameters, SensorConfig
+from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.messages.incoming import Intake, PARTS, Role
 from rs_relpose_ros.nodes import diagnostics
 from rs_relpose_ros.nodes import parameters as ros_parameters
 from rs_relpose_ros.nodes.diagnostics import PATIENCE, ReasonLog, SILENCE
-from rs_relpose_ros.nodes.inputs import message_class, SensorInputs, SHUT_DOWN
+from rs_relpose_ros.nodes.inputs import LATCHED, message_class, SensorInputs, SHUT_DOWN
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrameFailed, FrameLoop, Outcome
 from rs_relpose_ros.pipeline.sequencer import FrameRefused, Refusal
+
+if TYPE_CHECKING:
+    from rs_relpose_ros.calibrate.live import LiveCalibration
 
 # -- A node as a process --------------------------------------------------------------------------
 
@@ -142,8 +150,8 @@ class Worker(threading.Thread):
     `warm` is not set; then the thread ends.
     """
 
-    def __init__(self, loop: FrameLoop[Any], warm_up: Callable[[], object],
-                 consume: Callable[[Outcome[Any]], object]) -> None:
+    def __init__(self, loop: FrameLoop[Any] | LiveCalibration, warm_up: Callable[[], object],
+                 consume: Callable[[Any], object]) -> None:
         # A daemon: a thread that compiles cannot be stopped, and must not delay the exit.
         super().__init__(name='frame_worker', daemon=True)
         self.warm = threading.Event()   # the kernels are compiled or loaded
@@ -155,7 +163,7 @@ class Worker(threading.Thread):
     def stop(self, timeout: float) -> bool:
         """End the thread and wait for it; whether it ended in time."""
         self._stopping.set()
-        self._loop.sequencer.close()
+        self._loop.close()
         self.join(timeout)
         return not self.is_alive()
 
@@ -168,11 +176,10 @@ class Worker(threading.Thread):
             return
         self.warm.set()
         while not self._stopping.is_set():
-            outcome = self._loop.step(_STEP_TIMEOUT)
-            if outcome is None:
-                continue
             try:
-                self._consume(outcome)
+                outcome = self._loop.step(_STEP_TIMEOUT)
+                if outcome is not None:
+                    self._consume(outcome)
             except Exception as error:  # noqa: BLE001 - logged with its traceback by the node
                 self._consume(FrameFailed(None, error))
 
@@ -183,6 +190,12 @@ class Worker(threading.Thread):
 _JOIN_TIMEOUT = 0.4
 # Time [s] of a start above which kernels are being compiled, not loaded from the cache.
 _REPORT_COMPILING = 4.0
+
+
+def _calibrated(parameters: Parameters) -> tuple[SensorConfig, IntrinsicsConfig, ImuConfig]:
+    """The parameters with which a change makes a new loop: its frames are of another camera."""
+    sensor = replace(parameters.sensor, track_time_offset=False, track_readout_time=False)
+    return sensor, parameters.intrinsics, parameters.imu
 
 
 class SensorNode(StoppableNode):
@@ -208,11 +221,12 @@ class SensorNode(StoppableNode):
             self._open_outputs(self._settings.current)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_service(Trigger, '~/reset', self._reset)
-        self._cannot_start = self._why_it_cannot_start()
-        if self._cannot_start:
-            self._error(self._cannot_start)
-        else:
-            self._start()
+        self._found: Calibrated | None = None   # to be used by the executor's thread
+        self._calibrated: Calibrated | None = None   # in use
+        self._published = self.create_publisher(String, '~/calibration', LATCHED)
+        self.create_service(Trigger, '~/calibrate', self._calibrate_now)
+        self.create_service(Trigger, '~/save_calibration', self._save_now)
+        self._begin(self._settings.current.calibration.calibrate_at_start == 'always')
         self.create_timer(1.0, self._report, clock=self._steady)
 
     @abstractmethod
@@ -238,38 +252,61 @@ class SensorNode(StoppableNode):
 
     def _why_it_cannot_start(self) -> str:
         """The fault of parameters or topics; empty for none."""
-        idle, missing = self._frame_statistics.idle, self._settings.current.sensor.missing()
-        if missing:
-            return (f'{idle}: {" and ".join(missing)} must be given as parameter: see '
-                    'config/relpose.yaml, and start again')
+        parameters, idle = self._settings.current, self._frame_statistics.idle
+        missing = parameters.sensor.missing()
+        if missing and parameters.calibration.calibrate_at_start == 'never':
+            return (f'{idle}: {" and ".join(missing)} must be given as parameter, or allow '
+                    'calibrate_at_start: missing')
         topic = self.resolve_topic_name('image')
         if 'image_rect' in topic:
             return (f'{idle}: {topic} is a rectified image, whose rows have no single '
                     'timestamp; remap image to the raw one')
         return ''
 
-    def _start(self) -> None:
-        parameters = self._settings.current
-        self._loop = self._make_loop(parameters)
-        self._intake = Intake(self._loop.sequencer, parameters)
-        self._worker = Worker(self._loop, self._warm_up, self._consume)
+    def _begin(self, calibrate: bool = False) -> None:
+        """Estimate with the current parameters from here on, or calibrate before."""
+        self.stop()
+        self._active = parameters = self._settings.current
+        self._calibration: LiveCalibration | None = None
+        self._progress: Progress | None = None
+        self._loop = None
+        self._cannot_start = self._why_it_cannot_start()
+        if self._cannot_start:
+            self._error(self._cannot_start)
+            return
+        if calibrate or parameters.sensor.missing():
+            # Imported where it is needed: a start with a calibration is faster by it.
+            from rs_relpose_ros.calibrate.live import LiveCalibration
+            self._intake: Any = LiveCalibration(parameters, use_stored=not calibrate
+                                                and parameters.calibration.load_calibration)
+            self._calibration = self._intake
+            self._progress = Progress('calibrating: waiting for images and gyro')
+            self._worker = Worker(self._intake, lambda: None, self._consume_calibration)
+        else:
+            self._loop = self._make_loop(parameters)
+            self._intake = Intake(self._loop.sequencer, parameters)
+            self._worker = Worker(self._loop, self._warm_up, self._consume)
         self._worker.start()
         self._started_ns = time.monotonic_ns()
         # No subscription before the kernels are loaded: the first frames would be dropped.
         self._warm_timer = self.create_timer(0.02, self._subscribe_when_warm, clock=self._steady)
 
     def _subscribe_when_warm(self) -> None:
-        assert self._worker is not None and self._loop is not None
+        assert self._worker is not None
         if not self._worker.warm.is_set():
             if time.monotonic_ns() - self._started_ns > _REPORT_COMPILING * NANOSECONDS:
                 self._info('compiling kernels, as the build has none for this machine: this start '
                            'takes a minute or two, later ones some seconds')
             return
         self.destroy_timer(self._warm_timer)
+        if self._inputs is not None:
+            self._inputs.hand_to(self._intake)
+            self._frame_statistics.start()
+            self._log_ready(self._inputs)
+            return
         with ros_parameters.legal_qos():
-            inputs = SensorInputs(
-                self, self._intake, self._loop.sequencer.waits_for_imu,
-                self._settings.current.pair.image_transport, self._error)
+            inputs = SensorInputs(self, self._intake,
+                                  self._settings.current.pair.image_transport, self._error)
         for warning in ros_parameters.unknown_qos_overrides(self):
             self._warn(warning)
         # Objects that exist by now are permanent: the garbage collector need not scan them.
@@ -278,8 +315,12 @@ class SensorNode(StoppableNode):
         self._inputs = inputs
         self._frame_statistics.start()
         self._on_ready()
+        self._log_ready(inputs)
+
+    def _log_ready(self, inputs: SensorInputs) -> None:
         image, camera_info, imu, _ = inputs.topics.values()
-        self.get_logger().info(f'ready: {image}, {camera_info} and {imu}')
+        state = 'ready' if self._calibration is None else 'waiting for the first image'
+        self.get_logger().info(f'{state}: {image}, {camera_info} and {imu}')
 
     def stop(self) -> bool:
         """End the worker; whether it ended. Called before `destroy_node`."""
@@ -295,8 +336,64 @@ class SensorNode(StoppableNode):
         return response
 
     def _on_parameters(self, parameters: Parameters) -> None:
-        if self._loop is not None:
+        if _calibrated(parameters) != _calibrated(self._active):
+            self._begin()
+        elif self._loop is not None:
             self._loop.parameters = parameters
+
+    # -- calibration -------------------------------------------------------------------------
+
+    def _consume_calibration(
+            self, outcome: Progress | Calibrated | RsRelposeError | FrameFailed) -> None:
+        """By the worker; a calibration is used by `_report`, in the executor's thread."""
+        if isinstance(outcome, FrameFailed):
+            self._consume(outcome)
+        elif isinstance(outcome, RsRelposeError):
+            self._warn(str(outcome))
+        elif isinstance(outcome, Progress):
+            self._info(outcome.text)
+            self._progress = outcome
+        else:
+            self._found = outcome
+
+    def _use_calibration(self, found: Calibrated) -> None:
+        """Store and publish a calibration, and estimate with it."""
+        self._calibrated, config = found, self._settings.current.calibration
+        self._info(found.summary)
+        path = stored.path_of(config, found.camera)
+        try:
+            if found.new and config.save_calibration:
+                stored.save(path, found.camera, found.parameters)
+                self._info(f'the calibration is stored in {path}')
+        except InputError as error:
+            self._error(str(error))
+        self._published.publish(String(data=found.parameters))
+        try:
+            self._settings.adopt(text_values(found.parameters, str(path)))
+        except InputError as error:
+            self._error(str(error))
+            self._begin(calibrate=True)
+
+    def _calibrate_now(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Calibrate from here on; values that the user has given stay."""
+        self._begin(calibrate=True)
+        response.success, response.message = not self._cannot_start, (
+            self._cannot_start or 'calibrating: rotate the camera about all three axes')
+        return response
+
+    def _save_now(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Store the calibration that is used."""
+        found = self._calibrated
+        if found is None:
+            response.message = 'there is no calibration yet: call ~/calibrate'
+            return response
+        try:
+            path = stored.path_of(self._settings.current.calibration, found.camera)
+            stored.save(path, found.camera, found.parameters)
+            response.success, response.message = True, f'stored in {path}'
+        except InputError as error:
+            response.message = str(error)
+        return response
 
     # -- outcomes of frames (in the worker thread) ---------------------------------------------
 
@@ -341,11 +438,14 @@ class SensorNode(StoppableNode):
     # -- diagnostics -------------------------------------------------------------------------
 
     def _report(self) -> None:
+        found, self._found = self._found, None
+        if found is not None:
+            self._use_calibration(found)
         problem, missing = self._problem()
         counts: Counter[str] = Counter() if self._inputs is None else self._inputs.counts.copy()
         report = self._frame_statistics.report(
             counts, None if self._loop is None else self._loop.sequencer.counts(),
-            problem=problem, missing=missing)
+            problem=problem, missing=missing, progress=self._progress)
         status = outgoing.status_message(
             report.level, f'{self.get_fully_qualified_name()}: {self.task}', report.text,
             self._image_topic(), report.values, message_class)
@@ -392,9 +492,11 @@ class SensorNode(StoppableNode):
         if self._cannot_start:
             return self._cannot_start, tuple(self._settings.current.sensor.missing())
         assert self._worker is not None
+        if self._progress is not None:
+            return self._progress.text, tuple(self._settings.current.sensor.missing())
         if not self._worker.is_alive():
             return f'{self._frame_statistics.idle}: the worker ended, see the log', ()
-        if self._inputs is None:
+        if self._inputs is None or not self._worker.warm.is_set():
             return 'starting: kernels are compiled or loaded', ()
         return self._missing_input(self._inputs)
 

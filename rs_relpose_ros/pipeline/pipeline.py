@@ -310,6 +310,10 @@ class FrameLoop(Generic[Result]):
         self._processor = processor
         self._offline = offline
 
+    def close(self) -> None:
+        """End of the input: `step` returns what is left, then None."""
+        self.sequencer.close()
+
     def step(self, timeout: float = 0.0) -> Outcome[Result] | None:
         """The next frame with its result; None if none is ready within `timeout` seconds."""
         stamp_ns: int | None = None
