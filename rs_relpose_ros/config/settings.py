@@ -306,12 +306,11 @@ def pinhole_of_matrix(name: str, k: Sequence[float]) -> Pinhole:
 
 @dataclass(frozen=True, slots=True)
 class IntrinsicsConfig(Settings):
-    """Intrinsics for a camera without a calibrated CameraInfo, named as by camera_calibration."""
+    """Intrinsics in place of the CameraInfo's, named as by camera_calibration."""
 
     camera_matrix: tuple[float, ...] | None = setting(
-        None, 'intrinsics fx 0 cx 0 fy cy 0 0 1 of the images as published, for a camera whose '
-        'CameraInfo is uncalibrated (k[0] = 0) or absent; a calibrated CameraInfo has priority',
-        'px', length=9, kind=tuple)
+        None, 'intrinsics fx 0 cx 0 fy cy 0 0 1 of the images as published, with distortion_model '
+        'and distortion_coefficients in place of the CameraInfo', 'px', length=9, kind=tuple)
     distortion_model: str = setting(
         'plumb_bob', 'distortion model that belongs to camera_matrix',
         choices=tuple(DISTORTION_MODELS))

@@ -409,7 +409,6 @@ class SensorNode(StoppableNode):
         # Without any image the driver is probably not running: a status, but no log line.
         if image in missing:
             return f'{idle}: no image on {image} for {SILENCE:g} s', missing
-        # Configured intrinsics are used once some images have waited for a CameraInfo in vain.
         configured = self._settings.current.intrinsics.given
         if self._intake.intrinsics is None and camera_info in missing and not configured:
             text = (f'{idle}: no CameraInfo on {camera_info}; remap camera_info to the '
