@@ -359,7 +359,7 @@ def write_parts_report(folder: Path, quantities: Sequence[PartQuantity]) -> str:
 
 def _chi_squared_cells(groups: Iterable[Sequence[PartQuantity]]) -> tuple[str, str]:
     """chi^2 over its degrees of freedom, and the probability of more; empty for single parts."""
-    square, freedom = sum(map(chi_squared, groups))
+    square, freedom = np.sum([chi_squared(group) for group in groups], axis=0)
     if not freedom:
         return '', ''
     return f'{square:.1f} / {freedom:.0f}', f'{chi2.sf(square, freedom):.2f}'

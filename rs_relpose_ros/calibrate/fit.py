@@ -274,7 +274,8 @@ def fit(problem: Problem, unknowns: Unknowns, free: NDArray[np.bool_], *, rounds
             # The cost is not convex in the directions: less noise distinguishes more of them.
             unknowns = _chosen(problem, _settled(problem, redirected(problem, unknowns)),
                                _settled(problem, unknowns))[0]
-        at = _Iterate(unknowns, evaluate(problem, unknowns), 0.0 * at.newton, at.damping)
+        at = _Iterate(unknowns, evaluate(problem, unknowns), np.zeros_like(at.newton),
+                      at.damping)
     unknowns = at.unknowns._replace(damping=np.zeros(problem.pairs))
     evaluation = evaluate(problem, unknowns)
     noise = np.repeat(unknowns.noise, np.diff(problem.begin))
@@ -376,7 +377,7 @@ def _step(problem: Problem, at: _Iterate, free: NDArray[np.bool_]) -> _Iterate:
 
     cost = at.evaluation.cost + prior_cost(at.unknowns)
     H, gradient = _normal_equations(problem, at.evaluation, at.unknowns, free)
-    newton = np.linalg.solve(H + 1e-9 * np.diag(np.diag(H)), gradient)
+    newton = np.linalg.solve(H + 1e-9 * np.diag(np.diag(H)), gradient).astype(np.float64)
     length, damping = math.sqrt(max(float(gradient @ newton), 0.0)), at.damping
     # The weights of a robust loss make Gauss-Newton steps too short, by the share that the last
     # step left of itself: J. Barzilai, J. M. Borwein, Two-point step size gradient methods, 1988.
