@@ -56,7 +56,7 @@ def test_help_lists_the_legal_values_of_every_kind(capsys):
 def test_node_accepts_the_template(ros_domain_id):
     """Rcl's own YAML parser reads it as ours does."""
     with node_process(CONFIG / 'relpose.yaml') as node:
-        node.wait_for('readout_time and quat_cam_imu_xyzw must be given')
+        node.wait_for('waiting for the first image')
         assert 'there is no parameter' not in node.output
 
 

@@ -390,32 +390,17 @@ def test_no_outdated_calibration_is_used(fed):
     assert_refused(refused, Refusal.NO_CALIBRATION, 10**8, 'uncalibrated')
 
 
-def test_configured_intrinsics_replace_those_that_are_missing():
+@pytest.mark.parametrize('change', [UNCALIBRATED, {}, {'model': 'bananas'}])
+def test_configured_intrinsics_replace_the_camera_info(change):
     fed = Fed(CONFIGURED)
-    assert fed.info(**UNCALIBRATED) is None
+    fed.images(1)
+    assert fed.info(**change) is None
     assert fed.intake.camera_info_problem == ''
-    fed.images(1, 2)
+    fed.images(2)
     for number, frame in enumerate(fed.taken(), start=1):
         assert frame.stamp_ns == number * 10**8
         assert frame.intrinsics == CONFIGURED.of_image(640, 480) == fed.intake.intrinsics
-    # A calibration that comes later has priority, and is not used any more once it is withdrawn.
-    for change, fx in (({}, 450.0), (UNCALIBRATED, 400.0)):
-        fed.info(**change)
-        fed.images(3 + bool(change))
-        assert fed.taken()[0].intrinsics.fx == fx
-    # An unusable one is no missing one.
-    assert isinstance(fed.info(model='bananas'), InputError)
-    fed.images(5)
-    [refused] = fed.taken()
-    assert_refused(refused, Refusal.NO_CALIBRATION, 5 * 10**8, 'bananas')
-
-
-def test_without_a_camera_info_the_first_images_wait_for_one():
-    fed = Fed(CONFIGURED)
-    fed.images(1, 2, 3, 4)
-    assert fed.taken() == [] and fed.intake.intrinsics is None
-    fed.images(5)
-    assert [frame.intrinsics.fy for frame in fed.taken()] == [401.0] * 5
+        assert fed.intake.camera_info_of(frame.intrinsics) is None
     # Each image has its own size.
     fed.images(6, height=240)
     [frame] = fed.taken()

@@ -176,7 +176,7 @@ MAY_IMPORT = {
     'pipeline': CORE,
     'messages': CORE | {'pipeline'},
     'bags': BASE | {'imu', 'tracking', 'messages'},
-    'nodes': BASE | {'tracking', 'pipeline', 'messages', 'odometry'},
+    'nodes': BASE | {'tracking', 'pipeline', 'messages', 'calibrate', 'odometry'},
     'calibrate': CORE | {'pipeline', 'messages', 'bags'},
     'offline': CORE | {'pipeline', 'messages', 'bags', 'calibrate'},
     'odometry': BASE | {'estimator', 'imu', 'pipeline', 'messages', 'bags', 'offline'},

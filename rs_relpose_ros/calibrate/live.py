@@ -38,12 +38,12 @@ class LiveCalibration:
     """Takes the place of intake and frame loop until the calibration is known.
 
     `receive` is for the thread of the subscriptions, `step` for the worker. With `use_stored` the
-    file of the camera is used, if there is one.
+    file of the camera is used, if there is one; without `fits` it is waited for.
     """
 
-    def __init__(self, parameters: Parameters, *, use_stored: bool) -> None:
+    def __init__(self, parameters: Parameters, *, use_stored: bool, fits: bool = True) -> None:
         self._parameters = parameters
-        self._use_stored = use_stored
+        self._use_stored, self._fits = use_stored, fits
         self._queue: Queue[tuple[Role, Any]] = Queue()
         self._waiting = 0   # images in the queue
         self._done = False
@@ -72,7 +72,9 @@ class LiveCalibration:
 
     def receive(self, role: Role, message: Any) -> RsRelposeError | None:
         """Hand a message over; errors are those of `step`."""
-        if self._done or role is Role.ACCEL or (role is Role.IMAGE and self._waiting >= _WAITING):
+        configured = self._parameters.intrinsics.given
+        if (self._done or role is Role.ACCEL or (role is Role.CAMERA_INFO and configured)
+                or (role is Role.IMAGE and self._waiting >= _WAITING)):
             return None
         self._waiting += role is Role.IMAGE
         self._queue.put((role, message))
@@ -105,11 +107,10 @@ class LiveCalibration:
             self._restart()
         if error is not None:
             return error
-        if self._images > _WITHOUT_INFO and self._recorder.intrinsics is None:
-            configured = self._parameters.intrinsics
-            if configured.given:
-                self._recorder.intrinsics = configured.of_image(*self._recorder.size)
-            self._recorder.uncalibrated = True
+        configured = self._parameters.intrinsics
+        if configured.given:
+            self._recorder.intrinsics = configured.of_image(*self._recorder.size)
+        self._recorder.uncalibrated |= self._images > _WITHOUT_INFO
         if self._camera is None:
             return self._first_image(message.header.frame_id)
         return self._after_fit()
@@ -126,7 +127,8 @@ class LiveCalibration:
         path = stored.path_of(self._parameters.calibration, self._camera)
         if not (self._use_stored and path.is_file()):
             return Progress('calibrating: rotate the camera about all three axes, 20 to 60 deg/s, '
-                            'for some 20 s')
+                            'for some 20 s' if self._fits else
+                            'waiting for a calibration by relpose_node on calibration')
         try:
             _, day = stored.load(path, self._camera)
             return Calibrated(self._camera, path.read_text(encoding='utf-8'),
@@ -143,7 +145,7 @@ class LiveCalibration:
             return self._evaluated(result, recording)
         recorder = self._recorder
         grown = 1e-9 * (recorder.last_ns - self._fitted_ns) if self._fitted_ns else _STEP
-        if recorder.seconds < _FIRST or grown < _STEP:
+        if not self._fits or recorder.seconds < _FIRST or grown < _STEP:
             return None
         self._fitted_ns = recorder.last_ns
         sensor = self._parameters.sensor
@@ -183,7 +185,7 @@ class _Fit:
 
     def __init__(self, recording: CalibrationInput, config: CalibrationConfig) -> None:
         self.recording = recording
-        self._result = TemporaryFile()   # noqa: SIM115 closed with the object
+        self._result = TemporaryFile()   # noqa: SIM115 closed by result or stop
         with TemporaryFile() as arguments:
             pickle.dump((recording, config), arguments)
             arguments.seek(0)
@@ -194,18 +196,20 @@ class _Fit:
         """None while it runs."""
         if self._process.poll() is None:
             return None
-        self._result.seek(0)
-        try:
-            # Written by the own process.
-            found: CalibrationResult | RsRelposeError = pickle.load(self._result)   # noqa: S301
-        except (EOFError, pickle.UnpicklingError):
-            found = RsRelposeError('the process of the fit ended early: is there enough memory?')
+        with self._result:
+            self._result.seek(0)
+            try:
+                # Written by the own process.
+                found: CalibrationResult | RsRelposeError = pickle.load(self._result)  # noqa: S301
+            except (EOFError, pickle.UnpicklingError):
+                found = RsRelposeError('the process of the fit ended early: out of memory?')
         return found
 
     def stop(self) -> None:
         """End the process; signals of the terminal are blocked in it."""
         self._process.kill()
         self._process.wait()
+        self._result.close()
 
 
 def _fit() -> None:

@@ -177,7 +177,8 @@ def _fit_with_lens(about: Callable[[Array], Observations], data: Observations, c
         data = about(data.lens + coarse.parameters[LENS])
         problem = data.selected_problem(selection, coarse.parameters[OFFSET],
                                         config.max_gyro_gap, rng)
-        found = fit.refit(problem, coarse, free)
+        begin = fit.restarted(problem, coarse, 2.0)
+        found = fit.fit(fit.with_bends(problem, begin), begin, free)
         coarse = found.unknowns
         if (np.abs(coarse.parameters[LENS]) <= _LENS_STAYS).all():
             break

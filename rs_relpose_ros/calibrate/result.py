@@ -109,6 +109,11 @@ class CalibrationResult:
         return x, y, z, w
 
     @property
+    def bias_sigma(self) -> float:
+        """1 sigma of the bias of the worst axis after a restart of the gyro [rad/s]."""
+        return math.hypot(max(bias.sigma for bias in self.gyro_bias), _BIAS_CHANGE)
+
+    @property
     def shutter(self) -> str:
         """'rolling', 'global' or 'unsure'.
 
@@ -233,7 +238,7 @@ def parameter_file(result: CalibrationResult, title: str, *, camera: RollingShut
     groups += [(max(biases, key=lambda bias: bias.sigma), 'gyro_bias', [
         SourcedValue('gyro_bias', tuple(round(bias.value, 5) for bias in biases), '1 sigma '
                      + ', '.join(f'{bias.sigma:.5f}' for bias in biases) + ' rad/s.'),
-        _sigma('gyro_bias', math.hypot(max(bias.sigma for bias in biases), _BIAS_CHANGE), 5,
+        _sigma('gyro_bias', result.bias_sigma, 5,
                f'Of the worst axis, and {_BIAS_CHANGE:g} rad/s from one start to the next.')])]
     if result.focal_factor is not None:
         groups.append((result.focal_factor, 'camera_matrix', _lens_values(result, camera)))
@@ -299,8 +304,7 @@ def _lens_values(result: CalibrationResult, camera: RollingShutterCamera) -> lis
         SourcedValue('camera_matrix', (
             round(camera.fx * focal.value, 2), 0.0, round(column.value, 2), 0.0,
             round(camera.fy * focal.value, 2), round(row.value, 2), 0.0, 0.0, 1.0),
-            f'For images of {camera.width}x{camera.height}. A calibrated CameraInfo has '
-            'priority.'),
+            f'For images of {camera.width}x{camera.height}, in place of their CameraInfo.'),
         SourcedValue('distortion_model', camera.distortion_model, ''),
         SourcedValue('distortion_coefficients', (round(radial.value, 5), *others),
                      'The first coefficient is estimated, the others are assumed to be zero.'),

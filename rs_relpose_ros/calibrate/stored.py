@@ -87,9 +87,10 @@ def load(path: Path, camera: CameraId) -> tuple[dict[str, Any], str]:
         The file is damaged, or of another camera or image size.
     """
     own = file_values(path, _SECTION)
-    of = CameraId(str(own.get('camera_name')), own.get('image_width', 0),
-                  own.get('image_height', 0))
+    if not {'camera_name', 'image_width', 'image_height', 'date'} <= own.keys():
+        raise InputError(f'{path} is no stored calibration: it has no section {_SECTION}')
+    of = CameraId(own['camera_name'], own['image_width'], own['image_height'])
     if of != camera:
         raise InputError(f'{path} is for the camera {of.name!r} of {of.width}x{of.height}, not '
                          f'for {camera.name!r} of {camera.width}x{camera.height}')
-    return file_values(path), str(own.get('date'))
+    return file_values(path), str(own['date'])

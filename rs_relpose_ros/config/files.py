@@ -26,6 +26,11 @@ from rs_relpose_ros.errors import InputError, MissingInputError
 _NODE = 'relpose_node'
 # Parameters of every ROS node, without effect offline.
 _ROS_OWN = ('use_sim_time', 'start_type_description_service')
+# Sigma of each parameter of a calibration. A file that has one of them is a calibration file.
+_SIGMAS = {
+    'readout_time': 'readout_time_sigma', 'time_offset': 'time_offset_sigma',
+    'time_offset_per_interval': 'time_offset_per_interval_sigma',
+    'quat_cam_imu_xyzw': 'axes_sigma', 'camera_matrix': 'focal_length_sigma'}
 # Largest file that is read [bytes]; a file of all parameters has 10,000.
 _MAX_BYTES = 1 << 20
 _COMMENT_WIDTH = 95
@@ -54,6 +59,7 @@ def read_parameters(path: Path | str | None, assignments: Sequence[str] = (),
     if path is not None:
         values = file_values(Path(path), node)
         try:
+            _check_sigmas(values)
             parameters = parameters.updated(values)
         except InputError as error:
             raise InputError(f'{path}: {error}') from error
@@ -147,6 +153,15 @@ def text_values(text: str, path: str, wanted: str = _NODE) -> dict[str, Any]:
         raise InputError(f'{path} has no parameters of {wanted}: they must be below "/**:" or '
                          f'"{wanted}:" and "ros__parameters:"')
     return _converted(values)
+
+
+def _check_sigmas(values: Mapping[str, Any]) -> None:
+    """InputError if a calibration file has a parameter without its sigma."""
+    if any(values.get(sigma) for sigma in _SIGMAS.values()):
+        for name, sigma in _SIGMAS.items():
+            if name in values and sigma not in values:
+                raise InputError(f'{name} is given without {sigma}: a calibration file has each '
+                                 'parameter with its sigma, 0 if that is not known')
 
 
 def _converted(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -306,12 +306,12 @@ def pinhole_of_matrix(name: str, k: Sequence[float]) -> Pinhole:
 
 @dataclass(frozen=True, slots=True)
 class IntrinsicsConfig(Settings):
-    """Intrinsics for a camera without a calibrated CameraInfo, named as by camera_calibration."""
+    """Intrinsics in place of the CameraInfo's, named as by camera_calibration."""
 
     camera_matrix: tuple[float, ...] | None = setting(
-        None, 'intrinsics fx 0 cx 0 fy cy 0 0 1 of the images as published, for a camera whose '
-        'CameraInfo is uncalibrated (k[0] = 0) or absent; a calibrated CameraInfo has priority',
-        'px', length=9, kind=tuple, live=True)
+        None, 'intrinsics fx 0 cx 0 fy cy 0 0 1 of the images as published, with distortion_model '
+        'and distortion_coefficients in place of the CameraInfo', 'px', length=9, kind=tuple,
+        live=True)
     distortion_model: str = setting(
         'plumb_bob', 'distortion model that belongs to camera_matrix',
         choices=tuple(DISTORTION_MODELS), live=True)
@@ -546,6 +546,12 @@ class Parameters:
         return Parameters(*(dataclasses.replace(config, **{
             item.name: values[item.name] for item in dataclasses.fields(config)
             if item.name in values}) for config in groups))
+
+    def given(self) -> dict[str, Any]:
+        """The parameters that are not at their defaults, by flat name."""
+        defaults = Parameters().to_mapping()
+        return {name: value for name, value in self.to_mapping().items()
+                if value != defaults[name]}
 
     def to_mapping(self) -> dict[str, Any]:
         """Every parameter by flat name."""

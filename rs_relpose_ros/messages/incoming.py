@@ -301,10 +301,9 @@ _HELD_IMAGES = 4
 class Intake:
     """Receives the messages of camera and IMU, and fills a sequencer; images stay encoded.
 
-    An image is combined with the last CameraInfo. If that is uncalibrated, or none came with the
-    first images, the intrinsics of `parameters` are used, if there are any. Only images with one
-    of the `chosen` stamps are handed over, all for None. Without parameters a stuck gyro is not
-    detected. Not thread-safe: one thread feeds it.
+    An image is combined with the intrinsics of `parameters`, or with the last CameraInfo if these
+    have none. Only images with one of the `chosen` stamps are handed over, all for None. Without
+    parameters a stuck gyro is not detected. Not thread-safe: one thread feeds it.
     """
 
     def __init__(self, sequencer: Sequencer, parameters: Parameters | None = None,
@@ -320,7 +319,6 @@ class Intake:
         self._camera_info: Any = None
         configured = None if parameters is None else parameters.intrinsics
         self._configured = configured if configured is not None and configured.given else None
-        self._use_configured = False
         self._held: list[EncodedImage] = []   # wait for the first CameraInfo
         self._camera = StuckCamera()
         self._gyro = StuckGyro(0.0 if parameters is None else parameters.imu.stuck_gyro_time)
@@ -332,6 +330,8 @@ class Intake:
         intrinsics are active, rather than outdated ones.
         """
         self.images += role is Role.IMAGE
+        if role is Role.CAMERA_INFO and self._configured is not None:
+            return None
         try:
             data = PARTS[role].read(message)
             if role is Role.IMAGE:
@@ -346,9 +346,6 @@ class Intake:
                 self._sequencer.refuse(0, Refusal.BAD_IMAGE, str(error))
                 return None
             if role is Role.CAMERA_INFO:
-                if self._configured is not None and isinstance(error, MissingInputError):
-                    self._use_parameters()
-                    return None
                 self._use(None, str(error))
             return error
         return None
@@ -359,25 +356,19 @@ class Intake:
 
     def camera_info_of(self, intrinsics: Intrinsics) -> Any:
         """The last CameraInfo; None if it has other intrinsics."""
-        return None if self._use_configured or intrinsics != self.intrinsics else self._camera_info
+        return self._camera_info if intrinsics == self.intrinsics else None
 
     def finish(self) -> None:
         """End of the input: no image waits for a CameraInfo any longer."""
         if self._held:
-            self._use(None, configured=self._configured is not None)
+            self._use(None)
         self._sequencer.close()
 
-    def _use(self, intrinsics: Intrinsics | None, problem: str = '', *,
-             configured: bool = False) -> None:
-        """Use these intrinsics, or those of the parameters, from the images on that wait."""
+    def _use(self, intrinsics: Intrinsics | None, problem: str = '') -> None:
+        """Use these intrinsics from the images on that wait."""
         self.intrinsics, self.camera_info_problem = intrinsics, problem
-        self._use_configured = configured
         while self._held:
             self._add_frame(self._held.pop(0))
-
-    def _use_parameters(self) -> None:
-        # The intrinsics are determined by the size of the next image.
-        self._use(self.intrinsics if self._use_configured else None, configured=True)
 
     def _add_image(self, image: EncodedImage) -> None:
         if self._chosen is not None:
@@ -386,19 +377,16 @@ class Intake:
                 self._sequencer.pass_over(image.stamp_ns)
                 return
             self.stamps_found.add(image.stamp_ns)
-        if self.intrinsics is not None or self._use_configured or self.camera_info_problem:
+        if self.intrinsics or self._configured or self.camera_info_problem:
             self._add_frame(image)
             return
         self._held.append(image)
         if len(self._held) > _HELD_IMAGES:
-            if self._configured is not None:
-                self._use_parameters()
-            else:
-                self._add_frame(self._held.pop(0))
+            self._add_frame(self._held.pop(0))
 
     def _add_frame(self, image: EncodedImage) -> None:
         try:
-            if self._use_configured and self._configured is not None:
+            if self._configured is not None:
                 size, last = image.size, self.intrinsics
                 if last is None or size != (last.image_width, last.image_height):
                     self.intrinsics = self._configured.of_image(*size)

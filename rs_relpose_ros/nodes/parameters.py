@@ -36,14 +36,14 @@ class NodeParameters:
 
     def __init__(self, node: Node, on_change: Callable[[Parameters], None]) -> None:
         self._node, self._on_change = node, on_change
-        overrides, values = getattr(node, '_parameter_overrides', {}), {}
+        values = {}
         for name, default, declared in Parameters.declarations():
             value = _declare(node, name, default, declared)
             if value is not None:
                 values[name] = value
         self.current = Parameters.from_mapping(values)
         # Those of the user, which a calibration does not replace.
-        self._given = {name for name in values if name in overrides}
+        self._given = set(self.current.given())
         self._adopting = False
         node.add_on_set_parameters_callback(self._validate)
         node.add_post_set_parameters_callback(self._apply)

@@ -204,8 +204,9 @@ class SensorNode(StoppableNode):
     Callbacks convert little and fill the sequencer; one worker thread does the rest.
     """
 
-    # Name of the work on `/diagnostics`.
+    # Name of the work on `/diagnostics`; whether the node calibrates, or waits for another's.
     task: ClassVar[str]
+    calibrates: ClassVar[bool] = True
 
     def __init__(self, name: str, statistics: diagnostics.FrameStatistics) -> None:
         super().__init__(name)
@@ -223,9 +224,12 @@ class SensorNode(StoppableNode):
         self.create_service(Trigger, '~/reset', self._reset)
         self._found: Calibrated | None = None   # to be used by the executor's thread
         self._calibrated: Calibrated | None = None   # in use
-        self._published = self.create_publisher(String, '~/calibration', LATCHED)
-        self.create_service(Trigger, '~/calibrate', self._calibrate_now)
-        self.create_service(Trigger, '~/save_calibration', self._save_now)
+        if self.calibrates:
+            self._published = self.create_publisher(String, '~/calibration', LATCHED)
+            self.create_service(Trigger, '~/calibrate', self._calibrate_now)
+            self.create_service(Trigger, '~/save_calibration', self._save_now)
+        else:
+            self.create_subscription(String, 'calibration', self._on_calibration, LATCHED)
         self._begin(self._settings.current.calibration.calibrate_at_start == 'always')
         self.create_timer(1.0, self._report, clock=self._steady)
 
@@ -278,7 +282,8 @@ class SensorNode(StoppableNode):
             # Imported where it is needed: a start with a calibration is faster by it.
             from rs_relpose_ros.calibrate.live import LiveCalibration
             self._intake: Any = LiveCalibration(parameters, use_stored=not calibrate
-                                                and parameters.calibration.load_calibration)
+                                                and parameters.calibration.load_calibration,
+                                                fits=self.calibrates)
             self._calibration = self._intake
             self._progress = Progress('calibrating: waiting for images and gyro')
             self._worker = Worker(self._intake, lambda: None, self._consume_calibration)
@@ -367,12 +372,21 @@ class SensorNode(StoppableNode):
                 self._info(f'the calibration is stored in {path}')
         except InputError as error:
             self._error(str(error))
-        self._published.publish(String(data=found.parameters))
+        if self.calibrates:
+            self._published.publish(String(data=found.parameters))
+        self._adopt(found.parameters, str(path))
+        if self._calibration is not None:   # nothing in it was new
+            self._begin()
+
+    def _adopt(self, parameters: str, source: str) -> None:
         try:
-            self._settings.adopt(text_values(found.parameters, str(path)))
+            self._settings.adopt(text_values(parameters, source))
         except InputError as error:
             self._error(str(error))
-            self._begin(calibrate=True)
+
+    def _on_calibration(self, message: String) -> None:
+        self._info('using the calibration of relpose_node')
+        self._adopt(message.data, 'calibration')
 
     def _calibrate_now(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Calibrate from here on; values that the user has given stay."""
@@ -511,7 +525,6 @@ class SensorNode(StoppableNode):
         # Without any image the driver is probably not running: a status, but no log line.
         if image in missing:
             return f'{idle}: no image on {image} for {SILENCE:g} s', missing
-        # Configured intrinsics are used once some images have waited for a CameraInfo in vain.
         configured = self._settings.current.intrinsics.given
         if self._intake.intrinsics is None and camera_info in missing and not configured:
             text = (f'{idle}: no CameraInfo on {camera_info}; remap camera_info to the '
