@@ -174,7 +174,8 @@ CHANGE_AFTER = 1   # pair
 @pytest.fixture(scope='module')
 def parameters(bundled_bag) -> Parameters:
     """With a time offset that is to be found by tracking."""
-    live = {name for name, _, declared in Parameters.declarations() if declared.live}
+    live = {name for name, _, declared in Parameters.declarations()
+            if declared.live and not declared.restarts}
     assert live == CHANGED.keys() | OF_THE_NODE   # each is tried
     return read_parameters(bundled_bag.with_name('hand_held.yaml'), ['time_offset=0.003'])
 
@@ -301,8 +302,7 @@ def walk_of_a_pair(recorded: list[Any], parameters: Parameters) -> dict[tuple[st
 
     node, loop = MagicMock(), FrontEnd(parameters, keep_images=True, clock=lambda: 0)
     node.create_subscription.return_value.handle.take_message.return_value = None
-    inputs = SensorInputs(node, Intake(loop.sequencer, parameters), 'compressed',
-                          pytest.fail)
+    inputs = SensorInputs(node, Intake(loop.sequencer, parameters), 'compressed', pytest.fail)
     relpose = MagicMock(spec=RelposeNode, _outputs=PairPublishers(node, parameters.pair),
                         _settings=MagicMock(current=parameters), _statistics=Statistics(),
                         _frame_statistics=MagicMock(), _log_health=MagicMock(),

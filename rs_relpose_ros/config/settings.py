@@ -93,11 +93,12 @@ class ImuConfig(Settings):
 
     gyro_bias: tuple[float, ...] = setting(
         (0.0, 0.0, 0.0), 'gyro bias in the IMU frame, subtracted', 'rad/s', low=-1.0, high=1.0,
-        length=3, live=True)
+        length=3, restarts=True)
     gyro_noise_density: float = setting(
         2e-4, 'white noise of the gyro', 'rad/s/sqrt(Hz)', low=1e-7, high=0.1)
     gyro_bias_sigma: float = setting(
-        3e-3, 'uncertainty of gyro_bias, 1 sigma per axis', 'rad/s', low=0.0, high=1.0, live=True)
+        3e-3, 'uncertainty of gyro_bias, 1 sigma per axis', 'rad/s', low=0.0, high=1.0,
+        restarts=True)
     accel_noise_density: float = setting(
         3e-3, 'white noise of the accelerometer', 'm/s^2/sqrt(Hz)', low=1e-6, high=10.0)
     accel_bias_sigma: float = setting(
@@ -105,9 +106,10 @@ class ImuConfig(Settings):
         'axis', 'm/s^2', low=0.0, high=10.0)
     imu_position: tuple[float, ...] = setting(
         (0.0, 0.0, 0.0), 'position of the IMU in the camera frame', 'm', low=-5.0, high=5.0,
-        length=3, live=True)
+        length=3, restarts=True)
     imu_position_sigma: float = setting(
-        0.03, 'uncertainty of imu_position, 1 sigma per axis', 'm', low=0.0, high=5.0, live=True)
+        0.03, 'uncertainty of imu_position, 1 sigma per axis', 'm', low=0.0, high=5.0,
+        restarts=True)
     track_gyro_bias: bool = setting(
         True, 're-estimate the gyro bias whenever the IMU is at rest (within 4 gyro_bias_sigma)')
     use_imu_orientation: bool = setting(
@@ -311,22 +313,22 @@ class IntrinsicsConfig(Settings):
     camera_matrix: tuple[float, ...] | None = setting(
         None, 'intrinsics fx 0 cx 0 fy cy 0 0 1 of the images as published, with distortion_model '
         'and distortion_coefficients in place of the CameraInfo', 'px', length=9, kind=tuple,
-        live=True)
+        restarts=True)
     distortion_model: str = setting(
         'plumb_bob', 'distortion model that belongs to camera_matrix',
-        choices=tuple(DISTORTION_MODELS), live=True)
+        choices=tuple(DISTORTION_MODELS), restarts=True)
     distortion_coefficients: tuple[float, ...] | None = setting(
         None, 'coefficients of distortion_model in the order of OpenCV; no distortion if not '
-        'given', kind=tuple, live=True)
+        'given', kind=tuple, restarts=True)
     focal_length_sigma: float = setting(
         0.0, 'relative uncertainty of the focal length, 1 sigma; 0 if it is not known', low=0.0,
-        high=1.0, live=True)
+        high=1.0, restarts=True)
     distortion_sigma: float = setting(
         0.0, 'uncertainty of the first of distortion_coefficients, 1 sigma; 0 if it is not known',
-        low=0.0, high=10.0, live=True)
+        low=0.0, high=10.0, restarts=True)
     principal_point_sigma: float = setting(
         0.0, 'uncertainty of the principal point, 1 sigma per axis; 0 if it is not known', 'px',
-        low=0.0, high=1e4, live=True)
+        low=0.0, high=1e4, restarts=True)
 
     def __post_init__(self) -> None:
         Settings.__post_init__(self)
@@ -360,43 +362,43 @@ class SensorConfig(Settings):
 
     readout_time: float | None = setting(
         None, 'image height times line delay; 0 for a global shutter', 's', low=0.0, high=0.5,
-        kind=float, live=True)
+        kind=float, restarts=True)
     readout_time_sigma: float = setting(
         0.0, 'uncertainty of readout_time, 1 sigma; 0 if it is not known', 's', low=0.0,
-        high=1.0, live=True)
+        high=1.0, restarts=True)
     readout_direction: str = setting(
         'down', 'whether row 0 is read first (down) or last (up)',
-        choices=READOUT_DIRECTIONS, live=True)
+        choices=READOUT_DIRECTIONS, restarts=True)
     stamp_row: str = setting(
-        'first', 'row that the image stamp marks', choices=REFERENCE_ROWS, live=True)
+        'first', 'row that the image stamp marks', choices=REFERENCE_ROWS, restarts=True)
     pose_row: str = setting(
         'stamp', 'rows that poses relate and their stamps mark: those of the image stamps, or the '
         'middle rows, between which the translation is more accurate', choices=('stamp', 'middle'))
     stamp_exposure: str = setting(
         'middle', 'time within the exposure of that row that the stamp marks',
-        choices=STAMP_EXPOSURES, live=True)
+        choices=STAMP_EXPOSURES, restarts=True)
     exposure_time: float = setting(
         0.0, 'exposure time of a row, over which the gyro is averaged', 's', low=0.0,
-        high=1.0, live=True)
+        high=1.0, restarts=True)
     exposure_margin: float = setting(
         0.0, 'in place of exposure_time: the exposure is the interval between frames less this '
-        '(automatic exposure in little light); 0 for none', 's', low=0.0, high=1.0, live=True)
+        '(automatic exposure in little light); 0 for none', 's', low=0.0, high=1.0, restarts=True)
     time_offset: float = setting(
         0.0, 'IMU clock minus camera clock: t_imu = stamp + time_offset', 's', low=-10.0,
-        high=10.0, live=True)
+        high=10.0, restarts=True)
     time_offset_sigma: float = setting(
         0.0, 'uncertainty of time_offset, 1 sigma; 0 if it is not known', 's', low=0.0,
-        high=10.0, live=True)
+        high=10.0, restarts=True)
     time_offset_per_interval: float = setting(
         0.0, 'change of time_offset with the interval T between frames (automatic exposure): '
         't_imu = stamp + time_offset + time_offset_per_interval (T - '
-        'time_offset_reference_interval)', 's/s', low=-5.0, high=5.0, live=True)
+        'time_offset_reference_interval)', 's/s', low=-5.0, high=5.0, restarts=True)
     time_offset_per_interval_sigma: float = setting(
         0.0, 'uncertainty of time_offset_per_interval, 1 sigma; 0 if it is not known', 's/s',
-        low=0.0, high=5.0, live=True)
+        low=0.0, high=5.0, restarts=True)
     time_offset_reference_interval: float = setting(
         0.0, 'interval between frames at which time_offset holds; used with '
-        'time_offset_per_interval', 's', low=0.0, high=10.0, live=True)
+        'time_offset_per_interval', 's', low=0.0, high=10.0, restarts=True)
     track_time_offset: bool = setting(
         False, 'apply the time offset that is tracked at run time (it is always reported)',
         live=True)
@@ -405,10 +407,10 @@ class SensorConfig(Settings):
         live=True)
     quat_cam_imu_xyzw: tuple[float, ...] | None = setting(
         None, 'rotation IMU to camera, v_cam = R(q) v_imu; x y z w', low=-1.0, high=1.0, length=4,
-        kind=tuple, live=True)
+        kind=tuple, restarts=True)
     axes_sigma: float = setting(
         0.0, 'uncertainty of quat_cam_imu_xyzw, 1 sigma per axis; 0 if it is not known', 'rad',
-        low=0.0, high=1.0, live=True)
+        low=0.0, high=1.0, restarts=True)
 
     def __post_init__(self) -> None:
         Settings.__post_init__(self)

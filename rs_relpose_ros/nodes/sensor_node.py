@@ -6,7 +6,6 @@ from abc import abstractmethod
 import argparse
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 import gc
 import logging
 import os
@@ -30,7 +29,7 @@ from std_srvs.srv import Trigger
 from rs_relpose_ros.calibrate import stored
 from rs_relpose_ros.calibrate.stored import Calibrated, Progress
 from rs_relpose_ros.config.files import text_values
-from rs_relpose_ros.config.settings import ImuConfig, IntrinsicsConfig, Parameters, SensorConfig
+from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.messages import outgoing
@@ -192,10 +191,10 @@ _JOIN_TIMEOUT = 0.4
 _REPORT_COMPILING = 4.0
 
 
-def _calibrated(parameters: Parameters) -> tuple[SensorConfig, IntrinsicsConfig, ImuConfig]:
-    """The parameters with which a change makes a new loop: its frames are of another camera."""
-    sensor = replace(parameters.sensor, track_time_offset=False, track_readout_time=False)
-    return sensor, parameters.intrinsics, parameters.imu
+def _camera(parameters: Parameters) -> list[Any]:
+    """The parameters with a change of which a node begins again."""
+    values = parameters.to_mapping()
+    return [values[name] for name, _, declared in Parameters.declarations() if declared.restarts]
 
 
 class SensorNode(StoppableNode):
@@ -341,7 +340,7 @@ class SensorNode(StoppableNode):
         return response
 
     def _on_parameters(self, parameters: Parameters) -> None:
-        if _calibrated(parameters) != _calibrated(self._active):
+        if _camera(parameters) != _camera(self._active):
             self._begin()
         elif self._loop is not None:
             self._loop.parameters = parameters
