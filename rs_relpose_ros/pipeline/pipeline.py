@@ -233,7 +233,8 @@ class Pipeline(Processor[PairResult]):
         active[findings.OFFSET] = frame.imu.applied_offset_ns / NANOSECONDS
         active[findings.READOUT] = configured.direction * self._readout
         active[findings.BIAS] = parameters.sensor.R_cam_imu.T @ segment.bias - bias
-        pose = monitor.add_pair(frame.stamp_ns, measurement, pose, configured)
+        assessed = monitor.add_pair(frame.stamp_ns, measurement, pose, configured)
+        pose = monitor.agreement.enlarged(reference.stamp_ns, frame.stamp_ns, pose, assessed)
         tracked = Tracked.of(monitor.calibration, configured)
         self.applied = self.applied.moved(tracked, parameters.sensor)
         if parameters.pair.withhold_when_wrong:
