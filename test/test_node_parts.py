@@ -185,17 +185,17 @@ def test_silence_begins_with_the_first_image(clock, statistics):
     assert report(statistics, 30).silence == Silence(2.0, 30, {}, '')
 
 
-@pytest.mark.parametrize(('rate', 'size', 'expected'), [
-    (9, 921_600, True), (29, 921_600, False), (9, 300_000, False), (0, 921_600, False)])
-def test_lost_images_are_reported(rate, size, expected):
-    lost = diagnostics.LostImages()
-    for second in range(5):
-        assert lost.add(rate * second, 30 * second, size) == ''
-    text = lost.add(rate * 5, 150, size)
+@pytest.mark.parametrize(('share', 'size', 'jitter', 'expected'), [
+    (0.5, 921_600, 0, True), (0.95, 921_600, 0, False), (0.5, 300_000, 0, False),
+    # Of a rhythm with jitter; of a slow start, before the last seconds.
+    (0.5, 921_600, 2_000_000, True), (1.0, 921_600, 2_000_000, False)])
+def test_lost_images_are_reported(share, size, jitter, expected):
+    rng = np.random.default_rng(0)
+    stamps = [k * SECOND // 30 + int(jitter * rng.normal()) for k in range(300)
+              if k < 100 or rng.random() < share]
+    text = diagnostics.lost_images(stamps, size)
     assert bool(text) == expected
-    if expected:
-        assert text.startswith('9 images a second of 0.9 MB come, and 30 CameraInfo')
-        assert 'config/fastdds.xml' in text
+    assert ('config/fastdds.xml' in text) == expected
 
 
 # -- diagnostics -----------------------------------------------------------------------------

@@ -214,7 +214,7 @@ class SensorNode(StoppableNode):
         self._loop: FrameLoop[Any] | None = None
         self._inputs: SensorInputs | None = None
         self._worker: Worker | None = None
-        self._lost_images, self._reported_silence = diagnostics.LostImages(), ''
+        self._reported_silence = ''
         # For diagnostics and time-outs, which must run although /clock may not advance.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         with ros_parameters.legal_qos():
@@ -466,8 +466,7 @@ class SensorNode(StoppableNode):
             self.get_clock().now().nanoseconds, status, message_class))
         if self._inputs is not None:
             self._log_silence(self._inputs, report.silence, problem)
-            lost = self._lost_images.add(
-                counts[Role.IMAGE], counts[Role.CAMERA_INFO], self._inputs.image_bytes)
+            lost = diagnostics.lost_images(self._inputs.stamps_ns, self._inputs.image_bytes)
             if lost:
                 self._warn(lost)
 
