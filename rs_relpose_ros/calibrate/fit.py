@@ -630,7 +630,7 @@ def _exposure(data: Observations, final: Fit, square_sigma: float) -> Estimate:
     value = min(math.sqrt(max(square, 0.0)), data.interval)
     # Also of a square near zero, where the root has no derivative.
     sigma = math.sqrt(value**2 + square_sigma) - value
-    return _estimate(value, sigma, 0.5 * value)
+    return Estimate(value, sigma, sigma <= 0.5 * value, 'the images do not show any')
 
 
 def _bounded(unknowns: Unknowns, covariance: Array,

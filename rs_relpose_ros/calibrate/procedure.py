@@ -207,12 +207,16 @@ class CalibrationInput:
     camera: RollingShutterCamera    # of the full sensor, its readout time 0
     focal_known: bool               # by the CameraInfo; else `camera` is a guess
     unused: dict[str, int]          # messages that were not used, by reason
+    is_whole: bool = True           # whether the images show the whole sensor, without binning
 
     def with_unknown_lens(self, distortion_model: str) -> CalibrationInput:
         """The same for a lens that is to be estimated; InputError if it has a distortion."""
         if any(self.camera.distortion):
             raise InputError('the CameraInfo has distortion coefficients, beyond the first of '
                              'which nothing is estimated: calibrate without --lens')
+        if not self.is_whole:
+            raise InputError('the CameraInfo has a region of interest or binning, which '
+                             'camera_matrix cannot describe: calibrate without --lens')
         counts = DISTORTION_MODELS[distortion_model].coefficient_counts
         return replace(self, focal_known=False, camera=replace(
             self.camera, distortion_model=distortion_model,
@@ -329,8 +333,9 @@ class Recorder:
         frames = np.repeat(np.arange(len(self._ids)), [len(ids) for ids in self._ids])
         tracks = Tracks(np.array(self._stamps), frames, np.concatenate(self._ids), points)
         gyro = GyroSeries(np.array(stamps), np.array([self._gyro[stamp] for stamp in stamps]))
-        return CalibrationInput(tracks, gyro, _camera(intrinsics, *self.size),
-                                intrinsics is not None, unused)
+        camera = _camera(intrinsics, *self.size)
+        return CalibrationInput(tracks, gyro, camera, intrinsics is not None, unused,
+                                self.size == (camera.width, camera.height))
 
 
 def _camera(intrinsics: Intrinsics | None, width: int, height: int) -> RollingShutterCamera:
