@@ -271,6 +271,7 @@ EXPECTED = {
     'imu_rate_hz': '200.0', 'accel_rate_hz': '100.0', 'frames_received': '2000',
     'frames_processed': '1064', 'frames_failed': '3', 'messages_invalid': '15',
     'imu_samples': '9000', 'imu_gaps': '11', 'imu_repeated': '13', 'imu_late': '14',
+    'imu_wild': '16',
     'clock_jumps': '12', 'pairs': '3', 'poses': '2', 'matches': '20', 'inliers': '15',
     'inlier_ratio': '0.750', 'parallax_px': '3.2', 'residual_rms_px': '',
     'pixel_sigma_px': '',
@@ -302,7 +303,8 @@ def test_every_counter_has_its_own_field(clock, statistics):
         statistics.add_pair(result, clock.now - 15 * 10**6)
     statistics.add_frame(clock.now - 30 * 10**6)
     counted = SequencerCounts(frames=2000, frames_taken=1064, refused=refused, imu_samples=9000,
-                              imu_gaps=11, clock_jumps=12, imu_repeated=13, imu_late=14)
+                              imu_gaps=11, clock_jumps=12, imu_repeated=13, imu_late=14,
+                              imu_wild=16)
     clock.now = 2 * SECOND
     found = report(statistics, 60, counted, missing=('imu',), camera_info=62, imu=400, accel=200,
                    invalid=15).values

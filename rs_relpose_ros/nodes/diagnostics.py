@@ -132,7 +132,7 @@ class Report:
 
 
 # Counters of `SequencerCounts`.
-_COUNTERS = ('imu_samples', 'imu_gaps', 'imu_repeated', 'imu_late', 'clock_jumps')
+_COUNTERS = ('imu_samples', 'imu_gaps', 'imu_repeated', 'imu_late', 'imu_wild', 'clock_jumps')
 
 
 def _ms(seconds: float) -> str:
