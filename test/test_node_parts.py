@@ -259,10 +259,16 @@ def test_refused_frames_are_reported_once(statistics):
     assert first.level == WARN
     assert first.text.startswith('5 frames') and 'too slow' in first.text
     assert '(3 overload, 2 no_imu)' in first.text
-    later = counts(frames=10, taken=4, overload=3, no_imu=3)
+    later = counts(frames=11, taken=5, overload=3, no_imu=3)
     second = report(statistics, counted=later)
     assert second.text.startswith('1 frames') and '(1 no_imu)' in second.text
     assert report(statistics, counted=later).level == OK
+    # No frame at all was used since then.
+    statistics.add_refusal('the image is 320x240, but its CameraInfo is for 640x480')
+    unused = counts(frames=15, taken=5, overload=3, no_imu=3, bad_image=4)
+    third = report(statistics, counted=unused)
+    assert (third.level, dict(third.values)['state']) == (ERROR, 'not estimating')
+    assert third.text.endswith('CameraInfo is for 640x480')
 
 
 # Besides the refusals.

@@ -170,8 +170,9 @@ class FrameStatistics(ABC):
         self._lock = threading.Lock()
         self._latencies: deque[float] = deque(maxlen=_RECENT_RESULTS)
         self._failures = 0
-        self._last_failure = ''
+        self._last_failure = self._last_refusal = ''
         self._since_ns = clock()
+        self._taken = 0   # frames, until the last report
         self._counted: Counter[str] = Counter()
         self._refused: Counter[Refusal] = Counter()
         self._frame_times: deque[float] = deque(maxlen=_RECENT_FRAMES)
@@ -197,6 +198,11 @@ class FrameStatistics(ABC):
             self._failures += 1
             self._last_failure = reason
 
+    def add_refusal(self, reason: str) -> None:
+        """Keep the reason why a frame was not used."""
+        with self._lock:
+            self._last_refusal = reason
+
     def report(self, inputs: Counter[str], counts: SequencerCounts | None, *, problem: str,
                missing: tuple[str, ...], progress: Progress | None = None) -> Report:
         """The state since the last report.
@@ -212,6 +218,10 @@ class FrameStatistics(ABC):
             refused = Counter({} if counts is None else counts.refused)
             dropped, self._refused = refused - self._refused, refused
             busy, self._busy_ns = self._busy_ns / NANOSECONDS / elapsed, 0
+            taken = counts.frames_taken if counts else 0
+            used, self._taken = taken - self._taken, taken
+            if not problem and dropped and used <= 0:
+                problem = f'{self.idle}: no frame can be used: {self._last_refusal}'
             level, text = (self._evaluate(problem, dropped) if progress is None
                            else (OK, progress.text))
             values: dict[str, object] = {
@@ -225,7 +235,7 @@ class FrameStatistics(ABC):
                 rate = (inputs[role] - before[role]) / elapsed
                 values[f'{role.value}_rate_hz'] = f'{rate:.1f}'
             values['frames_received'] = counts.frames if counts else inputs[Role.IMAGE]
-            values['frames_processed'] = counts.frames_taken if counts else 0
+            values['frames_processed'] = taken
             for kind in Refusal:
                 values[f'frames_refused_{kind.value}'] = refused[kind]
             values['frames_failed'] = self._failures

@@ -268,7 +268,8 @@ class SensorNode(StoppableNode):
 
     def _begin(self, calibrate: bool = False) -> None:
         """Estimate with the current parameters from here on, or calibrate before."""
-        self.stop()
+        if self._worker is not None:
+            self._worker.stop(_JOIN_TIMEOUT)
         self._active = parameters = self._settings.current
         self._calibration: LiveCalibration | None = None
         self._progress: Progress | None = None
@@ -412,6 +413,7 @@ class SensorNode(StoppableNode):
 
     def _consume(self, outcome: Outcome[Any]) -> None:
         if isinstance(outcome, FrameRefused):
+            self._frame_statistics.add_refusal(outcome.reason)
             self._log_refused(outcome)
             return
         if self._stamps is not None and outcome.stamp_ns is not None:
