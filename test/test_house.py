@@ -27,7 +27,7 @@ BUDGETS = {
     'rs_relpose_ros/geometry': (1260, 7),
     'rs_relpose_ros/imu': (1290, 4),
     'rs_relpose_ros/messages': (1310, 4),
-    'rs_relpose_ros/nodes': (2010, 9),
+    'rs_relpose_ros/nodes': (2030, 9),
     'rs_relpose_ros/odometry': (1460, 6),
     'rs_relpose_ros/offline': (2950, 12),
     'rs_relpose_ros/pipeline': (3310, 13),
