@@ -306,8 +306,8 @@ def test_recordings(recordings, tmp_path, name):
     """With the gyro for the rows only, the rotation between the frames comes from the images.
 
     Without that of the gyro directions are less certain: 4 of 28 by more than 10 deg. Without the
-    exposure of the RealSense's file: with it, the monitor reports a wrong gyro bias in this mode, a
-    false alarm (docs/lab/benchmarks.md).
+    exposure of the RealSense's file, with which the monitor reports a wrong gyro bias in this
+    mode: a false alarm (docs/lab/benchmarks.md).
     """
     bag, out = tmp_path / name, tmp_path / 'out'
     assert main(['convert', name, str(recordings / name), str(bag)]) == 0
