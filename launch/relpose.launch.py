@@ -32,11 +32,12 @@ ARGUMENTS = {
     'image_transport': ('', 'raw or compressed; empty: as in the parameter file'),
     'params_file': (
         PathJoinSubstitution([FindPackageShare('rs_relpose_ros'), 'config', 'relpose.yaml']),
-        'parameter file; readout_time and quat_cam_imu_xyzw have no default'),
+        'parameter file; without readout_time and quat_cam_imu_xyzw the node calibrates itself'),
     'fastdds_profile': (
         EnvironmentVariable(PROFILE, default_value=PathJoinSubstitution(
             [FindPackageShare('rs_relpose_ros'), 'config', 'fastdds.xml'])),
         'Fast DDS profile of the node, for images above 512 KB; the driver needs it, too'),
+    'rviz': ('false', 'start RViz with the layout of this package'),
     'use_sim_time': ('false', 'clock of log lines and diagnostics; estimates use stamps alone'),
 }
 
@@ -50,7 +51,10 @@ def start_nodes(context: LaunchContext) -> list[Action]:
     profile = argument['fastdds_profile']
     environment = [SetEnvironmentVariable(PROFILE, profile)] if profile.perform(context) else []
     name = argument['name'].perform(context)
-    return [*environment, *(Node(
+    rviz = [Node(package='rviz2', executable='rviz2', arguments=['-d', PathJoinSubstitution(
+        [FindPackageShare('rs_relpose_ros'), 'config', 'rs_relpose.rviz'])])]
+    shown = argument['rviz'].perform(context).lower() == 'true'
+    return [*environment, *(rviz if shown else []), *(Node(
         package='rs_relpose_ros', executable=executable, name=name or executable,
         namespace=argument['namespace'], output='screen',
         parameters=[argument['params_file'], overrides],
@@ -59,6 +63,7 @@ def start_nodes(context: LaunchContext) -> list[Action]:
             ('image', PathJoinSubstitution([camera, argument['image']])),
             ('camera_info', PathJoinSubstitution([camera, argument['camera_info']])),
             ('imu', argument['imu']),
+            ('calibration', 'relpose_node/calibration'),
             ('accel', argument['accel'])])
         for executable in argument['executable'].perform(context).split(','))]
 

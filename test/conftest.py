@@ -12,7 +12,10 @@ from hypothesis import HealthCheck, settings
 import pytest
 
 from rs_relpose_lab.live.graph import private_domain
+from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.cli import main as command_line
+from rs_relpose_ros.offline.replay import read_truth
+from rs_relpose_ros.offline.truth import TrueTrajectory
 
 ROOT = Path(__file__).resolve().parent.parent
 BUNDLED_PARAMETERS = ROOT / 'bags' / 'hand_held.yaml'
@@ -22,6 +25,20 @@ settings.register_profile('repeatable', derandomize=True, deadline=None, databas
                           suppress_health_check=[HealthCheck.too_slow,
                                                  HealthCheck.data_too_large])
 settings.load_profile('repeatable')
+
+
+class Clock:
+    """A monotonic clock that a test moves by hand."""
+
+    now = 0
+
+    def __call__(self) -> int:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
@@ -89,6 +106,14 @@ def bundled_bag() -> Path:
     bag = ROOT / 'bags' / 'hand_held'
     assert (bag / 'metadata.yaml').is_file(), f'{bag} is no rosbag2 directory'
     return bag
+
+
+@pytest.fixture(scope='session')
+def bundled_truth(bundled_bag: Path) -> TrueTrajectory:
+    with open_bag(bundled_bag) as bag:
+        truth = read_truth(bag, bag.find_topics())
+    assert truth is not None
+    return truth
 
 
 @pytest.fixture

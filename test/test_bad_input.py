@@ -23,8 +23,6 @@ from rs_relpose_ros.geometry.camera import RollingShutterCamera
 POINTS = {'linear_9pt': 9, 'uniform_9pt': 9, 'angular_3pt': 3, 'angular_5pt': 5, 'global_5pt': 5,
           'uniform_11pt': 11}
 WIDTH, HEIGHT = 640, 480
-
-
 seeds = st.integers(0, 2**32 - 1)
 any_float = st.floats(allow_nan=True, allow_infinity=True)
 finite = st.floats(allow_nan=False, allow_infinity=False)
@@ -78,9 +76,6 @@ configs = st.fixed_dictionaries({
     'solver': st.sampled_from(SOLVER_CHOICES), 'refinement': st.sampled_from(REFINEMENTS)})
 
 
-# --- the checks
-
-
 @pytest.mark.parametrize(('check', 'message'), [
     (lambda: validate.number('x', '3', 0, 1, 's'), "x must be in [0, 1] s, got '3'"),
     (lambda: validate.number('x', np.nan), 'x must be finite, got nan'),
@@ -120,9 +115,6 @@ def test_legal_arrays_are_copied(values):
         np.testing.assert_allclose(np.linalg.norm(unit, axis=1), 1.0, rtol=1e-15)
 
 
-# --- the estimator
-
-
 @settings(max_examples=200)
 @given(seeds, st.integers(0, 160), configs, st.sampled_from([2.0, 4.0, 8.0, 13.0, 25.0]),
        st.booleans(), st.booleans())
@@ -134,13 +126,7 @@ def test_random_matches_never_give_a_good_pose(seed, n, config, threshold, gyro,
                     config={**config, 'threshold': threshold},
                     camera={'readout_direction': 'up' if up else 'down'}, **prior)
     assert pose is not None and not pose
-
-
-@settings(max_examples=60)
-@given(seeds, st.integers(0, 8), configs)
-def test_a_handful_of_matches_gives_no_pose(seed, n, config):
-    points = random_points(seed, n)
-    assert estimate(points, points + 5.0, config=config).status is Status.TOO_FEW_MATCHES
+    assert pose.status is Status.TOO_FEW_MATCHES or n > 8
 
 
 @st.composite
@@ -148,14 +134,12 @@ def degenerate_points(draw):
     """Identical, few distinct, or collinear points."""
     n = draw(st.integers(9, 60))
     rng = np.random.default_rng(draw(seeds))
-    kind = draw(st.sampled_from(['identical', 'two', 'four', 'line', 'row', 'column']))
     ends = rng.uniform(0.0, [WIDTH - 1, HEIGHT - 1], (4, 2))
     along = rng.uniform(size=(n, 1))
-    points = {'identical': np.repeat(ends[:1], n, axis=0), 'two': ends[rng.integers(0, 2, n)],
-              'four': ends[rng.integers(0, 4, n)], 'line': ends[0] + along * (ends[1] - ends[0]),
-              'row': np.column_stack([ends[0, 0] * along, np.full(n, ends[1, 1])]),
-              'column': np.column_stack([np.full(n, ends[1, 0]), ends[0, 1] * along])}[kind]
-    return points, rng
+    return draw(st.sampled_from([
+        *(ends[rng.integers(0, distinct, n)] for distinct in (1, 2, 4)),
+        *(ends[0] + along * (ends[1] - ends[0]) * axes for axes in ([1, 1], [1, 0], [0, 1])),
+    ])), rng
 
 
 @settings(max_examples=80)
@@ -309,9 +293,6 @@ def test_any_gyro_samples(times, rows, seed):
     turns = motion.rotations(np.clip([-0.01, 0.0, 0.02], times[0], times[-1]))
     np.testing.assert_allclose(turns @ np.swapaxes(turns, 1, 2), np.tile(np.eye(3), (3, 1, 1)),
                                atol=1e-6)
-
-
-# --- the solvers
 
 
 def solve(name, rays1, rays2, tau1, tau2, gravity1, gravity2, start_rotations):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-import csv
 from dataclasses import replace
 import json
 import math
@@ -17,6 +16,7 @@ import time
 from typing import Any
 
 from bag_kinds import copied
+from conftest import rows_of
 import cv2
 import numpy as np
 import pytest
@@ -32,15 +32,6 @@ pytestmark = pytest.mark.timeout(300)
 
 VERSION = batch.package_version()
 SECONDS = 2.5   # of a bag
-
-
-def job_for(name: str, command: str = 'check', **changes: object) -> Job:
-    values = {'bag': Bag(f'/bags/{name}', 5, 7, 'a: 1\n'), 'parameters': 'a: 1\n',
-              'options': ('--set', 'seed=1'), 'version': '1'}
-    return Job(command=command, name=name, **{**values, **changes})
-
-
-# --- which bags, and which of them are done
 
 
 def make_bag(path: Path, size: int = 10) -> Path:
@@ -76,32 +67,23 @@ def test_names_of_results_differ(paths, names):
     assert batch_results.unique_names(paths) == names
 
 
-@pytest.mark.parametrize('changes', [
-    {'bag': Bag('/bags/a', 6, 7, 'a: 1\n')}, {'bag': Bag('/bags/a', 5, 8, 'a: 1\n')},
-    {'parameters': 'a: 2\n'}, {'options': ()}, {'version': '2'}, {'command': 'replay'}])
-def test_result_is_reused_only_if_nothing_changed(tmp_path, changes):
-    store, job = Store(tmp_path), job_for('a')
-    outcome = Outcome(job, State.DONE, '', 1.5, {'pairs': 3, 'shutter': None})
+@pytest.mark.parametrize('state', State)
+def test_result_is_reused_only_if_it_is_one_and_nothing_changed(tmp_path, state):
+    store, job = Store(tmp_path), Job(
+        'check', Bag('/bags/a', 5, 7, 'a: 1\n'), 'a', 'a: 1\n', ('--set', 'seed=1'), '1')
+    outcome = Outcome(job, state, 'because', 1.5, {'pairs': 3, 'shutter': None})
     store.add(replace(outcome, files={'check.json': b'{}', 'in/it.txt': b'text'}))
     assert (tmp_path / 'a' / 'in' / 'it.txt').read_bytes() == b'text'
-    assert Store(tmp_path).done(job) == outcome
-    assert store.done(replace(job, **changes)) is None
-    assert store.done(job_for('b')) is None
-
-
-@pytest.mark.parametrize('state', State)
-def test_failures_and_damaged_results_are_run_again(tmp_path, state):
-    store, job = Store(tmp_path), job_for('a')
-    store.add(Outcome(job, state, 'because', 1.0, files={'check.json': b'{}'}))
     lasts = state in (State.DONE, State.FINDINGS, State.REFUSED)
-    assert (store.done(job) is not None) is lasts
+    assert Store(tmp_path).done(job) == (outcome if lasts else None)
+    for changes in ({'bag': replace(job.bag, size=6)}, {'bag': replace(job.bag, changed_ns=8)},
+                    {'parameters': 'a: 2\n'}, {'options': ()}, {'version': '2'},
+                    {'command': 'replay'}, {'name': 'b'}):
+        assert store.done(replace(job, **changes)) is None
     (tmp_path / 'a' / 'check.json').unlink()
     assert store.done(job) is None
     (tmp_path / 'a' / 'job.json').write_text('{')
     assert store.done(job) is None
-
-
-# --- calibrations as one
 
 
 @pytest.mark.parametrize('values, sigmas, mean, sigma, chi2, outliers', [
@@ -165,12 +147,8 @@ def test_message_names_the_problems(command, results, message):
     assert batch_results.message_of(command, results) == message
 
 
-# --- on clusters
-
-
-def rows_of(folder: Path) -> dict[str, dict[str, str]]:
-    with (folder / 'results.csv').open(newline='') as file:
-        return {row['name']: row for row in csv.DictReader(file)}
+def results_of(folder: Path) -> dict[str, dict[str, str]]:
+    return {row['name']: row for row in rows_of(folder / 'results.csv')}
 
 
 def damage(bag: Path) -> None:
@@ -224,17 +202,15 @@ def test_results_are_those_of_single_runs(replayed, single):
         assert (replayed / 'first' / name).read_bytes() == expected
         assert (replayed / 'third' / name).read_bytes() == expected
     summary = json.loads((single / 'summary.json').read_text())
-    row = rows_of(replayed)['first']
+    rows = results_of(replayed)
+    row = rows['first']
     assert row['state'] == 'done' and row['message'] == ''
     assert int(row['pairs']) == summary['pairs']['total']
     assert int(row['answered']) == summary['pairs']['answered']
     assert float(row['rotation_median_deg']) == summary['errors_against_truth'][
         'rotation_median_deg']
     assert float(row['seconds']) > 0.5
-
-
-def test_damaged_bag_among_good_ones(replayed, bags):
-    rows = rows_of(replayed)
+    # The damaged bag among them.
     assert list(rows) == ['first', 'second', 'third']
     assert rows['second']['state'] == 'refused'
     assert 'truncated' in rows['second']['message'] and rows['second']['pairs'] == ''
@@ -259,17 +235,15 @@ def test_only_what_changed_is_run_again(client, replayed, bags, tmp_path, capsys
     changed = {path.parent.name for path, stamp in before.items()
                if path.stat().st_mtime_ns != stamp}
     assert changed == {'third'}
-    assert rows_of(out)['third']['state'] == 'refused'
+    assert results_of(out)['third']['state'] == 'refused'
     assert not (out / 'third' / 'relative_poses.csv').exists()
 
 
-def test_check_on_a_running_cluster(client, bags, tmp_path, refused):
+def test_check_on_a_running_cluster(client, bags, tmp_path):
     options = ['--out', str(tmp_path), '--scheduler', client.scheduler.address]
-    refused('--workers is for local processes', 'batch', 'check', bags / 'first', *options,
-            '--workers', 2)
     assert main.main(['batch', 'check', str(bags / 'first'), str(bags / 'absent'), *options,
                       '--params', str(bags / 'first.yaml'), '--set', 'time_offset=0.03']) == 1
-    rows = rows_of(tmp_path)
+    rows = results_of(tmp_path)
     assert rows['first']['state'] == 'findings' and 'time_offset' in rows['first']['message']
     assert int(rows['first']['failure']) >= 1
     assert rows['absent']['state'] == 'refused' and 'there is no bag' in rows['absent']['message']
@@ -327,7 +301,7 @@ def test_bag_that_kills_every_worker(client, tmp_path):
     assert {row.job.name: row.state for row in result.rows} == {
         'a': State.DONE, 'mortal': State.LOST, 'b': State.DONE, 'faulty': State.FAILED,
         'c': State.DONE}
-    rows = rows_of(tmp_path / 'out')
+    rows = results_of(tmp_path / 'out')
     assert 'workers died over this bag' in rows['mortal']['message']
     assert rows['faulty']['message'] == 'ZeroDivisionError: no such number'
 
@@ -361,15 +335,12 @@ def test_summary_of_calibrations(client, tmp_path):
     readout = next(one for one in summary['combined']['figures']
                    if one['figure'] == 'readout_time_s')
     assert readout['outliers'] == ['wrong'] and readout['degrees_of_freedom'] == 2
-    rows = rows_of(tmp_path / 'out')
+    rows = results_of(tmp_path / 'out')
     assert float(rows['wrong']['readout_time_s']) == 0.024
     assert rows['still5']['readout_time_s_observable'] == 'False'
     lines = batch.report(result, tmp_path / 'out')
     assert any(line.startswith('readout_time_s: 0.03') and line.endswith('outliers: wrong')
                for line in lines)
-
-
-# --- what is refused
 
 
 @pytest.mark.parametrize('words, configured', [
@@ -387,17 +358,12 @@ def test_bad_usage(tmp_path, capsys, monkeypatch, words, configured):
     assert not (tmp_path / 'out').exists()
 
 
-def test_no_bag_at_all(client, tmp_path, refused):
-    refused('the workers find no bag at', 'batch', 'check', tmp_path / '*', '--out',
-            tmp_path / 'out', '--scheduler', client.scheduler.address)
-
-
-def test_dask_that_is_not_installed(tmp_path, refused, monkeypatch):
-    monkeypatch.setitem(sys.modules, 'dask', None)
-    refused("pip install 'dask[distributed]'", 'batch', 'check', 'x', '--out', tmp_path / 'out')
-
-
-def test_workers_of_another_version(client, tmp_path, refused, monkeypatch):
+def test_clusters_that_are_refused(client, tmp_path, refused, monkeypatch):
+    command = ['batch', 'check', tmp_path / '*', '--out', tmp_path / 'out']
+    running = ['--scheduler', client.scheduler.address]
+    refused('--workers is for local processes', *command, *running, '--workers', 2)
+    refused('the workers find no bag at', *command, *running)
     monkeypatch.setattr(batch, 'run_on_worker', lambda client, function: '9.9.9')
-    refused('the workers have version 9.9.9', 'batch', 'check', 'x', '--out', tmp_path / 'out',
-            '--scheduler', client.scheduler.address)
+    refused('the workers have version 9.9.9', *command, *running)
+    monkeypatch.setitem(sys.modules, 'dask', None)
+    refused("pip install 'dask[distributed]'", *command)

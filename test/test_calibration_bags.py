@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import io
 import json
 from pathlib import Path
@@ -77,6 +78,47 @@ def test_chosen_tracker_follows_the_points(bag, tmp_path, monkeypatch):
     assert values['readout_time_s']['value'] == pytest.approx(0.02, abs=4e-3)
     assert values['time_offset_s']['value'] == pytest.approx(0.03, abs=4e-3)
     assert values['shutter'] == 'rolling'
+
+
+def nominal(message: Any) -> None:
+    """A CameraInfo as of a data sheet: 10 % off, without distortion."""
+    if hasattr(message, 'distortion_model'):
+        message.d, message.k = np.zeros(5), message.k * ([1.1, 1.0, 1.0, 1.0, 1.1] + 4 * [1.0])
+
+
+def binned(message: Any) -> None:
+    nominal(message)
+    if hasattr(message, 'distortion_model'):
+        message.width, message.height, message.binning_x, message.binning_y = 640, 480, 2, 2
+
+
+def test_lens_of_a_nominal_camera_info_ends_in_poses(bag, tmp_path):
+    path, out = copied(bag, tmp_path / 'bag', nominal), tmp_path / 'out'
+    code, values = calibrated(path, out, '--lens')
+    assert code == 0
+    assert values['focal_px']['value'] == pytest.approx(225.0, rel=0.02)
+    poses = []
+    for parameters in (out / 'calibration.yaml', tmp_path / 'without.yaml'):
+        if not parameters.exists():   # the same with the lens of the CameraInfo
+            document = yaml.safe_load((out / 'calibration.yaml').read_text())
+            given = document['/**']['ros__parameters']
+            for name in ('camera_matrix', 'distortion_model', 'distortion_coefficients'):
+                del given[name]
+            parameters.write_text(yaml.safe_dump(document))
+        assert main(['replay', str(path), '--params', str(parameters), '--no-pictures',
+                     '--out', str(tmp_path / parameters.stem)]) in (0, 1)
+        with (tmp_path / parameters.stem / 'relative_poses.csv').open(newline='') as file:
+            rows = list(csv.DictReader(file))
+        poses.append(sum(row['tx'] != '' for row in rows) / len(rows))
+    assert poses[0] >= 0.9 and poses[0] > poses[1]
+
+
+@pytest.mark.parametrize(('change', 'reason'), [
+    (lambda message: None, 'distortion coefficients'), (binned, 'binning')])
+def test_lens_that_is_not_estimated(bag, change, reason, tmp_path, capsys):
+    path = copied(bag, tmp_path / 'bag', change)
+    assert main(['calibrate', str(path), '--lens', '--out', str(tmp_path / 'out')]) == 2
+    assert reason in capsys.readouterr().err
 
 
 @pytest.mark.long

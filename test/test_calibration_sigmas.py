@@ -84,6 +84,20 @@ def test_a_recording_of_the_model_is_hardly_widened():
     assert np.median(factors) < 1.3
 
 
+def test_a_fit_that_does_not_converge_has_wider_sigmas():
+    final, _ = undisturbed()
+    parameters = final.unknowns.parameters.copy()
+    parameters[[READOUT, BIAS]] += 0.004, 0.02
+    begin = final.unknowns._replace(parameters=parameters)
+    short = fitting.fit(final.problem, begin, final.free, rounds=2)
+    assert final.converged and not short.converged
+    error = short.unknowns.parameters - final.unknowns.parameters
+    for k in (READOUT, BIAS):
+        assert abs(error[k]) < 3.0 * math.sqrt(short.covariance[k, k])
+    # Most of it remains after two steps.
+    assert short.covariance[READOUT, READOUT] > 4.0 * final.covariance[READOUT, READOUT]
+
+
 def test_a_part_of_the_image_that_is_wrong_widens_the_sigmas():
     tracks = recorded().tracks
     points, left = tracks.points.copy(), tracks.points[:, 0] < 400.0

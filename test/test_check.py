@@ -247,7 +247,7 @@ def test_a_broken_recording_has_its_finding(case, tmp_path):
 
 @pytest.mark.parametrize('changes', [{'info': uncalibrated}, {'info_topic': ''}])
 def test_intrinsics_by_parameters(changes, tmp_path):
-    """As good as those of a CameraInfo, which comes first if it has some."""
+    """As good as those of a CameraInfo, in whose place they are used."""
     configured = Parameters.from_mapping(GIVEN | {
         'camera_matrix': (151.0, 0.0, 79.5, 0.0, 151.0, 59.5, 0.0, 0.0, 1.0),
         'distortion_coefficients': (-0.1, 0.0, 0.0, 0.0)})
@@ -256,7 +256,7 @@ def test_intrinsics_by_parameters(changes, tmp_path):
     assert findings['calibration'].measured['fx'] == 151.0
     assert 'camera_matrix' in findings['calibration'].message
     findings, _ = checked(broken(seconds=1.0).write(tmp_path / 'calibrated'), configured)
-    assert findings['calibration'].measured['fx'] == 150.0
+    assert findings['calibration'].measured['fx'] == 151.0
 
 
 def test_missing_parameters_are_a_warning(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from importlib.metadata import distribution
+import json
 import py_compile
 import re
 from xml.etree import ElementTree
@@ -16,6 +17,7 @@ from rs_relpose_lab.live.processes import node_process, Process
 from rs_relpose_ros.config.files import parameter_template, read_parameters
 from rs_relpose_ros.config.settings import Parameters, SensorConfig
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.messages.outgoing import PAIR_TOPICS
 from rs_relpose_ros.nodes import relpose_node as node_module
 
 CONFIG = ROOT / 'config'
@@ -56,7 +58,7 @@ def test_help_lists_the_legal_values_of_every_kind(capsys):
 def test_node_accepts_the_template(ros_domain_id):
     """Rcl's own YAML parser reads it as ours does."""
     with node_process(CONFIG / 'relpose.yaml') as node:
-        node.wait_for('readout_time and quat_cam_imu_xyzw must be given')
+        node.wait_for('waiting for the first image')
         assert 'there is no parameter' not in node.output
 
 
@@ -102,7 +104,9 @@ def call_in(tree, name):
 def test_launch_file_remaps_what_the_node_subscribes_to():
     py_compile.compile(str(LAUNCH_FILE), doraise=True, cfile=None)
     tree = ast.parse(LAUNCH_FILE.read_text(encoding='utf-8'))
-    keywords = {keyword.arg: keyword.value for keyword in call_in(tree, 'Node').keywords}
+    [keywords] = [keywords for call in ast.walk(tree) if isinstance(call, ast.Call)
+                  and ast.unparse(call.func) == 'Node'
+                  and 'remappings' in (keywords := {k.arg: k.value for k in call.keywords})]
     assert ast.literal_eval(keywords['package']) == 'rs_relpose_ros'
     assert ast.unparse(keywords['executable']) == 'executable'
     [arguments] = [part.value for part in tree.body if isinstance(part, ast.Assign)
@@ -111,7 +115,7 @@ def test_launch_file_remaps_what_the_node_subscribes_to():
                 for name, value in zip(arguments.keys, arguments.values, strict=True)}
     assert defaults['executable'] == "'relpose_node'"
     remapped = [ast.literal_eval(pair.elts[0]) for pair in keywords['remappings'].elts]
-    assert remapped == ['image', 'camera_info', 'imu', 'accel']
+    assert remapped == ['image', 'camera_info', 'imu', 'calibration', 'accel']
 
 
 def test_launch_file_uses_the_profile_unless_the_user_has_one():
@@ -145,6 +149,37 @@ def test_launch_file_describes_its_arguments(path):
     description = names['generate_launch_description']()
     described = {argument.name for argument in description.get_launch_arguments()}
     assert {'camera_namespace', 'params_file', 'fastdds_profile'} <= described
+
+
+def layout_topics() -> dict[str, dict[str, str]]:
+    """Topic -> display, of the layout of RViz, and of Foxglove's."""
+    rviz = yaml.safe_load((CONFIG / 'rs_relpose.rviz').read_text(encoding='utf-8'))
+    foxglove = json.loads((CONFIG / 'rs_relpose_foxglove.json').read_text(encoding='utf-8'))
+    panels = foxglove['configById']
+    shown = {panels['Image!debug']['imageMode']['imageTopic']: 'Image',
+             panels['RawMessages!pairs']['topicPath']: 'Raw',
+             **dict.fromkeys(panels['3D!path']['topics'], '3D'),
+             **{path['value'].split('.')[0]: 'Plot' for name, panel in panels.items()
+                if name.startswith('Plot!') for path in panel['paths']}}
+    # Every panel is in the layout.
+    assert set(re.findall(r'"([\w]+![\w]+)"', json.dumps(foxglove['layout']))) == set(panels)
+    return {'foxglove': shown, 'rviz': {
+        display['Topic']['Value']: display['Class'].rpartition('/')[2]
+        for display in rviz['Visualization Manager']['Displays'] if 'Topic' in display}}
+
+
+@pytest.mark.parametrize('layout', ['rviz', 'foxglove'])
+def test_layouts_show_topics_that_the_nodes_publish(layout):
+    published = {f'/relpose_node/{name}': kind for name, kind in PAIR_TOPICS.items()}
+    published |= {'/relpose_node/debug_image': 'sensor_msgs/msg/Image',
+                  '/odometry_node/odometry': 'nav_msgs/msg/Odometry',
+                  '/odometry_node/path': 'nav_msgs/msg/Path'}
+    topics = layout_topics()[layout]
+    assert topics.keys() <= published.keys()
+    assert len(topics) >= 4
+    for topic, display in topics.items():
+        if layout == 'rviz':
+            assert published[topic].endswith(f'/{display}')
 
 
 def test_an_exposure_is_given_once():

@@ -173,7 +173,7 @@ def test_all_frames_beat_two_views():
 
 
 def test_covariance_is_that_of_the_errors():
-    chi2, logs, lengths = [], [], []
+    chi2, logs, lengths, starts, by_gyro = [], [], [], [], []
     for seed in range(100, 140):
         scene = Scene(seed)
         pose = scene.pose()
@@ -183,10 +183,19 @@ def test_covariance_is_that_of_the_errors():
         chi2.append(error @ np.linalg.pinv(pose.covariance, rcond=1e-9) @ error / 5.0)
         logs.append(log_baseline / pose.baseline_log_sigma)
         lengths.append(pose.pixel_sigma)
+        start = scene.motion.p(1e-5) - scene.motion.p(-1e-5)
+        across = np.linalg.svd(pose.linear_velocity1[None])[2][1:]
+        off = across @ start / np.linalg.norm(start) * np.linalg.norm(pose.linear_velocity1)
+        starts.append(off @ np.linalg.solve(
+            across @ pose.linear_velocity1_covariance @ across.T, off) / 2.0)
+        by_gyro.append(pose.gyro_square / 3.0)
     # Mean of 40 chi-squares of 5 degrees of freedom, by freedom: 1 +- 0.1.
     assert 0.7 < np.mean(chi2) < 1.4
     assert np.isfinite(logs).sum() > 30 and 0.5 < np.nanmean(np.square(logs)) < 1.8
     assert abs(np.median(lengths) - SIGMA) < 0.04
+    # Mean of 40 of 2 degrees of freedom: +- 0.16. The gyro's rotation is a prior of the pose's.
+    assert 0.5 < np.mean(starts) < 1.6
+    assert 0.2 < np.mean(by_gyro) < 1.2
 
 
 def cost_of(state, arguments, sigma):

@@ -18,23 +18,23 @@ OF_PACKAGE = {path: text for path, text in MODULES.items() if path.parts[0] == P
 
 # Folder -> most lines and modules. A larger number needs its reason in the commit that raises it.
 BUDGETS = {
-    'rs_relpose_ros': (252, 5),
-    'rs_relpose_ros/bags': (1876, 6),
-    'rs_relpose_ros/calibrate': (2500, 7),
-    'rs_relpose_ros/cli': (1035, 6),
-    'rs_relpose_ros/config': (810, 4),
-    'rs_relpose_ros/estimator': (3760, 12),
+    'rs_relpose_ros': (260, 5),
+    'rs_relpose_ros/bags': (1880, 6),
+    'rs_relpose_ros/calibrate': (2840, 9),
+    'rs_relpose_ros/cli': (1070, 6),
+    'rs_relpose_ros/config': (870, 4),
+    'rs_relpose_ros/estimator': (3770, 12),
     'rs_relpose_ros/geometry': (1260, 7),
     'rs_relpose_ros/imu': (1290, 4),
-    'rs_relpose_ros/messages': (1320, 4),
-    'rs_relpose_ros/nodes': (1850, 9),
-    'rs_relpose_ros/odometry': (1470, 6),
-    'rs_relpose_ros/offline': (2945, 12),
-    'rs_relpose_ros/pipeline': (3210, 13),
+    'rs_relpose_ros/messages': (1310, 4),
+    'rs_relpose_ros/nodes': (2010, 9),
+    'rs_relpose_ros/odometry': (1460, 6),
+    'rs_relpose_ros/offline': (2950, 12),
+    'rs_relpose_ros/pipeline': (3280, 13),
     'rs_relpose_ros/solvers': (1760, 6),
-    'rs_relpose_ros/tracking': (1235, 5),
-    'rs_relpose_lab': (9310, 42),
-    'test': (18800, 55),
+    'rs_relpose_ros/tracking': (1240, 5),
+    'rs_relpose_lab': (9480, 43),
+    'test': (18496, 54),
 }
 MOST_MODULES, MOST_FOLDERS = 110, 15
 LONGEST_MODULE, SHORTEST_MODULE, LONGEST_FUNCTION = 700, 80, 60

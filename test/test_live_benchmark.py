@@ -14,15 +14,11 @@ from rs_relpose_lab.experiments import live, live_clip
 from rs_relpose_lab.live.live_run import ReceivedPose
 from rs_relpose_lab.live.player import Outgoing, repeated, stamp_of
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.nodes.diagnostics import FrameTimings
 
 # The node may have to compile the kernels.
 pytestmark = pytest.mark.timeout(600)
 
 SECOND = 10**9
-
-
-# -- motion and messages without a seam ------------------------------------------------------
 
 
 @pytest.mark.parametrize('period', [2.0, 4.0, 6.5])
@@ -71,9 +67,6 @@ def test_stamps_run_over_seconds_and_a_long_recording_is_no_period():
         next(repeated([message(0, 0), message(100, 100)], 10**8, SECOND))
 
 
-# -- statistics ------------------------------------------------------------------------------
-
-
 def pose(first: int, second: int, error: np.ndarray | None = None) -> ReceivedPose:
     """The true pose between two stamps of the clip's eleventh round, and an error."""
     start = live_clip.configuration(640, 480).start_ns
@@ -111,11 +104,6 @@ def test_without_ros_nothing_is_rendered(monkeypatch, tmp_path, refused):
     monkeypatch.setitem(sys.modules, 'rs_relpose_lab.live.live_run', None)
     refused('needs ROS 2', 'benchmark', 'live', '--output', tmp_path / 'out')
     assert not (tmp_path / 'out').exists()
-
-
-def test_frame_timings_name_what_cannot_be_written(tmp_path):
-    with pytest.raises(InputError, match=r'timings_file .* cannot be written'):
-        FrameTimings(str(tmp_path / 'nowhere' / 'frames.csv'))
 
 
 @pytest.mark.live

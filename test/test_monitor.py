@@ -17,7 +17,7 @@ from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import EstimatorConfig, ImuConfig, Parameters
 from rs_relpose_ros.estimator.estimate import estimate_relative_pose
-from rs_relpose_ros.estimator.result import Status
+from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.estimator.velocity import InertialEvidence
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
@@ -29,7 +29,7 @@ from rs_relpose_ros.offline.replay import read_truth, Replay
 from rs_relpose_ros.pipeline import findings, recursion
 from rs_relpose_ros.pipeline.assessment import assess, Configured, Effect, find_inconsistencies
 from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState, worst_of
-from rs_relpose_ros.pipeline.monitor import Applied, ConsistencyMonitor, Tracked
+from rs_relpose_ros.pipeline.monitor import Agreement, Applied, ConsistencyMonitor, Tracked
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrameFailed, FrontEnd
 from rs_relpose_ros.pipeline.recursion import pair_information, PairData, Recursion
@@ -740,6 +740,75 @@ def test_a_deviation_so_large_that_no_pair_has_a_translation():
         rotation = pose.without_translation(Status.LOW_PARALLAX, 'none')
         monitor.add_pair(stamp_ns, replace(pair, R=pose.R, t=rotation.t), rotation, CONFIGURED)
     assert {fault.quantity for fault in monitor.health.faults} == {'focal_length'}
+
+
+# -- errors that the tracks of a pair share ------------------------------------------------------
+
+
+def agreeing_pairs(scatter, count=60, seed=0, frames=5, gyro_square=0.0):
+    """Poses of a straight motion, directions at the ends off by `scatter` times their sigma."""
+    rng, sigma = np.random.default_rng(seed), 0.01
+    for _ in range(count):
+        ends = np.array([0.0, 0.0, 4.0]) + [1.0, 1.0, 0.0] * (
+            4.0 * scatter * sigma * rng.normal(size=(2, 3)))
+        spread = np.diag([1.0, 1.0, 4.0]) * (4.0 * sigma)**2
+        yield RelativePose(
+            Status.OK, R=np.eye(3), t=np.array([0.0, 0.0, 1.0]), frames=frames,
+            linear_velocity1=ends[0], linear_velocity2=ends[1], gyro_square=gyro_square,
+            linear_velocity1_covariance=spread if frames > 2 else np.full((3, 3), np.nan),
+            covariance=np.diag([1.0, 1.0, 0.0, 2.0, 2.0, 2.0]), velocity_covariance=np.diag(
+                [*np.diag(spread), 1.0, 1.0, 1.0]))
+
+
+def factors(poses, gap=0, doubt=0.0):
+    """By which the covariance of each pair is enlarged, `gap` ns after the pair before.
+
+    `doubt`: variance that the monitor adds about one axis.
+    """
+    agreement, found = Agreement(), []
+    for k, pose in enumerate(poses):
+        first = k * (100 + gap)
+        assessed = replace(pose, covariance=pose.covariance + np.diag([0, 0, 0, doubt, 0, 0]))
+        out = agreement.enlarged(first, first + 100, pose, assessed)
+        by = out.covariance[4, 4] / pose.covariance[4, 4]
+        expected = by * pose.covariance
+        expected[3, 3] = max(expected[3, 3], assessed.covariance[3, 3])
+        np.testing.assert_allclose(out.covariance, expected, atol=1e-12)
+        np.testing.assert_allclose(np.diag(out.velocity_covariance) / np.diag(
+            pose.velocity_covariance), [by] * 3 + [1.0] * 3)
+        for name in ('R', 't', 'linear_velocity1', 'linear_velocity2'):
+            assert np.array_equal(getattr(out, name), getattr(pose, name))
+        found.append(by)
+    return np.array(found)
+
+
+def test_pairs_that_disagree_enlarge_the_covariances_of_later_ones():
+    assert factors(agreeing_pairs(1.0)).max() < 1.6
+    assert (factors(agreeing_pairs(0.5)) == 1.0).all()
+    for scatter in (2.0, 3.0):
+        found = factors(agreeing_pairs(scatter))
+        assert found[0] == 1.0
+        # A third of the weight is that of the prior, 1.
+        assert found[30:].mean() == pytest.approx((1.0 + 2.0 * scatter**2) / 3.0, rel=0.25)
+        np.testing.assert_allclose(factors(agreeing_pairs(scatter), doubt=3.0), found)
+    # One wrong pose spoils two comparisons only, which are bounded.
+    poses = list(agreeing_pairs(0.7))
+    poses[20] = replace(poses[20], linear_velocity1=np.array([4.0, 0.0, 0.5]),
+                        linear_velocity2=np.array([4.0, 0.0, 0.5]))
+    found = factors(poses)
+    assert 1.5 < found[21] < 4.0 and found[-1] < 0.6 * found[21]
+
+
+def test_only_consecutive_pairs_with_frames_between_are_compared():
+    assert (factors(agreeing_pairs(5.0), gap=1) == 1.0).all()
+    assert (factors(agreeing_pairs(5.0, frames=2)) == 1.0).all()
+
+
+def test_a_rotation_that_contradicts_the_gyro_enlarges_its_own_covariance():
+    poses = list(agreeing_pairs(0.5))
+    poses[10] = replace(poses[10], gyro_square=31.0)
+    assert list(np.flatnonzero(factors(poses) != 1.0)) == [10]
+    assert factors(poses)[10] == pytest.approx(8.0)
 
 
 # -- tracked parameters, on the bundled bag ------------------------------------------------------

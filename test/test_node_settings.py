@@ -136,11 +136,11 @@ def test_a_live_parameter_takes_effect(running):
 
 
 def test_parameters_are_described(running):
-    [threshold, readout] = running.graph.call(
+    [threshold, levels] = running.graph.call(
         DescribeParameters, '/relpose_node/describe_parameters',
-        DescribeParameters.Request(names=['threshold', 'readout_time'])).descriptors
+        DescribeParameters.Request(names=['threshold', 'klt_levels'])).descriptors
     assert isinstance(threshold, ParameterDescriptor)
-    assert (threshold.read_only, readout.read_only) == (False, True)
+    assert (threshold.read_only, levels.read_only) == (False, True)
     assert threshold.description.endswith('[px]')
     [bounds] = threshold.floating_point_range
     assert (bounds.from_value, bounds.to_value) == (0.05, 50.0)
@@ -149,15 +149,18 @@ def test_parameters_are_described(running):
 # -- settings that keep a node from estimating -----------------------------------------------
 
 
+NEVER = {'calibrate_at_start': 'never'}
 QUATERNION = {'quat_cam_imu_xyzw': '[0.0, 0.0, 0.0, 1.0]'}
 CANNOT_ESTIMATE = {
-    'no_readout': ({**QUATERNION, 'readout_tme': 0.03}, {},
+    'no_readout': ({**QUATERNION, **NEVER, 'readout_tme': 0.03}, {},
                    'not estimating: readout_time must be given', 'readout_time'),
-    'no_rotation': ({'readout_time': 0.03}, {}, 'not estimating: quat_cam_imu_xyzw must be given',
+    'no_rotation': ({'readout_time': 0.03, **NEVER}, {},
+                    'not estimating: quat_cam_imu_xyzw must be given',
                     'quat_cam_imu_xyzw'),
     'rectified': ({'readout_time': 0, **QUATERNION}, {'image': '/camera/image_rect'},
                   '/camera/image_rect is a rectified image', ''),
-    'global_shutter': ({}, {}, 'not publishing: readout_time and quat_cam_imu_xyzw must be given',
+    'global_shutter': (NEVER, {},
+                       'not publishing: readout_time and quat_cam_imu_xyzw must be given',
                        'readout_time, quat_cam_imu_xyzw'),
 }
 

@@ -33,9 +33,6 @@ def test_independent_of_the_package(module):
         'rs_relpose_lab.experiments.problems', 'rs_relpose_lab.simulation.rows'}
 
 
-# -- the camera, row by row -------------------------------------------------------------------
-
-
 def constant(w, v):
     return uniform_motion(Rotation.identity(), np.zeros(3), np.array(w), np.array(v))
 
@@ -83,9 +80,6 @@ def test_points_outside_of_the_image_or_faster_than_the_rows_are_nan(point, w, v
         assert observed[0] == pytest.approx(CENTRE)
 
 
-# -- problems ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize('name', CELLS)
 def test_problems_are_those_of_their_cell(name):
     cell = CELLS[name]
@@ -120,9 +114,6 @@ def test_problems_depend_on_nothing_but_their_numbers():
                                (replace(cell, speed=7.0, rate=0.0), 3, 7)):
         assert np.array_equal(first.R, paper_problem(other, 'forward', seed, trial).R) == (
             (seed, trial) == (3, 7))
-
-
-# -- the oracle -------------------------------------------------------------------------------
 
 
 def objective_of(problem):

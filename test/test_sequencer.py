@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 
+from conftest import Clock
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -27,15 +28,6 @@ START = 1_700_000_000 * SECOND
 INTRINSICS = Intrinsics(width=32, height=20, fx=30.0, fy=30.0, cx=16.0, cy=10.0,
                         image_width=32, image_height=20)
 IMAGE = np.zeros((20, 32), dtype=np.uint8)
-
-
-class Clock:
-    """A monotonic clock that is moved by hand."""
-
-    now_ns = 0
-
-    def __call__(self) -> int:
-        return self.now_ns
 
 
 def parameters(**values):
@@ -78,16 +70,8 @@ def refusals(items):
 
 
 @pytest.fixture
-def clock():
-    return Clock()
-
-
-@pytest.fixture
 def live(clock):
     return Sequencer(parameters(), clock=clock)
-
-
-# -- waiting for the IMU -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(('values', 'last_row_ms'), [
@@ -140,17 +124,14 @@ def test_separate_topics_wait_for_both(live):
 
 
 def test_latency_counts_from_the_later_of_image_and_imu(live, clock):
-    clock.now_ns = 5
+    clock.now = 5
     add_imu(live, 0, 200)
-    clock.now_ns = 7
+    clock.now = 7
     add_frames(live, 100, 190)
-    for ms, clock.now_ns in ((205, 11), (210, 13)):
+    for ms, clock.now in ((205, 11), (210, 13)):
         live.add_imu(sample(ms))
-    clock.now_ns = 15
+    clock.now = 15
     assert [frame.ready_ns for frame in drain(live)] == [7, 13]
-
-
-# -- refusals ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(('imu_until', 'times_ms', 'refusal', 'released'), [
@@ -189,34 +170,13 @@ def test_offline_drops_nothing_and_needs_no_clock():
     assert refusals(drain(offline)) == [Refusal.NO_IMU]
 
 
-def test_a_gap_in_the_gyro_refuses_the_frame(live):
-    add_frames(live, -5)   # before the first sample
-    add_imu(live, 0, 100)
-    add_imu(live, 200, 400)
-    add_frames(live, 50, 90, 110, 250)
-    *refused, first, second = drain(live)
-    assert stamps([first, second]) == [50.0, 250.0]
-    assert refusals(refused) == [Refusal.IMU_GAP] * 3
-    assert live.counts().imu_gaps == 1
-    # No rotation over the gap.
-    assert second.imu.since_previous is None
-
-
-def test_a_gap_does_not_count_as_waiting_for_the_worker(live):
-    """When the gyro returns, all frames of a gap are known to be lost at once."""
-    add_imu(live, 0, 100)
-    add_frames(live, *range(110, 410, 30))
-    add_imu(live, 500, 600)
-    assert live.counts().refused == {Refusal.IMU_GAP: 10}
-
-
 @pytest.mark.parametrize('accelerometer', [False, True])
 def test_no_gyro_is_reported_after_a_while(live, clock, accelerometer):
     add_frames(live, 0)
     if accelerometer:
         add_imu(live, -50, 200, gyro=None)
     for wait_ms, refused in ((0, []), (999, []), (2, [Refusal.NO_IMU])):
-        clock.now_ns += wait_ms * MS
+        clock.now += wait_ms * MS
         assert refusals(drain(live)) == refused
 
 
@@ -225,47 +185,42 @@ def test_sensor_parameters_are_required():
         Sequencer(Parameters.from_mapping({'readout_time': 0.03}))
 
 
-# -- stamps out of order, and clocks that jump ---------------------------------------------------
+def imu(first_ms, last_ms, step_ms=5):
+    return range(first_ms, last_ms + 1, step_ms)
 
 
-def test_duplicate_and_late_frames_are_refused(live):
-    add_imu(live, 0, 1000)
-    add_frames(live, 100, 200, 200, 150, 300)
-    items = drain(live)
-    assert stamps(items) == [100.0, 200.0, 300.0]
-    assert refusals(items) == [Refusal.DUPLICATE, Refusal.OUT_OF_ORDER]
-
-
-@pytest.mark.parametrize('imu_first', [True, False])
-def test_a_bag_that_loops_restarts(live, imu_first):
-    add_imu(live, 0, 5000, 10)
-    add_frames(live, 4900, 4990)   # the second one waits for the IMU
-    assert not drain(live)[0].restart
-    if imu_first:
-        add_imu(live, 0, 200)
-    add_frames(live, 100)
-    if not imu_first:
-        add_imu(live, 0, 200)
-    *refused, ready = drain(live)
-    assert refusals(refused) == [Refusal.CLOCK_JUMP]
-    assert ready.restart
-    assert ready.imu.since_previous is None
-    add_imu(live, 205, 300)
-    add_frames(live, 200)
-    assert not live.take().restart
-    assert live.counts().clock_jumps in (1, 2)
-
-
-def test_stamps_far_ahead_do_not_stop_the_node(live):
-    add_imu(live, 0, 200)
-    add_frames(live, 100_000, 100)
-    items = drain(live)
-    assert refusals(items) == [Refusal.CLOCK_JUMP]
-    assert stamps(items) == [100.0]
-    live.add_imu(sample(100_000))
-    add_imu(live, 205, 400)
-    add_frames(live, 300)
-    assert stamps(drain(live)) == [300.0]
+# Frames by their times, and the times of IMU samples; of the frames that are released those that
+# restart the tracking, and those without the gyro since the frame before.
+@pytest.mark.parametrize((
+    'events', 'released', 'restarted', 'alone', 'refused', 'gaps', 'jumps'), [
+    ((imu(0, 1000), 100, 200, 200, 150, 300), [100, 200, 300], [], [100],
+     [Refusal.DUPLICATE, Refusal.OUT_OF_ORDER], 0, 0),
+    # More frames in the gap than may wait for the worker: it is no overload.
+    ((-5, imu(0, 100), 50, *range(90, 210, 15), imu(200, 400), 250), [50, 250], [], [50, 250],
+     [Refusal.IMU_GAP] * 9, 1, 0),
+    # A bag that loops, while a frame waits for its IMU.
+    ((imu(0, 5000, 10), 4900, 4990, imu(0, 200), 100, imu(205, 300), 200), [4900, 100, 200],
+     [100], [4900, 100], [Refusal.CLOCK_JUMP], 0, 1),
+    ((imu(0, 5000, 10), 4900, 4990, 100, imu(0, 200), imu(205, 300), 200), [4900, 100, 200],
+     [100], [4900, 100], [Refusal.CLOCK_JUMP], 0, 1),
+    # Stamps far ahead: of a frame, then of the IMU.
+    ((imu(0, 200), 100_000, 100, [100_000], imu(205, 400), 300), [100, 300], [100, 300],
+     [100, 300], [Refusal.CLOCK_JUMP], 1, 2)])
+def test_gaps_and_jumps(live, events, released, restarted, alone, refused, gaps, jumps):
+    items = []
+    for event in events:
+        if isinstance(event, int):
+            add_frames(live, event)
+        else:
+            for ms in event:
+                live.add_imu(sample(ms))
+        items += drain(live)
+    assert stamps(items) == released
+    assert refusals(items) == refused
+    frames = [item for item in items if isinstance(item, Frame)]
+    assert stamps(item for item in frames if item.restart) == restarted
+    assert stamps(item for item in frames if item.imu.since_previous is None) == alone
+    assert (live.counts().imu_gaps, live.counts().clock_jumps) == (gaps, jumps)
 
 
 def test_a_clock_that_is_set_back_by_less_than_a_second(live):
@@ -310,9 +265,6 @@ def test_imu_stamps_are_counted_and_change_no_frame_elsewhere(order, repeated, l
     assert (counts.imu_repeated, counts.imu_late, counts.imu_gaps, counts.clock_jumps) == (
         repeated, late, gaps, 0)
     np.testing.assert_array_equal(*knots)
-
-
-# -- live and replay -----------------------------------------------------------------------------
 
 
 @settings(max_examples=30)
@@ -365,8 +317,6 @@ def test_threads():
     assert counts.frames == 200 == counts.frames_taken + sum(counts.refused.values())
 
 
-# -- offset by the interval --------------------------------------------------------------------
-
 BY_INTERVAL = {'time_offset_per_interval': -0.5, 'time_offset_reference_interval': 0.04}
 
 
@@ -409,9 +359,6 @@ def test_a_frame_of_a_longer_interval_waits_for_its_own_last_row():
         assert stamps(drain(sequencer)) == released
 
 
-# -- tracked parameters ------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize('offline', [False, True])
 def test_a_shifted_frame_waits_for_its_shifted_rows(offline):
     sequencer = Sequencer(parameters(), offline=offline, clock=Clock())
@@ -447,8 +394,6 @@ def test_a_frame_of_a_longer_readout_waits_for_its_rows(live):
     assert since_start(ready.imu.reference_ns) == [50]
     assert ready.imu.motion.knot_times[[0, -1]] == pytest.approx([-0.0045, 0.0235])
 
-
-# -- scatter of the stamps ------------------------------------------------------------------------
 
 EVEN = START + 33_366_700 * np.arange(60)
 

@@ -307,6 +307,24 @@ def _run_calibration_bags(args: argparse.Namespace) -> int:
         calibration.write_bags_report, args, 'bag')
 
 
+def _lenses_arguments(parser: argparse.ArgumentParser) -> None:
+    _number(parser, '--bags', 10, 'bags, each with a lens of its own')
+    _seconds(parser, '--seconds', 20.0, 'length of a bag')
+    parser.add_argument('--model', choices=('plumb_bob', 'equidistant'), default='plumb_bob',
+                        help='distortion model (default: %(default)s)')
+
+
+def _run_lenses(args: argparse.Namespace) -> int:
+    from rs_relpose_lab.experiments import lenses
+
+    _check_at_least(1, args, 'bags')
+    return _report_of(
+        range(args.seed, args.seed + args.bags),
+        lambda seed: lenses.on_lens(seed, args.model, args.seconds,
+                                    args.output / f'{args.model}_{seed}_{args.seconds:g}s'),
+        lenses.write_report, args, 'bag')
+
+
 def _stretches_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('bags', nargs='+', type=Path, metavar='BAG',
                         help='recordings of one camera with one IMU')
@@ -464,6 +482,10 @@ BENCHMARKS = {
         'shutter and one with rotation about one axis only',
         lambda parser: _number(parser, '--bags', 6, 'bags of a walk'), _run_calibration_bags,
         'calibration_bags', first_seed=301, seed_of='bag'),
+    'calibration-lenses': Benchmark(
+        '`rs_relpose calibrate` on rendered bags without a CameraInfo, and the poses with its '
+        'file against those with the true calibration',
+        _lenses_arguments, _run_lenses, 'calibration_lenses', first_seed=601, seed_of='bag'),
     'calibration-stretches': Benchmark(
         'whether parts of real recordings agree within the sigmas of `rs_relpose calibrate`: '
         'chi^2 of every quantity over the parts',

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 import json
 import math
 from pathlib import Path
@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from rs_relpose_lab.experiments.calibration_tracks import about_one_axis, drawn, record
-from rs_relpose_lab.experiments.harness import markdown_table, write_table
+from rs_relpose_lab.experiments.harness import grouped, markdown_table, write_table
 from rs_relpose_lab.simulation import SimulationConfig
 from rs_relpose_lab.simulation.bag import render_once
 from rs_relpose_lab.simulation.scene import SCENES
@@ -230,9 +230,10 @@ def write_bags_report(folder: Path, bags: Sequence[CalibratedBag]) -> str:
 
 # -- parts of recordings ----------------------------------------------------------------------
 #
-# Whether parts of one camera's recordings agree within their sigmas. Each bag is tracked once and
-# cut into parts; each part is calibrated from nothing. Where the offset follows the exposure,
-# parts are compared at one interval between frames.
+# Whether parts of one camera's recordings agree within their sigmas, those of the parameter file
+# (the worst axis of rotation and bias). Each bag is tracked once and cut into parts; each part is
+# calibrated from nothing. Where the offset follows the exposure, parts are compared at one
+# interval between frames.
 
 
 @dataclass(frozen=True, slots=True)
@@ -325,22 +326,21 @@ def _quantities(part: Part, interval: float, slope: Estimate | None, reference: 
     rotation = (Rotation.from_matrix(result.R_cam_imu) * reference.inv()).as_rotvec()
     yield 'readout time [ms]', result.readout_time, 1e3
     yield 'time offset [ms]', offset, 1e3
-    for axis, angle, sigma in zip('xyz', rotation, result.rotation_sigma, strict=True):
-        yield (f'rotation, {axis} [deg]', Estimate(
-            float(angle), float(sigma), result.rotation.observable), math.degrees(1.0))
-    for axis, bias in zip('xyz', result.gyro_bias, strict=True):
-        yield f'gyro bias, {axis} [mrad/s]', bias, 1e3
+    for axis, angle, bias in zip('xyz', rotation, result.gyro_bias, strict=True):
+        yield (f'rotation, {axis} [deg]', replace(result.rotation, value=float(angle)),
+               math.degrees(1.0))
+        yield f'gyro bias, {axis} [mrad/s]', replace(bias, sigma=result.bias_sigma), 1e3
     yield 'focal length [px]', result.focal_factor, part.focal
     yield 'offset by interval [ms/ms]', result.offset_by_interval, 1.0
     yield 'offset by jitter [ms/ms]', result.offset_by_jitter, 1.0
 
 
-def chi_squared(quantities: Sequence[PartQuantity]) -> tuple[float, int]:
+def chi_squared(quantities: Sequence[PartQuantity]) -> NDArray[np.float64]:
     """Sum of squared deviations from the weighted mean, in sigmas, and degrees of freedom."""
     values = np.array([quantity.value for quantity in quantities])
     weights = np.array([quantity.sigma**-2.0 for quantity in quantities])
     mean = weights @ values / weights.sum()
-    return float(weights @ (values - mean) ** 2), len(quantities) - 1
+    return np.array([weights @ (values - mean) ** 2, len(quantities) - 1])
 
 
 def write_parts_report(folder: Path, quantities: Sequence[PartQuantity]) -> str:
@@ -350,15 +350,16 @@ def write_parts_report(folder: Path, quantities: Sequence[PartQuantity]) -> str:
         own = [quantity for quantity in quantities if quantity.name == name]
         rows.append([name, ', '.join(
             f'{q.value:.2f} +- {q.sigma:.2f}{"" if q.observable else " (no)"}' for q in own),
-            *_chi_squared_cells([q for q in own if q.observable]), *_chi_squared_cells(own)])
+            *_chi_squared_cells([own]), *_chi_squared_cells(
+                grouped(own, lambda quantity: quantity.bag).values())])
     return write_table(folder, 'calibration_stretches', quantities, markdown_table(
-        ['quantity', 'parts; (no): not observable', 'chi2 / dof of the observable', 'P',
-         'chi2 / dof of all', 'P'], rows))
+        ['quantity', 'parts; (no): not observable', 'chi2 / dof about the mean', 'P',
+         "about each recording's mean", 'P'], rows))
 
 
-def _chi_squared_cells(quantities: Sequence[PartQuantity]) -> tuple[str, str]:
-    """chi^2 over its degrees of freedom, and the probability of more; empty for one part."""
-    if len(quantities) < 2:
+def _chi_squared_cells(groups: Iterable[Sequence[PartQuantity]]) -> tuple[str, str]:
+    """chi^2 over its degrees of freedom, and the probability of more; empty for single parts."""
+    square, freedom = np.sum([chi_squared(group) for group in groups], axis=0)
+    if not freedom:
         return '', ''
-    square, freedom = chi_squared(quantities)
-    return f'{square:.1f} / {freedom}', f'{chi2.sf(square, freedom):.2f}'
+    return f'{square:.1f} / {freedom:.0f}', f'{chi2.sf(square, freedom):.2f}'

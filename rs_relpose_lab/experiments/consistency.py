@@ -136,16 +136,22 @@ def on_simulated_bag(config: SimulationConfig, folder: Path) -> Iterator[PairCon
     parameters = read_parameters(parameter_file)
     name = f'{config.scene} {config.seed}, {1e3 * config.readout_time:.0f} ms'
     for parallax in PARALLAXES:
-        keyframes = replace(parameters.keyframes, min_keyframe_parallax=parallax)
-        with open_bag(path) as bag:
-            topics = bag.find_topics()
-            truth = read_truth(bag, topics)
-            assert truth is not None
-            for result in Replay(bag, topics, replace(parameters, keyframes=keyframes)).pairs():
-                known = truth.relative_pose(result.reference_ns1, result.reference_ns2)
-                if known and np.linalg.norm(known[1]) > STILL:
-                    yield pair_consistency(SIMULATED, name, TruePair(
-                        result.reference_stamp_ns, result.stamp_ns, *known), result.pose)
+        yield from replayed(path, parameters.updated({'min_keyframe_parallax': parallax}),
+                            SIMULATED, name)
+
+
+def replayed(path: Path, parameters: Parameters, source: str,
+             name: str) -> Iterator[PairConsistency]:
+    """Pairs of a simulated bag, without those at rest."""
+    with open_bag(path) as bag:
+        topics = bag.find_topics(needs_camera_info=not parameters.intrinsics.given)
+        truth = read_truth(bag, topics)
+        assert truth is not None
+        for result in Replay(bag, topics, parameters).pairs():
+            known = truth.relative_pose(result.reference_ns1, result.reference_ns2)
+            if known and np.linalg.norm(known[1]) > STILL:
+                yield pair_consistency(source, name, TruePair(
+                    result.reference_stamp_ns, result.stamp_ns, *known), result.pose)
 
 
 def read_true_pairs(path: Path) -> list[TruePair]:

@@ -31,11 +31,12 @@ Entry = tuple[int, str, str, Any]
 
 
 def write_bag(simulation: Simulation, path: Path | str, *, jpeg_quality: int = 88,
-              raw: bool = False, on_frame: Callable[[], object] = lambda: None) -> None:
+              raw: bool = False, on_frame: Callable[[], object] = lambda: None,
+              camera_info: bool = True) -> None:
     """Render `simulation` into a bag, in the order in which drivers would deliver.
 
     `path`: directory to create; `jpeg_quality`: 1 to 100; `raw`: sensor_msgs/Image instead.
-    `on_frame`: called after each image.
+    `on_frame`: called after each image. `camera_info`: whether the bag has a CameraInfo.
     """
     if not 1 <= jpeg_quality <= 100:
         raise InputError(f'jpeg_quality must lie in [1, 100], got {jpeg_quality}')
@@ -49,7 +50,9 @@ def write_bag(simulation: Simulation, path: Path | str, *, jpeg_quality: int = 8
                                                jpeg(pixels, jpeg_quality), bag.type))
 
     with BagWriter(path) as bag:
-        write_in_order(bag, image_entries(simulation, bag, encode, on_frame),
+        images = image_entries(simulation, bag, encode, on_frame)
+        write_in_order(bag, (entry for entry in images
+                             if camera_info or entry[1] != reader.CAMERA_INFO_TOPIC),
                        imu_entries(simulation, bag, reader.IMU_TOPIC),
                        _truth_entries(simulation, bag))
 

@@ -131,10 +131,11 @@ class Simulation:
 
 
 def simulate(config: SimulationConfig | None = None, *, scene: Scene | None = None,
-             trajectory: Trajectory | None = None) -> Simulation:
-    """Set up a recording; `scene`, `trajectory`: instead of those of the configuration."""
+             trajectory: Trajectory | None = None,
+             camera: RollingShutterCamera | None = None) -> Simulation:
+    """Set up a recording; `scene`, `trajectory`, `camera`: instead of the configuration's."""
     config = SimulationConfig() if config is None else config
-    camera = config.camera
+    camera = config.camera if camera is None else camera
     margin = _MARGIN + 0.5 * config.exposure_time
     before = -camera.row_time_span[0] + margin
     after = config.frame_count / config.fps + camera.row_time_span[1] + margin

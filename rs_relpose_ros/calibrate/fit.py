@@ -90,8 +90,8 @@ _BEND, _BEND_RANGE = 0.01, (0.03, 0.5)
 # Scatter of a match before the fit [px], and at the least.
 _NOISE_AT_START, _LEAST_NOISE = 5.0, 0.05
 _HYPOTHESES = 60
-# Newton's step [sigma] below which the optimum is near.
-_NEAR = 2.0
+# Newton's step [sigma] below which the optimum is near; its largest multiple that is taken.
+_NEAR, _MOST_GAIN = 2.0, 8.0
 # Levenberg-Marquardt's damping of the pairs' own unknowns stays in this range.
 _DAMPING = (1e-6, 1e3)
 LOCAL = model.ALL - GLOBAL
@@ -249,30 +249,33 @@ class Fit:
     converged: bool
 
 
-def fit(problem: Problem, unknowns: Unknowns, free: NDArray[np.bool_], *, rounds: int = 40,
-        tolerance: float = 0.1) -> Fit:
+def fit(problem: Problem, unknowns: Unknowns, free: NDArray[np.bool_], *, rounds: int = 60,
+        tolerance: float = 0.05) -> Fit:
     """Minimise the cost over the `free` (GLOBAL,) parameters, and estimate the noise meanwhile.
 
-    Newton steps shorter than `tolerance` [sigma of the parameters] end the fit.
+    Newton steps shorter than `tolerance` [sigma of the parameters] end the fit. After `rounds`
+    the sigmas contain what may be left to the optimum.
     """
-    at = _Iterate(unknowns, evaluate(problem, unknowns))
-    converged = False
+    at = _Iterate(unknowns, evaluate(problem, unknowns), np.zeros(int(free.sum())))
+    noise_known = converged = False
     for _ in range(rounds):
         at = _step(problem, at, free)
-        if at.length > _NEAR:
-            continue
-        # Noise is estimated near the optimum only: far from it, residuals are no noise.
-        noise = _estimated_noise(problem, at)
-        change = float(np.median(np.abs(np.log(noise / at.unknowns.noise))))
-        converged = at.length < tolerance and change < 0.03
+        converged = noise_known and at.length < tolerance
         if converged:
             break
+        # Noise is estimated near the optimum only: far from it, residuals are no noise.
+        if noise_known or at.length > _NEAR:
+            continue
+        noise = _estimated_noise(problem, at)
+        change = float(np.median(np.abs(np.log(noise / at.unknowns.noise))))
+        noise_known = change < 0.03
         unknowns = at.unknowns._replace(noise=noise)
         if change > 0.1:
             # The cost is not convex in the directions: less noise distinguishes more of them.
             unknowns = _chosen(problem, _settled(problem, redirected(problem, unknowns)),
                                _settled(problem, unknowns))[0]
-        at = at._replace(unknowns=unknowns, evaluation=evaluate(problem, unknowns))
+        at = _Iterate(unknowns, evaluate(problem, unknowns), np.zeros_like(at.newton),
+                      at.damping)
     unknowns = at.unknowns._replace(damping=np.zeros(problem.pairs))
     evaluation = evaluate(problem, unknowns)
     noise = np.repeat(unknowns.noise, np.diff(problem.begin))
@@ -281,15 +284,10 @@ def fit(problem: Problem, unknowns: Unknowns, free: NDArray[np.bool_], *, rounds
     covariance[np.ix_(free, free)] = jackknife(
         evaluation.score[:, free], bent(weights) * evaluation.reduced[:, free][:, :, free],
         stretches(problem.middles), problem.prior[free])
+    if not converged:
+        covariance[np.ix_(free, free)] += _MOST_GAIN**2 * np.outer(at.newton, at.newton)
     return Fit(problem, unknowns, free, weights, covariance, evaluation.reduced.sum(axis=0),
                converged)
-
-
-def refit(problem: Problem, coarse: Unknowns, free: NDArray[np.bool_], *, rounds: int = 40,
-          tolerance: float = 0.1) -> Fit:
-    """Fit from a coarser calibration, with priors of `bend` by its parallax."""
-    begin = restarted(problem, coarse, 2.0)
-    return fit(with_bends(problem, begin), begin, free, rounds=rounds, tolerance=tolerance)
 
 
 def cost_curve(problem: Problem, final: Fit, interval: float,
@@ -366,8 +364,10 @@ class _Iterate(NamedTuple):
 
     unknowns: Unknowns
     evaluation: Evaluation
+    newton: Array               # Newton's step to here, of the free parameters
     damping: float = 1e-3       # Levenberg-Marquardt's, of the calibration's parameters
-    length: float = math.inf    # of Newton's step to here [sigma]
+    length: float = math.inf    # of `newton` [sigma]
+    gain: float = 1.0           # step taken, over `newton`
 
 
 def _step(problem: Problem, at: _Iterate, free: NDArray[np.bool_]) -> _Iterate:
@@ -377,20 +377,24 @@ def _step(problem: Problem, at: _Iterate, free: NDArray[np.bool_]) -> _Iterate:
 
     cost = at.evaluation.cost + prior_cost(at.unknowns)
     H, gradient = _normal_equations(problem, at.evaluation, at.unknowns, free)
-    newton = np.linalg.solve(H + 1e-9 * np.diag(np.diag(H)), gradient)
+    newton = np.linalg.solve(H + 1e-9 * np.diag(np.diag(H)), gradient).astype(np.float64)
     length, damping = math.sqrt(max(float(gradient @ newton), 0.0)), at.damping
+    # The weights of a robust loss make Gauss-Newton steps too short, by the share that the last
+    # step left of itself: J. Barzilai, J. M. Borwein, Two-point step size gradient methods, 1988.
+    left = float(newton @ H @ at.newton) / max(float(at.newton @ H @ at.newton), 1e-12)
+    gain = min(max(at.gain / max(1.0 - left, 1e-3), 1.0), _MOST_GAIN)
     for _ in range(8):
         step = np.zeros(GLOBAL)
-        step[free] = -np.linalg.solve(H + damping * np.diag(np.diag(H)), gradient)
+        step[free] = -gain * np.linalg.solve(H + damping * np.diag(np.diag(H)), gradient)
         tried = stepped(at.unknowns, step, at.evaluation.local_step(step))
         result = evaluate(problem, tried)
         if result.cost + prior_cost(tried) > cost:
             tried, tried_cost = _chosen(problem, tried, at.unknowns)
             if tried_cost + prior_cost(tried) > cost:
-                damping = max(10.0 * damping, 1e-3)
+                gain, damping = 1.0, max(10.0 * damping, 1e-3)
                 continue
             result = evaluate(problem, tried)
-        return _Iterate(tried, result, max(0.1 * damping, 1e-9), length)
+        return _Iterate(tried, result, newton, max(0.1 * damping, 1e-9), length, gain)
     return at._replace(damping=damping, length=length)
 
 
@@ -626,7 +630,7 @@ def _exposure(data: Observations, final: Fit, square_sigma: float) -> Estimate:
     value = min(math.sqrt(max(square, 0.0)), data.interval)
     # Also of a square near zero, where the root has no derivative.
     sigma = math.sqrt(value**2 + square_sigma) - value
-    return _estimate(value, sigma, 0.5 * value)
+    return Estimate(value, sigma, sigma <= 0.5 * value, 'the images do not show any')
 
 
 def _bounded(unknowns: Unknowns, covariance: Array,

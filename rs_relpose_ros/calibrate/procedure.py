@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 import logging
+import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics
+from rs_relpose_ros.bags.reader import Bag, SensorTopics
 from rs_relpose_ros.calibrate import fit
 from rs_relpose_ros.calibrate.coplanarity import (
     EXPOSURE,
@@ -27,6 +30,7 @@ from rs_relpose_ros.config.settings import CalibrationConfig, TrackingConfig
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.distortion import DISTORTION_MODELS
+from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.messages.incoming import PARTS, ReasonCounts, Role, sensor_messages
 from rs_relpose_ros.tracking.features import make_tracker
 from rs_relpose_ros.tracking.images import EncodedImage, GrayLevels
@@ -173,7 +177,8 @@ def _fit_with_lens(about: Callable[[Array], Observations], data: Observations, c
         data = about(data.lens + coarse.parameters[LENS])
         problem = data.selected_problem(selection, coarse.parameters[OFFSET],
                                         config.max_gyro_gap, rng)
-        found = fit.refit(problem, coarse, free)
+        begin = fit.restarted(problem, coarse, 2.0)
+        found = fit.fit(fit.with_bends(problem, begin), begin, free)
         coarse = found.unknowns
         if (np.abs(coarse.parameters[LENS]) <= _LENS_STAYS).all():
             break
@@ -187,6 +192,8 @@ _FOCAL_GUESS = 0.8
 # The current image becomes the reference when this share of the points is left, or after so many
 # images.
 _KEPT, _RENEWED_AFTER = 0.8, 30
+# The gyro is kept for longer than the images [ns], as the clocks may differ.
+_MARGIN_NS = to_nanoseconds(1.0)
 
 _logger = logging.getLogger(__name__)
 
@@ -200,12 +207,16 @@ class CalibrationInput:
     camera: RollingShutterCamera    # of the full sensor, its readout time 0
     focal_known: bool               # by the CameraInfo; else `camera` is a guess
     unused: dict[str, int]          # messages that were not used, by reason
+    is_whole: bool = True           # whether the images show the whole sensor, without binning
 
     def with_unknown_lens(self, distortion_model: str) -> CalibrationInput:
         """The same for a lens that is to be estimated; InputError if it has a distortion."""
         if any(self.camera.distortion):
             raise InputError('the CameraInfo has distortion coefficients, beyond the first of '
                              'which nothing is estimated: calibrate without --lens')
+        if not self.is_whole:
+            raise InputError('the CameraInfo has a region of interest or binning, which '
+                             'camera_matrix cannot describe: calibrate without --lens')
         counts = DISTORTION_MODELS[distortion_model].coefficient_counts
         return replace(self, focal_known=False, camera=replace(
             self.camera, distortion_model=distortion_model,
@@ -219,38 +230,55 @@ def read_recording(bag: Bag, topics: SensorTopics, tracking: TrackingConfig, *,
     Of `images`, by their number in the bag, and of the gyro meanwhile; None: all. InputError or
     MissingInputError if the bag is damaged, or has no usable image or no gyro.
     """
-    reader = _Reader(topics, tracking)
-    number = 0
+    recorder, number = Recorder(tracking), 0
+    if topics.camera_info is None:
+        recorder.uncalibrated = True
     for role, message in sensor_messages(bag, topics, (Role.IMU, Role.CAMERA_INFO, Role.IMAGE)):
         if images is None or role is Role.CAMERA_INFO or number in images:
-            reader.take(role, message)
+            error = recorder.add(role, message.message)
+            if error is not None and recorder.unused.add(reason := f'{message.topic}: {error}'):
+                _logger.info('not used: %s', reason)
         number += role is Role.IMAGE
-    return reader.recording()
+    return recorder.recording()
 
 
-class _Reader:
-    """Follows points from image to image by the chosen tracker, and keeps the gyro."""
+class Recorder:
+    """Follows points from image to image by the chosen tracker, and keeps the gyro.
 
-    def __init__(self, topics: SensorTopics, tracking: TrackingConfig) -> None:
-        self._topics = topics
+    Of the last `longest` seconds. Without a calibrated CameraInfo the lens is `uncalibrated`;
+    `unused`: messages that were not used.
+    """
+
+    def __init__(self, tracking: TrackingConfig, longest: float = math.inf) -> None:
+        self.intrinsics: Intrinsics | None = None
+        self.uncalibrated, self.unused = False, ReasonCounts()
+        self._longest = longest
         self._tracker, self._levels = make_tracker(tracking), GrayLevels()
         self._since_renewed = 0     # images
-        self._stamps: list[int] = []
-        self._ids: list[NDArray[np.uint32]] = []
-        self._points: list[Array] = []
-        self._intrinsics: Intrinsics | None = None
-        self._uncalibrated = topics.camera_info is None
-        self._size: tuple[int, int] | None = None
+        self._stamps: deque[int] = deque()
+        self._ids: deque[NDArray[np.uint32]] = deque()
+        self._points: deque[Array] = deque()
+        self.size = (0, 0)   # of the images [px]
         self._gyro: dict[int, tuple[float, float, float]] = {}
-        self._unused = ReasonCounts()
 
-    def take(self, role: Role, message: BagMessage) -> None:
+    @property
+    def seconds(self) -> float:
+        """Time between the first and the last image."""
+        return seconds_between(self._stamps[0], self._stamps[-1]) if self._stamps else 0.0
+
+    @property
+    def last_ns(self) -> int:
+        """Stamp of the last image."""
+        return self._stamps[-1]
+
+    def add(self, role: Role, message: Any) -> RsRelposeError | None:
+        """Use a message; the error of one that cannot be used."""
         try:
-            value = PARTS[role].read(message.message)
+            value = PARTS[role].read(message)
             if role is Role.IMAGE:
-                self._follow(value)
+                self.follow(value)
             elif role is Role.CAMERA_INFO:
-                self._intrinsics = value
+                self.intrinsics = value
             elif value.angular_velocity is None:
                 raise MissingInputError('an IMU message has no gyro')
             else:
@@ -258,11 +286,13 @@ class _Reader:
         except RsRelposeError as error:
             # Without a calibration the focal length is guessed.
             if role is Role.CAMERA_INFO and isinstance(error, MissingInputError):
-                self._uncalibrated = True
-            elif self._unused.add(reason := f'{message.topic}: {error}'):
-                _logger.info('not used: %s', reason)
+                self.uncalibrated = True
+                return None
+            return error
+        return None
 
-    def _follow(self, encoded: EncodedImage) -> None:
+    def follow(self, encoded: EncodedImage) -> None:
+        """Track the points of the images before in another one; InputError if it is unusable."""
         if self._stamps and encoded.stamp_ns <= self._stamps[-1]:
             raise InputError('the stamp of an image is not later than the previous one')
         image, tracker = encoded.decoded(self._levels), self._tracker
@@ -278,28 +308,34 @@ class _Reader:
         self._stamps.append(encoded.stamp_ns)
         self._ids.append(matches.track_ids)
         self._points.append(matches.points2)
-        self._size = image.shape[1], image.shape[0]
+        self.size = image.shape[1], image.shape[0]
+        while self.seconds > self._longest:
+            for of_frames in (self._stamps, self._ids, self._points):
+                of_frames.popleft()
+            while self._gyro and (first := next(iter(self._gyro))) < self._stamps[0] - _MARGIN_NS:
+                del self._gyro[first]
 
     def recording(self) -> CalibrationInput:
-        unused = self._unused.most_common()
+        """All that was recorded; InputError or MissingInputError if something is missing."""
+        unused = self.unused.most_common()
         why = ''.join(f'; {reason}' for reason in list(unused)[:2])
-        if self._size is None:
-            raise InputError(f'no image of {self._topics.image.name} can be used{why}')
+        if not self._stamps:
+            raise InputError(f'no image can be used{why}')
         if not self._gyro:
-            raise MissingInputError(
-                f'no message of {self._topics.imu.name} has a gyro{why}: record the angular '
-                'velocity together with the images')
-        intrinsics = self._intrinsics
-        if intrinsics is None and not self._uncalibrated:
-            raise MissingInputError(f'no message of {self._topics.camera_info} can be used{why}')
+            raise MissingInputError(f'no message of the IMU has a gyro{why}: record the angular '
+                                    'velocity together with the images')
+        intrinsics = self.intrinsics
+        if intrinsics is None and not self.uncalibrated:
+            raise MissingInputError(f'no CameraInfo can be used{why}')
         points, stamps = np.concatenate(self._points), sorted(self._gyro)
         if intrinsics is not None:
             points = intrinsics.to_sensor(points)
         frames = np.repeat(np.arange(len(self._ids)), [len(ids) for ids in self._ids])
         tracks = Tracks(np.array(self._stamps), frames, np.concatenate(self._ids), points)
         gyro = GyroSeries(np.array(stamps), np.array([self._gyro[stamp] for stamp in stamps]))
-        return CalibrationInput(tracks, gyro, _camera(intrinsics, *self._size),
-                                intrinsics is not None, unused)
+        camera = _camera(intrinsics, *self.size)
+        return CalibrationInput(tracks, gyro, camera, intrinsics is not None, unused,
+                                self.size == (camera.width, camera.height))
 
 
 def _camera(intrinsics: Intrinsics | None, width: int, height: int) -> RollingShutterCamera:

@@ -109,6 +109,11 @@ class CalibrationResult:
         return x, y, z, w
 
     @property
+    def bias_sigma(self) -> float:
+        """1 sigma of the bias of the worst axis after a restart of the gyro [rad/s]."""
+        return math.hypot(max(bias.sigma for bias in self.gyro_bias), _BIAS_CHANGE)
+
+    @property
     def shutter(self) -> str:
         """'rolling', 'global' or 'unsure'.
 
@@ -130,12 +135,11 @@ _BLUE, _ORANGE = '#0072B2', '#E69F00'
 _MS = 1e3
 
 
-def report(result: CalibrationResult, camera: RollingShutterCamera) -> list[str]:
-    """Lines for a reader: each quantity with its 1 sigma and its observability."""
+def quantities(result: CalibrationResult,
+               camera: RollingShutterCamera) -> list[tuple[str, str, Estimate]]:
+    """Each quantity: its name, its value with 1 sigma in words, and its estimate."""
     readout, focal = result.readout_time, result.focal_factor
     slope, jitter = result.offset_by_interval, result.offset_by_jitter
-    rates = ', '.join(f'{axis} {np.degrees(rate):.1f}'
-                      for axis, rate in zip(AXES, result.rotation_rates, strict=True))
     sigmas = ', '.join(f'{np.degrees(sigma):.3f}' for sigma in result.rotation_sigma)
     rows = [('readout time', _shown('readout_time', readout, abs(readout.value))
              + (', read upwards' if readout.value < 0.0 else ''), readout),
@@ -173,12 +177,19 @@ def report(result: CalibrationResult, camera: RollingShutterCamera) -> list[str]
              f'coefficient of {camera.distortion_model})'), result.radial),
             ('principal point', (f'{column.value:.1f} +- {column.sigma:.1f}, {row.value:.1f} +- '
              f'{row.sigma:.1f} px'), column)]
+    return rows
+
+
+def report(result: CalibrationResult, camera: RollingShutterCamera) -> list[str]:
+    """Lines for a reader: each quantity with its 1 sigma and its observability."""
+    rates = ', '.join(f'{axis} {np.degrees(rate):.1f}'
+                      for axis, rate in zip(AXES, result.rotation_rates, strict=True))
     return [
         (f'{result.frames} frames, {result.pairs} pairs, {result.matches} matches; '
          f'{100 * result.inlier_ratio:.0f} % inliers, noise of a match '
          f'{result.pixel_sigma:.2f} px'),
         f'rotation of the camera, rms [deg/s]: {rates}', f'shutter: {_shutter_text(result)}',
-        *(f'{name}: {text} [{_state(of)}]' for name, text, of in rows),
+        *(f'{name}: {text} [{_state(of)}]' for name, text, of in quantities(result, camera)),
         'quaternion x y z w: ' + ', '.join(f'{v:.6f}' for v in result.quat_cam_imu_xyzw),
         *(f'note: {warning}' for warning in result.warnings)]
 
@@ -227,7 +238,7 @@ def parameter_file(result: CalibrationResult, title: str, *, camera: RollingShut
     groups += [(max(biases, key=lambda bias: bias.sigma), 'gyro_bias', [
         SourcedValue('gyro_bias', tuple(round(bias.value, 5) for bias in biases), '1 sigma '
                      + ', '.join(f'{bias.sigma:.5f}' for bias in biases) + ' rad/s.'),
-        _sigma('gyro_bias', math.hypot(max(bias.sigma for bias in biases), _BIAS_CHANGE), 5,
+        _sigma('gyro_bias', result.bias_sigma, 5,
                f'Of the worst axis, and {_BIAS_CHANGE:g} rad/s from one start to the next.')])]
     if result.focal_factor is not None:
         groups.append((result.focal_factor, 'camera_matrix', _lens_values(result, camera)))
@@ -293,8 +304,7 @@ def _lens_values(result: CalibrationResult, camera: RollingShutterCamera) -> lis
         SourcedValue('camera_matrix', (
             round(camera.fx * focal.value, 2), 0.0, round(column.value, 2), 0.0,
             round(camera.fy * focal.value, 2), round(row.value, 2), 0.0, 0.0, 1.0),
-            f'For images of {camera.width}x{camera.height}. A calibrated CameraInfo has '
-            'priority.'),
+            f'For images of {camera.width}x{camera.height}, in place of their CameraInfo.'),
         SourcedValue('distortion_model', camera.distortion_model, ''),
         SourcedValue('distortion_coefficients', (round(radial.value, 5), *others),
                      'The first coefficient is estimated, the others are assumed to be zero.'),

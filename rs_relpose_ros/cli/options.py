@@ -80,9 +80,14 @@ def add_run_arguments(parser: argparse.ArgumentParser, suffix: str) -> None:
     add_topic_arguments(parser, *_TOPICS)
 
 
-def run_on_bag(args: argparse.Namespace, suffix: str, work: Work[Made]) -> tuple[Path, Made]:
-    """Run `work` and write summary.json into its folder; return the folder and the results."""
+def run_on_bag(args: argparse.Namespace, suffix: str, work: Work[Made],
+               calibration: Mapping[str, Any] | None = None) -> tuple[Path, Made]:
+    """Run `work` and write summary.json into its folder; return the folder and the results.
+
+    `calibration`: parameters by name where `args` do not give others.
+    """
     parameters = read_parameters(args.params, args.set)
+    parameters = Parameters().updated({**(calibration or {}), **parameters.given()})
     folder = out_folder(args, suffix)
     with open_bag(args.bag) as bag:
         topics = bag.find_topics(topic_options(args),

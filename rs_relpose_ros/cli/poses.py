@@ -9,8 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from rs_relpose_ros.bags.reader import Bag, SensorTopics
-from rs_relpose_ros.cli.main import Command, FAILED
-from rs_relpose_ros.cli.options import add_run_arguments, run_on_bag, warn_unused
+from rs_relpose_ros.cli.main import Command, FAILED, make_parser
+from rs_relpose_ros.cli.options import (
+    add_run_arguments,
+    out_folder,
+    run_on_bag,
+    topic_options,
+    warn_unused,
+)
+from rs_relpose_ros.config.files import file_values
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.odometry import need_gtsam
@@ -31,6 +38,9 @@ def _add_replay_arguments(parser: argparse.ArgumentParser) -> None:
                         help='use only the frames whose stamps [ns] are in FILE, one per line, as '
                         'the parameter stamps_file of a live node wrote them: the poses are then '
                         'equal to its poses, bit by bit')
+    parser.add_argument('--calibrate', action='store_true',
+                        help='first calibrate from the bag into OUT/calibration, as `rs_relpose '
+                        'calibrate` does; parameters that are given stay')
     parser.add_argument('--no-pictures', action='store_true', help='tables and summary only')
     parser.add_argument('--bag', dest='with_bag', action='store_true',
                         help="write the node's topics as an MCAP bag, too")
@@ -42,7 +52,22 @@ def replay_bag(args: argparse.Namespace) -> tuple[Path, ReplayOutcome]:
     return run_on_bag(
         args, 'relpose', lambda folder, bag, topics, parameters: replay_into(
             folder, bag, topics, parameters, stamps=stamps, pictures=not args.no_pictures,
-            with_bag=args.with_bag))
+            with_bag=args.with_bag), _calibration(args) if args.calibrate else {})
+
+
+def _calibration(args: argparse.Namespace) -> dict[str, Any]:
+    """Calibrate from the bag of `args`; the parameters. InputError if one is not determined."""
+    from rs_relpose_ros.cli.recordings import calibrate_bag, CALIBRATION_FILE
+    folder = out_folder(args, 'relpose') / 'calibration'
+    words = ['calibrate', str(args.bag), '--out', str(folder)]
+    for role, topic in topic_options(args).items():
+        if topic and role in ('image', 'camera_info', 'imu'):
+            words += [f'--{role.replace("_", "-")}-topic', topic]
+    result, _ = calibrate_bag(make_parser('calibrate').parse_args(words))
+    if not result.complete:
+        reasons = dict.fromkeys(part.remark for part in result.needed if not part.determined)
+        raise InputError(f'the bag does not determine its calibration: {"; ".join(reasons)}')
+    return file_values(folder / CALIBRATION_FILE)
 
 
 def has_good_poses(outcome: ReplayOutcome) -> bool:

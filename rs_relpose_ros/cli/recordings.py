@@ -29,7 +29,8 @@ from rs_relpose_ros.offline.check import check_bag, CheckReport, choose_topics
 from rs_relpose_ros.offline.unroll import unroll
 from rs_relpose_ros.output_files import prepare_folder, refuse_unwritable
 
-_CALIBRATION_FILES = ('calibration.yaml', 'calibration.json', 'cost_over_readout.png')
+CALIBRATION_FILE = 'calibration.yaml'
+_CALIBRATION_FILES = (CALIBRATION_FILE, 'calibration.json', 'cost_over_readout.png')
 
 _logger = logging.getLogger(__name__)
 

@@ -20,7 +20,10 @@ ANY_VALUE = {bool: 'true or false', str: 'text'}
 
 @dataclass(frozen=True, slots=True)
 class Declared:
-    """Declaration of a setting; `live`: a running node may change it."""
+    """Declaration of a setting.
+
+    `live`: a running node may change it; `restarts`: it may, and begins again with the new value.
+    """
 
     description: str
     unit: str = ''
@@ -29,6 +32,7 @@ class Declared:
     choices: tuple[str, ...] = ()
     length: int | None = None
     live: bool = False
+    restarts: bool = False
     kind: type = float
 
     @property
@@ -62,6 +66,7 @@ def setting(default: Any, description: str, unit: str = '', *, kind: type | None
     `legal`: other fields of `Declared`. A tuple setting declares its `length`, and a setting
     without a default (None) its `kind`.
     """
+    legal.setdefault('live', legal.get('restarts', False))
     declared = Declared(description, unit, kind=type(default) if kind is None else kind, **legal)
     return dataclasses.field(default=default, metadata={'declared': declared})
 

@@ -26,6 +26,11 @@ from rs_relpose_ros.errors import InputError, MissingInputError
 _NODE = 'relpose_node'
 # Parameters of every ROS node, without effect offline.
 _ROS_OWN = ('use_sim_time', 'start_type_description_service')
+# Sigma of each parameter of a calibration. A file that has one of them is a calibration file.
+_SIGMAS = {
+    'readout_time': 'readout_time_sigma', 'time_offset': 'time_offset_sigma',
+    'time_offset_per_interval': 'time_offset_per_interval_sigma',
+    'quat_cam_imu_xyzw': 'axes_sigma', 'camera_matrix': 'focal_length_sigma'}
 # Largest file that is read [bytes]; a file of all parameters has 10,000.
 _MAX_BYTES = 1 << 20
 _COMMENT_WIDTH = 95
@@ -52,9 +57,10 @@ def read_parameters(path: Path | str | None, assignments: Sequence[str] = (),
     """
     parameters = Parameters()
     if path is not None:
-        values = _values(Path(path), node)
+        values = file_values(Path(path), node)
         try:
-            parameters = parameters.updated(_converted(values))
+            _check_sigmas(values)
+            parameters = parameters.updated(values)
         except InputError as error:
             raise InputError(f'{path}: {error}') from error
     given = {}
@@ -108,7 +114,7 @@ def yaml_text(value: Any) -> str:
     return text.replace('e', '.0e') if 'e' in text and '.' not in text else text
 
 
-def _values(path: Path, wanted: str) -> dict[str, Any]:
+def file_values(path: Path, wanted: str = _NODE) -> dict[str, Any]:
     """Flat values of a parameter file for the node `wanted`."""
     if not path.is_file():
         raise MissingInputError(f'the parameter file {path} does not exist')
@@ -116,11 +122,19 @@ def _values(path: Path, wanted: str) -> dict[str, Any]:
         raise InputError(f'{path} is not a parameter file: it has more than {_MAX_BYTES} bytes')
     try:
         text = path.read_text(encoding='utf-8')
+    except UnicodeDecodeError as error:
+        raise InputError(f'{path} is not valid YAML: {error}') from error
+    return text_values(text, str(path), wanted)
+
+
+def text_values(text: str, path: str, wanted: str = _NODE) -> dict[str, Any]:
+    """The same from the text of a file."""
+    try:
         # Nested aliases expand without a limit; ROS does not support them either.
         if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
             raise InputError(f'{path} has YAML aliases, which are not supported')
         document = yaml.safe_load(text)
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+    except (yaml.YAMLError, RecursionError) as error:
         raise InputError(f'{path} is not valid YAML: {error}') from error
     if not isinstance(document, dict):
         raise InputError(f'{path} is not a ROS parameter file: it must begin with "/**:" and '
@@ -138,7 +152,16 @@ def _values(path: Path, wanted: str) -> dict[str, Any]:
     if not values:
         raise InputError(f'{path} has no parameters of {wanted}: they must be below "/**:" or '
                          f'"{wanted}:" and "ros__parameters:"')
-    return values
+    return _converted(values)
+
+
+def _check_sigmas(values: Mapping[str, Any]) -> None:
+    """InputError if a calibration file has a parameter without its sigma."""
+    if any(values.get(sigma) for sigma in _SIGMAS.values()):
+        for name, sigma in _SIGMAS.items():
+            if name in values and sigma not in values:
+                raise InputError(f'{name} is given without {sigma}: a calibration file has each '
+                                 'parameter with its sigma, 0 if that is not known')
 
 
 def _converted(values: Mapping[str, Any]) -> dict[str, Any]:

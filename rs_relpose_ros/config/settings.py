@@ -93,11 +93,12 @@ class ImuConfig(Settings):
 
     gyro_bias: tuple[float, ...] = setting(
         (0.0, 0.0, 0.0), 'gyro bias in the IMU frame, subtracted', 'rad/s', low=-1.0, high=1.0,
-        length=3)
+        length=3, restarts=True)
     gyro_noise_density: float = setting(
         2e-4, 'white noise of the gyro', 'rad/s/sqrt(Hz)', low=1e-7, high=0.1)
     gyro_bias_sigma: float = setting(
-        3e-3, 'uncertainty of gyro_bias, 1 sigma per axis', 'rad/s', low=0.0, high=1.0)
+        3e-3, 'uncertainty of gyro_bias, 1 sigma per axis', 'rad/s', low=0.0, high=1.0,
+        restarts=True)
     accel_noise_density: float = setting(
         3e-3, 'white noise of the accelerometer', 'm/s^2/sqrt(Hz)', low=1e-6, high=10.0)
     accel_bias_sigma: float = setting(
@@ -105,9 +106,10 @@ class ImuConfig(Settings):
         'axis', 'm/s^2', low=0.0, high=10.0)
     imu_position: tuple[float, ...] = setting(
         (0.0, 0.0, 0.0), 'position of the IMU in the camera frame', 'm', low=-5.0, high=5.0,
-        length=3)
+        length=3, restarts=True)
     imu_position_sigma: float = setting(
-        0.03, 'uncertainty of imu_position, 1 sigma per axis', 'm', low=0.0, high=5.0)
+        0.03, 'uncertainty of imu_position, 1 sigma per axis', 'm', low=0.0, high=5.0,
+        restarts=True)
     track_gyro_bias: bool = setting(
         True, 're-estimate the gyro bias whenever the IMU is at rest (within 4 gyro_bias_sigma)')
     use_imu_orientation: bool = setting(
@@ -306,27 +308,27 @@ def pinhole_of_matrix(name: str, k: Sequence[float]) -> Pinhole:
 
 @dataclass(frozen=True, slots=True)
 class IntrinsicsConfig(Settings):
-    """Intrinsics for a camera without a calibrated CameraInfo, named as by camera_calibration."""
+    """Intrinsics in place of the CameraInfo's, named as by camera_calibration."""
 
     camera_matrix: tuple[float, ...] | None = setting(
-        None, 'intrinsics fx 0 cx 0 fy cy 0 0 1 of the images as published, for a camera whose '
-        'CameraInfo is uncalibrated (k[0] = 0) or absent; a calibrated CameraInfo has priority',
-        'px', length=9, kind=tuple)
+        None, 'intrinsics fx 0 cx 0 fy cy 0 0 1 of the images as published, with distortion_model '
+        'and distortion_coefficients in place of the CameraInfo', 'px', length=9, kind=tuple,
+        restarts=True)
     distortion_model: str = setting(
         'plumb_bob', 'distortion model that belongs to camera_matrix',
-        choices=tuple(DISTORTION_MODELS))
+        choices=tuple(DISTORTION_MODELS), restarts=True)
     distortion_coefficients: tuple[float, ...] | None = setting(
         None, 'coefficients of distortion_model in the order of OpenCV; no distortion if not '
-        'given', kind=tuple)
+        'given', kind=tuple, restarts=True)
     focal_length_sigma: float = setting(
         0.0, 'relative uncertainty of the focal length, 1 sigma; 0 if it is not known', low=0.0,
-        high=1.0)
+        high=1.0, restarts=True)
     distortion_sigma: float = setting(
         0.0, 'uncertainty of the first of distortion_coefficients, 1 sigma; 0 if it is not known',
-        low=0.0, high=10.0)
+        low=0.0, high=10.0, restarts=True)
     principal_point_sigma: float = setting(
         0.0, 'uncertainty of the principal point, 1 sigma per axis; 0 if it is not known', 'px',
-        low=0.0, high=1e4)
+        low=0.0, high=1e4, restarts=True)
 
     def __post_init__(self) -> None:
         Settings.__post_init__(self)
@@ -360,38 +362,43 @@ class SensorConfig(Settings):
 
     readout_time: float | None = setting(
         None, 'image height times line delay; 0 for a global shutter', 's', low=0.0, high=0.5,
-        kind=float)
+        kind=float, restarts=True)
     readout_time_sigma: float = setting(
-        0.0, 'uncertainty of readout_time, 1 sigma; 0 if it is not known', 's', low=0.0, high=1.0)
+        0.0, 'uncertainty of readout_time, 1 sigma; 0 if it is not known', 's', low=0.0,
+        high=1.0, restarts=True)
     readout_direction: str = setting(
-        'down', 'whether row 0 is read first (down) or last (up)', choices=READOUT_DIRECTIONS)
-    stamp_row: str = setting('first', 'row that the image stamp marks', choices=REFERENCE_ROWS)
+        'down', 'whether row 0 is read first (down) or last (up)',
+        choices=READOUT_DIRECTIONS, restarts=True)
+    stamp_row: str = setting(
+        'first', 'row that the image stamp marks', choices=REFERENCE_ROWS, restarts=True)
     pose_row: str = setting(
         'stamp', 'rows that poses relate and their stamps mark: those of the image stamps, or the '
         'middle rows, between which the translation is more accurate', choices=('stamp', 'middle'))
     stamp_exposure: str = setting(
         'middle', 'time within the exposure of that row that the stamp marks',
-        choices=STAMP_EXPOSURES)
+        choices=STAMP_EXPOSURES, restarts=True)
     exposure_time: float = setting(
-        0.0, 'exposure time of a row, over which the gyro is averaged', 's', low=0.0, high=1.0)
+        0.0, 'exposure time of a row, over which the gyro is averaged', 's', low=0.0,
+        high=1.0, restarts=True)
     exposure_margin: float = setting(
         0.0, 'in place of exposure_time: the exposure is the interval between frames less this '
-        '(automatic exposure in little light); 0 for none', 's', low=0.0, high=1.0)
+        '(automatic exposure in little light); 0 for none', 's', low=0.0, high=1.0, restarts=True)
     time_offset: float = setting(
         0.0, 'IMU clock minus camera clock: t_imu = stamp + time_offset', 's', low=-10.0,
-        high=10.0)
+        high=10.0, restarts=True)
     time_offset_sigma: float = setting(
-        0.0, 'uncertainty of time_offset, 1 sigma; 0 if it is not known', 's', low=0.0, high=10.0)
+        0.0, 'uncertainty of time_offset, 1 sigma; 0 if it is not known', 's', low=0.0,
+        high=10.0, restarts=True)
     time_offset_per_interval: float = setting(
         0.0, 'change of time_offset with the interval T between frames (automatic exposure): '
         't_imu = stamp + time_offset + time_offset_per_interval (T - '
-        'time_offset_reference_interval)', 's/s', low=-5.0, high=5.0)
+        'time_offset_reference_interval)', 's/s', low=-5.0, high=5.0, restarts=True)
     time_offset_per_interval_sigma: float = setting(
         0.0, 'uncertainty of time_offset_per_interval, 1 sigma; 0 if it is not known', 's/s',
-        low=0.0, high=5.0)
+        low=0.0, high=5.0, restarts=True)
     time_offset_reference_interval: float = setting(
         0.0, 'interval between frames at which time_offset holds; used with '
-        'time_offset_per_interval', 's', low=0.0, high=10.0)
+        'time_offset_per_interval', 's', low=0.0, high=10.0, restarts=True)
     track_time_offset: bool = setting(
         False, 'apply the time offset that is tracked at run time (it is always reported)',
         live=True)
@@ -400,10 +407,10 @@ class SensorConfig(Settings):
         live=True)
     quat_cam_imu_xyzw: tuple[float, ...] | None = setting(
         None, 'rotation IMU to camera, v_cam = R(q) v_imu; x y z w', low=-1.0, high=1.0, length=4,
-        kind=tuple)
+        kind=tuple, restarts=True)
     axes_sigma: float = setting(
         0.0, 'uncertainty of quat_cam_imu_xyzw, 1 sigma per axis; 0 if it is not known', 'rad',
-        low=0.0, high=1.0)
+        low=0.0, high=1.0, restarts=True)
 
     def __post_init__(self) -> None:
         Settings.__post_init__(self)
@@ -424,6 +431,22 @@ class SensorConfig(Settings):
         """Names of the required settings that are not given."""
         return [name for name in ('readout_time', 'quat_cam_imu_xyzw')
                 if getattr(self, name) is None]
+
+
+@dataclass(frozen=True, slots=True)
+class StoredCalibrationConfig(Settings):
+    """Calibration at the start of relpose_node, and its file."""
+
+    calibrate_at_start: str = setting(
+        'missing', 'calibrate from the images and the gyro at the start: if a required parameter '
+        'and the file are missing, always, or never',
+        choices=('missing', 'always', 'never'))
+    calibration_file: str = setting(
+        '', 'file of the calibration; empty for <camera_name>_<width>x<height>.yaml in '
+        '${ROS_HOME:-~/.ros}/rs_relpose')
+    camera_name: str = setting('', 'name of the camera; empty for the frame_id of its images')
+    load_calibration: bool = setting(True, 'use the file, if it exists')
+    save_calibration: bool = setting(True, 'write the file after a calibration')
 
 
 @lru_cache(maxsize=16)
@@ -485,6 +508,7 @@ class Parameters:
     """All parameters, grouped by the module that uses them; flat names are unique."""
 
     sensor: SensorConfig = field(default_factory=SensorConfig)
+    calibration: StoredCalibrationConfig = field(default_factory=StoredCalibrationConfig)
     intrinsics: IntrinsicsConfig = field(default_factory=IntrinsicsConfig)
     pair: PairConfig = field(default_factory=PairConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
@@ -524,6 +548,12 @@ class Parameters:
         return Parameters(*(dataclasses.replace(config, **{
             item.name: values[item.name] for item in dataclasses.fields(config)
             if item.name in values}) for config in groups))
+
+    def given(self) -> dict[str, Any]:
+        """The parameters that are not at their defaults, by flat name."""
+        defaults = Parameters().to_mapping()
+        return {name: value for name, value in self.to_mapping().items()
+                if value != defaults[name]}
 
     def to_mapping(self) -> dict[str, Any]:
         """Every parameter by flat name."""

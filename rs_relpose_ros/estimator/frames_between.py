@@ -182,7 +182,7 @@ def refined(pose: RelativePose, points1: Array, motion1: FrameMotion, second: tu
     if not (np.isfinite(adjusted.covariance).all()
             and np.median(adjusted.state.inverse_distances) > 0.0):
         return replace(pose, frames_reason='the adjustment of all frames does not converge')
-    return _result(pose, adjusted, tracks, path, len(views))
+    return _result(pose, adjusted, tracks, priors, path, len(views))
 
 
 class _Path(NamedTuple):
@@ -328,36 +328,43 @@ def _start(pose: RelativePose, views: Sequence[_View], tracks: Tracks,
                      np.where(near, 1.0 / np.where(near, depths, 1.0), _FAR))
 
 
-def _result(pose: RelativePose, adjusted: Adjusted, tracks: Tracks, path: _Path,
-            views: int) -> RelativePose:
+def _result(pose: RelativePose, adjusted: Adjusted, tracks: Tracks, priors: PathPriors,
+            path: _Path, views: int) -> RelativePose:
     """The two-view result with the pose, its covariance and the velocities of all frames."""
     state, C, T = adjusted.state, adjusted.covariance, tracks.duration
     n, k = len(C), math.exp(state.log_scale)
-    R = exp_so3(T * state.bias + state.rotations[-1]) @ tracks.rotations[-1]
+    off = T * state.bias + state.rotations[-1]   # from the gyro's rotation
+    R = exp_so3(off) @ tracks.rotations[-1]
     by_state = np.zeros((6, n))
     by_state[:3, TANGENT:LOG_SCALE] = tangent_basis(state.t)
     by_state[3:, BIAS:BIAS + 3], by_state[3:, -3:] = T * np.eye(3), np.eye(3)
-    # p' at both ends, in the axes of camera 1.
-    moved1, moved2 = (velocity - path.chord / T for velocity in path.ends)
     # B_j' at both ends.
-    bend1, bend2 = T * np.array([[-0.5, 1.0 / 6.0, 0.0], [0.5, 1.0 / 6.0, 0.0]])[
+    bends = T * np.array([[-0.5, 1.0 / 6.0, 0.0], [0.5, 1.0 / 6.0, 0.0]])[
         :, :len(state.accelerations)]
-    velocity1 = state.t / T + k * (moved1 + bend1 @ state.accelerations)
-    velocity2 = state.t / T + k * (moved2 + bend2 @ state.accelerations)
-    by_velocity = np.zeros((3, n))
-    by_velocity[:, TANGENT:LOG_SCALE] = tangent_basis(state.t) / T
-    by_velocity[:, LOG_SCALE] = velocity2 - state.t / T
-    by_velocity[:, ACCELERATION:ACCELERATION + 3 * len(bend2)] = k * np.kron(bend2, np.eye(3))
-    by_velocity += skew(velocity2) @ by_state[3:]   # R^T p' rotates with the error of R
-    by_velocity = R.T @ by_velocity
+    # p' at both ends, in the axes of camera 1, and its derivatives.
+    velocities, derivatives = np.empty((2, 3)), np.zeros((2, 3, n))
+    for end, (velocity, bend) in enumerate(zip(path.ends, bends, strict=True)):
+        of_scale = k * (velocity - path.chord / T + bend @ state.accelerations)
+        velocities[end] = state.t / T + of_scale
+        derivatives[end, :, TANGENT:LOG_SCALE] = by_state[:3, TANGENT:LOG_SCALE] / T
+        derivatives[end, :, LOG_SCALE] = of_scale
+        derivatives[end, :, ACCELERATION:ACCELERATION + 3 * len(bend)] = k * np.kron(
+            bend, np.eye(3))
+    by_first, by_second = derivatives
+    # R^T p' rotates with the error of R.
+    by_second = R.T @ (by_second + skew(velocities[1]) @ by_state[3:])
     velocity_covariance = pose.velocity_covariance.copy()
     velocity_covariance[:3] = velocity_covariance[:, :3] = 0.0
-    velocity_covariance[:3, :3] = by_velocity @ C @ by_velocity.T
+    velocity_covariance[:3, :3] = by_second @ C @ by_second.T
+    of_gyro = T * T / priors.bias_weight * np.eye(3) + np.linalg.inv(
+        priors.rotation_information)[-3:, -3:]
     known = path.known and math.isfinite(pose.baseline)
     return replace(
-        pose, R=R, t=state.t, covariance=by_state @ C @ by_state.T, linear_velocity1=velocity1,
-        linear_velocity2=R.T @ velocity2, velocity_covariance=velocity_covariance,
+        pose, R=R, t=state.t, covariance=by_state @ C @ by_state.T,
+        linear_velocity1=velocities[0], linear_velocity1_covariance=by_first @ C @ by_first.T,
+        linear_velocity2=R.T @ velocities[1], velocity_covariance=velocity_covariance,
         baseline=1.0 / k if known else pose.baseline,
         baseline_log_sigma=(math.sqrt(C[LOG_SCALE, LOG_SCALE]) if known
                             else pose.baseline_log_sigma),
-        frames=views, pixel_sigma=adjusted.sigma)
+        frames=views, gyro_square=float(off @ np.linalg.solve(of_gyro, off)),
+        pixel_sigma=adjusted.sigma)

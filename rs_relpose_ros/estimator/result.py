@@ -49,6 +49,8 @@ class RelativePose:
         Unit direction of ``R_1^T (p_2 - p_1)``; NaN if not known.
     linear_velocity1, linear_velocity2 : (3,) ndarray
         Each in its own camera's frame [baselines per second].
+    linear_velocity1_covariance : (3, 3) ndarray
+        In camera 1; NaN without frames between.
     angular_velocity1, angular_velocity2 : (3,) ndarray
         As corrected by the estimate [rad/s], each in its own camera's frame.
     inliers : (N,) ndarray of bool
@@ -84,6 +86,8 @@ class RelativePose:
         Number of views that the pose was estimated from; 2 without frames between.
     frames_reason : str
         Why given frames between were not used; empty if they were.
+    gyro_square : float
+        Chi-square of the rotation from all frames by that of the gyro, 3 degrees of freedom.
     pixel_sigma : float
         Noise of a match as estimated from the residuals, 1 sigma per coordinate [px].
     duration : float
@@ -95,6 +99,7 @@ class RelativePose:
     R: Array = field(default_factory=lambda: _nan(3, 3))
     t: Array = field(default_factory=lambda: _nan(3))
     linear_velocity1: Array = field(default_factory=lambda: _nan(3))
+    linear_velocity1_covariance: Array = field(default_factory=lambda: _nan(3, 3))
     linear_velocity2: Array = field(default_factory=lambda: _nan(3))
     angular_velocity1: Array = field(default_factory=lambda: _nan(3))
     angular_velocity2: Array = field(default_factory=lambda: _nan(3))
@@ -114,6 +119,7 @@ class RelativePose:
     residual_rms: float = float('nan')
     frames: int = 2
     frames_reason: str = ''
+    gyro_square: float = float('nan')
     pixel_sigma: float = float('nan')
     duration: float = float('nan')
 
@@ -143,7 +149,8 @@ class RelativePose:
             matrix[:3] = matrix[:, :3] = np.nan
         return replace(
             self.without_baseline(''), status=status, reason=reason, t=_nan(3),
-            linear_velocity1=_nan(3), linear_velocity2=_nan(3), covariance=covariance,
+            linear_velocity1=_nan(3), linear_velocity1_covariance=_nan(3, 3),
+            linear_velocity2=_nan(3), covariance=covariance,
             images=None if self.images is None else self.images.of_rotation(),
             velocity_covariance=velocity_covariance)
 
@@ -166,6 +173,7 @@ class RelativePose:
         covariance[3:, 3:] = R_inv @ self.covariance[3:, 3:] @ self.R
         return replace(
             self, R=R_inv, t=-R_inv @ self.t, linear_velocity1=self.linear_velocity2,
+            linear_velocity1_covariance=_nan(3, 3),
             linear_velocity2=self.linear_velocity1, angular_velocity1=self.angular_velocity2,
             angular_velocity2=self.angular_velocity1, covariance=covariance,
             velocity_covariance=_nan(6, 6), images=None, inertial_evidence=None, pixels1_gs=None,

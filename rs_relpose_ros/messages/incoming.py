@@ -234,14 +234,14 @@ class StuckCamera:
         self._previous: NDArray[np.uint8] | None = None
         self._stamp_ns = 0
 
-    def problem(self, image: EncodedImage) -> str:
+    def problem(self, stamp_ns: int, data: NDArray[np.uint8]) -> str:
         """Reason why an image is no new one; empty for none."""
-        previous, self._previous = self._previous, image.data
+        previous, self._previous = self._previous, data
         # A message that is delivered twice is no fault of the camera.
-        again, self._stamp_ns = image.stamp_ns == self._stamp_ns, image.stamp_ns
-        if (previous is not None and not again and len(previous) == len(image.data)
-                and np.array_equal(previous[::_STRIDE], image.data[::_STRIDE])
-                and np.array_equal(previous, image.data)):
+        again, self._stamp_ns = stamp_ns == self._stamp_ns, stamp_ns
+        if (previous is not None and not again and len(previous) == len(data)
+                and np.array_equal(previous[::_STRIDE], data[::_STRIDE])
+                and np.array_equal(previous, data)):
             return ('the image repeats the one before bit by bit: the camera or its driver is '
                     'stuck, or the image is empty')
         return ''
@@ -301,10 +301,9 @@ _HELD_IMAGES = 4
 class Intake:
     """Receives the messages of camera and IMU, and fills a sequencer; images stay encoded.
 
-    An image is combined with the last CameraInfo. If that is uncalibrated, or none came with the
-    first images, the intrinsics of `parameters` are used, if there are any. Only images with one
-    of the `chosen` stamps are handed over, all for None. Without parameters a stuck gyro is not
-    detected. Not thread-safe: one thread feeds it.
+    An image is combined with the intrinsics of `parameters`, or with the last CameraInfo if these
+    have none. Only images with one of the `chosen` stamps are handed over, all for None. Without
+    parameters a stuck gyro is not detected. Not thread-safe: one thread feeds it.
     """
 
     def __init__(self, sequencer: Sequencer, parameters: Parameters | None = None,
@@ -320,7 +319,6 @@ class Intake:
         self._camera_info: Any = None
         configured = None if parameters is None else parameters.intrinsics
         self._configured = configured if configured is not None and configured.given else None
-        self._use_configured = False
         self._held: list[EncodedImage] = []   # wait for the first CameraInfo
         self._camera = StuckCamera()
         self._gyro = StuckGyro(0.0 if parameters is None else parameters.imu.stuck_gyro_time)
@@ -332,6 +330,8 @@ class Intake:
         intrinsics are active, rather than outdated ones.
         """
         self.images += role is Role.IMAGE
+        if role is Role.CAMERA_INFO and self._configured is not None:
+            return None
         try:
             data = PARTS[role].read(message)
             if role is Role.IMAGE:
@@ -346,34 +346,29 @@ class Intake:
                 self._sequencer.refuse(0, Refusal.BAD_IMAGE, str(error))
                 return None
             if role is Role.CAMERA_INFO:
-                if self._configured is not None and isinstance(error, MissingInputError):
-                    self._use_parameters()
-                    return None
                 self._use(None, str(error))
             return error
         return None
 
+    def waits_for_imu(self) -> bool:
+        """Whether a frame needs samples that have not been received yet."""
+        return self._sequencer.waits_for_imu()
+
     def camera_info_of(self, intrinsics: Intrinsics) -> Any:
         """The last CameraInfo; None if it has other intrinsics."""
-        return None if self._use_configured or intrinsics != self.intrinsics else self._camera_info
+        return self._camera_info if intrinsics == self.intrinsics else None
 
     def finish(self) -> None:
         """End of the input: no image waits for a CameraInfo any longer."""
         if self._held:
-            self._use(None, configured=self._configured is not None)
+            self._use(None)
         self._sequencer.close()
 
-    def _use(self, intrinsics: Intrinsics | None, problem: str = '', *,
-             configured: bool = False) -> None:
-        """Use these intrinsics, or those of the parameters, from the images on that wait."""
+    def _use(self, intrinsics: Intrinsics | None, problem: str = '') -> None:
+        """Use these intrinsics from the images on that wait."""
         self.intrinsics, self.camera_info_problem = intrinsics, problem
-        self._use_configured = configured
         while self._held:
             self._add_frame(self._held.pop(0))
-
-    def _use_parameters(self) -> None:
-        # The intrinsics are determined by the size of the next image.
-        self._use(self.intrinsics if self._use_configured else None, configured=True)
 
     def _add_image(self, image: EncodedImage) -> None:
         if self._chosen is not None:
@@ -382,19 +377,16 @@ class Intake:
                 self._sequencer.pass_over(image.stamp_ns)
                 return
             self.stamps_found.add(image.stamp_ns)
-        if self.intrinsics is not None or self._use_configured or self.camera_info_problem:
+        if self.intrinsics or self._configured or self.camera_info_problem:
             self._add_frame(image)
             return
         self._held.append(image)
         if len(self._held) > _HELD_IMAGES:
-            if self._configured is not None:
-                self._use_parameters()
-            else:
-                self._add_frame(self._held.pop(0))
+            self._add_frame(self._held.pop(0))
 
     def _add_frame(self, image: EncodedImage) -> None:
         try:
-            if self._use_configured and self._configured is not None:
+            if self._configured is not None:
                 size, last = image.size, self.intrinsics
                 if last is None or size != (last.image_width, last.image_height):
                     self.intrinsics = self._configured.of_image(*size)
@@ -407,7 +399,7 @@ class Intake:
                 self.camera_info_problem or 'no CameraInfo came before or with the image')
             return
         # Compared before any image is dropped: after a gap a repeated image would pass as new.
-        problem = self._camera.problem(image)
+        problem = self._camera.problem(image.stamp_ns, image.data)
         if problem:
             self._sequencer.refuse(image.stamp_ns, Refusal.BAD_IMAGE, problem)
         else:

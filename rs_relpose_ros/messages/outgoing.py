@@ -90,9 +90,8 @@ class PairValue(NamedTuple):
     of: Callable[[PairResult], Any]
     field: str = ''
 
-    def text(self, pair: PairResult) -> str:
-        """The value in the message."""
-        value = self.of(pair)
+    def text(self, value: Any) -> str:
+        """The value as in the message."""
         if self.kind is Kind.REAL:
             return number(value)
         if self.kind in (Kind.VECTOR, Kind.REALS):
@@ -125,13 +124,17 @@ class PairValue(NamedTuple):
         return np.array(values)
 
 
-def _of_images(part: Callable[[ImageInformation], ArrayLike]) -> Callable[[PairResult], Any]:
-    def values(pair: PairResult) -> Array | None:
-        if pair.pose.images is None:
-            return None
-        numbers = np.atleast_1d(part(pair.pose.images))
-        return numbers if np.isfinite(numbers).all() else None
-    return values
+def _part(images: ImageInformation | None,
+          of: Callable[[ImageInformation], ArrayLike]) -> Array | None:
+    """Part of the images' estimate; None if it is not known."""
+    if images is None:
+        return None
+    numbers = np.atleast_1d(of(images))
+    return numbers if np.isfinite(numbers).all() else None
+
+
+def _image_value(key: str, of: Callable[[ImageInformation], ArrayLike]) -> PairValue:
+    return PairValue(key, Kind.REALS, lambda pair: _part(pair.pose.images, of))
 
 
 # `TOPICS_KEY` follows: the other topics of the pair.
@@ -153,14 +156,14 @@ PAIR_VALUES = {value.key: value for value in (
     PairValue('reference_imu_ns', Kind.TIME, lambda pair: pair.reference_ns1, 'reference_imu_ns'),
     PairValue('current_imu_ns', Kind.TIME, lambda pair: pair.reference_ns2, 'current_imu_ns'),
     # `ImageInformation`: the estimate of the images without the priors of the IMU.
-    PairValue('image_row_s', Kind.REALS, _of_images(lambda images: images.row_time)),
-    PairValue('image_rotation_xyzw', Kind.REALS,
-              _of_images(lambda images: Rotation.from_matrix(images.R).as_quat())),
-    PairValue('image_direction', Kind.REALS, _of_images(lambda images: images.t)),
-    PairValue('image_velocities', Kind.REALS, _of_images(lambda images: images.velocities)),
-    PairValue('image_gradient', Kind.REALS, _of_images(lambda images: images.gradient)),
-    PairValue('image_information', Kind.REALS, _of_images(
-        lambda images: images.information[np.triu_indices(len(images.gradient))])),
+    _image_value('image_row_s', lambda images: images.row_time),
+    _image_value('image_rotation_xyzw',
+                 lambda images: Rotation.from_matrix(images.R).as_quat()),
+    _image_value('image_direction', lambda images: images.t),
+    _image_value('image_velocities', lambda images: images.velocities),
+    _image_value('image_gradient', lambda images: images.gradient),
+    _image_value('image_information',
+                 lambda images: images.information[np.triu_indices(len(images.gradient))]),
     PairValue('gyro_bias_rad_s', Kind.VECTOR, lambda pair: pair.gyro_bias, 'gyro_bias'),
     PairValue('health', Kind.TEXT, lambda pair: pair.health.state.value, 'health'),
     PairValue('health_findings', Kind.TEXT, lambda pair: pair.health.text),
@@ -191,7 +194,7 @@ def pair_messages(result: PairResult, types: MessageTypes,
             angular_velocity_covariance=published_covariance(pose.velocity_covariance[3:, 3:]),
             orientation=quat_xyzw(pose.R),
             orientation_covariance=published_covariance(pose.covariance[3:, 3:]))
-    values = [(value.key, value.text(result)) for value in PAIR_VALUES.values()]
+    values = [(value.key, value.text(value.of(result))) for value in PAIR_VALUES.values()]
     values.append((TOPICS_KEY, ' '.join(messages)))
     text = f'{pose.status.value}: {pose.reason}' if pose.reason else pose.status.value
     if result.health.state is FindingState.WRONG:
@@ -223,12 +226,11 @@ def _pose_messages(result: PairResult, reference_frame: str,
         'velocity': types('geometry_msgs/msg/TwistWithCovarianceStamped')(
             header=in_camera, twist=twist_message(pose.linear_velocity2, pose.angular_velocity2,
                                                   pose.velocity_covariance, types)),
-        'matches': _matches_message(result, in_reference, types)}
+        'matches': _matches_message(inlier_records(result), in_reference, types)}
 
 
-def _matches_message(result: PairResult, in_reference: Any, types: MessageTypes) -> Any:
+def _matches_message(points: NDArray[np.void], in_reference: Any, types: MessageTypes) -> Any:
     """sensor_msgs/PointCloud2 of `inlier_records`, with landmarks in the frame of the header."""
-    points = inlier_records(result)
     field_type = types('sensor_msgs/msg/PointField')
     fields = [field_type(name=name, offset=offset, datatype=datatype, count=1)
               for name, offset, datatype in MATCH_FIELDS]

@@ -14,6 +14,7 @@ from typing import NamedTuple, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.calibrate.stored import Progress
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.messages.incoming import MOST_REASONS, reason_key, Role
@@ -200,12 +201,12 @@ class FrameStatistics(ABC):
             self._last_failure = reason
 
     def report(self, inputs: Counter[str], counts: SequencerCounts | None, *, problem: str,
-               missing: tuple[str, ...]) -> Report:
+               missing: tuple[str, ...], progress: Progress | None = None) -> Report:
         """The state since the last report.
 
         `inputs` are the numbers of messages so far, by role, and of the invalid ones. `counts` is
         None while no frame is processed; `problem` is the reason for that, or empty; `missing` are
-        names of missing parameters and inputs.
+        names of missing parameters and inputs; `progress` is that of a calibration.
         """
         now_ns = self._clock()
         with self._lock:
@@ -214,11 +215,15 @@ class FrameStatistics(ABC):
             refused = Counter({} if counts is None else counts.refused)
             dropped, self._refused = refused - self._refused, refused
             busy, self._busy_ns = self._busy_ns / NANOSECONDS / elapsed, 0
-            level, text = self._evaluate(problem, dropped)
+            level, text = (self._evaluate(problem, dropped) if progress is None
+                           else (OK, progress.text))
             values: dict[str, object] = {
                 'state': self.idle if problem else {
                     OK: 'ok', WARN: 'degraded', ERROR: self.wrong}[level],
                 'missing': ', '.join(missing)}
+            if progress is not None:
+                values.update(state='calibrating', progress=f'{100.0 * progress.share:.0f}',
+                              **progress.values)
             for role in TOPICS:
                 rate = (inputs[role] - before[role]) / elapsed
                 values[f'{role.value}_rate_hz'] = f'{rate:.1f}'

@@ -71,6 +71,7 @@ class GlobalShutterNode(SensorNode):
     """Publishes each derotated image with a CameraInfo of the same stamp."""
 
     task = 'global shutter'
+    calibrates = False   # relpose_node does, from the same images
 
     def __init__(self) -> None:
         self._statistics = _Statistics()

@@ -8,7 +8,7 @@ import functools
 from functools import partial
 import importlib
 import time
-from typing import Any
+from typing import Any, Protocol
 
 from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
@@ -20,9 +20,10 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import deserialize_message
 
-from rs_relpose_ros.errors import MissingInputError
+from rs_relpose_ros.errors import MissingInputError, RsRelposeError
+from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.timing import NANOSECONDS
-from rs_relpose_ros.messages.incoming import Intake, PARTS, Role
+from rs_relpose_ros.messages.incoming import PARTS, Role
 from rs_relpose_ros.nodes.diagnostics import INVALID, SILENCE, TOPICS
 
 # -- Subscriptions that are read on demand --------------------------------------------------------
@@ -135,24 +136,38 @@ _IMAGE_DEPTH = 15
 # Queue of some seconds of samples, so that none is lost while the process is stalled.
 _IMU_DEPTH = 2000
 # Messages published earlier are sent to reliable subscriptions only.
-_LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                       durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # Period [s] at which IMU and CameraInfo are read without an image.
 _DRAIN_PERIOD = 0.1
+
+
+class Receiver(Protocol):
+    """Takes the messages: `Intake`, or `LiveCalibration` before it."""
+
+    @property
+    def intrinsics(self) -> Intrinsics | None:
+        """Those of the last CameraInfo."""
+
+    def waits_for_imu(self) -> bool:
+        """Whether a frame needs samples that have not been read yet."""
+
+    def receive(self, role: Role, message: Any) -> RsRelposeError | None:
+        """Hand a message over; the error of an unusable one."""
 
 
 class SensorInputs:
     """Subscriptions to the topics of camera and IMU; passes messages to the intake.
 
     `topics` are the resolved names by role, `image_bytes` is the size of the last image.
-    `waits_for_imu`: whether a frame needs samples that have not been read yet. `on_invalid` gets
-    the reason why a message is unusable. Silence is measured in real time, also if /clock does
-    not advance.
+    `on_invalid` gets the reason why a message is unusable. Silence is measured in real time, also
+    if /clock does not advance.
     """
 
-    def __init__(self, node: Node, intake: Intake, waits_for_imu: Callable[[], bool],
-                 image_transport: str, on_invalid: Callable[[str], None]) -> None:
+    def __init__(self, node: Node, intake: Receiver, image_transport: str,
+                 on_invalid: Callable[[str], None]) -> None:
         self._intake, self._on_invalid = intake, on_invalid
+        self._info: Any = None   # the last CameraInfo
         self._started_ns = time.monotonic_ns()
         self.counts: Counter[str] = Counter()   # of messages by role, and of the `INVALID` ones
         self._last_ns: dict[Role, int] = {}
@@ -167,7 +182,7 @@ class SensorInputs:
         self._info_type = types[Role.CAMERA_INFO]
 
         def missing_info() -> bool:
-            return intake.intrinsics is None
+            return self._intake.intrinsics is None
 
         self._camera_info = PolledSubscription(
             node, self._info_type, Role.CAMERA_INFO.value, best_effort(_IMAGE_DEPTH),
@@ -176,18 +191,25 @@ class SensorInputs:
         # A message that a driver published once, before this node started: only a subscription of
         # the same durability gets it, which most drivers do not match, and need not.
         self._latched = PolledSubscription(
-            node, self._info_type, Role.CAMERA_INFO.value, _LATCHED,
+            node, self._info_type, Role.CAMERA_INFO.value, LATCHED,
             partial(self._on_info, latched=True), missing_info, raw=True,
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
         self._imu = [PolledSubscription(
             node, types[role], role.value, best_effort(_IMU_DEPTH),
-            partial(self._on_sample, role), waits_for_imu, qos_overriding_options=overridable())
+            partial(self._on_sample, role), lambda: self._intake.waits_for_imu(),
+            qos_overriding_options=overridable())
             for role in (Role.IMU, Role.ACCEL)]
         node.create_subscription(
             types[Role.IMAGE], self.topics[Role.IMAGE], self._on_image,
             best_effort(_IMAGE_DEPTH), qos_overriding_options=overridable())
         node.create_timer(_DRAIN_PERIOD, self._drain,
                           clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def hand_to(self, intake: Receiver) -> None:
+        """Messages go to another receiver from here on, the last CameraInfo first."""
+        self._intake = intake
+        if self._info is not None:
+            self._receive(Role.CAMERA_INFO, self._info)
 
     def silent(self, role: Role, seconds: float = SILENCE) -> bool:
         """Whether no message has come for this time."""
@@ -209,7 +231,8 @@ class SensorInputs:
             self._count(Role.CAMERA_INFO)
         if data[_STAMPED:] != self._last_info:
             self._last_info = data[_STAMPED:]
-            self._receive(Role.CAMERA_INFO, deserialize_message(data, self._info_type))
+            self._info = deserialize_message(data, self._info_type)
+            self._receive(Role.CAMERA_INFO, self._info)
 
     def _on_sample(self, role: Role, message: Any) -> None:
         self._count(role)

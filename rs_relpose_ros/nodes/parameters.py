@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import array
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 import sys
 from typing import Any
@@ -35,15 +35,31 @@ class NodeParameters:
     """
 
     def __init__(self, node: Node, on_change: Callable[[Parameters], None]) -> None:
-        self._on_change = on_change
+        self._node, self._on_change = node, on_change
         values = {}
         for name, default, declared in Parameters.declarations():
             value = _declare(node, name, default, declared)
             if value is not None:
                 values[name] = value
         self.current = Parameters.from_mapping(values)
+        # Those of the user, which a calibration does not replace.
+        self._given = set(self.current.given())
+        self._adopting = False
         node.add_on_set_parameters_callback(self._validate)
         node.add_post_set_parameters_callback(self._apply)
+
+    def adopt(self, values: Mapping[str, Any]) -> None:
+        """Set the live ones among `values` that the user has not given; InputError if illegal."""
+        live = {name for name, _, declared in Parameters.declarations() if declared.live}
+        new = [Parameter(name, value=list(value) if isinstance(value, tuple) else value)
+               for name, value in values.items() if name in live - self._given]
+        self._adopting = True
+        try:
+            result = self._node.set_parameters_atomically(new)
+        finally:
+            self._adopting = False
+        if not result.successful:
+            raise InputError(f'the calibration cannot be used: {result.reason}')
 
     def _validate(self, parameters: list[Parameter]) -> SetParametersResult:
         """Whether the new values are legal; without side effects, as others may refuse them."""
@@ -56,6 +72,7 @@ class NodeParameters:
     def _apply(self, parameters: list[Parameter]) -> None:
         changed = self._known(parameters)
         if changed:
+            self._given |= set() if self._adopting else set(changed)
             self.current = self.current.updated(changed)
             self._on_change(self.current)
 

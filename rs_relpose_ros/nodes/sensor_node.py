@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 import traceback
-from typing import Any, ClassVar, NoReturn, TextIO
+from typing import Any, ClassVar, NoReturn, TextIO, TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticArray
 import rclpy
@@ -23,20 +23,27 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from rs_relpose_ros.calibrate import stored
+from rs_relpose_ros.calibrate.stored import Calibrated, Progress
+from rs_relpose_ros.config.files import text_values
 from rs_relpose_ros.config.settings import Parameters
-from rs_relpose_ros.errors import RsRelposeError
+from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.messages.incoming import Intake, PARTS, Role
 from rs_relpose_ros.nodes import diagnostics
 from rs_relpose_ros.nodes import parameters as ros_parameters
 from rs_relpose_ros.nodes.diagnostics import PATIENCE, ReasonLog, SILENCE
-from rs_relpose_ros.nodes.inputs import message_class, SensorInputs, SHUT_DOWN
+from rs_relpose_ros.nodes.inputs import LATCHED, message_class, SensorInputs, SHUT_DOWN
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrameFailed, FrameLoop, Outcome
 from rs_relpose_ros.pipeline.sequencer import FrameRefused, Refusal
+
+if TYPE_CHECKING:
+    from rs_relpose_ros.calibrate.live import LiveCalibration
 
 # -- A node as a process --------------------------------------------------------------------------
 
@@ -142,8 +149,8 @@ class Worker(threading.Thread):
     `warm` is not set; then the thread ends.
     """
 
-    def __init__(self, loop: FrameLoop[Any], warm_up: Callable[[], object],
-                 consume: Callable[[Outcome[Any]], object]) -> None:
+    def __init__(self, loop: FrameLoop[Any] | LiveCalibration, warm_up: Callable[[], object],
+                 consume: Callable[[Any], object]) -> None:
         # A daemon: a thread that compiles cannot be stopped, and must not delay the exit.
         super().__init__(name='frame_worker', daemon=True)
         self.warm = threading.Event()   # the kernels are compiled or loaded
@@ -155,7 +162,7 @@ class Worker(threading.Thread):
     def stop(self, timeout: float) -> bool:
         """End the thread and wait for it; whether it ended in time."""
         self._stopping.set()
-        self._loop.sequencer.close()
+        self._loop.close()
         self.join(timeout)
         return not self.is_alive()
 
@@ -168,11 +175,10 @@ class Worker(threading.Thread):
             return
         self.warm.set()
         while not self._stopping.is_set():
-            outcome = self._loop.step(_STEP_TIMEOUT)
-            if outcome is None:
-                continue
             try:
-                self._consume(outcome)
+                outcome = self._loop.step(_STEP_TIMEOUT)
+                if outcome is not None:
+                    self._consume(outcome)
             except Exception as error:  # noqa: BLE001 - logged with its traceback by the node
                 self._consume(FrameFailed(None, error))
 
@@ -185,14 +191,21 @@ _JOIN_TIMEOUT = 0.4
 _REPORT_COMPILING = 4.0
 
 
+def _camera(parameters: Parameters) -> list[Any]:
+    """The parameters with a change of which a node begins again."""
+    values = parameters.to_mapping()
+    return [values[name] for name, _, declared in Parameters.declarations() if declared.restarts]
+
+
 class SensorNode(StoppableNode):
     """A node that works on the frames of a camera with an IMU; its states: docs/architecture.md.
 
     Callbacks convert little and fill the sequencer; one worker thread does the rest.
     """
 
-    # Name of the work on `/diagnostics`.
+    # Name of the work on `/diagnostics`; whether the node calibrates, or waits for another's.
     task: ClassVar[str]
+    calibrates: ClassVar[bool] = True
 
     def __init__(self, name: str, statistics: diagnostics.FrameStatistics) -> None:
         super().__init__(name)
@@ -208,11 +221,15 @@ class SensorNode(StoppableNode):
             self._open_outputs(self._settings.current)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_service(Trigger, '~/reset', self._reset)
-        self._cannot_start = self._why_it_cannot_start()
-        if self._cannot_start:
-            self._error(self._cannot_start)
+        self._found: Calibrated | None = None   # to be used by the executor's thread
+        self._calibrated: Calibrated | None = None   # in use
+        if self.calibrates:
+            self._published = self.create_publisher(String, '~/calibration', LATCHED)
+            self.create_service(Trigger, '~/calibrate', self._calibrate_now)
+            self.create_service(Trigger, '~/save_calibration', self._save_now)
         else:
-            self._start()
+            self.create_subscription(String, 'calibration', self._on_calibration, LATCHED)
+        self._begin(self._settings.current.calibration.calibrate_at_start == 'always')
         self.create_timer(1.0, self._report, clock=self._steady)
 
     @abstractmethod
@@ -238,38 +255,62 @@ class SensorNode(StoppableNode):
 
     def _why_it_cannot_start(self) -> str:
         """The fault of parameters or topics; empty for none."""
-        idle, missing = self._frame_statistics.idle, self._settings.current.sensor.missing()
-        if missing:
-            return (f'{idle}: {" and ".join(missing)} must be given as parameter: see '
-                    'config/relpose.yaml, and start again')
+        parameters, idle = self._settings.current, self._frame_statistics.idle
+        missing = parameters.sensor.missing()
+        if missing and parameters.calibration.calibrate_at_start == 'never':
+            return (f'{idle}: {" and ".join(missing)} must be given as parameter, or allow '
+                    'calibrate_at_start: missing')
         topic = self.resolve_topic_name('image')
         if 'image_rect' in topic:
             return (f'{idle}: {topic} is a rectified image, whose rows have no single '
                     'timestamp; remap image to the raw one')
         return ''
 
-    def _start(self) -> None:
-        parameters = self._settings.current
-        self._loop = self._make_loop(parameters)
-        self._intake = Intake(self._loop.sequencer, parameters)
-        self._worker = Worker(self._loop, self._warm_up, self._consume)
+    def _begin(self, calibrate: bool = False) -> None:
+        """Estimate with the current parameters from here on, or calibrate before."""
+        self.stop()
+        self._active = parameters = self._settings.current
+        self._calibration: LiveCalibration | None = None
+        self._progress: Progress | None = None
+        self._loop = None
+        self._cannot_start = self._why_it_cannot_start()
+        if self._cannot_start:
+            self._error(self._cannot_start)
+            return
+        if calibrate or parameters.sensor.missing():
+            # Imported where it is needed: a start with a calibration is faster by it.
+            from rs_relpose_ros.calibrate.live import LiveCalibration
+            self._intake: Any = LiveCalibration(parameters, use_stored=not calibrate
+                                                and parameters.calibration.load_calibration,
+                                                fits=self.calibrates)
+            self._calibration = self._intake
+            self._progress = Progress('calibrating: waiting for images and gyro')
+            self._worker = Worker(self._intake, lambda: None, self._consume_calibration)
+        else:
+            self._loop = self._make_loop(parameters)
+            self._intake = Intake(self._loop.sequencer, parameters)
+            self._worker = Worker(self._loop, self._warm_up, self._consume)
         self._worker.start()
         self._started_ns = time.monotonic_ns()
         # No subscription before the kernels are loaded: the first frames would be dropped.
         self._warm_timer = self.create_timer(0.02, self._subscribe_when_warm, clock=self._steady)
 
     def _subscribe_when_warm(self) -> None:
-        assert self._worker is not None and self._loop is not None
+        assert self._worker is not None
         if not self._worker.warm.is_set():
             if time.monotonic_ns() - self._started_ns > _REPORT_COMPILING * NANOSECONDS:
                 self._info('compiling kernels, as the build has none for this machine: this start '
                            'takes a minute or two, later ones some seconds')
             return
         self.destroy_timer(self._warm_timer)
+        if self._inputs is not None:
+            self._inputs.hand_to(self._intake)
+            self._frame_statistics.start()
+            self._log_ready(self._inputs)
+            return
         with ros_parameters.legal_qos():
-            inputs = SensorInputs(
-                self, self._intake, self._loop.sequencer.waits_for_imu,
-                self._settings.current.pair.image_transport, self._error)
+            inputs = SensorInputs(self, self._intake,
+                                  self._settings.current.pair.image_transport, self._error)
         for warning in ros_parameters.unknown_qos_overrides(self):
             self._warn(warning)
         # Objects that exist by now are permanent: the garbage collector need not scan them.
@@ -278,8 +319,12 @@ class SensorNode(StoppableNode):
         self._inputs = inputs
         self._frame_statistics.start()
         self._on_ready()
+        self._log_ready(inputs)
+
+    def _log_ready(self, inputs: SensorInputs) -> None:
         image, camera_info, imu, _ = inputs.topics.values()
-        self.get_logger().info(f'ready: {image}, {camera_info} and {imu}')
+        state = 'ready' if self._calibration is None else 'waiting for the first image'
+        self.get_logger().info(f'{state}: {image}, {camera_info} and {imu}')
 
     def stop(self) -> bool:
         """End the worker; whether it ended. Called before `destroy_node`."""
@@ -295,8 +340,73 @@ class SensorNode(StoppableNode):
         return response
 
     def _on_parameters(self, parameters: Parameters) -> None:
-        if self._loop is not None:
+        if _camera(parameters) != _camera(self._active):
+            self._begin()
+        elif self._loop is not None:
             self._loop.parameters = parameters
+
+    # -- calibration -------------------------------------------------------------------------
+
+    def _consume_calibration(
+            self, outcome: Progress | Calibrated | RsRelposeError | FrameFailed) -> None:
+        """By the worker; a calibration is used by `_report`, in the executor's thread."""
+        if isinstance(outcome, FrameFailed):
+            self._consume(outcome)
+        elif isinstance(outcome, RsRelposeError):
+            self._warn(str(outcome))
+        elif isinstance(outcome, Progress):
+            self._info(outcome.text)
+            self._progress = outcome
+        else:
+            self._found = outcome
+
+    def _use_calibration(self, found: Calibrated) -> None:
+        """Store and publish a calibration, and estimate with it."""
+        self._calibrated, config = found, self._settings.current.calibration
+        self._info(found.summary)
+        path = stored.path_of(config, found.camera)
+        try:
+            if found.new and config.save_calibration:
+                stored.save(path, found.camera, found.parameters)
+                self._info(f'the calibration is stored in {path}')
+        except InputError as error:
+            self._error(str(error))
+        if self.calibrates:
+            self._published.publish(String(data=found.parameters))
+        self._adopt(found.parameters, str(path))
+        if self._calibration is not None:   # nothing in it was new
+            self._begin()
+
+    def _adopt(self, parameters: str, source: str) -> None:
+        try:
+            self._settings.adopt(text_values(parameters, source))
+        except InputError as error:
+            self._error(str(error))
+
+    def _on_calibration(self, message: String) -> None:
+        self._info('using the calibration of relpose_node')
+        self._adopt(message.data, 'calibration')
+
+    def _calibrate_now(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Calibrate from here on; values that the user has given stay."""
+        self._begin(calibrate=True)
+        response.success, response.message = not self._cannot_start, (
+            self._cannot_start or 'calibrating: rotate the camera about all three axes')
+        return response
+
+    def _save_now(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Store the calibration that is used."""
+        found = self._calibrated
+        if found is None:
+            response.message = 'there is no calibration yet: call ~/calibrate'
+            return response
+        try:
+            path = stored.path_of(self._settings.current.calibration, found.camera)
+            stored.save(path, found.camera, found.parameters)
+            response.success, response.message = True, f'stored in {path}'
+        except InputError as error:
+            response.message = str(error)
+        return response
 
     # -- outcomes of frames (in the worker thread) ---------------------------------------------
 
@@ -341,11 +451,14 @@ class SensorNode(StoppableNode):
     # -- diagnostics -------------------------------------------------------------------------
 
     def _report(self) -> None:
+        found, self._found = self._found, None
+        if found is not None:
+            self._use_calibration(found)
         problem, missing = self._problem()
         counts: Counter[str] = Counter() if self._inputs is None else self._inputs.counts.copy()
         report = self._frame_statistics.report(
             counts, None if self._loop is None else self._loop.sequencer.counts(),
-            problem=problem, missing=missing)
+            problem=problem, missing=missing, progress=self._progress)
         status = outgoing.status_message(
             report.level, f'{self.get_fully_qualified_name()}: {self.task}', report.text,
             self._image_topic(), report.values, message_class)
@@ -392,9 +505,11 @@ class SensorNode(StoppableNode):
         if self._cannot_start:
             return self._cannot_start, tuple(self._settings.current.sensor.missing())
         assert self._worker is not None
+        if self._progress is not None:
+            return self._progress.text, tuple(self._settings.current.sensor.missing())
         if not self._worker.is_alive():
             return f'{self._frame_statistics.idle}: the worker ended, see the log', ()
-        if self._inputs is None:
+        if self._inputs is None or not self._worker.warm.is_set():
             return 'starting: kernels are compiled or loaded', ()
         return self._missing_input(self._inputs)
 
@@ -409,7 +524,6 @@ class SensorNode(StoppableNode):
         # Without any image the driver is probably not running: a status, but no log line.
         if image in missing:
             return f'{idle}: no image on {image} for {SILENCE:g} s', missing
-        # Configured intrinsics are used once some images have waited for a CameraInfo in vain.
         configured = self._settings.current.intrinsics.given
         if self._intake.intrinsics is None and camera_info in missing and not configured:
             text = (f'{idle}: no CameraInfo on {camera_info}; remap camera_info to the '

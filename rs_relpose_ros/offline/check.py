@@ -118,7 +118,7 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
     first, or if the front end fails on them. InputError if the bag is damaged.
     """
     images = chosen.image.count if chosen.image else 0
-    scan = Scan(images, parameters.intrinsics, no_camera_info=chosen.camera_info is None)
+    scan = Scan(images, parameters.intrinsics)
     completion, sample, topics = Completion(parameters, None, ''), None, None
     if chosen.image is not None and chosen.imu is not None:
         topics = SensorTopics(chosen.image, chosen.camera_info, chosen.imu, chosen.accel, None)

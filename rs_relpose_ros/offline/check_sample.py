@@ -71,6 +71,10 @@ def _calibrated(bag: Bag, topics: SensorTopics, parameters: Parameters) -> Calib
         bag, topics, TrackingConfig(detector=tracking.detector,
                                     feature_rows=tracking.feature_rows),
         images=range(first, first + min(images, _CALIBRATED_IMAGES)))
+    if parameters.intrinsics.given:
+        size = recording.camera.width, recording.camera.height
+        recording = replace(recording, focal_known=True, camera=parameters.intrinsics.of_image(
+            *size).global_shutter_camera())
     return calibrate(recording.tracks, recording.gyro, recording.camera,
                      focal_known=recording.focal_known, config=TRACKED_IN_IMAGES)
 

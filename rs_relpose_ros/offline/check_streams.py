@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.bags.reader import BagMessage, Topic
 from rs_relpose_ros.config.settings import ImuConfig, IntrinsicsConfig
-from rs_relpose_ros.errors import MissingInputError, RsRelposeError
+from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.imu.buffer import ImuSample, Vector
 from rs_relpose_ros.imu.filters import BiasTracker, GyroBias
@@ -149,13 +149,12 @@ class Chosen(NamedTuple):
 class Scan:
     """Statistics of all streams; `images` is the number of images to come.
 
-    `configured`: intrinsics of a camera whose CameraInfo has none.
+    `configured`: intrinsics in place of the CameraInfo's, if there are any.
     """
 
-    def __init__(self, images: int, configured: IntrinsicsConfig, no_camera_info: bool) -> None:
+    def __init__(self, images: int, configured: IntrinsicsConfig) -> None:
         self._configured = configured
-        # Whether the intrinsics are those of the parameters: there is no calibrated CameraInfo.
-        self.by_parameters = no_camera_info and configured.given
+        self.by_parameters = configured.given
         self._every = max(images // _DECODED, 1)
         self.image_stamps, self.imu_stamps, self.inertial = Stamps(), Stamps(), Inertial()
         self.encodings: Counter[str] = Counter()             # images by encoding or format
@@ -171,8 +170,6 @@ class Scan:
         try:
             self._take(role, PARTS[role].read(message.message), message.bag_time_ns)
         except RsRelposeError as error:
-            if role is Role.CAMERA_INFO and isinstance(error, MissingInputError):
-                self.by_parameters = self._configured.given
             self.bad_images += role is Role.IMAGE
             self.bad_imu += role in (Role.IMU, Role.ACCEL)
             self.problems.setdefault(Role.IMU if role is Role.ACCEL else role, str(error))
@@ -181,8 +178,9 @@ class Scan:
         if role is Role.IMAGE:
             self._add_image(data, recorded_ns)
         elif role is Role.CAMERA_INFO:
-            self.calibrations += data != self.intrinsics
-            self.intrinsics, self.by_parameters = data, False
+            if not self.by_parameters:
+                self.calibrations += data != self.intrinsics
+                self.intrinsics = data
         else:
             if role is Role.IMU:
                 self.imu_stamps.add(data.stamp_ns, recorded_ns)

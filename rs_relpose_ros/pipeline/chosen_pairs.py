@@ -90,13 +90,13 @@ def estimate_wide_pair(first: Frame[Any], second: Frame[Any], parameters: Parame
                                 else tracking)
     tracker.start(first.image)
     gyro = _gyro(first, second, parameters)
-    inertial, interval = pair.inertial_of(first, second, gyro, second.imu, parameters), None
-    if pair.interval_of(first, second) <= parameters.keyframes.max_keyframe_interval:
-        interval = pair.interval_of(first, second)
-    elif not isinstance(inertial, str):
+    inertial = pair.inertial_of(first.imu, second.imu, gyro, second.imu, parameters)
+    interval = pair.interval_of(first.imu, second.imu)
+    near = interval <= parameters.keyframes.max_keyframe_interval
+    if not near and not isinstance(inertial, str):
         inertial = 'the frames are further apart than max_keyframe_interval'
     history = TrackHistory(first.imu)
-    if gyro is not None and interval is not None:
+    if gyro is not None and near:
         for frame in used_frames(between):
             if (rotation := _gyro(first, frame, parameters)) is not None:
                 history.add(frame.imu, rotation, tracker.track(frame.image))
@@ -104,7 +104,8 @@ def estimate_wide_pair(first: Frame[Any], second: Frame[Any], parameters: Parame
     if gyro is not None:
         history.add(second.imu, gyro, matches)
     pose = pair.estimate_pair(
-        first, second, matches, sensor, gyro, inertial, parameters, interval=interval,
+        first, second, matches, sensor, gyro, inertial, parameters,
+        interval=interval if near else None,
         between=() if gyro is None else history.between(matches, sensor, second.imu, inertial))
     rays1, rays2 = (
         pair.DerotatedRays.from_points(matches.track_ids, points, sensor, frame.imu.motion)
@@ -127,8 +128,8 @@ Stamps = tuple[int, int]
 class ChosenPairs(Processor[dict[Stamps, PairResult | str]]):
     """Estimates the `wanted` pairs: results by their stamps, or the reasons for none.
 
-    Frames are kept until the last of their pairs, those after them for `max_keyframe_interval`, and
-    the IMU data of all frames since the oldest of them.
+    Frames are kept until the last of their pairs, those after them for `max_keyframe_interval`,
+    and the IMU data of all frames since the oldest of them.
     """
 
     def __init__(self, wanted: Collection[Stamps]) -> None:
@@ -158,8 +159,8 @@ class ChosenPairs(Processor[dict[Stamps, PairResult | str]]):
                         if self._last.get(stamp_ns, 0) > current_ns}
         oldest_ns = min(self._frames, default=current_ns)
         longest_ns = to_nanoseconds(parameters.keyframes.max_keyframe_interval)
-        first_ns = min((stamp_ns for stamp_ns in self._frames if stamp_ns > current_ns - longest_ns),
-                       default=current_ns)
+        first_ns = min((stamp_ns for stamp_ns in self._frames
+                        if stamp_ns > current_ns - longest_ns), default=current_ns)
         self._recent = {stamp_ns: one for stamp_ns, one in
                         (*self._recent.items(), (current_ns, frame)) if stamp_ns > first_ns}
         self._imus = {stamp_ns: one for stamp_ns, one in self._imus.items()

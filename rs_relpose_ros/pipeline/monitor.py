@@ -13,6 +13,7 @@ from scipy.linalg import solve_triangular
 from rs_relpose_ros.config.settings import SensorConfig
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.estimator.velocity import InertialEvidence
+from rs_relpose_ros.geometry.so3 import norm, tangent_basis
 from rs_relpose_ros.pipeline import assessment, findings, recursion
 from rs_relpose_ros.pipeline.assessment import Configured, Effect, Inconsistency
 from rs_relpose_ros.pipeline.findings import Assessment, BIAS, DEVIATIONS, OFFSET, READOUT
@@ -25,6 +26,9 @@ Array = NDArray[np.float64]
 _EFFECTS = 30
 # Largest deviations about which a pair is linearised: lens and readout must stay possible.
 _LARGEST = np.array([0.5] * 3 + [0.06, 0.1] + [0.2] * 3 + [0.3, 0.45, 0.6])
+# Pairs whose agreement is remembered, pairs as which the prior counts (covariances are right),
+# and the largest chi-square of a pair, per degree of freedom.
+_REMEMBERED, _PRIOR_PAIRS, _LARGEST_DISAGREEMENT = 20.0, 10.0, 20.0
 
 
 class ConsistencyMonitor:
@@ -37,6 +41,7 @@ class ConsistencyMonitor:
         self.rotations = RotationSums()
         self._recursion = Recursion()
         self.acceleration = AccelerationSums()
+        self.agreement = Agreement()
         self._on_poses: deque[Effect] = deque(maxlen=_EFFECTS)
         self._on_rotations: deque[Effect] = deque(maxlen=_EFFECTS)
         self.latest: recursion.PairInformation | None = None   # of the last pair
@@ -123,6 +128,64 @@ def _effect(information: recursion.PairInformation, pose: RelativePose) -> Effec
         shift = information.shift_by_deviation
     return Effect(shift, solve_triangular(
         np.linalg.cholesky(claimed), information.pose_by_deviation[rows], lower=True))
+
+
+# -- Errors that all tracks of a pair share ------------------------------------------------------
+
+class Agreement:
+    """How far consecutive pairs agree about the direction of motion at the keyframe they share.
+
+    Errors that all tracks of a pair share (stamps, exposure, small errors of the calibration,
+    tilt) are not in its residuals, but in this difference. Of the pairs so far it gives a factor
+    for the covariances of those with frames between; two views give no velocity without priors.
+    """
+
+    def __init__(self) -> None:
+        self._last: tuple[int, RelativePose] | None = None   # with its second stamp
+        self._squares = self._freedom = 0.0
+
+    def enlarged(self, first_ns: int, second_ns: int, estimated: RelativePose,
+                 assessed: RelativePose) -> RelativePose:
+        """Add a pair as estimated; the assessed pose with its covariance enlarged accordingly.
+
+        `first_ns`, `second_ns`: stamps of its keyframes. The factor is never below 1.
+        """
+        before, self._last = self._last, None
+        if not (estimated and np.isfinite(estimated.linear_velocity1_covariance).all()):
+            return assessed
+        self._last = second_ns, estimated
+        if before is not None and before[0] == first_ns:
+            kept = 1.0 - 1.0 / _REMEMBERED
+            self._squares = kept * self._squares + min(2.0 * _LARGEST_DISAGREEMENT,
+                                                       _disagreement(before[1], estimated))
+            self._freedom = kept * self._freedom + 2.0
+        prior = 2.0 * _PRIOR_PAIRS
+        # The second factor: of a rotation that contradicts the gyro, as with two views.
+        factor = max((prior + self._squares) / (prior + self._freedom), 1.0) * max(
+            (1.0 + estimated.gyro_square) / 4.0, 1.0)
+        if factor == 1.0:
+            return assessed
+        velocities = assessed.velocity_covariance.copy()
+        velocities[:3, :3] *= factor
+        # Deviations that the monitor has not excluded would be in the disagreement, too: the
+        # larger of both in each direction. Along t neither has a variance.
+        along = np.pad(np.outer(estimated.t, estimated.t), (0, 3))
+        root = np.linalg.cholesky(factor * estimated.covariance + along)
+        half = solve_triangular(root, assessed.covariance + along, lower=True)
+        values, vectors = np.linalg.eigh(solve_triangular(root, half.T, lower=True))
+        axes = root @ vectors
+        return replace(assessed, velocity_covariance=velocities, covariance=(
+            axes * np.maximum(values, 1.0)) @ axes.T - along)
+
+
+def _disagreement(before: RelativePose, after: RelativePose) -> float:
+    """Chi-square (2 degrees of freedom) of the directions of motion at the shared keyframe."""
+    lengths = [norm(before.linear_velocity2), norm(after.linear_velocity1)]
+    across = tangent_basis(before.linear_velocity2 / lengths[0])
+    apart = across.T @ after.linear_velocity1 / lengths[1]
+    spread = (before.velocity_covariance[:3, :3] / lengths[0]**2
+              + after.linear_velocity1_covariance / lengths[1]**2)
+    return float(apart @ np.linalg.solve(across.T @ spread @ across, apart))
 
 
 # -- Tracked parameters, applied in small steps ---------------------------------------------

@@ -255,9 +255,9 @@ class GyroRotation:
             segment.stamps_ns, segment.angular_velocities, config, segment.bias_sigma), segment)
 
 
-def interval_of(first: Frame[Any], second: Frame[Any]) -> float:
+def interval_of(first: FrameImu, second: FrameImu) -> float:
     """Seconds between the stamped rows of two frames."""
-    return seconds_between(first.imu.reference_ns, second.imu.reference_ns)
+    return seconds_between(first.reference_ns, second.reference_ns)
 
 
 def joined(before: FrameImu, imu: FrameImu) -> FrameImu:
@@ -272,7 +272,7 @@ def joined(before: FrameImu, imu: FrameImu) -> FrameImu:
                    force=force)
 
 
-def inertial_of(first: Frame[Any], second: Frame[Any], gyro: GyroRotation | None, since: FrameImu,
+def inertial_of(first: FrameImu, second: FrameImu, gyro: GyroRotation | None, since: FrameImu,
                 parameters: Parameters) -> InertialMotion | str:
     """Motion of a pair by the accelerometer, or the reason why it is not known.
 
@@ -287,8 +287,8 @@ def inertial_of(first: Frame[Any], second: Frame[Any], gyro: GyroRotation | None
         return 'the gyro has a gap'
     if isinstance(since.force, str):
         return since.force
-    return integration.inertial_motion(gyro.segment, since.force.since_previous, first.imu,
-                                       second.imu, parameters.imu)
+    return integration.inertial_motion(gyro.segment, since.force.since_previous, first, second,
+                                       parameters.imu)
 
 
 def estimate_pair(first: Frame[Any], second: Frame[Any], matches: Matches, sensor: Sensor,
@@ -322,14 +322,14 @@ def estimate_pair(first: Frame[Any], second: Frame[Any], matches: Matches, senso
     return pose
 
 
-def evidence_without(pose: RelativePose, first: Frame[Any], second: Frame[Any], sensor: Sensor,
+def evidence_without(pose: RelativePose, first: FrameImu, second: FrameImu, sensor: Sensor,
                      gyro: GyroRotation, inertial: InertialMotion,
                      parameters: Parameters) -> velocity.InertialEvidence | None:
     """Consistency of the images with an acceleration that was not used; None if not known."""
     if pose.images is None:
         return None
     nothing, interval = np.empty((0, 2)), interval_of(first, second)
-    problem = build_problem(nothing, nothing, sensor.camera, first.imu.motion, second.imu.motion,
+    problem = build_problem(nothing, nothing, sensor.camera, first.motion, second.motion,
                             gyro.rotation, gyro.covariance)
     motion = parameters.estimator.motion
     expected, _ = velocity.expected_velocities(problem, motion, interval, inertial)
@@ -358,7 +358,7 @@ def pair_result(first: Frame[Any], second: Frame[Any], matches: Matches, rays1: 
         reference_stamp_ns=first.stamp_ns + later_ns,
         stamp_ns=second.stamp_ns + later_ns,
         reference_ns1=first.imu.reference_ns, reference_ns2=second.imu.reference_ns,
-        frame_id=second.frame_id, interval=interval_of(first, second), pose=pose,
+        frame_id=second.frame_id, interval=interval_of(first.imu, second.imu), pose=pose,
         matches=matches, row_times1=rays1.row_times, row_times2=rays2.row_times,
         rays1=rays1.rays, rays2=rays2.rays, parallax=parallax_of(rays1, rays2, gyro, sensor),
         landmarks=points,

@@ -133,7 +133,7 @@ class Pipeline(Processor[PairResult]):
         rays1, rays2 = self._derotate(matches, reference.imu.motion, imu.motion, sensor)
         keyframe = pair.is_keyframe(
             parameters.keyframes, parallax=pair.parallax_of(rays1, rays2, gyro, sensor),
-            interval=pair.interval_of(reference, frame), frames=self._frames,
+            interval=pair.interval_of(reference.imu, imu), frames=self._frames,
             tracked_fraction=self._tracker.tracked_fraction)
         self._compare_rotations(frame.stamp_ns, matches, rotation, sensor, keyframe)
         if not keyframe:
@@ -221,8 +221,9 @@ class Pipeline(Processor[PairResult]):
         if np.isfinite(pose.R).all():
             measurement = PairData(
                 to_sensor(matches.points1), to_sensor(matches.points2), sensor.camera,
-                reference.imu.motion, frame.imu.motion, pair.interval_of(reference, frame), pose.R,
-                pose.t, gyro.rotation, gyro.covariance, rotation_sensitivity(
+                reference.imu.motion, frame.imu.motion,
+                pair.interval_of(reference.imu, frame.imu), pose.R, pose.t, gyro.rotation,
+                gyro.covariance, rotation_sensitivity(
                     segment.stamps_ns, segment.angular_velocities, parameters.imu),
                 (segment.angular_velocities[0], segment.angular_velocities[-1]),
                 parameters.sensor.R_cam_imu, parameters.estimator.gyro_sigma)
@@ -232,7 +233,8 @@ class Pipeline(Processor[PairResult]):
         active[findings.OFFSET] = frame.imu.applied_offset_ns / NANOSECONDS
         active[findings.READOUT] = configured.direction * self._readout
         active[findings.BIAS] = parameters.sensor.R_cam_imu.T @ segment.bias - bias
-        pose = monitor.add_pair(frame.stamp_ns, measurement, pose, configured)
+        assessed = monitor.add_pair(frame.stamp_ns, measurement, pose, configured)
+        pose = monitor.agreement.enlarged(reference.stamp_ns, frame.stamp_ns, pose, assessed)
         tracked = Tracked.of(monitor.calibration, configured)
         self.applied = self.applied.moved(tracked, parameters.sensor)
         if parameters.pair.withhold_when_wrong:
@@ -256,17 +258,17 @@ class Pipeline(Processor[PairResult]):
         def estimate(inertial: InertialMotion | str) -> RelativePose:
             return pair.estimate_pair(
                 reference, frame, matches, sensor, gyro, inertial, parameters,
-                interval=pair.interval_of(reference, frame), stamp_sigma=sigma,
+                interval=pair.interval_of(reference.imu, frame.imu), stamp_sigma=sigma,
                 between=history.between(matches, sensor, since, inertial))
 
-        inertial = pair.inertial_of(reference, frame, gyro, since, parameters)
+        inertial = pair.inertial_of(reference.imu, frame.imu, gyro, since, parameters)
         if isinstance(inertial, str):
             return estimate(inertial)
         acceleration = self._monitor.acceleration
         used = acceleration.uses(None)
         pose = estimate(inertial if used else _CONTRADICTED)
         evidence = pose.inertial_evidence if used else pair.evidence_without(
-            pose, reference, frame, sensor, gyro, inertial, parameters)
+            pose, reference.imu, frame.imu, sensor, gyro, inertial, parameters)
         if evidence is not None:
             self._monitor.add_acceleration(frame.stamp_ns, evidence)
             if used and not acceleration.uses(evidence):
@@ -308,6 +310,10 @@ class FrameLoop(Generic[Result]):
         self.sequencer = Sequencer(parameters, offline=offline, colors=colors, clock=clock)
         self._processor = processor
         self._offline = offline
+
+    def close(self) -> None:
+        """End of the input: `step` returns what is left, then None."""
+        self.sequencer.close()
 
     def step(self, timeout: float = 0.0) -> Outcome[Result] | None:
         """The next frame with its result; None if none is ready within `timeout` seconds."""

@@ -90,8 +90,7 @@ class QueuedFrame:
 
     image: EncodedImage
     intrinsics: Intrinsics
-    start_ns: int   # begin and end of exposure on the IMU clock, without a tracked offset
-    end_ns: int
+    span_ns: tuple[int, int]   # of the exposure on the IMU clock, without a tracked offset
     reference_ns: int   # of the stamped row
     exposure: float   # of a row [s]
     received_ns: int   # on the monotonic clock
@@ -192,7 +191,7 @@ class Sequencer:
             # Of all frames that come, also of those refused later: live as in replay.
             interval_ns = self._intervals.add(stamp_ns)
             self._queue.append(QueuedFrame(
-                image, intrinsics, *clock.exposed_span_ns(stamp_ns, interval_ns),
+                image, intrinsics, clock.exposed_span_ns(stamp_ns, interval_ns),
                 clock.reference_ns(stamp_ns, interval_ns), clock.exposure(interval_ns),
                 received_ns=self._now(), generation=self._generation))
             self._update_queue()
@@ -267,8 +266,9 @@ class Sequencer:
                 return self._counted(image.stamp_ns, Refusal.BAD_IMAGE, str(error))
         with self._changed:
             # Stamps may have jumped meanwhile, and the buffer then belongs to another time.
+            span_ns = self._corrected(head.span_ns)
             if (head.generation != self._generation
-                    or self._buffer.coverage(*self._span(head)) is not Coverage.AVAILABLE):
+                    or self._buffer.coverage(*span_ns) is not Coverage.AVAILABLE):
                 return self._counted(
                     frame.stamp_ns, Refusal.CLOCK_JUMP,
                     'stamps jumped while the frame was decoded: its gyro samples are lost')
@@ -276,8 +276,8 @@ class Sequencer:
             if previous_ns is not None and reference_ns - previous_ns > self._longest_interval_ns:
                 previous_ns = None
             frame.imu_data = replace(
-                frame_imu(self._buffer, self._span(head), reference_ns, self._R_cam_imu,
-                          previous_ns, head.exposure), applied_offset_ns=self._offset_ns)
+                frame_imu(self._buffer, span_ns, reference_ns, self._R_cam_imu, previous_ns,
+                          head.exposure), applied_offset_ns=self._offset_ns)
             frame.restart = self._taken_generation != self._generation
             self._previous_ns, self._taken_generation = reference_ns, self._generation
             self._counts.frames_taken += 1
@@ -297,7 +297,7 @@ class Sequencer:
         if not self._queue:
             return None
         head = self._queue[0]
-        start_ns, end_ns = self._span(head)
+        start_ns, end_ns = self._corrected(head.span_ns)
         # A tracked offset may have moved a frame that was ready.
         coverage = (self._buffer.coverage(start_ns, end_ns)
                     if head.ready_ns is not None and self._imu_reaches(end_ns)
@@ -323,9 +323,9 @@ class Sequencer:
         ready = 0
         for queued in tuple(self._queue):
             if queued.ready_ns is None:
-                if not self._imu_reaches(self._span(queued)[1]):
+                if not self._imu_reaches(self._corrected(queued.span_ns)[1]):
                     break
-                if self._buffer.coverage(queued.start_ns, queued.end_ns) is Coverage.NEVER:
+                if self._buffer.coverage(*queued.span_ns) is Coverage.NEVER:
                     # Refused at once: it must not count as a frame that waits for the worker.
                     self._queue.remove(queued)
                     self._refuse(queued.image.stamp_ns, Refusal.IMU_GAP, _IMU_GAP)
@@ -342,10 +342,10 @@ class Sequencer:
         if ready:
             self._changed.notify()
 
-    def _span(self, queued: QueuedFrame) -> tuple[int, int]:
-        """Times of its first and last row, with the corrections tracked by now."""
-        return (queued.start_ns + self._offset_ns - self._margin_ns,
-                queued.end_ns + self._offset_ns + self._margin_ns)
+    def _corrected(self, span_ns: tuple[int, int]) -> tuple[int, int]:
+        """Times of a frame's first and last row, with the corrections tracked by now."""
+        return (span_ns[0] + self._offset_ns - self._margin_ns,
+                span_ns[1] + self._offset_ns + self._margin_ns)
 
     def _imu_reaches(self, end_ns: int) -> bool:
         """Whether gyro and accelerometer, which may have a topic each, have come to a time."""

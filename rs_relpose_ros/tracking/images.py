@@ -268,15 +268,15 @@ class CompressedImage:
     def decoded(self, levels: GrayLevels | None = None) -> Image:
         """Gray image (H, W); `levels` as of `RawImage.decoded`."""
         # EXIF orientation is ignored: rows must stay in the order of the readout.
-        image = self._decoded(cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-                              | cv2.IMREAD_ANYDEPTH)
+        image = _decoded(self.data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+                         | cv2.IMREAD_ANYDEPTH)
         if image.dtype == np.uint16:
             return (levels or GrayLevels()).gray(image)
         return np.asarray(image, dtype=np.uint8)
 
     def pixels(self, levels: GrayLevels | None = None) -> Pixels:
         """The image in colour or gray, 8 or 16 bits, as encoded; `levels` is not used."""
-        image = self._decoded(cv2.IMREAD_UNCHANGED)
+        image = _decoded(self.data, cv2.IMREAD_UNCHANGED)
         channels = 1 if image.ndim == 2 else image.shape[2]
         encoding = _ENCODED.get((image.dtype.name, channels))
         if encoding is None:
@@ -284,17 +284,18 @@ class CompressedImage:
                              f'publish one of {", ".join(_ENCODED.values())}')
         return Pixels(image, encoding)
 
-    def _decoded(self, flags: int) -> NDArray[Any]:
-        width, height = self.size
-        check_image_size(width, height)
-        try:
-            image = cv2.imdecode(self.data, flags)
-        except cv2.error:
-            image = None
-        if image is None or image.shape[:2] != (height, width):
-            raise InputError(
-                f'compressed image of {len(self.data)} bytes cannot be decoded: it is corrupt')
-        return np.asarray(image)
+def _decoded(data: Bytes, flags: int) -> NDArray[Any]:
+    """Pixels of a JPEG or PNG file; `flags` of cv2.imdecode."""
+    width, height = encoded_image_size(data)
+    check_image_size(width, height)
+    try:
+        image = cv2.imdecode(data, flags)
+    except cv2.error:
+        image = None
+    if image is None or image.shape[:2] != (height, width):
+        raise InputError(
+            f'compressed image of {len(data)} bytes cannot be decoded: it is corrupt')
+    return np.asarray(image)
 
 
 EncodedImage = RawImage | CompressedImage

@@ -1,0 +1,229 @@
+"""Calibration of a running camera: its tracks and gyro in memory, the fit in its own process."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import os
+import pickle
+from queue import Empty, Queue
+import subprocess
+import sys
+from tempfile import TemporaryFile
+import time
+from typing import Any
+
+from rs_relpose_ros.calibrate import stored
+from rs_relpose_ros.calibrate.procedure import calibrate, CalibrationInput, Recorder
+from rs_relpose_ros.calibrate.result import CalibrationResult, parameter_file, quantities
+from rs_relpose_ros.calibrate.stored import Calibrated, CameraId, Progress
+from rs_relpose_ros.config.settings import CalibrationConfig, Parameters, TRACKED_IN_IMAGES
+from rs_relpose_ros.errors import RsRelposeError
+from rs_relpose_ros.geometry.camera import Intrinsics
+from rs_relpose_ros.messages.incoming import Role
+
+# Length of the recording [s]: of the first fit, kept at most, and added before the next fit.
+_FIRST, _LONGEST, _STEP = 6.0, 60.0, 2.0
+# Images that wait to be tracked; more are left out.
+_WAITING = 8
+# Images without a usable CameraInfo after which the lens counts as uncalibrated.
+_WITHOUT_INFO = 15
+# Consecutive images that cannot be used after which the recording starts again: another size, or
+# a clock that was set back.
+_MOST_REFUSED = 15
+# Niceness of the process of the fit: the node's own work goes first.
+_NICE = 15
+
+
+class LiveCalibration:
+    """Takes the place of intake and frame loop until the calibration is known.
+
+    `receive` is for the thread of the subscriptions, `step` for the worker. With `use_stored` the
+    file of the camera is used, if there is one; without `fits` it is waited for.
+    """
+
+    def __init__(self, parameters: Parameters, *, use_stored: bool, fits: bool = True) -> None:
+        self._parameters = parameters
+        self._use_stored, self._fits = use_stored, fits
+        self._queue: Queue[tuple[Role, Any]] = Queue()
+        self._waiting = 0   # images in the queue
+        self._done = False
+        self._camera: CameraId | None = None
+        self._fit: _Fit | None = None
+        self._restart()
+
+    def _restart(self) -> None:
+        self._recorder = Recorder(self._parameters.tracking, _LONGEST)
+        self._images = self._refused = 0
+        self._fitted_ns = 0   # stamp of the last image at the begin of the last fit
+
+    @property
+    def intrinsics(self) -> Intrinsics | None:
+        """Those of the last CameraInfo."""
+        return self._recorder.intrinsics
+
+    @property
+    def camera_info_problem(self) -> str:
+        """An uncalibrated CameraInfo is none: the lens is calibrated, too."""
+        return ''
+
+    def waits_for_imu(self) -> bool:
+        """Samples may come in batches."""
+        return False
+
+    def receive(self, role: Role, message: Any) -> RsRelposeError | None:
+        """Hand a message over; errors are those of `step`."""
+        configured = self._parameters.intrinsics.given
+        if (self._done or role is Role.ACCEL or (role is Role.CAMERA_INFO and configured)
+                or (role is Role.IMAGE and self._waiting >= _WAITING)):
+            return None
+        self._waiting += role is Role.IMAGE
+        self._queue.put((role, message))
+        return None
+
+    def step(self, timeout: float = 0.0) -> Progress | Calibrated | RsRelposeError | None:
+        """Use a message; the state after a fit, the error of the message, or None.
+
+        Nothing follows a `Calibrated`.
+        """
+        if self._done:
+            time.sleep(timeout)
+            return None
+        outcome = self._next(timeout)
+        self._done = isinstance(outcome, Calibrated)
+        return outcome
+
+    def _next(self, timeout: float) -> Progress | Calibrated | RsRelposeError | None:
+        try:
+            role, message = self._queue.get(timeout=timeout)
+        except Empty:
+            return self._after_fit()
+        if role is not Role.IMAGE:
+            return self._recorder.add(role, message)
+        self._waiting -= 1
+        self._images += 1
+        error = self._recorder.add(role, message)
+        self._refused = 0 if error is None else self._refused + 1
+        if self._refused > _MOST_REFUSED:
+            self._restart()
+        if error is not None:
+            return error
+        configured = self._parameters.intrinsics
+        if configured.given:
+            self._recorder.intrinsics = configured.of_image(*self._recorder.size)
+        self._recorder.uncalibrated |= self._images > _WITHOUT_INFO
+        if self._camera is None:
+            return self._first_image(message.header.frame_id)
+        return self._after_fit()
+
+    def close(self) -> None:
+        """End the process of the fit."""
+        if self._fit is not None:
+            self._fit.stop()
+
+    def _first_image(self, frame_id: str) -> Progress | Calibrated | RsRelposeError:
+        """The stored calibration of the camera, if there is one, or the error of its file."""
+        name = self._parameters.calibration.camera_name or frame_id
+        self._camera = CameraId(name, *self._recorder.size)
+        path = stored.path_of(self._parameters.calibration, self._camera)
+        if not (self._use_stored and path.is_file()):
+            return Progress('calibrating: rotate the camera about all three axes, 20 to 60 deg/s, '
+                            'for some 20 s' if self._fits else
+                            'waiting for a calibration by relpose_node on calibration')
+        try:
+            _, day = stored.load(path, self._camera)
+            return Calibrated(self._camera, path.read_text(encoding='utf-8'),
+                              f'using the calibration of {day} in {path}', new=False)
+        except RsRelposeError as error:
+            return error
+
+    def _after_fit(self) -> Progress | Calibrated | None:
+        if self._fit is not None:
+            result = self._fit.result()
+            if result is None:
+                return None
+            recording, self._fit = self._fit.recording, None
+            return self._evaluated(result, recording)
+        recorder = self._recorder
+        grown = 1e-9 * (recorder.last_ns - self._fitted_ns) if self._fitted_ns else _STEP
+        if not self._fits or recorder.seconds < _FIRST or grown < _STEP:
+            return None
+        self._fitted_ns = recorder.last_ns
+        sensor = self._parameters.sensor
+        config = replace(TRACKED_IN_IMAGES, exposure_time=sensor.exposure_time,
+                         exposure_margin=sensor.exposure_margin)
+        try:
+            self._fit = _Fit(recorder.recording(), config)
+        except RsRelposeError as error:
+            return Progress(f'calibrating: {error}')
+        return None
+
+    def _evaluated(self, result: CalibrationResult | RsRelposeError,
+                   recording: CalibrationInput) -> Progress | Calibrated:
+        seconds = 1e-9 * (recording.tracks.stamps_ns[-1] - recording.tracks.stamps_ns[0])
+        if isinstance(result, RsRelposeError):
+            return Progress(f'calibrating, {seconds:.0f} s: {result}')
+        rows = quantities(result, recording.camera)
+        known = '; '.join(f'{name} {text}' for name, text, of in rows if of in result.needed)
+        if result.observable:
+            assert self._camera is not None
+            return Calibrated(self._camera, parameter_file(
+                result, f'Calibration of {self._camera.name} by {seconds:.0f} s while running.',
+                camera=recording.camera, compressed=False), f'calibrated: {known}')
+        missing = [of.remark for of in result.needed if not of.observable]
+        needed = '; '.join(dict.fromkeys(missing))
+        return Progress(
+            f'calibrating, {seconds:.0f} s: {known}. Needed: {needed}',
+            1.0 - len(missing) / len(result.needed),
+            {name: text if of.observable else f'{text}; {of.remark}' for name, text, of in rows})
+
+
+class _Fit:
+    """A fit in a process of its own, so that it takes no time of the interpreter's lock.
+
+    Not by multiprocessing, which unblocks the signals of the calling thread.
+    """
+
+    def __init__(self, recording: CalibrationInput, config: CalibrationConfig) -> None:
+        self.recording = recording
+        self._result = TemporaryFile()   # noqa: SIM115 closed by result or stop
+        with TemporaryFile() as arguments:
+            pickle.dump((recording, config), arguments)
+            arguments.seek(0)
+            self._process = subprocess.Popen([sys.executable, '-m', __name__], stdin=arguments,
+                                             stdout=self._result)
+
+    def result(self) -> CalibrationResult | RsRelposeError | None:
+        """None while it runs."""
+        if self._process.poll() is None:
+            return None
+        with self._result:
+            self._result.seek(0)
+            try:
+                # Written by the own process.
+                found: CalibrationResult | RsRelposeError = pickle.load(self._result)  # noqa: S301
+            except (EOFError, pickle.UnpicklingError):
+                found = RsRelposeError('the process of the fit ended early: out of memory?')
+        return found
+
+    def stop(self) -> None:
+        """End the process; signals of the terminal are blocked in it."""
+        self._process.kill()
+        self._process.wait()
+        self._result.close()
+
+
+def _fit() -> None:
+    """Fit the pickled recording of stdin, and write the result, or its error, to stdout."""
+    os.nice(_NICE)
+    recording, config = pickle.load(sys.stdin.buffer)   # noqa: S301 of the parent
+    try:
+        result: CalibrationResult | RsRelposeError = calibrate(
+            recording.tracks, recording.gyro, recording.camera,
+            focal_known=recording.focal_known, config=config)
+    except RsRelposeError as error:
+        result = error
+    pickle.dump(result, sys.stdout.buffer)
+
+
+if __name__ == '__main__':
+    _fit()

@@ -1,0 +1,96 @@
+"""The calibration of a node: how far it is, and the file that stores it with its camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from datetime import datetime
+import os
+from pathlib import Path
+import re
+from typing import Any
+
+from rs_relpose_ros.config.files import file_values
+from rs_relpose_ros.config.settings import StoredCalibrationConfig
+from rs_relpose_ros.errors import InputError
+
+# Section of the file that identifies the camera; a node of another name ignores it.
+_SECTION = 'rs_relpose_calibration'
+_ILLEGAL = re.compile(r'[^\w.-]+')
+
+
+@dataclass(frozen=True, slots=True)
+class CameraId:
+    """Name and image size [px] of a camera."""
+
+    name: str
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """State of a calibration that goes on."""
+
+    text: str
+    share: float = 0.0   # of the quantities that are known well enough
+    # Name -> value with sigma, and what is missing.
+    values: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Calibrated:
+    """A calibration that a node can use: the text of its parameter file."""
+
+    camera: CameraId
+    parameters: str
+    summary: str
+    new: bool = True   # whether it is not in its file yet
+
+
+def path_of(config: StoredCalibrationConfig, camera: CameraId) -> Path:
+    """File of a camera's calibration, where camera_info_manager has that of its CameraInfo."""
+    if config.calibration_file:
+        return Path(config.calibration_file).expanduser()
+    home = Path(os.environ.get('ROS_HOME') or Path.home() / '.ros')
+    name = _ILLEGAL.sub('_', camera.name) or 'camera'
+    return home / 'rs_relpose' / f'{name}_{camera.width}x{camera.height}.yaml'
+
+
+def save(path: Path, camera: CameraId, parameters: str) -> None:
+    """Write a parameter file with its camera; InputError if it cannot be written.
+
+    It is written beside and renamed: a file with this name is complete.
+    """
+    name = camera.name.replace("'", "''")
+    text = (f"{parameters}{_SECTION}:\n  ros__parameters:\n    camera_name: '{name}'\n"
+            f'    image_width: {camera.width}\n    image_height: {camera.height}\n'
+            f"    date: '{datetime.now().astimezone().date().isoformat()}'\n")
+    part = path.with_name(f'.{path.name}.{os.getpid()}')
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            part.write_text(text, encoding='utf-8')
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f'the calibration cannot be stored in {path}: {error.strerror}; give '
+                         'another calibration_file') from error
+
+
+def load(path: Path, camera: CameraId) -> tuple[dict[str, Any], str]:
+    """Parameters of a stored calibration by name, and its date.
+
+    Raises
+    ------
+    InputError
+        The file is damaged, or of another camera or image size.
+    """
+    own = file_values(path, _SECTION)
+    if not {'camera_name', 'image_width', 'image_height', 'date'} <= own.keys():
+        raise InputError(f'{path} is no stored calibration: it has no section {_SECTION}')
+    of = CameraId(own['camera_name'], own['image_width'], own['image_height'])
+    if of != camera:
+        raise InputError(f'{path} is for the camera {of.name!r} of {of.width}x{of.height}, not '
+                         f'for {camera.name!r} of {camera.width}x{camera.height}')
+    return file_values(path), str(own['date'])

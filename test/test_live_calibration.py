@@ -1,0 +1,170 @@
+"""A node without parameters: it calibrates itself, stores the result, and uses the file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+import fault_stream as faults
+from geometry_msgs.msg import PoseWithCovarianceStamped
+import pytest
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from scipy.spatial.transform import Rotation
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from rs_relpose_lab.live.graph import diagnostic_values, Graph
+from rs_relpose_lab.live.processes import node_process, player_process, wait_until
+from rs_relpose_lab.simulation import simulate, SimulationConfig
+from rs_relpose_lab.simulation.bag import write_bag
+from rs_relpose_ros.bags.reader import COMPRESSED_TOPIC, IMU_TOPIC, open_bag
+from rs_relpose_ros.calibrate import stored
+from rs_relpose_ros.calibrate.live import LiveCalibration
+from rs_relpose_ros.calibrate.stored import Calibrated, CameraId, Progress
+from rs_relpose_ros.config.files import text_values
+from rs_relpose_ros.config.settings import Parameters, StoredCalibrationConfig
+from rs_relpose_ros.errors import InputError, RsRelposeError
+from rs_relpose_ros.messages.incoming import Role, sensor_messages
+from rs_relpose_ros.nodes.inputs import LATCHED
+
+CAMERA = CameraId('a/b:c', 320, 240)
+TEXT = '/**:\n  ros__parameters:\n    readout_time: 0.02\n    readout_time_sigma: 0.001\n'
+TRUTH = SimulationConfig(
+    duration=7.0, width=320, height=240, fx=225.0, edge_samples=1, plan='walk:7',
+    readout_time=0.02, time_offset=0.03, seed=5)
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp('walk') / 'bag'
+    write_bag(simulate(TRUTH), folder)
+    return folder
+
+
+# -- the file ------------------------------------------------------------------------------------
+
+
+def test_a_stored_calibration_is_of_its_camera_only(tmp_path, monkeypatch):
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    path = stored.path_of(StoredCalibrationConfig(), CAMERA)
+    assert path == tmp_path / 'rs_relpose' / 'a_b_c_320x240.yaml'
+    stored.save(path, CAMERA, TEXT)
+    assert stored.load(path, CAMERA)[0] == {'readout_time': 0.02, 'readout_time_sigma': 0.001}
+    assert [item.name for item in path.parent.iterdir()] == [path.name]
+    for other in (CameraId('a/b:d', 320, 240), CameraId('a/b:c', 640, 240)):
+        with pytest.raises(InputError, match='is for the camera'):
+            stored.load(path, other)
+    path.write_text(TEXT)
+    with pytest.raises(InputError, match='rs_relpose_calibration'):
+        stored.load(path, CAMERA)
+
+
+def test_a_file_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / 'file').write_text('')
+    config = StoredCalibrationConfig(calibration_file=str(tmp_path / 'file' / 'c.yaml'))
+    with pytest.raises(InputError, match=r'c\.yaml.*calibration_file'):
+        stored.save(stored.path_of(config, CAMERA), CAMERA, TEXT)
+
+
+# -- without ROS ---------------------------------------------------------------------------------
+
+
+def outcomes(bag: Path, calibration: LiveCalibration, *, moving: bool = True) -> Iterator[Any]:
+    """Outcomes of the messages, the fits awaited; not `moving`: of the first image and a gyro."""
+    first: Any = None
+    with open_bag(bag) as opened:
+        for role, message in sensor_messages(opened, opened.find_topics({})):
+            content = message.message
+            if not moving and role is Role.IMAGE:
+                first = content if first is None else first
+                content.data = first.data
+            elif not moving and role is Role.IMU:
+                content.angular_velocity.x = content.angular_velocity.y = 0.01
+                content.angular_velocity.z = 0.0
+            calibration.receive(role, content)
+            yield calibration.step()
+            while calibration._fit is not None:
+                yield calibration.step(0.02)
+
+
+def is_near_the_truth(parameters: str) -> bool:
+    values = text_values(parameters, 'text')
+    turn = Rotation.from_quat(values['quat_cam_imu_xyzw']).as_matrix() @ TRUTH.R_cam_imu.T
+    return (abs(values['readout_time'] - 0.02) < 4.0 * values['readout_time_sigma'] < 8e-3
+            and abs(values['time_offset'] - 0.03) < 4.0 * values['time_offset_sigma'] < 8e-3
+            and Rotation.from_matrix(turn).magnitude() < 0.03)
+
+
+def test_a_calibration_comes_of_seven_seconds_and_ends(bag):
+    calibration = LiveCalibration(Parameters(), use_stored=False)
+    found = [outcome for outcome in outcomes(bag, calibration) if outcome is not None]
+    assert not any(isinstance(outcome, RsRelposeError) for outcome in found)
+    assert isinstance(found[-1], Calibrated)
+    assert found[-1].camera == CameraId('camera_optical_frame', 320, 240)
+    assert is_near_the_truth(found[-1].parameters)
+
+
+def test_a_camera_at_rest_is_never_calibrated_and_the_motion_is_named(bag):
+    calibration = LiveCalibration(Parameters(), use_stored=False)
+    found = [outcome for outcome in outcomes(bag, calibration, moving=False)
+             if outcome is not None]
+    assert {type(outcome) for outcome in found} == {Progress}
+    assert 'about all three axes' in found[-1].text
+
+
+# -- the node ------------------------------------------------------------------------------------
+
+
+@pytest.mark.live
+@pytest.mark.timeout(600)
+def test_a_node_without_parameters_calibrates_itself(bag, ros_domain_id, tmp_path, monkeypatch):
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    start = {'parameters': {'image_transport': 'compressed',
+                            **faults.reliable(COMPRESSED_TOPIC, IMU_TOPIC)},
+             'remap': faults.BAG_TOPICS}
+    path = tmp_path / 'rs_relpose' / 'camera_optical_frame_320x240.yaml'
+    with Graph() as graph:
+        poses = graph.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
+        diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
+        published: list[String] = []
+        graph.node.create_subscription(
+            String, '/relpose_node/calibration', published.append, LATCHED)
+        with node_process(**start) as node:
+            node.wait_for('waiting for the first image')
+            with player_process(bag) as playing:
+                assert playing.wait() == 0
+            node.wait_for(f'stored in {path}')
+            states = {diagnostic_values(item)['state'] for item in diagnostics}
+            assert 'calibrating' in states
+            node.wait_for('ready')
+            with player_process(bag) as playing:
+                assert playing.wait() == 0
+            wait_until(lambda: poses, 'a pose', node)
+            wait_until(lambda: published, 'the calibration', node)
+            assert is_near_the_truth(published[0].data)
+            path.unlink()
+            assert graph.call(Trigger, '/relpose_node/save_calibration', Trigger.Request()).success
+            assert is_near_the_truth(path.read_text())
+            node.stop()
+        poses.clear()
+        # The second start takes the file; a value can be set while it runs.
+        with node_process(**start) as node:
+            node.wait_for('waiting for the first image')
+            with player_process(bag) as playing:
+                node.wait_for('using the calibration of')
+                assert playing.wait() == 0
+            node.wait_for('ready')
+            value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=0.0201)
+            request = SetParameters.Request(parameters=[Parameter(
+                name='readout_time', value=value)])
+            assert graph.call(SetParameters, '/relpose_node/set_parameters',
+                              request).results[0].successful
+            wait_until(lambda: node.output.count('ready:') == 2, 'a new start', node)
+            with player_process(bag) as playing:
+                assert playing.wait() == 0
+            wait_until(lambda: poses, 'a pose', node)
+            assert 'Traceback' not in node.output
+            node.stop()
