@@ -278,8 +278,10 @@ def test_frames_between_close_ones_are_used(library, returned):
     two = estimate_wide_pair(views[0], later[-1], parameters).pose
     assert two.frames == 2
     assert np.linalg.norm(pose.t - true) < 0.8 * np.linalg.norm(two.t - true)
-    # Of frames whose gyro begins elsewhere nothing is used.
-    assert estimate_wide_pair(views[0], later[-1], parameters, views[2:-1]).pose.frames == 2
+    # Frames with another gyro or another calibration are left out.
+    zoomed = [replace(view, intrinsics=replace(view.intrinsics, fx=500.0)) for view in later[:-1]]
+    for others in (views[2:-1], zoomed):
+        assert estimate_wide_pair(views[0], later[-1], parameters, others).pose.frames == 2
 
 
 def test_images_are_kept_until_the_last_of_their_pairs(library):

@@ -44,9 +44,8 @@ _GRAVITY_SIGMA = 1.0
 _LEAST_WALK = 5e-4
 # Degrees of freedom as which the configured noise of a match counts.
 _SIGMA_FREEDOM = 10.0
-# Least number of inliers that a frame between must have, and most that are used of a pair: time
-# grows with their number. From 280 to 200, t and R lose 8 % on simulated walks, and nothing on
-# recordings, where errors that tracks share are larger.
+# Least number of inliers that a frame between must have, and most of a pair: 200 of 280 cost 8 %
+# of t and R on simulated walks, nothing on recordings, where tracks share larger errors.
 _LEAST_TRACKS, _MOST_TRACKS = 10, 200
 # Sine squared of the parallax below which the distance of a track starts at a small value.
 _PARALLEL, _FAR = 1e-8, 1e-2

@@ -1,8 +1,8 @@
 """Relative poses of chosen frames, however far apart: loop closures, wide baselines.
 
 Frames are matched by descriptors, without tracks in between. The IMU derotates the rows of each
-frame and gives gravity; the gyro between the frames is used unless it has a gap. The interval
-constrains the velocities only of frames that are close to each other.
+frame and gives gravity; the gyro between the frames is used unless it has a gap. Of frames that
+are close to each other the interval constrains the velocities, and the frames between are used.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ def estimate_wide_pair(first: Frame[Any], second: Frame[Any], parameters: Parame
     parameters : Parameters
         `detector` chooses the descriptors; SIFT if it is klt.
     between : sequence of Frame, optional
-        Frames between the two, of `view_frame` since the first one; used if the gyro has no gap
-        and the two are at most `max_keyframe_interval` apart.
+        Frames between the two, of `view_frame` since the first one, with its intrinsics; used if
+        the gyro has no gap and the two are at most `max_keyframe_interval` apart.
 
     Returns
     -------
@@ -98,7 +98,8 @@ def estimate_wide_pair(first: Frame[Any], second: Frame[Any], parameters: Parame
     history = TrackHistory(first.imu)
     if gyro is not None and near:
         for frame in used_frames(between):
-            if (rotation := _gyro(first, frame, parameters)) is not None:
+            rotation = _gyro(first, frame, parameters)
+            if rotation is not None and frame.intrinsics == first.intrinsics:
                 history.add(frame.imu, rotation, tracker.track(frame.image))
     matches = tracker.track(second.image)
     if gyro is not None:
