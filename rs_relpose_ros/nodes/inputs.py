@@ -19,6 +19,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import deserialize_message
+from rclpy.time import Time
 
 from rs_relpose_ros.errors import MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry.camera import Intrinsics
@@ -113,6 +114,30 @@ def transform_broadcaster(node: Node, parameter: str) -> Any:
                                 f'ros-jazzy-tf2-ros-py, or set {parameter} to false') from error
 
 
+def transform_lookup(node: Node) -> Callable[[str, str], tuple[float, ...] | None]:
+    """Function of (parent, child): x y z, quaternion x y z w of the child's pose; None if unknown.
+
+    It listens to /tf and /tf_static until it knows one. Without tf2_ros nothing is known.
+    """
+    try:
+        tf2_ros = importlib.import_module('tf2_ros')
+    except ImportError:
+        return lambda parent, child: None
+    buffer = tf2_ros.Buffer()
+    listener = tf2_ros.TransformListener(buffer, node)
+
+    def lookup(parent: str, child: str) -> tuple[float, ...] | None:
+        try:
+            found = buffer.lookup_transform(parent, child, Time()).transform
+        except tf2_ros.TransformException:
+            return None
+        listener.unregister()
+        t, q = found.translation, found.rotation
+        return t.x, t.y, t.z, q.x, q.y, q.z, q.w
+
+    return lookup
+
+
 def overridable() -> QoSOverridingOptions:
     """The policies that parameters may override."""
     return QoSOverridingOptions((QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH,
@@ -176,6 +201,7 @@ class SensorInputs:
         self._last_ns: dict[Role, int] = {}
         self._last_info = b''
         self.image_bytes = 0   # of the last image
+        self.frame_ids: dict[Role, str] = {}   # of the last messages
         self.stamps_ns: deque[int] = deque(maxlen=_RECENT_STAMPS)   # of the last images
         self.topics = {role: node.resolve_topic_name(role.value) for role in TOPICS}
         # As image_transport does: the transport's name follows the remapped one.
@@ -225,6 +251,7 @@ class SensorInputs:
         self._camera_info.drain()
         self._count(Role.IMAGE)
         self.image_bytes = len(image.data)
+        self.frame_ids[Role.IMAGE] = image.header.frame_id
         self.stamps_ns.append(stamp_ns(image.header))
         # An unusable image is refused by the sequencer, which counts it.
         self._intake.receive(Role.IMAGE, image)
@@ -241,6 +268,7 @@ class SensorInputs:
 
     def _on_sample(self, role: Role, message: Any) -> None:
         self._count(role)
+        self.frame_ids[role] = message.header.frame_id
         self._receive(role, message)
 
     def _receive(self, role: Role, message: Any) -> None:
