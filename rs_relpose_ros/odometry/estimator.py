@@ -236,7 +236,10 @@ class OdometryEstimator:
         self._waiting[pair.current_ns] = pair
         if len(self._waiting) > _MOST_WAITING:
             self.counts['dropped'] += _MOST_WAITING
-            self._waiting = {max(self._waiting): self._waiting[max(self._waiting)]}
+            newest = max(self._waiting)
+            found = [one.contradiction for one in self._waiting.values() if one.contradiction]
+            self._waiting = {newest: replace(
+                self._waiting[newest], contradiction=found[-1] if found else '')}
 
     def reset(self) -> None:
         """Forget the path: the next start is at the origin."""
