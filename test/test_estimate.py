@@ -41,8 +41,12 @@ def estimate(scene, config=CONFIG, **arguments):
 
 def rotation_nees(pose, R, covariance):
     """NEES by degrees of freedom: 1 on average, 0.79 in the median if the covariance holds."""
-    error = Rotation.from_matrix(R @ pose.R.T).as_rotvec()
-    return error @ np.linalg.solve(covariance, error) / 3
+    return sigmas(pose.R, R, covariance)**2 / 3
+
+
+def sigmas(R, truth, covariance):
+    error = Rotation.from_matrix(truth @ R.T).as_rotvec()
+    return np.sqrt(error @ np.linalg.solve(covariance, error))
 
 
 # Limits: twice the prototype's medians (design, section 4); the 5-point on derotated rays has
@@ -264,11 +268,6 @@ def by_images(pose):
 def test_the_gyro_between_the_frames_has_no_part_in_it():
     """A gyro with an error of 4 sigmas pulls the pose, and not the rotation by the images."""
     sigma, moved, moved_images = 3e-4, [], []
-
-    def sigmas(R1, R2, covariance):
-        angles = Rotation.from_matrix(R1 @ R2.T).as_rotvec()
-        return float(np.sqrt(angles @ np.linalg.solve(covariance, angles)))
-
     for seed in range(1, 9):
         scene = make_scene(seed, constant_velocity=True)
         poses = [gyro_prior(scene, error, sigma)

@@ -171,6 +171,7 @@ def test_the_list_is_not_replaced_by_the_results(bundled_bag, tmp_path, refused)
 
 FPS, SECONDS = 5.0, 6.0
 LAST = round(FPS * SECONDS) - 1
+CLOSE = 4   # frames from the first one, 0.8 s
 
 
 def loop() -> Trajectory:
@@ -254,6 +255,33 @@ def test_frames_and_an_imu_buffer(library, returned):
     assert second.imu.since_previous is not None
     with pytest.raises(InputError, match='must be later than the first: exchange them'):
         estimate_wide_pair(second, first, parameters)
+
+
+def test_frames_between_close_ones_are_used(library, returned):
+    parameters, imu, _ = library
+    parameters = parameters.updated({'max_keyframe_interval': 1.0})
+    simulation, views, done = returned[2], [], {}
+    frames = [Frame(simulation.stamp_ns(k), simulation.image(k), 'camera',
+                    intrinsics_of(simulation.camera)) for k in range(CLOSE + 1)]
+    ends = frames[0].stamp_ns, frames[-1].stamp_ns
+    pairs = ChosenPairs([ends])
+    for frame in frames:
+        views.append(view_frame(frame, imu, parameters, views[-1] if views else None))
+        done |= pairs.process(views[-1], parameters) or {}
+    later = [view_frame(frame, imu, parameters, since=views[0]) for frame in frames[1:]]
+    pose = estimate_wide_pair(views[0], later[-1], parameters, later[:-1]).pose
+    assert pose.frames == done[ends].pose.frames == 5
+    np.testing.assert_allclose(done[ends].pose.t, pose.t, atol=1e-4)
+    states = simulation.states([views[k].imu.reference_ns for k in (0, -1)])
+    true = states.R_world_cam[0].T @ (states.position[1] - states.position[0])
+    true /= np.linalg.norm(true)
+    two = estimate_wide_pair(views[0], later[-1], parameters).pose
+    assert two.frames == 2
+    assert np.linalg.norm(pose.t - true) < 0.8 * np.linalg.norm(two.t - true)
+    # Frames with another gyro or another calibration are left out.
+    zoomed = [replace(view, intrinsics=replace(view.intrinsics, fx=500.0)) for view in later[:-1]]
+    for others in (views[2:-1], zoomed):
+        assert estimate_wide_pair(views[0], later[-1], parameters, others).pose.frames == 2
 
 
 def test_images_are_kept_until_the_last_of_their_pairs(library):
