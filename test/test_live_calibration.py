@@ -142,6 +142,19 @@ def test_the_position_of_the_imu_is_that_of_tf(frames, turn, adopted, warned):
 
 
 @pytest.mark.live
+@pytest.mark.parametrize('node', ['odometry_node', 'global_shutter_node'])
+def test_other_nodes_take_the_published_calibration(ros_domain_id, node):
+    text = (TEXT + '    quat_cam_imu_xyzw: [0.0, 0.0, 0.0, 1.0]\n    axes_sigma: 0.01\n')
+    with Graph() as graph, node_process(node=node, remap={
+            'calibration': '/relpose_node/calibration'}) as process:
+        process.wait_for('waiting for')
+        graph.node.create_publisher(String, '/relpose_node/calibration', LATCHED).publish(
+            String(data=text))
+        process.wait_for('ready')
+        process.stop()
+
+
+@pytest.mark.live
 @pytest.mark.timeout(600)
 def test_a_node_without_parameters_calibrates_itself(bag, ros_domain_id, tmp_path, monkeypatch):
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
