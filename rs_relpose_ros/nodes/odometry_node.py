@@ -145,7 +145,9 @@ class OdometryNode(StoppableNode):
         except RsRelposeError as error:
             self._warn(str(error))
             return
-        self._read_sensors()
+        # Else with the next state: the graph must not delay it.
+        if self._config.odometry_rate < _LEAST_RATE:
+            self._read_sensors()
 
     def _on_sample(self, role: Role, message: Any) -> None:
         frame = message.header.frame_id
