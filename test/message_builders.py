@@ -123,10 +123,6 @@ def _at(place: int, length: int) -> int:
     return place * 40_503 % WHOLE * length // WHOLE
 
 
-def random_edits(rng: np.random.Generator) -> list[Edit]:
-    return rng.integers(0, WHOLE, (int(rng.integers(1, 5)), 3)).tolist()
-
-
 def damaged(data: bytes, edits: Sequence[Edit]) -> bytes:
     """`data` with places flipped, overwritten, cut out or repeated."""
     out = bytearray(data)

@@ -137,18 +137,20 @@ VIDEO_TICKS = [1000 * k for k in range(len(STAMPS))]
 
 def make_posecam(folder: Path) -> Path:
     (folder / 'frames').mkdir(parents=True)
-    rows: list[list[object]] = []
-    for number, stamp in enumerate(STAMPS):
-        saved = number != 2
-        pose = [''] * 7 if number == 1 else [0.1 * number, 0.2, 0.3, 0, 0, 0, 1]
-        rows.append([number, stamp, *pose,
+    for number in (0, 1, 3, 4):
+        (folder / 'frames' / f'{number:06d}_{STAMPS[number]}.jpg').write_bytes(picture(number))
+    write_table(folder / 'poses.csv',
+                'frame_index,timestamp_ns,tx,ty,tz,qx,qy,qz,qw,tracking_state,image', [
+                    [number, stamp, *([''] * 7 if number == 1 else [
+                        0.1 * number, 0.2, 0.3, 0, 0, 0, 1]),
                      'PAUSED:INSUFFICIENT_FEATURES' if number == 1 else 'TRACKING',
-                     'saved' if saved else 'dropped:queue_full'])
-        if saved:
-            (folder / 'frames' / f'{number:06d}_{stamp}.jpg').write_bytes(picture(number))
-    write_posecam_tables(folder, rows, [
-        [number, stamp, 4_000_000 + number, '' if number == 0 else 21_500_000, 0]
-        for number, stamp in enumerate(STAMPS)], [
+                     'dropped:queue_full' if number == 2 else 'saved']
+                    for number, stamp in enumerate(STAMPS)])
+    write_table(folder / 'frame_metadata.csv', 'frame_index,timestamp_ns,exposure_time_ns,'
+                'rolling_shutter_skew_ns,ois_mode', [
+                    [number, stamp, 4_000_000 + number, '' if number == 0 else 21_500_000, 0]
+                    for number, stamp in enumerate(STAMPS)])
+    write_table(folder / 'imu.csv', 'timestamp_ns,sensor,x,y,z,bias_x,bias_y,bias_z', [
         row for stamp in IMU_STAMPS for row in (
             [stamp, 'accel', 0.05, 9.8, 0.5, '', '', ''],
             [stamp + 1_000_000, 'gyro_uncal', '-5.5E-4', 0.25, 0.5, 0.01, 0.02, -0.03])])
@@ -157,15 +159,6 @@ def make_posecam(folder: Path) -> Path:
     (folder / 'device.json').write_text(json.dumps({'camera': {'sensor_orientation_deg': 90}}))
     (folder / 'manifest.json').write_text(json.dumps({'pose_jumps': {'count': 0, 'jumps': []}}))
     return folder
-
-
-def write_posecam_tables(folder: Path, poses: list[list[object]], metadata: list[list[object]],
-                         imu: list[list[object]]) -> None:
-    write_table(folder / 'poses.csv',
-                'frame_index,timestamp_ns,tx,ty,tz,qx,qy,qz,qw,tracking_state,image', poses)
-    write_table(folder / 'frame_metadata.csv', 'frame_index,timestamp_ns,exposure_time_ns,'
-                'rolling_shutter_skew_ns,ois_mode', metadata)
-    write_table(folder / 'imu.csv', 'timestamp_ns,sensor,x,y,z,bias_x,bias_y,bias_z', imu)
 
 
 def make_mars(folder: Path, clock: str = 'REALTIME', difference: int = 0) -> Path:

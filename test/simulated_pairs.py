@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-import two_view_scene as scenes
-from two_view_scene import CENTRE, FOCAL
 
+from rs_relpose_lab.experiments import problems
+from rs_relpose_lab.experiments.problems import VIEW
+from rs_relpose_lab.simulation.rows import observe, uniform_motion
 from rs_relpose_ros import estimate_relative_pose, FrameMotion, RollingShutterCamera
 from rs_relpose_ros.estimator.result import Landmarks, landmarks, RelativePose, Status
 from rs_relpose_ros.geometry.camera import Intrinsics
@@ -19,8 +20,9 @@ from rs_relpose_ros.pipeline.pair import PairResult
 from rs_relpose_ros.tracking.features import Matches
 
 SCENE_CAMERA = {
-    'width': scenes.WIDTH, 'height': scenes.HEIGHT, 'fx': FOCAL, 'fy': FOCAL, 'cx': CENTRE[0],
-    'cy': CENTRE[1], 'readout_time': scenes.HEIGHT * scenes.LINE_DELAY}
+    'width': VIEW.width, 'height': VIEW.height, 'fx': problems.FOCAL, 'fy': problems.FOCAL,
+    'cx': problems.CENTRE_U, 'cy': problems.CENTRE_V,
+    'readout_time': VIEW.height * VIEW.line_delay}
 
 
 def estimate_scene(scene, config, gravity=True, camera=(), **arguments):
@@ -56,33 +58,20 @@ class Flight:
     true_landmarks: list[Landmarks]
 
 
-@dataclass(frozen=True)
-class View:
-    """Observations of each point in a keyframe: pixels, row time, derotated unit ray."""
+class Keyframe:
+    """Pose and motion; of each point pixel, row time, derotated unit ray, place at row time 0."""
 
-    rotation: Rotation
-    position: NDArray[np.float64]
-    angular_velocity: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    pixels: NDArray[np.float64]
-    tau: NDArray[np.float64]
-    rays: NDArray[np.float64]
-    points: NDArray[np.float64]   # in the camera as it is at row time 0 [m]
-
-
-def projected(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    return FOCAL * points[:, :2] / points[:, 2:] + CENTRE
-
-
-def view(world: NDArray[np.float64], time: float, rng: np.random.Generator) -> View:
-    rotation = Rotation.from_rotvec(rng.normal(size=3) * 0.1)
-    position, w, v = time * VELOCITY, rng.normal(size=3), rotation.inv().apply(VELOCITY)
-    local, tau, settled = scenes.expose(world, rotation, position, w, v, 0.0, 60)
-    assert settled.all()
-    rays = Rotation.from_rotvec(tau[:, None] * w).apply(
-        local / np.linalg.norm(local, axis=1, keepdims=True))
-    return View(rotation, position, w, v, projected(local), tau, rays,
-                rotation.inv().apply(world - position))
+    def __init__(self, world: NDArray[np.float64], time: float, rng: np.random.Generator) -> None:
+        self.rotation = Rotation.from_rotvec(rng.normal(size=3) * 0.1)
+        self.position, self.rate = time * VELOCITY, rng.normal(size=3)
+        self.velocity = self.rotation.inv().apply(VELOCITY)
+        motion = uniform_motion(self.rotation, self.position, self.rate, self.velocity)
+        self.pixels = observe(world, motion, VIEW, margin=np.inf)
+        self.tau = self.pixels[:, 1] * VIEW.line_delay
+        local = motion(world, self.tau)
+        self.rays = Rotation.from_rotvec(self.tau[:, None] * self.rate).apply(
+            local / np.linalg.norm(local, axis=1, keepdims=True))
+        self.points = self.rotation.inv().apply(world - self.position)
 
 
 def simulated_flight(seed: int, points: int = 120,
@@ -95,10 +84,10 @@ def simulated_flight(seed: int, points: int = 120,
     """
     rng = np.random.default_rng(seed)
     world = rng.uniform([-4.0, -2.0, 6.0], [4.0, 2.0, 20.0], (points, 3))
-    views = [view(world, time, rng) for time in places]
+    frames = [Keyframe(world, time, rng) for time in places]
     chosen = [np.arange(points)] * (len(TIMES) - 1) if tracks is None else list(tracks)
-    first, pairs, baselines, true_landmarks = views[0], [], [], []
-    for k, (a, b, use) in enumerate(zip(views[:-1], views[1:], chosen, strict=True)):
+    first, pairs, baselines, true_landmarks = frames[0], [], [], []
+    for k, (a, b, use) in enumerate(zip(frames[:-1], frames[1:], chosen, strict=True)):
         t = a.rotation.inv().apply(b.position - a.position)
         length = float(np.linalg.norm(t))
         baselines.append(length)
@@ -106,7 +95,7 @@ def simulated_flight(seed: int, points: int = 120,
         use = rng.permutation(use)
         pose = RelativePose(
             status=Status.OK, R=(a.rotation.inv() * b.rotation).as_matrix(),
-            angular_velocity2=b.angular_velocity, inliers=np.ones(len(use), dtype=bool),
+            angular_velocity2=b.rate, inliers=np.ones(len(use), dtype=bool),
             covariance=1e-6 * np.eye(6), velocity_covariance=1e-4 * np.eye(6), model='uniform')
         if length > 0.0:
             pose = replace(pose, t=t / length, linear_velocity1=a.velocity / length,
@@ -115,13 +104,13 @@ def simulated_flight(seed: int, points: int = 120,
             pose = pose.without_translation(Status.PURE_ROTATION, 'no translation')
         matches = Matches(use.astype(np.uint32) + 7, a.pixels[use], b.pixels[use],
                           np.ones(len(use)))
-        truth = Landmarks(projected(a.points[use]), projected(b.points[use]), a.points[use])
-        true_landmarks.append(truth)
+        true_landmarks.append(Landmarks(
+            VIEW.project(a.points[use]), VIEW.project(b.points[use]), a.points[use]))
         rows = a.rays[use], b.rays[use], a.tau[use], b.tau[use]
         stamps = [START_NS + round(1e9 * time) for time in TIMES[k:k + 2]]
         pairs.append(PairResult(
             *stamps, *stamps, 'camera', TIMES[k + 1] - TIMES[k], pose, matches, *rows[2:],
             *rows[:2], 10.0, landmarks(pose, *rows, SENSOR.camera) if pose else None))
-    positions = np.array([first.rotation.inv().apply(v.position - first.position) for v in views])
-    return Flight(pairs, positions, [(first.rotation.inv() * v.rotation).as_matrix()
-                                     for v in views], np.array(baselines), true_landmarks)
+    positions = np.array([first.rotation.inv().apply(f.position - first.position) for f in frames])
+    return Flight(pairs, positions, [(first.rotation.inv() * f.rotation).as_matrix()
+                                     for f in frames], np.array(baselines), true_landmarks)

@@ -138,39 +138,34 @@ def test_realsense_publishes_gyro_and_accelerometer_separately(tmp_path):
     assert found(path, accel='/camera/accel/sample') == found(path)
 
 
-def test_several_candidates_are_listed_with_the_option(tmp_path):
-    path = topics_bag(tmp_path, ('/left', IMAGE), ('/right', IMAGE), ('/a/info', INFO),
-                      ('/b/info', INFO), ('/imu0', IMU), ('/imu1', IMU))
-    check_refusal(path, InputError, ('--image-topic', '/left', '/right', IMAGE))
-    check_refusal(path, InputError, ('--camera-info-topic', '/a/info', '/b/info'), image='/left',
-                  imu='/imu0')
-    check_refusal(path, InputError, ('--imu-topic', '--accel-topic', '/imu0', '/imu1'),
-                  image='/left', camera_info='/a/info')
-    chosen = {'image': '/left', 'camera_info': '/b/info', 'imu': '/imu1'}
+SEVERAL = (('/left', IMAGE), ('/right', IMAGE), ('/a/info', INFO), ('/b/info', INFO),
+           ('/imu0', IMU), ('/imu1', IMU))
+
+
+def test_a_choice_among_several_with_or_without_the_slash(tmp_path):
+    path, chosen = topics_bag(tmp_path, *SEVERAL), {
+        'image': '/left', 'camera_info': '/b/info', 'imu': '/imu1'}
     assert found(path, **chosen) == chosen
-    # As people type it.
     assert found(path, **{role: name[1:] for role, name in chosen.items()}) == chosen
 
 
-@pytest.mark.parametrize('absent, named', [
-    ('/image', 'image topic'), ('/info', 'CameraInfo topic'), ('/imu', 'IMU topic')])
-def test_an_absent_topic_is_named_with_those_there_are(tmp_path, absent, named):
-    there = [(name, msgtype) for name, msgtype in SENSORS if name != absent]
-    check_refusal(topics_bag(tmp_path, *there), MissingInputError, (
-        f'has no {named}', *(f'{name} ({msgtype})' for name, msgtype in there)))
-
-
-@pytest.mark.parametrize('kind, options, words', [
-    (MissingInputError, {'image': '/picture'}, ('/picture', '--image-topic', '/image')),
-    (InputError, {'imu': '/info'}, ('/info', '--imu-topic', IMU, INFO)),
-    (InputError, {'truth': '/imu'}, (POSE, '--truth-topic'))])
-def test_wrong_choices(tmp_path, kind, options, words):
-    check_refusal(topics_bag(tmp_path, *SENSORS), kind, words, **options)
-
-
-def test_rectified_images_are_refused(tmp_path):
-    path = topics_bag(tmp_path, ('/camera/image_rect', IMAGE), ('/info', INFO), ('/imu', IMU))
-    check_refusal(path, InputError, ('rectified',))
+@pytest.mark.parametrize('topics, options, kind, words', [
+    (SEVERAL, {}, InputError, ('--image-topic', '/left', '/right', IMAGE)),
+    (SEVERAL, {'image': '/left', 'imu': '/imu0'}, InputError,
+     ('--camera-info-topic', '/a/info', '/b/info')),
+    (SEVERAL, {'image': '/left', 'camera_info': '/a/info'}, InputError,
+     ('--imu-topic', '--accel-topic', '/imu0', '/imu1')),
+    *((SENSORS[:k] + SENSORS[k + 1:], {}, MissingInputError, (
+        f'has no {name} topic', *(f'{other} ({msgtype})' for other, msgtype in (
+            SENSORS[:k] + SENSORS[k + 1:]))))
+      for k, name in enumerate(('image', 'CameraInfo', 'IMU'))),
+    (SENSORS, {'image': '/picture'}, MissingInputError, ('/picture', '--image-topic', '/image')),
+    (SENSORS, {'imu': '/info'}, InputError, ('/info', '--imu-topic', IMU, INFO)),
+    (SENSORS, {'truth': '/imu'}, InputError, (POSE, '--truth-topic')),
+    ((('/image_rect', IMAGE), *SENSORS[1:]), {}, InputError, ('rectified',))])
+def test_topics_that_cannot_be_used(tmp_path, topics, options, kind, words):
+    """Several candidates are listed with their option, and for an absent topic all there are."""
+    check_refusal(topics_bag(tmp_path, *topics), kind, words, **options)
 
 
 def test_ground_truth_is_that_of_the_project_among_several(tmp_path, caplog):

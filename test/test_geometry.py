@@ -18,7 +18,7 @@ from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.geometry import so3
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.distortion import DISTORTION_MODELS, DistortionModel
-from rs_relpose_ros.geometry.motion import FrameMotion
+from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 from rs_relpose_ros.geometry.timing import ImageClock, seconds_between, to_nanoseconds
 from rs_relpose_ros.jit import kernel
 
@@ -198,12 +198,6 @@ def test_camera_and_clock_of_a_parameter_set():
         sensor_model(INTRINSICS, SensorConfig())
 
 
-def test_pixels_of_the_published_image():
-    pixels = np.array([[0.0, 0.0], [375.0, 199.0]])
-    np.testing.assert_array_equal(INTRINSICS.to_sensor(pixels), [[0.5, 40.5], [750.5, 438.5]])
-    np.testing.assert_array_equal(INTRINSICS.to_image(INTRINSICS.to_sensor(pixels)), pixels)
-
-
 # --- motion during the readout
 
 
@@ -373,6 +367,12 @@ NAN, STEADY = float('nan'), np.zeros((2, 3))
     *((lambda times=times: FrameMotion.from_gyro(times, STEADY), 'times')
       for times in ([0.0, 0.0], [0.01, 0.02], [0.0, np.inf])),
     (lambda: FrameMotion.from_gyro([0.0, 0.01], STEADY).rotations([0.011]), 'row times'),
+    *((lambda changes=changes: InertialMotion(**{
+        'alpha': np.zeros(3), 'beta': np.zeros(3), 'duration': 0.1,
+        'covariance': 1e-4 * np.eye(6), **changes}), next(iter(changes))) for changes in (
+            {'duration': 0.0}, {'duration': -0.1}, {'duration': NAN}, {'alpha': [1.0, 2.0]},
+            {'beta': [1.0, NAN, 0.0]}, {'lever_arm': [30.0, 0.0, 0.0]}, {'covariance': np.eye(3)},
+            {'covariance': -np.eye(6)}, {'acceleration2': [1e9, 0.0, 0.0]})),
 ])
 def test_illegal_values_are_refused_by_name(build, name):
     with pytest.raises(InputError, match=f'^{name} '):

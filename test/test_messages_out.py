@@ -6,7 +6,6 @@ from dataclasses import replace
 import struct
 from typing import Any
 
-import cv2
 import message_builders as build
 import numpy as np
 import pytest
@@ -23,7 +22,6 @@ from rs_relpose_ros.messages import incoming, outgoing
 from rs_relpose_ros.messages.published_pair import published_pair
 from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState
 from rs_relpose_ros.pipeline.pair import PairResult
-from rs_relpose_ros.tracking.images import Pixels
 
 
 def pair() -> PairResult:
@@ -170,32 +168,22 @@ def test_messages_of_rclpy_and_rosbags_serialise_alike():
 STAMP_NS = 1_700_000_000_123_456_789
 
 
-def test_messages_come_back_as_written(tmp_path):
-    rng = np.random.default_rng(0)
-    picture = cv2.GaussianBlur(rng.integers(0, 256, (48, 64), dtype=np.uint8), (5, 5), 2.0)
-    jpeg = build.jpeg(picture)
+def test_messages_of_sensors(tmp_path):
+    """As written by `simulate` and `convert`, whose tests read their images and poses back."""
     camera = RollingShutterCamera(
         width=64, height=48, fx=50.0, fy=51.0, cx=31.0, cy=23.0, readout_time=0.03,
         distortion=(-0.1, 0.01, 0.0, 0.0, 0.0))
-    path = tmp_path / 'deep' / 'bag'
-    with BagWriter(path) as bag:
-        written = [
-            outgoing.imu_message(STAMP_NS, 'imu_link', (0.1, 0.2, 0.3), (1.0, 2.0, 9.8), bag.type,
-                                 angular_velocity_covariance=4e-6 * np.eye(3)),
-            outgoing.camera_info_message(STAMP_NS, 'cam', camera, None, bag.type),
-            outgoing.encoded_image_message(STAMP_NS, 'cam', jpeg, bag.type),
-            outgoing.image_message(STAMP_NS, 'cam', Pixels(picture, 'mono8'), bag.type),
-            outgoing.pose_stamped_message(STAMP_NS, 'world', (0.5, -0.5, 0.5, -0.5),
-                                          (1.0, 2.0, 3.0), bag.type)]
-        for number, message in enumerate(written):
+    with BagWriter(tmp_path / 'deep' / 'bag') as bag:
+        for number, message in enumerate((
+                outgoing.imu_message(STAMP_NS, 'imu_link', (0.1, 0.2, 0.3), (1.0, 2.0, 9.8),
+                                     bag.type, angular_velocity_covariance=4e-6 * np.eye(3)),
+                outgoing.camera_info_message(STAMP_NS, 'cam', camera, None, bag.type))):
             bag.write(f'/{number}', message.__msgtype__, message, STAMP_NS + number)
-    with AnyReader([path]) as reader:
-        found = [(connection.topic, time_ns, reader.deserialize(data, connection.msgtype))
-                 for connection, time_ns, data in reader.messages()]
-    assert [(topic, time_ns - STAMP_NS) for topic, time_ns, _ in found] == [
-        (f'/{number}', number) for number in range(5)]
-    imu, info, compressed, raw, pose = messages = [message for *_, message in found]
-    assert {incoming.stamp_ns(message.header) for message in messages} == {STAMP_NS}
+    with AnyReader([tmp_path / 'deep' / 'bag']) as reader:
+        (topic, time_ns, imu), (*_, info) = (
+            (connection.topic, time_ns, reader.deserialize(data, connection.msgtype))
+            for connection, time_ns, data in reader.messages())
+    assert (topic, time_ns, incoming.stamp_ns(imu.header)) == ('/0', STAMP_NS, STAMP_NS)
     assert imu.header.frame_id == 'imu_link'
     assert (imu.angular_velocity.x, imu.linear_acceleration.z) == (0.1, 9.8)
     assert imu.orientation_covariance[0] == -1.0
@@ -205,10 +193,6 @@ def test_messages_come_back_as_written(tmp_path):
     assert info.k.tolist() == [50.0, 0.0, 31.0, 0.0, 51.0, 23.0, 0.0, 0.0, 1.0]
     np.testing.assert_array_equal(info.p.reshape(3, 4)[:, :3], info.k.reshape(3, 3))
     np.testing.assert_array_equal(info.d, camera.distortion)
-    assert compressed.data.tobytes() == jpeg
-    assert (raw.encoding, raw.step) == ('mono8', 64)
-    np.testing.assert_array_equal(raw.data.reshape(48, 64), picture)
-    assert (pose.pose.position.y, pose.pose.orientation.w) == (2.0, -0.5)
 
 
 def test_path_that_cannot_be_used_is_untouched(tmp_path):

@@ -85,7 +85,7 @@ FAULTS = [
     Fault('clocks ahead', faults.nothing, GAP, jump=20.0),
     Fault('clocks back by less than a second', faults.nothing, 'older than the one before',
           jump=-0.4),
-    Fault('one image far ahead', faults.first_ahead(Image, 100.0), 'image stamps jumped back'),
+    Fault('one image far ahead', faults.first_ahead(Image, 100.0), 'no other is near it'),
     Fault('one IMU sample far ahead', faults.first_ahead(Imu, 100.0)),
     Fault('camera stops', faults.without(Image)),
     Fault('camera slows down', faults.every(Image, 3)),
@@ -302,11 +302,11 @@ def test_diagnostics_count_what_happened(session):
                if key.startswith('frames_refused_')}
     assert int(values['frames_received']) == int(values['frames_processed']) + sum(
         refused.values())
-    for reason in ('imu_gap', 'duplicate', 'out_of_order', 'clock_jump', 'bad_image',
-                   'no_calibration'):
+    for reason in ('imu_gap', 'duplicate', 'out_of_order', 'bad_image', 'no_calibration'):
         assert refused[reason] > 0, reason
     assert int(values['imu_gaps']) >= 5
-    assert int(values['clock_jumps']) >= 4
+    assert int(values['clock_jumps']) >= 2
+    assert int(values['imu_wild']) >= 1
     assert int(values['messages_invalid']) > 200
     assert values['frames_failed'] == '0'
     assert int(values['poses']) == len(session.poses)

@@ -151,15 +151,17 @@ def test_silence_is_counted_from_the_last_result(clock, statistics):
                                               'LOW_PARALLAX: at rest')
 
 
-@pytest.mark.parametrize(('rate', 'size', 'expected'), [
-    (9, 921_600, True), (29, 921_600, False), (9, 300_000, False), (0, 921_600, False)])
-def test_lost_images_are_reported(rate, size, expected):
-    lost = diagnostics.LostImages()
-    for second in range(5):
-        assert lost.add(rate * second, 30 * second, size) == ''
-    text = lost.add(rate * 5, 150, size)
-    assert ('9 images' in text and '0.9 MB' in text and '30 CameraInfo' in text) == expected
+@pytest.mark.parametrize(('share', 'size', 'jitter', 'expected'), [
+    (0.5, 921_600, 0, True), (0.95, 921_600, 0, False), (0.5, 300_000, 0, False),
+    # Of a rhythm with jitter; of a slow start, before the last seconds.
+    (0.5, 921_600, 2_000_000, True), (1.0, 921_600, 2_000_000, False)])
+def test_lost_images_are_reported(share, size, jitter, expected):
+    rng = np.random.default_rng(0)
+    stamps = [k * SECOND // 30 + int(jitter * rng.normal()) for k in range(300)
+              if k < 100 or rng.random() < share]
+    text = diagnostics.lost_images(stamps, size)
     assert bool(text) == expected
+    assert ('config/fastdds.xml' in text) == expected
 
 
 def pair(status: Status = Status.OK, reason: str = '') -> PairResult:
@@ -216,13 +218,19 @@ def test_latency_is_from_ready_to_publication(clock, statistics):
 
 
 def test_refused_frames_are_reported_once(statistics):
-    later = counts(frames=10, taken=4, overload=3, no_imu=3)
+    later = counts(frames=11, taken=5, overload=3, no_imu=3)
     for counted, parts in ((counts(9, 4, overload=3, no_imu=2), ('5 frames', '3 overload, 2 no_')),
                            (later, ('1 frames', '(1 no_imu)'))):
         found = report(statistics, counted=counted)
         assert found.level == WARN
         assert all(part in found.text for part in parts)
     assert report(statistics, counted=later).level == OK
+    # No frame at all was used since then.
+    statistics.add_refusal('the image is 320x240, but its CameraInfo is for 640x480')
+    unused = counts(frames=15, taken=5, overload=3, no_imu=3, bad_image=4)
+    third = report(statistics, counted=unused)
+    assert (third.level, dict(third.values)['state']) == (ERROR, 'not estimating')
+    assert third.text.endswith('CameraInfo is for 640x480')
 
 
 # Besides the refusals.
@@ -231,6 +239,7 @@ EXPECTED = {
     'imu_rate_hz': '200.0', 'accel_rate_hz': '100.0', 'frames_received': '2000',
     'frames_processed': '1064', 'frames_failed': '3', 'messages_invalid': '15',
     'imu_samples': '9000', 'imu_gaps': '11', 'imu_repeated': '13', 'imu_late': '14',
+    'imu_wild': '16',
     'clock_jumps': '12', 'pairs': '3', 'poses': '2', 'matches': '20', 'inliers': '15',
     'inlier_ratio': '0.750', 'parallax_px': '3.2', 'residual_rms_px': '',
     'pixel_sigma_px': '',
@@ -262,7 +271,8 @@ def test_every_counter_has_its_own_field(clock, statistics):
         statistics.add_pair(result, clock.now - 15 * 10**6)
     statistics.add_frame(clock.now - 30 * 10**6)
     counted = SequencerCounts(frames=2000, frames_taken=1064, refused=refused, imu_samples=9000,
-                              imu_gaps=11, clock_jumps=12, imu_repeated=13, imu_late=14)
+                              imu_gaps=11, clock_jumps=12, imu_repeated=13, imu_late=14,
+                              imu_wild=16)
     clock.now = 2 * SECOND
     found = report(statistics, 60, counted, missing=('imu',), camera_info=62, imu=400, accel=200,
                    invalid=15).values

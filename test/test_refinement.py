@@ -8,7 +8,7 @@ from two_view_scene import make_scene, rotation_error
 
 from rs_relpose_ros import EstimatorConfig
 from rs_relpose_ros.estimator import fit, priors, sampson
-from rs_relpose_ros.estimator.priors import D2, PARAMETERS, Priors, SCALE, TwoViewState
+from rs_relpose_ros.estimator.priors import PARAMETERS, Priors, SCALE, TwoViewState
 from rs_relpose_ros.geometry.so3 import tangent_basis
 
 
@@ -53,20 +53,9 @@ def test_jacobian_equals_finite_differences(seed):
 
 
 def constraint(rows, state):
-    """``(f_1 x R f_2) . b`` with ``b = t - tau_1 d_1 + tau_2 d_2``, and ``f_1 x R f_2``."""
+    """``(f_1 x R f_2) . b`` with ``b = t - tau_1 d_1 + tau_2 d_2``."""
     b = state.t - rows[:, 18:19] * state.d1 + rows[:, 19:20] * state.d2
-    normals = np.cross(rows[:, 0:3], rows[:, 9:12] @ state.R.T)
-    return np.einsum('ni,ni->n', normals, b), normals
-
-
-def test_a_frozen_denominator_would_fail_the_comparison():
-    """The usual shortcut, d(e)/s, is a different derivative: the test above can tell."""
-    rng = np.random.default_rng(0)
-    rows, state = random_observations(rng), random_state(rng)
-    e, normals = constraint(rows, state)
-    shortcut = normals * (sampson.residuals(rows, state) / e)[:, None]
-    exact = sampson.jacobian(rows, state)[:, D2:D2 + 3] / rows[:, 19:20]
-    assert np.abs(shortcut - exact).max() > 0.05 * np.abs(exact).max()
+    return (np.cross(rows[:, 0:3], rows[:, 9:12] @ state.R.T) * b).sum(axis=1)
 
 
 def test_residual_is_the_constraint_over_its_gradient_by_pixels():
@@ -79,10 +68,10 @@ def test_residual_is_the_constraint_over_its_gradient_by_pixels():
         ahead[:, ray:ray + 3] += rows[:, derivative:derivative + 3]
         back[:, ray:ray + 3] -= rows[:, derivative:derivative + 3]
         # Exact: the constraint is linear in either ray.
-        gradient[:, k] = (constraint(ahead, state)[0] - constraint(back, state)[0]) / 2.0
+        gradient[:, k] = (constraint(ahead, state) - constraint(back, state)) / 2.0
     np.testing.assert_allclose(
         sampson.residuals(rows, state),
-        constraint(rows, state)[0] / np.linalg.norm(gradient, axis=1), rtol=1e-10)
+        constraint(rows, state) / np.linalg.norm(gradient, axis=1), rtol=1e-10)
 
 
 def test_depths_of_exact_matches():

@@ -203,9 +203,12 @@ def imu(first_ms, last_ms, step_ms=5):
      [100], [4900, 100], [Refusal.CLOCK_JUMP], 0, 1),
     ((imu(0, 5000, 10), 4900, 4990, 100, imu(0, 200), imu(205, 300), 200), [4900, 100, 200],
      [100], [4900, 100], [Refusal.CLOCK_JUMP], 0, 1),
-    # Stamps far ahead: of a frame, then of the IMU.
-    ((imu(0, 200), 100_000, 100, [100_000], imu(205, 400), 300), [100, 300], [100, 300],
-     [100, 300], [Refusal.CLOCK_JUMP], 1, 2)])
+    # Single stamps far ahead, of a frame, then of the IMU; a frame of stamp zero.
+    ((imu(20_000, 20_200), 20_050, 100_000, 20_100, [100_000], imu(20_205, 20_400), 0, 20_300),
+     [20_050, 20_100, 20_300], [], [20_050], [Refusal.OUT_OF_ORDER] * 2, 0, 0),
+    # Clocks that jump ahead: of two stamps the first is not used.
+    ((imu(0, 200), 100, imu(100_000, 100_400), 100_100, 100_200), [100, 100_200], [],
+     [100, 100_200], [Refusal.OUT_OF_ORDER], 1, 0)])
 def test_gaps_and_jumps(live, events, released, restarted, alone, refused, gaps, jumps):
     items = []
     for event in events:

@@ -1,4 +1,4 @@
-"""Random two-view problems, independent of the package's geometry: SciPy only.
+"""Random two-view problems, independent of the package's geometry: cameras of the laboratory.
 
 The paper's set-up: 1920x1080, f = 640 px, 60 us per row, baseline about 2 m, points 6 to 34 m
 away, velocities opposite in the two frames.
@@ -6,15 +6,17 @@ away, velocities opposite in the two frames.
 
 from __future__ import annotations
 
-from dataclasses import make_dataclass
+from dataclasses import make_dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-WIDTH, HEIGHT, FOCAL, CENTRE = 1920, 1080, 640.0, (959.5, 539.5)
-LINE_DELAY = 60e-6
-GRAVITY_NOISE, GYRO_NOISE = np.radians(0.2), np.radians(0.1)
+from rs_relpose_lab.experiments.problems import BASELINES, HEIGHT, LINE_DELAY, VIEW, WIDTH
+from rs_relpose_lab.simulation.rows import in_both_views, measured, uniform_motion
 
+SIZE = (WIDTH - 1, HEIGHT - 1)
+GRAVITY_NOISE, GYRO_NOISE = np.radians(0.2), np.radians(0.1)
+DOWN = np.array([0.0, 1.0, 0.0])
 
 # Matches in pixels, measurements of the IMU, and the truth (velocities in baselines/s).
 TwoViewScene = make_dataclass('TwoViewScene', (
@@ -28,42 +30,6 @@ MinimalProblems = make_dataclass('MinimalProblems', (
     'v1', 'v2', 'w1', 'w2'), frozen=True)
 
 
-def rays_from(world, R, p, w, v, tau):
-    """World points (N, 3) in the frame of the camera as it is at the row times (N,)."""
-    turn = R * Rotation.from_rotvec(tau[:, None] * w)
-    return turn.inv().apply(world - p - tau[:, None] * R.apply(v))
-
-
-def expose(world, R, p, w, v, reference_row, iterations):
-    """Points (N, 3) in the frame of a camera that moves while it reads rows, and their row times.
-
-    Of one camera, or of N: `R` a rotation or N of them, `p`, `w`, `v` (3,) or (N, 3).
-    """
-    rows, tau = np.full(len(world), HEIGHT / 2), np.empty(len(world))
-    local, settled = np.empty((len(world), 3)), np.empty(len(world), dtype=bool)
-    left = np.arange(len(world))
-    for _ in range(iterations):
-        if not len(left):
-            break
-        turn = R if R.single else R[left]
-        at, velocity, rate = (x if np.ndim(x) == 1 else x[left] for x in (p, v, w))
-        tau[left] = (rows[left] - reference_row) * LINE_DELAY
-        local[left] = rays_from(world[left], turn, at, rate, velocity, tau[left])
-        moved = FOCAL * local[left, 1] / local[left, 2] + CENTRE[1]
-        settled[left] = np.abs(moved - rows[left]) < 1e-9
-        # Another iteration would not change the others, to the last bit.
-        again = moved != rows[left]
-        rows[left] = moved
-        left = left[again]
-    return local, tau, settled
-
-
-def project(world, R, p, w, v, reference_row):
-    """Pixels and depths of world points (N, 3), and whether their rows were found."""
-    local, _, settled = expose(world, Rotation.from_matrix(R), p, w, v, reference_row, 60)
-    return FOCAL * local[:, :2] / local[:, 2:] + CENTRE, local[:, 2], settled
-
-
 def make_scene(seed, *, n=300, direction='forward', speed=1.0, rate=1.0, pixel_noise=0.5,
                gravity_noise=GRAVITY_NOISE, gyro_noise=GYRO_NOISE, outliers=0.3,
                constant_velocity=False, pure_rotation=False, on_a_line=False, reference='first'):
@@ -74,46 +40,36 @@ def make_scene(seed, *, n=300, direction='forward', speed=1.0, rate=1.0, pixel_n
     `reference` the row that pose and motion refer to.
     """
     rng = np.random.default_rng(seed)
-    reference_row = {'first': 0.0, 'middle': (HEIGHT - 1) / 2, 'last': HEIGHT - 1.0}[reference]
-    baseline = {'forward': [0.0, 0.0, 2.0], 'sideways': [2.0, 0.0, 0.0]}[direction]
-    p2 = np.array(baseline) + rng.normal(size=3) * 0.2
+    view = replace(VIEW, reference_row={
+        'first': 0.0, 'middle': (HEIGHT - 1) / 2, 'last': HEIGHT - 1.0}[reference])
+    p2 = BASELINES[direction] + rng.normal(size=3) * 0.2
     if pure_rotation:
         p2, speed = np.zeros(3), 0.0
-    R1, R2 = (Rotation.from_euler('xyz', rng.uniform(-10, 10, 3), degrees=True).as_matrix()
-              for _ in range(2))
+    R1, R2 = Rotation.from_euler('xyz', rng.uniform(-10, 10, (2, 3)), degrees=True)
     v1 = speed * rng.choice([-1.0, 1.0], 3)
     v2 = -v1
     if constant_velocity:
         velocity = speed * np.sqrt(3.0) * p2 / np.linalg.norm(p2)
-        v1, v2 = R1.T @ velocity, R2.T @ velocity
+        v1, v2 = R1.inv().apply(velocity), R2.inv().apply(velocity)
     w1 = rate * rng.choice([-1.0, 1.0], 3)
     w2 = -w1
-    found1, found2 = [], []
     ends = rng.uniform([-4, -2, 8], [4, 2, 20], (2, 3)) if on_a_line else None
-    while sum(map(len, found1)) < n:
-        world = rng.uniform([-30, -18, 6], [30, 18, 34], (8 * n, 3))
+
+    def candidates():
         if on_a_line:
-            world = ends[0] + rng.uniform(size=(8 * n, 1)) * (ends[1] - ends[0])
-        a, za, settled_a = project(world, R1, np.zeros(3), w1, v1, reference_row)
-        b, zb, settled_b = project(world, R2, p2, w2, v2, reference_row)
-        size = [WIDTH - 1, HEIGHT - 1]
-        observed = (za > 1) & (zb > 1) & settled_a & settled_b
-        observed &= ((a >= 0) & (b >= 0) & (a <= size) & (b <= size)).all(axis=1)
-        found1.append(a[observed])
-        found2.append(b[observed])
-    points1 = np.concatenate(found1)[:n] + rng.normal(size=(n, 2)) * pixel_noise
-    points2 = np.concatenate(found2)[:n] + rng.normal(size=(n, 2)) * pixel_noise
-    is_outlier = np.zeros(n, dtype=bool)
-    is_outlier[rng.permutation(n)[:int(outliers * n)]] = True
-    points2[is_outlier] = rng.uniform([0, 0], size, (is_outlier.sum(), 2))
+            return ends[0] + rng.uniform(size=(8 * n, 1)) * (ends[1] - ends[0])
+        return rng.uniform([-30, -18, 6], [30, 18, 34], (8 * n, 3))
+
+    exact = in_both_views(candidates, uniform_motion(R1, np.zeros(3), w1, v1),
+                          uniform_motion(R2, p2, w2, v2), view, n)
+    points1, points2, is_outlier = measured(exact, view, pixel_noise, outliers, rng)
     length = np.linalg.norm(p2) if not pure_rotation else 1.0
     tilt = Rotation.from_rotvec(gravity_noise * rng.choice([-1.0, 1.0], 3))
-    down = np.array([0.0, 1.0, 0.0])
     return TwoViewScene(
         points1, points2, w1 + rng.normal(size=3) * gyro_noise,
-        w2 + rng.normal(size=3) * gyro_noise, tilt.apply(R1.T @ down),
-        tilt.inv().apply(R2.T @ down), R1.T @ R2, R1.T @ p2 / length, v1 / length, v2 / length,
-        w1, w2, is_outlier)
+        w2 + rng.normal(size=3) * gyro_noise, tilt.apply(R1.inv().apply(DOWN)),
+        tilt.inv().apply(R2.inv().apply(DOWN)), (R1.inv() * R2).as_matrix(),
+        R1.inv().apply(p2) / length, v1 / length, v2 / length, w1, w2, is_outlier)
 
 
 def make_minimal_problems(seed, count, n, *, speed=(0.0, 10.0), rate=(0.0, 3.0),
@@ -126,32 +82,34 @@ def make_minimal_problems(seed, count, n, *, speed=(0.0, 10.0), rate=(0.0, 3.0),
     times to rounding, however far the search for the row has come.
     """
     rng = np.random.default_rng(seed)
-    p2 = np.where(np.arange(count)[:, None] % 2, [2.0, 0.0, 0.0], [0.0, 0.0, 2.0])
+    p2 = np.where(np.arange(count)[:, None] % 2, BASELINES['sideways'], BASELINES['forward'])
     p2 = p2 + rng.normal(size=(count, 3)) * 0.2
     R1, R2 = (Rotation.from_euler('xyz', rng.uniform(-10, 10, (count, 3)), degrees=True)
               for _ in range(2))
     v1, w1 = (rng.uniform(*size, (count, 1)) * rng.choice([-1.0, 1.0], (count, 3))
               for size in (speed, rate))
     v2, w2 = -v1, -w1
+    length = np.linalg.norm(p2, axis=1, keepdims=True)
     if constant_velocity:
-        velocity = np.linalg.norm(v1, axis=1, keepdims=True) * p2 / np.linalg.norm(
-            p2, axis=1, keepdims=True)
+        velocity = np.linalg.norm(v1, axis=1, keepdims=True) * p2 / length
         v1, v2 = R1.inv().apply(velocity), R2.inv().apply(velocity)
     rays1, rays2 = np.empty((2, count * n, 3))
     tau1, tau2 = np.empty((2, count * n))
     missing, owner = np.arange(count * n), np.repeat(np.arange(count), n)
-    size = [WIDTH - 1, HEIGHT - 1]
     while len(missing):
         k = owner[missing]
-        pixels = rng.uniform([0, 0], size, (len(k), 2))
-        a = np.c_[(pixels - CENTRE) / FOCAL, np.ones(len(k))]
-        tau = pixels[:, 1] * LINE_DELAY
+        pixels = rng.uniform([0, 0], SIZE, (len(k), 2))
+        a, tau = VIEW.unproject(pixels), pixels[:, 1] * LINE_DELAY
         turn = R1[k] * Rotation.from_rotvec(tau[:, None] * w1[k])
         world = turn.apply(rng.uniform(6, 34, (len(k), 1)) * a) + (
             tau[:, None] * R1[k].apply(v1[k]))
-        b, later, _ = expose(world, R2[k], p2[k], w2[k], v2[k], 0.0, 15)
-        pixels = FOCAL * b[:, :2] / b[:, 2:] + CENTRE
-        observed = (b[:, 2] > 1.0) & ((pixels >= 0) & (pixels <= size)).all(axis=1)
+        second, rows = uniform_motion(R2[k], p2[k], w2[k], v2[k]), np.full(len(k), HEIGHT / 2)
+        for _ in range(15):
+            later = rows * LINE_DELAY
+            b = second(world, later)
+            pixels = VIEW.project(b)
+            rows = pixels[:, 1]
+        observed = (b[:, 2] > 1.0) & ((pixels >= 0) & (pixels <= SIZE)).all(axis=1)
         found = missing[observed]
         rays1[found], tau1[found] = a[observed], tau[observed]
         rays2[found], tau2[found] = b[observed], later[observed]
@@ -162,11 +120,9 @@ def make_minimal_problems(seed, count, n, *, speed=(0.0, 10.0), rate=(0.0, 3.0),
                  for tau, w, rays in ((tau1, w1, rays1), (tau2, w2, rays2))]
     rays = [Q[owner].apply(f).reshape(count, n, 3) / np.linalg.norm(f, axis=1).reshape(count, n, 1)
             for Q, f in zip((Q1, Q2, Q1, Q2), (rays1, rays2, *derotated), strict=True)]
-    length = np.linalg.norm(p2, axis=1, keepdims=True)
-    down = np.array([0.0, 1.0, 0.0])
     return MinimalProblems(
-        *rays, tau1.reshape(count, n), tau2.reshape(count, n), (Q1 * R1.inv()).apply(down),
-        (Q2 * R2.inv()).apply(down), (Q1 * R1.inv() * R2 * Q2.inv()).as_matrix(),
+        *rays, tau1.reshape(count, n), tau2.reshape(count, n), (Q1 * R1.inv()).apply(DOWN),
+        (Q2 * R2.inv()).apply(DOWN), (Q1 * R1.inv() * R2 * Q2.inv()).as_matrix(),
         (Q1 * R1.inv()).apply(p2 / length), Q1.apply(v1 / length), Q2.apply(v2 / length),
         Q1.apply(w1), Q2.apply(w2))
 

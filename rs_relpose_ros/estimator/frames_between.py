@@ -336,15 +336,13 @@ def _result(pose: RelativePose, adjusted: Adjusted, tracks: Tracks, priors: Path
     # B_j' at both ends.
     bends = T * np.array([[-0.5, 1.0 / 6.0, 0.0], [0.5, 1.0 / 6.0, 0.0]])[
         :, :len(state.accelerations)]
-    # p' at both ends, in the axes of camera 1, and its derivatives.
-    velocities, derivatives = np.empty((2, 3)), np.zeros((2, 3, n))
-    for end, (velocity, bend) in enumerate(zip(path.ends, bends, strict=True)):
-        of_scale = k * (velocity - path.chord / T + bend @ state.accelerations)
-        velocities[end] = state.t / T + of_scale
-        derivatives[end, :, TANGENT:LOG_SCALE] = by_state[:3, TANGENT:LOG_SCALE] / T
-        derivatives[end, :, LOG_SCALE] = of_scale
-        derivatives[end, :, ACCELERATION:ACCELERATION + 3 * len(bend)] = k * np.kron(
-            bend, np.eye(3))
+    # p' at both ends (2, 3), in the axes of camera 1, and its derivatives.
+    of_scale = k * (np.array(path.ends) - path.chord / T + bends @ state.accelerations)
+    velocities, derivatives = state.t / T + of_scale, np.zeros((2, 3, n))
+    derivatives[..., TANGENT:LOG_SCALE] = by_state[:3, TANGENT:LOG_SCALE] / T
+    derivatives[..., LOG_SCALE] = of_scale
+    derivatives[..., ACCELERATION:ACCELERATION + bends.shape[1] * 3] = k * np.kron(
+        bends[:, None], np.eye(3))
     by_first, by_second = derivatives
     # R^T p' rotates with the error of R.
     by_second = R.T @ (by_second + skew(velocities[1]) @ by_state[3:])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 import threading
@@ -29,8 +29,8 @@ from rs_relpose_ros.pipeline.sequencer import Refusal, SequencerCounts
 PATIENCE = 5.0
 # Share of the images whose refusal is the reason for no result.
 _MOST = 0.8
-# Images per CameraInfo below which images are lost: drivers publish one CameraInfo for each.
-_LOST = 0.7
+# Share of the images of an even rhythm below which images are lost, and fewest that show it.
+_LOST, _FEWEST = 0.7, 10
 # With its default transports Fast DDS loses best-effort messages above this size [bytes], which do
 # not fit into its segment of shared memory.
 _BIG = 512 * 1024
@@ -86,28 +86,25 @@ def why_nothing(silence: Silence) -> Reason:
     return Reason('nothing', f'nothing came of {silence.images} images in {PATIENCE:g} s')
 
 
-class LostImages:
-    """Detects lost large images from the numbers of messages per second."""
+def lost_images(stamps_ns: Sequence[int], size: int) -> str:
+    """A warning if large images are lost, by the rhythm of their stamps; else ''.
 
-    def __init__(self) -> None:
-        self._totals: deque[tuple[int, int]] = deque(maxlen=round(PATIENCE) + 1)
-
-    def add(self, images: int, camera_infos: int, size: int) -> str:
-        """Add the totals after another second; a warning if images are lost, else ''.
-
-        `size` is that of an image [bytes].
-        """
-        self._totals.append((images, camera_infos))
-        first_images, first_infos = self._totals[0]
-        images, camera_infos = images - first_images, camera_infos - first_infos
-        if (len(self._totals) < PATIENCE + 1 or size < _BIG or images >= _LOST * camera_infos
-                or images == 0):
-            return ''
-        return (f'{images / PATIENCE:.0f} images a second of {size / 1e6:.1f} MB come, and '
-                f'{camera_infos / PATIENCE:.0f} CameraInfo: Fast DDS loses big messages. Give the '
-                'driver and this node the shipped profile, FASTRTPS_DEFAULT_PROFILES_FILE='
-                '$(ros2 pkg prefix --share rs_relpose_ros)/config/fastdds.xml; ros2 launch '
-                'rs_relpose_ros relpose.launch.py does it for the node')
+    `stamps_ns`: of the recent images; `size`: of an image [bytes].
+    """
+    recent = np.array([stamp for stamp in stamps_ns
+                       if stamp > stamps_ns[-1] - PATIENCE * NANOSECONDS])
+    if size < _BIG or len(recent) < _FEWEST:
+        return ''
+    # A quarter of the intervals has no lost image between, unless most images are lost.
+    period = float(np.quantile(np.diff(recent), 0.25, method='lower'))
+    sent = (recent[-1] - recent[0]) / max(period, 1.0) + 1.0
+    if len(recent) >= _LOST * sent:
+        return ''
+    return (f'about {100.0 * (1.0 - len(recent) / sent):.0f} % of the images, of '
+            f'{size / 1e6:.1f} MB, are lost, by their stamps: Fast DDS loses big messages. Give '
+            'the driver and this node the shipped profile, FASTRTPS_DEFAULT_PROFILES_FILE='
+            '$(ros2 pkg prefix --share rs_relpose_ros)/config/fastdds.xml; ros2 launch '
+            'rs_relpose_ros relpose.launch.py does it for the node')
 
 
 # -- Fields of /diagnostics -----------------------------------------------------------------------
@@ -135,7 +132,7 @@ class Report:
 
 
 # Counters of `SequencerCounts`.
-_COUNTERS = ('imu_samples', 'imu_gaps', 'imu_repeated', 'imu_late', 'clock_jumps')
+_COUNTERS = ('imu_samples', 'imu_gaps', 'imu_repeated', 'imu_late', 'imu_wild', 'clock_jumps')
 
 
 def _ms(seconds: float) -> str:
@@ -173,8 +170,9 @@ class FrameStatistics(ABC):
         self._lock = threading.Lock()
         self._latencies: deque[float] = deque(maxlen=_RECENT_RESULTS)
         self._failures = 0
-        self._last_failure = ''
+        self._last_failure = self._last_refusal = ''
         self._since_ns = clock()
+        self._taken = 0   # frames, until the last report
         self._counted: Counter[str] = Counter()
         self._refused: Counter[Refusal] = Counter()
         self._frame_times: deque[float] = deque(maxlen=_RECENT_FRAMES)
@@ -200,6 +198,11 @@ class FrameStatistics(ABC):
             self._failures += 1
             self._last_failure = reason
 
+    def add_refusal(self, reason: str) -> None:
+        """Keep the reason why a frame was not used."""
+        with self._lock:
+            self._last_refusal = reason
+
     def report(self, inputs: Counter[str], counts: SequencerCounts | None, *, problem: str,
                missing: tuple[str, ...], progress: Progress | None = None) -> Report:
         """The state since the last report.
@@ -215,6 +218,10 @@ class FrameStatistics(ABC):
             refused = Counter({} if counts is None else counts.refused)
             dropped, self._refused = refused - self._refused, refused
             busy, self._busy_ns = self._busy_ns / NANOSECONDS / elapsed, 0
+            taken = counts.frames_taken if counts else 0
+            used, self._taken = taken - self._taken, taken
+            if not problem and dropped and used <= 0:
+                problem = f'{self.idle}: no frame can be used: {self._last_refusal}'
             level, text = (self._evaluate(problem, dropped) if progress is None
                            else (OK, progress.text))
             values: dict[str, object] = {
@@ -228,7 +235,7 @@ class FrameStatistics(ABC):
                 rate = (inputs[role] - before[role]) / elapsed
                 values[f'{role.value}_rate_hz'] = f'{rate:.1f}'
             values['frames_received'] = counts.frames if counts else inputs[Role.IMAGE]
-            values['frames_processed'] = counts.frames_taken if counts else 0
+            values['frames_processed'] = taken
             for kind in Refusal:
                 values[f'frames_refused_{kind.value}'] = refused[kind]
             values['frames_failed'] = self._failures

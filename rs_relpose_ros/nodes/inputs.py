@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 import functools
 from functools import partial
@@ -23,7 +23,7 @@ from rclpy.serialization import deserialize_message
 from rs_relpose_ros.errors import MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.timing import NANOSECONDS
-from rs_relpose_ros.messages.incoming import PARTS, Role
+from rs_relpose_ros.messages.incoming import PARTS, Role, stamp_ns
 from rs_relpose_ros.nodes.diagnostics import INVALID, SILENCE, TOPICS
 
 # -- Subscriptions that are read on demand --------------------------------------------------------
@@ -138,6 +138,8 @@ _IMU_DEPTH = 2000
 # Messages published earlier are sent to reliable subscriptions only.
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                       durability=DurabilityPolicy.TRANSIENT_LOCAL)
+# Some seconds of stamps.
+_RECENT_STAMPS = 600
 # Period [s] at which IMU and CameraInfo are read without an image.
 _DRAIN_PERIOD = 0.1
 
@@ -159,7 +161,8 @@ class Receiver(Protocol):
 class SensorInputs:
     """Subscriptions to the topics of camera and IMU; passes messages to the intake.
 
-    `topics` are the resolved names by role, `image_bytes` is the size of the last image.
+    `topics` are the resolved names by role, `image_bytes` is the size of the last image,
+    `stamps_ns` are the stamps of the last ones.
     `on_invalid` gets the reason why a message is unusable. Silence is measured in real time, also
     if /clock does not advance.
     """
@@ -173,6 +176,7 @@ class SensorInputs:
         self._last_ns: dict[Role, int] = {}
         self._last_info = b''
         self.image_bytes = 0   # of the last image
+        self.stamps_ns: deque[int] = deque(maxlen=_RECENT_STAMPS)   # of the last images
         self.topics = {role: node.resolve_topic_name(role.value) for role in TOPICS}
         # As image_transport does: the transport's name follows the remapped one.
         self.topics[Role.IMAGE] += '/compressed' if image_transport == 'compressed' else ''
@@ -221,6 +225,7 @@ class SensorInputs:
         self._camera_info.drain()
         self._count(Role.IMAGE)
         self.image_bytes = len(image.data)
+        self.stamps_ns.append(stamp_ns(image.header))
         # An unusable image is refused by the sequencer, which counts it.
         self._intake.receive(Role.IMAGE, image)
         self._drain_imu()

@@ -28,8 +28,8 @@ _DESCRIPTION = (
     'subscribes: image (or image/compressed with image_transport:=compressed), '
     'camera_info, imu, accel\n'
     'publishes:  ~/relative_pose, ~/reference, ~/velocity, ~/matches, '
-    '~/relative_rotation, ~/pairs,\n            ~/debug_image, /diagnostics\n'
-    'service:    ~/reset')
+    '~/relative_rotation, ~/pairs,\n            ~/debug_image, ~/calibration, /diagnostics\n'
+    'services:   ~/reset, ~/calibrate, ~/save_calibration')
 
 
 class RelposeNode(SensorNode):
@@ -48,8 +48,10 @@ class RelposeNode(SensorNode):
 
     def _make_loop(self, parameters: Parameters) -> FrontEnd:
         files = parameters.pair
-        self._stamps = opened('stamps_file', files.stamps_file) if files.stamps_file else None
-        self._timings = FrameTimings(files.timings_file) if files.timings_file else None
+        if files.stamps_file and self._stamps is None:
+            self._stamps = opened('stamps_file', files.stamps_file)
+        if files.timings_file and self._timings is None:
+            self._timings = FrameTimings(files.timings_file)
         # The images are for ~/debug_image; only references to them are kept.
         return FrontEnd(parameters, keep_images=True)
 

@@ -214,7 +214,7 @@ class SensorNode(StoppableNode):
         self._loop: FrameLoop[Any] | None = None
         self._inputs: SensorInputs | None = None
         self._worker: Worker | None = None
-        self._lost_images, self._reported_silence = diagnostics.LostImages(), ''
+        self._reported_silence = ''
         # For diagnostics and time-outs, which must run although /clock may not advance.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         with ros_parameters.legal_qos():
@@ -268,7 +268,8 @@ class SensorNode(StoppableNode):
 
     def _begin(self, calibrate: bool = False) -> None:
         """Estimate with the current parameters from here on, or calibrate before."""
-        self.stop()
+        if self._worker is not None:
+            self._worker.stop(_JOIN_TIMEOUT)
         self._active = parameters = self._settings.current
         self._calibration: LiveCalibration | None = None
         self._progress: Progress | None = None
@@ -412,6 +413,7 @@ class SensorNode(StoppableNode):
 
     def _consume(self, outcome: Outcome[Any]) -> None:
         if isinstance(outcome, FrameRefused):
+            self._frame_statistics.add_refusal(outcome.reason)
             self._log_refused(outcome)
             return
         if self._stamps is not None and outcome.stamp_ns is not None:
@@ -466,8 +468,7 @@ class SensorNode(StoppableNode):
             self.get_clock().now().nanoseconds, status, message_class))
         if self._inputs is not None:
             self._log_silence(self._inputs, report.silence, problem)
-            lost = self._lost_images.add(
-                counts[Role.IMAGE], counts[Role.CAMERA_INFO], self._inputs.image_bytes)
+            lost = diagnostics.lost_images(self._inputs.stamps_ns, self._inputs.image_bytes)
             if lost:
                 self._warn(lost)
 

@@ -29,6 +29,8 @@ from rs_relpose_ros.tracking.images import EncodedImage, GrayLevels
 
 # A stamp further behind the newest one [ns] is a bag that restarts, not a late message.
 CLOCK_JUMP_NS = NANOSECONDS
+# A single stamp further from the one before [ns] is no time of this stream.
+_FAR_NS = 10 * NANOSECONDS
 # Number of consecutive stamps behind the newest, each newer than the one before, that indicate a
 # clock that was set back by less than that: messages out of order come alone.
 _BACK_FRAMES = 3
@@ -82,6 +84,7 @@ class SequencerCounts:
     clock_jumps: int = 0
     imu_repeated: int = 0   # samples with the stamp of an earlier one, dropped
     imu_late: int = 0   # samples that came after a younger one, sorted in
+    imu_wild: int = 0   # samples with a stamp far from those before and after, dropped
 
 
 @dataclass(slots=True, eq=False)
@@ -118,6 +121,22 @@ class _BackwardStamps:
         return True
 
 
+class _WildStamps:
+    """Recognises single stamps far from the one before: zeros, or far in the future."""
+
+    def __init__(self) -> None:
+        self._wild_ns: int | None = None   # the last one, unless the clock jumped to it
+
+    def add(self, stamp_ns: int, last_ns: int | None) -> bool:
+        """Whether this stamp is far from the last one, and no other came before it there."""
+        if last_ns is None or abs(stamp_ns - last_ns) <= _FAR_NS:
+            self._wild_ns = None
+            return False
+        confirmed = self._wild_ns is not None and 0 < stamp_ns - self._wild_ns <= _FAR_NS
+        self._wild_ns = None if confirmed else stamp_ns
+        return not confirmed
+
+
 class Sequencer:
     """Thread-safe queue of frames and IMU samples; its states: ``docs/architecture.md``.
 
@@ -142,6 +161,9 @@ class Sequencer:
         self._closed = False
         self._buffer = ImuBuffer(parameters.imu)
         self._samples_back = _BackwardStamps(_BACK_SAMPLES)
+        # Of samples without and with a gyro, and of frames.
+        self._wild_samples = _WildStamps(), _WildStamps()
+        self._wild_frames = _WildStamps()
         self._queue: deque[QueuedFrame] = deque()
         self._refusals: deque[FrameRefused] = deque(maxlen=None if offline else _REFUSALS_KEPT)
         self._frames_back = _BackwardStamps(_BACK_FRAMES)
@@ -161,7 +183,11 @@ class Sequencer:
         """Store an IMU sample; InputError if it is unusable, and nothing is stored."""
         has_gyro, stamp_ns = sample.angular_velocity is not None, sample.stamp_ns
         with self._changed:
-            buffer = self._buffer
+            buffer, counts = self._buffer, self._counts
+            last_ns = (buffer.gyro if has_gyro else buffer.force).newest_ns
+            if self._wild_samples[has_gyro].add(stamp_ns, last_ns):
+                counts.imu_wild += 1
+                return
             set_back = has_gyro and self._samples_back.add(stamp_ns, buffer.gyro.newest_ns)
             newest_ns = buffer.newest_ns
             if newest_ns is not None and (set_back or stamp_ns < newest_ns - CLOCK_JUMP_NS):
@@ -170,7 +196,6 @@ class Sequencer:
                 buffer.clear()
             before_ns = buffer.gyro.newest_ns
             added = buffer.add(sample)
-            counts = self._counts
             counts.imu_samples += 1
             counts.imu_repeated += added is AddResult.DUPLICATE
             if has_gyro and before_ns is not None:
@@ -364,6 +389,11 @@ class Sequencer:
         A stamp that only a clock set back can produce is accepted: time restarts with it.
         """
         last_ns = self._last_stamp_ns
+        if last_ns is not None and self._wild_frames.add(stamp_ns, last_ns):
+            self._refuse(stamp_ns, Refusal.OUT_OF_ORDER, 'the stamp of the frame is '
+                         f'{seconds_between(last_ns, stamp_ns):.0f} s from the one before, and '
+                         'no other is near it')
+            return False
         set_back = self._frames_back.add(stamp_ns, last_ns)
         if last_ns is None or stamp_ns > last_ns:
             return True
