@@ -34,6 +34,8 @@ REALSENSE_PARAMETERS = (
     SourcedValue('time_offset_per_interval', -0.54,
                  'Auto exposure moves it: -56.3 ms for frames of 33.4 ms.'),
     SourcedValue('time_offset_reference_interval', 0.05, 'Of time_offset.'),
+    SourcedValue('exposure_margin', 0.008,
+                 'In little light it exposes nearly as long as its frame interval.'),
     SourcedValue('quat_cam_imu_xyzw', (-0.0018, -0.0021, 0.0016, 1.0),
                  'By the same adjustment: the camchain.yaml of the dataset is 1.2 deg off about x '
                  'and 0.7 deg about z.'),

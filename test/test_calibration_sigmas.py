@@ -18,6 +18,7 @@ from rs_relpose_lab.experiments.calibration_tracks import Recorded
 from rs_relpose_ros.calibrate import fit as fitting
 from rs_relpose_ros.calibrate.coplanarity import (
     BIAS,
+    CENTER,
     EXPOSURE,
     GLOBAL,
     LENS,
@@ -216,6 +217,21 @@ def test_a_readout_that_the_images_do_not_determine_is_that_of_the_interval():
     # What is correlated with it follows, with a sigma of its own part only.
     assert result.time_offset.sigma > 0.4 * known
     assert any('hardly determine' in text for text in result.warnings)
+
+
+def test_sigmas_of_the_lens_do_not_exceed_those_of_its_priors():
+    final, data = fitted(free_of(EXPOSURE) | np.isin(np.arange(GLOBAL), np.arange(GLOBAL)[LENS]))
+    covariance, sigma = final.covariance.copy(), 0.015 * data.camera.width
+    covariance[CENTER, CENTER] += (10.0 * sigma)**2
+    wide = dataclasses.replace(final, covariance=covariance)
+    curve = CostCurve(np.linspace(-0.03, 0.03, 3), np.zeros(3))
+    result = fitting.evaluated(data, wide, curve, CalibrationConfig())
+    column, row = result.center
+    assert 0.9 * sigma < column.sigma < sigma
+    assert row.sigma == pytest.approx(math.sqrt(covariance[CENTER + 1, CENTER + 1]), rel=0.1)
+    # Moved to the middle by all but a hundredth.
+    moved = final.unknowns.parameters[CENTER]
+    assert column.value - data.camera.cx == pytest.approx(0.01 * moved, abs=0.02 * abs(moved))
 
 
 @pytest.mark.parametrize('sign', [1.0, -1.0])

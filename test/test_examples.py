@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+import importlib.util
 from operator import itemgetter
 from pathlib import Path
 import signal
@@ -10,6 +11,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from conftest import BUNDLED_PARAMETERS, ROOT
+from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
 import numpy as np
 import pytest
@@ -31,6 +33,7 @@ pytestmark = [pytest.mark.live, pytest.mark.timeout(600)]
 # A pair before the bag's standstill.
 LOST = 4
 EXAMPLE = ROOT / 'docs' / 'examples' / 'chain_poses.py'
+PX4 = ROOT / 'docs' / 'examples' / 'px4_odometry.py'
 
 
 @pytest.fixture(scope='module')
@@ -113,3 +116,37 @@ def after_similarity(points: np.ndarray, target: np.ndarray) -> np.ndarray:
     centred, aim = points - points.mean(axis=0), target - target.mean(axis=0)
     rotated = Rotation.align_vectors(aim, centred)[0].apply(centred)
     return np.sum(rotated * aim) / np.sum(rotated**2) * rotated + target.mean(axis=0)
+
+
+def test_odometry_in_the_axes_of_px4():
+    """What is ahead, left and above is ahead, right and below."""
+    spec = importlib.util.spec_from_file_location('px4_odometry', PX4)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    rng, message = np.random.default_rng(0), Odometry()
+    root = rng.normal(size=(6, 6))
+    message.header.stamp.sec, message.header.stamp.nanosec = 12, 345_678_901
+    pose, twist = message.pose.pose, message.twist.twist
+    message.pose.covariance = (root @ root.T).ravel()
+    R, (p, v, w) = Rotation.random(random_state=1), rng.normal(size=(3, 3))
+    for vector, values in ((pose.position, p), (pose.orientation, R.as_quat()), (twist.linear, v),
+                           (twist.angular, w)):
+        for axis, value in zip('xyzw', values, strict=False):
+            setattr(vector, axis, float(value))
+    found = module.px4_fields(message)
+    assert found['timestamp_sample'] == 12_345_678
+    right_down = np.diag([1.0, -1.0, -1.0])
+    q = found['q']
+    px4_R = Rotation.from_quat([q[1], q[2], q[3], q[0]])
+    # A point of the body, in the world of PX4, by PX4's pose and by that of the message.
+    point = rng.normal(size=3)
+    np.testing.assert_allclose(px4_R.apply(right_down @ point) + found['position'],
+                               right_down @ (R.apply(point) + p), atol=1e-6)
+    np.testing.assert_allclose(found['velocity'], right_down @ v, atol=1e-6)
+    np.testing.assert_allclose(found['angular_velocity'], right_down @ w, atol=1e-6)
+    # Variances of errors that are drawn from the covariance, in the body's axes of PX4.
+    errors = rng.multivariate_normal(np.zeros(6), root @ root.T, 20_000)
+    np.testing.assert_allclose(found['position_variance'],
+                               (errors[:, :3] @ right_down).var(axis=0), rtol=0.05)
+    np.testing.assert_allclose(found['orientation_variance'], px4_R.apply(
+        errors[:, 3:] @ right_down, inverse=True).var(axis=0), rtol=0.05)

@@ -51,7 +51,7 @@ def front_end_of(images: list[RawImage], parameters: Parameters = PARAMETERS, *,
                  offline: bool = True) -> FrontEnd:
     """Frames that are ready, with all of their IMU samples."""
     front_end = FrontEnd(parameters, offline=offline)
-    for ms in range(0, 300, 5):
+    for ms in range(0, images[-1].stamp_ns // MS + 150, 5):
         front_end.sequencer.add_imu(ImuSample(ms * MS, (0.0, 0.1, 0.0), (0.0, -9.81, 0.0)))
     for image in images:
         front_end.sequencer.add_frame(image, INTRINSICS)
@@ -94,6 +94,17 @@ def test_a_dark_image_is_reported_as_dark(encoding, brightest, dark):
     assert pair.pose.status is Status.TOO_FEW_MATCHES
     assert pair.pose.reason.startswith('the image is dark: ') is dark
     assert 'usable matches' in pair.pose.reason
+
+
+def test_pairs_with_too_few_matches_have_a_bounded_rate():
+    """Nothing can be matched in 2 s of noise at 20 Hz: a pair each 0.5 s, not each frame."""
+    rng = np.random.default_rng(3)
+    front_end = front_end_of([noise(ms, rng, 3) for ms in range(50, 2100, 50)])
+    frames = [front_end.step() for _ in range(41)]
+    pairs = [frame.result for frame in frames if frame.result is not None]
+    assert {pair.pose.status for pair in pairs} == {Status.TOO_FEW_MATCHES}
+    assert pairs[0].stamp_ns == frames[1].stamp_ns   # the first at once
+    assert np.diff([pair.stamp_ns for pair in pairs]).tolist() == [500 * MS] * 3
 
 
 @pytest.mark.parametrize('offline', [False, True])

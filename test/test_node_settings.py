@@ -197,8 +197,36 @@ def test_missing_parameters_are_reported_and_the_node_stays(ros_domain_id):
 
 ESTIMATES = {'readout_time': 0.03, **QUATERNION}
 OVERRIDE = 'qos_overrides./image.subscription'
-# In place of tf2_ros, which is in no wheel: publishes the transforms to be sent.
+# In place of tf2_ros, which is in no wheel: publishes the transforms to be sent; knows the one of
+# the environment variable TF, "parent child x y z qx qy qz qw".
 FAKE_TF2_ROS = """
+import os
+from types import SimpleNamespace
+
+
+class TransformException(Exception):
+    pass
+
+
+class Buffer:
+    def lookup_transform(self, parent, child, time):
+        known, names = os.environ.get('TF', '').split(), ('x', 'y', 'z', 'w')
+        if known[:2] != [parent, child]:
+            raise TransformException
+        values = [float(word) for word in known[2:]]
+        return SimpleNamespace(transform=SimpleNamespace(
+            translation=SimpleNamespace(**dict(zip(names, values[:3]))),
+            rotation=SimpleNamespace(**dict(zip(names, values[3:])))))
+
+
+class TransformListener:
+    def __init__(self, buffer, node):
+        pass
+
+    def unregister(self):
+        pass
+
+
 class TransformBroadcaster:
     def __init__(self, node):
         self._publisher = node.create_publisher(__import__(

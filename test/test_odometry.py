@@ -20,15 +20,15 @@ from rs_relpose_lab.experiments.odometry import drift, live_nees, on_euroc, step
 from rs_relpose_lab.simulation.motions import hand_held, Plan
 from rs_relpose_lab.simulation.simulation import ImuModel
 from rs_relpose_ros.config.settings import Parameters
-from rs_relpose_ros.errors import MissingInputError
+from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.estimator.covariance import ImageInformation
 from rs_relpose_ros.geometry.so3 import exp_so3, tangent_basis
 from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.odometry import need_gtsam
-from rs_relpose_ros.odometry.estimator import OdometryEstimator, path_of, write_tum
-from rs_relpose_ros.odometry.offline import draw_paths
+from rs_relpose_ros.odometry.estimator import OdometryEstimator
+from rs_relpose_ros.odometry.offline import draw_paths, path_of, write_tum
 from rs_relpose_ros.odometry.pair import BodyState, deviations, KeyframePair, Mounting, square_root
-from rs_relpose_ros.odometry.states import ContinuousPath, OdometryState
+from rs_relpose_ros.odometry.states import Base, ContinuousPath, OdometryState
 from rs_relpose_ros.offline.truth import TrueTrajectory
 
 START_NS = 1_700_000_000_000_000_000
@@ -330,6 +330,87 @@ def test_the_imu_propagates_keyframes(walked):
     assert estimator.propagated(newest.imu_ns + 2 * SECOND) is None   # no samples
 
 
+# --- the frame of the robot
+
+# Camera optical axes on a robot with x forward and z up, tilted by 10 deg: 0.4 m ahead of it.
+BASE_TO_CAMERA = (0.4, -0.1, 0.3, *(Rotation.from_euler('y', 10.0, degrees=True)
+                                    * Rotation.from_quat((-0.5, 0.5, -0.5, 0.5))).as_quat())
+BASE = Base.of('base_link', BASE_TO_CAMERA)
+OF_BASE = PARAMETERS.updated({'base_frame': 'base_link', 'base_to_camera': BASE_TO_CAMERA})
+
+
+@pytest.fixture(scope='module')
+def of_base(walked):
+    return run(walked, estimator=OdometryEstimator(OF_BASE, keep=True))
+
+
+def test_the_base_moves_with_the_camera(tracked, of_base):
+    """Poses and twists of both are those of one rigid body, in worlds of another heading."""
+    assert len(of_base[1]) == len(tracked[1])
+    first = BASE.camera(of_base[1][0])
+    G = first.R @ tracked[1][0].R.T
+    assert G[2, 2] == pytest.approx(1.0, abs=1e-6)   # z is up in both
+    for camera, base in zip(tracked[1], of_base[1], strict=True):
+        assert (camera.frame_id, base.frame_id) == ('camera', 'base_link')
+        carried = BASE.camera(base)
+        np.testing.assert_allclose(carried.R, G @ camera.R, atol=1e-4)
+        np.testing.assert_allclose(carried.position - first.position,
+                                   G @ (camera.position - tracked[1][0].position), atol=2e-3)
+        np.testing.assert_allclose(base.angular_velocity, BASE.R @ camera.angular_velocity,
+                                   atol=1e-4)
+        np.testing.assert_allclose(
+            base.velocity + np.cross(base.angular_velocity, BASE.position),
+            BASE.R @ camera.velocity, atol=2e-3)
+
+
+def test_the_base_starts_at_the_origin_with_x_forward(of_base):
+    start = of_base[0].smoothed()[0]
+    # By 0.5 m times what all data correct of the first tilt.
+    np.testing.assert_allclose(start.position, 0.0, atol=0.03)
+    assert abs(math.atan2(start.R[1, 0], start.R[0, 0])) < 0.01
+
+
+def test_covariances_of_the_base_are_those_of_samples(of_base):
+    """The body's state is drawn from its covariance; that of the gyro's noise is left out."""
+    estimator = of_base[0]
+    run_, rate = estimator._run, np.array((0.5, -0.8, 0.3))
+    noiseless = OdometryEstimator(OF_BASE.updated({'gyro_noise_density': 1e-7}))
+    noiseless._first_R = estimator._first_R
+    state = run_.graph.newest
+    # Lever arms and rates are uncertain enough that every term counts.
+    P = state.covariance + np.diag([0.0] * 12 + [1e-2**2] * 3 + [0.02**2] * 3)
+
+    def odometry(state):
+        return noiseless._odometry(run_, state, rate, 0, 0)
+
+    published = odometry(replace(state, covariance=P))
+    poses, twists = [], []
+    for d in np.random.default_rng(5).multivariate_normal(np.zeros(18), P, 4000):
+        one = odometry(replace(
+            state, R=state.R @ exp_so3(d[:3]), position=state.position + state.R @ d[3:6],
+            velocity=state.velocity + d[6:9], gyro_bias=state.gyro_bias + d[12:15],
+            arm=state.arm + d[15:]))
+        turn = Rotation.from_matrix(one.R @ published.R.T).as_rotvec()
+        poses.append([*(one.position - published.position), *turn])
+        twists.append([*(one.velocity - published.velocity),
+                       *(one.angular_velocity - published.angular_velocity)])
+    for samples, claimed in ((poses, published.pose_covariance),
+                             (twists, published.velocity_covariance)):
+        sigmas = np.sqrt(np.diag(claimed))
+        np.testing.assert_allclose(np.cov(np.transpose(samples)) / np.outer(sigmas, sigmas),
+                                   claimed / np.outer(sigmas, sigmas), atol=0.08)
+
+
+def test_without_the_position_of_the_camera_on_the_base_nothing_starts(walked):
+    estimator, out = run(walked, pairs=walked.pairs[:15], estimator=OdometryEstimator(
+        PARAMETERS.updated({'base_frame': 'base_link'})))
+    assert out == []
+    assert estimator.blocking_reason.startswith(
+        'the camera is not known in base_frame base_link: publish their static transform')
+    estimator.base = BASE
+    assert run(walked, pairs=walked.pairs[15:30], estimator=estimator)[1]
+
+
 # --- faults
 
 
@@ -506,15 +587,62 @@ def test_a_lost_path_continues_where_the_imu_propagated_it(walked):
     assert np.linalg.norm(error) < 0.5
 
 
-def test_a_clock_that_is_set_back_restarts(walked):
-    estimator, _ = run(walked, pairs=walked.pairs[:40], samples=samples_of(walked, -1.0, 6.5))
-    back = 100 * SECOND
-    pairs = [replace(pair, stamp_ns=pair.stamp_ns - back, reference_ns=pair.reference_ns - back,
-                     current_ns=pair.current_ns - back) for pair in walked.pairs]
-    samples = [replace(sample, stamp_ns=sample.stamp_ns - back) for sample in walked.samples]
+@pytest.mark.parametrize('seconds', [-100.0, -0.5, 0.5, 100.0])
+def test_a_path_continues_after_a_jump_of_the_clock(walked, seconds):
+    jump, at = round(seconds * SECOND), seconds_of(walked.pairs[39].current_ns)
+    estimator, first = run(walked, pairs=walked.pairs[:40],
+                           samples=samples_of(walked, -1.0, at + 0.03),
+                           estimator=OdometryEstimator(PARAMETERS))
+    pairs = [replace(pair, stamp_ns=pair.stamp_ns + jump, reference_ns=pair.reference_ns + jump,
+                     current_ns=pair.current_ns + jump) for pair in walked.pairs[40:]]
+    samples = [replace(sample, stamp_ns=sample.stamp_ns + jump)
+               for sample in samples_of(walked, at + 0.03, 13.0)]
     estimator, second = run(walked, pairs=pairs, samples=samples, estimator=estimator)
     assert estimator.counts['lost'] == 1
-    assert len(second) > 0.9 * len(pairs)
+    [lost] = [text for text in estimator.warnings() if text.startswith('lost')]
+    assert lost == 'lost: ' + ('the clock of the IMU was set back' if seconds < 0.0 else
+                               'the IMU has a gap, or its clock jumped: see its driver')
+    assert len(second) > 0.6 * len(pairs)
+    for after in second:
+        _, t = walked.truth.relative_pose(first[-1].imu_ns, after.imu_ns - jump)
+        error = first[-1].R.T @ (after.position - first[-1].position) - t
+        assert np.linalg.norm(error) < 3.0 * math.sqrt(np.trace(after.pose_covariance[:3, :3]))
+
+
+def test_samples_that_come_far_too_late_are_left_out(walked, tracked):
+    samples = [*walked.samples]
+    late = samples.pop(1000)
+    samples.insert(1100, replace(late, angular_velocity=(9.0, 9.0, 9.0)))
+    _, out = run(walked, samples=samples)
+    np.testing.assert_allclose(positions(out), positions(tracked[1]), atol=0.01)
+
+
+def test_pairs_of_another_camera_are_refused(walked):
+    other = [replace(pair, frame_id='rear_camera') for pair in walked.pairs]
+    estimator, _ = run(walked, pairs=walked.pairs[:20], samples=samples_of(walked, -1.0, 3.1),
+                         estimator=OdometryEstimator(PARAMETERS))
+    with pytest.raises(InputError, match='remap relpose_node/pairs to those of one camera'):
+        estimator.add_pair(other[20])
+    assert estimator.state is OdometryState.TRACKING
+    estimator.reset()
+    estimator.add_pair(other[20])
+
+
+@pytest.mark.parametrize('turn', [10.0, 90.0, 180.0])
+def test_an_imu_of_another_frame_gives_no_path_and_the_reason(walked, turn):
+    R = Rotation.from_euler('x', turn, degrees=True)
+    samples = [replace(sample, angular_velocity=tuple(R.apply(sample.angular_velocity)),
+                       linear_acceleration=tuple(R.apply(sample.linear_acceleration)))
+               for sample in samples_of(walked, -1.0, 6.0)]
+    # From 3.1 s on at rest, where axes do not show, to 4.5 s.
+    for begin in (0.0, 3.1):
+        estimator, out = run(
+            walked, samples=samples, estimator=OdometryEstimator(PARAMETERS),
+            pairs=[pair for pair in walked.pairs[:38] if seconds_of(pair.reference_ns) > begin])
+        assert [k for k in out if not 3.0 < seconds_of(k.imu_ns) < 5.5] == []
+        assert not (out and begin == 0.0)
+        assert estimator.reason.startswith('pairs and IMU contradict each other')
+        assert [text for text in estimator.warnings() if 'quat_cam_imu_xyzw' in text]
 
 
 def test_nothing_is_published_while_a_parameter_is_wrong(walked):

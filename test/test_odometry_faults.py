@@ -8,15 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 import math
+import os
 import re
 import signal
 from types import SimpleNamespace
 from typing import Any
 
-from conftest import BUNDLED_PARAMETERS
+from conftest import BUNDLED_PARAMETERS, ROOT
 from diagnostic_msgs.msg import DiagnosticArray
 from fault_stream import BAG_TOPICS, publish_in_time, SECOND, stamp_of
+from geometry_msgs.msg import TransformStamped
 import message_builders as build
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
@@ -25,19 +28,34 @@ import pytest
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
-from test_odometry import LEVER, PARAMETERS, QUAT, START_NS, Walk, walk
+from test_node_settings import FAKE_TF2_ROS
+from test_odometry import (
+    BASE,
+    BASE_TO_CAMERA,
+    LEVER,
+    PARAMETERS,
+    QUAT,
+    START_NS,
+    Walk,
+    walk,
+)
+import yaml
 
 from rs_relpose_lab.live import processes
 from rs_relpose_lab.live.graph import diagnostic_values, Graph
 from rs_relpose_lab.live.processes import node_process, wait_until, wait_until_quiet
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.config.files import read_parameters
+from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.result import Landmarks, RelativePose, Status
+from rs_relpose_ros.geometry.so3 import exp_so3, log_so3, skew
 from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.messages.incoming import PARTS, Role
 from rs_relpose_ros.messages.outgoing import pair_messages
-from rs_relpose_ros.odometry.estimator import aligned, OdometryEstimator
+from rs_relpose_ros.odometry.estimator import OdometryEstimator
+from rs_relpose_ros.odometry.offline import aligned
 from rs_relpose_ros.odometry.pair import KeyframePair
+from rs_relpose_ros.odometry.states import Base
 from rs_relpose_ros.offline.replay import read_truth
 from rs_relpose_ros.offline.truth import TrueTrajectory
 from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState
@@ -105,6 +123,31 @@ def test_a_contradicted_accelerometer_stops_the_path(quantity, state, stops):
     assert KeyframePair.of_message(pairs_message(pair, health)).contradiction == expected
 
 
+# Values of a message on ~/pairs that no relpose_node publishes, and what is said of them.
+BAD_PAIRS = {
+    'covariance zero': ('image_information', ' '.join(['1e30'] * 66), 'positive semidefinite'),
+    'no information': ('image_information', ' '.join(['0'] * 66), 'positive semidefinite'),
+    'negative covariance': ('image_information', ' '.join(['-1'] * 66), 'positive semidefinite'),
+    'NaN': ('image_information', ' '.join(['nan'] * 66), 'must be finite'),
+    'NaN of the rotation': ('image_rotation_xyzw', 'nan 0 0 1', 'image_rotation_xyzw of ~/pairs'),
+    'no rotation': ('image_rotation_xyzw', '0 0 0 0', 'image_information of ~/pairs'),
+    'infinite baseline': ('baseline_m', 'inf', 'baseline_m of ~/pairs must be finite'),
+    'backwards in time': ('current_imu_ns', str(START_NS - SECOND), 'must be later than'),
+    'far in the future': ('current_imu_ns', str(START_NS + 1000 * SECOND), 'less than 100 s'),
+}
+
+
+@pytest.mark.parametrize('case', BAD_PAIRS)
+def test_an_impossible_pair_is_refused_with_the_reason(case):
+    key, text, said = BAD_PAIRS[case]
+    message = pairs_message(walk('walk:2', 1.0).pairs[0], Assessment(()))
+    KeyframePair.of_message(message)
+    [value] = [item for item in message.status[0].values if item.key == key]
+    value.value = text
+    with pytest.raises(InputError, match=re.escape(said)):
+        KeyframePair.of_message(message)
+
+
 def stream(given: Walk) -> Iterator[tuple[float, Any]]:
     """Messages and their times [s] of arrival."""
     for sample in given.samples:
@@ -119,16 +162,27 @@ def stream(given: Walk) -> Iterator[tuple[float, Any]]:
         yield end + PAIR_DELAY, pairs_message(pair, WRONG_HEALTH if wrong else Assessment(()))
 
 
-def positions_of(published: list[Odometry]) -> np.ndarray:
-    return np.array([[p.x, p.y, p.z] for p in (one.pose.pose.position for one in published)])
+def vector_of(value: Any) -> np.ndarray:
+    return np.array([getattr(value, axis) for axis in 'xyzw' if hasattr(value, axis)])
+
+
+def positions_of(published: list[Odometry], base: Base | None = None) -> np.ndarray:
+    """Positions, with a `base` those of the camera on it."""
+    on_base = np.zeros(3) if base is None else base.position
+    return np.array([vector_of(pose.position) + rotation_of(pose) @ on_base
+                     for pose in (one.pose.pose for one in published)])
+
+
+def rotation_of(pose: Any) -> np.ndarray:
+    return Rotation.from_quat(vector_of(pose.orientation)).as_matrix()
 
 
 def assert_metric(published: list[Odometry], truth: TrueTrajectory, ate: float,
-                  scale_error: float) -> np.ndarray:
+                  scale_error: float, base: Base | None = None) -> np.ndarray:
     """RMS error [m] and scale after alignment, the rotation of which is returned."""
     known = [message for message in published if truth.covers(stamp_of(message))]
     true = np.array([truth.position(stamp_of(message)) for message in known])
-    R, t, scale = aligned(positions := positions_of(known), true)
+    R, t, scale = aligned(positions := positions_of(known, base), true)
     assert np.sqrt(((positions @ R.T + t - true) ** 2).sum(axis=1).mean()) < ate
     assert scale == pytest.approx(1.0, abs=scale_error)
     return R
@@ -195,7 +249,8 @@ def test_faults_are_reported(session):
     assert 'Traceback' not in session.output
     [status] = session.diagnostics[-1].status
     assert re.fullmatch(r'no message on /relpose_node/pairs for \d+ s and '
-                        rf'{BAG_TOPICS["imu"]} for \d+ s', status.message)
+                        rf'{BAG_TOPICS["imu"]} for \d+ s: start or remap what publishes it .*',
+                        status.message)
     values = diagnostic_values(session.diagnostics[-1])
     assert values['lost'] == '2'
     assert int(values['calibration_contradicted']) >= 3
@@ -233,17 +288,60 @@ def test_the_imu_is_read_at_a_low_rate_of_publication(ros_domain_id):
         publish_in_time((imu, round((sample.stamp_ns - START_NS) / FASTER), imu_message(sample))
                         for sample in samples)
         [status] = diagnostics[-1].status
-        assert re.fullmatch(r'no message on /relpose_node/pairs for \d+ s', status.message)
+        assert re.fullmatch(r'no message on /relpose_node/pairs for \d+ s: start or remap .*',
+                            status.message)
 
 
 # -- next to relpose_node and a player, on the bundled bag ---------------------------------------
 
 
-def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag):
+def fused(messages: list[Odometry], used: list[bool]) -> tuple[np.ndarray, float]:
+    """Positions by a Kalman filter of a constant twist, and its innovations squared.
+
+    As ekf_node of robot_localization, which is in no wheel: of position and rotation in odom, and
+    the twist in the base; `used` of these 12 are measured. The innovations are the mean per degree
+    of freedom.
+    """
+    def measured(message):
+        twist = message.twist.twist
+        return (vector_of(message.pose.pose.position), rotation_of(message.pose.pose),
+                np.concatenate([vector_of(twist.linear), vector_of(twist.angular)]))
+
+    (p, R, w), P, nis, path = measured(messages[0]), 1e-2 * np.eye(12), [], []
+    for before, message in pairwise(messages):
+        dt = (stamp_of(message) - stamp_of(before)) / SECOND
+        F, N, H = np.eye(12), np.zeros((12, 12)), np.eye(12)[used]
+        F[:3, 3:6], F[:3, 6:9], F[3:6, 9:] = -skew(R @ w[:3]) * dt, R * dt, R * dt
+        p, R = p + R @ w[:3] * dt, R @ exp_so3(w[3:] * dt)
+        # Accelerations of 3 m/s^2 and 3 rad/s^2.
+        P = F @ P @ F.T + np.diag([1e-8] * 6 + [9.0 * dt**2] * 6)
+        z = measured(message)
+        e = H @ np.concatenate([z[0] - p, log_so3(z[1] @ R.T), z[2] - w])
+        N[:6, :6], N[6:, 6:] = (np.reshape(part.covariance, (6, 6))
+                                for part in (message.pose, message.twist))
+        S = H @ (P + N) @ H.T
+        K = P @ H.T @ np.linalg.inv(S)
+        x, P = K @ e, P - K @ S @ K.T
+        p, R, w = p + x[:3], exp_so3(x[3:6]) @ R, w + x[6:]
+        nis.append(e @ np.linalg.solve(S, e) / len(e))
+        path.append(p)
+    return np.array(path), float(np.mean(nis))
+
+
+def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag, tmp_path, monkeypatch):
+    """Of a robot with the camera on it, at a place that tf knows."""
+    (tmp_path / 'tf2_ros.py').write_text(FAKE_TF2_ROS)
+    monkeypatch.setenv('PYTHONPATH', os.pathsep.join(
+        [str(tmp_path), *filter(None, [os.environ.get('PYTHONPATH')])]))
+    monkeypatch.setenv('TF', ' '.join(map(str, (
+        'base_link', 'camera_optical_frame', *BASE_TO_CAMERA))))
     imu = {'imu': BAG_TOPICS['imu']}
+    of_base = {'base_frame': 'base_link', 'publish_odometry_tf': True}
     with Graph() as graph, \
             node_process(BUNDLED_PARAMETERS, remap=BAG_TOPICS) as relpose, \
-            node_process(BUNDLED_PARAMETERS, remap=imu, node='odometry_node') as node:
+            node_process(BUNDLED_PARAMETERS, remap=imu, parameters=of_base,
+                         node='odometry_node') as node:
+        transforms = graph.listen(TransformStamped, '/sent_transform')
         received = graph.listen(Odometry, '/odometry_node/keyframes')
         propagated = graph.listen(Odometry, '/odometry_node/odometry')
         paths = graph.listen(PathMessage, '/odometry_node/path')
@@ -273,7 +371,8 @@ def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag):
     assert 'tracking' in [value['state'] for value in values]
 
     # The same pairs and samples, given to the estimator in another order.
-    parameters = read_parameters(BUNDLED_PARAMETERS)
+    parameters = read_parameters(BUNDLED_PARAMETERS).updated({
+        'base_frame': 'base_link', 'base_to_camera': BASE_TO_CAMERA})
     estimator = OdometryEstimator(parameters)
     with open_bag(bundled_bag) as bag:
         topics = bag.find_topics()
@@ -292,7 +391,7 @@ def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag):
         turn = Rotation.from_quat([q.x, q.y, q.z, q.w]).inv() * Rotation.from_matrix(keyframe.R)
         assert np.degrees(turn.magnitude()) < 0.01
         assert message.header.frame_id == 'odom'
-        assert message.child_frame_id == 'camera_optical_frame'
+        assert message.child_frame_id == 'base_link'
 
     # By the IMU, at increasing times; the camera's clock is that of the IMU here.
     assert (np.diff([stamp_of(message) for message in propagated]) > 0).all()
@@ -300,4 +399,32 @@ def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag):
     assert len(propagated) > 2 * len(of_keyframes)
     for messages in (of_keyframes, propagated):
         # z is up in both: gravity is found.
-        assert assert_metric(messages, truth, 0.08, 0.03)[2, 2] > np.cos(np.radians(2.0))
+        assert assert_metric(messages, truth, 0.08, 0.03, BASE)[2, 2] > np.cos(np.radians(2.0))
+    by_stamp = {stamp_of(message): message.pose.pose for message in propagated}
+    assert len(transforms) > 0.9 * len(propagated)
+    for sent in transforms:
+        assert (sent.header.frame_id, sent.child_frame_id) == ('odom', 'base_link')
+        if pose := by_stamp.get(stamp_of(sent)):
+            np.testing.assert_equal(vector_of(sent.transform.translation),
+                                    vector_of(pose.position))
+
+    # A filter with the shipped configuration; pose and twist agree, and the twist alone leads
+    # along the poses. Found on a replay: 2.7; 7.2 without the lever arm in the twist, and 2400
+    # with it in the axes of the camera.
+    text = (ROOT / 'config' / 'robot_localization.yaml').read_text()
+    ekf = yaml.safe_load(text)['ekf_filter_node']['ros__parameters']
+    assert ekf['odom0'] == '/odometry_node/odometry'
+    assert ekf['publish_tf'] and not parameters.odometry.publish_odometry_tf
+    assert (ekf['odom_frame'], ekf['base_link_frame']) == ('odom', 'base_link')
+    # A busy machine leaves gaps, in which no twist is constant.
+    gaps = np.flatnonzero(np.diff([stamp_of(message) for message in propagated]) > SECOND // 10)
+    parts = [propagated[begin:end] for begin, end in pairwise([0, *(gaps + 1), len(propagated)])
+             if end - begin > 10]
+    assert sum(map(len, parts)) > 30
+    for part in parts:
+        poses = positions_of(part)[1:]
+        path, nis = fused(part, ekf['odom0_config'][:12])
+        assert np.linalg.norm(path - poses, axis=1).max() < 0.1
+        assert nis < 4.0
+        path, _ = fused(part, [False] * 6 + [True] * 6)
+        assert np.linalg.norm(path - poses, axis=1).max() < 0.15

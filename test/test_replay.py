@@ -305,13 +305,15 @@ def test_a_wrong_parameter_is_reported_and_is_exit_code_1(bundled_bag, tmp_path,
 def test_recordings(recordings, tmp_path, name):
     """With the gyro for the rows only, the rotation between the frames comes from the images.
 
-    Without that of the gyro directions are less certain: 4 of 28 by more than 10 deg.
+    Without that of the gyro directions are less certain: 4 of 28 by more than 10 deg. Without the
+    exposure of the RealSense's file, with which the monitor reports a wrong gyro bias in this
+    mode: a false alarm (docs/lab/benchmarks.md).
     """
     bag, out = tmp_path / name, tmp_path / 'out'
     assert main(['convert', name, str(recordings / name), str(bag)]) == 0
     assert main(['replay', str(bag), '--params', f'{bag}.yaml', '--set',
                  'use_gyro_rotation=false', '--set', 'max_translation_sigma=30',
-                 '--out', str(out)]) == 0
+                 '--set', 'exposure_margin=0.0', '--out', str(out)]) == 0
     summary = summary_of(out)
     assert summary['frames']['processed'] == summary['frames']['in_bag']
     assert summary['pairs']['total'] >= 5

@@ -40,13 +40,14 @@ from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuSample
-from rs_relpose_ros.odometry.estimator import (
+from rs_relpose_ros.odometry.estimator import OdometryEstimator
+from rs_relpose_ros.odometry.offline import (
     aligned,
-    OdometryEstimator,
+    draw_paths,
+    follow,
     path_of,
     TrajectoryErrors,
 )
-from rs_relpose_ros.odometry.offline import draw_paths, follow
 from rs_relpose_ros.odometry.pair import KeyframePair, warm_up_odometry
 from rs_relpose_ros.odometry.states import Odometry
 from rs_relpose_ros.offline.truth import TrueTrajectory

@@ -32,7 +32,7 @@ from scipy.stats import t as student_t
 from rs_relpose_ros.calibrate import coplanarity as model
 from rs_relpose_ros.calibrate.coplanarity import GLOBAL, Problem, READOUT, ROTATION, Unknowns
 from rs_relpose_ros.calibrate.observations import Observations, Varying, with_lens
-from rs_relpose_ros.calibrate.result import AXES, CalibrationResult, CostCurve, Estimate
+from rs_relpose_ros.calibrate.result import CalibrationResult, CostCurve, Estimate
 from rs_relpose_ros.calibrate.start import GyroPath, nearest_axis_map
 from rs_relpose_ros.config.settings import CalibrationConfig
 from rs_relpose_ros.errors import InputError
@@ -562,9 +562,16 @@ def evaluated(data: Observations, final: Fit, curve: CostCurve,
               config: CalibrationConfig) -> CalibrationResult:
     """Result of a fit; InputError if the readout time is longer than the frame interval."""
     covariance = final.covariance + np.diag(np.where(final.free, _tracker_sigmas(config), 0.0)**2)
-    bounded, covariance, beyond = _bounded(final.unknowns, covariance, data.interval)
+    unknowns = final.unknowns
+    if final.free[model.FOCAL]:
+        # Widened, the sigmas of the lens may exceed those of its priors.
+        lens = slice(model.RADIAL, model.EXPOSURE)
+        unknowns, covariance = _joined(unknowns, covariance, lens, final.problem.center[lens],
+                                       1.0 / final.problem.prior[lens])
+    bounded, covariance, beyond = _bounded(unknowns, covariance, data.interval)
     parameters, R_cam_imu = bounded.parameters, bounded.R_imu_cam.T
-    rates, one_axis = _excitation(data, parameters[model.BIAS:model.BIAS + 3], R_cam_imu, config)
+    rates, one_axis = data.excitation(parameters[model.BIAS:model.BIAS + 3], R_cam_imu,
+                                      config.min_rotation_rate)
     sigmas = np.sqrt(np.diag(covariance))
     # Row 0 is read this share of the readout before the middle row.
     to_first = np.zeros(GLOBAL)
@@ -593,7 +600,7 @@ def evaluated(data: Observations, final: Fit, curve: CostCurve,
     return CalibrationResult(
         readout_time=replace(_estimate(parameters[READOUT], sigmas[READOUT],
                                        config.max_readout_sigma), determined=True),
-        fitted_readout=float(final.unknowns.parameters[READOUT]),
+        fitted_readout=float(unknowns.parameters[READOUT]),
         time_offset=_estimate(float(to_first @ parameters),
                               math.sqrt(to_first @ covariance @ to_first),
                               config.max_offset_sigma),
@@ -633,6 +640,16 @@ def _exposure(data: Observations, final: Fit, square_sigma: float) -> Estimate:
     return Estimate(value, sigma, sigma <= 0.5 * value, 'the images do not show any')
 
 
+def _joined(unknowns: Unknowns, covariance: Array, known: slice, values: Array | float,
+            variances: Array | float) -> tuple[Unknowns, Array]:
+    """The calibration with independent values of some parameters, and its covariance."""
+    own = covariance[known, known]
+    gain = covariance[:, known] @ np.linalg.inv(own + variances * np.eye(len(own)))
+    step = gain @ (values - unknowns.parameters[known])
+    return (stepped(unknowns, step, np.zeros((len(unknowns.direction), LOCAL))),
+            covariance - gain @ covariance[known])
+
+
 def _bounded(unknowns: Unknowns, covariance: Array,
              interval: float) -> tuple[Unknowns, Array, str]:
     """The calibration with its readout within an interval T between frames, and a note.
@@ -644,10 +661,8 @@ def _bounded(unknowns: Unknowns, covariance: Array,
     """
     known = interval / math.sqrt(12.0)
     if covariance[READOUT, READOUT] > known**2:
-        gain = covariance[:, READOUT] / (covariance[READOUT, READOUT] + known**2)
-        step = gain * (0.5 * interval - unknowns.parameters[READOUT])
-        return (stepped(unknowns, step, np.zeros((len(unknowns.direction), LOCAL))),
-                covariance - np.outer(gain, covariance[READOUT]),
+        return (*_joined(unknowns, covariance, slice(READOUT, READOUT + 1), 0.5 * interval,
+                         known**2),
                 ('the images hardly determine the readout time: it is mostly that of any camera '
                 f'that is read downwards within the {1e3 * interval:.1f} ms between frames'))
     readout, sigma = float(unknowns.parameters[READOUT]), math.sqrt(covariance[READOUT, READOUT])
@@ -676,22 +691,3 @@ def _estimate(value: float, sigma: float, limit: float, blocking_reason: str = '
     return Estimate(float(value), float(sigma), good,
                     '' if good else blocking_reason or _RECORD_MORE,
                     determined=sigma <= _USELESS * limit and not blocking_reason)
-
-
-def _excitation(data: Observations, bias: Array, R_cam_imu: Array,
-                config: CalibrationConfig) -> tuple[Array, str]:
-    """Rms rates about the camera's axes [rad/s], and what is missing (empty: nothing)."""
-    inside = (data.gyro_times >= data.times[0]) & (data.gyro_times <= data.times[-1])
-    rates = (data.gyro_rates[inside] - bias) @ R_cam_imu.T
-    rates = rates - rates.mean(axis=0)
-    rms = np.sqrt((rates**2).mean(axis=0))
-    values, vectors = np.linalg.eigh(rates.T @ rates / len(rates))
-    # Two axes fix a rotation.
-    if np.sqrt(max(values[1], 0.0)) >= config.min_rotation_rate:
-        return rms, ''
-    main = vectors[:, 2]
-    lacking = [AXES[i] for i in np.argsort(np.abs(main))[:2]]
-    about = AXES[int(np.argmax(np.abs(main)))]
-    return rms, (f'the camera rotates about one axis only, nearly {about}, so the rotation about '
-                 f'it is not observable: rotate about {lacking[0]} and {lacking[1]} too, 20 to 60 '
-                 'deg/s')

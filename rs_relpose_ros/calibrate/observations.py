@@ -25,6 +25,7 @@ from rs_relpose_ros.calibrate.coplanarity import (
     SLOPE,
     View,
 )
+from rs_relpose_ros.calibrate.result import AXES
 from rs_relpose_ros.calibrate.start import GyroSeries, noise_density, rotation_between
 from rs_relpose_ros.config.settings import CalibrationConfig
 from rs_relpose_ros.errors import InputError
@@ -255,7 +256,7 @@ _BEND_AT_START = 0.1
 # 1 sigma of a gyro's bias [rad/s]; of the offset's change by a covariate [s/s]; of an unknown
 # lens: first coefficient of the distortion, principal point as a share of the width.
 _BIAS_SIGMA, _SLOPE_SIGMA = 0.03, 1.0
-_RADIAL_SIGMA, _CENTER_SIGMA = 0.3, 0.03
+_RADIAL_SIGMA, _CENTER_SIGMA = 0.3, 0.015
 # Steps of the lens [1, 1, px, px] for its derivatives.
 _LENS_STEPS = (1e-5, 1e-5, 1e-2, 1e-2)
 # Error of the rotation between two frames of a gyro without noise, by its sampling [rad].
@@ -307,6 +308,23 @@ class Observations:
     def gyro_steps(self) -> Array:
         """Steps (K - 1,) between samples of the gyro [s]."""
         return np.diff(self.gyro_times)
+
+    def excitation(self, bias: Array, R_cam_imu: Array, least: float) -> tuple[Array, str]:
+        """Rms rates (3,) about the camera's axes [rad/s], and what is missing (empty: nothing)."""
+        inside = (self.gyro_times >= self.times[0]) & (self.gyro_times <= self.times[-1])
+        rates = (self.gyro_rates[inside] - bias) @ R_cam_imu.T
+        rates = rates - rates.mean(axis=0)
+        rms = np.sqrt((rates**2).mean(axis=0))
+        values, vectors = np.linalg.eigh(rates.T @ rates / len(rates))
+        # Two axes fix a rotation.
+        if np.sqrt(max(values[1], 0.0)) >= least:
+            return rms, ''
+        main = vectors[:, 2]
+        lacking = [AXES[i] for i in np.argsort(np.abs(main))[:2]]
+        about = AXES[int(np.argmax(np.abs(main)))]
+        return rms, (f'the camera rotates about one axis only, nearly {about}, so the rotation '
+                     f'about it is not observable: rotate about {lacking[0]} and {lacking[1]} '
+                     'too, 20 to 60 deg/s')
 
     def pairs(self, selection: PairSelection, rng: np.random.Generator) -> Pairs:
         """All pairs of these spans without lost frames."""

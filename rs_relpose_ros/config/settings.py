@@ -155,11 +155,17 @@ class OdometryConfig(Settings):
 
     odometry_frame: str = setting(
         'odom', 'frame_id of the odometry: z up, origin and heading those of the first keyframe')
+    base_frame: str = setting(
+        '', "frame_id of the robot, whose pose and twist are published; empty for the camera's")
+    base_to_camera: tuple[float, ...] | None = setting(
+        None, 'pose of the camera in base_frame, as a static transform: x y z [m], quaternion x y '
+        'z w; from /tf_static if not given', low=-100.0, high=100.0, length=7, kind=tuple)
     odometry_rate: float = setting(
         30.0, 'rate of the odometry between keyframes, propagated by the IMU', 'Hz', low=0.0,
         high=1000.0)
     publish_odometry_tf: bool = setting(
-        False, 'broadcast the camera as a child of odometry_frame on /tf; needs tf2_ros')
+        False, 'broadcast base_frame as a child of odometry_frame on /tf; it must have no other '
+        'parent; needs tf2_ros')
     smoothing_lag: float = setting(
         4.0, 'length of the window of keyframes that is optimised', 's', low=0.5, high=60.0)
     max_scale_sigma: float = setting(
@@ -179,6 +185,11 @@ class OdometryConfig(Settings):
     pure_rotation_motion: float = setting(
         0.02, 'largest displacement of a pair without visible translation, 1 sigma per axis: the '
         'noise of a match times the distance of the scene', 'm', low=1e-3, high=1e3)
+
+    def __post_init__(self) -> None:
+        Settings.__post_init__(self)
+        if self.base_to_camera is not None:
+            validate.unit_length('the quaternion of base_to_camera', self.base_to_camera[3:], 1e-2)
 
 
 # Tracker by name: a class that implements `rs_relpose_ros.tracking.features.Tracker`, imported on

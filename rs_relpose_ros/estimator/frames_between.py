@@ -44,8 +44,9 @@ _GRAVITY_SIGMA = 1.0
 _LEAST_WALK = 5e-4
 # Degrees of freedom as which the configured noise of a match counts.
 _SIGMA_FREEDOM = 10.0
-# Least number of inliers that a frame between must have.
-_LEAST_TRACKS = 10
+# Least number of inliers that a frame between must have, and most of a pair: 200 of 280 cost 8 %
+# of t and R on simulated walks, nothing on recordings, where tracks share larger errors.
+_LEAST_TRACKS, _MOST_TRACKS = 10, 200
 # Sine squared of the parallax below which the distance of a track starts at a small value.
 _PARALLEL, _FAR = 1e-8, 1e-2
 _LARGEST_PIXEL = 1e6
@@ -135,8 +136,8 @@ class _View(NamedTuple):
     inertial: InertialMotion | None
 
     @classmethod
-    def of(cls, frame: IntermediateFrame, inliers: NDArray[np.bool_]) -> _View | None:
-        """None without the gyro's rotation."""
+    def of(cls, frame: IntermediateFrame, inliers: NDArray[np.intp]) -> _View | None:
+        """With the tracks `inliers` (N,); None without the gyro's rotation."""
         if frame.relative_rotation is None or frame.relative_rotation_covariance is None:
             return None
         return cls(frame.points[inliers], frame.motion, frame.interval, frame.relative_rotation,
@@ -155,12 +156,15 @@ def refined(pose: RelativePose, points1: Array, motion1: FrameMotion, second: tu
         return pose
     if config.refinement != 'map' or pose.model in ('linear', 'global'):
         return replace(pose, frames_reason='solver or refinement are for two views')
-    last = _View.of(IntermediateFrame(*second), pose.inliers)
+    inliers = np.flatnonzero(pose.inliers)   # new corners are spread in this order
+    if len(inliers) > _MOST_TRACKS:
+        inliers = inliers[np.linspace(0, len(inliers) - 1, _MOST_TRACKS).astype(int)]
+    last = _View.of(IntermediateFrame(*second), inliers)
     if last is None:
         return replace(pose, frames_reason='there is no rotation by the gyro')
-    views = [_View(points1[pose.inliers], motion1, 0.0, np.eye(3), np.zeros((3, 3)), None)]
+    views = [_View(points1[inliers], motion1, 0.0, np.eye(3), np.zeros((3, 3)), None)]
     for frame in between:
-        view = _View.of(frame, pose.inliers)
+        view = _View.of(frame, inliers)
         if view is not None and np.isfinite(view.points[:, 0]).sum() >= _LEAST_TRACKS:
             views.append(view)
     if len(views) == 1:

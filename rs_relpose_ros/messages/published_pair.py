@@ -27,6 +27,9 @@ Array = NDArray[np.float64]
 
 # Largest deviation from 1 of the length of directions, quaternions and rays.
 _UNIT_TOLERANCE = 1e-3
+# Most negative eigenvalue of an information by rounding, relative to the largest one; the largest
+# one of all: a sigma of 1e-7 rad.
+_LEAST_INFORMATION, _MOST_INFORMATION = 1e-6, 1e14
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,6 +114,12 @@ class PairStatus:
                              f'{POSE} or {ROTATION} unknowns, got {size}')
         H = np.zeros((size, size))
         H[rows] = H.T[rows] = upper
+        values = np.linalg.eigvalsh(H)
+        if not -_LEAST_INFORMATION * values[-1] <= values[0] <= values[-1] or \
+                not 0.0 < values[-1] < _MOST_INFORMATION:
+            raise InputError('image_information of ~/pairs must be positive semidefinite, with '
+                             f'eigenvalues below {_MOST_INFORMATION:g}, got {values[0]:.3g} to '
+                             f'{values[-1]:.3g}: the pair is not used')
         if size == ROTATION:
             t, velocities = np.full(3, math.nan), np.full(6, math.nan)
         return ImageInformation(float(row_times[0]), Rotation.from_quat(xyzw).as_matrix(), t,

@@ -19,6 +19,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import deserialize_message
+from rclpy.time import Time
 
 from rs_relpose_ros.errors import MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry.camera import Intrinsics
@@ -111,6 +112,30 @@ def transform_broadcaster(node: Node, parameter: str) -> Any:
     except ImportError as error:
         raise MissingInputError(f'{parameter} needs tf2_ros, which is not installed: install '
                                 f'ros-jazzy-tf2-ros-py, or set {parameter} to false') from error
+
+
+def transform_lookup(node: Node) -> Callable[[str, str], tuple[float, ...] | None]:
+    """Function of (parent, child): x y z, quaternion x y z w of the child's pose; None if unknown.
+
+    It listens to /tf and /tf_static until it knows one. Without tf2_ros nothing is known.
+    """
+    try:
+        tf2_ros = importlib.import_module('tf2_ros')
+    except ImportError:
+        return lambda parent, child: None
+    buffer = tf2_ros.Buffer()
+    listener = tf2_ros.TransformListener(buffer, node)
+
+    def lookup(parent: str, child: str) -> tuple[float, ...] | None:
+        try:
+            found = buffer.lookup_transform(parent, child, Time()).transform
+        except tf2_ros.TransformException:
+            return None
+        listener.unregister()
+        t, q = found.translation, found.rotation
+        return t.x, t.y, t.z, q.x, q.y, q.z, q.w
+
+    return lookup
 
 
 def overridable() -> QoSOverridingOptions:

@@ -20,7 +20,7 @@ from rs_relpose_ros.nodes.parameters import legal_qos
 from rs_relpose_ros.nodes.sensor_node import run_node, StoppableNode
 from rs_relpose_ros.odometry import need_gtsam
 from rs_relpose_ros.odometry.pair import KeyframePair, warm_up_odometry
-from rs_relpose_ros.odometry.states import ContinuousPath
+from rs_relpose_ros.odometry.states import Base, ContinuousPath
 
 NAME = 'odometry_node'
 
@@ -56,9 +56,12 @@ class OdometryNode(StoppableNode):
         self._config = parameters.odometry
         self._estimator = OdometryEstimator(parameters)
         self._continuous = ContinuousPath(self._estimator)
+        if self._estimator.base is None:
+            self._lookup = inputs.transform_lookup(self)
         self._newest_ns = 0   # of the samples, on the IMU clock
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._sample_at = self._steady.now()
+        self._frames: dict[Role, str] = {}   # of the samples
         self._path: deque[Any] = deque(maxlen=_PATH_LENGTH)
         self._transforms = (inputs.transform_broadcaster(self, 'publish_odometry_tf')
                             if self._config.publish_odometry_tf else None)
@@ -99,19 +102,31 @@ class OdometryNode(StoppableNode):
         self._estimator.reset()
         self._continuous.reset()
         self._path.clear()
+        self._frames.clear()
         response.success, response.message = True, 'restarting with the next pair'
         return response
 
     def _on_pair(self, message: Any) -> None:
         self._silent[self._pairs] = 0
         try:
-            self._estimator.add_pair(KeyframePair.of_message(message))
+            pair = KeyframePair.of_message(message)
+            base = self._config.base_frame
+            if self._estimator.base is None and (found := self._lookup(base, pair.frame_id)):
+                self._estimator.base = Base.of(base, found)
+            self._estimator.add_pair(pair)
         except RsRelposeError as error:
             self._warn(str(error))
             return
         self._read_sensors()
 
     def _on_sample(self, role: Role, message: Any) -> None:
+        frame = message.header.frame_id
+        first = self._frames.setdefault(role, frame)
+        if frame != first:
+            self._warn(f'a message of {frame} on {self.resolve_topic_name(role.value)} is not '
+                       f'used, as the first was of {first}: remap {role.value} to one IMU; '
+                       '~/reset accepts another one')
+            return
         if role is Role.IMU:
             self._silent[self._imu] = 0
         try:
@@ -155,7 +170,7 @@ class OdometryNode(StoppableNode):
             pose=message_class('geometry_msgs/msg/PoseWithCovariance')(
                 pose=pose.pose,
                 covariance=outgoing.published_covariance(odometry.pose_covariance)),
-            # In the axes of the camera.
+            # In the axes of the child frame.
             twist=outgoing.twist_message(odometry.velocity, odometry.angular_velocity,
                                          odometry.velocity_covariance, message_class))
 
@@ -188,7 +203,9 @@ class OdometryNode(StoppableNode):
         silent = [f'{topic} for {reports - 1} s' for topic, reports in self._silent.items()
                   if reports > _SILENCE]
         if silent:
-            level, state = 2, f'no message on {" and ".join(silent)}'
+            level, state = 2, (f'no message on {" and ".join(silent)}: start or remap what '
+                               'publishes it (relpose_node, the driver of the IMU)')
+            self._warn(state)
         values = [('state', estimator.state.value), ('reason', estimator.reason), *(
             (name.replace(' ', '_'), str(estimator.counts[name])) for name in (
                 'pairs', 'contradicting', 'late', 'without images', 'dropped', 'lost',

@@ -7,30 +7,24 @@ arrival within `_LATE_NS`.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 import math
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import Parameters
-from rs_relpose_ros.geometry.so3 import (
-    aligning_rotation,
-    exp_so3,
-    skew,
-    STANDARD_GRAVITY,
-)
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry.so3 import exp_so3, skew, STANDARD_GRAVITY
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.buffer import Coverage, ImuInterval, ImuSample, ImuSamples
 from rs_relpose_ros.messages.incoming import StuckGyro
-from rs_relpose_ros.messages.outgoing import quat_xyzw
 from rs_relpose_ros.odometry.graph import (
     ARM,
     GraphError,
+    GYRO_BIAS,
     KeyframeGraph,
     KeyframeState,
     POSE,
@@ -39,19 +33,21 @@ from rs_relpose_ros.odometry.graph import (
 )
 from rs_relpose_ros.odometry.pair import KeyframePair
 from rs_relpose_ros.odometry.states import (
-    JUMP_NS,
+    Base,
     Odometry,
     OdometryState,
     StartReport,
     StateInterval,
 )
-from rs_relpose_ros.offline.truth import TrueTrajectory
 
 Array = NDArray[np.float64]
 
 # Largest delay of a message.
 _LATE_NS = 100_000_000
-# Largest number of pairs that wait; the IMU bridges older ones, so that a slow machine keeps up.
+# Consecutive samples later than that of a clock that was set back.
+_SET_BACK = 5
+# Number of waiting pairs beyond which all but the newest are left out: the IMU bridges them at the
+# cost of one, so that a slow machine keeps up.
 _MOST_WAITING = 10
 # Largest age of a usable pair while tracking [s], and in intervals of recent pairs; period of the
 # test [ns].
@@ -73,15 +69,24 @@ _START_LOG_SIGMA, _GUESSED_SPEED = 0.7, 1.0
 # Innovation of a contradicting pair, in units of recent ones, and chi squared per degree of
 # freedom of a wrong start.
 _CONTRADICTING, _WRONG_START = 4.0, 3.0
+# Number of wrong starts in motion, or of contradicting pairs after a start at rest, after which
+# rest is no start.
+_WRONG_STARTS = 3
+_CONTRADICTION = ('pairs and IMU contradict each other: are relpose_node/pairs and imu of one '
+                  'camera, and quat_cam_imu_xyzw and imu_position those of this IMU?')
 # Longest propagation of a lost path by the IMU [s]; largest delay of a pair behind its samples.
 _LONGEST_PROPAGATED, _LONGEST_DELAY = 10.0, 10.0
 # Longest start [s]; then a new one begins.
 _LONGEST_START = 4.0
-_GAP = 'the IMU has a gap'
+_GAP = 'the IMU has a gap, or its clock jumped: see its driver'
 # 1 sigma of an unknown acceleration [m/s^2] and rate [rad/s], of a body whose IMU had a gap.
 _UNKNOWN_ACCELERATION, _UNKNOWN_RATE = 3.0, 1.0
+# Time for which a body has moved until the next start, if the clock was set back [s].
+_UNKNOWN_TIME = 1.0
 # 1 sigma of the position of the IMU if none is configured, and the least one [m].
 _UNKNOWN_ARM, _LEAST_ARM_SIGMA = 0.15, 1e-4
+# Noise of a single sample of the gyro in units of its density [sqrt(Hz)].
+_RATE_NOISE = 10.0
 # Fewest pairs that determine the scale of a start in motion.
 _LEAST_PAIRS = 4
 
@@ -111,7 +116,9 @@ class _Run:
     variances: tuple[float, float] = (0.0, 0.0)
     # Of recent pairs: times, innovations (chi squared by degrees of freedom) and intervals [s].
     recent: deque[tuple[int, float, float]] = field(default_factory=lambda: deque(maxlen=20))
-    pairs: int = 0
+    pairs: int = 0   # used
+    contradicting: int = 0   # not used
+    confirmed: bool = False   # by a pair in motion
     published: bool = False
     path: int = 0   # number of earlier starts
 
@@ -136,14 +143,21 @@ class OdometryEstimator:
         self._arm_covariance = max(sigma, _LEAST_ARM_SIGMA if lever.any() else _UNKNOWN_ARM
                                    )**2 * np.eye(3)
         self._first_R: Array | None = None   # of the body at the first start: the origin
+        # None until it is known.
+        self.base = (Base() if not self._config.base_frame
+                     else None if self._config.base_to_camera is None
+                     else Base.of(self._config.base_frame, self._config.base_to_camera))
         self._samples = ImuSamples(parameters.imu.max_imu_gap)
         self._gyro = StuckGyro(parameters.imu.stuck_gyro_time)
         self._keep = keep
+        self._camera = ''   # frame_id of the pairs
         self._waiting: dict[int, KeyframePair] = {}
         self._run: _Run | None = None
         self._last_run: _Run | None = None   # its end is the start of the next path
         self._runs: list[_Run] = []
         self._last_ns: int | None = None
+        self._wrong_starts = 0   # since the last right one in motion
+        self._behind = 0   # consecutive samples that came too late
         self._row_ns = 0   # from the stamped to the middle row
         self._offset_ns = self._watched_ns = 0   # of the camera's clock from that of the IMU
         self.state, self.reason = OdometryState.STARTING, 'no pair with a pose yet'
@@ -164,17 +178,25 @@ class OdometryEstimator:
 
     @property
     def blocking_reason(self) -> str:
-        """Fault of the accelerometer that prevents a start; empty for none."""
+        """Unknown base or fault of the accelerometer that prevents a start; empty for none."""
+        if self.base is None:
+            return (f'the camera is not known in base_frame {self._config.base_frame}: publish '
+                    'their static transform on /tf_static (tf2_ros reads it), or set '
+                    'base_to_camera')
         return self._samples.fault if self.state is OdometryState.STARTING else ''
 
     def add_imu(self, sample: ImuSample) -> None:
         """Add a sample; InputError for a stuck gyro."""
         newest = self._samples.both_until_ns
-        if newest is not None and sample.stamp_ns < newest - JUMP_NS:
+        self._behind = (self._behind + 1 if newest is not None
+                        and sample.stamp_ns < newest - _LATE_NS else 0)
+        if newest is not None and self._behind == _SET_BACK:
             self._end('the clock of the IMU was set back', newest)
-            self._watched_ns = 0
+            self._behind = self._watched_ns = 0
             self._samples.clear()
             self._waiting, self._last_ns = {}, None
+        elif self._behind:
+            return   # too late for any pair
         if not self._gyro.repeats(sample):
             self._samples.add(sample)
             self._samples.prune(sample.stamp_ns - to_nanoseconds(
@@ -194,7 +216,12 @@ class OdometryEstimator:
                          self._watched_ns)
 
     def add_pair(self, pair: KeyframePair) -> None:
-        """Add a pair; one without information is only counted."""
+        """Add a pair; one without information is only counted. InputError for another camera."""
+        self._camera = self._camera or pair.frame_id
+        if pair.frame_id != self._camera:
+            raise InputError(f'a pair of {pair.frame_id} is not used, as the first was of '
+                             f'{self._camera}: remap relpose_node/pairs to those of one camera; '
+                             '~/reset accepts another one')
         self.counts['pairs'] += 1
         if pair.images is None and not pair.contradiction:
             self.counts['without images'] += 1
@@ -208,13 +235,16 @@ class OdometryEstimator:
             return
         self._waiting[pair.current_ns] = pair
         if len(self._waiting) > _MOST_WAITING:
-            del self._waiting[min(self._waiting)]
-            self.counts['dropped'] += 1
+            self.counts['dropped'] += _MOST_WAITING
+            newest = max(self._waiting)
+            found = [one.contradiction for one in self._waiting.values() if one.contradiction]
+            self._waiting = {newest: replace(
+                self._waiting[newest], contradiction=found[-1] if found else '')}
 
     def reset(self) -> None:
         """Forget the path: the next start is at the origin."""
         self._run = self._last_run = self._first_R = None
-        self._waiting = {}
+        self._waiting, self._camera = {}, ''
         self._change(OdometryState.STARTING, 'reset', self._watched_ns)
 
     def warnings(self) -> list[str]:
@@ -319,11 +349,17 @@ class OdometryEstimator:
         if innovation > gate:
             self.counts['contradicting'] += 1
             self.corrections += 1
+            run.contradicting += 1
+            if not run.confirmed and run.contradicting == _WRONG_STARTS:
+                self._wrong_starts = _WRONG_STARTS
+                self._end(_CONTRADICTION, pair.current_ns)
+                return None
             if seconds_between(run.observed_ns, pair.current_ns) > self._config.max_coast:
                 self._end(f'no usable pair for {self._config.max_coast:g} s', pair.current_ns)
                 return None
         else:
             run.observed_ns, run.pairs = pair.current_ns, run.pairs + 1
+            run.confirmed |= pair.has_direction
             run.variances = _variances(run.graph.newest)
             if run.published:
                 self._change(OdometryState.TRACKING, '', pair.current_ns)
@@ -387,10 +423,10 @@ class OdometryEstimator:
         """A run that starts at the pair's reference; None if the pair cannot start one."""
         interval = self._samples.between(pair.reference_ns, pair.current_ns)
         before = self._samples.up_to(pair.reference_ns, _GRAVITY_WINDOW)
-        if pair.images is None or interval is None:
+        if pair.images is None or interval is None or self.base is None:
             return None
         at_rest = pair.is_pure_rotation and interval.at_rest
-        if not at_rest and not pair.has_direction:
+        if self._wrong_starts >= _WRONG_STARTS if at_rest else not pair.has_direction:
             return None
         moving = (pair.baseline * pair.images.velocities[:3]
                   if pair.baseline_log_sigma < _START_LOG_SIGMA
@@ -404,8 +440,8 @@ class OdometryEstimator:
         else:
             force = before.mean_force(bias)
         path_end = self._path_end_at(pair.reference_ns)
-        R = _levelled(force, path_end)
         C = self._R_cam_body
+        R = _levelled(force, path_end, self.base.R @ C if self.base.frame_id else np.eye(3))
         velocity = np.zeros(3) if at_rest else R @ (C.T @ moving - np.cross(rate, self._arm))
         tilt = self._imu.accel_bias_sigma / STANDARD_GRAVITY if at_rest else _MOVING_TILT
         covariance = np.diag(np.square(
@@ -422,7 +458,7 @@ class OdometryEstimator:
         stamps = deque([(pair.reference_ns - offset, pair.reference_ns)],
                        maxlen=None if self._keep else 1)
         return _Run(graph, path_end, at_rest, pair.reference_ns, pair.reference_ns, stamps,
-                    pair.frame_id)
+                    self.base.frame_id or pair.frame_id)
 
     def _path_end_at(self, imu_ns: int) -> _PathEnd:
         """End of the last path, propagated by the IMU to a time."""
@@ -439,10 +475,14 @@ class OdometryEstimator:
         if interval is not None and seconds <= _LONGEST_PROPAGATED:
             state = run.graph.propagated(interval)
         elif abs(seconds) > _SAME_NS / NANOSECONDS:   # else the keyframe itself: no gap
-            # On at the same velocity.
-            turned = _UNKNOWN_RATE * abs(seconds)
-            moved = 0.5 * _UNKNOWN_ACCELERATION * seconds**2
-            state = replace(state, position=state.position + seconds * state.velocity)
+            # On at the same velocity; for an unknown time if the clock was set back.
+            way = max(seconds, 0.0) * state.velocity
+            unknown = 0.0 if seconds > 0.0 else _UNKNOWN_TIME * float(
+                np.linalg.norm(state.velocity))
+            seconds = seconds if seconds > 0.0 else _UNKNOWN_TIME
+            turned = _UNKNOWN_RATE * seconds
+            moved = 0.5 * _UNKNOWN_ACCELERATION * seconds**2 + unknown
+            state = replace(state, position=state.position + way)
             variance += seconds**2 * float(np.trace(state.covariance[VELOCITY, VELOCITY])) / 3.0
         of_position, of_heading = _variances(state)
         return _PathEnd(
@@ -454,17 +494,24 @@ class OdometryEstimator:
         """Whether the scale of a starting run is known."""
         seconds = seconds_between(run.first_ns, run.newest_ns)
         sigma = run.graph.scale_sigma()
-        if self.state is OdometryState.STARTING:
+        if self.state is OdometryState.STARTING and \
+                self._wrong_starts < _WRONG_STARTS:
             self.reason = (f'the speed is known to {100.0 * sigma:.0f} % of '
                            f'{100.0 * self._config.max_scale_sigma:.0f} %: it needs motion that '
                            'changes its speed, or standstill')
         if run.at_rest or run.pairs >= _LEAST_PAIRS:
             if run.graph.misfit() > _WRONG_START:
                 self.counts['wrong starts'] += 1
+                self._wrong_starts += 1
                 self._run = None
+                if self._wrong_starts == _WRONG_STARTS:
+                    self.reason = _CONTRADICTION
+                    self._warnings.append(_CONTRADICTION)
                 return False
             if sigma < self._config.max_scale_sigma:
                 run.published = True
+                if not run.at_rest:
+                    self._wrong_starts = 0
                 self.starts.append(StartReport(run.at_rest, run.newest_ns, seconds, sigma))
                 run.path = len(self.starts) - 1
                 if self._keep:
@@ -516,23 +563,26 @@ class OdometryEstimator:
 
     def _odometry(self, run: _Run, state: KeyframeState, rate: Array, stamp_ns: int,
                   imu_ns: int) -> Odometry:
-        C, c, first_R = self._R_cam_body, state.arm, self._first_R
-        assert first_R is not None
+        base, first_R = self.base, self._first_R
+        assert base is not None and first_R is not None
+        # The base on the body, as the camera: its rotation and position.
+        C = base.R @ self._R_cam_body
+        c = state.arm - C.T @ base.position
         rate = rate - state.gyro_bias
-        # The camera is at the origin at first: p + (R - R_first) c, in the world.
-        to_world, to_twist = np.zeros((6, 18)), np.zeros((3, 18))
+        # It is at the origin at first: p + (R - R_first) c, in the world.
+        to_world, to_twist = np.zeros((6, 18)), np.zeros((6, 18))
         to_world[:3, :3], to_world[:3, 3:6] = -state.R @ skew(c), state.R
         to_world[3:, :3], to_world[:3, ARM] = state.R, state.R - first_R
         R = state.R @ C.T
-        to_twist[:, :3], to_twist[:, VELOCITY] = C @ skew(state.R.T @ state.velocity), R.T
-        to_twist[:, ARM] = C @ skew(rate)
-        velocity = np.zeros((6, 6))
-        velocity[:3, :3] = to_twist @ state.covariance @ to_twist.T
-        velocity[3:, 3:] = self._imu.gyro_noise_density**2 * 100.0 * np.eye(3)
+        to_twist[:3, :3], to_twist[:3, VELOCITY] = C @ skew(state.R.T @ state.velocity), R.T
+        to_twist[:3, ARM] = C @ skew(rate)
+        to_twist[:3, GYRO_BIAS], to_twist[3:, GYRO_BIAS] = C @ skew(c), -C
+        by_rate = to_twist[:, GYRO_BIAS] * self._imu.gyro_noise_density * _RATE_NOISE
+        velocity = to_twist @ state.covariance @ to_twist.T + by_rate @ by_rate.T
         # A later start has position and heading from the end of the path before.
         position, up = state.position + (state.R - first_R) @ c, np.array([0.0, 0.0, 1.0])
         by_heading = run.path_end.heading_sigma * np.concatenate([
-            np.cross(up, position - run.path_end.position), up])
+            np.cross(up, state.position + state.R @ c - run.path_end.position), up])
         covariance = to_world @ state.covariance @ to_world.T + np.outer(by_heading, by_heading)
         covariance[:3, :3] += run.path_end.position_sigma**2 * np.eye(3)
         return Odometry(
@@ -546,84 +596,18 @@ def _variances(state: KeyframeState) -> tuple[float, float]:
     return float(np.trace(covariance[3:, 3:])), float(up @ covariance[:3, :3] @ up)
 
 
-def _levelled(force: Array, path_end: _PathEnd) -> Array:
-    """Rotation (3, 3) from the body to the world, by the specific force at rest."""
-    up = force / np.linalg.norm(force)
+def _levelled(force: Array, path_end: _PathEnd, axes: Array) -> Array:
+    """Rotation (3, 3) from the body to the world, by the specific force at rest.
+
+    `axes` (3, 3): from the body to the axes that keep their heading.
+    """
+    up = axes @ force / np.linalg.norm(force)
     # The smallest rotation that takes it upwards, then one about z to the last heading.
     turn = skew(np.cross(up, [0.0, 0.0, 1.0]))
     R = (np.eye(3) + turn + turn @ turn / (1.0 + up[2]) if up[2] > -0.999
          else np.diag([1.0, -1.0, -1.0]))
+    R = R @ axes
     if path_end.R is not None:
         M = path_end.R @ R.T
         R = exp_so3(np.array([0.0, 0.0, math.atan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1])])) @ R
     return np.asarray(R)
-
-
-# Path length of relative errors [m].
-_SEGMENT = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class TrajectoryErrors:
-    """Errors of positions after the best rigid alignment, without scale."""
-
-    ate_m: float   # root mean square distance
-    scale_error: float   # of the best similarity, less 1
-    relative_translation_error_percent: float   # median over segments of 1 m
-    length_m: float   # of the true path
-
-
-class ComparedPath(NamedTuple):
-    """Positions (N, 3) at times [ns]; with errors, aligned with the true ones that cover them."""
-
-    imu_ns: Sequence[int]
-    positions: Array
-    truth: Array | None = None
-    errors: TrajectoryErrors | None = None
-
-
-def write_tum(path: Path, trajectory: Sequence[Odometry]) -> None:
-    """Lines ``seconds x y z qx qy qz qw``, seconds being those of the stamps."""
-    with path.open('w', encoding='ascii') as file:
-        for pose in trajectory:
-            values = [*pose.position, *quat_xyzw(pose.R)]
-            file.write(f'{pose.stamp_ns // 10**9}.{pose.stamp_ns % 10**9:09d} '
-                       + ' '.join(f'{value:.9f}' for value in values) + '\n')
-
-
-def aligned(positions: Array, truth: Array) -> tuple[Array, Array, float]:
-    """R (3, 3), t (3,) of ``truth = R positions + t``, and the best scale of the positions.
-
-    S. Umeyama, *Least-squares estimation of transformation parameters between two point
-    patterns*, PAMI 13(4), 1991.
-    """
-    mean, true_mean = positions.mean(axis=0), truth.mean(axis=0)
-    a, b = positions - mean, truth - true_mean
-    correlation = b.T @ a
-    R = aligning_rotation(correlation)
-    return R, true_mean - R @ mean, float((R * correlation).sum() / (a**2).sum())
-
-
-def path_of(trajectory: Sequence[Odometry], truth: TrueTrajectory | None) -> ComparedPath:
-    """Positions of a trajectory; compared with the ground truth if it covers 4 poses or more."""
-    covered = [pose for pose in trajectory if truth is not None and truth.covers(pose.imu_ns)]
-    if truth is None or len(covered) < 4:
-        return ComparedPath([pose.imu_ns for pose in trajectory],
-                            np.array([pose.position for pose in trajectory]).reshape(-1, 3))
-    positions = np.array([pose.position for pose in covered])
-    true = np.array([truth.position(pose.imu_ns) for pose in covered])
-    R, t, scale = aligned(positions, true)
-    moved = positions @ R.T + t
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(true, axis=0), axis=1))])
-    relative = []
-    for i, pose in enumerate(covered):
-        j = int(np.searchsorted(way, way[i] + _SEGMENT))
-        if j == len(covered):
-            break
-        known = truth.relative_pose(pose.imu_ns, covered[j].imu_ns)
-        if known is not None and covered[j].path == pose.path:
-            step = pose.R.T @ (covered[j].position - pose.position)
-            relative.append(float(np.linalg.norm(step - known[1])) / float(way[j] - way[i]))
-    return ComparedPath([pose.imu_ns for pose in covered], moved, true, TrajectoryErrors(
-        float(np.sqrt(((moved - true) ** 2).sum(axis=1).mean())), scale - 1.0,
-        100.0 * float(np.median(relative)) if relative else math.nan, float(way[-1])))

@@ -36,7 +36,8 @@ _INTEGRATION = 1e-4
 # Columns of a pair's derivatives: pose and velocity of the first body, of the second one, camera.
 _BLOCKS = (slice(0, 6), slice(6, 9), slice(9, 15), slice(15, 18), slice(18, 21))
 # Columns of the covariance of a keyframe.
-POSE, VELOCITY, BIAS, ARM = slice(0, 6), slice(6, 9), slice(9, 15), slice(15, 18)
+POSE, VELOCITY, BIAS, GYRO_BIAS, ARM = (
+    slice(0, 6), slice(6, 9), slice(9, 15), slice(12, 15), slice(15, 18))
 
 
 class GraphError(RsRelposeError):

@@ -1,4 +1,4 @@
-"""Metric odometry of a bag: pairs of a replay and IMU samples in the order of a live node."""
+"""Metric odometry of a bag, as of a live node, and its errors against the ground truth."""
 
 from __future__ import annotations
 
@@ -7,24 +7,29 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from matplotlib.figure import Figure
 import numpy as np
+from numpy.typing import NDArray
 
 from rs_relpose_ros.bags.reader import Bag, SensorTopics
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry.so3 import aligning_rotation
 from rs_relpose_ros.geometry.timing import seconds_between
 from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.messages.incoming import PARTS, Role, sensor_messages
-from rs_relpose_ros.odometry import estimator as paths
+from rs_relpose_ros.messages.outgoing import quat_xyzw
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.pair import KeyframePair
-from rs_relpose_ros.odometry.states import Odometry, OdometryState
+from rs_relpose_ros.odometry.states import Base, Odometry, OdometryState
 from rs_relpose_ros.offline.replay import read_truth, Replay
+from rs_relpose_ros.offline.truth import TrueTrajectory
 from rs_relpose_ros.output_files import prepare_folder, save_picture, SUMMARY_FILE
 from rs_relpose_ros.pipeline.findings import FindingState
+
+Array = NDArray[np.float64]
 
 _STYLES: Mapping[str, Mapping[str, Any]] = {
     'truth': {'color': 'black', 'lw': 2.5}, 'live': {'color': '#E69F00', 'lw': 1.2},
@@ -65,7 +70,9 @@ def odometry_into(folder: Path, bag: Bag, topics: SensorTopics,
     smoothed = estimator.smoothed()
     warnings = estimator.warnings()
     truth = read_truth(bag, topics)
-    drawn = {name: paths.path_of(trajectory, truth)
+    # The ground truth is that of the camera.
+    base = estimator.base or Base()
+    drawn = {name: path_of([base.camera(pose) for pose in trajectory], truth)
              for name, trajectory in (('live', live), ('smoothed', smoothed))}
     positions = [pose.position for pose in live]
     metrics: dict[str, Any] = {
@@ -84,8 +91,8 @@ def odometry_into(folder: Path, bag: Bag, topics: SensorTopics,
         metrics[name] = path.errors and {
             key: value if math.isfinite(value) else None
             for key, value in asdict(path.errors).items()}
-    paths.write_tum(folder / LIVE_FILE, live)
-    paths.write_tum(folder / SMOOTHED_FILE, smoothed)
+    write_tum(folder / LIVE_FILE, live)
+    write_tum(folder / SMOOTHED_FILE, smoothed)
     draw_paths(drawn, folder / PICTURE)
     return OdometryOutcome(live, smoothed, metrics, warnings, estimator.blocking_reason)
 
@@ -125,7 +132,77 @@ def _add(estimator: OdometryEstimator, sample: ImuSample) -> None:
         estimator.add_imu(sample)
 
 
-def draw_paths(drawn: Mapping[str, paths.ComparedPath], path: Path) -> Figure:
+# Path length of relative errors [m].
+_SEGMENT = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class TrajectoryErrors:
+    """Errors of positions after the best rigid alignment, without scale."""
+
+    ate_m: float   # root mean square distance
+    scale_error: float   # of the best similarity, less 1
+    relative_translation_error_percent: float   # median over segments of 1 m
+    length_m: float   # of the true path
+
+
+class ComparedPath(NamedTuple):
+    """Positions (N, 3) at times [ns]; with errors, aligned with the true ones that cover them."""
+
+    imu_ns: Sequence[int]
+    positions: Array
+    truth: Array | None = None
+    errors: TrajectoryErrors | None = None
+
+
+def write_tum(path: Path, trajectory: Sequence[Odometry]) -> None:
+    """Lines ``seconds x y z qx qy qz qw``, seconds being those of the stamps."""
+    with path.open('w', encoding='ascii') as file:
+        for pose in trajectory:
+            values = [*pose.position, *quat_xyzw(pose.R)]
+            file.write(f'{pose.stamp_ns // 10**9}.{pose.stamp_ns % 10**9:09d} '
+                       + ' '.join(f'{value:.9f}' for value in values) + '\n')
+
+
+def aligned(positions: Array, truth: Array) -> tuple[Array, Array, float]:
+    """R (3, 3), t (3,) of ``truth = R positions + t``, and the best scale of the positions.
+
+    S. Umeyama, *Least-squares estimation of transformation parameters between two point
+    patterns*, PAMI 13(4), 1991.
+    """
+    mean, true_mean = positions.mean(axis=0), truth.mean(axis=0)
+    a, b = positions - mean, truth - true_mean
+    correlation = b.T @ a
+    R = aligning_rotation(correlation)
+    return R, true_mean - R @ mean, float((R * correlation).sum() / (a**2).sum())
+
+
+def path_of(trajectory: Sequence[Odometry], truth: TrueTrajectory | None) -> ComparedPath:
+    """Positions of a trajectory; compared with the ground truth if it covers 4 poses or more."""
+    covered = [pose for pose in trajectory if truth is not None and truth.covers(pose.imu_ns)]
+    if truth is None or len(covered) < 4:
+        return ComparedPath([pose.imu_ns for pose in trajectory],
+                            np.array([pose.position for pose in trajectory]).reshape(-1, 3))
+    positions = np.array([pose.position for pose in covered])
+    true = np.array([truth.position(pose.imu_ns) for pose in covered])
+    R, t, scale = aligned(positions, true)
+    moved = positions @ R.T + t
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(true, axis=0), axis=1))])
+    relative = []
+    for i, pose in enumerate(covered):
+        j = int(np.searchsorted(way, way[i] + _SEGMENT))
+        if j == len(covered):
+            break
+        known = truth.relative_pose(pose.imu_ns, covered[j].imu_ns)
+        if known is not None and covered[j].path == pose.path:
+            step = pose.R.T @ (covered[j].position - pose.position)
+            relative.append(float(np.linalg.norm(step - known[1])) / float(way[j] - way[i]))
+    return ComparedPath([pose.imu_ns for pose in covered], moved, true, TrajectoryErrors(
+        float(np.sqrt(((moved - true) ** 2).sum(axis=1).mean())), scale - 1.0,
+        100.0 * float(np.median(relative)) if relative else math.nan, float(way[-1])))
+
+
+def draw_paths(drawn: Mapping[str, ComparedPath], path: Path) -> Figure:
     """Paths by name, from above and their heights, with the ground truth if known."""
     picture = Figure(figsize=(11.0, 5.5), dpi=110, layout='constrained')
     above, height = picture.subplots(1, 2)

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.covariance import ImageInformation
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.geometry.so3 import log_so3, norm, tangent_basis
@@ -23,6 +24,9 @@ from rs_relpose_ros.pipeline.findings import FindingState
 from rs_relpose_ros.pipeline.pair import PairResult
 
 Array = NDArray[np.float64]
+
+# Interval that no pair reaches [ns].
+_LONGEST_NS = 100_000_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,6 +58,9 @@ class KeyframePair:
     def of_message(cls, pairs: Any) -> KeyframePair:
         """From a message on ``~/pairs``; InputError if it is unusable."""
         status = PairStatus(pairs)
+        if not 0 < status['current_imu_ns'] - status['reference_imu_ns'] < _LONGEST_NS:
+            raise InputError('current_imu_ns of ~/pairs must be later than reference_imu_ns, by '
+                             'less than 100 s: the pair is not used')
         return cls(stamp_ns(pairs.header), status['reference_imu_ns'], status['current_imu_ns'],
                    status.frame_id, status['status'], status.images(), status['baseline_m'],
                    status['baseline_log_sigma'], status['gyro_bias_rad_s'],

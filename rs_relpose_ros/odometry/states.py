@@ -5,6 +5,7 @@ Free of gtsam.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 import math
@@ -12,6 +13,7 @@ from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
 from rs_relpose_ros.geometry.timing import seconds_between
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 # A larger step back of the stamps is a clock that was set back.
-JUMP_NS = 1_000_000_000
+_JUMP_NS = 1_000_000_000
 # Time constant in which corrections are blended in [s].
 _BLENDING = 0.3
 
@@ -45,19 +47,37 @@ class StateInterval(NamedTuple):
     end_ns: int | None
 
 
+class Base(NamedTuple):
+    """The frame that is published, with the camera on it: ``X_base = R X_cam + position``."""
+
+    frame_id: str = ''   # empty: the camera itself
+    R: Array = np.eye(3)
+    position: Array = np.zeros(3)   # of the camera [m]
+
+    @classmethod
+    def of(cls, frame_id: str, base_to_camera: Sequence[float]) -> Base:
+        """From x y z, quaternion x y z w of the camera in the base."""
+        return cls(frame_id, Rotation.from_quat(base_to_camera[3:]).as_matrix(),
+                   np.array(base_to_camera[:3]))
+
+    def camera(self, pose: Odometry) -> Odometry:
+        """The pose of the camera instead of that of the base; the rest is unchanged."""
+        return replace(pose, R=pose.R @ self.R, position=pose.position + pose.R @ self.position)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Odometry:
-    """The camera in a metric world with z up, at a time."""
+    """The base, or without one the camera, in a metric world with z up, at a time."""
 
     stamp_ns: int   # on the camera's clock, as image stamps
     imu_ns: int   # the same time on the IMU clock
-    frame_id: str   # of the camera
+    frame_id: str   # of the base
     path: int   # number of earlier starts in the same world
-    R: Array   # (3, 3) from the camera
+    R: Array   # (3, 3) from the base
     position: Array   # (3,) [m]
     pose_covariance: Array   # (6, 6) of (position, rotation), in the axes of the world
-    velocity: Array   # (3,) of the camera, in its axes [m/s]
-    angular_velocity: Array   # (3,) of the camera, in its axes [rad/s]
+    velocity: Array   # (3,) of the base, in its axes [m/s]
+    angular_velocity: Array   # (3,) likewise [rad/s]
     velocity_covariance: Array   # (6, 6) of the two
 
 
@@ -89,7 +109,7 @@ class ContinuousPath:
     def at(self, imu_ns: int) -> Odometry | None:
         """The state at a time; None without one, and if the time is not new."""
         estimator, last = self._estimator, self._last
-        if last is not None and last.imu_ns - JUMP_NS < imu_ns <= last.imu_ns:
+        if last is not None and last.imu_ns - _JUMP_NS < imu_ns <= last.imu_ns:
             return None
         state = estimator.propagated(imu_ns)
         if state is None:

@@ -7,7 +7,8 @@ that in proportion to time, which is the mean of a random walk with known ends.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +21,16 @@ from rs_relpose_ros.pipeline.pair import GyroRotation
 from rs_relpose_ros.tracking.features import Matches
 
 Array = NDArray[np.float64]
+Frames = TypeVar('Frames')
 
 # Frames between that are used, evenly in the pair: more of them add hardly any accuracy.
 MOST_FRAMES = 3
+
+
+def used_frames(between: Sequence[Frames]) -> list[Frames]:
+    """Those of the frames between the two of a pair that its estimate uses."""
+    places = np.linspace(-1, len(between), min(len(between), MOST_FRAMES) + 2)[1:-1]
+    return [between[k] for k in np.round(places).astype(int)]
 
 
 class _TrackedFrame(NamedTuple):
@@ -51,8 +59,7 @@ class TrackHistory:
         `since`: IMU data of the last frame since the reference; `inertial`: motion of the pair.
         """
         *before, last = self._frames
-        places = np.linspace(-1, len(before), min(len(before), MOST_FRAMES) + 2)[1:-1]
-        chosen = [before[k] for k in np.round(places).astype(int)]
+        chosen = used_frames(before)
         motions: list[InertialMotion | None] = [None] * len(chosen)
         if not isinstance(inertial, str):
             motions = list(motions_on_the_way(inertial, self._reference, since,

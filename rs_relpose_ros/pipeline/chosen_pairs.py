@@ -1,23 +1,25 @@
 """Relative poses of chosen frames, however far apart: loop closures, wide baselines.
 
 Frames are matched by descriptors, without tracks in between. The IMU derotates the rows of each
-frame and gives gravity; the gyro between the frames is used unless it has a gap. The interval
-constrains the velocities only of frames that are close to each other.
+frame and gives gravity; the gyro between the frames is used unless it has a gap. Of frames that
+are close to each other the interval constrains the velocities, and the frames between are used.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import reduce
 from typing import Any
 
 from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.errors import InputError, RsRelposeError
+from rs_relpose_ros.geometry.timing import to_nanoseconds
 from rs_relpose_ros.imu.buffer import frame_imu, ImuBuffer
 from rs_relpose_ros.imu.integration import FrameImu
 from rs_relpose_ros.pipeline import pair
-from rs_relpose_ros.pipeline.pair import Frame, PairResult
+from rs_relpose_ros.pipeline.between import TrackHistory, used_frames
+from rs_relpose_ros.pipeline.pair import Frame, GyroRotation, PairResult
 from rs_relpose_ros.pipeline.pipeline import Processor
 from rs_relpose_ros.tracking.features import DescriptorTracker
 
@@ -53,8 +55,8 @@ def view_frame(frame: Frame[Any], imu: ImuBuffer, parameters: Parameters,
         clock.exposure()))
 
 
-def estimate_wide_pair(first: Frame[Any], second: Frame[Any],
-                       parameters: Parameters) -> PairResult:
+def estimate_wide_pair(first: Frame[Any], second: Frame[Any], parameters: Parameters,
+                       between: Sequence[Frame[Any]] = ()) -> PairResult:
     """The relative pose of two frames, matched by descriptors.
 
     Parameters
@@ -63,6 +65,9 @@ def estimate_wide_pair(first: Frame[Any], second: Frame[Any],
         Of `view_frame`, in the order of time, of one camera with one calibration.
     parameters : Parameters
         `detector` chooses the descriptors; SIFT if it is klt.
+    between : sequence of Frame, optional
+        Frames between the two, of `view_frame` since the first one, with its intrinsics; used if
+        the gyro has no gap and the two are at most `max_keyframe_interval` apart.
 
     Returns
     -------
@@ -84,22 +89,37 @@ def estimate_wide_pair(first: Frame[Any], second: Frame[Any],
     tracker = DescriptorTracker(replace(tracking, detector='sift') if tracking.detector == 'klt'
                                 else tracking)
     tracker.start(first.image)
-    matches = tracker.track(second.image)
-    # The second frame's gyro may begin at another one.
-    segment, gyro = second.imu.since_previous, None
-    if segment is not None and segment.stamps_ns[0] == first.imu.reference_ns:
-        gyro = pair.GyroRotation.of(second.imu, parameters.imu)
+    gyro = _gyro(first, second, parameters)
     inertial = pair.inertial_of(first.imu, second.imu, gyro, second.imu, parameters)
     interval = pair.interval_of(first.imu, second.imu)
     near = interval <= parameters.keyframes.max_keyframe_interval
     if not near and not isinstance(inertial, str):
         inertial = 'the frames are further apart than max_keyframe_interval'
-    pose = pair.estimate_pair(first, second, matches, sensor, gyro, inertial, parameters,
-                              interval=interval if near else None)
+    history = TrackHistory(first.imu)
+    if gyro is not None and near:
+        for frame in used_frames(between):
+            rotation = _gyro(first, frame, parameters)
+            if rotation is not None and frame.intrinsics == first.intrinsics:
+                history.add(frame.imu, rotation, tracker.track(frame.image))
+    matches = tracker.track(second.image)
+    if gyro is not None:
+        history.add(second.imu, gyro, matches)
+    pose = pair.estimate_pair(
+        first, second, matches, sensor, gyro, inertial, parameters,
+        interval=interval if near else None,
+        between=() if gyro is None else history.between(matches, sensor, second.imu, inertial))
     rays1, rays2 = (
         pair.DerotatedRays.from_points(matches.track_ids, points, sensor, frame.imu.motion)
         for points, frame in ((matches.points1, first), (matches.points2, second)))
     return pair.pair_result(first, second, matches, rays1, rays2, pose, gyro, sensor, parameters)
+
+
+def _gyro(first: Frame[Any], frame: Frame[Any], parameters: Parameters) -> GyroRotation | None:
+    """Rotation since the first frame; None if the frame's gyro begins at another one."""
+    segment = frame.imu.since_previous
+    if segment is None or segment.stamps_ns[0] != first.imu.reference_ns:
+        return None
+    return GyroRotation.of(frame.imu, parameters.imu)
 
 
 # Of the earlier and of the later image of a pair [ns].
@@ -109,8 +129,8 @@ Stamps = tuple[int, int]
 class ChosenPairs(Processor[dict[Stamps, PairResult | str]]):
     """Estimates the `wanted` pairs: results by their stamps, or the reasons for none.
 
-    Frames are kept until the last of their pairs, and the IMU data of all frames since the oldest
-    of them.
+    Frames are kept until the last of their pairs, those after them for `max_keyframe_interval`,
+    and the IMU data of all frames since the oldest of them.
     """
 
     def __init__(self, wanted: Collection[Stamps]) -> None:
@@ -119,11 +139,13 @@ class ChosenPairs(Processor[dict[Stamps, PairResult | str]]):
         for first_ns, second_ns in self._wanted:
             self._last[first_ns] = max(second_ns, self._last.get(first_ns, second_ns))
         self._frames: dict[int, Frame[Any]] = {}   # by stamp
+        self._recent: dict[int, Frame[Any]] = {}
         self._imus: dict[int, FrameImu] = {}
 
     def reset(self) -> None:
         """Forget the frames so far."""
         self._frames.clear()
+        self._recent.clear()
         self._imus.clear()
 
     def process(self, frame: Frame[Any],
@@ -137,15 +159,26 @@ class ChosenPairs(Processor[dict[Stamps, PairResult | str]]):
         self._frames = {stamp_ns: one for stamp_ns, one in self._frames.items()
                         if self._last.get(stamp_ns, 0) > current_ns}
         oldest_ns = min(self._frames, default=current_ns)
+        longest_ns = to_nanoseconds(parameters.keyframes.max_keyframe_interval)
+        first_ns = min((stamp_ns for stamp_ns in self._frames
+                        if stamp_ns > current_ns - longest_ns), default=current_ns)
+        self._recent = {stamp_ns: one for stamp_ns, one in
+                        (*self._recent.items(), (current_ns, frame)) if stamp_ns > first_ns}
         self._imus = {stamp_ns: one for stamp_ns, one in self._imus.items()
                       if stamp_ns > oldest_ns}
         return pairs or None
 
     def _pair(self, first_ns: int, second: Frame[Any], parameters: Parameters) -> PairResult | str:
         """Of an earlier frame and the current one."""
-        second = replace(second, imu_data=reduce(pair.joined, [
-            imu for stamp_ns, imu in self._imus.items() if stamp_ns > first_ns]))
+        def since_first(frame: Frame[Any]) -> Frame[Any]:
+            return replace(frame, imu_data=reduce(pair.joined, [
+                imu for stamp_ns, imu in self._imus.items()
+                if first_ns < stamp_ns <= frame.stamp_ns]))
+
+        between = [frame for stamp_ns, frame in self._recent.items() if stamp_ns > first_ns]
         try:
-            return estimate_wide_pair(self._frames[first_ns], second, parameters)
+            return estimate_wide_pair(
+                self._frames[first_ns], since_first(second), parameters,
+                [since_first(frame) for frame in used_frames(between)])
         except RsRelposeError as error:
             return str(error)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.errors import MissingInputError, RsRelposeError
-from rs_relpose_ros.estimator.result import RelativePose
+from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, Sensor
@@ -34,6 +34,8 @@ Array = NDArray[np.float64]
 # Number of points, of the longest tracks, and of frames over which the rotation of the images is
 # compared with the gyro.
 _ROTATION_POINTS, _ROTATION_FRAMES = 120, 3
+# Least time between two pairs with too few matches [s].
+_UNMATCHED_PERIOD = 0.5
 # Reason for a pair without the accelerometer.
 _CONTRADICTED = 'images and accelerometer contradict each other (see health)'
 
@@ -99,6 +101,7 @@ class Pipeline(Processor[PairResult]):
         self._current_rays: DerotatedRays | None = None
         self._rotation: _RotationStart | None = None
         self._promotion_due = False
+        self._unmatched_ns: int | None = None   # of the last published pair with too few matches
 
     def process(self, frame: Frame[Any], parameters: Parameters) -> PairResult | None:
         """Track `frame`; the estimate of the keyframe pair that it creates, or None.
@@ -141,6 +144,12 @@ class Pipeline(Processor[PairResult]):
         result = self._pair(reference, frame, gyro, sensor, parameters)
         self._restart_from(frame)
         self._promotion_due = True
+        if result.pose.status is Status.TOO_FEW_MATCHES:
+            # Where nothing can be matched each frame creates a pair.
+            if self._unmatched_ns is not None and seconds_between(
+                    self._unmatched_ns, frame.stamp_ns) < _UNMATCHED_PERIOD:
+                return None
+            self._unmatched_ns = frame.stamp_ns
         return result
 
     def prepare(self) -> None:
