@@ -25,6 +25,7 @@ from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
 import numpy as np
 import pytest
+import rclpy
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
@@ -52,6 +53,7 @@ from rs_relpose_ros.geometry.so3 import exp_so3, log_so3, skew
 from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.messages.incoming import PARTS, Role
 from rs_relpose_ros.messages.outgoing import pair_messages
+from rs_relpose_ros.nodes.odometry_node import OdometryNode
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.offline import aligned
 from rs_relpose_ros.odometry.pair import KeyframePair
@@ -290,6 +292,23 @@ def test_the_imu_is_read_at_a_low_rate_of_publication(ros_domain_id):
         [status] = diagnostics[-1].status
         assert re.fullmatch(r'no message on /relpose_node/pairs for \d+ s: start or remap .*',
                             status.message)
+
+
+def test_the_newest_state_is_published_before_pairs_are_used(ros_domain_id, monkeypatch):
+    """In this process: a pair takes the graph some 20 ms, which no state waits for."""
+    rclpy.init(args=['--ros-args', '--params-file', str(BUNDLED_PARAMETERS)])
+    node, calls = OdometryNode(), []
+    try:
+        monkeypatch.setattr(node._estimator, 'take', lambda most: calls.append('pair') or [])
+        monkeypatch.setattr(node._continuous, 'at', lambda imu_ns: calls.append('state'))
+        node._on_pair(pairs_message(walk('walk:2', 1.0).pairs[0], Assessment(())))
+        assert node._estimator.waiting
+        assert calls == []
+        node._publish_propagated()
+        assert calls == ['state', 'pair']
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()
 
 
 # -- next to relpose_node and a player, on the bundled bag ---------------------------------------
