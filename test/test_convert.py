@@ -23,7 +23,7 @@ import yaml
 from rs_relpose_lab import datasets
 from rs_relpose_ros.bags.convert import read_rows, Row
 from rs_relpose_ros.bags.reader import BagMessage, open_bag
-from rs_relpose_ros.bags.video import read_telemetry, START_NS, Video
+from rs_relpose_ros.bags.video import START_NS
 from rs_relpose_ros.cli import main
 from rs_relpose_ros.config.files import parameter_text, read_parameters, write_parameters
 from rs_relpose_ros.config.settings import Parameters
@@ -589,12 +589,31 @@ def test_xiaomi_recording(recordings, tmp_path):
     assert max(np.diff(read.stamps('/imu/data_raw'))) < 3 * made.MILLISECOND
 
 
+def rotates_as_its_images(read: Converted) -> None:
+    """Pan of the images, by far points, against the gyro."""
+    gyro, shifts, before = read.samples('/imu/gyro'), [], None
+    times = np.array([sample.stamp_ns - START_NS for sample in gyro]) * 1e-9
+    yaw = np.array([sample.angular_velocity[1] for sample in gyro])
+    rotation = np.concatenate([[0.0], np.cumsum(yaw[1:] * np.diff(times))])
+    for number in range(len(read.of(IMAGES))):
+        pixels = read.pixels(number)
+        assert pixels.shape == (480, 854)
+        far = pixels[:235].astype(float)   # above the horizon
+        if before is not None:
+            shifts.append(cv2.phaseCorrelate(before, far)[0][0])
+        before = far
+    frame_times = np.arange(len(shifts) + 1) * 1001 / 30000 - 0.03
+    rates = np.diff(np.interp(frame_times, times, rotation))
+    # To the right (about y, down) by the gyro: points move to the left.
+    assert np.corrcoef(rates, shifts)[0, 1] < -0.97
+
+
 @pytest.mark.recordings
 def test_gopro(recordings, tmp_path):
     read = converted('video', recordings / 'gopro_samples' / 'karma.mp4', tmp_path / 'bag')
     assert [stamp - START_NS for stamp in read.stamps()] == [
         round(k * 1001 / 30000 * 1e9) for k in range(362)]
-    assert read.pixels(0).shape == (480, 854)
+    rotates_as_its_images(read)
     gyro, accel = read.stamps('/imu/gyro'), read.stamps('/imu/accel')
     assert len(gyro) == 4795 and len(accel) == 2397
     # The accelerometer has half the gyro's rate, and covers the same time.
@@ -606,27 +625,6 @@ def test_gopro(recordings, tmp_path):
     assert np.abs(forces.mean(axis=0) - (0.2, -9.69, 0.2)).max() < 0.1
     assert forces[:400, 2].mean() > 1.5
     assert read.readout[0] is None
-
-
-@pytest.mark.recordings
-def test_gopro_rotates_as_its_images(recordings):
-    """Pan of the images, by far points, against the gyro."""
-    path = recordings / 'gopro_samples' / 'karma.mp4'
-    gyro = read_telemetry(path, 0).gyro
-    times = np.array([sample.stamp_ns for sample in gyro]) * 1e-9
-    yaw = np.array([sample.angular_velocity[1] for sample in gyro])
-    rotation = np.concatenate([[0.0], np.cumsum(yaw[1:] * np.diff(times))])
-    video, shifts, before = Video(path), [], None
-    for number in range(len(video)):
-        data = np.frombuffer(video.jpeg(number), dtype=np.uint8)
-        gray = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)[:235]   # above the horizon
-        if before is not None:
-            shifts.append(cv2.phaseCorrelate(before, gray.astype(float))[0][0])
-        before = gray.astype(float)
-    frame_times = np.arange(len(shifts) + 1) * 1001 / 30000 - 0.03
-    rates = np.diff(np.interp(frame_times, times, rotation))
-    # To the right (about y, down) by the gyro: points move to the left.
-    assert np.corrcoef(rates, shifts)[0, 1] < -0.97
 
 
 @pytest.mark.recordings

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 from diagnostic_msgs.msg import DiagnosticArray
 import fault_stream as faults
@@ -29,6 +30,7 @@ from rs_relpose_ros.config.settings import Parameters, StoredCalibrationConfig
 from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.messages.incoming import Role, sensor_messages
 from rs_relpose_ros.nodes.inputs import LATCHED
+from rs_relpose_ros.nodes.sensor_node import SensorNode
 
 CAMERA = CameraId('a/b:c', 320, 240)
 TEXT = '/**:\n  ros__parameters:\n    readout_time: 0.02\n    readout_time_sigma: 0.001\n'
@@ -116,6 +118,40 @@ def test_a_camera_at_rest_is_never_calibrated_and_the_motion_is_named(bag):
 
 
 # -- the node ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(('frames', 'turn', 'adopted', 'warned'), [
+    ({Role.IMAGE: 'camera', Role.IMU: 'imu'}, 0.02, True, False),
+    ({Role.IMAGE: 'camera', Role.IMU: 'imu'}, 0.2, False, True),
+    ({Role.IMAGE: 'camera', Role.IMU: 'other'}, 0.02, False, False),
+    ({Role.IMAGE: 'camera'}, 0.02, False, False)])
+def test_the_position_of_the_imu_is_that_of_tf(frames, turn, adopted, warned):
+    quaternion = Rotation.from_matrix(TRUTH.R_cam_imu).as_quat()
+    known = {('camera', 'imu'): (
+        0.1, 0.2, 0.3, *(Rotation.from_rotvec([0.0, turn, 0.0]) * Rotation.from_quat(
+            quaternion)).as_quat())}
+    node = MagicMock(_lookup=lambda parent, child: known.get((parent, child)))
+    node._settings.current = Parameters.from_mapping(
+        {'readout_time': 0.02, 'quat_cam_imu_xyzw': tuple(quaternion)})
+    SensorNode._use_transform(node, frames)
+    assert node._settings.adopt.called == adopted
+    assert node._warn.called == warned
+    assert (node._lookup is None) == (adopted or warned)
+    if adopted:
+        assert node._settings.adopt.call_args.args[0]['imu_position'] == (0.1, 0.2, 0.3)
+
+
+@pytest.mark.live
+@pytest.mark.parametrize('node', ['odometry_node', 'global_shutter_node'])
+def test_other_nodes_take_the_published_calibration(ros_domain_id, node):
+    text = (TEXT + '    quat_cam_imu_xyzw: [0.0, 0.0, 0.0, 1.0]\n    axes_sigma: 0.01\n')
+    with Graph() as graph, node_process(node=node, remap={
+            'calibration': '/relpose_node/calibration'}) as process:
+        process.wait_for('waiting for')
+        graph.node.create_publisher(String, '/relpose_node/calibration', LATCHED).publish(
+            String(data=text))
+        process.wait_for('ready')
+        process.stop()
 
 
 @pytest.mark.live

@@ -458,6 +458,9 @@ class StoredCalibrationConfig(Settings):
     camera_name: str = setting('', 'name of the camera; empty for the frame_id of its images')
     load_calibration: bool = setting(True, 'use the file, if it exists')
     save_calibration: bool = setting(True, 'write the file after a calibration')
+    use_tf: bool = setting(
+        True, 'imu_position from /tf_static, if it is not given; its rotation is compared with '
+        'quat_cam_imu_xyzw')
 
 
 @lru_cache(maxsize=16)

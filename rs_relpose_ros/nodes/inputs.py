@@ -201,6 +201,7 @@ class SensorInputs:
         self._last_ns: dict[Role, int] = {}
         self._last_info = b''
         self.image_bytes = 0   # of the last image
+        self.frame_ids: dict[Role, str] = {}   # of the last messages
         self.stamps_ns: deque[int] = deque(maxlen=_RECENT_STAMPS)   # of the last images
         self.topics = {role: node.resolve_topic_name(role.value) for role in TOPICS}
         # As image_transport does: the transport's name follows the remapped one.
@@ -250,6 +251,7 @@ class SensorInputs:
         self._camera_info.drain()
         self._count(Role.IMAGE)
         self.image_bytes = len(image.data)
+        self.frame_ids[Role.IMAGE] = image.header.frame_id
         self.stamps_ns.append(stamp_ns(image.header))
         # An unusable image is refused by the sequencer, which counts it.
         self._intake.receive(Role.IMAGE, image)
@@ -266,6 +268,7 @@ class SensorInputs:
 
     def _on_sample(self, role: Role, message: Any) -> None:
         self._count(role)
+        self.frame_ids[role] = message.header.frame_id
         self._receive(role, message)
 
     def _receive(self, role: Role, message: Any) -> None:

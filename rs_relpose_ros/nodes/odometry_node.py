@@ -9,8 +9,11 @@ from typing import Any
 from rclpy.clock import Clock, ClockType
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from rs_relpose_ros.config.files import text_values
+from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.messages.incoming import PARTS, Role
@@ -39,7 +42,7 @@ _SILENT_IMU = 0.25
 _LEVELS = {'starting': 0, 'tracking': 0, 'uncertain': 1, 'lost': 2}
 _DESCRIPTION = (
     'Metric odometry: the keyframe pairs of relpose_node and the IMU in one graph (gtsam).\n\n'
-    f'subscribes: {_PAIRS}, imu, accel\n'
+    f'subscribes: {_PAIRS}, imu, accel, calibration\n'
     'publishes:  ~/odometry, ~/keyframes, ~/path, /diagnostics, /tf with publish_odometry_tf\n'
     'service:    ~/reset')
 
@@ -50,14 +53,39 @@ class OdometryNode(StoppableNode):
     def __init__(self) -> None:
         super().__init__(NAME)
         need_gtsam()
-        from rs_relpose_ros.odometry.estimator import OdometryEstimator
         warm_up_odometry()
-        parameters = self._settings.current
-        self._config = parameters.odometry
+        self._begun = False
+        self.create_subscription(String, 'calibration', self._on_calibration, inputs.LATCHED)
+        missing = self._settings.current.sensor.missing()
+        if missing:
+            self._info(f'waiting for {" and ".join(missing)}: parameters, or the calibration of '
+                       f'relpose_node on {self.resolve_topic_name("calibration")}')
+        else:
+            self._begin(self._settings.current)
+
+    def _on_calibration(self, message: String) -> None:
+        try:
+            self._settings.adopt(text_values(message.data, 'calibration'))
+        except InputError as error:
+            self._error(str(error))
+
+    def _on_parameters(self, parameters: Parameters) -> None:
+        if self._begun:
+            self._use(parameters)
+        elif not parameters.sensor.missing():
+            self._begin(parameters)
+
+    def _use(self, parameters: Parameters) -> None:
+        """A path with these parameters, from the next pair on."""
+        from rs_relpose_ros.odometry.estimator import OdometryEstimator
         self._estimator = OdometryEstimator(parameters)
         self._continuous = ContinuousPath(self._estimator)
         if self._estimator.base is None:
             self._lookup = inputs.transform_lookup(self)
+
+    def _begin(self, parameters: Parameters) -> None:
+        self._begun, self._config = True, parameters.odometry
+        self._use(parameters)
         self._newest_ns = 0   # of the samples, on the IMU clock
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._sample_at = self._steady.now()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 import argparse
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import gc
 import logging
 import os
@@ -16,6 +16,7 @@ import traceback
 from typing import Any, ClassVar, NoReturn, TextIO, TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticArray
+import numpy as np
 import rclpy
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -23,6 +24,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
+from scipy.spatial.transform import Rotation
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
@@ -37,7 +39,13 @@ from rs_relpose_ros.messages.incoming import Intake, PARTS, Role
 from rs_relpose_ros.nodes import diagnostics
 from rs_relpose_ros.nodes import parameters as ros_parameters
 from rs_relpose_ros.nodes.diagnostics import PATIENCE, ReasonLog, SILENCE
-from rs_relpose_ros.nodes.inputs import LATCHED, message_class, SensorInputs, SHUT_DOWN
+from rs_relpose_ros.nodes.inputs import (
+    LATCHED,
+    message_class,
+    SensorInputs,
+    SHUT_DOWN,
+    transform_lookup,
+)
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrameFailed, FrameLoop, Outcome
 from rs_relpose_ros.pipeline.sequencer import FrameRefused, Refusal
@@ -191,6 +199,14 @@ _JOIN_TIMEOUT = 0.4
 _REPORT_COMPILING = 4.0
 
 
+# Uncertainty of a position from /tf_static [m]; largest deviation of its rotation [deg].
+_TF_POSITION_SIGMA, _TF_ROTATION = 0.02, 5.0
+
+
+def _quaternion(values: Sequence[float]) -> str:
+    return f'[{", ".join(f"{value:.4f}" for value in values)}]'
+
+
 def _camera(parameters: Parameters) -> list[Any]:
     """The parameters with a change of which a node begins again."""
     values = parameters.to_mapping()
@@ -221,6 +237,8 @@ class SensorNode(StoppableNode):
             self._open_outputs(self._settings.current)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_service(Trigger, '~/reset', self._reset)
+        self._lookup = (transform_lookup(self) if self._settings.current.calibration.use_tf
+                        else None)
         self._found: Calibrated | None = None   # to be used by the executor's thread
         self._calibrated: Calibrated | None = None   # in use
         if self.calibrates:
@@ -378,6 +396,27 @@ class SensorNode(StoppableNode):
         if self._calibration is not None:   # nothing in it was new
             self._begin()
 
+    def _use_transform(self, frame_ids: Mapping[Role, str]) -> None:
+        """Position of the IMU from /tf_static, once it is there; its rotation is compared."""
+        camera, imu = frame_ids.get(Role.IMAGE), frame_ids.get(Role.IMU)
+        sensor = self._settings.current.sensor
+        if not (camera and imu) or sensor.missing() or self._lookup is None:
+            return
+        found = self._lookup(camera, imu)
+        if found is None:
+            return
+        self._lookup = None
+        values = {'imu_position': tuple(found[:3]), 'imu_position_sigma': _TF_POSITION_SIGMA}
+        turn = Rotation.from_quat(found[3:]) * Rotation.from_matrix(sensor.R_cam_imu).inv()
+        if np.degrees(turn.magnitude()) > _TF_ROTATION:
+            self._warn(
+                f'/tf_static and quat_cam_imu_xyzw differ by {np.degrees(turn.magnitude()):.1f} '
+                f'deg: {imu} in {camera} has {_quaternion(found[3:])}, in use is '
+                f'{_quaternion(sensor.quat_cam_imu_xyzw or ())}; imu_position is not taken from '
+                'there')
+        else:
+            self._settings.adopt(values)
+
     def _adopt(self, parameters: str, source: str) -> None:
         try:
             self._settings.adopt(text_values(parameters, source))
@@ -456,6 +495,8 @@ class SensorNode(StoppableNode):
         found, self._found = self._found, None
         if found is not None:
             self._use_calibration(found)
+        if self._lookup is not None and self._inputs is not None:
+            self._use_transform(self._inputs.frame_ids)
         problem, missing = self._problem()
         counts: Counter[str] = Counter() if self._inputs is None else self._inputs.counts.copy()
         report = self._frame_statistics.report(
