@@ -98,13 +98,10 @@ def test_everything_is_installed_and_found(install_space):
     assert missing == []
 
 
-def test_first_start_compiles_nothing(install_space):
+def test_first_start_compiles_nothing_and_the_command_line_runs(install_space):
     loaded, compiled = map(int, printed(install_space, sys.executable, '-c', FIRST_START).split())
     assert loaded > 20
     assert compiled == 0
-
-
-def test_command_line_runs(install_space):
     assert 'replay' in printed(install_space, executable(install_space, 'rs_relpose'), '--help')
 
 

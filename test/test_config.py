@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 from importlib.metadata import distribution
 import json
-import py_compile
 import re
 from xml.etree import ElementTree
 
@@ -25,13 +24,10 @@ LAUNCH_FILE = ROOT / 'launch' / 'relpose.launch.py'
 NAMESPACE = '{http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles}'
 
 
-def test_template_is_up_to_date():
-    assert (CONFIG / 'relpose.yaml').read_text(encoding='utf-8') == parameter_template(), (
-        'run python -m rs_relpose_ros.config.files config/relpose.yaml')
-
-
-def test_template_holds_every_parameter_at_its_default():
+def test_template_is_up_to_date_and_holds_every_parameter_at_its_default():
     text = parameter_template()
+    assert (CONFIG / 'relpose.yaml').read_text(encoding='utf-8') == text, (
+        'run python -m rs_relpose_ros.config.files config/relpose.yaml')
     values = yaml.safe_load(text)['/**']['ros__parameters']
     for name, default, _ in Parameters.declarations():
         if default is None:
@@ -94,18 +90,11 @@ def test_profile_loses_no_big_image(ros_domain_id, monkeypatch):
     pytest.fail(f'{lost} of {count} images were lost')
 
 
-def call_in(tree, name):
-    """The one call of a function."""
-    [call] = [call for call in ast.walk(tree) if isinstance(call, ast.Call)
-              and isinstance(call.func, ast.Name) and call.func.id == name]
-    return call
-
-
-def test_launch_file_remaps_what_the_node_subscribes_to():
-    py_compile.compile(str(LAUNCH_FILE), doraise=True, cfile=None)
+def test_launch_file_remaps_what_the_node_subscribes_to_and_has_a_profile():
+    """The shipped profile, unless the user has one."""
     tree = ast.parse(LAUNCH_FILE.read_text(encoding='utf-8'))
-    [keywords] = [keywords for call in ast.walk(tree) if isinstance(call, ast.Call)
-                  and ast.unparse(call.func) == 'Node'
+    calls = [call for call in ast.walk(tree) if isinstance(call, ast.Call)]
+    [keywords] = [keywords for call in calls if ast.unparse(call.func) == 'Node'
                   and 'remappings' in (keywords := {k.arg: k.value for k in call.keywords})]
     assert ast.literal_eval(keywords['package']) == 'rs_relpose_ros'
     assert ast.unparse(keywords['executable']) == 'executable'
@@ -116,10 +105,7 @@ def test_launch_file_remaps_what_the_node_subscribes_to():
     assert defaults['executable'] == "'relpose_node'"
     remapped = [ast.literal_eval(pair.elts[0]) for pair in keywords['remappings'].elts]
     assert remapped == ['image', 'camera_info', 'imu', 'calibration', 'accel']
-
-
-def test_launch_file_uses_the_profile_unless_the_user_has_one():
-    default = call_in(ast.parse(LAUNCH_FILE.read_text(encoding='utf-8')), 'EnvironmentVariable')
+    [default] = [call for call in calls if ast.unparse(call.func) == 'EnvironmentVariable']
     assert ast.unparse(default.args[0]) == 'PROFILE'
     [path] = [keyword.value for keyword in default.keywords if keyword.arg == 'default_value']
     assert "'config', 'fastdds.xml'" in ast.unparse(path)
@@ -131,10 +117,8 @@ def test_launch_file_uses_the_profile_unless_the_user_has_one():
     ('relpose_and_global_shutter', 'relpose_node,global_shutter_node'),
     ('odometry', 'relpose_node,odometry_node')])
 def test_launch_files_of_other_nodes_include_that_of_relpose_node(name, nodes):
-    path = ROOT / 'launch' / f'{name}.launch.py'
-    py_compile.compile(str(path), doraise=True, cfile=None)
-    texts = [node.value for node in ast.walk(ast.parse(path.read_text(encoding='utf-8')))
-             if isinstance(node, ast.Constant)]
+    tree = ast.parse((ROOT / 'launch' / f'{name}.launch.py').read_text(encoding='utf-8'))
+    texts = [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)]
     assert LAUNCH_FILE.name in texts
     scripts = {entry.name for entry in distribution('rs_relpose_ros').entry_points}
     assert nodes in texts

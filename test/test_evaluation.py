@@ -28,15 +28,11 @@ from rs_relpose_ros.geometry.timing import ImageClock
 from rs_relpose_ros.imu.buffer import ImuSample
 
 
-def evaluate(experiment, *arguments):
-    return main.main(['evaluate', experiment, *map(str, arguments)])
-
-
-def tables_of(folder):
+def evaluate(folder, experiment, *arguments):
+    """Rows of the trials and of the cells."""
+    words = ['evaluate', experiment, *arguments, '--output', folder]
+    assert main.main([str(word) for word in words]) == 0
     return [rows_of(folder / name) for name in ('trials.csv', 'cells.csv')]
-
-
-# -- the synthetic experiments ----------------------------------------------------------------
 
 
 def test_auto_is_as_good_as_five_points_on_derotated_rays_at_constant_velocity():
@@ -110,14 +106,13 @@ def test_table_counts_what_has_no_pose_and_leaves_it_out():
 
 def test_command_writes_tables_pictures_and_its_arguments(tmp_path, capsys):
     folder = tmp_path / 'deep' / 'results'
-    assert evaluate('paper', '--output', folder, '--trials', '2', '--figures', 'gyro_noise',
-                    '--motions', 'forward', 'sideways', 'forward', '--solvers', 'auto',
-                    'angular_5pt', '--pixel-noise', '0.3') == 0
+    trials, cells = evaluate(
+        folder, 'paper', '--trials', '2', '--figures', 'gyro_noise', '--motions', 'forward',
+        'sideways', 'forward', '--solvers', 'auto', 'angular_5pt', '--pixel-noise', '0.3')
     shown = capsys.readouterr()
     assert shown.err == ''      # no progress bar in a pipe
     for motion in ('forward', 'sideways'):
         assert shown.out.count(f'{motion} motion, 2 scenes a row') == 1
-    trials, cells = tables_of(folder)
     assert len(trials) == 2 * 6 * 2 * 2
     for cell in cells:
         mine = [float(row['rotation_error_deg']) for row in trials
@@ -125,12 +120,10 @@ def test_command_writes_tables_pictures_and_its_arguments(tmp_path, capsys):
         assert len(mine) == int(cell['poses']) == 2
         assert float(cell['rotation_median_deg']) == pytest.approx(np.median(mine))
         assert float(cell['rotation_max_deg']) == max(mine)
-    made = json.loads((folder / 'run.json').read_text())
-    assert made['trials'] == 2 and made['base']['pixel_noise'] == 0.3
+    arguments = json.loads((folder / 'run.json').read_text())
+    assert arguments['trials'] == 2 and arguments['base']['pixel_noise'] == 0.3
     assert cv2.imread(str(folder / 'gyro_noise.png')).shape[0] > 600   # two motions
 
-
-# -- PennCOSYVIO ------------------------------------------------------------------------------
 
 # The published parameters of the GoPro C2, as in OCamCalib (Matlab): row before column, both
 # counted from 1.
@@ -140,6 +133,7 @@ C2 = {'ss': [-877.468361, 0.0, 3.33880820e-04, -9.24194160e-09, 1.10410236e-11],
 # The same lens on a chip of 480x360 pixels, for images that are quickly made.
 SMALL = {**C2, 'ss': [a * 4.0**(k - 1) for k, a in enumerate(C2['ss'])], 'xc': 180.4, 'yc': 240.7,
          'width': 480, 'height': 360}
+
 
 FRAME_TIME = 1.0 / 30.0
 FRAMES = 62
@@ -159,23 +153,18 @@ def way():
     return files.Poses(stamps, positions, Rotation.from_euler('ZYX', angles) * ahead)
 
 
-def lines(path, rows):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(''.join(' '.join(f'{x:.9f}' for x in row) + '\n' for row in rows))
-
-
 @pytest.fixture(scope='module')
 def made(tmp_path_factory):
     """A folder as the data set's repository has it."""
     folder = tmp_path_factory.mktemp('penncosyvio')
+    for name in ('data/ground_truth/as', 'tools/intrinsic_calibration'):
+        (folder / name).mkdir(parents=True)
     poses = way()
-    lines(folder / 'data/ground_truth/as/pose.txt', (
-        [stamp * 1e-9, *np.column_stack([R, p]).ravel()] for stamp, R, p in
-        zip(poses.stamps_ns, poses.rotations.as_matrix(), poses.positions, strict=True)))
+    matrices = np.dstack([poses.rotations.as_matrix(), poses.positions])
+    np.savetxt(folder / 'data/ground_truth/as/pose.txt', np.column_stack(
+        [1e-9 * poses.stamps_ns, matrices.reshape(-1, 12)]), fmt='%.9f')
     cells = np.empty((1, 7), dtype=object)
-    for k in range(7):
-        cells[0, k] = SMALL
-    (folder / 'tools/intrinsic_calibration').mkdir(parents=True)
+    cells[0, :] = [SMALL] * 7
     savemat(folder / 'tools/intrinsic_calibration/cc.mat', {'cc': cells})
     return folder
 
@@ -277,12 +266,11 @@ def test_simulated_points_without_noise_are_exact(made):
 
 def test_command_runs_on_the_made_folder(made, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(penncosyvio.STRETCHES, 'as', ((2, 32),))
-    assert evaluate('penncosyvio', made, '--sequences', 'as', '--solvers', 'auto', 'opencv_gyro',
-                    '--output', tmp_path, '--trajectory-only') == 0
+    trials, cells = evaluate(tmp_path, 'penncosyvio', made, '--sequences', 'as', '--solvers',
+                             'auto', 'opencv_gyro', '--trajectory-only')
     assert 'simulated points' in capsys.readouterr().out
     assert {file.name for file in tmp_path.iterdir()} == {
         'trials.csv', 'cells.csv', 'run.json', f'{penncosyvio.EXPERIMENT}.png'}
-    trials, cells = tables_of(tmp_path)
     assert [(row['method'], row['trial'], row['status']) for row in trials] == [
         ('auto', '2', 'OK'), ('opencv_gyro', '2', 'OK')]
     assert [row['level'] for row in cells] == ['1', '1', 'all', 'all']
@@ -305,10 +293,10 @@ def test_bad_input_is_refused(made, tmp_path, arguments, message, refused):
 @pytest.mark.recordings
 def test_recorded_trajectories_carry_a_simulation(recordings, tmp_path):
     """Every hundredth frame: 24 pairs; more in docs/lab/evaluation.md."""
-    assert evaluate('penncosyvio', recordings / 'penncosyvio', '--every', '100', '--solvers',
-                    'auto_gyro', 'global_5pt', '--output', tmp_path) == 0
+    _, cells = evaluate(tmp_path, 'penncosyvio', recordings / 'penncosyvio', '--every', '100',
+                        '--solvers', 'auto_gyro', 'global_5pt')
     found = {(row['case'], row['method']): float(row['rotation_median_deg'])
-             for row in tables_of(tmp_path)[1] if row['level'] == 'all'}
+             for row in cells if row['level'] == 'all'}
     for case in penncosyvio.STRETCHES:
         assert found[case, 'auto_gyro'] < 0.05
         assert found[case, 'global_5pt'] > 4.0 * found[case, 'auto_gyro']

@@ -108,21 +108,17 @@ def test_a_ray_is_where_its_own_row_observed_it(lens, region, direction, stamp_r
     by_map = np.stack([map_coordinates(found[..., axis], in_image[both].T[::-1], order=1)
                        for axis in range(2)], axis=1)
     errors = np.linalg.norm(by_map - as_read[both], axis=1)
-    assert errors.max() <= 0.02
-    assert np.median(errors) <= 0.01
+    assert errors.max() <= 0.02 and np.median(errors) <= 0.01
 
 
 def test_pixels_outside_of_the_lens_are_black_for_any_border():
-    """Corners of a fisheye beyond 90 degrees; the others are derotated as always."""
+    """Corners of a fisheye beyond 90 degrees."""
     found = MiddleRow(sensor('equidistant', fx=200.0, fy=200.0, cx=319.5, cy=239.5,
                              distortion=(0.0, 0.0, 0.0, 0.0))).map(FrameMotion(RATE))
     assert not found.complete
     sources = np.concatenate([band for _, band in found.bands()])
     assert np.isnan(sources[0, 0]).all()
     assert np.isfinite(sources[200:280, 200:440]).all()
-
-
-# -- pixels and stamps -----------------------------------------------------------------------
 
 
 def derotated(image: Any, *, rate: Any = RATE, **configured: Any) -> Any:
@@ -229,9 +225,6 @@ def test_without_rotation_or_readout_the_image_is_unchanged(changed, rate):
     np.testing.assert_array_equal(frame.image().values, values[..., 0])
 
 
-# -- against frames that are rendered with all rows at the time of the middle one -----------------
-
-
 def test_a_swinging_camera_against_the_truth():
     """Measured IMU, its bias and noise included; the aim of the project."""
     errors = lab.map_errors('swing', SimulationConfig(seed=9301, duration=0.4),
@@ -258,9 +251,6 @@ def test_a_tracked_time_offset_is_applied():
     assert last.applied_offset_ns == pytest.approx(8 * MS, abs=1.5 * MS)
     middle = simulation.reference_ns(index) + round(119.5 / 240 * 30 * MS)
     assert last.stamp_ns == pytest.approx(middle, abs=1.5 * MS)
-
-
-# -- bags ------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope='module')
@@ -331,66 +321,52 @@ def test_images_and_infos_have_the_stamp_of_the_middle_row(bag, unrolled):
     assert 1.0 < np.abs(pixels[1] - pixels[0]).mean() < 40.0
 
 
-def rewritten(path: Path, out: Path, change: Any, extra: Any = None) -> Path:
-    """A copy of a bag; `change` gets each raw message, and may leave it out by None."""
+def rewritten(path: Path, out: Path, keep: Any, extra: Any = lambda writer: None) -> Path:
+    """A copy of a bag with the raw messages for which `keep` is true, and extra ones."""
     with open_bag(path) as opened, Writer2(out, version=9,
                                            storage_plugin=StoragePlugin.MCAP) as writer:
         connections = {topic.name: writer.add_connection(
             topic.name, topic.msgtype, typestore=build.TYPESTORE) for topic in opened.topics}
-        for raw_message in opened.raw_messages(opened.topics):
-            kept = change(raw_message)
-            if kept is not None:
-                writer.write(connections[kept.topic], kept.bag_time_ns, kept.data)
-        if extra is not None:
-            extra(writer)
+        for m in filter(keep, opened.raw_messages(opened.topics)):
+            writer.write(connections[m.topic], m.bag_time_ns, m.data)
+        extra(writer)
     return out
 
 
-def test_images_without_gyro_are_left_out(bag, tmp_path, capsys):
+def test_images_without_gyro_are_left_out_and_configured_intrinsics_become_a_camera_info(
+        bag, tmp_path, capsys):
     path, parameters = bag
-    first = messages_of(path)[0].bag_time_ns
-    cut = rewritten(path, tmp_path / 'cut', lambda m: None if m.topic == '/imu/data_raw'
-                    and 500 * MS < m.bag_time_ns - first < 600 * MS else m)
-    assert unroll(cut, parameters, tmp_path / 'out') == 0
-    images, infos = sensor_messages_of(tmp_path / 'out')
-    assert 23 <= len(images) == len(infos) <= 28
-    assert (f'{len(images)} of 30 images derotated, {30 - len(images)} omitted'
-            in capsys.readouterr().out)
-
-
-def test_configured_intrinsics_become_a_camera_info(bag, tmp_path):
-    """Of a bag without one."""
-    path, parameters = bag
-    first = sensor_messages_of(path)[1][0]
-    bare = rewritten(path, tmp_path / 'bare',
-                     lambda m: None if m.topic == '/camera/camera_info' else m)
-    matrix, distortion = ([float(v) for v in values] for values in (first.k, first.d))
+    start, info = messages_of(path)[0].bag_time_ns, sensor_messages_of(path)[1][0]
+    bare = rewritten(path, tmp_path / 'bare', lambda m: not (
+        m.topic == '/camera/camera_info' or (
+            m.topic == '/imu/data_raw' and 500 * MS < m.bag_time_ns - start < 600 * MS)))
+    matrix, distortion = ([float(v) for v in values] for values in (info.k, info.d))
     assert unroll(bare, parameters, tmp_path / 'out', '--set', f'camera_matrix={matrix}',
                   '--set', f'distortion_coefficients={distortion}') == 0
     images, infos = sensor_messages_of(tmp_path / 'out')
+    assert 23 <= len(images) <= 28
+    assert (f'{len(images)} of 30 images derotated, {30 - len(images)} omitted'
+            in capsys.readouterr().out)
     assert [stamp_ns(m.header) for m in infos] == [stamp_ns(m.header) for m in images]
-    assert len(infos) == 30
-    assert intrinsics_from_info(infos[0]) == intrinsics_from_info(first)
+    assert intrinsics_from_info(infos[0]) == intrinsics_from_info(info)
 
 
-def test_unknown_types_are_copied_and_other_images_of_the_same_stamps_reported(bag, tmp_path,
-                                                                               caplog):
+def test_unknown_types_are_copied_and_other_images_of_the_same_stamps_reported(
+        bag, tmp_path, caplog):
     path, parameters = bag
-    depth = [build.gray_image(build.rosbags_types, np.zeros((4, 4), np.uint8), stamp_ns(m.header))
-             for m in sensor_messages_of(path)[0]]
-    payload = b'\x00\x01\x00\x00' + bytes(range(20))
+    payload, end_ns = b'\x00\x01\x00\x00' + bytes(range(20)), messages_of(path)[-1].bag_time_ns
 
     def add(writer):
         own = writer.add_connection('/own', 'own_msgs/msg/Thing', msgdef='uint8[20] data',
                                     rihs01='RIHS01_' + 'ab' * 32)
-        writer.write(own, messages_of(path)[-1].bag_time_ns + 1, payload)
+        writer.write(own, end_ns + 1, payload)
         other = writer.add_connection('/depth', 'sensor_msgs/msg/Image',
                                       typestore=build.TYPESTORE)
-        for k, message in enumerate(depth):
-            writer.write(other, messages_of(path)[-1].bag_time_ns + k,
-                         build.TYPESTORE.serialize_cdr(message, 'sensor_msgs/msg/Image'))
+        for k, m in enumerate(sensor_messages_of(path)[0]):
+            writer.write(other, end_ns + k, build.serialized(build.gray_image(
+                build.rosbags_types, np.zeros((4, 4), np.uint8), stamp_ns(m.header))))
 
-    both = rewritten(path, tmp_path / 'both', lambda m: m, add)
+    both = rewritten(path, tmp_path / 'both', lambda m: True, add)
     options = ('--image-topic', '/camera/image_raw/compressed')
     assert unroll(both, parameters, tmp_path / 'out', *options) == 0
     assert '/depth had the stamps of the derotated images and keep them' in caplog.text

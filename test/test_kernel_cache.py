@@ -197,8 +197,6 @@ def test_every_import_of_a_kernels_module_counts(monkeypatch):
         assert read == {MODULES[name] for name in {module, *reached(module)}}
 
 
-# --- after the warm-up no frame waits for a compiler
-
 # In a process of its own: other tests compile kernels in this one.
 WARM_UP = """
 from collections import Counter
@@ -223,6 +221,7 @@ def kernels():
         if function.__module__.startswith('rs_relpose_ros'):
             kernels[f'{function.__module__}.{function.__name__}'] += count
     return kernels
+
 
 parameters = read_parameters(sys.argv[2], sys.argv[3:])
 warm_up_pipeline(parameters)

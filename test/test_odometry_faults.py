@@ -294,21 +294,45 @@ def test_the_imu_is_read_at_a_low_rate_of_publication(ros_domain_id):
                             status.message)
 
 
-def test_the_newest_state_is_published_before_pairs_are_used(ros_domain_id, monkeypatch):
-    """In this process: a pair takes the graph some 20 ms, which no state waits for."""
+@pytest.fixture
+def own_node(ros_domain_id: int) -> Iterator[OdometryNode]:
+    """A node in this process, which is not spun."""
     rclpy.init(args=['--ros-args', '--params-file', str(BUNDLED_PARAMETERS)])
-    node, calls = OdometryNode(), []
-    try:
-        monkeypatch.setattr(node._estimator, 'take', lambda most: calls.append('pair') or [])
-        monkeypatch.setattr(node._continuous, 'at', lambda imu_ns: calls.append('state'))
-        node._on_pair(pairs_message(walk('walk:2', 1.0).pairs[0], Assessment(())))
-        assert node._estimator.waiting
-        assert calls == []
-        node._publish_propagated()
-        assert calls == ['state', 'pair']
-    finally:
-        node.destroy_node()
-        rclpy.shutdown()
+    node = OdometryNode()
+    yield node
+    node.destroy_node()
+    rclpy.shutdown()
+
+
+def test_the_newest_state_is_published_before_pairs_are_used(own_node, monkeypatch):
+    """A pair takes the graph some 20 ms, which no state waits for."""
+    calls: list[str] = []
+    monkeypatch.setattr(own_node._estimator, 'take', lambda most: calls.append('pair') or [])
+    monkeypatch.setattr(own_node._continuous, 'at', lambda imu_ns: calls.append('state'))
+    own_node._on_pair(pairs_message(walk('walk:2', 1.0).pairs[0], Assessment(())))
+    assert own_node._estimator.waiting
+    assert calls == []
+    own_node._publish_propagated()
+    assert calls == ['state', 'pair']
+
+
+def test_samples_of_another_frame_are_refused_until_reset(own_node, monkeypatch):
+    warnings: list[str] = []
+    monkeypatch.setattr(own_node, '_warn', warnings.append)
+    first, other, again = map(imu_message, walk('walk:2', 1.0).samples[:3])
+    other.header.frame_id = 'gimbal_imu'
+    own_node._on_sample(Role.IMU, first)
+    own_node._on_sample(Role.IMU, other)
+    assert own_node._newest_ns == stamp_of(first)
+    [warning] = warnings
+    assert warning.startswith('a message of gimbal_imu on /imu is not used')
+    assert 'remap imu to one IMU' in warning
+    own_node._on_sample(Role.IMU, again)
+    assert own_node._newest_ns == stamp_of(again)
+    own_node._reset(Trigger.Request(), Trigger.Response())
+    other.header.stamp = imu_message(walk('walk:2', 1.0).samples[3]).header.stamp
+    own_node._on_sample(Role.IMU, other)
+    assert own_node._newest_ns == stamp_of(other)
 
 
 # -- next to relpose_node and a player, on the bundled bag ---------------------------------------

@@ -27,6 +27,7 @@ from rs_relpose_ros.pipeline.chosen_pairs import ChosenPairs, estimate_wide_pair
 from rs_relpose_ros.pipeline.pair import Frame
 
 START_NS = 1_700_000_000_000_000_000
+HEAD = 'reference_stamp_ns,stamp_ns\n'
 COLUMNS = ('reference_stamp_ns,stamp_ns,tx,ty,tz,qx,qy,qz,qw,sigma_t1,sigma_t2,sigma_rx,sigma_ry,'
            'sigma_rz,inliers,matches,model,status,baseline_m,baseline_log_sigma,reason')
 
@@ -45,8 +46,7 @@ def run_pairs(bag: Path, parameters: Path, pairs: list[tuple[int, int]], folder:
               *options: str) -> tuple[int, list[dict[str, str]]]:
     folder.mkdir(exist_ok=True)
     listed = folder / 'pairs.csv'
-    listed.write_text('reference_stamp_ns,stamp_ns\n'
-                      + ''.join(f'{first},{second}\n' for first, second in pairs))
+    listed.write_text(HEAD + ''.join(f'{first},{second}\n' for first, second in pairs))
     code = main(pairs_command(bag, listed, folder / 'out', '--params', parameters, *options))
     return code, rows_of(folder / 'out' / 'relative_poses.csv')
 
@@ -58,8 +58,6 @@ def assert_within_covariance(rows: list[dict[str, str]], errors: list[dict[str, 
             sigma = math.hypot(*(float(row[f'sigma_{axis}']) for axis in sigmas))
             assert float(error[f'{name}_error_deg']) < 3.0 * math.degrees(sigma)
 
-
-# -- the bundled bag, its list with everything that can be wrong -------------------------------
 
 # From 0.3 to 3.6 s apart, with parallax; not in the order of time.
 GOOD = [(45, 81), (0, 9), (0, 48), (9, 75), (115, 157), (0, 69)]
@@ -91,17 +89,13 @@ def test_every_row_of_the_list_has_one_in_its_order(bundled):
 
 def test_wide_pairs_agree_with_the_truth(bundled):
     """Baselines of 0.6 to 4.2 m, over which no corner is followed."""
-    _, rows, errors, _ = bundled
-    assert [row['status'] for row in rows[:len(GOOD)]] == ['OK'] * len(GOOD)
-    assert all(row['reason'] == '' for row in rows[:len(GOOD)])
-    rotation, translation = (np.array([float(row[f'{name}_error_deg'])
-                                       for row in errors[:len(GOOD)]])
-                             for name in ('rotation', 'translation'))
-    assert np.median(rotation) < 0.1
-    assert rotation.max() < 0.2
-    assert np.median(translation) < 0.4
-    assert translation.max() < 1.0
-    assert_within_covariance(rows[:len(GOOD)], errors[:len(GOOD)])
+    rows, errors = (table[:len(GOOD)] for table in bundled[1:3])
+    assert {(row['status'], row['reason']) for row in rows} == {('OK', '')}
+    for name, median, largest in (('rotation', 0.1, 0.2), ('translation', 0.4, 1.0)):
+        found = [float(row[f'{name}_error_deg']) for row in errors]
+        assert np.median(found) < median
+        assert max(found) < largest
+    assert_within_covariance(rows, errors)
 
 
 def test_rows_that_cannot_be_estimated_have_the_reason(bundled):
@@ -112,32 +106,24 @@ def test_rows_that_cannot_be_estimated_have_the_reason(bundled):
         assert row['tx'] == row['inliers'] == ''
 
 
-def test_no_imu_cover(bundled_bag, tmp_path):
-    """With a time offset of 0.2 s the last frame's gyro lies behind the end of the bag."""
-    pair = stamp_of(0), stamp_of(179)
-    code, rows = run_pairs(bundled_bag, BUNDLED_PARAMETERS, [pair], tmp_path, '--set',
-                           'time_offset=0.2')
-    assert code == 1
-    assert rows[0]['reason'].startswith(f'the image of {pair[1]} cannot be used: ')
-    assert 'the gyro ends before the last row' in rows[0]['reason']
-
-
-def test_too_few_matches(bundled_bag, tmp_path):
-    pair = stamp_of(0), stamp_of(9)
-    code, rows = run_pairs(bundled_bag, BUNDLED_PARAMETERS, [pair], tmp_path, '--set',
-                           'max_descriptors=8')
-    assert code == 1
-    assert rows[0]['status'] == 'TOO_FEW_MATCHES'
-    assert 'usable matches' in rows[0]['reason']
+@pytest.mark.parametrize(('last', 'setting', 'status', 'reason'), [
+    # The last frame's gyro lies behind the end of the bag.
+    (179, 'time_offset=0.2', 'BAD_INPUT', 'the gyro ends before the last row'),
+    (9, 'max_descriptors=8', 'TOO_FEW_MATCHES', 'usable matches')])
+def test_pair_without_gyro_or_matches(bundled_bag, tmp_path, last, setting, status, reason):
+    code, [row] = run_pairs(bundled_bag, BUNDLED_PARAMETERS, [(stamp_of(0), stamp_of(last))],
+                            tmp_path, '--set', setting)
+    assert (code, row['status']) == (1, status)
+    assert reason in row['reason']
 
 
 @pytest.mark.parametrize(('text', 'words'), [
     ('', 'has no pairs below a line with the column names reference_stamp_ns and stamp_ns'),
     ('1,2\n3,4\n', 'line 2: it has no column reference_stamp_ns'),
-    ('reference_stamp_ns,stamp_ns\n', 'has no pairs'),
-    ('reference_stamp_ns,stamp_ns\n1, 2\n1.7e18,3\n',
+    (HEAD, 'has no pairs'),
+    (f'{HEAD}1, 2\n1.7e18,3\n',
      'line 3: column reference_stamp_ns must be a stamp in nanoseconds, an integer'),
-    ('reference_stamp_ns,stamp_ns\n1\n', 'line 2: column stamp_ns must be')])
+    (f'{HEAD}1\n', 'line 2: column stamp_ns must be')])
 def test_list_that_is_none(text, words, bundled_bag, tmp_path, refused):
     listed = tmp_path / 'pairs.csv'
     listed.write_text(text)
@@ -145,13 +131,15 @@ def test_list_that_is_none(text, words, bundled_bag, tmp_path, refused):
     assert not (tmp_path / 'out').exists()
 
 
-def test_files_of_an_earlier_run_are_not_taken_for_results(
+def test_results_replace_those_of_an_earlier_run_but_not_the_list(
         bundled_bag, tmp_path, refused, monkeypatch):
     def refuse(_: object, role: Role, message: object) -> InputError | None:
         return InputError('not calibrated') if role is Role.CAMERA_INFO else None
 
-    listed, out = tmp_path / 'pairs.csv', tmp_path / 'out'
-    listed.write_text('reference_stamp_ns,stamp_ns\n1,2\n')
+    listed, out = tmp_path / 'relative_poses.csv', tmp_path / 'out'
+    listed.write_text(f'{HEAD}1,2\n')
+    refused('would replace the list', *pairs_command(bundled_bag, listed, tmp_path))
+    assert listed.read_text() == f'{HEAD}1,2\n'
     out.mkdir()
     for name in ('relative_poses.csv', 'errors.csv', 'summary.json'):
         (out / name).write_text('earlier')
@@ -159,15 +147,6 @@ def test_files_of_an_earlier_run_are_not_taken_for_results(
     refused('not calibrated', *pairs_command(bundled_bag, listed, out))
     assert not list(out.iterdir())
 
-
-def test_the_list_is_not_replaced_by_the_results(bundled_bag, tmp_path, refused):
-    listed = tmp_path / 'relative_poses.csv'
-    listed.write_text('reference_stamp_ns,stamp_ns\n1,2\n')
-    refused('would replace the list', *pairs_command(bundled_bag, listed, tmp_path))
-    assert listed.read_text() == 'reference_stamp_ns,stamp_ns\n1,2\n'
-
-
-# -- a walk that returns -----------------------------------------------------------------------
 
 FPS, SECONDS = 5.0, 6.0
 LAST = round(FPS * SECONDS) - 1
@@ -221,9 +200,6 @@ def test_gyro_is_propagated_over_the_frames_between(returned, tmp_path):
     _, with_it = run_pairs(bag, parameters, [(first, between), (between, last), (first, last)],
                            tmp_path / 'b')
     assert float(with_it[2]['sigma_rz']) < 0.95 * float(alone[0]['sigma_rz'])
-
-
-# -- as a library ------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope='module')
@@ -305,18 +281,14 @@ def test_images_are_kept_until_the_last_of_their_pairs(library):
     assert all(pair.gyro_rotation is not None for pair in done.values())
 
 
-def test_one_calibration_for_both_frames(library):
+def test_other_intrinsics_and_a_frame_outside_of_the_buffer(library):
     parameters, imu, (frame1, frame2) = library
     first = view_frame(frame1, imu, parameters)
     zoomed = replace(frame2, intrinsics=replace(frame2.intrinsics, fx=500.0))
     with pytest.raises(InputError, match='intrinsics changed'):
         estimate_wide_pair(first, view_frame(zoomed, imu, parameters), parameters)
-
-
-def test_frame_outside_of_the_buffer(library):
-    parameters, imu, frames = library
     with pytest.raises(InputError, match='does not cover'):
-        view_frame(replace(frames[1], stamp_ns=frames[1].stamp_ns + 10**10), imu, parameters)
+        view_frame(replace(frame2, stamp_ns=frame2.stamp_ns + 10**10), imu, parameters)
 
 
 def test_example(bundled_bag, bundled):
