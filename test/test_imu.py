@@ -439,6 +439,17 @@ def test_sigma_of_gravity_at_rest_under_acceleration_and_after_braking():
     assert dragged.sigma > 2.0 * sigma().sigma
 
 
+@pytest.mark.parametrize('constant', [2.0, 10.0])
+def test_gravity_follows_with_its_time_constant(constant):
+    """The measured direction jumps by 1 deg: 1 - 1/e of it is left behind after the constant."""
+    aside = 9.80665 * np.tan(np.radians(1.0))
+    buffer, end = run(acceleration=lambda t: np.outer(t > 4.0 * constant, [aside, 0.0, 0.0]),
+                      seconds=5.0 * constant, noise=0.0, gyro_bias_sigma=0.0,
+                      gravity_time_constant=constant)
+    assert direction_error(buffer.gravity(end).direction, -UP) == pytest.approx(
+        1.0 - np.exp(-1.0), abs=0.01)
+
+
 def test_a_gap_ends_the_propagation_by_the_gyro():
     """The IMU rotates by 90 degrees during a gap: the direction before it is worthless."""
     buffer, end = run()
