@@ -34,7 +34,7 @@ BUDGETS = {
     'rs_relpose_ros/solvers': (1760, 6),
     'rs_relpose_ros/tracking': (1240, 5),
     'rs_relpose_lab': (9490, 43),
-    'test': (18792, 54),
+    'test': (18798, 54),
 }
 MOST_MODULES, MOST_FOLDERS = 110, 15
 LONGEST_MODULE, SHORTEST_MODULE, LONGEST_FUNCTION = 700, 80, 60
