@@ -12,10 +12,7 @@ from hypothesis import HealthCheck, settings
 import pytest
 
 from rs_relpose_lab.live.graph import private_domain
-from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.cli import main as command_line
-from rs_relpose_ros.offline.replay import read_truth
-from rs_relpose_ros.offline.truth import TrueTrajectory
 
 ROOT = Path(__file__).resolve().parent.parent
 BUNDLED_PARAMETERS = ROOT / 'bags' / 'hand_held.yaml'
@@ -106,14 +103,6 @@ def bundled_bag() -> Path:
     bag = ROOT / 'bags' / 'hand_held'
     assert (bag / 'metadata.yaml').is_file(), f'{bag} is no rosbag2 directory'
     return bag
-
-
-@pytest.fixture(scope='session')
-def bundled_truth(bundled_bag: Path) -> TrueTrajectory:
-    with open_bag(bundled_bag) as bag:
-        truth = read_truth(bag, bag.find_topics())
-    assert truth is not None
-    return truth
 
 
 @pytest.fixture

@@ -407,6 +407,23 @@ def down(at_ns):
     return -swinging(at_ns * 1e-9)[0, 2]
 
 
+def test_hand_held_acceleration_affects_the_mean_and_not_the_filter():
+    def shaking(t):
+        return np.stack([1.5 * np.sin(7.0 * t), 1.2 * np.cos(9.0 * t), 0.8 * np.sin(11.0 * t)],
+                        axis=1)
+    errors = {}
+    for mode in ('complementary', 'mean'):
+        found = []
+        for seed in range(6):
+            buffer, end = run(swinging, shaking, 6.0 + 0.13 * seed, seed, gravity_filter=mode)
+            estimate = buffer.gravity(end)
+            found.append(direction_error(estimate.direction, down(end)))
+            assert found[-1] < 4.0 * np.degrees(estimate.sigma)
+        errors[mode] = np.median(found)
+    assert errors['complementary'] < 1.0
+    assert errors['mean'] > 3.0 * errors['complementary']
+
+
 def test_sigma_of_gravity_at_rest_under_acceleration_and_after_braking():
     def sigma(**arguments):
         buffer, end = run(**arguments)

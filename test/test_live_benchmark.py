@@ -14,6 +14,7 @@ from rs_relpose_lab.experiments import live, live_clip
 from rs_relpose_lab.live.live_run import ReceivedPose
 from rs_relpose_lab.live.player import Outgoing, repeated, stamp_of
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.nodes.diagnostics import FrameTimings
 
 # The node may have to compile the kernels.
 pytestmark = pytest.mark.timeout(600)
@@ -104,6 +105,11 @@ def test_without_ros_nothing_is_rendered(monkeypatch, tmp_path, refused):
     monkeypatch.setitem(sys.modules, 'rs_relpose_lab.live.live_run', None)
     refused('needs ROS 2', 'benchmark', 'live', '--output', tmp_path / 'out')
     assert not (tmp_path / 'out').exists()
+
+
+def test_frame_timings_name_what_cannot_be_written(tmp_path):
+    with pytest.raises(InputError, match=r'timings_file .* cannot be written'):
+        FrameTimings(str(tmp_path / 'nowhere' / 'frames.csv'))
 
 
 @pytest.mark.live

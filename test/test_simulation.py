@@ -130,9 +130,14 @@ def test_exposed_row_is_the_mean_of_its_times(direction, stamp_row):
     assert np.abs(exposed.render(0.502) - mean).max() > 10.0   # by the exposure's middle
 
 
+def walk(seed, seconds, rotation_rate):
+    return hand_held(np.random.default_rng(seed), -0.2, seconds + 0.2,
+                     Plan.drawn(np.random.default_rng(1), seconds), speed=1.5,
+                     rotation_rate=rotation_rate)
+
+
 def test_trajectory_derivatives_are_exact():
-    trajectory = hand_held(np.random.default_rng(3), -0.2, 6.2, Plan.drawn(
-        np.random.default_rng(1), 6.0), speed=1.5, rotation_rate=0.6)
+    trajectory = walk(3, 6.0, rotation_rate=0.6)
     times, h = np.linspace(0.0, 6.0, 300), 1e-4
     here, before, after = (trajectory.states(times + d) for d in (0.0, -h, h))
     for name, of, tolerance in (('velocity', 'position', 2e-6), ('acceleration', 'velocity', 1e-4),
@@ -169,6 +174,23 @@ def test_stretches_are_those_of_their_names(seed):
         else:
             assert speeds_up > 0.02
     assert lengths['constant'] >= 0.7 and lengths['still'] >= 0.5 and lengths['rotate'] >= 0.5
+
+
+def test_motion_is_hand_held_like_for_every_seed():
+    times = np.linspace(0.0, 6.0, 200)
+    for seed in range(30):
+        states = on_wall(seed=seed).trajectory.states(times)
+        speed = np.linalg.norm(states.velocity, axis=1)
+        moving = speed > 0.5
+        assert moving.mean() > 0.6
+        assert speed.max() < 2.0
+        rate = np.degrees(np.linalg.norm(states.angular_velocity[moving], axis=1))
+        assert 15.0 < np.sqrt((rate**2).mean()) < 60.0
+        # Clear of all surfaces; long walks, too, remain in the scene.
+        assert np.linalg.norm(states.position[:, :2], axis=1).max() < 3.3
+        assert np.abs(states.position[:, 2] - 1.6).max() < 0.2
+    positions, _ = walk(0, 60.0, 0.5).poses(np.linspace(0.0, 60.0, 1000))
+    assert np.linalg.norm(positions[:, :2], axis=1).max() < 4.8
 
 
 def test_imu_noise_and_bias_are_as_configured():

@@ -23,6 +23,11 @@ from rs_relpose_ros.messages.incoming import Role
 
 # Length of the recording [s]: of the first fit, kept at most, and added before the next fit.
 _FIRST, _LONGEST, _STEP = 6.0, 60.0, 2.0
+# From this length on [s] values with wider sigmas suffice, as their doubt is in the covariances:
+# factor and names of the limits.
+_LONG, _WIDER = 10.0, 2.0
+_LIMITS = ('max_readout_sigma', 'max_offset_sigma', 'max_rotation_sigma', 'max_bias_sigma',
+           'max_focal_sigma')
 # Images that wait to be tracked; more are left out.
 _WAITING = 8
 # Images without a usable CameraInfo after which the lens counts as uncalibrated.
@@ -151,6 +156,8 @@ class LiveCalibration:
         sensor = self._parameters.sensor
         config = replace(TRACKED_IN_IMAGES, exposure_time=sensor.exposure_time,
                          exposure_margin=sensor.exposure_margin)
+        if recorder.seconds >= _LONG:
+            config = replace(config, **{name: _WIDER * getattr(config, name) for name in _LIMITS})
         try:
             self._fit = _Fit(recorder.recording(), config)
         except RsRelposeError as error:
