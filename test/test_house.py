@@ -34,7 +34,7 @@ BUDGETS = {
     'rs_relpose_ros/solvers': (1760, 6),
     'rs_relpose_ros/tracking': (1240, 5),
     'rs_relpose_lab': (9820, 44),
-    'test': (18894, 55),
+    'test': (18900, 55),
 }
 MOST_MODULES, MOST_FOLDERS = 110, 15
 LONGEST_MODULE, SHORTEST_MODULE, LONGEST_FUNCTION = 700, 80, 60
