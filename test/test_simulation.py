@@ -324,6 +324,7 @@ def test_command_writes_a_bag_and_its_parameters(raw, topic, tmp_path, capsys):
         message.data, cv2.IMREAD_UNCHANGED)
     assert np.abs(image.astype(float) - simulation.image(2)).mean() < (1e-9 if raw else 4.0)
     assert stamps[topic][2] == simulation.stamp_ns(2)
+    assert not raw or message.step == 160
     pose = found['/ground_truth/pose'][30][1].pose
     state = simulation.states([stamps['/ground_truth/pose'][30]])
     np.testing.assert_allclose((pose.position.x, pose.position.y, pose.position.z),

@@ -407,13 +407,18 @@ def _odometry_arguments(parser: argparse.ArgumentParser) -> None:
     _number(parser, '--long', 1, 'walks of 5 min, as the first ones')
     parser.add_argument('--euroc', type=Path, metavar='FOLDER',
                         help='also corners of a real recording, euroc_imu_april_corners')
+    _number(parser, '--disturbances', 0, 'instead, walks with each disturbance')
 
 
 def _run_odometry(args: argparse.Namespace) -> int:
     from rs_relpose_ros.odometry import need_gtsam
     need_gtsam()
-    from rs_relpose_lab.experiments import odometry
+    from rs_relpose_lab.experiments import odometry, odometry_disturbances
 
+    if args.disturbances:
+        return _report_of(odometry_disturbances.tasks(args.disturbances, args.seed),
+                          odometry_disturbances.measure, odometry_disturbances.write_report,
+                          args, 'walk')
     _check_at_least(0, args, 'walks', 'global_shutter', 'in_motion', 'long')
     walks, seed = odometry.walks, args.seed
     chosen = [*walks(args.walks, seed), *walks(args.global_shutter, seed, readout=0.0),

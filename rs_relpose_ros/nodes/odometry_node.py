@@ -16,7 +16,7 @@ from rs_relpose_ros.config.files import text_values
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.messages import outgoing
-from rs_relpose_ros.messages.incoming import PARTS, Role
+from rs_relpose_ros.messages.incoming import PARTS, Role, stamp_ns
 from rs_relpose_ros.nodes import inputs
 from rs_relpose_ros.nodes.inputs import message_class
 from rs_relpose_ros.nodes.parameters import legal_qos
@@ -42,7 +42,7 @@ _SILENT_IMU = 0.25
 _LEVELS = {'starting': 0, 'tracking': 0, 'uncertain': 1, 'lost': 2}
 _DESCRIPTION = (
     'Metric odometry: the keyframe pairs of relpose_node and the IMU in one graph (gtsam).\n\n'
-    f'subscribes: {_PAIRS}, imu, accel, calibration\n'
+    f'subscribes: {_PAIRS}, imu, accel, camera_info, calibration\n'
     'publishes:  ~/odometry, ~/keyframes, ~/path, /diagnostics, /tf with publish_odometry_tf\n'
     'service:    ~/reset')
 
@@ -121,6 +121,11 @@ class OdometryNode(StoppableNode):
             self, message_class(PARTS[role].msgtypes[0]), role.value,
             inputs.best_effort(_IMU_DEPTH), partial(self._on_sample, role), lambda: False,
             qos_overriding_options=overridable()) for role in (Role.IMU, Role.ACCEL)]
+        # Of each image: whether the camera still delivers where no pair comes.
+        self._sensors.append(inputs.PolledSubscription(
+            self, message_class('sensor_msgs/msg/CameraInfo'), Role.CAMERA_INFO.value,
+            inputs.best_effort(_DEPTH), lambda info: self._estimator.add_frame(
+                stamp_ns(info.header)), lambda: False, qos_overriding_options=overridable()))
         self._pairs, self._imu = map(self.resolve_topic_name, (_PAIRS, Role.IMU.value))
         # Reports since the last message, by topic.
         self._silent = {self._pairs: 0, self._imu: 0}

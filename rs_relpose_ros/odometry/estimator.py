@@ -49,9 +49,12 @@ _SET_BACK = 5
 # Number of waiting pairs beyond which all but the newest are left out: the IMU bridges them at the
 # cost of one, so that a slow machine keeps up.
 _MOST_WAITING = 10
-# Largest age of a usable pair while tracking [s], and in intervals of recent pairs; period of the
-# test [ns].
-_OVERDUE, _OVERDUE_INTERVALS, _WATCH_NS = 0.3, 1.5, 50_000_000
+# Age of a usable pair [s] from which one is missing where no frame arrives, or where pairs have no
+# information; without knowledge of the frames, in intervals of recent pairs. Delay of a pair that
+# is due [s]; period of the test [ns].
+_OVERDUE, _OVERDUE_INTERVALS, _PAIR_DELAY, _WATCH_NS = 0.25, 1.5, 0.1, 50_000_000
+# Frame intervals without a frame after which the camera is silent.
+_SILENT_FRAMES = 3
 # Time in which the deviations of pairs are averaged [ns].
 _RECENT_NS = 1_000_000_000
 # Times within this belong to one keyframe: a tracked readout time moves the middle row.
@@ -66,6 +69,9 @@ _REST_VELOCITY, _ANY_VELOCITY, _GAUGE_SIGMA = 0.01, 3.0, 1e-4
 # Largest 1 sigma of the logarithm of a baseline that starts a graph, and the initial speed without
 # one [m/s]: pairs of a global shutter have no baseline.
 _START_LOG_SIGMA, _GUESSED_SPEED = 0.7, 1.0
+# Variance of pairs by that of each alone: consecutive ones share tracks, whose errors persist
+# (docs/lab/odometry.md).
+_SHARED = 2.5
 # Innovation of a contradicting pair, in units of recent ones, and chi squared per degree of
 # freedom of a wrong start.
 _CONTRADICTING, _WRONG_START = 4.0, 3.0
@@ -160,6 +166,10 @@ class OdometryEstimator:
         self._behind = 0   # consecutive samples that came too late
         self._row_ns = 0   # from the stamped to the middle row
         self._offset_ns = self._watched_ns = 0   # of the camera's clock from that of the IMU
+        # Of the newest frame: its stamp, arrival in IMU time and interval; of the newest pair that
+        # could not be used: its time.
+        self._frame_ns = self._arrived_ns = self._frame_interval_ns = self._unusable_ns = 0
+        self._longest_interval = parameters.keyframes.max_keyframe_interval
         self.state, self.reason = OdometryState.STARTING, 'no pair with a pose yet'
         self.intervals: list[StateInterval] = []   # with `keep`
         self.corrections = 0   # number of changes to the newest keyframe
@@ -215,6 +225,11 @@ class OdometryEstimator:
             self._change(OdometryState.LOST, f'no message of the IMU for {seconds:.2f} s',
                          self._watched_ns)
 
+    def add_frame(self, stamp_ns: int) -> None:
+        """Tell that a frame has arrived: pairs are due then, or missing if none arrives."""
+        self._frame_ns, self._frame_interval_ns = stamp_ns, max(stamp_ns - self._frame_ns, 0)
+        self._arrived_ns = self._samples.newest_ns or 0
+
     def add_pair(self, pair: KeyframePair) -> None:
         """Add a pair; one without information is only counted. InputError for another camera."""
         self._camera = self._camera or pair.frame_id
@@ -225,6 +240,7 @@ class OdometryEstimator:
         self.counts['pairs'] += 1
         if pair.images is None and not pair.contradiction:
             self.counts['without images'] += 1
+            self._unusable_ns = pair.current_ns
             return
         if pair.images is not None:
             self._row_ns = to_nanoseconds(pair.images.row_time)
@@ -343,12 +359,14 @@ class OdometryEstimator:
                   if at_ns > pair.current_ns - _RECENT_NS]
         inflation = max(1.0, float(np.mean(recent or [1.0])))
         gate = inflation * _CONTRADICTING if run.published else math.inf
-        innovation = run.graph.add(interval, pair, at_rest, inflation=inflation, gate=gate)
+        innovation = run.graph.add(interval, pair, at_rest, inflation=_SHARED * inflation,
+                                   gate=gate)
         run.stamps.append((pair.stamp_ns, pair.current_ns))
         run.recent.append((pair.current_ns, min(innovation, _CONTRADICTING), interval.duration))
         if innovation > gate:
             self.counts['contradicting'] += 1
             self.corrections += 1
+            self._unusable_ns = pair.current_ns
             run.contradicting += 1
             if not run.confirmed and run.contradicting == _WRONG_STARTS:
                 self._wrong_starts = _WRONG_STARTS
@@ -399,8 +417,7 @@ class OdometryEstimator:
             self._end(_GAP, imu_ns)
             return
         age = seconds_between(run.observed_ns, imu_ns)
-        usual = max((seconds for *_, seconds in run.recent), default=0.0)
-        if age <= max(_OVERDUE, _OVERDUE_INTERVALS * usual):
+        if age <= self._due(run, imu_ns):
             return
         self._change(OdometryState.UNCERTAIN, f'no usable pair for {age:.2f} s', imu_ns)
         interval = self._samples.between(run.newest_ns, until_ns)
@@ -416,6 +433,17 @@ class OdometryEstimator:
             self._end(f'the position is known to {position:.2f} m', imu_ns)
         elif heading > self._config.max_heading_sigma:
             self._end(f'the heading is known to {heading:.2f} rad', imu_ns)
+
+    def _due(self, run: _Run, imu_ns: int) -> float:
+        """Age of the newest usable pair [s] up to which the next one is not missing."""
+        silent_ns = imu_ns - self._arrived_ns
+        if self._unusable_ns > run.observed_ns:
+            return _OVERDUE
+        if 0 < self._frame_interval_ns < NANOSECONDS:   # of a topic with each frame
+            silent = silent_ns > _SILENT_FRAMES * self._frame_interval_ns
+            return _OVERDUE if silent else self._longest_interval + _PAIR_DELAY
+        usual = max((seconds for *_, seconds in run.recent), default=0.0)
+        return max(_OVERDUE, _OVERDUE_INTERVALS * usual)
 
     # -- start and end -----------------------------------------------------------------------
 

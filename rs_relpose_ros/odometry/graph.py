@@ -29,6 +29,8 @@ Array = NDArray[np.float64]
 
 # 1 sigma of the velocity of a body at rest [m/s], per axis.
 _REST_VELOCITY_SIGMA = 0.005
+# Largest share of the window that one interval takes.
+_LONGEST_STEP = 0.25
 # Integration error of the samples, as a noise density of the position [m/sqrt(s)].
 _INTEGRATION = 1e-4
 
@@ -152,7 +154,9 @@ class KeyframeGraph:
         if at_rest and innovation <= gate:
             for key in (V(i), V(j)):
                 factors.addPriorVector(key, np.zeros(3), _diagonal([_REST_VELOCITY_SIGMA] * 3))
-        self._update(factors, values, j, self._seconds + interval.duration)
+        # States before a long bridge stay: the first pairs after it correct them, too.
+        self._update(factors, values, j, self._seconds + min(
+            interval.duration, _LONGEST_STEP * self._config.smoothing_lag))
         return innovation
 
     def scale_sigma(self) -> float:
@@ -296,13 +300,13 @@ class KeyframeGraph:
         return gtsam.CustomFactor(_diagonal([sigma] * 3), [X(i), X(j), L(0)], error)
 
     def _update(self, factors: Any, values: Any, newest: int, seconds: float) -> None:
-        """Add the newest keyframe, at `seconds` since the first; after a failure none is added."""
+        """Add the newest keyframe, at `seconds` in the window; after a failure none is added."""
         with _solving():
             # The camera on the body stays in the window.
             self._smoother.update(factors, values,
                                   dict.fromkeys([*values.keys(), L(0)], seconds))
             self._read(newest)
-        self._count, self._seconds = newest + 1, seconds   # keyframes, and time of the newest
+        self._count, self._seconds = newest + 1, seconds   # keyframes; time of the newest
         if self._record is not None:
             self._record[0].push_back(factors)
 

@@ -19,7 +19,7 @@ from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.so3 import aligning_rotation
 from rs_relpose_ros.geometry.timing import seconds_between
 from rs_relpose_ros.imu.buffer import ImuSample
-from rs_relpose_ros.messages.incoming import PARTS, Role, sensor_messages
+from rs_relpose_ros.messages.incoming import PARTS, Role, sensor_messages, stamp_ns
 from rs_relpose_ros.messages.outgoing import quat_xyzw
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.pair import KeyframePair
@@ -98,8 +98,11 @@ def odometry_into(folder: Path, bag: Bag, topics: SensorTopics,
 
 
 def follow(estimator: OdometryEstimator, pairs: Iterable[tuple[int, KeyframePair]],
-           samples: Sequence[tuple[int, ImuSample]]) -> list[Odometry]:
-    """Keyframes of pairs and samples, both with their times of arrival [ns]."""
+           samples: Sequence[tuple[int, ImuSample | int]]) -> list[Odometry]:
+    """Keyframes of pairs and samples, both with their times of arrival [ns].
+
+    A number among the samples is the stamp of a frame.
+    """
     live, given = [], 0
     for arrives_ns, pair in pairs:
         while given < len(samples) and samples[given][0] <= arrives_ns:
@@ -115,21 +118,22 @@ def follow(estimator: OdometryEstimator, pairs: Iterable[tuple[int, KeyframePair
     return live + estimator.take(end=True)
 
 
-def _samples(bag: Bag, topics: SensorTopics) -> list[tuple[int, ImuSample]]:
-    """IMU samples of a bag with their bag times, in bag order."""
-    out = []
-    for role, message in sensor_messages(bag, topics, (Role.IMU, Role.ACCEL)):
-        try:
-            sample = PARTS[role].read(message.message)
-        except InputError:
-            continue   # the replay counts and reports it
-        out.append((message.bag_time_ns, sample))
+def _samples(bag: Bag, topics: SensorTopics) -> list[tuple[int, ImuSample | int]]:
+    """IMU samples and stamps of the frames of a bag with their bag times, in bag order."""
+    out: list[tuple[int, ImuSample | int]] = []
+    for role, message in sensor_messages(bag, topics, (Role.IMU, Role.ACCEL, Role.CAMERA_INFO)):
+        with suppress(InputError):   # the replay counts and reports it
+            out.append((message.bag_time_ns, stamp_ns(message.message.header)
+                        if role is Role.CAMERA_INFO else PARTS[role].read(message.message)))
     return out
 
 
-def _add(estimator: OdometryEstimator, sample: ImuSample) -> None:
+def _add(estimator: OdometryEstimator, sample: ImuSample | int) -> None:
     with suppress(InputError):   # a stuck gyro: the replay counts and reports it
-        estimator.add_imu(sample)
+        if isinstance(sample, int):
+            estimator.add_frame(sample)
+        else:
+            estimator.add_imu(sample)
 
 
 # Path length of relative errors [m].

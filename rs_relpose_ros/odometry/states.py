@@ -117,12 +117,17 @@ class ContinuousPath:
         if last is None or last.path != state.path or imu_ns < last.imu_ns:
             self._offset = np.zeros(6)
         else:
+            seconds = seconds_between(last.imu_ns, imu_ns)
             if estimator.corrections != self._corrections:
                 before = estimator.propagated(last.imu_ns)
-                self._offset = np.zeros(6) if before is None else np.concatenate([
+                if before is None:   # the newest keyframe is later: back at the mean velocity
+                    way = 0.5 * seconds * (last.R @ last.velocity + state.R @ state.velocity)
+                    turn = 0.5 * seconds * (last.angular_velocity + state.angular_velocity)
+                    before = replace(state, position=state.position - way,
+                                     R=state.R @ exp_so3(-turn))
+                self._offset = np.concatenate([
                     last.position - before.position, log_so3(last.R @ before.R.T)])
-            self._offset = self._offset * math.exp(
-                -seconds_between(last.imu_ns, imu_ns) / _BLENDING)
+            self._offset = self._offset * math.exp(-seconds / _BLENDING)
         self._corrections = estimator.corrections
         self._last = replace(
             state, position=state.position + self._offset[:3],

@@ -1,0 +1,66 @@
+"""The disturbances of `benchmark odometry`: their tracks, and the states that follow."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from test_odometry import PARAMETERS, START_NS, walk, without
+
+from rs_relpose_lab.experiments import odometry_disturbances as disturbances
+from rs_relpose_lab.experiments.odometry_disturbances import Disturbance
+from rs_relpose_lab.experiments.trust_runs import simulated, Source, TrackNoise, TRACKS
+from rs_relpose_lab.simulation import simulate, SimulationConfig
+
+
+def test_tracks_of_a_disturbance(monkeypatch):
+    monkeypatch.setattr(disturbances, '_MARGIN', 0.2)
+    simulation = simulate(SimulationConfig(seed=3, duration=0.6, plan='walk:0.6'))
+    rng = np.random.default_rng(0)
+    recording = simulated(Source('', TRACKS), simulation, TrackNoise(), rng)
+    before = recording.sightings
+
+    def other(**values):
+        return disturbances.disturbed(recording, simulation, Disturbance(0.2, **values), rng)
+
+    assert [a.number for a in other(images=False).arrivals] == [*range(6), *range(12, 18)]
+    assert other().sightings is before
+    dark = other(corners=0.1, white=5.0).sightings
+    object_ = other(object_speed=60.0).sightings
+    for k, ids in enumerate(before.ids):
+        if not 6 <= k < 12:   # the same corners, and none of them after the disturbance
+            np.testing.assert_array_equal(object_.pixels[k], before.pixels[k])
+            assert np.isin(object_.ids[k], before.ids[0]).any() == (k < 6)
+            continue
+        assert len(dark.ids[k]) < 0.2 * len(ids)
+        assert dark.noise[k].std() > 3.0
+        moved = object_.pixels[k] - before.pixels[k]
+        # By 2 px from frame to frame since a corner appeared, on the left.
+        assert np.isclose(moved[:, 0] / 2.0, np.rint(moved[:, 0] / 2.0), atol=1e-6).all()
+        assert 0.3 < (moved[:, 0] > 1.0).mean() < 0.7 or k == 6
+        assert (moved[before.pixels[k][:, 0] > 400.0, 0] < 1.0).all()
+
+
+def test_states_through_a_disturbance():
+    given = walk('walk:14', 14.0, imu_rate=100.0)
+    samples = [(sample.stamp_ns, sample) for sample in given.samples]
+    R = Rotation.from_quat(given.quats).as_matrix()
+    velocity = np.gradient(given.positions, (given.stamps - START_NS) * 1e-9, axis=0)
+    feed = disturbances.Feed(
+        PARAMETERS.updated({'max_coast': 10.0}).to_mapping(),
+        [(pair.current_ns, pair) for pair in without(given.pairs, 6.0, 8.0)], samples, [],
+        disturbances.TrueStates(given.stamps, given.positions, R, velocity))
+    found = disturbances.on_feed('no images, 2 s', 1, feed)
+    # At 25 Hz, of an IMU with 100 Hz, and until the last sample.
+    assert found.states == pytest.approx(25 * 8.4, abs=10)
+    assert found.beyond_position + found.beyond_rotation + found.beyond_velocity < 10
+    assert found.velocity_ratio < 2.0 and found.tilt_ratio < 2.0
+    assert 0.2 < found.uncertain_after < 0.32
+    assert found.lost == 0 and found.largest_step < 1.0
+    # A truth that is elsewhere by 1 m after the disturbance.
+    elsewhere = given.positions + (given.stamps > START_NS + 8e9)[:, None] * [1.0, 0.0, 0.0]
+    other = disturbances.on_feed('no images, 2 s', 1, feed._replace(
+        truth=replace(feed.truth, position=elsewhere)))
+    assert other.beyond_position > 100
