@@ -51,7 +51,7 @@ _TRACK = 3
 # within this sigma, and a floor of its normal equations.
 _INVERSE_DISTANCE_SIGMA, _FLOOR = 10.0, 1e-9
 # Largest number of steps, decrease of the cost at which they end, largest step of log k.
-_STEPS, _CONVERGED, _LARGEST_STEP = 4, 0.5, 1.0
+_STEPS, _CONVERGED, _LARGEST_STEP = 5, 0.5, 1.0
 _FIRST_DAMPING = 1e-4
 # Error of a track that its residuals do not show, since it is similar in all frames [px].
 _COMMON_SIGMA = 0.06

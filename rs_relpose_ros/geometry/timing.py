@@ -41,6 +41,17 @@ def to_nanoseconds(seconds: float) -> int:
     return round(seconds * NANOSECONDS)
 
 
+# Difference of stamps [s] that no delay of a message explains.
+_APART = 1.0
+
+
+def clocks_apart(ahead: float) -> str:
+    """Message on stamps of the IMU that are `ahead` [s] of the images'; empty if by little."""
+    return '' if abs(ahead) < _APART else (
+        f"the clock of the IMU is {abs(ahead):.1f} s {'ahead of' if ahead > 0.0 else 'behind'} "
+        "the images'")
+
+
 def exposure_shift(stamp_exposure: str, exposure_time: float) -> float:
     """From the stamp to the middle of the stamped row's exposure [s]; of `STAMP_EXPOSURES`."""
     return {'start': 0.5, 'middle': 0.0, 'end': -0.5}[stamp_exposure] * exposure_time

@@ -162,15 +162,27 @@ _LIKELY_LENGTHS = (0.7, 1.4)
 _CLIPPED_SAMPLES, _LEAST_RANGE = 3, 1.5
 
 
+class ForceFault(str):
+    """Reason why an accelerometer is no specific force, and what to do, after a colon."""
+
+
+def length_fault(length: float) -> str:
+    """`ForceFault` of forces of this mean length [m/s^2]; empty if it may be that of gravity."""
+    low, high = (bound * STANDARD_GRAVITY for bound in _LIKELY_LENGTHS)
+    if low <= length <= high:
+        return ''
+    hint = ', these are g' if abs(length - 1.0) < 0.15 else (
+        ', gravity is removed' if length < 0.5 * STANDARD_GRAVITY else '')
+    return ForceFault(f'the accelerometer reads {length:.3g} m/s^2 in the mean, not '
+                      f'{STANDARD_GRAVITY}{hint}: it must be specific force in m/s^2 (REP-145)')
+
+
 def force_fault(forces: Array) -> str:
     """Reason why the samples (K, 3) of the last seconds are unusable; empty if they are usable."""
     if not len(forces):
         return 'there is no accelerometer'
-    length = float(np.linalg.norm(forces, axis=1).mean())
-    low, high = (bound * STANDARD_GRAVITY for bound in _LIKELY_LENGTHS)
-    if not low <= length <= high:
-        return (f'the accelerometer reads {length:.3g} m/s^2 in the mean, not {STANDARD_GRAVITY}: '
-                'it must be specific force in m/s^2')
+    if fault := length_fault(float(np.linalg.norm(forces, axis=1).mean())):
+        return fault
     size = np.abs(forces)
     equal = (forces[1:] == forces[:-1]) & (size[1:] >= np.maximum(
         0.999 * size.max(axis=0), _LEAST_RANGE * STANDARD_GRAVITY))

@@ -76,6 +76,7 @@ class FrameImu:
     since_previous: GyroSegment | None
     applied_offset_ns: int = 0   # tracked time offset in these times, beyond the parameter's
     exposure: float = 0.0   # of a row [s], over which the gyro is averaged
+    ahead: float = 0.0   # [s] newest stamp of the gyro when the image came, less `reference_ns`
     force: FrameForce | str = 'there is no accelerometer'   # or the reason why there is none
 
 

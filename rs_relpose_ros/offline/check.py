@@ -16,7 +16,7 @@ from rs_relpose_ros.calibrate.observations import frame_times, Varying
 from rs_relpose_ros.calibrate.start import axes_text, nearest_axis_map
 from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.errors import InputError, MissingInputError
-from rs_relpose_ros.geometry.so3 import STANDARD_GRAVITY
+from rs_relpose_ros.imu.buffer import length_fault
 from rs_relpose_ros.messages.incoming import PARTS, Role, sensor_messages
 from rs_relpose_ros.offline import check_sample
 from rs_relpose_ros.offline.check_sample import Completion, SampleRun
@@ -397,16 +397,14 @@ def _accelerometer(inertial: Inertial) -> Finding:
             Case(True, SUSPECT, "poses are less accurate without: choose the accelerometer's "
                  'topic with --accel-topic (node: remap accel)'))
     length = float(np.linalg.norm(forces, axis=1).mean())
-    text = f'|acc| {length:.2f} m/s^2 in the mean'
+    fault = length_fault(length)
+    text = fault.partition(': ')[0] or f'|acc| {length:.2f} m/s^2 in the mean'
     if inertial.orientations:
         text += f', and {inertial.orientations} orientations with covariance'
     return by_case(
         name, text, {'mean_length_m_s2': length, 'mean_m_s2': forces.mean(axis=0).tolist(),
                      'orientations': inertial.orientations},
-        Case(abs(length - 1.0) < 0.15, WRONG, 'these are g: sensor_msgs/Imu requires m/s^2, so '
-             'correct the driver, or set use_gravity: false'),
-        Case(length < 0.5 * STANDARD_GRAVITY, WRONG, 'publish the accelerometer as measured '
-             '(REP-145), or set use_gravity: false', ': gravity is removed'),
+        Case(bool(fault), WRONG, f'{fault.partition(": ")[2]}; or set use_gravity: false'),
         Case(not _PLAUSIBLE_FORCE[0] <= length <= _PLAUSIBLE_FORCE[1], SUSPECT, 'calibrate the '
              'accelerometer (bias, scale), or set use_gravity: false', ', not near 9.81'))
 

@@ -19,6 +19,7 @@ from rs_relpose_ros.config.settings import SensorConfig
 from rs_relpose_ros.estimator.priors import inverse, log_determinant
 from rs_relpose_ros.geometry.camera import REFERENCE_ROWS, RollingShutterCamera
 from rs_relpose_ros.geometry.so3 import exp_so3
+from rs_relpose_ros.geometry.timing import clocks_apart
 from rs_relpose_ros.pipeline import findings
 from rs_relpose_ros.pipeline.findings import BIAS, Finding, FindingState, OFFSET, Quantity
 from rs_relpose_ros.pipeline.recursion import Calibration, PRIOR_INFORMATION, PRIOR_SIGMA
@@ -204,10 +205,9 @@ def _inconsistency(quantity: Quantity, together: Array, sigma: Array, certainty:
                          length([effect.claimed_shift @ deviation for effect in effects], 0.5))
 
 
-def assess(estimated: Calibration, inconsistent: list[Inconsistency],
-           rotations: RotationComparison | None, configured: Configured) -> findings.Assessment:
-    """Findings on all quantities; `inconsistent`: by `find_inconsistencies`."""
-    gross = tuple(_gross_errors(rotations, configured))
+def assess(estimated: Calibration, inconsistent: list[Inconsistency], gross: tuple[Finding, ...],
+           configured: Configured) -> findings.Assessment:
+    """Findings on all quantities; by `find_inconsistencies` and `gross_errors`."""
     if gross:
         # Poses of wrong axes or units do not determine the other quantities.
         return findings.Assessment(gross + not_evaluated(
@@ -266,28 +266,27 @@ def _fault_findings(one: Inconsistency, configured: Configured,
     if quantity.tracking and not getattr(configured.sensor, quantity.tracking) and (
             abs(estimated - (getattr(configured.sensor, quantity.name) or 0.0)) < quantity.reach):
         fix += f', or {quantity.tracking}: true'
+    if quantity.name == 'time_offset':
+        fix += _another_row(one, configured)
     if alternatives:
         fix += f' (ambiguous: {alternatives})'
     yield replace(found, fix=fix,
                   message=f'{found.message} (shifts the pose by {one.shift:.1f} sigmas)')
-    if quantity.name == 'time_offset':
-        yield from _another_row(one, state, configured)
     if quantity.name == 'distortion' and found.configured and (
             abs(estimated) < _LITTLE_OF * abs(found.configured)):
         yield _fault('image_geometry', 'hardly any distortion left in the images: they may be '
                      'rectified', 'subscribe to the original images', state)
 
 
-def _another_row(one: Inconsistency, state: FindingState,
-                 configured: Configured) -> Iterator[Finding]:
-    """Another stamped row, if it is equivalent to the same offset."""
+def _another_row(one: Inconsistency, configured: Configured) -> str:
+    """Remark on another stamped row that is equivalent to the same offset; empty for none."""
     camera, deviation = configured.camera, one.deviation[OFFSET]
     for name in REFERENCE_ROWS:
         row = replace(camera, reference_row=name).reference_row_index
         makes = (camera.reference_row_index - row) * camera.line_delay
         if name != camera.reference_row and abs(deviation - makes) < 2.0 * one.sigma[OFFSET]:
-            yield _fault('stamp_row', f'stamps of the {name} row are equivalent to this offset',
-                         f'set stamp_row: {name}', state)
+            return f' (stamp_row: {name} is equivalent)'
+    return ''
 
 
 def _fault(quantity: str, message: str, fix: str, state: FindingState = FindingState.WRONG,
@@ -337,11 +336,32 @@ def _values(quantity: Quantity, left: Array, sigmas: Array,
 # -- Gross errors ----------------------------------------------------------------------------
 
 
-def _gross_errors(rotations: RotationComparison | None,
-                  configured: Configured) -> Iterator[Finding]:
-    """Axes, unit and flips, from the rotations of images and gyro."""
+def gross_errors(rotations: RotationComparison | None, ahead: float, configured: Configured,
+                 before: tuple[Finding, ...] = ()) -> tuple[Finding, ...]:
+    """Axes, unit, flips and clocks; those found `before` until the rotations contradict them.
+
+    `ahead` [s]: stamps of the IMU are so far ahead of those of the images as they arrive.
+    """
     if rotations is None:
-        return
+        return before
+    if rotations.left_as_configured < _EXPLAINED_AT_BEST and (
+            1.0 < rotations.scale * _UNIT_FACTOR < _UNIT_FACTOR**2):
+        return tuple(_rotation_errors(rotations, configured))
+    if apart := clocks_apart(ahead):
+        return _fault('time_offset', apart, 'stamp both by one clock, or set time_offset: '
+                      f'{configured.sensor.time_offset + ahead:.2f} if they differ by a constant'),
+    found = tuple(_rotation_errors(rotations, configured))
+    # Any error may leave images and gyro independent for a while, if frames are lost.
+    certain = found and (not before or found[0].quantity != _INDEPENDENT_OF[0])
+    return found if certain else before
+
+
+# Quantities that are wrong if images and gyro rotate independently.
+_INDEPENDENT_OF = 'image_geometry', 'time_offset'
+
+
+def _rotation_errors(rotations: RotationComparison, configured: Configured) -> Iterator[Finding]:
+    """Axes, unit and flips, from the rotations of images and gyro."""
     explained = min(rotations.left_at_best, rotations.left_mirrored)
     if explained < _EXPLAINED_AT_BEST:
         if rotations.scale * _UNIT_FACTOR < 1.0 or rotations.scale > _UNIT_FACTOR:
@@ -353,7 +373,7 @@ def _gross_errors(rotations: RotationComparison | None,
     elif rotations.by_gyro > _LONG_ROTATION and min(
             explained, rotations.left_of_all) > _INDEPENDENT:
         # Of a constant rate only noise is left once it is removed.
-        for name in ('image_geometry', 'time_offset'):
+        for name in _INDEPENDENT_OF:
             yield _fault(name, 'images and gyro rotate independently of each other', 'verify that '
                          'the IMU is that of this camera, that both stamp by one clock, and that '
                          'electronic stabilisation is off')

@@ -16,12 +16,21 @@ from rs_relpose_ros.estimator.velocity import InertialEvidence
 from rs_relpose_ros.geometry.so3 import norm, tangent_basis
 from rs_relpose_ros.pipeline import assessment, findings, recursion
 from rs_relpose_ros.pipeline.assessment import Configured, Effect, Inconsistency
-from rs_relpose_ros.pipeline.findings import Assessment, BIAS, DEVIATIONS, OFFSET, READOUT
+from rs_relpose_ros.pipeline.findings import (
+    Assessment,
+    BIAS,
+    DEVIATIONS,
+    Finding,
+    OFFSET,
+    READOUT,
+)
 from rs_relpose_ros.pipeline.recursion import Calibration, Recursion
 from rs_relpose_ros.pipeline.rotations import AccelerationSums, RotationSums
 
 Array = NDArray[np.float64]
 
+# Frames by which clocks are compared.
+_ARRIVALS = 20
 # Latest pairs whose shift by a deviation is evaluated.
 _EFFECTS = 30
 # Largest deviations about which a pair is linearised: lens and readout must stay possible.
@@ -46,6 +55,9 @@ class ConsistencyMonitor:
         self._on_rotations: deque[Effect] = deque(maxlen=_EFFECTS)
         self.latest: recursion.PairInformation | None = None   # of the last pair
         self._inconsistent: list[Inconsistency] = []
+        self._gross: tuple[Finding, ...] = ()
+        # Seconds by which stamps of the IMU are ahead as images arrive, of the last frames.
+        self.ahead: deque[float] = deque(maxlen=_ARRIVALS)
         self._wrong_configuration = False   # by the last pair
         self.health, self.calibration = findings.NOT_EVALUATED, recursion.NOTHING_ESTIMATED
 
@@ -68,8 +80,10 @@ class ConsistencyMonitor:
             except np.linalg.LinAlgError:
                 # A pair without rank has no information on the calibration; its pose is kept.
                 self._inconsistent = []
-        self.health = assessment.assess(self.calibration, self._inconsistent,
-                                        self.rotations.compared(), configured)
+        self._gross = assessment.gross_errors(
+            self.rotations.compared(), self._ahead(), configured, self._gross)
+        self.health = assessment.assess(self.calibration, self._inconsistent, self._gross,
+                                        configured)
         self._wrong_configuration = bool(self.health.faults)
         if self._wrong_configuration:
             self.acceleration.clear()
@@ -102,6 +116,11 @@ class ConsistencyMonitor:
         # The effect of an inconsistent parameter on the baseline is not known.
         return pose.without_baseline('baseline not known: a configured parameter is inconsistent '
                                      '(see health)') if shift.any() and pose else pose
+
+    def _ahead(self) -> float:
+        """The least lead of the IMU's clock, forwards or backwards; 0 if its sign changes."""
+        least, largest = min(self.ahead, default=0.0), max(self.ahead, default=0.0)
+        return max(least, 0.0) + min(largest, 0.0)
 
     def _deviation(self) -> Array:
         """(11,) from the active values, of all inconsistent quantities."""

@@ -118,6 +118,7 @@ class Pipeline(Processor[PairResult]):
             self._current_rays = None   # their row times are those of the camera before
         self._sensor, self._readout, imu = sensor, self.applied.readout_time, frame.imu
         self._stamps_ns.append(frame.stamp_ns)
+        self._monitor.ahead.append(imu.ahead)
         reference, previous = self._reference, self._previous
         # Without the gyro tracks are not predicted, and wrong ones that agree by chance pass.
         if reference is None or previous is None or imu.since_previous is None:
@@ -271,9 +272,10 @@ class Pipeline(Processor[PairResult]):
                 between=history.between(matches, sensor, since, inertial))
 
         inertial = pair.inertial_of(reference.imu, frame.imu, gyro, since, parameters)
+        acceleration = self._monitor.acceleration
+        acceleration.report(frame.stamp_ns, inertial)
         if isinstance(inertial, str):
             return estimate(inertial)
-        acceleration = self._monitor.acceleration
         used = acceleration.uses(None)
         pose = estimate(inertial if used else _CONTRADICTED)
         evidence = pose.inertial_evidence if used else pair.evidence_without(

@@ -17,8 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.estimator.velocity import InertialEvidence
+from rs_relpose_ros.geometry.motion import InertialMotion
 from rs_relpose_ros.geometry.so3 import aligning_rotation, log_so3, median
 from rs_relpose_ros.geometry.timing import to_nanoseconds
+from rs_relpose_ros.imu.buffer import ForceFault
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.pipeline.findings import Finding, FindingState
 from rs_relpose_ros.pipeline.recursion import MOST_PAIRS, WINDOW_NS
@@ -186,6 +188,8 @@ def _unsteady(rotations: Array, intervals: Array) -> Array:
 _LARGEST = 3.0
 # Logarithm of a Bayes factor that is certain, errors of neighbours being alike.
 _CERTAIN = 10.0
+# Time after which samples that are no specific force are reported: a step of a walk is shorter.
+_FAULTY_NS = to_nanoseconds(1.0)
 
 
 class AccelerationSums:
@@ -193,6 +197,14 @@ class AccelerationSums:
 
     def __init__(self) -> None:
         self._pairs: deque[tuple[int, float, float]] = deque(maxlen=MOST_PAIRS)
+        self._fault, self._fault_ns, self._faulty = '', 0, False   # of the samples
+
+    def report(self, stamp_ns: int, inertial: InertialMotion | str) -> None:
+        """Note the acceleration of a pair, or the reason why it has none."""
+        if not (isinstance(inertial, ForceFault) and self._fault):
+            self._fault_ns = stamp_ns
+        self._fault = inertial if isinstance(inertial, ForceFault) else ''
+        self._faulty = bool(self._fault) and stamp_ns - self._fault_ns >= _FAULTY_NS
 
     def clear(self) -> None:
         """Forget all pairs."""
@@ -218,7 +230,10 @@ class AccelerationSums:
         return max(opposite, 0.0) - configured > _CERTAIN
 
     def finding(self) -> Finding | None:
-        """On the axes of the accelerometer; None if the pairs do not determine it."""
+        """On the accelerometer; None if the pairs do not determine it."""
+        if self._faulty:
+            message, _, fix = self._fault.partition(': ')
+            return Finding('accel_scale', FindingState.SUSPECT, message, fix, observable=True)
         configured, opposite = self._sums()
         if self.contradicts:
             fix = ('reverse its sign: at rest a specific force of +9.8 m/s^2 points up'

@@ -98,7 +98,14 @@ class QueuedFrame:
     exposure: float   # of a row [s]
     received_ns: int   # on the monotonic clock
     generation: int
+    ahead: float   # [s] newest stamp of the gyro as it came, less `reference_ns`
     ready_ns: int | None = None   # None until the IMU covers its last row
+
+
+def _because(reason: str, queued: QueuedFrame) -> str:
+    """A reason for which a frame has no IMU data, and clocks that differ."""
+    apart = timing.clocks_apart(queued.ahead)
+    return f'{reason}: {apart}' if apart else reason
 
 
 class _BackwardStamps:
@@ -218,7 +225,8 @@ class Sequencer:
             self._queue.append(QueuedFrame(
                 image, intrinsics, clock.exposed_span_ns(stamp_ns, interval_ns),
                 clock.reference_ns(stamp_ns, interval_ns), clock.exposure(interval_ns),
-                received_ns=self._now(), generation=self._generation))
+                received_ns=self._now(), generation=self._generation, ahead=self._ahead(
+                    clock.reference_ns(stamp_ns, interval_ns))))
             self._update_queue()
 
     def pass_over(self, stamp_ns: int) -> None:
@@ -302,7 +310,7 @@ class Sequencer:
                 previous_ns = None
             frame.imu_data = replace(
                 frame_imu(self._buffer, span_ns, reference_ns, self._R_cam_imu, previous_ns,
-                          head.exposure), applied_offset_ns=self._offset_ns)
+                          head.exposure), applied_offset_ns=self._offset_ns, ahead=head.ahead)
             frame.restart = self._taken_generation != self._generation
             self._previous_ns, self._taken_generation = reference_ns, self._generation
             self._counts.frames_taken += 1
@@ -330,17 +338,22 @@ class Sequencer:
         if coverage is Coverage.AVAILABLE:
             return self._queue.popleft()
         if coverage is Coverage.NEVER:
-            refusal, reason = Refusal.IMU_GAP, _IMU_GAP
+            refusal, reason = Refusal.IMU_GAP, _because(_IMU_GAP, head)
         elif self._closed:
-            refusal, reason = Refusal.NO_IMU, 'the gyro ends before the last row of the frame'
+            refusal, reason = Refusal.NO_IMU, _because(
+                'the gyro ends before the last row of the frame', head)
         elif not self._offline and self._now() >= head.received_ns + MAX_IMU_WAIT_NS:
-            refusal, reason = Refusal.NO_IMU, (
+            refusal, reason = Refusal.NO_IMU, _because(
                 'no gyro sample that covers the last row of the frame came within '
-                f'{MAX_IMU_WAIT_NS / NANOSECONDS:g} s')
+                f'{MAX_IMU_WAIT_NS / NANOSECONDS:g} s', head)
         else:
             return None
         self._queue.popleft()
         return self._counted(head.image.stamp_ns, refusal, reason)
+
+    def _ahead(self, reference_ns: int) -> float:
+        newest_ns = self._buffer.gyro.newest_ns
+        return 0.0 if newest_ns is None else seconds_between(reference_ns, newest_ns)
 
     def _update_queue(self) -> None:
         """Mark the frames that the IMU covers by now, and keep the queue within its bounds."""
@@ -353,7 +366,8 @@ class Sequencer:
                 if self._buffer.coverage(*queued.span_ns) is Coverage.NEVER:
                     # Refused at once: it must not count as a frame that waits for the worker.
                     self._queue.remove(queued)
-                    self._refuse(queued.image.stamp_ns, Refusal.IMU_GAP, _IMU_GAP)
+                    self._refuse(queued.image.stamp_ns, Refusal.IMU_GAP,
+                                 _because(_IMU_GAP, queued))
                     continue
                 queued.ready_ns = now_ns
             ready += 1
@@ -362,8 +376,9 @@ class Sequencer:
                 self._refuse(self._queue.popleft().image.stamp_ns, Refusal.OVERLOAD,
                              'the worker was too slow, newer frames wait')
             while len(self._queue) > WAITING_FRAMES:
-                self._refuse(self._queue.popleft().image.stamp_ns, Refusal.NO_IMU,
-                             f'{WAITING_FRAMES} newer frames wait for the gyro')
+                head = self._queue.popleft()
+                self._refuse(head.image.stamp_ns, Refusal.NO_IMU, _because(
+                    f'{WAITING_FRAMES} newer frames wait for the gyro', head))
         if ready:
             self._changed.notify()
 
