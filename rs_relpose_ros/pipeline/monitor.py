@@ -13,7 +13,7 @@ from scipy.linalg import solve_triangular
 from rs_relpose_ros.config.settings import SensorConfig
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.estimator.velocity import InertialEvidence
-from rs_relpose_ros.geometry.so3 import norm, tangent_basis
+from rs_relpose_ros.geometry.so3 import tangent_basis
 from rs_relpose_ros.pipeline import assessment, findings, recursion
 from rs_relpose_ros.pipeline.assessment import Configured, Effect, Inconsistency
 from rs_relpose_ros.pipeline.findings import (
@@ -199,7 +199,7 @@ class Agreement:
 
 def _disagreement(before: RelativePose, after: RelativePose) -> float:
     """Chi-square (2 degrees of freedom) of the directions of motion at the shared keyframe."""
-    lengths = [norm(before.linear_velocity2), norm(after.linear_velocity1)]
+    lengths = np.linalg.norm([before.linear_velocity2, after.linear_velocity1], axis=1)
     across = tangent_basis(before.linear_velocity2 / lengths[0])
     apart = across.T @ after.linear_velocity1 / lengths[1]
     spread = (before.velocity_covariance[:3, :3] / lengths[0]**2
