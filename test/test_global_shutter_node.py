@@ -90,6 +90,7 @@ def session(module_ros_domain_id: int, bundled_bag: Path) -> Iterator[SimpleName
             for topic in ('image', 'image/compressed', 'mask', 'camera_info'):
                 other.wait_for_publisher(f'{OWN}/{topic}')
             faults.play(publishers, messages)
+        wait_until_quiet(lambda: len(images), 1.0, node)   # a busy machine is behind
         undisturbed = list(images)
         stream.play(publish, images, enough=ENOUGH)
         count = len(diagnostics)
