@@ -20,7 +20,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 
 from rs_relpose_lab.experiments.global_shutter import frames_of_bag
 from rs_relpose_lab.live.graph import diagnostic_values, Graph
-from rs_relpose_lab.live.processes import node_process, Process, wait_until
+from rs_relpose_lab.live.processes import node_process, Process, wait_until, wait_until_quiet
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.pipeline.global_shutter import GlobalShutterFrame
 
