@@ -33,9 +33,11 @@ demo: $(stamp)
 	$(bin)/python demo/run_demo.py
 
 # One thread of OpenBLAS, as nodes and commands have: with more, results differ in the last bits
-# (NumPy 1.26). Message types are checked in tests; in Jazzy that is off unless asked for. Two processes: one runs
-# the live tests, which wait most of the time (test/conftest.py); PYTEST_ARGS='-n 0 ...' for one.
-pytest := OPENBLAS_NUM_THREADS=1 ROS_PYTHON_CHECK_FIELDS=1 $(bin)/python -m pytest -n 2 --no-loadscope-reorder
+# (NumPy 1.26). Message types are checked in tests; in Jazzy that is off unless asked for. Two
+# processes: one runs the live tests, which wait most of the time (test/conftest.py);
+# PYTEST_ARGS='-n 0 ...' for one.
+pytest := OPENBLAS_NUM_THREADS=1 ROS_PYTHON_CHECK_FIELDS=1 $(bin)/python -m pytest -n 2 \
+    --no-loadscope-reorder
 
 test: $(stamp)
 	$(pytest) $(PYTEST_ARGS)
