@@ -20,7 +20,7 @@ OF_PACKAGE = {path: text for path, text in MODULES.items() if path.parts[0] == P
 BUDGETS = {
     'rs_relpose_ros': (260, 5),
     'rs_relpose_ros/bags': (1880, 6),
-    'rs_relpose_ros/calibrate': (2860, 9),
+    'rs_relpose_ros/calibrate': (2870, 9),
     'rs_relpose_ros/cli': (1070, 6),
     'rs_relpose_ros/config': (890, 4),
     'rs_relpose_ros/estimator': (3770, 12),
@@ -34,7 +34,7 @@ BUDGETS = {
     'rs_relpose_ros/solvers': (1760, 6),
     'rs_relpose_ros/tracking': (1240, 5),
     'rs_relpose_lab': (9820, 44),
-    'test': (18960, 55),
+    'test': (18970, 55),
 }
 MOST_MODULES, MOST_FOLDERS = 110, 15
 LONGEST_MODULE, SHORTEST_MODULE, LONGEST_FUNCTION = 700, 80, 60

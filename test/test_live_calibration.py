@@ -120,6 +120,17 @@ def test_a_camera_at_rest_is_never_calibrated_and_the_motion_is_named(bag):
 # -- the node ------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize('given', [{}, {'readout_time': 0.02,
+                                        'quat_cam_imu_xyzw': (0.0, 0.0, 0.0, 1.0)}])
+def test_a_file_that_lacks_a_parameter_is_not_read_again(given):
+    """Edited by hand: the node calibrates, in place of reading it once a second."""
+    node = MagicMock(calibrates=True)
+    node._settings.current = Parameters.from_mapping(given)
+    SensorNode._use_calibration(node, Calibrated(CAMERA, TEXT, '', new=False))
+    node._begin.assert_called_once_with(calibrate=not given)
+    assert node._warn.called == (not given)
+
+
 @pytest.mark.parametrize(('frames', 'turn', 'adopted', 'warned'), [
     ({Role.IMAGE: 'camera', Role.IMU: 'imu'}, 0.02, True, False),
     ({Role.IMAGE: 'camera', Role.IMU: 'imu'}, 0.2, False, True),

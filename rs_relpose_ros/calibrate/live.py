@@ -50,7 +50,8 @@ class LiveCalibration:
         self._parameters = parameters
         self._use_stored, self._fits = use_stored, fits
         self._queue: Queue[tuple[Role, Any]] = Queue()
-        self._waiting = 0   # images in the queue
+        # Images put into the queue by `receive`, and taken by `step`: a thread each.
+        self._put = self._taken = 0
         self._done = False
         self._camera: CameraId | None = None
         self._fit: _Fit | None = None
@@ -79,9 +80,9 @@ class LiveCalibration:
         """Hand a message over; errors are those of `step`."""
         configured = self._parameters.intrinsics.given
         if (self._done or role is Role.ACCEL or (role is Role.CAMERA_INFO and configured)
-                or (role is Role.IMAGE and self._waiting >= _WAITING)):
+                or (role is Role.IMAGE and self._put - self._taken >= _WAITING)):
             return None
-        self._waiting += role is Role.IMAGE
+        self._put += role is Role.IMAGE
         self._queue.put((role, message))
         return None
 
@@ -104,7 +105,7 @@ class LiveCalibration:
             return self._after_fit()
         if role is not Role.IMAGE:
             return self._recorder.add(role, message)
-        self._waiting -= 1
+        self._taken += 1
         self._images += 1
         error = self._recorder.add(role, message)
         self._refused = 0 if error is None else self._refused + 1

@@ -86,7 +86,10 @@ def load(path: Path, camera: CameraId) -> tuple[dict[str, Any], str]:
     InputError
         The file is damaged, or of another camera or image size.
     """
-    own = file_values(path, _SECTION)
+    try:
+        own = file_values(path, _SECTION)
+    except OSError as error:
+        raise InputError(f'{path} cannot be read: {error.strerror}') from error
     if not {'camera_name', 'image_width', 'image_height', 'date'} <= own.keys():
         raise InputError(f'{path} is no stored calibration: it has no section {_SECTION}')
     of = CameraId(own['camera_name'], own['image_width'], own['image_height'])

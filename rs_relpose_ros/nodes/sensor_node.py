@@ -393,8 +393,11 @@ class SensorNode(StoppableNode):
         if self.calibrates:
             self._published.publish(String(data=found.parameters))
         self._adopt(found.parameters, str(path))
-        if self._calibration is not None:   # nothing in it was new
-            self._begin()
+        if self._calibration is not None:   # nothing in it was new, or it cannot be used
+            missing = self._settings.current.sensor.missing()
+            if missing:
+                self._warn(f'the calibration in {path} has no usable {" and ".join(missing)}')
+            self._begin(calibrate=bool(missing))
 
     def _use_transform(self, frame_ids: Mapping[Role, str]) -> None:
         """Position of the IMU from /tf_static, once it is there; its rotation is compared."""
