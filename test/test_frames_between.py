@@ -287,9 +287,13 @@ def test_no_frames_between_change_nothing(scene):
     lost = [replace(frame, points=nothing) for frame in scene.between]
     blind = [replace(frame, relative_rotation=None, relative_rotation_covariance=None,
                      inertial=None) for frame in scene.between]
+    # A gyro that rotates the other way.
+    turned = [replace(frame, relative_rotation=frame.relative_rotation.T)
+              for frame in scene.between]
     default = estimate_relative_pose(**scene.arguments)
     for other, reason in ((default, ''), (scene.pose(between=lost), 'no frame between'),
-                          (scene.pose(between=blind), 'no frame between')):
+                          (scene.pose(between=blind), 'no frame between'),
+                          (scene.pose(between=turned), 'tracks and gyro')):
         assert other.frames == 2 and other.frames_reason.startswith(reason)
         assert bool(reason) == bool(other.frames_reason)
         for name in ('R', 't', 'covariance', 'linear_velocity1', 'linear_velocity2', 'inliers',

@@ -47,6 +47,10 @@ _SIGMA_FREEDOM = 10.0
 # Least number of inliers that a frame between must have, and most of a pair: 200 of 280 cost 8 %
 # of t and R on simulated walks, nothing on recordings, where tracks share larger errors.
 _LEAST_TRACKS, _MOST_TRACKS = 10, 200
+# Noise of the observations, as a part of `threshold`, beyond which tracks and gyro contradict each
+# other: 4 sigmas are then twice that, the largest limit of an inlier. All tracks have the errors
+# of the frames, so that the covariance would be too small.
+_LARGEST_NOISE = 0.5
 # Sine squared of the parallax below which the distance of a track starts at a small value.
 _PARALLEL, _FAR = 1e-8, 1e-2
 _LARGEST_PIXEL = 1e6
@@ -181,6 +185,9 @@ def refined(pose: RelativePose, points1: Array, motion1: FrameMotion, second: tu
     if not (np.isfinite(adjusted.covariance).all()
             and np.median(adjusted.state.inverse_distances) > 0.0):
         return replace(pose, frames_reason='the adjustment of all frames does not converge')
+    if adjusted.sigma > max(_LARGEST_NOISE * config.threshold, config.pixel_sigma):
+        return replace(pose, frames_reason='tracks and gyro of the frames between contradict each '
+                       f'other: {adjusted.sigma:.1f} px')
     return _result(pose, adjusted, tracks, priors, path, len(views))
 
 
