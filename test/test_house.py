@@ -23,7 +23,7 @@ BUDGETS = {
     'rs_relpose_ros/calibrate': (2870, 9),
     'rs_relpose_ros/cli': (1070, 6),
     'rs_relpose_ros/config': (890, 4),
-    'rs_relpose_ros/estimator': (3770, 12),
+    'rs_relpose_ros/estimator': (3780, 12),
     'rs_relpose_ros/geometry': (1270, 7),
     'rs_relpose_ros/imu': (1300, 4),
     'rs_relpose_ros/messages': (1320, 4),
