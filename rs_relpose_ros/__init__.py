@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
     from rs_relpose_ros.imu.buffer import ImuBuffer, ImuSample
     from rs_relpose_ros.messages.published_pair import PairSynchronizer, PoseChain
+    from rs_relpose_ros.odometry.rows import RowTrajectory
     from rs_relpose_ros.pipeline.chosen_pairs import estimate_wide_pair, view_frame
     from rs_relpose_ros.pipeline.pair import Frame
     from rs_relpose_ros.pipeline.warm_up import warm_up
@@ -28,8 +29,8 @@ if TYPE_CHECKING:
 __all__ = ['EstimatorConfig', 'Frame', 'FrameMotion', 'ImuBuffer', 'ImuSample', 'InertialMotion',
            'InputError', 'IntermediateFrame', 'Intrinsics', 'MissingInputError',
            'PairSynchronizer', 'Parameters', 'PoseChain', 'RelativePose', 'RollingShutterCamera',
-           'RsRelposeError', 'Status', 'estimate_relative_pose', 'estimate_wide_pair',
-           'view_frame', 'warm_up']
+           'RowTrajectory', 'RsRelposeError', 'Status', 'estimate_relative_pose',
+           'estimate_wide_pair', 'view_frame', 'warm_up']
 
 _HOMES = {
     'EstimatorConfig': 'config.settings', 'Frame': 'pipeline.pair',
@@ -40,7 +41,8 @@ _HOMES = {
     'PairSynchronizer': 'messages.published_pair', 'Parameters': 'config.settings',
     'PoseChain': 'messages.published_pair', 'RelativePose': 'estimator.result',
     'RollingShutterCamera': 'geometry.camera', 'RsRelposeError': 'errors',
-    'Status': 'estimator.result', 'estimate_relative_pose': 'estimator.estimate',
+    'RowTrajectory': 'odometry.rows', 'Status': 'estimator.result',
+    'estimate_relative_pose': 'estimator.estimate',
     'estimate_wide_pair': 'pipeline.chosen_pairs', 'view_frame': 'pipeline.chosen_pairs',
     'warm_up': 'pipeline.warm_up',
 }

@@ -209,7 +209,13 @@ PAIRS = Command(
 
 def _odometry(args: argparse.Namespace) -> int:
     need_gtsam()
-    from rs_relpose_ros.odometry.offline import LIVE_FILE, odometry_into, PICTURE, SMOOTHED_FILE
+    from rs_relpose_ros.odometry.offline import (
+        LIVE_FILE,
+        odometry_into,
+        PICTURE,
+        ROWS_FILE,
+        SMOOTHED_FILE,
+    )
     folder, outcome = run_on_bag(args, 'odometry', odometry_into)
     for text in outcome.warnings:
         print(text)
@@ -230,7 +236,7 @@ def _odometry(args: argparse.Namespace) -> int:
             outcome.blocking_reason
             or 'it needs some seconds of motion, or standstill, and informative pairs'))
         return FAILED
-    print(f'in {folder}: {LIVE_FILE}, {SMOOTHED_FILE}, {PICTURE}, {SUMMARY_FILE}')
+    print(f'in {folder}: {LIVE_FILE}, {SMOOTHED_FILE}, {ROWS_FILE}, {PICTURE}, {SUMMARY_FILE}')
     return 0
 
 

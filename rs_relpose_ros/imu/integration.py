@@ -189,7 +189,7 @@ def preintegrate(seconds: Array, rates: Array, forces: Array, gravity: Array,
     """
     steps, duration = np.diff(seconds), float(seconds[-1] - seconds[0])
     rotations = integrated_rotations(seconds, rates)
-    once, twice = _integrals(steps, np.einsum('kij,kj->ki', rotations, forces))
+    once, twice = force_integrals(steps, np.einsum('kij,kj->ki', rotations, forces))
     beta = once[-1] + duration * gravity
     alpha = twice[-1] + 0.5 * duration**2 * gravity
 
@@ -214,7 +214,7 @@ def preintegrate(seconds: Array, rates: Array, forces: Array, gravity: Array,
     return InertialMotion(alpha, beta, duration, covariance, lever_arm)
 
 
-def _integrals(steps: Array, forces: Array) -> tuple[Array, Array]:
+def force_integrals(steps: Array, forces: Array) -> tuple[Array, Array]:
     """Integrals (K, 3) up to each sample, of forces (K, 3) that are linear in between."""
     mean = 0.5 * (forces[1:] + forces[:-1]) * steps[:, None]
     once = np.vstack([np.zeros(3), np.cumsum(mean, axis=0)])
@@ -295,7 +295,7 @@ def motions_on_the_way(whole: InertialMotion, first: FrameImu, since: FrameImu,
         return [None] * len(frames)
     seconds, rates, specific = _resampled(gyro, force.since_previous)
     rotations = integrated_rotations(seconds, rates)
-    once, twice = _integrals(np.diff(seconds), np.einsum('kij,kj->ki', rotations, specific))
+    once, twice = force_integrals(np.diff(seconds), np.einsum('kij,kj->ki', rotations, specific))
     gravity = np.asarray(whole.acceleration1) - first.force.within
     motions: list[InertialMotion | None] = []
     for frame in frames:

@@ -301,7 +301,11 @@ class OdometryEstimator:
                               imu_ns)
 
     def smoothed(self) -> list[Odometry]:
-        """All keyframes, given all measurements; needs `keep`.
+        """All keyframes, given all measurements; needs `keep`."""
+        return [keyframe for path in self.smoothed_paths() for _, keyframe in path]
+
+    def smoothed_paths(self) -> list[list[tuple[KeyframeState, Odometry]]]:
+        """The same with the states of the body, a list for each start.
 
         A run with an unsolvable graph is left out, with a warning.
         """
@@ -312,8 +316,8 @@ class OdometryEstimator:
             except GraphError as error:
                 self._warnings.append(f'not smoothed: {len(run.stamps)} keyframes: {error}')
                 continue
-            out += [self._odometry(run, state, np.full(3, math.nan), *stamps)
-                    for state, stamps in zip(states, run.stamps, strict=True)]
+            out.append([(state, self._odometry(run, state, np.full(3, math.nan), *stamps))
+                        for state, stamps in zip(states, run.stamps, strict=True)])
         return out
 
     def smoothed_steps(self) -> list[tuple[int, int, Step]]:

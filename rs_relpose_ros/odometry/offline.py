@@ -18,11 +18,13 @@ from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.so3 import aligning_rotation
 from rs_relpose_ros.geometry.timing import seconds_between
-from rs_relpose_ros.imu.buffer import ImuSample
+from rs_relpose_ros.imu.buffer import ImuSample, ImuSamples
 from rs_relpose_ros.messages.incoming import PARTS, Role, sensor_messages, stamp_ns
 from rs_relpose_ros.messages.outgoing import quat_xyzw
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
+from rs_relpose_ros.odometry.graph import KeyframeState
 from rs_relpose_ros.odometry.pair import KeyframePair
+from rs_relpose_ros.odometry.rows import Knot, RowTrajectory
 from rs_relpose_ros.odometry.states import Base, Odometry, OdometryState
 from rs_relpose_ros.offline.replay import read_truth, Replay
 from rs_relpose_ros.offline.truth import TrueTrajectory
@@ -36,6 +38,7 @@ _STYLES: Mapping[str, Mapping[str, Any]] = {
     'smoothed': {'color': '#0072B2', 'lw': 1.2}}
 
 LIVE_FILE, SMOOTHED_FILE, PICTURE = 'trajectory.tum', 'trajectory_smoothed.tum', 'path.png'
+ROWS_FILE = 'trajectory_rows.npz'
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +58,7 @@ def odometry_into(folder: Path, bag: Bag, topics: SensorTopics,
 
     Files of an earlier run are replaced.
     """
-    prepare_folder(folder, (LIVE_FILE, SMOOTHED_FILE, PICTURE, SUMMARY_FILE))
+    prepare_folder(folder, (LIVE_FILE, SMOOTHED_FILE, ROWS_FILE, PICTURE, SUMMARY_FILE))
     estimator = OdometryEstimator(parameters, keep=True)
     replay = Replay(bag, topics, parameters)
     health = FindingState.UNKNOWN
@@ -66,8 +69,10 @@ def odometry_into(folder: Path, bag: Bag, topics: SensorTopics,
             health = pair.health.state
             yield replay.counts.last_ns, KeyframePair.of_result(pair)
 
-    live = follow(estimator, pairs(), _samples(bag, topics))
-    smoothed = estimator.smoothed()
+    samples = _samples(bag, topics)
+    live = follow(estimator, pairs(), samples)
+    paths = estimator.smoothed_paths()
+    smoothed = [keyframe for path in paths for _, keyframe in path]
     warnings = estimator.warnings()
     truth = read_truth(bag, topics)
     # The ground truth is that of the camera.
@@ -93,8 +98,31 @@ def odometry_into(folder: Path, bag: Bag, topics: SensorTopics,
             for key, value in asdict(path.errors).items()}
     write_tum(folder / LIVE_FILE, live)
     write_tum(folder / SMOOTHED_FILE, smoothed)
+    if paths:
+        row_trajectory(paths, base, parameters, [
+            sample for _, sample in samples if isinstance(sample, ImuSample)]).save(
+                folder / ROWS_FILE)
     draw_paths(drawn, folder / PICTURE)
     return OdometryOutcome(live, smoothed, metrics, warnings, estimator.blocking_reason)
+
+
+def row_trajectory(paths: Sequence[Sequence[tuple[KeyframeState, Odometry]]], base: Base,
+                   parameters: Parameters, samples: Iterable[ImuSample]) -> RowTrajectory:
+    """Poses at any time, of `OdometryEstimator.smoothed_paths` and the samples of the IMU."""
+    buffer = ImuSamples(parameters.imu.max_imu_gap)
+    for sample in samples:
+        with suppress(InputError):   # not finite: the replay counts and reports it
+            buffer.add(sample)
+    C, arm = parameters.sensor.R_cam_imu, paths[-1][-1][0].arm
+    base_R = C.T @ base.R.T
+    mounts = np.array([np.column_stack(mount) for mount in (
+        (C.T, arm), (np.eye(3), np.zeros(3)), (base_R, arm - base_R @ base.position))])
+    # The cameras' positions are kept: the arm of an earlier path may differ.
+    return RowTrajectory.of_paths([[
+        Knot(keyframe.stamp_ns, keyframe.imu_ns, state.R,
+             base.camera(keyframe).position - state.R @ arm, state.velocity, state.gyro_bias,
+             state.accel_bias, keyframe.pose_covariance)
+        for state, keyframe in path] for path in paths], buffer, mounts)
 
 
 def follow(estimator: OdometryEstimator, pairs: Iterable[tuple[int, KeyframePair]],
