@@ -188,8 +188,7 @@ def test_a_node_without_parameters_calibrates_itself(bag, ros_domain_id, tmp_pat
             assert 'calibrating' in states
             node.wait_for('ready')
             with player_process(bag) as playing:
-                assert playing.wait() == 0
-            wait_until(lambda: poses, 'a pose', node)
+                wait_until(lambda: poses, 'a pose', node, playing)
             wait_until(lambda: published, 'the calibration', node)
             assert is_near_the_truth(published[0].data)
             path.unlink()
@@ -200,9 +199,8 @@ def test_a_node_without_parameters_calibrates_itself(bag, ros_domain_id, tmp_pat
         # The second start takes the file; a value can be set while it runs.
         with node_process(**start) as node:
             node.wait_for('waiting for the first image')
-            with player_process(bag) as playing:
+            with player_process(bag):
                 node.wait_for('using the calibration of')
-                assert playing.wait() == 0
             node.wait_for('ready')
             value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=0.0201)
             request = SetParameters.Request(parameters=[Parameter(
@@ -211,7 +209,6 @@ def test_a_node_without_parameters_calibrates_itself(bag, ros_domain_id, tmp_pat
                               request).results[0].successful
             wait_until(lambda: node.output.count('ready:') == 2, 'a new start', node)
             with player_process(bag) as playing:
-                assert playing.wait() == 0
-            wait_until(lambda: poses, 'a pose', node)
+                wait_until(lambda: poses, 'a pose', node, playing)
             assert 'Traceback' not in node.output
             node.stop()
