@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 import math
 from pathlib import Path
 from typing import Any
@@ -108,9 +108,14 @@ def as_ros1(message: Any) -> Any:
 
 
 def copied(source: Path, path: Path, change: Callable[[Any], bool | None] = lambda message: None,
-           seconds: float = math.inf) -> Path:
-    """The first seconds of a bag, its messages changed in place; left out where that is true."""
+           seconds: float = math.inf, first: Sequence[tuple[str, Any]] = ()) -> Path:
+    """The first seconds of a bag, its messages changed in place; left out where that is true.
+
+    `first`: topics and messages before them.
+    """
     with open_bag(source) as bag, BagWriter(path) as out:
+        for topic, message in first:
+            out.write(topic, message.__msgtype__, message, 1)
         begin_ns = None
         for item in bag.messages(bag.topics):
             begin_ns = begin_ns or item.bag_time_ns

@@ -220,6 +220,26 @@ def test_rotation_about_one_axis_is_not_observable(tmp_path):
     assert 'quat_cam_imu_xyzw' in text and 'quat_cam_imu_xyzw:' not in text
 
 
+def test_a_transform_gives_the_rotation_that_the_motion_does_not():
+    """Of a robot on wheels; one that contradicts the images is not used."""
+    recorded = simulated(15, calibration_tracks.about_one_axis(0, 6.0))
+    true = Rotation.from_matrix(recorded.truth.R_cam_imu)
+    result = calibrated(recorded, quat_prior=(
+        Rotation.from_rotvec([0.03, -0.04, 0.02]) * true).as_quat())
+    assert result.complete and result.rotation.determined
+    apart = (Rotation.from_matrix(result.R_cam_imu) * true.inv()).as_rotvec()
+    assert (np.abs(apart) < 3.0 * result.rotation_sigma).all()
+    assert 0.04 < result.rotation_sigma.max() < 0.09
+    other = calibrated(recorded, quat_prior=(
+        Rotation.from_rotvec([0.0, 0.0, 1.5]) * true).as_quat())
+    assert not other.rotation.determined
+    recorded, usual_result = usual()
+    same = calibrated(recorded, quat_prior=(
+        Rotation.from_rotvec([0.0, 0.5, 0.0]) * Rotation.from_matrix(
+            recorded.truth.R_cam_imu)).as_quat())
+    np.testing.assert_array_equal(same.R_cam_imu, usual_result.R_cam_imu)
+
+
 def few_frames(tracks: Tracks, count: int) -> Tracks:
     kept = tracks.frames < count
     return Tracks(tracks.stamps_ns[:count], tracks.frames[kept], tracks.ids[kept],

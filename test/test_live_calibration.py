@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+import os
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
 
+from conftest import BUNDLED_PARAMETERS
 from diagnostic_msgs.msg import DiagnosticArray
 import fault_stream as faults
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -16,22 +18,30 @@ from rcl_interfaces.srv import SetParameters
 from scipy.spatial.transform import Rotation
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
+from test_node_settings import FAKE_TF2_ROS
 
 from rs_relpose_lab.live.graph import diagnostic_values, Graph
 from rs_relpose_lab.live.processes import node_process, player_process, wait_until
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.bag import write_bag
-from rs_relpose_ros.bags.reader import COMPRESSED_TOPIC, IMU_TOPIC, open_bag
+from rs_relpose_ros.bags.reader import (
+    CAMERA_FRAME,
+    COMPRESSED_TOPIC,
+    IMU_FRAME,
+    IMU_TOPIC,
+    open_bag,
+)
 from rs_relpose_ros.calibrate import stored
 from rs_relpose_ros.calibrate.live import LiveCalibration
 from rs_relpose_ros.calibrate.stored import Calibrated, CameraId, Progress
-from rs_relpose_ros.config.files import text_values
+from rs_relpose_ros.config.files import read_parameters, text_values
 from rs_relpose_ros.config.settings import Parameters, StoredCalibrationConfig
 from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.messages.incoming import Role, sensor_messages
 from rs_relpose_ros.nodes.inputs import LATCHED
 from rs_relpose_ros.nodes.sensor_node import SensorNode
 
+QUATERNION = (0.0, 0.0, 0.0, 1.0)
 CAMERA = CameraId('a/b:c', 320, 240)
 TEXT = '/**:\n  ros__parameters:\n    readout_time: 0.02\n    readout_time_sigma: 0.001\n'
 TRUTH = SimulationConfig(
@@ -131,25 +141,68 @@ def test_a_file_that_lacks_a_parameter_is_not_read_again(given):
     assert node._warn.called == (not given)
 
 
-@pytest.mark.parametrize(('frames', 'turn', 'adopted', 'warned'), [
-    ({Role.IMAGE: 'camera', Role.IMU: 'imu'}, 0.02, True, False),
-    ({Role.IMAGE: 'camera', Role.IMU: 'imu'}, 0.2, False, True),
-    ({Role.IMAGE: 'camera', Role.IMU: 'other'}, 0.02, False, False),
-    ({Role.IMAGE: 'camera'}, 0.02, False, False)])
-def test_the_position_of_the_imu_is_that_of_tf(frames, turn, adopted, warned):
-    quaternion = Rotation.from_matrix(TRUTH.R_cam_imu).as_quat()
-    known = {('camera', 'imu'): (
-        0.1, 0.2, 0.3, *(Rotation.from_rotvec([0.0, turn, 0.0]) * Rotation.from_quat(
-            quaternion)).as_quat())}
-    node = MagicMock(_lookup=lambda parent, child: known.get((parent, child)))
-    node._settings.current = Parameters.from_mapping(
-        {'readout_time': 0.02, 'quat_cam_imu_xyzw': tuple(quaternion)})
+KNOWN = {'readout_time': 0.02, 'quat_cam_imu_xyzw': tuple(
+    Rotation.from_matrix(TRUTH.R_cam_imu).as_quat())}
+
+
+@pytest.mark.parametrize(('given', 'frames', 'turn', 'adopted', 'warned'), [
+    (KNOWN, {Role.IMAGE: 'camera', Role.IMU: 'imu'}, 0.02, True, False),
+    (KNOWN, {Role.IMAGE: 'camera', Role.IMU: 'imu'}, 0.2, False, True),
+    (KNOWN, {Role.IMAGE: 'camera', Role.IMU: 'other'}, 0.02, False, False),
+    (KNOWN, {Role.IMAGE: 'same', Role.IMU: 'same'}, 0.02, False, False),
+    (KNOWN, {Role.IMAGE: 'camera'}, 0.02, False, False),
+    ({'readout_time': 0.02}, {Role.IMAGE: 'camera', Role.IMU: 'imu'}, 0.2, True, False)])
+def test_extrinsics_are_those_of_tf(given, frames, turn, adopted, warned):
+    quaternion = (Rotation.from_rotvec([0.0, turn, 0.0])
+                  * Rotation.from_matrix(TRUTH.R_cam_imu)).as_quat()
+    known = {('camera', 'imu'): (0.1, 0.2, 0.3, *quaternion), ('same', 'same'): (0.0,) * 7}
+    node = MagicMock(_lookup=lambda parent, child: known.get((parent, child)), _calibration=None)
+    node._settings.current = Parameters.from_mapping(given)
     SensorNode._use_transform(node, frames)
     assert node._settings.adopt.called == adopted
     assert node._warn.called == warned
     assert (node._lookup is None) == (adopted or warned)
     if adopted:
-        assert node._settings.adopt.call_args.args[0]['imu_position'] == (0.1, 0.2, 0.3)
+        values = node._settings.adopt.call_args.args[0]
+        assert values['imu_position'] == (0.1, 0.2, 0.3)
+        assert ('quat_cam_imu_xyzw' in values) == ('quat_cam_imu_xyzw' not in given)
+
+
+def test_a_calibration_starts_from_the_rotation_of_tf():
+    """It is used as it is only where nothing else is missing, or to be calibrated."""
+    node = MagicMock(_lookup=lambda parent, child: (0.1, 0.2, 0.3, *QUATERNION),
+                     _waits_for_tf=lambda: False)
+    node._settings.current = Parameters()
+    SensorNode._use_transform(node, {Role.IMAGE: 'camera', Role.IMU: 'imu'})
+    assert node._calibration.quat_prior == node._quat_prior == QUATERNION
+    assert not node._settings.adopt.called and node._lookup is not None
+
+
+@pytest.mark.live
+def test_a_node_waits_for_the_transform_and_names_the_missing_frame(
+        ros_domain_id, bundled_bag, tmp_path, monkeypatch):
+    """tf2_ros is in no wheel: a stand-in that knows the transform once a file exists."""
+    values = ' '.join(map(str, (0.1, 0.2, 0.3, *read_parameters(
+        BUNDLED_PARAMETERS).sensor.quat_cam_imu_xyzw)))
+    (tmp_path / 'tf2_ros.py').write_text(FAKE_TF2_ROS)
+    monkeypatch.setenv('PYTHONPATH', os.pathsep.join(
+        [str(tmp_path), *filter(None, [os.environ.get('PYTHONPATH')])]))
+    monkeypatch.setenv('TF', f'{CAMERA_FRAME} {IMU_FRAME} {values}')
+    monkeypatch.setenv('TF_FILE', str(tmp_path / 'tf'))
+    messages = faults.read_messages(bundled_bag, 3.0)
+    given = {'readout_time': 0.03, 'calibrate_at_start': 'never', 'image_transport': 'raw'}
+    with Graph() as graph, node_process(remap=faults.BAG_TOPICS, parameters=given) as node:
+        poses = graph.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
+        node.wait_for('waiting for the first image')
+        publishers = faults.drivers(graph)
+        faults.play(publishers, messages)
+        node.wait_for(f'on /tf_static: "{IMU_FRAME}"')
+        (tmp_path / 'tf').touch()
+        node.wait_for(f'from /tf_static, {IMU_FRAME} in {CAMERA_FRAME}: quat_cam_imu_xyzw')
+        wait_until(lambda: node.output.count('ready:') == 1, 'a start', node)
+        faults.play(publishers, messages, later=100.0)
+        wait_until(lambda: poses, 'a pose', node)
+        assert 'Traceback' not in node.output
 
 
 @pytest.mark.live

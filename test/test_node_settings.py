@@ -211,8 +211,8 @@ class TransformException(Exception):
 class Buffer:
     def lookup_transform(self, parent, child, time):
         known, names = os.environ.get('TF', '').split(), ('x', 'y', 'z', 'w')
-        if known[:2] != [parent, child]:
-            raise TransformException
+        if known[:2] != [parent, child] or not os.path.exists(os.environ.get('TF_FILE', '/')):
+            raise TransformException(f'"{child}" does not exist')
         values = [float(word) for word in known[2:]]
         return SimpleNamespace(transform=SimpleNamespace(
             translation=SimpleNamespace(**dict(zip(names, values[:3]))),

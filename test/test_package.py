@@ -176,7 +176,7 @@ MAY_IMPORT = {
     'calibrate': CORE | {'pipeline', 'messages', 'bags'},
     'offline': CORE | {'pipeline', 'messages', 'bags', 'calibrate'},
     'odometry': BASE | {'estimator', 'imu', 'pipeline', 'messages', 'bags', 'offline'},
-    'cli': BASE | {'bags', 'offline', 'calibrate', 'odometry'},
+    'cli': BASE | {'messages', 'bags', 'offline', 'calibrate', 'odometry'},
 }
 # The laboratory uses all of the product, and nothing of the product imports it.
 MAY_IMPORT_IN_THE_LABORATORY = {

@@ -559,27 +559,27 @@ _MOST_SLOPE_SIGMA = 0.5
 
 
 def evaluated(data: Observations, final: Fit, curve: CostCurve,
-              config: CalibrationConfig) -> CalibrationResult:
-    """Result of a fit; InputError if the readout time is longer than the frame interval."""
+              config: CalibrationConfig, *, axes_known: bool = False) -> CalibrationResult:
+    """Result of a fit; `axes_known`: also of a transform. InputError for a readout too long."""
     covariance = final.covariance + np.diag(np.where(final.free, _tracker_sigmas(config), 0.0)**2)
     unknowns = final.unknowns
     if final.free[model.FOCAL]:
         # Widened, the sigmas of the lens may exceed those of its priors.
         lens = slice(model.RADIAL, model.EXPOSURE)
-        unknowns, covariance = _joined(unknowns, covariance, lens, final.problem.center[lens],
+        unknowns, covariance = joined(unknowns, covariance, lens, final.problem.center[lens],
                                        1.0 / final.problem.prior[lens])
     bounded, covariance, beyond = _bounded(unknowns, covariance, data.interval)
     parameters, R_cam_imu = bounded.parameters, bounded.R_imu_cam.T
-    rates, one_axis = data.excitation(parameters[model.BIAS:model.BIAS + 3], R_cam_imu,
-                                      config.min_rotation_rate)
+    rates, one_axis, _ = data.excitation(parameters[model.BIAS:model.BIAS + 3], R_cam_imu,
+                                         config.min_rotation_rate)
     sigmas = np.sqrt(np.diag(covariance))
     # Row 0 is read this share of the readout before the middle row.
     to_first = np.zeros(GLOBAL)
     height = data.camera.height
     to_first[[model.OFFSET, READOUT]] = 1.0, -0.5 * (height - 1) / height
     # Rotations about the axes of the camera.
-    rotation_covariance = covariance[ROTATION:ROTATION + 3, ROTATION:ROTATION + 3]
-    rotation_sigma = np.sqrt(np.diag(R_cam_imu @ rotation_covariance @ R_cam_imu.T))
+    part = slice(ROTATION, ROTATION + 3)
+    rotation_sigma = np.sqrt(np.diag(R_cam_imu @ covariance[part, part] @ R_cam_imu.T))
     axis_map = nearest_axis_map(R_cam_imu)
     cosine = (np.trace(R_cam_imu @ axis_map.T) - 1.0) / 2.0
     bias_x, bias_y, bias_z = (_estimate(parameters[i], sigmas[i], config.max_bias_sigma)
@@ -606,7 +606,7 @@ def evaluated(data: Observations, final: Fit, curve: CostCurve,
                               config.max_offset_sigma),
         R_cam_imu=R_cam_imu, rotation_sigma=rotation_sigma,
         rotation=_estimate(math.acos(np.clip(cosine, -1.0, 1.0)), rotation_sigma.max(),
-                           config.max_rotation_sigma, one_axis),
+                           config.max_rotation_sigma, '' if axes_known else one_axis),
         axis_map=axis_map, gyro_bias=(bias_x, bias_y, bias_z), focal_factor=focal,
         radial=radial, center=center, exposure=_exposure(data, final, sigmas[model.EXPOSURE]),
         exposure_margin=data.exposure.margin,
@@ -640,8 +640,8 @@ def _exposure(data: Observations, final: Fit, square_sigma: float) -> Estimate:
     return Estimate(value, sigma, sigma <= 0.5 * value, 'the images do not show any')
 
 
-def _joined(unknowns: Unknowns, covariance: Array, known: slice, values: Array | float,
-            variances: Array | float) -> tuple[Unknowns, Array]:
+def joined(unknowns: Unknowns, covariance: Array, known: slice, values: Array | float,
+           variances: Array | float) -> tuple[Unknowns, Array]:
     """The calibration with independent values of some parameters, and its covariance."""
     own = covariance[known, known]
     gain = covariance[:, known] @ np.linalg.inv(own + variances * np.eye(len(own)))
@@ -661,7 +661,7 @@ def _bounded(unknowns: Unknowns, covariance: Array,
     """
     known = interval / math.sqrt(12.0)
     if covariance[READOUT, READOUT] > known**2:
-        return (*_joined(unknowns, covariance, slice(READOUT, READOUT + 1), 0.5 * interval,
+        return (*joined(unknowns, covariance, slice(READOUT, READOUT + 1), 0.5 * interval,
                          known**2),
                 ('the images hardly determine the readout time: it is mostly that of any camera '
                 f'that is read downwards within the {1e3 * interval:.1f} ms between frames'))

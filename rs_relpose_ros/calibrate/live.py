@@ -20,6 +20,7 @@ from rs_relpose_ros.config.settings import CalibrationConfig, Parameters, TRACKE
 from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.messages.incoming import Role
+from rs_relpose_ros.messages.transforms import AXES_SIGMA
 
 # Length of the recording [s]: of the first fit, kept at most, and added before the next fit.
 _FIRST, _LONGEST, _STEP = 6.0, 60.0, 2.0
@@ -28,6 +29,9 @@ _FIRST, _LONGEST, _STEP = 6.0, 60.0, 2.0
 _LONG, _WIDER = 10.0, 2.0
 _LIMITS = ('max_readout_sigma', 'max_offset_sigma', 'max_rotation_sigma', 'max_bias_sigma',
            'max_focal_sigma')
+# From this length on [s] a rotation as exact as that of a transform suffices: a robot on wheels
+# rotates about one axis only.
+_WHEELS = 20.0
 # Images that wait to be tracked; more are left out.
 _WAITING = 8
 # Images without a usable CameraInfo after which the lens counts as uncalibrated.
@@ -43,12 +47,14 @@ class LiveCalibration:
     """Takes the place of intake and frame loop until the calibration is known.
 
     `receive` is for the thread of the subscriptions, `step` for the worker. With `use_stored` the
-    file of the camera is used, if there is one; without `fits` it is waited for.
+    file of the camera is used, if there is one. `waits_for`: what others will give, in place of
+    a fit. `quat_prior`: rotation IMU to camera of a transform, +- 5 deg.
     """
 
-    def __init__(self, parameters: Parameters, *, use_stored: bool, fits: bool = True) -> None:
+    def __init__(self, parameters: Parameters, *, use_stored: bool, waits_for: str = '') -> None:
         self._parameters = parameters
-        self._use_stored, self._fits = use_stored, fits
+        self._use_stored, self.waits_for = use_stored, waits_for
+        self.quat_prior: tuple[float, ...] | None = None
         self._queue: Queue[tuple[Role, Any]] = Queue()
         # Images put into the queue by `receive`, and taken by `step`: a thread each.
         self._put = self._taken = 0
@@ -133,8 +139,8 @@ class LiveCalibration:
         path = stored.path_of(self._parameters.calibration, self._camera)
         if not (self._use_stored and path.is_file()):
             return Progress('calibrating: rotate the camera about all three axes, 20 to 60 deg/s, '
-                            'for some 20 s' if self._fits else
-                            'waiting for a calibration by relpose_node on calibration')
+                            'for some 20 s' if not self.waits_for else
+                            f'waiting for {self.waits_for}')
         try:
             _, day = stored.load(path, self._camera)
             return Calibrated(self._camera, path.read_text(encoding='utf-8'),
@@ -151,7 +157,7 @@ class LiveCalibration:
             return self._evaluated(result, recording)
         recorder = self._recorder
         grown = 1e-9 * (recorder.last_ns - self._fitted_ns) if self._fitted_ns else _STEP
-        if not self._fits or recorder.seconds < _FIRST or grown < _STEP:
+        if self.waits_for or recorder.seconds < _FIRST or grown < _STEP:
             return None
         self._fitted_ns = recorder.last_ns
         sensor = self._parameters.sensor
@@ -159,8 +165,10 @@ class LiveCalibration:
                          exposure_margin=sensor.exposure_margin)
         if recorder.seconds >= _LONG:
             config = replace(config, **{name: _WIDER * getattr(config, name) for name in _LIMITS})
+        if recorder.seconds >= _WHEELS and self.quat_prior is not None:
+            config = replace(config, max_rotation_sigma=1.1 * AXES_SIGMA)
         try:
-            self._fit = _Fit(recorder.recording(), config)
+            self._fit = _Fit(recorder.recording(), config, self.quat_prior)
         except RsRelposeError as error:
             return Progress(f'calibrating: {error}')
         return None
@@ -191,11 +199,12 @@ class _Fit:
     Not by multiprocessing, which unblocks the signals of the calling thread.
     """
 
-    def __init__(self, recording: CalibrationInput, config: CalibrationConfig) -> None:
+    def __init__(self, recording: CalibrationInput, config: CalibrationConfig,
+                 quat_prior: tuple[float, ...] | None) -> None:
         self.recording = recording
         self._result = TemporaryFile()   # noqa: SIM115 closed by result or stop
         with TemporaryFile() as arguments:
-            pickle.dump((recording, config), arguments)
+            pickle.dump((recording, config, quat_prior), arguments)
             arguments.seek(0)
             self._process = subprocess.Popen([sys.executable, '-m', __name__], stdin=arguments,
                                              stdout=self._result)
@@ -223,11 +232,11 @@ class _Fit:
 def _fit() -> None:
     """Fit the pickled recording of stdin, and write the result, or its error, to stdout."""
     os.nice(_NICE)
-    recording, config = pickle.load(sys.stdin.buffer)   # noqa: S301 of the parent
+    recording, config, quat_prior = pickle.load(sys.stdin.buffer)   # noqa: S301 of the parent
     try:
         result: CalibrationResult | RsRelposeError = calibrate(
             recording.tracks, recording.gyro, recording.camera,
-            focal_known=recording.focal_known, config=config)
+            focal_known=recording.focal_known, config=config, quat_prior=quat_prior)
     except RsRelposeError as error:
         result = error
     pickle.dump(result, sys.stdout.buffer)

@@ -309,8 +309,11 @@ class Observations:
         """Steps (K - 1,) between samples of the gyro [s]."""
         return np.diff(self.gyro_times)
 
-    def excitation(self, bias: Array, R_cam_imu: Array, least: float) -> tuple[Array, str]:
-        """Rms rates (3,) about the camera's axes [rad/s], and what is missing (empty: nothing)."""
+    def excitation(self, bias: Array, R_cam_imu: Array, least: float) -> tuple[Array, str, Array]:
+        """Rms rates (3,) about the camera's axes [rad/s], what is missing (empty: nothing), axis.
+
+        The latter (3,) is that of the most rotation, a unit vector of the camera.
+        """
         inside = (self.gyro_times >= self.times[0]) & (self.gyro_times <= self.times[-1])
         rates = (self.gyro_rates[inside] - bias) @ R_cam_imu.T
         rates = rates - rates.mean(axis=0)
@@ -318,13 +321,13 @@ class Observations:
         values, vectors = np.linalg.eigh(rates.T @ rates / len(rates))
         # Two axes fix a rotation.
         if np.sqrt(max(values[1], 0.0)) >= least:
-            return rms, ''
+            return rms, '', vectors[:, 2]
         main = vectors[:, 2]
         lacking = [AXES[i] for i in np.argsort(np.abs(main))[:2]]
         about = AXES[int(np.argmax(np.abs(main)))]
         return rms, (f'the camera rotates about one axis only, nearly {about}, so the rotation '
                      f'about it is not observable: rotate about {lacking[0]} and {lacking[1]} '
-                     'too, 20 to 60 deg/s')
+                     'too, 20 to 60 deg/s'), main
 
     def pairs(self, selection: PairSelection, rng: np.random.Generator) -> Pairs:
         """All pairs of these spans without lost frames."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 import logging
 import math
@@ -11,15 +11,18 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.bags.reader import Bag, SensorTopics
 from rs_relpose_ros.calibrate import fit
 from rs_relpose_ros.calibrate.coplanarity import (
+    BIAS,
     EXPOSURE,
     FOCAL,
     GLOBAL,
     LENS,
     OFFSET,
+    ROTATION,
     SLOPE,
     Unknowns,
 )
@@ -30,8 +33,10 @@ from rs_relpose_ros.config.settings import CalibrationConfig, TrackingConfig
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.distortion import DISTORTION_MODELS
+from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.messages.incoming import PARTS, ReasonCounts, Role, sensor_messages
+from rs_relpose_ros.messages.transforms import AXES_SIGMA
 from rs_relpose_ros.tracking.features import make_tracker
 from rs_relpose_ros.tracking.images import EncodedImage, GrayLevels
 
@@ -47,11 +52,14 @@ _PAIRS_AT_START = _SOME_PAIRS._replace(spans=(0.067,))
 _NEIGHBOURS = _ALL_PAIRS._replace(spans=(0.0,), min_matches=8)
 # Changes of the lens within which the fit is linear in it, and fits at the most.
 _LENS_STAYS, _LENS_ROUNDS = (0.01, 0.02, 5.0, 5.0), 6
+# Sigma of an angle that is not known [rad].
+_ANY_ANGLE = math.pi / math.sqrt(3.0)
 _FOCAL_FACTORS = np.geomspace(0.5, 2.0, 9)
 
 
 def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
               focal_known: bool = True, config: CalibrationConfig | None = None,
+              quat_prior: Sequence[float] | None = None,
               rng: np.random.Generator | int = 0,
               progress: Callable[[float], object] = lambda share: None) -> CalibrationResult:
     """Readout time, clock offset, rotation, gyro bias and perhaps focal length, without a guess.
@@ -60,20 +68,22 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
     `rs_relpose_ros.calibrate.coplanarity` and docs/calibration.md.
 
     The clock of `gyro` differs from the camera's by at most ``config.max_time_offset``; the
-    readout time of `camera` is not used. Unless `focal_known`, fx and fy are a guess within a
-    factor of 2, whose ratio holds, and focal length, first coefficient of the distortion and
-    principal point are estimated. `rng` selects matches if
-    there are more than needed; `progress` is called with the finished share of the work.
+    readout time of `camera` is not used. `quat_prior`: rotation IMU to camera of a transform, x y
+    z w, +- 5 deg. Unless `focal_known`, fx and fy are a guess within a factor of 2, whose ratio
+    holds, and focal length, first coefficient of the distortion and principal point are estimated.
+    `rng` selects matches if there are more than needed; `progress` is called with the finished
+    share of the work.
     InputError if the recording cannot be used, with what to record instead.
     """
     config = CalibrationConfig() if config is None else config
+    R_prior = None if quat_prior is None else Rotation.from_quat(quat_prior).as_matrix()
     rng = np.random.default_rng(rng)
     if len(tracks) < 2 or len(gyro) < 2:
         raise InputError(f'{len(tracks)} frames and {len(gyro)} gyro samples are too few: record '
                          'at least 10 s with both')
     data = Observations.of(tracks, gyro, camera, config)
     _check_recording(data, config)
-    starts = _starts(data, focal_known, config, rng)
+    starts = _starts(data, focal_known, R_prior, config, rng)
     progress(0.15)
 
     def about(lens: Array) -> Observations:
@@ -101,7 +111,31 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
                                  config.max_gyro_gap, rng)
     curve = fit.cost_curve(fit.with_bends(some, final.unknowns), final, data.interval,
                            lambda share: progress(0.8 + 0.2 * share))
-    return fit.evaluated(data, final, curve, config)
+    final, axes_known = _with_axes(data, final, R_prior, config)
+    return fit.evaluated(data, final, curve, config, axes_known=axes_known)
+
+
+def _with_axes(data: Observations, final: fit.Fit, R_prior: Array | None,
+               config: CalibrationConfig) -> tuple[fit.Fit, bool]:
+    """The fit joined with the rotation of a transform, and whether: not if they contradict."""
+    if R_prior is None:
+        return final, False
+    R, part = final.unknowns.R_imu_cam, slice(ROTATION, ROTATION + 3)
+    covariance = final.covariance.copy()
+    _, one_axis, axis = data.excitation(final.unknowns.parameters[BIAS:BIAS + 3], R.T,
+                                        config.min_rotation_rate)
+    if one_axis:   # about which the fit means nothing
+        axis = R @ axis
+        covariance[part] -= np.outer(axis, axis @ covariance[part])
+        covariance[:, part] -= np.outer(covariance[:, part] @ axis, axis)
+        covariance[part, part] += _ANY_ANGLE**2 * np.outer(axis, axis)
+    turn = log_so3(np.ascontiguousarray((R @ R_prior).T))
+    # As `angle_between`, axis by axis.
+    if turn @ np.linalg.solve(AXES_SIGMA**2 * np.eye(3) + 9.0 * covariance[part, part],
+                              turn) > 1.0:
+        return final, False
+    unknowns, covariance = fit.joined(final.unknowns, covariance, part, turn, AXES_SIGMA**2)
+    return replace(final, unknowns=unknowns, covariance=covariance), True
 
 
 def _check_recording(data: Observations, config: CalibrationConfig) -> None:
@@ -138,8 +172,8 @@ def _check_recording(data: Observations, config: CalibrationConfig) -> None:
             'all three axes, 20 to 60 deg/s')
 
 
-def _starts(data: Observations, focal_known: bool, config: CalibrationConfig,
-            rng: np.random.Generator) -> list[Start]:
+def _starts(data: Observations, focal_known: bool, R_prior: Array | None,
+            config: CalibrationConfig, rng: np.random.Generator) -> list[Start]:
     pairs = data.pairs(_NEIGHBOURS, rng)
     if len(pairs) < 0.5 * len(data.tracks):
         raise InputError(
@@ -149,7 +183,7 @@ def _starts(data: Observations, focal_known: bool, config: CalibrationConfig,
     found = find_starts(
         data.image_rates(pairs), data.times[pairs.first], data.times[pairs.second],
         data.gyro_times, data.gyro_rates, max_offset=config.max_time_offset + 0.02, step=5e-3,
-        focal_factors=np.ones(1) if focal_known else _FOCAL_FACTORS, count=3)
+        focal_factors=np.ones(1) if focal_known else _FOCAL_FACTORS, count=3, R_prior=R_prior)
     if not found:
         raise InputError('the gyro does not cover the images: record both together')
     return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 import math
 from pathlib import Path
@@ -219,10 +220,12 @@ def _shutter_text(result: CalibrationResult) -> str:
 
 
 def parameter_file(result: CalibrationResult, title: str, *, camera: RollingShutterCamera,
-                   compressed: bool, feature_rows: tuple[float, ...] = (0.0, 0.0)) -> str:
+                   compressed: bool, feature_rows: tuple[float, ...] = (0.0, 0.0),
+                   placed: Mapping[str, Any] | None = None) -> str:
     """The node's parameter file: each value with its sigma; undetermined ones are named only.
 
-    `camera` is that of the calibration: a guess if the lens was not known.
+    `camera` is that of the calibration: a guess if the lens was not known. `placed`: parameters
+    of a transform.
     """
     # Parameters of each quantity, if it is determined.
     groups = [
@@ -247,6 +250,8 @@ def parameter_file(result: CalibrationResult, title: str, *, camera: RollingShut
     values += [value for part, _, group in groups if part.determined for value in group]
     if feature_rows[1] > 0.0:
         values.append(SourcedValue('feature_rows', tuple(feature_rows), 'As given to calibrate.'))
+    values += [SourcedValue(name, value, 'By /tf_static.')
+               for name, value in (placed or {}).items()]
     missing = [f'{name} ({part.remark})' for part, name, _ in groups if not part.determined]
     if missing:
         title += ' Not observable in this recording, so left out: ' + '; '.join(missing) + '.'

@@ -83,12 +83,14 @@ def rotation_between(rays1: Array, rays2: Array) -> Array:
 
 
 def find_starts(rates: Array, begins: Array, ends: Array, gyro_times: Array, gyro_rates: Array, *,
-                max_offset: float, step: float, focal_factors: Array, count: int) -> list[Start]:
+                max_offset: float, step: float, focal_factors: Array, count: int,
+                R_prior: Array | None = None) -> list[Start]:
     """Offsets at which the rotated gyro agrees best with the images; best first.
 
     `rates` (P, 3) of the camera hold between `begins` and `ends` (P,) [s] on its clock. Offsets to
     +- `max_offset` [s] are searched in steps of `step`, with each of the `focal_factors` of the
-    assumed focal length; at most `count` starts of different offsets are returned.
+    assumed focal length; at most `count` starts of different offsets are returned. Where the
+    rotation about one axis is not determined, it is that of `R_prior`, or of an axis map.
     """
     turned = cumulative_trapezoid(gyro_rates, gyro_times, axis=0, initial=0.0)
     starts: list[Start] = []
@@ -102,7 +104,8 @@ def find_starts(rates: Array, begins: Array, ends: Array, gyro_times: Array, gyr
             (np.interp(end, gyro_times, of_axis) - np.interp(begin, gyro_times, of_axis))
             / (end - begin) for of_axis in turned.T], axis=1)
         starts.append(min((_aligned(rates[inside] * [1.0 / factor, 1.0 / factor, 1.0], measured,
-                                    float(offset), float(factor)) for factor in focal_factors),
+                                    float(offset), float(factor), R_prior)
+                           for factor in focal_factors),
                           key=lambda start: start.misfit))
     chosen: list[Start] = []
     for start in sorted(starts, key=lambda start: start.misfit):
@@ -111,14 +114,15 @@ def find_starts(rates: Array, begins: Array, ends: Array, gyro_times: Array, gyr
     return chosen[:count]
 
 
-def _aligned(estimated: Array, measured: Array, offset: float, focal_factor: float) -> Start:
+def _aligned(estimated: Array, measured: Array, offset: float, focal_factor: float,
+             R_prior: Array | None) -> Start:
     """Start with the rotation between two series of rates (P, 3) without their outliers."""
     kept = np.ones(len(estimated), dtype=bool)
     start = Start(offset, np.eye(3), focal_factor, 1.0)
     for _ in range(3):
         # A bias and a constant translation drop out with the means.
         a, b = (rates - rates[kept].mean(axis=0) for rates in (estimated, measured))
-        R = _rotation_onto(a[kept], b[kept])
+        R = _rotation_onto(a[kept], b[kept], R_prior)
         squares = ((a - b @ R.T)**2).sum(axis=1)
         both = float((a[kept]**2).sum()) + float((b[kept]**2).sum())
         start = start._replace(
@@ -127,12 +131,12 @@ def _aligned(estimated: Array, measured: Array, offset: float, focal_factor: flo
     return start
 
 
-def _rotation_onto(estimated: Array, measured: Array) -> Array:
-    """Rotation R with ``estimated = R measured``; of one axis, the one nearest to an axis map."""
+def _rotation_onto(estimated: Array, measured: Array, R_prior: Array | None) -> Array:
+    """Rotation R with ``estimated = R measured``; of one axis, the one nearest to a known one."""
     C = estimated.T @ measured
     u, s, vt = np.linalg.svd(C)
     if s[1] < _ONE_AXIS * s[0]:
-        nearest = nearest_axis_map(C)
+        nearest = nearest_axis_map(C) if R_prior is None else R_prior
         tilt, _ = Rotation.align_vectors(u[:, :1].T, vt[:1] @ nearest.T)
         return np.asarray(tilt.as_matrix() @ nearest)
     return so3.aligning_rotation(C)

@@ -15,6 +15,7 @@ from tqdm import tqdm
 from rs_relpose_ros.bags.reader import Bag, open_bag, SensorTopics, Topic
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import Parameters
+from rs_relpose_ros.messages.transforms import with_extrinsics
 from rs_relpose_ros.offline.replay import need_sensor_parameters
 from rs_relpose_ros.offline.tables import write_summary
 from rs_relpose_ros.output_files import SUMMARY_FILE
@@ -92,7 +93,7 @@ def run_on_bag(args: argparse.Namespace, suffix: str, work: Work[Made],
     with open_bag(args.bag) as bag:
         topics = bag.find_topics(topic_options(args),
                                  needs_camera_info=not parameters.intrinsics.given)
-        check_parameters(parameters, args)
+        parameters = completed(bag, topics, parameters, args)
         with image_progress(bag, topics.image, bag_name(args.bag)):
             results = work(folder, bag, topics, parameters)
     write_summary(folder / SUMMARY_FILE, results.metrics, bag=args.bag, topics=topics,
@@ -117,14 +118,20 @@ def topic_options(args: argparse.Namespace) -> dict[str, str]:
             if name.endswith('_topic')}
 
 
-def check_parameters(parameters: Parameters, args: argparse.Namespace) -> None:
-    """Raise MissingInputError for required parameters that no message contains.
+def completed(bag: Bag, topics: SensorTopics, parameters: Parameters,
+              args: argparse.Namespace) -> Parameters:
+    """`parameters` with the extrinsics of the bag's transforms where they have none.
 
-    `args` have `bag` and the options of `add_parameter_arguments`.
+    MissingInputError for required parameters that no message contains. `args` have `bag` and the
+    options of `add_parameter_arguments`.
     """
+    parameters, contradiction = with_extrinsics(bag, topics, parameters)
+    if contradiction:
+        _logger.warning('%s', contradiction)
     neighbour = args.bag.resolve().with_name(f'{bag_name(args.bag)}.yaml')
     need_sensor_parameters(parameters, f'use --params {neighbour}, the file next to the bag'
                            if args.params is None and neighbour.is_file() else '')
+    return parameters
 
 
 def bag_name(bag: Path) -> str:

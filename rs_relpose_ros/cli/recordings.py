@@ -10,7 +10,7 @@ import logging
 from pathlib import Path
 import shutil
 import sys
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rs_relpose_ros.bags import phones, video
 from rs_relpose_ros.bags.convert import Recording, write_bag
@@ -25,6 +25,7 @@ from rs_relpose_ros.config.files import read_parameters, write_parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.distortion import DISTORTION_MODELS
+from rs_relpose_ros.messages.transforms import bag_frames, extrinsics
 from rs_relpose_ros.offline.check import check_bag, CheckReport, choose_topics
 from rs_relpose_ros.offline.unroll import unroll
 from rs_relpose_ros.output_files import prepare_folder, refuse_unwritable
@@ -81,6 +82,8 @@ def calibrate_bag(
         topics = bag.find_topics(options.topic_options(args), needs_camera_info=False)
         with options.image_progress(bag, topics.image, 'tracking'):
             recording = read_recording(bag, topics, tracking)
+        frames = bag_frames(bag, topics)
+        placed = frames.imu_in_camera
     if args.lens is not None:
         recording = recording.with_unknown_lens(args.lens)
     first, last = args.rows
@@ -90,13 +93,22 @@ def calibrate_bag(
     options.warn_unused(recording.unused)
     with options.progress_bar(100, '%', 'fitting') as bar:
         result = calibrate(recording.tracks, recording.gyro, recording.camera,
-                           focal_known=recording.focal_known, config=config,
+                           focal_known=recording.focal_known, config=config, quat_prior=placed
+                           and placed[3:],
                            progress=lambda share: bar.update(round(100 * share) - bar.n))
+    values: dict[str, Any] = {}
+    if placed is not None:
+        values, contradiction = extrinsics(
+            settings.Parameters.from_mapping({'quat_cam_imu_xyzw': result.quat_cam_imu_xyzw,
+                                              'axes_sigma': min(result.rotation.sigma, 1.0)}),
+            placed, frames.camera, frames.imu)
+        if contradiction:
+            _logger.warning('%s', contradiction)
     prepare_folder(folder, _CALIBRATION_FILES)
     text = calibration.parameter_file(
         result, f'Parameters of relpose_node from `rs_relpose calibrate {args.bag.name}`.',
         camera=recording.camera, compressed=topics.image.msgtype == COMPRESSED_IMAGE,
-        feature_rows=tuple(args.rows))
+        feature_rows=tuple(args.rows), placed=values)
     parameters, metrics, curve = (folder / name for name in _CALIBRATION_FILES)
     parameters.write_text(text, encoding='utf-8')
     mapping = calibration.as_mapping(result, recording.camera)
@@ -268,10 +280,10 @@ def _add_unroll_arguments(parser: argparse.ArgumentParser) -> None:
 def _unroll(args: argparse.Namespace) -> int:
     refuse_existing(args.out_bag)
     parameters = read_parameters(args.params, args.set, node='global_shutter_node')
-    options.check_parameters(parameters, args)
     with open_bag(args.bag) as bag:
         topics = bag.find_topics(options.topic_options(args),
                                  needs_camera_info=not parameters.intrinsics.given)
+        parameters = options.completed(bag, topics, parameters, args)
         with options.image_progress(bag, topics.image, options.bag_name(args.bag)):
             report = unroll(bag, topics, parameters, args.out_bag)
     for line in report.warnings:

@@ -459,8 +459,8 @@ class StoredCalibrationConfig(Settings):
     load_calibration: bool = setting(True, 'use the file, if it exists')
     save_calibration: bool = setting(True, 'write the file after a calibration')
     use_tf: bool = setting(
-        True, 'imu_position from /tf_static, if it is not given; its rotation is compared with '
-        'quat_cam_imu_xyzw')
+        True, 'quat_cam_imu_xyzw (+- 5 deg) and imu_position (+- 2 cm) from /tf_static and /tf '
+        'where they are not given; a rotation that differs is reported')
 
 
 @lru_cache(maxsize=16)

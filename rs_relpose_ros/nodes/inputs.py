@@ -114,28 +114,36 @@ def transform_broadcaster(node: Node, parameter: str) -> Any:
                                 f'ros-jazzy-tf2-ros-py, or set {parameter} to false') from error
 
 
-def transform_lookup(node: Node) -> Callable[[str, str], tuple[float, ...] | None]:
-    """Function of (parent, child): x y z, quaternion x y z w of the child's pose; None if unknown.
+class TransformLookup:
+    """Finds x y z, quaternion x y z w of a frame in another one by /tf and /tf_static.
 
-    It listens to /tf and /tf_static until it knows one. Without tf2_ros nothing is known.
+    It listens until it finds one; `problem`: why it has not, such as the missing frame.
     """
-    try:
-        tf2_ros = importlib.import_module('tf2_ros')
-    except ImportError:
-        return lambda parent, child: None
-    buffer = tf2_ros.Buffer()
-    listener = tf2_ros.TransformListener(buffer, node)
 
-    def lookup(parent: str, child: str) -> tuple[float, ...] | None:
+    def __init__(self, node: Node) -> None:
+        self.problem, self._listener = '', None
         try:
-            found = buffer.lookup_transform(parent, child, Time()).transform
-        except tf2_ros.TransformException:
+            self._tf2: Any = importlib.import_module('tf2_ros')
+        except ImportError:
+            self._tf2, self.problem = None, 'tf2_ros is not installed'
+            return
+        self._buffer = self._tf2.Buffer()
+        self._listener = self._tf2.TransformListener(self._buffer, node)
+
+    def __call__(self, parent: str, child: str) -> tuple[float, ...] | None:
+        """Pose of `child` in `parent`; None if it is unknown."""
+        if self._tf2 is None:
             return None
-        listener.unregister()
+        try:
+            found = self._buffer.lookup_transform(parent, child, Time()).transform
+        except self._tf2.TransformException as error:
+            self.problem = str(error)
+            return None
+        if self._listener is not None:
+            self._listener.unregister()
+            self._listener = None
         t, q = found.translation, found.rotation
         return t.x, t.y, t.z, q.x, q.y, q.z, q.w
-
-    return lookup
 
 
 def overridable() -> QoSOverridingOptions:

@@ -17,6 +17,7 @@ from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.messages.incoming import PARTS, Role, stamp_ns
+from rs_relpose_ros.messages.transforms import extrinsics
 from rs_relpose_ros.nodes import inputs
 from rs_relpose_ros.nodes.inputs import message_class
 from rs_relpose_ros.nodes.parameters import legal_qos
@@ -55,6 +56,8 @@ class OdometryNode(StoppableNode):
         need_gtsam()
         warm_up_odometry()
         self._begun = False
+        self._imu_lookup = (inputs.TransformLookup(self)
+                            if self._settings.current.calibration.use_tf else None)
         self.create_subscription(String, 'calibration', self._on_calibration, inputs.LATCHED)
         missing = self._settings.current.sensor.missing()
         if missing:
@@ -81,7 +84,7 @@ class OdometryNode(StoppableNode):
         self._estimator = OdometryEstimator(parameters)
         self._continuous = ContinuousPath(self._estimator)
         if self._estimator.base is None:
-            self._lookup = inputs.transform_lookup(self)
+            self._lookup = inputs.TransformLookup(self)
 
     def _begin(self, parameters: Parameters) -> None:
         self._begun, self._config = True, parameters.odometry
@@ -143,6 +146,7 @@ class OdometryNode(StoppableNode):
         self._silent[self._pairs] = 0
         try:
             pair = KeyframePair.of_message(message)
+            self._place_imu(pair.frame_id, self._frames.get(Role.IMU, ''))
             base = self._config.base_frame
             if self._estimator.base is None and (found := self._lookup(base, pair.frame_id)):
                 self._estimator.base = Base.of(base, found)
@@ -153,6 +157,18 @@ class OdometryNode(StoppableNode):
         # Else with the next state: the graph must not delay it.
         if self._config.odometry_rate < _LEAST_RATE:
             self._read_sensors()
+
+    def _place_imu(self, camera: str, imu: str) -> None:
+        """Position of the IMU by /tf_static, if it is there before the path begins."""
+        if (self._imu_lookup is None or not imu or imu == camera or self._estimator.starts
+                or (found := self._imu_lookup(camera, imu)) is None):
+            return
+        self._imu_lookup = None
+        values, contradiction = extrinsics(self._settings.current, found, camera, imu)
+        if contradiction:
+            self._warn(contradiction)
+        if values:
+            self._settings.adopt(values)
 
     def _on_sample(self, role: Role, message: Any) -> None:
         frame = message.header.frame_id

@@ -16,7 +16,6 @@ import traceback
 from typing import Any, ClassVar, NoReturn, TextIO, TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticArray
-import numpy as np
 import rclpy
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -24,7 +23,6 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
-from scipy.spatial.transform import Rotation
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
@@ -36,6 +34,7 @@ from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.messages.incoming import Intake, PARTS, Role
+from rs_relpose_ros.messages.transforms import extrinsics
 from rs_relpose_ros.nodes import diagnostics
 from rs_relpose_ros.nodes import parameters as ros_parameters
 from rs_relpose_ros.nodes.diagnostics import PATIENCE, ReasonLog, SILENCE
@@ -44,7 +43,7 @@ from rs_relpose_ros.nodes.inputs import (
     message_class,
     SensorInputs,
     SHUT_DOWN,
-    transform_lookup,
+    TransformLookup,
 )
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrameFailed, FrameLoop, Outcome
@@ -199,14 +198,6 @@ _JOIN_TIMEOUT = 0.4
 _REPORT_COMPILING = 4.0
 
 
-# Uncertainty of a position from /tf_static [m]; largest deviation of its rotation [deg].
-_TF_POSITION_SIGMA, _TF_ROTATION = 0.02, 5.0
-
-
-def _quaternion(values: Sequence[float]) -> str:
-    return f'[{", ".join(f"{value:.4f}" for value in values)}]'
-
-
 def _camera(parameters: Parameters) -> list[Any]:
     """The parameters with a change of which a node begins again."""
     values = parameters.to_mapping()
@@ -237,8 +228,10 @@ class SensorNode(StoppableNode):
             self._open_outputs(self._settings.current)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_service(Trigger, '~/reset', self._reset)
-        self._lookup = (transform_lookup(self) if self._settings.current.calibration.use_tf
+        # None once its transform is used; the rotation IMU to camera in it.
+        self._lookup = (TransformLookup(self) if self._settings.current.calibration.use_tf
                         else None)
+        self._quat_prior: tuple[float, ...] | None = None
         self._found: Calibrated | None = None   # to be used by the executor's thread
         self._calibrated: Calibrated | None = None   # in use
         if self.calibrates:
@@ -275,7 +268,8 @@ class SensorNode(StoppableNode):
         """The fault of parameters or topics; empty for none."""
         parameters, idle = self._settings.current, self._frame_statistics.idle
         missing = parameters.sensor.missing()
-        if missing and parameters.calibration.calibrate_at_start == 'never':
+        if (missing and parameters.calibration.calibrate_at_start == 'never'
+                and not self._waits_for_tf()):
             return (f'{idle}: {" and ".join(missing)} must be given as parameter, or allow '
                     'calibrate_at_start: missing')
         topic = self.resolve_topic_name('image')
@@ -284,8 +278,14 @@ class SensorNode(StoppableNode):
                     'timestamp; remap image to the raw one')
         return ''
 
+    def _waits_for_tf(self) -> bool:
+        """Whether only the rotation is missing, and /tf_static may give it."""
+        return (self._lookup is not None and not self._calibrating
+                and self._settings.current.sensor.missing() == ['quat_cam_imu_xyzw'])
+
     def _begin(self, calibrate: bool = False) -> None:
         """Estimate with the current parameters from here on, or calibrate before."""
+        self._calibrating = calibrate
         if self._worker is not None:
             self._worker.stop(_JOIN_TIMEOUT)
         self._active = parameters = self._settings.current
@@ -299,10 +299,18 @@ class SensorNode(StoppableNode):
         if calibrate or parameters.sensor.missing():
             # Imported where it is needed: a start with a calibration is faster by it.
             from rs_relpose_ros.calibrate.live import LiveCalibration
-            self._intake: Any = LiveCalibration(parameters, use_stored=not calibrate
-                                                and parameters.calibration.load_calibration,
-                                                fits=self.calibrates)
-            self._calibration = self._intake
+            config, others = parameters.calibration, [
+                'the rotation of the IMU on /tf_static'] if self._waits_for_tf() else []
+            if not self.calibrates:
+                others.append('a calibration by relpose_node on '
+                              + self.resolve_topic_name('calibration'))
+            fits = self.calibrates and config.calibrate_at_start != 'never'
+            self._calibration = LiveCalibration(
+                parameters, use_stored=not calibrate and config.load_calibration
+                and config.calibrate_at_start != 'never',
+                waits_for='' if fits else ' or '.join(others))
+            self._calibration.quat_prior = self._quat_prior
+            self._intake: Any = self._calibration
             self._progress = Progress('calibrating: waiting for images and gyro')
             self._worker = Worker(self._intake, lambda: None, self._consume_calibration)
         else:
@@ -400,24 +408,29 @@ class SensorNode(StoppableNode):
             self._begin(calibrate=bool(missing))
 
     def _use_transform(self, frame_ids: Mapping[Role, str]) -> None:
-        """Position of the IMU from /tf_static, once it is there; its rotation is compared."""
+        """Extrinsics from /tf_static, once it is there: parameters, or start of a calibration."""
         camera, imu = frame_ids.get(Role.IMAGE), frame_ids.get(Role.IMU)
-        sensor = self._settings.current.sensor
-        if not (camera and imu) or sensor.missing() or self._lookup is None:
+        # Of one frame_id for both sensors the axes are not known.
+        if self._lookup is None or not camera or not imu or camera == imu:
             return
-        found = self._lookup(camera, imu)
+        found, parameters = self._lookup(camera, imu), self._settings.current
         if found is None:
+            if self._calibration is not None and self._calibration.waits_for:
+                self._progress = Progress(
+                    f'waiting for {self._calibration.waits_for}: {self._lookup.problem}')
+                self._info(self._progress.text)
             return
+        self._quat_prior = found[3:]
+        if self._calibration is not None:
+            self._calibration.quat_prior = self._quat_prior
+            if not self._waits_for_tf():
+                return
         self._lookup = None
-        values = {'imu_position': tuple(found[:3]), 'imu_position_sigma': _TF_POSITION_SIGMA}
-        turn = Rotation.from_quat(found[3:]) * Rotation.from_matrix(sensor.R_cam_imu).inv()
-        if np.degrees(turn.magnitude()) > _TF_ROTATION:
-            self._warn(
-                f'/tf_static and quat_cam_imu_xyzw differ by {np.degrees(turn.magnitude()):.1f} '
-                f'deg: {imu} in {camera} has {_quaternion(found[3:])}, in use is '
-                f'{_quaternion(sensor.quat_cam_imu_xyzw or ())}; imu_position is not taken from '
-                'there')
-        else:
+        values, contradiction = extrinsics(parameters, found, camera, imu)
+        if contradiction:
+            self._warn(contradiction)
+        if values:
+            self._info(f'from /tf_static, {imu} in {camera}: {", ".join(values)}')
             self._settings.adopt(values)
 
     def _adopt(self, parameters: str, source: str) -> None:

@@ -18,6 +18,7 @@ from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.imu.buffer import length_fault
 from rs_relpose_ros.messages.incoming import PARTS, Role, sensor_messages
+from rs_relpose_ros.messages.transforms import with_extrinsics
 from rs_relpose_ros.offline import check_sample
 from rs_relpose_ros.offline.check_sample import Completion, SampleRun
 from rs_relpose_ros.offline.check_streams import Chosen, Inertial, Scan, Stamps
@@ -118,6 +119,7 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
     first, or if the front end fails on them. InputError if the bag is damaged.
     """
     images = chosen.image.count if chosen.image else 0
+    parameters, contradiction = with_extrinsics(bag, chosen, parameters)
     scan = Scan(images, parameters.intrinsics)
     completion, sample, topics = Completion(parameters, None, ''), None, None
     if chosen.image is not None and chosen.imu is not None:
@@ -137,6 +139,9 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
     else:
         sample.run(scanned())
     findings = [_topics(bag, chosen, parameters), _parameters(parameters)]
+    if contradiction:
+        findings.append(Finding('transforms', SUSPECT, contradiction, 'correct the description of '
+                                'the robot (URDF), or the parameter', measured={}))
     if chosen.image is not None:
         findings += image_findings(scan, chosen.image, bag.reliability(chosen.image), parameters)
     if chosen.imu is not None:

@@ -1,0 +1,154 @@
+"""Extrinsics from /tf_static and /tf, where the parameters do not give them.
+
+A transform is the pose of a child frame in a parent: x y z [m], quaternion x y z w. Functions of
+plain transforms, for the buffer of tf2_ros (live) and the messages of a bag alike.
+"""
+
+from __future__ import annotations
+
+from itertools import islice
+import logging
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_ros.config.settings import Parameters
+
+Transform = tuple[float, ...]
+
+# Doubt of a transform, 1 sigma per axis: URDFs hold drawings, not calibrations [rad, m].
+AXES_SIGMA, POSITION_SIGMA = math.radians(5.0), 0.02
+TF_TYPE = 'tf2_msgs/msg/TFMessage'
+# Messages of /tf that are read for a frame that /tf_static does not connect.
+_MOST_MESSAGES = 1000
+
+_logger = logging.getLogger(__name__)
+
+
+class FrameTree:
+    """Transforms by child; of several for one child the first one holds."""
+
+    def __init__(self) -> None:
+        self._parents: dict[str, tuple[str, NDArray[np.float64]]] = {}
+
+    def add(self, message: Any) -> None:
+        """Add those of a tf2_msgs/TFMessage that are rigid transforms."""
+        for stamped in message.transforms:
+            t, q = stamped.transform.translation, stamped.transform.rotation
+            quaternion, pose = np.array([q.x, q.y, q.z, q.w]), np.eye(4)
+            pose[:3, 3] = t.x, t.y, t.z
+            if abs(np.linalg.norm(quaternion) - 1.0) < 1e-2 and np.isfinite(pose).all():
+                pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+                # ROS 1 has names with and without a slash.
+                self._parents.setdefault(stamped.child_frame_id.lstrip('/'), (
+                    stamped.header.frame_id.lstrip('/'), pose))
+
+    def lookup(self, parent: str, child: str) -> Transform | None:
+        """Pose of `child` in `parent`; None if they are not connected."""
+        (root, of_parent), (other, of_child) = map(self._in_root, (parent, child))
+        if root != other:
+            return None
+        pose = np.linalg.inv(of_parent) @ of_child
+        return *map(float, pose[:3, 3]), *map(float, Rotation.from_matrix(pose[:3, :3]).as_quat())
+
+    def _in_root(self, frame: str) -> tuple[str, NDArray[np.float64]]:
+        frame, pose = frame.lstrip('/'), np.eye(4)
+        for _ in self._parents:   # at most: a circle has no root
+            if frame in self._parents:
+                frame, step = self._parents[frame]
+                pose = step @ pose
+        return frame, pose
+
+
+def angle_between(R: NDArray[np.float64], other: NDArray[np.float64], sigma: float) -> float:
+    """Angle [deg] by which a rotation of `sigma` [rad] contradicts that of a transform; else 0."""
+    angle = float(Rotation.from_matrix(R @ other.T).magnitude())
+    return math.degrees(angle) if angle > math.hypot(AXES_SIGMA, 3.0 * sigma) else 0.0
+
+
+class Extrinsics(NamedTuple):
+    """`values`: parameters by name that are not configured; `contradiction`: '' for none."""
+
+    values: dict[str, Any]
+    contradiction: str = ''
+
+
+def extrinsics(parameters: Parameters, found: Transform, camera: str, imu: str) -> Extrinsics:
+    """Rotation and position of the IMU by its pose `found` in the camera; configured ones win."""
+    sensor, position = parameters.sensor, parameters.imu.imu_position
+    rotation, head = Rotation.from_quat(found[3:]), f'/tf_static has {imu} in {camera}'
+    values: dict[str, Any] = {}
+    if sensor.quat_cam_imu_xyzw is None:
+        values = {'quat_cam_imu_xyzw': tuple(map(float, rotation.as_quat())),
+                  'axes_sigma': AXES_SIGMA}
+    elif angle := angle_between(rotation.as_matrix(), sensor.R_cam_imu, sensor.axes_sigma):
+        return Extrinsics({}, f'{head} rotated by {_text(found[3:])}, quat_cam_imu_xyzw is '
+                          f'{_text(sensor.quat_cam_imu_xyzw)}, {angle:.1f} deg apart: the '
+                          'parameter is used, and nothing of the transform')
+    if not any(position):
+        return Extrinsics({**values, 'imu_position': found[:3],
+                           'imu_position_sigma': POSITION_SIGMA})
+    apart = float(np.abs(np.subtract(found[:3], position)).max())
+    if apart > 3.0 * math.hypot(POSITION_SIGMA, parameters.imu.imu_position_sigma):
+        return Extrinsics(values, f'{head} at {_text(found[:3])} m, imu_position is '
+                          f'{_text(position)} m: the parameter is used')
+    return Extrinsics(values)
+
+
+def _text(values: tuple[float, ...]) -> str:
+    return f'[{", ".join(f"{value:.4f}" for value in values)}]'
+
+
+# -- Bags -----------------------------------------------------------------------------------------
+
+
+class BagFrames(NamedTuple):
+    """Frames of a bag: names of camera and IMU, '' if unknown, and the transforms."""
+
+    camera: str
+    imu: str
+    tree: FrameTree
+
+    @property
+    def imu_in_camera(self) -> Transform | None:
+        """Pose of the IMU; None if it is unknown, or both have one frame_id."""
+        known = self.camera and self.imu and self.camera != self.imu
+        return self.tree.lookup(self.camera, self.imu) if known else None
+
+
+def bag_frames(bag: Any, topics: Any, base: str = '') -> BagFrames:
+    """Frames of a `Bag` with `SensorTopics`; /tf is read only if /tf_static does not suffice.
+
+    `base`: another frame that is needed.
+    """
+    camera, imu = (next((str(message.message.header.frame_id).lstrip('/') for message
+                         in bag.messages([topic])), '') if topic is not None else ''
+                   for topic in (topics.image, topics.imu))
+    frames = BagFrames(camera, imu, FrameTree())
+    for name, most in (('/tf_static', None), ('/tf', _MOST_MESSAGES)):
+        found = [topic for topic in bag.topics if topic.name == name and topic.msgtype == TF_TYPE]
+        for message in islice(bag.messages(found), most):
+            if most is not None and frames.imu_in_camera is not None and (
+                    not base or frames.tree.lookup(base, camera) is not None):
+                break
+            frames.tree.add(message.message)
+    return frames
+
+
+def with_extrinsics(bag: Any, topics: Any, parameters: Parameters) -> tuple[Parameters, str]:
+    """`parameters` completed by the transforms of a bag, and a contradiction ('' for none)."""
+    base = parameters.odometry.base_frame
+    if not parameters.calibration.use_tf:
+        return parameters, ''
+    frames = bag_frames(bag, topics, base)
+    values, contradiction = Extrinsics({}) if (found := frames.imu_in_camera) is None else (
+        extrinsics(parameters, found, frames.camera, frames.imu))
+    if base and parameters.odometry.base_to_camera is None and (
+            found := frames.tree.lookup(base, frames.camera)):
+        values['base_to_camera'] = found
+    if values:
+        _logger.info('from /tf_static: %s', ', '.join(values))
+    return parameters.updated(values), contradiction
