@@ -6,8 +6,6 @@ Starts relpose_node and a player as separate processes, plays bags/hand_held in 
 records the poses, replays the same bag offline with several methods, and prints a table.
 """
 
-from __future__ import annotations
-
 from concurrent.futures import ProcessPoolExecutor
 import multiprocessing
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Public recordings for `rs_relpose convert`: how they are read, and the node's parameters."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 import re

@@ -4,8 +4,6 @@ Matrices of an estimate have some tens of rows: more threads do not help. Idle t
 wait without sleeping on the cores of camera driver and DDS (measured in docs/lab/node.md).
 """
 
-from __future__ import annotations
-
 import os
 
 

@@ -1,7 +1,5 @@
 """Files of results: pictures, and their folder."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Bags of every storage, with messages of a camera and an IMU."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 import math
 from pathlib import Path

@@ -3,8 +3,6 @@
 The receiver only counts what arrives: what is lost is lost by the transport.
 """
 
-from __future__ import annotations
-
 from array import array
 import sys
 import time

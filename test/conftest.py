@@ -1,7 +1,5 @@
 """What all tests share: places of data, a DDS domain of their own, and how they are shared out."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 import csv
 import os

@@ -1,7 +1,5 @@
 """A sensor stream with faults: phases of a bag, each good, then faulty, then good again."""
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Callable, Collection, Iterable, Iterator
 import copy

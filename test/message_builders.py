@@ -1,7 +1,5 @@
 """Messages for tests, of rclpy's classes or of those of rosbags; and damage to them."""
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Callable, Iterator, Sequence
 import copy

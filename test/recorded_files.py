@@ -1,7 +1,5 @@
 """Small recordings as cameras, phones and data sets have them, and damage to their files."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from fractions import Fraction
 import json

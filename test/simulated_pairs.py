@@ -1,7 +1,5 @@
 """Estimates of `two_view_scene`; pairs of a camera that flies through points, exact, by SciPy."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 

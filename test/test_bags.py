@@ -1,7 +1,5 @@
 """The bag reader: every storage, the choice of topics, and damage of every kind."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 import shutil

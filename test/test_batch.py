@@ -1,7 +1,5 @@
 """Many bags on real Dask clusters of processes, all on the loopback interface."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 import json

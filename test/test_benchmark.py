@@ -1,7 +1,5 @@
 """The benchmarks: one smoke run each, their statistics, the demo's comparison."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import replace
 import re

@@ -1,7 +1,5 @@
 """Calibration on simulated tracks: values, observability, refusals, and stamps of the frames."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import lru_cache
 import math

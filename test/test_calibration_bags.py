@@ -1,7 +1,5 @@
 """``rs_relpose calibrate`` from bag to parameter file, and bags that it refuses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Sigmas of the calibration: regions of the image, both halves, lens and gyro, exposure."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """`rs_relpose check`: findings on good bags, and on bags broken in one way each."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

@@ -1,7 +1,5 @@
 """The package as a ROS machine sees it: built by colcon, run from the install space."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 import shutil

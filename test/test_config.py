@@ -1,7 +1,5 @@
 """The shipped configuration: parameter template, Fast DDS profile, launch file."""
 
-from __future__ import annotations
-
 import ast
 from importlib.metadata import distribution
 import json

@@ -1,7 +1,5 @@
 """`convert`: videos, folders of phone loggers and public data sets as bags."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import importlib.util
 import json

@@ -1,7 +1,5 @@
 """The experiments of the paper: scenes, the formats of PennCOSYVIO, tables, commands."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 import json
 import re

@@ -1,7 +1,5 @@
 """The examples of the documentation do what they say."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 import importlib.util
 from operator import itemgetter

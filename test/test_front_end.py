@@ -1,7 +1,5 @@
 """The drive loop: errors, what makes a keyframe, and parameters that change in mid-run."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import replace

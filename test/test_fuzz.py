@@ -4,8 +4,6 @@ No traceback, no crash, no hang, no unbounded memory. A short share here, the fu
 `make test-all`.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace

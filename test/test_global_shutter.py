@@ -1,7 +1,5 @@
 """Derotated images: map, pixels, stamps, and bags, against independent truth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

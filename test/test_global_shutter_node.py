@@ -1,7 +1,5 @@
 """global_shutter_node over DDS: images of an undisturbed bag, and after faults."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 import itertools
 from pathlib import Path

@@ -1,7 +1,5 @@
 """How the house is built: sizes of folders, modules and functions, and the words that are used."""
 
-from __future__ import annotations
-
 import ast
 from collections import Counter
 from collections.abc import Iterator
@@ -18,23 +16,23 @@ OF_PACKAGE = {path: text for path, text in MODULES.items() if path.parts[0] == P
 
 # Folder -> most lines and modules. A larger number needs its reason in the commit that raises it.
 BUDGETS = {
-    'rs_relpose_ros': (260, 5),
-    'rs_relpose_ros/bags': (1880, 6),
-    'rs_relpose_ros/calibrate': (2920, 9),
-    'rs_relpose_ros/cli': (1090, 6),
-    'rs_relpose_ros/config': (890, 4),
-    'rs_relpose_ros/estimator': (3780, 12),
-    'rs_relpose_ros/geometry': (1270, 7),
+    'rs_relpose_ros': (250, 5),
+    'rs_relpose_ros/bags': (1870, 6),
+    'rs_relpose_ros/calibrate': (2910, 9),
+    'rs_relpose_ros/cli': (1080, 6),
+    'rs_relpose_ros/config': (880, 4),
+    'rs_relpose_ros/estimator': (3750, 12),
+    'rs_relpose_ros/geometry': (1260, 7),
     'rs_relpose_ros/imu': (1300, 4),
-    'rs_relpose_ros/messages': (1470, 5),
-    'rs_relpose_ros/nodes': (2190, 9),
-    'rs_relpose_ros/odometry': (1870, 7),
-    'rs_relpose_ros/offline': (2950, 12),
-    'rs_relpose_ros/pipeline': (3430, 13),
-    'rs_relpose_ros/solvers': (1760, 6),
-    'rs_relpose_ros/tracking': (1240, 5),
-    'rs_relpose_lab': (9820, 44),
-    'test': (19430, 57),
+    'rs_relpose_ros/messages': (1460, 5),
+    'rs_relpose_ros/nodes': (2170, 9),
+    'rs_relpose_ros/odometry': (1850, 7),
+    'rs_relpose_ros/offline': (2930, 12),
+    'rs_relpose_ros/pipeline': (3400, 13),
+    'rs_relpose_ros/solvers': (1740, 6),
+    'rs_relpose_ros/tracking': (1230, 5),
+    'rs_relpose_lab': (9740, 44),
+    'test': (19330, 57),
 }
 MOST_MODULES, MOST_FOLDERS = 112, 15
 LONGEST_MODULE, SHORTEST_MODULE, LONGEST_FUNCTION = 700, 80, 60

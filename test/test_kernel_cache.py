@@ -1,7 +1,5 @@
 """Compiled kernels: found after a move, never used for another source; none after the warm-up."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 import functools
 import json

@@ -1,7 +1,5 @@
 """The live benchmark: its endless clip, its statistics, and one short run with its report."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 import sys
 

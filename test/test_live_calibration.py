@@ -1,7 +1,5 @@
 """A node without parameters: it calibrates itself, stores the result, and uses the file."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 import os
 from pathlib import Path

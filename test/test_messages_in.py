@@ -1,7 +1,5 @@
 """Message conversion, with rclpy's classes and with those of rosbags."""
 
-from __future__ import annotations
-
 import struct
 from typing import Any
 import zlib

@@ -1,7 +1,5 @@
 """Results to messages, with the classes of rclpy and of rosbags; messages into a bag."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 import struct
 from typing import Any

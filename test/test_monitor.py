@@ -1,7 +1,5 @@
 """Consistency monitor: its parts, wrong parameters one by one, and tracked parameters."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 import itertools
 import json

@@ -4,8 +4,6 @@ After each fault a pose comes within a second of good data, and no pose that was
 wrong: those of frames during the faults are compared with the truth as well.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 import re

@@ -1,7 +1,5 @@
 """The node and a player as processes over DDS, on the bundled bag; signals that end the node."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 import itertools
 from pathlib import Path

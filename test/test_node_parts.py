@@ -1,7 +1,5 @@
 """Parts of the node: log lines, silence, diagnostics, parameters, and its worker."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Parameters, QoS overrides and sensors that do not come: what the node says and does."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Metric odometry on pairs that are the truth plus noise, and on its faults."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 import gc

@@ -1,7 +1,5 @@
 """The disturbances of `benchmark odometry`: their tracks, and the states that follow."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

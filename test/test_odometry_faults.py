@@ -4,8 +4,6 @@ Pairs of the walk are the truth plus noise, put into messages by the package. Th
 faster than in real time, as the node goes by stamps, and with fewer samples instead.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """The package as a whole: metadata, layers of its modules, commands."""
 
-from __future__ import annotations
-
 import ast
 import doctest
 import fcntl

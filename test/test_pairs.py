@@ -1,7 +1,5 @@
 """Relative poses of chosen pairs: on the bundled bag, where a walk returns, and bad lists."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 import gc
 import math

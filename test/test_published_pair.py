@@ -1,7 +1,5 @@
 """The messages of a pair gathered, read back, and chained to a path."""
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Callable
 import copy

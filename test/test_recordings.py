@@ -5,8 +5,6 @@ VI-Sensor, with its IMU. `euroc_v101_10frames`: ten images in flight with poses 
 `realsense_rgb_rs`, `xiaomi_cc9_rs`: images of rolling shutters, for the residuals of row times.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 import io
 import tarfile

@@ -1,7 +1,5 @@
 """Replay: outputs on the bundled bag, repeatability, and bad input from end to end."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import itertools
 import json

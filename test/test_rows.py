@@ -1,7 +1,5 @@
 """Poses at any time, from keyframes and the IMU, on a motion that is known exactly."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """The sequencer: which frames are released when, and that each one is released or counted."""
 
-from __future__ import annotations
-
 import threading
 import time
 

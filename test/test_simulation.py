@@ -1,7 +1,5 @@
 """The simulator, against equations that are written out here again."""
 
-from __future__ import annotations
-
 import argparse
 import functools
 from pathlib import Path

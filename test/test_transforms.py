@@ -1,7 +1,5 @@
 """Extrinsics from the transforms of a robot: rules, bags, commands, calibration."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

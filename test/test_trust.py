@@ -1,7 +1,5 @@
 """The laboratory's matrix of wrong configurations: tracks, rows, information, results."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import replace
 import json

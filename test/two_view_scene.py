@@ -4,8 +4,6 @@ The paper's set-up: 1920x1080, f = 640 px, 60 us per row, baseline about 2 m, po
 away, velocities opposite in the two frames.
 """
 
-from __future__ import annotations
-
 from dataclasses import make_dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """``rs_relpose benchmark``: measurements of the package; see benchmarks/README.md."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Iterable, Sequence
 from fnmatch import fnmatchcase

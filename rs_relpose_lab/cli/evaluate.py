@@ -1,7 +1,5 @@
 """``rs_relpose evaluate``: the experiments of the paper."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Mapping, Sequence
 import dataclasses

@@ -1,7 +1,5 @@
 """``rs_relpose simulate``: render a recording of a known motion into a bag."""
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import math

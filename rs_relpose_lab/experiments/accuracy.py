@@ -12,7 +12,6 @@ from pathlib import Path
 import time
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2, trim_mean
 
 from rs_relpose_lab.experiments import oracle, problems
@@ -23,6 +22,7 @@ from rs_relpose_lab.experiments.problems import Cell, CELLS, make_problem, Noise
 from rs_relpose_lab.experiments.scoring import pose_error, POSE_FREEDOM, PoseError, Quantiles
 from rs_relpose_lab.simulation import rows
 from rs_relpose_ros import RelativePose, warm_up
+from rs_relpose_ros.geometry import Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,8 +160,6 @@ def _source() -> bytes:
 
 
 # -- report: statistics of each cell, against the project's limits ----------------------------
-
-Array = NDArray[np.float64]
 
 # A rotation this wrong [deg] is no noise in any of the cells.
 GROSS_ERROR = 2.0

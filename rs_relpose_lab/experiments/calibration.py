@@ -1,7 +1,5 @@
 """`rs_relpose calibrate` against the truth of tracks and rendered bags; parts of recordings."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 import json

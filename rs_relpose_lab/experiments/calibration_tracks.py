@@ -1,7 +1,5 @@
 """Simulated tracks and gyro of a rolling-shutter camera with a known calibration."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 import math
 from typing import Any
@@ -15,8 +13,7 @@ from rs_relpose_lab.simulation.rows import observe, View
 from rs_relpose_lab.simulation.trajectory import FinePath, Trajectory
 from rs_relpose_ros.calibrate.observations import Tracks
 from rs_relpose_ros.calibrate.start import axis_maps, GyroSeries
-
-Array = NDArray[np.float64]
+from rs_relpose_ros.geometry import Array
 
 START_NS = 1_700_000_000_000_000_000
 

@@ -1,7 +1,5 @@
 """Errors of a live run, its replay and other methods over the same pairs."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 import csv
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ A recording has the relative poses of some pairs from elsewhere (a bundle adjust
 frames), whose covariance is added to the estimate's own.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 import csv
 from dataclasses import dataclass, replace
@@ -15,7 +13,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from rs_relpose_lab.experiments.comparison import opencv_pose
@@ -30,6 +27,7 @@ from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.estimator.result import RelativePose
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.timing import seconds_between
 from rs_relpose_ros.messages.incoming import (
@@ -41,8 +39,6 @@ from rs_relpose_ros.messages.incoming import (
 from rs_relpose_ros.offline.replay import MessageRefused, outcomes, read_truth, Replay
 from rs_relpose_ros.pipeline.pair import Frame, PairResult
 from rs_relpose_ros.pipeline.pipeline import FrontEnd
-
-Array = NDArray[np.float64]
 
 R_FREEDOM, T_FREEDOM = 3, 2
 # Of the errors of poses within their covariance.

@@ -3,8 +3,6 @@
 Three measurements: the map against the truth, OpenCV's 5-point on raw and derotated images, time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +12,6 @@ import time
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_relpose_lab.experiments.comparison import best_opencv_score, Score
 from rs_relpose_lab.experiments.consistency import STILL
@@ -29,6 +26,7 @@ from rs_relpose_lab.simulation.trajectory import Trajectory
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import Parameters
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuSample
@@ -39,8 +37,6 @@ from rs_relpose_ros.pipeline.global_shutter import GlobalShutterFrame, unrolling
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrameLoop
 from rs_relpose_ros.tracking.images import RawImage
-
-Array = NDArray[np.float64]
 
 # -- the map against the truth of a simulation ------------------------------------------------
 #

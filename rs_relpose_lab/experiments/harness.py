@@ -1,7 +1,5 @@
 """Shared by the experiments: groups, tables in Markdown and CSV, and worker processes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 import csv

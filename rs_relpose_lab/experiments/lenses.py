@@ -1,7 +1,5 @@
 """Whether an uncalibrated lens ends in poses: `calibrate`, and the pairs with its file."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math

@@ -19,14 +19,13 @@ from rs_relpose_lab.experiments.scoring import pose_error
 from rs_relpose_lab.live.processes import ProcessMetrics
 from rs_relpose_ros.bags.reader import CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, RAW_TOPIC
 from rs_relpose_ros.estimator.result import Status
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 from rs_relpose_ros.pipeline.sequencer import Refusal
 
 if TYPE_CHECKING:   # the rest of this module needs no ROS
     from rs_relpose_lab.live.live_run import MeasuredRun, ReceivedPose
 
-
-Array = NDArray[np.float64]
 
 SIZES = ((640, 480), (1280, 720), (1920, 1080))
 FORMATS = ('mono8', 'bgr8', 'jpeg')

@@ -1,7 +1,5 @@
 """A short recording without a seam, for the live benchmark: rendered once, played for hours."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 import math
@@ -25,10 +23,9 @@ from rs_relpose_lab.simulation.motions import EYE_HEIGHT
 from rs_relpose_lab.simulation.trajectory import DEGREE, Trajectory
 from rs_relpose_ros.bags.reader import CAMERA_FRAME, COMPRESSED_TOPIC, IMU_DELAY
 from rs_relpose_ros.bags.writer import BagWriter
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 from rs_relpose_ros.messages.outgoing import encoded_image_message
-
-Array = NDArray[np.float64]
 
 # Duration of the motion before it repeats itself [s].
 PERIOD = 4.0

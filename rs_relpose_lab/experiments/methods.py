@@ -14,17 +14,15 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_relpose_lab.experiments import problems
 from rs_relpose_lab.experiments.scoring import NO_POSE, pose_error, PoseError
 from rs_relpose_ros.config.settings import EstimatorConfig
 from rs_relpose_ros.estimator.estimate import estimate_relative_pose
 from rs_relpose_ros.estimator.result import RelativePose, Status
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
-
-Array = NDArray[np.float64]
 
 # Camera of the problems that are drawn at random.
 CAMERA = RollingShutterCamera(

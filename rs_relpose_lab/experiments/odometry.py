@@ -3,8 +3,6 @@
 Tracks without images go through the whole front end; its pairs and the samples through the graph.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 import io
@@ -37,6 +35,7 @@ from rs_relpose_lab.simulation.scene import SCENES
 from rs_relpose_ros.bags.reader import IMAGE_DELAY, IMU_DELAY
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuSample
@@ -51,8 +50,6 @@ from rs_relpose_ros.odometry.offline import (
 from rs_relpose_ros.odometry.pair import KeyframePair, warm_up_odometry
 from rs_relpose_ros.odometry.states import Odometry
 from rs_relpose_ros.offline.truth import TrueTrajectory
-
-Array = NDArray[np.float64]
 
 # -- EuRoC's corners as tracks: a real global shutter with its IMU, and metric truth -----------
 #

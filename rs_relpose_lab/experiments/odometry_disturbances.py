@@ -4,8 +4,6 @@ Each walk has 6 s before and 6 s after its disturbance; states are those that od
 publish, at 30 Hz.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -34,14 +32,13 @@ from rs_relpose_lab.simulation.simulation import Simulation
 from rs_relpose_ros.bags.reader import IMU_DELAY
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.pair import KeyframePair
 from rs_relpose_ros.odometry.states import ContinuousPath, Odometry, OdometryState
-
-Array = NDArray[np.float64]
 
 # Before and after a disturbance [s]; afterwards all is to be normal again [s].
 _MARGIN, NORMAL_AGAIN = 6.0, 2.0

@@ -15,8 +15,6 @@ and the estimate minimises ``sum r^2 / sigma^2`` plus the priors of both graviti
 the velocities.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -31,8 +29,8 @@ from rs_relpose_lab.experiments.problems import (
     LINE_DELAY,
     TwoViewProblem,
 )
+from rs_relpose_ros.geometry import Array
 
-Array = NDArray[np.float64]
 Values = NDArray[Any]  # real, or complex under a complex step
 
 # Unknowns, as a step from a start: rotation of R (3), tangent of t (2), tangent of gravity (2),

@@ -12,7 +12,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_relpose_lab.experiments.harness import in_processes, markdown_table, write_csv
 from rs_relpose_lab.experiments.methods import as_pair, METHODS, PairProblem, run_method
@@ -20,11 +19,10 @@ from rs_relpose_lab.experiments.problems import BASELINES, Cell, make_problem
 from rs_relpose_lab.experiments.scoring import PoseError
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.result import Status
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.output_files import save_picture
 
 # -- Errors of the paper's experiments by the boxes of its plots: CSV, tables and pictures --------
-
-Array = NDArray[np.float64]
 
 # Level of a box that holds all levels of a case.
 ALL_LEVELS = 'all'

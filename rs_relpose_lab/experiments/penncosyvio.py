@@ -4,8 +4,6 @@ Of eight stretches of the sequences 'as' and 'af', every fifth frame makes a pai
 frames later; angular velocity and gravity are means over 0.1 s. Points and IMU are simulated.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +11,7 @@ import math
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
@@ -27,12 +25,11 @@ from rs_relpose_lab.simulation.simulation import ImuModel
 from rs_relpose_lab.simulation.trajectory import CameraStates
 from rs_relpose_ros.config.settings import EstimatorConfig, ImuConfig
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.timing import ImageClock, NANOSECONDS, seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.buffer import frame_imu, ImuBuffer, ImuSample
 from rs_relpose_ros.imu.filters import mean_gravity
-
-Array = NDArray[np.float64]
 
 # -- motion of a pair by an IMU: the paper's means, and the continuous gyro -------------------
 

@@ -8,8 +8,6 @@ The folder is a checkout of the data set's repository::
 The rig's axes are those of the GoPro C2.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.bags.convert import read_rows, Row
 from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import rays_with_jacobian, RollingShutterCamera
 
 # -- The camera model of the OCamCalib toolbox (Scaramuzza), in which PennCOSYVIO is calibrated ---
@@ -30,8 +29,6 @@ from rs_relpose_ros.geometry.camera import rays_with_jacobian, RollingShutterCam
 # points backwards), and m = (x, y) right and down from the centre on an ideal sensor:
 #
 #     u - cx = x + e y          v - cy = d x + c y          ray ~ (x, y, -f(|m|))
-
-Array = NDArray[np.float64]
 
 _MAX_STEPS = 50
 _SETTLED = 1e-10

@@ -12,8 +12,6 @@ magnitude on each axis, with random signs, in the camera's own frame, and the op
 the second camera.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -23,8 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.simulation.rows import in_both_views, in_front, measured, uniform_motion, View
-
-Array = NDArray[np.float64]
+from rs_relpose_ros.geometry import Array
 
 Noise = Literal['paper', 'gaussian']
 

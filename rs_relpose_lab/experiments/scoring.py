@@ -8,10 +8,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
+from rs_relpose_ros.geometry import Array
 
 # Of a relative pose: three of the rotation, two of the direction of translation.
 POSE_FREEDOM = 5

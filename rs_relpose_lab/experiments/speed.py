@@ -1,7 +1,5 @@
 """Time and accuracy of this library, OpenCV and PoseLib on the same problems."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace

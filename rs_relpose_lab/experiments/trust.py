@@ -3,8 +3,6 @@
 Each bag is simulated once, run with the right configuration, and then with every row of `ROWS`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 import json
@@ -24,8 +22,6 @@ from rs_relpose_lab.simulation.motions import vehicle
 from rs_relpose_lab.simulation.scene import make_scene, SCENES
 from rs_relpose_lab.simulation.simulation import simulate, Simulation
 from rs_relpose_ros.config.settings import EstimatorConfig, ImuConfig
-
-Array = NDArray[np.float64]
 
 # Of simulated bags.
 MOTIONS = ('hand-held', 'vehicle')

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.imu.buffer import ImuSample, Vector
 
-Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
 # Informative seconds of motion within which an error must be flagged.

@@ -3,8 +3,6 @@
 Recordings are simulated, with rendered images or with tracks alone, or real.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 import heapq
@@ -27,6 +25,7 @@ from rs_relpose_ros.bags.convert import by_stamp
 from rs_relpose_ros.bags.reader import CAMERA_FRAME, IMAGE_DELAY, IMU_DELAY, open_bag
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import Parameters, sensor_model
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuSample
@@ -37,7 +36,6 @@ from rs_relpose_ros.pipeline.pipeline import FrontEnd
 from rs_relpose_ros.tracking.features import keep_apart, Matches, TrackIds
 from rs_relpose_ros.tracking.images import Image, RawImage
 
-Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
 # -- tracks without images --------------------------------------------------------------------

@@ -3,8 +3,6 @@
 For the demo and for measurements. This process only subscribes, and reads /proc once a second.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import csv
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ For tests, the demo, the live benchmark and machines without ``ros2 bag``. Ends 
 last message.
 """
 
-from __future__ import annotations
-
 import argparse
 from array import array
 from collections.abc import Iterator, Sequence

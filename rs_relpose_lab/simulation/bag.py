@@ -1,7 +1,5 @@
 """Write a simulated recording as a bag, and the node's parameters for it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 import heapq
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Everything that defines a simulated recording; the only place of its defaults."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -7,12 +7,10 @@ import itertools
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_relpose_lab.simulation.trajectory import Segment, Trajectory
 from rs_relpose_ros.errors import InputError
-
-Array = NDArray[np.float64]
+from rs_relpose_ros.geometry import Array
 
 KINDS = ('walk', 'constant', 'still', 'rotate')
 

@@ -1,7 +1,5 @@
 """Rolling-shutter images of a scene: every row at the camera's pose of its own time."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 import math
 from typing import NamedTuple
@@ -15,9 +13,8 @@ from rs_relpose_lab.simulation.rows import observe, View
 from rs_relpose_lab.simulation.scene import Scene
 from rs_relpose_lab.simulation.trajectory import Trajectory
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
-
-Array = NDArray[np.float64]
 
 # Pixels whose rays are tried against the same short list of surfaces.
 _TILE = 40

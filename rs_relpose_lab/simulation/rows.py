@@ -4,8 +4,6 @@ It uses nothing of the estimator's geometry, so that an error in one cannot hide
 error in the other.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -13,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
+from rs_relpose_ros.geometry import Array
 
 # Points (N, 3) of the world [m] and times (N,) [s] -> points (N, 3) in the camera frame at each
 # one's time. Time 0 is that of the reference row.

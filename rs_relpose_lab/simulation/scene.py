@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry import Array
 
 # -------------------------------------------------------------------------------------------------
 # Procedural textures: detail at every scale, distinct corners and blobs, nothing that repeats.
@@ -127,8 +128,6 @@ _SHIFT = 4
 def _fixed(coordinates: NDArray[np.float64]) -> NDArray[np.int32]:
     return np.rint(coordinates * (1 << _SHIFT)).astype(np.int32)
 
-
-Array = NDArray[np.float64]
 
 SCENES = ('hall', 'yard', 'gallery')
 

@@ -1,7 +1,5 @@
 """A simulated recording: frames, IMU and truth of one configuration."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import math
 
@@ -13,11 +11,10 @@ from rs_relpose_lab.simulation.motions import hand_held, Plan
 from rs_relpose_lab.simulation.render import Renderer
 from rs_relpose_lab.simulation.scene import make_scene, Scene
 from rs_relpose_lab.simulation.trajectory import CameraStates, Trajectory
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuSample
-
-Array = NDArray[np.float64]
 
 GRAVITY = np.array([0.0, 0.0, -9.80665])
 

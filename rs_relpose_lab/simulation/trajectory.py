@@ -9,20 +9,17 @@ where they advance evenly it moves at constant velocity.
 The body axes are x forward, y left, z up; the camera looks along x.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.simulation.rows import Motion
 from rs_relpose_ros.errors import InputError
-
-Array = NDArray[np.float64]
+from rs_relpose_ros.geometry import Array
 
 DEGREE = 5
 

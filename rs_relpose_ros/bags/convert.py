@@ -4,8 +4,6 @@ A format has a reader that gives a `Recording`: `phones`, `video`, and those of 
 the laboratory. `read_rows`, `read_lines` and `read_object` read text files of such formats.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 import csv

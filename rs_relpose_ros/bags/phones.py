@@ -1,7 +1,5 @@
 """Folders of Android loggers, each recognised by its files (`LOGGERS`)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 import logging

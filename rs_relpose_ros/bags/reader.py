@@ -3,8 +3,6 @@
 A bag that is damaged, truncated or far too large raises an InputError with one line of text.
 """
 
-from __future__ import annotations
-
 import bz2
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, ExitStack, suppress

@@ -1,7 +1,5 @@
 """Videos of cameras that log their IMU: GoPro, and others that telemetry-parser reads."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Write rosbag2 directories (MCAP storage) with ROS 2 Jazzy's messages."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from pathlib import Path
 import shutil

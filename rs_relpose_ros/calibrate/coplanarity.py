@@ -30,11 +30,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.calibrate.start import GyroPath, knot_before, rotation_at
-from rs_relpose_ros.geometry import so3
+from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.geometry.so3 import cross, dot, multiply, norm, rotated, rotated_back, Vector
 from rs_relpose_ros.jit import inlined_kernel, kernel
-
-Array = NDArray[np.float64]
 
 # Parameters of the calibration, in this order: readout time [s], offset of the middle row [s],
 # slope of the offset, rotation vector on the left of R_imu_cam (3) [rad], bias (3) [rad/s]; of the

@@ -14,8 +14,6 @@ Three kinds of errors exceed the noise of the matches:
   (`ModelErrors`). How far each moves the calibration follows from one evaluation.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -36,10 +34,9 @@ from rs_relpose_ros.calibrate.result import CalibrationResult, CostCurve, Estima
 from rs_relpose_ros.calibrate.start import GyroPath, nearest_axis_map
 from rs_relpose_ros.config.settings import CalibrationConfig
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.pipeline.findings import BY_NAME
-
-Array = NDArray[np.float64]
 
 # Stretches of a second, within which errors may be correlated, and limits of their number.
 _STRETCH = 1.0

@@ -1,7 +1,5 @@
 """Calibration of a running camera: its tracks and gyro in memory, the fit in its own process."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 import os
 import pickle

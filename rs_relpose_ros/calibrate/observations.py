@@ -29,12 +29,11 @@ from rs_relpose_ros.calibrate.result import AXES
 from rs_relpose_ros.calibrate.start import GyroSeries, noise_density, rotation_between
 from rs_relpose_ros.config.settings import CalibrationConfig
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.distortion import DISTORTION_MODELS
 from rs_relpose_ros.geometry.timing import FrameIntervals, NANOSECONDS
 from rs_relpose_ros.imu.integration import mean_rates
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

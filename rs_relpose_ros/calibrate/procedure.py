@@ -31,6 +31,7 @@ from rs_relpose_ros.calibrate.result import CalibrationResult
 from rs_relpose_ros.calibrate.start import find_starts, GyroSeries, Start
 from rs_relpose_ros.config.settings import CalibrationConfig, TrackingConfig
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.distortion import DISTORTION_MODELS
 from rs_relpose_ros.geometry.so3 import log_so3
@@ -39,8 +40,6 @@ from rs_relpose_ros.messages.incoming import PARTS, ReasonCounts, Role, sensor_m
 from rs_relpose_ros.messages.transforms import AXES_SIGMA
 from rs_relpose_ros.tracking.features import make_tracker
 from rs_relpose_ros.tracking.images import EncodedImage, GrayLevels
-
-Array = NDArray[np.float64]
 
 _LEAST_MATCHES = 20
 # Spans [s]: over long ones the gyro's rates at the rows differ; over short ones the errors of the

@@ -1,7 +1,5 @@
 """Result of a calibration: values and sigmas, as report, parameter file, JSON and picture."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 import math
@@ -10,16 +8,14 @@ from typing import Any
 
 from matplotlib.figure import Figure
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.calibrate.start import axes_text
 from rs_relpose_ros.config.files import parameter_text, SourcedValue
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.output_files import save_picture
 from rs_relpose_ros.pipeline.findings import BY_NAME
-
-Array = NDArray[np.float64]
 
 AXES = ('x (pitch)', 'y (yaw)', 'z (roll)')
 

@@ -12,10 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.geometry import so3
+from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.jit import inlined_kernel, kernel
-
-Array = NDArray[np.float64]
 
 
 @cache

@@ -1,7 +1,5 @@
 """The calibration of a node: how far it is, and the file that stores it with its camera."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from datetime import datetime
 import os

@@ -1,7 +1,5 @@
 """``rs_relpose batch``: check, calibrate or replay over many bags, on Dask."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stderr

@@ -1,7 +1,5 @@
 """``rs_relpose <command>``: everything that runs offline."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Mapping, Sequence
 import importlib

@@ -1,7 +1,5 @@
 """Common parts of the commands: options, progress bar, version, a run over a bag."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Mapping
 from importlib.metadata import PackageNotFoundError, version

@@ -1,7 +1,5 @@
 """Commands `replay`, `pairs` and `odometry`: poses from a bag into a folder."""
 
-from __future__ import annotations
-
 import argparse
 from collections import Counter
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Commands `calibrate`, `check`, `convert` and `unroll`: recordings before the estimation."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Mapping
 from dataclasses import replace

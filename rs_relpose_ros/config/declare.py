@@ -4,8 +4,6 @@ Configuration dataclasses are the only places of defaults; node parameters, YAML
 and the parameter file with comments are derived from their fields.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 import math

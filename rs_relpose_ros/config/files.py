@@ -7,8 +7,6 @@
 writes all parameters at their defaults, with descriptions.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 import contextlib
 from dataclasses import dataclass

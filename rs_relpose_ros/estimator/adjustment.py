@@ -17,8 +17,6 @@ rho_i, which are eliminated (Schur complement). An observation has the robust co
 ``4 log(1 + r^2 / 4)``, r being its distance from the prediction in units of the noise.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
@@ -26,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.estimator.priors import inverse
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import (
     copy_vector,
     cross,
@@ -39,7 +38,6 @@ from rs_relpose_ros.geometry.so3 import (
 from rs_relpose_ros.jit import kernel, small_kernel
 from rs_relpose_ros.solvers.algebra import cholesky, newton_step
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 # First unknown: two steps of t in its tangent plane, log k, b, e_0, e_1, ...; then phi of the

@@ -17,11 +17,9 @@ from rs_relpose_ros.estimator import priors, sampson
 from rs_relpose_ros.estimator.fit import FitMatches, linearised, with_priors
 from rs_relpose_ros.estimator.priors import DW1, PARAMETERS, Priors, SCALE, THETA, TwoViewState
 from rs_relpose_ros.estimator.problem import PairState, TwoViewProblem
-from rs_relpose_ros.geometry import so3
+from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.solvers.algebra import cholesky, newton_step
-
-Array = NDArray[np.float64]
 
 # Regions of the field that the matches cover: columns and rows.
 REGIONS = (4, 3)

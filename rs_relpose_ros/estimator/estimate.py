@@ -1,7 +1,5 @@
 """One frame pair, end to end: derotate, sample, optimise, refine, covariance."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 import math
@@ -28,14 +26,12 @@ from rs_relpose_ros.estimator.result import landmarks, RelativePose, Status
 from rs_relpose_ros.estimator.sampling import SolverMode
 from rs_relpose_ros.estimator.sampson import Flags, RayMatches
 from rs_relpose_ros.estimator.velocity import Refined
-from rs_relpose_ros.geometry import so3, validate
+from rs_relpose_ros.geometry import Array, so3, validate
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 from rs_relpose_ros.solvers.common import Solutions
 
 # -- Arguments of `estimate_relative_pose`: each error names the argument -------------------------
-
-Array = NDArray[np.float64]
 
 # Pixels beyond this are no pixels. Of a predicted rotation [rad^2]: far above that of an unknown
 # rotation, which is 10.

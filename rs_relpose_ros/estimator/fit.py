@@ -6,8 +6,6 @@ constant converges to another point). Besides: the paper's alternating refinemen
 rotation alone.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
@@ -18,11 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.estimator import priors, sampson
 from rs_relpose_ros.estimator.priors import PARAMETERS, Priors, SCALE, TwoViewState
-from rs_relpose_ros.geometry import so3
+from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.solvers.algebra import cholesky, newton_step
-
-Array = NDArray[np.float64]
 
 # Damping of the first step, as a share of the diagonal of the Hessian.
 FIRST_DAMPING = 1e-4

@@ -29,13 +29,11 @@ from rs_relpose_ros.estimator.adjustment import (
 )
 from rs_relpose_ros.estimator.result import depths_of_rays, RelativePose
 from rs_relpose_ros.estimator.velocity import CORRELATION_TIME, span_of_scales
-from rs_relpose_ros.geometry import validate
+from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3, skew, tangent_basis
 from rs_relpose_ros.jit import kernel
-
-Array = NDArray[np.float64]
 
 # Error of gravity and accelerometer together, 1 sigma per axis [m/s^2]: a camera in motion does
 # not measure its tilt better.

@@ -19,19 +19,15 @@ the cost. n is 17, or 18 if ``log b`` is unknown, too: the cost then contains
 ``-2 g log b + (log b - m)^2 / s^2``, g being the number of velocities that the matches determine.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import cross, dot, exp_so3, log_so3, norm, tangent_basis
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.solvers.algebra import cholesky
-
-Array = NDArray[np.float64]
 
 # First local parameter of each unknown: a rotation on the left of R, two steps of t in its tangent
 # plane, and four vectors.

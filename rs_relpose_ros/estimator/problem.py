@@ -4,20 +4,17 @@ Motion and pose refer to the middle row of each frame, which decouples the trans
 velocities; `to_reference_row` moves the result, with its covariance, to the user's reference row.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import skew
 from rs_relpose_ros.jit import kernel
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

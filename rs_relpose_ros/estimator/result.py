@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.estimator.covariance import ImageInformation
 from rs_relpose_ros.estimator.velocity import InertialEvidence
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.so3 import skew
-
-Array = NDArray[np.float64]
 
 
 class Status(str, Enum):

@@ -4,8 +4,6 @@ The sampled set grows from the matches of the highest quality to all of them, as
 and Matas, CVPR 2005). The stopping rule is the usual one on the inlier ratio.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import math
 import time
@@ -20,7 +18,7 @@ from rs_relpose_ros.estimator.fit import FitMatches, gauss_newton
 from rs_relpose_ros.estimator.priors import Priors, TwoViewState
 from rs_relpose_ros.estimator.problem import TwoViewProblem
 from rs_relpose_ros.estimator.sampson import RayMatches
-from rs_relpose_ros.geometry import so3
+from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.solvers import common
 from rs_relpose_ros.solvers.api import GYRO_2PT, SOLVERS, UNIFORM
@@ -34,8 +32,6 @@ from rs_relpose_ros.solvers.common import Knowledge, Model, Sample, Solutions, S
 #
 # At 10 m/s during the readout the angular model leaves 20 px at true inliers, so a single narrow
 # threshold would discard good rotations: the cost is the mean of MSAC costs at growing thresholds.
-
-Array = NDArray[np.float64]
 
 # Multiples of the inlier threshold. The widest still rejects 19 of 20 random matches.
 SCALES = np.array([1.0, 4.0, 12.0])

@@ -17,8 +17,6 @@ compiler vectorises. For that it must know the strides, hence the arrays of fixe
 forced inlining.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
@@ -26,10 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.estimator.priors import PARAMETERS, TwoViewState
-from rs_relpose_ros.geometry import so3
+from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.jit import inlined_kernel, kernel
-
-Array = NDArray[np.float64]
 
 # Matches of a block: enough to vectorise, few enough for the nearest cache.
 BLOCK = 64

@@ -7,13 +7,10 @@ between the frames is known, b is the baseline: an unknown of each fit, with a m
 grid as prior.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import CarrierMotion, MOTIONS
 from rs_relpose_ros.errors import InputError
@@ -23,11 +20,9 @@ from rs_relpose_ros.estimator.fit import DataTerm, fit, FitMatches, linearised
 from rs_relpose_ros.estimator.priors import PARAMETERS, Priors, SCALE, TwoViewState, VelocityPrior
 from rs_relpose_ros.estimator.problem import TwoViewProblem
 from rs_relpose_ros.estimator.sampson import Flags, RayMatches
-from rs_relpose_ros.geometry import so3
+from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.geometry.motion import InertialMotion
 from rs_relpose_ros.jit import kernel
-
-Array = NDArray[np.float64]
 
 ROUNDS = 3
 ITERATIONS = 6

@@ -4,21 +4,17 @@ Camera frame: x right, y down, z forward. The row time is that of the **raw, dis
 point is undistorted, its row is not.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry import distortion, validate
+from rs_relpose_ros.geometry import Array, distortion, validate
 from rs_relpose_ros.geometry.distortion import DistortionModel
 from rs_relpose_ros.geometry.so3 import dot
 from rs_relpose_ros.jit import kernel
-
-Array = NDArray[np.float64]
 
 REFERENCE_ROWS = ('first', 'middle', 'last')
 READOUT_DIRECTIONS = ('down', 'up')

@@ -4,19 +4,15 @@ To add a model: write its kernel and its row of `DISTORTION_MODELS`; camera, cal
 use the registry only.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 import math
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.jit import kernel, KernelInterface
-
-Array = NDArray[np.float64]
 
 
 @kernel

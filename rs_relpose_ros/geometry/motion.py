@@ -9,11 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry import validate
+from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.geometry.so3 import copy_matrix, copy_vector, exp_so3, log_so3, multiply
 from rs_relpose_ros.jit import kernel
-
-Array = NDArray[np.float64]
 
 # Far beyond any sensor: products of larger numbers may overflow.
 _LARGEST_RATE = 1e4   # [rad/s]

@@ -6,16 +6,13 @@ inlined in their callers, without allocation. Every sum runs over x, y, z in thi
 the bits are those of a sum that is written out.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.jit import kernel, small_kernel
 
-Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 STANDARD_GRAVITY = 9.80665   # [m/s^2]

@@ -12,19 +12,14 @@ stamp and middle of the exposure depends otherwise on the interval T between fra
 given (automatic exposure in little light).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rs_relpose_ros.geometry import validate
+from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
-
-Array = NDArray[np.float64]
 
 NANOSECONDS = 1_000_000_000
 

@@ -3,8 +3,6 @@
 A function returns the checked value: numbers as they are, arrays as a contiguous copy.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 import math
 import sys
@@ -14,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry import Array
 
-Array = NDArray[np.float64]
 Number = TypeVar('Number', int, float)
 
 _FLOAT_MAX = sys.float_info.max

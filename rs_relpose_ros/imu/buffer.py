@@ -4,8 +4,6 @@
 `frame_imu` collects the share of one frame.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from enum import Enum
 import math
@@ -16,6 +14,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import ImuConfig
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import integrated_rotations, STANDARD_GRAVITY
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
@@ -23,7 +22,6 @@ from rs_relpose_ros.imu import filters, integration
 from rs_relpose_ros.imu.filters import GravityEstimate, GyroBias
 from rs_relpose_ros.imu.integration import ForceSegment, FrameForce, FrameImu, GyroSegment
 
-Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 Vector = tuple[float, float, float]
 

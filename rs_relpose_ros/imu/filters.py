@@ -18,8 +18,6 @@ chapter 7)::
     E <- F E F^T + Q_gyro dt           E <- (I - K H) E (I - K H)^T + K noise K^T
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 import math
 from typing import NamedTuple
@@ -28,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import ImuConfig
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import cross, dot, exp_so3, norm, rotated, STANDARD_GRAVITY
 from rs_relpose_ros.geometry.timing import to_nanoseconds
 from rs_relpose_ros.jit import kernel
@@ -41,8 +40,6 @@ from rs_relpose_ros.jit import kernel
 #
 # `P_0` is the square of ``gyro_bias_sigma``. Of two consecutive windows at rest only the older one
 # is used: the newer one may contain the beginning of a motion.
-
-Array = NDArray[np.float64]
 
 # Time in which the variance of a measured bias grows back to `gyro_bias_sigma` squared [s].
 BIAS_MEMORY = 600.0

@@ -10,13 +10,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.config.settings import ImuConfig
-from rs_relpose_ros.geometry import so3
+from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 from rs_relpose_ros.geometry.so3 import integrated_rotations, skew
 from rs_relpose_ros.geometry.timing import seconds_between
 from rs_relpose_ros.jit import kernel
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

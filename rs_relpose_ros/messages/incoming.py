@@ -5,8 +5,6 @@ field is trusted: sizes are checked before memory is allocated, and an unusable 
 `InputError`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum

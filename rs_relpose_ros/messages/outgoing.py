@@ -4,8 +4,6 @@
 have the stamp of the current image.
 """
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Callable, Sequence
 from enum import auto, Enum
@@ -20,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.covariance import ImageInformation
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.messages.incoming import info_field
@@ -27,7 +26,6 @@ from rs_relpose_ros.pipeline.findings import FindingState
 from rs_relpose_ros.pipeline.pair import PAIR_METRICS, PairResult
 from rs_relpose_ros.tracking.images import Pixels
 
-Array = NDArray[np.float64]
 MessageTypes = Callable[[str], Any]
 
 _UINT32, _FLOAT32 = 6, 7   # sensor_msgs/PointField

@@ -4,8 +4,6 @@ For subscribers and readers of bags. Messages are read by field name only, and n
 trusted: an unusable one raises `InputError` with one line.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 import math
@@ -18,12 +16,10 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.covariance import ImageInformation, POSE, ROTATION
 from rs_relpose_ros.estimator.result import depths_of_rays, Status
-from rs_relpose_ros.geometry import validate
+from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.messages.incoming import stamp_ns, time_ns
 from rs_relpose_ros.messages.outgoing import MATCH_DTYPE, PAIR_TOPICS, PAIR_VALUES
-
-Array = NDArray[np.float64]
 
 # Largest deviation from 1 of the length of directions, quaternions and rays.
 _UNIT_TOLERANCE = 1e-3

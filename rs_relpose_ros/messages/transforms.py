@@ -4,8 +4,6 @@ A transform is the pose of a child frame in a parent: x y z [m], quaternion x y 
 plain transforms, for the buffer of tf2_ros (live) and the messages of a bag alike.
 """
 
-from __future__ import annotations
-
 from itertools import islice
 import logging
 import math

@@ -1,7 +1,5 @@
 """Statistics of the nodes: the fields of /diagnostics, log lines, files with a line per frame."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping, Sequence

@@ -1,7 +1,5 @@
 """global_shutter_node: derotated images of a rolling-shutter camera."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 import time

@@ -1,7 +1,5 @@
 """Subscriptions to camera and IMU, with counters; helpers for rclpy that all nodes share."""
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from collections.abc import Callable
 import functools

@@ -1,7 +1,5 @@
 """odometry_node: metric odometry from the pairs of relpose_node and the IMU."""
 
-from __future__ import annotations
-
 from collections import deque
 from functools import partial
 from typing import Any

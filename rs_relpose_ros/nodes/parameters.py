@@ -1,7 +1,5 @@
 """ROS parameters of the nodes, declared from the settings."""
 
-from __future__ import annotations
-
 import array
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager

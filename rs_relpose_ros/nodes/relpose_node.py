@@ -1,7 +1,5 @@
 """relpose_node: publishes the keyframe pairs of a rolling-shutter camera with an IMU."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import cv2

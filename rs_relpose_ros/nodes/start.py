@@ -5,8 +5,6 @@ for them. rclpy's own handlers are not used: they end the context in a thread of
 the main thread destroys the node, which has crashed the process.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 import importlib

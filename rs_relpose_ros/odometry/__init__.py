@@ -1,7 +1,5 @@
 """Metric odometry: pairs and IMU samples in one graph. Needs gtsam, an extra."""
 
-from __future__ import annotations
-
 import importlib.util
 
 from rs_relpose_ros.errors import MissingInputError

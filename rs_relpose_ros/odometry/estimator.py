@@ -4,8 +4,6 @@ The same live and offline: the result depends on pairs and samples, not on the o
 arrival within `_LATE_NS`.
 """
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -13,10 +11,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import exp_so3, skew, STANDARD_GRAVITY
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.buffer import Coverage, ImuInterval, ImuSample, ImuSamples
@@ -39,8 +37,6 @@ from rs_relpose_ros.odometry.states import (
     StartReport,
     StateInterval,
 )
-
-Array = NDArray[np.float64]
 
 # Largest delay of a message.
 _LATE_NS = 100_000_000

@@ -6,8 +6,6 @@ consecutive keyframes, and for a pair the information of its images alone (`esti
 so that no IMU sample counts twice.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -17,15 +15,13 @@ from typing import Any, NamedTuple
 import gtsam
 from gtsam.symbol_shorthand import B, L, V, X
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import ImuConfig, OdometryConfig
 from rs_relpose_ros.errors import RsRelposeError
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import skew, STANDARD_GRAVITY
 from rs_relpose_ros.imu.buffer import ImuInterval
 from rs_relpose_ros.odometry.pair import BodyState, deviations, KeyframePair, Mounting, square_root
-
-Array = NDArray[np.float64]
 
 # 1 sigma of the velocity of a body at rest [m/s], per axis.
 _REST_VELOCITY_SIGMA = 0.005

@@ -1,7 +1,5 @@
 """Metric odometry of a bag, as of a live node, and its errors against the ground truth."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -11,11 +9,11 @@ from typing import Any, NamedTuple
 
 from matplotlib.figure import Figure
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_relpose_ros.bags.reader import Bag, SensorTopics
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import aligning_rotation
 from rs_relpose_ros.geometry.timing import seconds_between
 from rs_relpose_ros.imu.buffer import ImuSample, ImuSamples
@@ -30,8 +28,6 @@ from rs_relpose_ros.offline.replay import read_truth, Replay
 from rs_relpose_ros.offline.truth import TrueTrajectory
 from rs_relpose_ros.output_files import prepare_folder, save_picture, SUMMARY_FILE
 from rs_relpose_ros.pipeline.findings import FindingState
-
-Array = NDArray[np.float64]
 
 _STYLES: Mapping[str, Mapping[str, Any]] = {
     'truth': {'color': 'black', 'lw': 2.5}, 'live': {'color': '#E69F00', 'lw': 1.2},

@@ -10,11 +10,11 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.covariance import ImageInformation
 from rs_relpose_ros.estimator.result import Status
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import log_so3, norm, tangent_basis
 from rs_relpose_ros.imu.buffer import ImuInterval
 from rs_relpose_ros.jit import kernel
@@ -22,8 +22,6 @@ from rs_relpose_ros.messages.incoming import stamp_ns
 from rs_relpose_ros.messages.published_pair import PairStatus
 from rs_relpose_ros.pipeline.findings import FindingState
 from rs_relpose_ros.pipeline.pair import PairResult
-
-Array = NDArray[np.float64]
 
 # Interval that no pair reaches [ns].
 _LONGEST_NS = 100_000_000_000

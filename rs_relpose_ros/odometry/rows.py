@@ -21,13 +21,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry import validate
+from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.geometry.so3 import integrated_rotations, log_so3, STANDARD_GRAVITY
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.imu.buffer import ImuInterval, ImuSamples
 from rs_relpose_ros.imu.integration import force_integrals
 
-Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
 CAMERA, IMU, BASE = FRAMES = ('camera', 'imu', 'base')

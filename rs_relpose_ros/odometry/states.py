@@ -12,16 +12,14 @@ import math
 from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
 from rs_relpose_ros.geometry.timing import seconds_between
 
 if TYPE_CHECKING:
     from rs_relpose_ros.odometry.estimator import OdometryEstimator
-
-Array = NDArray[np.float64]
 
 # A larger step back of the stamps is a clock that was set back.
 _JUMP_NS = 1_000_000_000

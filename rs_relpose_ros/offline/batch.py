@@ -1,7 +1,5 @@
 """A command over many bags on a Dask cluster; bags with a result of an earlier run are skipped."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, ExitStack

@@ -1,7 +1,5 @@
 """Results of many bags: a folder for each, one table, one picture, one combined calibration."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 import csv
 from dataclasses import asdict, dataclass, field, replace

@@ -1,7 +1,5 @@
 """The check of a bag: choose topics, read it once, report findings."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 import math

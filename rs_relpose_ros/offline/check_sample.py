@@ -4,8 +4,6 @@ The front end runs with the parameters as configured; a calibration completes pa
 missing, and replaces those that are too far off for the front end.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 import math

@@ -3,8 +3,6 @@
 Of a message only numbers are kept: 16 bytes, and another 72 of an IMU.
 """
 
-from __future__ import annotations
-
 from array import array
 from collections import Counter
 from typing import Any, NamedTuple
@@ -15,13 +13,12 @@ from numpy.typing import NDArray
 from rs_relpose_ros.bags.reader import BagMessage, Topic
 from rs_relpose_ros.config.settings import ImuConfig, IntrinsicsConfig
 from rs_relpose_ros.errors import RsRelposeError
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.imu.buffer import ImuSample, Vector
 from rs_relpose_ros.imu.filters import BiasTracker, GyroBias
 from rs_relpose_ros.messages.incoming import PARTS, Role
 from rs_relpose_ros.tracking.images import EncodedImage
-
-Array = NDArray[np.float64]
 
 # Uncertainty of the bias before it is measured at rest, 1 sigma [rad/s]; the gate is four times
 # that.

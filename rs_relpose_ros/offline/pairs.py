@@ -1,7 +1,5 @@
 """Relative poses of the pairs of a list, a row each."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 import csv
 from pathlib import Path

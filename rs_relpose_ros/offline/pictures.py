@@ -3,8 +3,6 @@
 They are drawn on canvases of their own, without matplotlib's global state.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
@@ -20,13 +18,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.estimator.result import Status
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.timing import seconds_between
 from rs_relpose_ros.offline.tables import PairRecord, rotation_sigmas, translation_sigmas
 from rs_relpose_ros.offline.truth import PairErrors, rotation_angle, TrueTrajectory
 from rs_relpose_ros.output_files import BLUE, GREEN, ORANGE, RED, save_picture
 from rs_relpose_ros.pipeline.pair import PairResult
-
-Array = NDArray[np.float64]
 
 _COLORMAP = 'plasma'
 _DPI = 110

@@ -15,18 +15,16 @@ from typing import Any, NamedTuple
 import cv2
 import numba
 import numpy as np
-from numpy.typing import NDArray
 import scipy
 
 from rs_relpose_ros.bags.reader import SensorTopics
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.estimator.result import RelativePose, Status
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.messages.incoming import ReasonCounts
 from rs_relpose_ros.messages.outgoing import number, published_covariance, quat_xyzw
 from rs_relpose_ros.offline.truth import median_and_p90, PairErrors, TrueTrajectory
 from rs_relpose_ros.pipeline.pair import PAIR_METRICS, PairResult
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,19 +1,16 @@
 """Errors of relative poses against the ground truth of a camera."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
-
-Array = NDArray[np.float64]
 
 # Largest interval of two poses for an interpolation.
 _MAX_GAP_NS = to_nanoseconds(0.2)

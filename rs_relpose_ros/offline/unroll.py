@@ -1,7 +1,5 @@
 """A bag with its images derotated to their middle row, and all other messages unchanged."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

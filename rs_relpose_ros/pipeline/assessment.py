@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.config.settings import SensorConfig
 from rs_relpose_ros.estimator.priors import inverse, log_determinant
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import REFERENCE_ROWS, RollingShutterCamera
 from rs_relpose_ros.geometry.so3 import exp_so3
 from rs_relpose_ros.geometry.timing import clocks_apart
@@ -24,8 +25,6 @@ from rs_relpose_ros.pipeline import findings
 from rs_relpose_ros.pipeline.findings import BIAS, Finding, FindingState, OFFSET, Quantity
 from rs_relpose_ros.pipeline.recursion import Calibration, PRIOR_INFORMATION, PRIOR_SIGMA
 from rs_relpose_ros.pipeline.rotations import RotationComparison
-
-Array = NDArray[np.float64]
 
 # Sigmas beyond which a deviation is certain.
 _CERTAIN = 4.0

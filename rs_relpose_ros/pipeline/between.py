@@ -5,22 +5,19 @@ those of its first one: the drift of a track is known there. In the frames befor
 that in proportion to time, which is the mean of a random walk with known ends.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_relpose_ros.estimator.frames_between import IntermediateFrame
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.motion import InertialMotion
 from rs_relpose_ros.geometry.timing import seconds_between, Sensor
 from rs_relpose_ros.imu.integration import FrameImu, motions_on_the_way
 from rs_relpose_ros.pipeline.pair import GyroRotation
 from rs_relpose_ros.tracking.features import Matches
 
-Array = NDArray[np.float64]
 Frames = TypeVar('Frames')
 
 # Frames between that are used, evenly in the pair: more of them add hardly any accuracy.

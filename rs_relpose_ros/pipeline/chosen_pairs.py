@@ -5,8 +5,6 @@ frame and gives gravity; the gyro between the frames is used unless it has a gap
 are close to each other the interval constrains the velocities, and the frames between are used.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import reduce

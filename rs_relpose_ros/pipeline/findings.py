@@ -12,8 +12,6 @@ The vector ``c`` (11,) of small deviations, true minus configured, has these par
 - `DISTORTION`: of the first coefficient of the lens.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum

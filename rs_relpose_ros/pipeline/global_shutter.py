@@ -10,8 +10,6 @@ R(tau)^T R_mid, distort, K, with tau of the row of the original pixel. The trans
 readout is not corrected: the gyro does not measure it, and its effect depends on depth.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 import math

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from rs_relpose_ros.config.settings import SensorConfig
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.estimator.velocity import InertialEvidence
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import tangent_basis
 from rs_relpose_ros.pipeline import assessment, findings, recursion
 from rs_relpose_ros.pipeline.assessment import Configured, Effect, Inconsistency
@@ -26,8 +26,6 @@ from rs_relpose_ros.pipeline.findings import (
 )
 from rs_relpose_ros.pipeline.recursion import Calibration, Recursion
 from rs_relpose_ros.pipeline.rotations import AccelerationSums, RotationSums
-
-Array = NDArray[np.float64]
 
 # Frames by which clocks are compared.
 _ARRIVALS = 20

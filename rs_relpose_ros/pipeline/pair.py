@@ -21,6 +21,7 @@ from rs_relpose_ros.estimator.estimate import estimate_relative_pose
 from rs_relpose_ros.estimator.frames_between import IntermediateFrame
 from rs_relpose_ros.estimator.problem import build_problem
 from rs_relpose_ros.estimator.result import Landmarks, landmarks, RelativePose, Status
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 from rs_relpose_ros.geometry.so3 import aligning_rotation, cross, median, norm, rotated
@@ -32,9 +33,6 @@ from rs_relpose_ros.pipeline.findings import Assessment, NOT_EVALUATED
 from rs_relpose_ros.pipeline.monitor import Applied, Tracked
 from rs_relpose_ros.tracking.features import Matches
 from rs_relpose_ros.tracking.images import EncodedImage, is_dark
-
-Array = NDArray[np.float64]
-
 
 Result = TypeVar('Result')
 

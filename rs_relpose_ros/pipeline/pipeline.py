@@ -1,7 +1,5 @@
 """The loop over frames, and the pipeline that tracks them and estimates keyframe pairs."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable
@@ -15,6 +13,7 @@ from numpy.typing import NDArray
 from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.errors import MissingInputError, RsRelposeError
 from rs_relpose_ros.estimator.result import RelativePose, Status
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, Sensor
@@ -28,8 +27,6 @@ from rs_relpose_ros.pipeline.recursion import PairData
 from rs_relpose_ros.pipeline.rotations import rotation_of_rays
 from rs_relpose_ros.pipeline.sequencer import FrameRefused, SCATTER_FRAMES, Sequencer, stamp_sigma
 from rs_relpose_ros.tracking.features import make_tracker, Matches, Tracker
-
-Array = NDArray[np.float64]
 
 # Number of points, of the longest tracks, and of frames over which the rotation of the images is
 # compared with the gyro.

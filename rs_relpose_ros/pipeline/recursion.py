@@ -30,6 +30,7 @@ from rs_relpose_ros.estimator.fit import FitMatches, gauss_newton
 from rs_relpose_ros.estimator.priors import inverse, PARAMETERS, TANGENT, THETA, TwoViewState
 from rs_relpose_ros.estimator.problem import build_problem, observed, TwoViewProblem
 from rs_relpose_ros.estimator.sampson import jacobian, residuals
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3, median, skew, tangent_basis
@@ -45,8 +46,6 @@ from rs_relpose_ros.pipeline.findings import (
     READOUT,
     SCALE,
 )
-
-Array = NDArray[np.float64]
 
 # Sigma of the velocities about the mean one [baselines per second].
 _VELOCITY_SIGMA = 1.0

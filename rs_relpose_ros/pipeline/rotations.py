@@ -7,16 +7,14 @@ maximises ``trace(Q^T M)`` aligns them (Kabsch 1976). A constant rate is removed
 a bias of the gyro, and a steady translation, which is similar to a rotation of the images.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_relpose_ros.estimator.velocity import InertialEvidence
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.motion import InertialMotion
 from rs_relpose_ros.geometry.so3 import aligning_rotation, log_so3, median
 from rs_relpose_ros.geometry.timing import to_nanoseconds
@@ -24,8 +22,6 @@ from rs_relpose_ros.imu.buffer import ForceFault
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.pipeline.findings import Finding, FindingState
 from rs_relpose_ros.pipeline.recursion import MOST_PAIRS, WINDOW_NS
-
-Array = NDArray[np.float64]
 
 # Fewer rays give no rotation.
 _LEAST_RAYS = 12

@@ -5,8 +5,6 @@ is dropped if the worker is too slow; offline no frame is dropped and no clock i
 that is not released is counted by its `Refusal`.
 """
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace

@@ -5,8 +5,6 @@
 fills the cache on two cores, in one to two minutes: the first run then starts at once.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 import gc
@@ -21,6 +19,7 @@ from rs_relpose_ros.estimator.estimate import estimate_relative_pose, Estimation
 from rs_relpose_ros.estimator.frames_between import IntermediateFrame
 from rs_relpose_ros.estimator.problem import build_problem
 from rs_relpose_ros.estimator.sampling import MODES
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.timing import NANOSECONDS
@@ -29,8 +28,6 @@ from rs_relpose_ros.pipeline.pair import Frame, Result
 from rs_relpose_ros.pipeline.pipeline import FrameLoop, FrontEnd
 from rs_relpose_ros.solvers.common import Solutions
 from rs_relpose_ros.tracking.images import RawImage
-
-Array = NDArray[np.float64]
 
 _WIDTH, _HEIGHT = 320, 240
 # With distortion, so that its kernels are compiled, too.

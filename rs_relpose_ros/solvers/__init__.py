@@ -1,7 +1,5 @@
 """Minimal solvers: a function per row of the table, such as `uniform_9pt`."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from rs_relpose_ros.solvers.api import as_function, MinimalSolution, MinimalSolver, SOLVERS

@@ -1,17 +1,14 @@
 """Small dense factorisations, and real roots of polynomials, for compiled code."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import cross, dot, Vector
 from rs_relpose_ros.jit import kernel
-
-Array = NDArray[np.float64]
 
 
 @kernel

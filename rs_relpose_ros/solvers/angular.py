@@ -7,19 +7,15 @@ every solution polished by Newton's method on the five constraints, which remove
 the elimination.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.geometry import so3
+from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.solvers import algebra, common
 from rs_relpose_ros.solvers.common import Knowledge, Sample, Solutions
-
-Array = NDArray[np.float64]
 
 MAX_5PT = 10
 

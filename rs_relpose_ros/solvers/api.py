@@ -10,21 +10,17 @@ C.-R. Lee and K.-J. Yoon, *Inertial-aided Rolling Shutter Relative Pose Estimati
 'Minimal Algorithms' and 'Solver'.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry import validate
+from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.solvers import angular, common, uniform
 from rs_relpose_ros.solvers.common import Knowledge, Model, Sample, Solver
-
-Array = NDArray[np.float64]
 
 UNIFORM = Model('uniform', derotated=True, velocities=True)
 LINEAR = Model('linear', derotated=False, velocities=True)

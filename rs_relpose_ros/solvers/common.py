@@ -4,8 +4,6 @@ A solver is a kernel that is called by its address: the robust loop is compiled 
 only when it is used.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 import math
@@ -13,12 +11,10 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import copy_matrix, cross, dot, norm, rotated, rotated_back
 from rs_relpose_ros.jit import kernel, KernelInterface
-
-Array = NDArray[np.float64]
 
 
 class Sample(NamedTuple):

@@ -1,20 +1,16 @@
 """Solvers with linear velocities: uniform and linear 9-point (gravity known), uniform 11-point."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_relpose_ros.geometry import so3
+from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.solvers import algebra, common
 from rs_relpose_ros.solvers.angular import MAX_5PT, solve_5pt
 from rs_relpose_ros.solvers.common import AlignedRays, Knowledge, RowTimeFactors, Sample, Solutions
-
-Array = NDArray[np.float64]
 
 MAX_9PT = 12
 # Of the determinant of A(psi). Not 9: its leading complex coefficient matrix loses rank.

@@ -14,10 +14,9 @@ from scipy.spatial import KDTree
 
 from rs_relpose_ros.config.settings import TRACKERS, TrackingConfig
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.tracking.images import checked, Image
-
-Array = NDArray[np.float64]
 
 # Side of the window over which the structure tensor of the half-size image is summed.
 _BLOCK = 5

@@ -1,7 +1,5 @@
 """Lucas-Kanade tracking of corners; alignment of their windows with the reference keyframe."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 import math
 from typing import NamedTuple
@@ -12,11 +10,10 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import TrackingConfig
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.tracking import features, windows
 from rs_relpose_ros.tracking.features import Matches
 from rs_relpose_ros.tracking.images import checked, Image
-
-Array = NDArray[np.float64]
 
 # OpenCV's termination criteria: kind, steps, step [px].
 Criteria = tuple[int, int, float]

@@ -4,8 +4,6 @@ OpenCV's Lucas-Kanade prepares a whole image for a few hundred windows. On a mos
 cost does not depend on the size of the image.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import math
 
@@ -13,11 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import median
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.tracking.images import Image
 
-Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
 # Beyond any image, and small enough for integers [px].
