@@ -1,9 +1,11 @@
 """Derotated images: map, pixels, stamps, and bags, against independent truth."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from conftest import BUNDLED_PARAMETERS
 import cv2
 import message_builders as build
 import numpy as np
@@ -20,12 +22,21 @@ from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.bag import write_bag, write_parameters
 from rs_relpose_ros.bags.reader import open_bag, RawMessage
 from rs_relpose_ros.cli.main import main as command_line
+from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.timing import ImageClock, Sensor
 from rs_relpose_ros.imu.buffer import ImuSample
-from rs_relpose_ros.messages.incoming import image_from_message, intrinsics_from_info, stamp_ns
+from rs_relpose_ros.messages.incoming import (
+    image_from_message,
+    Intake,
+    intrinsics_from_info,
+    Role,
+    sensor_messages,
+    stamp_ns,
+)
+from rs_relpose_ros.pipeline.findings import Assessment
 from rs_relpose_ros.pipeline.global_shutter import MiddleRow, unrolling_loop
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.tracking.images import CompressedImage, RawImage
@@ -423,3 +434,51 @@ def test_nothing_is_left_behind_by_a_run_that_fails(bag, tmp_path, monkeypatch, 
 ])
 def test_bad_input_is_one_line(bag, tmp_path, refused, options, expected):
     refused(expected, 'unroll', bag[0], tmp_path / 'out', '--params', bag[1], *options)
+
+
+# -- the own watch of the rotation ---------------------------------------------------------------
+
+
+def watched(bag: Path, parameters: Parameters, change: Callable[[Any], None], *,
+            is_watched: bool = True) -> list[Assessment]:
+    """States of the calibration with each frame."""
+    loop = unrolling_loop(parameters, offline=True, watched=lambda: is_watched)
+    intake, found = Intake(loop.sequencer, parameters), []
+    with open_bag(bag) as opened:
+        for role, message in sensor_messages(opened, opened.find_topics()):
+            if role is Role.IMU:
+                change(message.message.angular_velocity)
+            intake.receive(role, message.message)
+            while (frame := loop.step()) is not None:
+                found.append(frame.result.health)
+    return found
+
+
+def in_degrees(rate: Any) -> None:
+    rate.x, rate.y, rate.z = np.degrees([rate.x, rate.y, rate.z])
+
+
+def with_a_sign(rate: Any) -> None:
+    rate.y = -rate.y
+
+
+@pytest.mark.parametrize(('turn', 'change', 'quantity'), [
+    ((0.0, 0.0, np.pi), lambda rate: None, 'axes'),
+    ((0.0, 0.0, 0.0), in_degrees, 'gyro_unit'), ((0.0, 0.0, 0.0), with_a_sign, 'axes'),
+    ((0.0, 0.0, 0.0), lambda rate: None, '')])
+def test_gross_errors_are_found_without_relpose_node(bundled_bag, turn, change, quantity):
+    parameters = read_parameters(BUNDLED_PARAMETERS)
+    parameters = parameters.updated({'quat_cam_imu_xyzw': tuple((
+        Rotation.from_rotvec(turn) * Rotation.from_quat(
+            parameters.sensor.quat_cam_imu_xyzw)).as_quat())})
+    found = watched(bundled_bag, parameters, change)
+    named = [health.faults[0].quantity if health.faults else '' for health in found]
+    assert set(named) == {'', quantity} and named[-1] == quantity
+    # Within 3 s of the walk.
+    assert not quantity or named.index(quantity) < 90
+
+
+def test_nothing_is_watched_where_relpose_node_does(bundled_bag):
+    found = watched(bundled_bag, read_parameters(BUNDLED_PARAMETERS), in_degrees,
+                    is_watched=False)
+    assert not any(health.faults for health in found)

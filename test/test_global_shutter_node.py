@@ -9,11 +9,12 @@ from typing import Any
 
 from conftest import BUNDLED_PARAMETERS, ROOT
 import cv2
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import fault_stream as faults
 from fault_stream import BAG_TOPICS, Fault, SECOND, stamp_of, Stream
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 
 from rs_relpose_lab.experiments.global_shutter import frames_of_bag
@@ -239,3 +240,44 @@ def test_other_images_of_the_same_driver_are_reported(ros_domain_id):
             silent.wait_for('ready')
             node.wait_for('/camera/depth of the same driver keep stamps on the clock of the camer')
             assert 'same driver' not in silent.output
+
+
+def status_of_relpose(state: str) -> DiagnosticArray:
+    return DiagnosticArray(status=[DiagnosticStatus(
+        name='/relpose_node: relative pose', hardware_id=BAG_TOPICS['image'], values=[
+            KeyValue(key='health', value=state), KeyValue(
+                key='health_findings', value=f'axes ok: a; readout_time {state}: b')])])
+
+
+def test_images_of_a_wrong_calibration_are_suppressed(ros_domain_id, bundled_bag):
+    """By the own watch, and by relpose_node while it runs."""
+    quaternion = Rotation.from_rotvec([0.0, 0.0, np.pi]) * Rotation.from_quat(read_parameters(
+        BUNDLED_PARAMETERS).sensor.quat_cam_imu_xyzw)
+    messages = faults.read_messages(bundled_bag, 4.0)
+    with Graph() as graph, node_process(
+            BUNDLED_PARAMETERS, remap=BAG_TOPICS, node='global_shutter_node', parameters={
+                'image_transport': 'raw', 'quat_cam_imu_xyzw': quaternion.as_quat().tolist(),
+                **faults.reliable(*BAG_TOPICS.values())}) as node:
+        infos = graph.listen(CameraInfo, f'{OWN}/camera_info')
+        diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
+        node.wait_for('ready')
+        publishers = faults.drivers(graph)
+        faults.play(publishers, messages)
+        node.wait_for('axes is wrong')
+        wait_until_quiet(lambda: len(infos), 1.0, node)
+        count = len(infos)
+        faults.play(publishers, messages, later=10.0)
+        wait_until_quiet(lambda: len(infos), 1.0, node)
+        assert len(infos) < count + 5   # the window of the watch begins again after a jump
+        values = diagnostic_values(diagnostics[-1])
+        assert int(values['images_withheld']) > 100
+        assert (values['health'], values['health_source']) == ('wrong', 'own watch')
+        assert diagnostics[-1].status[0].level == DiagnosticStatus.ERROR
+        relpose = graph.node.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        relpose.publish(status_of_relpose('ok'))
+        count = len(infos)
+        faults.play(publishers, messages[:200], later=20.0)
+        wait_until(lambda: len(infos) > count + 5, 'images', node)
+        relpose.publish(status_of_relpose('wrong'))
+        faults.play(publishers, messages[:200], later=30.0)
+        node.wait_for('readout_time wrong: b')

@@ -499,8 +499,8 @@ class PairConfig(Settings):
         True, 'accelerometer between the frames for velocities and baseline, with '
         'use_gyro_rotation (otherwise it only gives gravity)')
     withhold_when_wrong: bool = setting(
-        True, 'suppress poses while a configured parameter contradicts the data (see health in '
-        '/diagnostics)', live=True)
+        True, 'suppress poses (global_shutter_node: images) while a configured parameter '
+        'contradicts the data (see health in /diagnostics)', live=True)
     reference_frame: str = setting(
         '', 'frame_id of relative poses; empty for <camera frame>_reference')
     image_transport: str = setting('raw', 'transport of the images', choices=('raw', 'compressed'))

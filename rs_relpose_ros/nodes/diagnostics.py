@@ -108,6 +108,8 @@ def lost_images(stamps_ns: Sequence[int], size: int) -> str:
 # -- Fields of /diagnostics -----------------------------------------------------------------------
 
 OK, WARN, ERROR = 0, 1, 2
+# Task in the name of the status of relpose_node.
+RELATIVE_POSE = 'relative pose'
 
 # Numbers of the latest results and frames over which latency and time per frame are taken.
 _RECENT_RESULTS = 300

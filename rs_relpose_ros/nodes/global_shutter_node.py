@@ -1,19 +1,23 @@
 """global_shutter_node: derotated images of a rolling-shutter camera."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
+import re
 import time
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.messages.incoming import PARTS, Role
-from rs_relpose_ros.nodes.diagnostics import FrameStatistics, OK
+from rs_relpose_ros.nodes.diagnostics import ERROR, FrameStatistics, OK, RELATIVE_POSE, WARN
 from rs_relpose_ros.nodes.inputs import message_class
 from rs_relpose_ros.nodes.sensor_node import run_node, SensorNode
+from rs_relpose_ros.pipeline.findings import FindingState
 from rs_relpose_ros.pipeline.global_shutter import (
     GlobalShutterFrame,
     unrolling_loop,
@@ -26,15 +30,40 @@ NAME = 'global_shutter_node'
 
 # Queue of a third of a second of images.
 _DEPTH = 10
+# Age of a state of relpose_node, which comes once a second [s].
+_FRESH = 3.0
 _IMAGE_TYPES = PARTS[Role.IMAGE].msgtypes
 _DESCRIPTION = (
     'Derotated images of a rolling-shutter camera: every row rotated by the gyro to the time of\n'
     'the middle one.\n\n'
     'subscribes: image (or image/compressed with image_transport:=compressed), '
-    'camera_info, imu, accel\n'
+    'camera_info, imu, accel,\n            calibration, /diagnostics\n'
     'publishes:  ~/image, ~/image/compressed and ~/mask, each while it is subscribed,\n'
     '            ~/camera_info, /diagnostics\n'
     'service:    ~/reset')
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """State of the calibration, the worst finding, and which node found it."""
+
+    state: FindingState = FindingState.UNKNOWN
+    text: str = ''
+    source: str = ''
+
+    @property
+    def level(self) -> int:
+        """Of the diagnostic status."""
+        return {FindingState.WRONG: ERROR, FindingState.SUSPECT: WARN}.get(self.state, OK)
+
+    @classmethod
+    def of_status(cls, status: Any) -> Health:
+        """That of a status of relpose_node on /diagnostics."""
+        values = {item.key: item.value for item in status.values}
+        findings = [text for text in values.get('health_findings', '').split('; ')
+                    if re.match(r'\w+ (wrong|suspect): ', text)]
+        return cls(FindingState(values.get('health', 'unknown')), '; '.join(findings),
+                   status.name.partition(':')[0])
 
 
 class _Statistics(FrameStatistics):
@@ -44,22 +73,28 @@ class _Statistics(FrameStatistics):
 
     def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
         super().__init__(clock)
-        self._images = 0
+        self._images = self._withheld = 0
         self._last: GlobalShutterFrame | None = None
+        self._health = Health()
 
-    def add_image(self, frame: GlobalShutterFrame, ready_ns: int) -> None:
+    def add_image(self, frame: GlobalShutterFrame, ready_ns: int, health: Health, *,
+                  withheld: bool) -> None:
         """Count an image right after its publication; its data were complete at `ready_ns`."""
         with self._lock:
-            self._images += 1
-            self._last = frame
+            self._images += not withheld
+            self._withheld += withheld
+            self._last, self._health = frame, health
             self._published(ready_ns)
 
     def _evaluate_results(self) -> tuple[int, str]:
+        if self._health.level != OK:
+            return self._health.level, self._health.text
         return OK, f'publishing: {self._images} images' if self._images else 'no image yet'
 
     def _values(self) -> dict[str, object]:
         last = self._last
-        return {'images_published': self._images,
+        return {'images_published': self._images, 'images_withheld': self._withheld,
+                'health': self._health.state.value, 'health_source': self._health.source,
                 'largest_shift_px': '' if last is None else f'{last.map.shift:.1f}',
                 'applied_time_offset_ms': '' if last is None else
                 f'{1e-6 * last.applied_offset_ns:.2f}'}
@@ -73,7 +108,9 @@ class GlobalShutterNode(SensorNode):
 
     def __init__(self) -> None:
         self._statistics = _Statistics()
+        self._of_others: tuple[float, Health] | None = None   # with its time [s]
         super().__init__(NAME, self._statistics)
+        self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
 
     def _open_outputs(self, parameters: Parameters) -> None:
         def publisher(msgtype: str, topic: str) -> Any:
@@ -87,7 +124,7 @@ class GlobalShutterNode(SensorNode):
         self._camera_info = publisher('sensor_msgs/msg/CameraInfo', '~/camera_info')
 
     def _make_loop(self, parameters: Parameters) -> FrameLoop[GlobalShutterFrame]:
-        return unrolling_loop(parameters)
+        return unrolling_loop(parameters, watched=lambda: self._by_relpose() is None)
 
     def _warm_up(self) -> None:
         warm_up_unroller(self._settings.current)
@@ -98,9 +135,35 @@ class GlobalShutterNode(SensorNode):
                                                     clock=self._steady)
 
     def _on_processed(self, frame: Frame[GlobalShutterFrame]) -> None:
-        assert frame.result is not None
-        self._publish(frame.result)
-        self._statistics.add_image(frame.result, frame.ready_ns)
+        result = frame.result
+        assert result is not None
+        own = result.health
+        health = self._by_relpose() or Health(
+            own.state, '; '.join(fault.text for fault in own.faults), 'own watch')
+        withhold = self._settings.current.pair.withhold_when_wrong
+        withheld = withhold and health.state is FindingState.WRONG
+        if health.level != OK:
+            text = health.text + ('' if health.level == WARN else (
+                '; images are suppressed: withhold_when_wrong: false publishes them all the same'
+                if withhold else '; images are published all the same, as withhold_when_wrong is '
+                'false'))
+            (self._error if health.level == ERROR else self._warn)(text, health.text[:20])
+        if not withheld:
+            self._publish(result)
+        self._statistics.add_image(result, frame.ready_ns, health, withheld=withheld)
+
+    def _by_relpose(self) -> Health | None:
+        """The state of relpose_node; None if it does not run on these images."""
+        found = self._of_others
+        return found[1] if found and time.monotonic() - found[0] < _FRESH else None
+
+    def _on_diagnostics(self, message: Any) -> None:
+        """Keep the state of relpose_node on the same images."""
+        own = self._image_topic().removesuffix('/compressed')
+        for status in message.status:
+            if (status.name.endswith(f': {RELATIVE_POSE}')
+                    and status.hardware_id.removesuffix('/compressed') == own):
+                self._of_others = time.monotonic(), Health.of_status(status)
 
     def _publish(self, frame: GlobalShutterFrame) -> None:
         """Publish the topics that are subscribed."""

@@ -11,7 +11,13 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_ros.config.settings import PairConfig, Parameters
 from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.messages.outgoing import DEBUG_IMAGE, PAIR_TOPICS
-from rs_relpose_ros.nodes.diagnostics import FrameTimings, HealthLog, opened, Statistics
+from rs_relpose_ros.nodes.diagnostics import (
+    FrameTimings,
+    HealthLog,
+    opened,
+    RELATIVE_POSE,
+    Statistics,
+)
 from rs_relpose_ros.nodes.inputs import message_class, transform_broadcaster
 from rs_relpose_ros.nodes.sensor_node import run_node, SensorNode
 from rs_relpose_ros.pipeline.pair import Frame, PairResult
@@ -33,7 +39,7 @@ _DESCRIPTION = (
 class RelposeNode(SensorNode):
     """Relative poses of a rolling-shutter camera with an IMU."""
 
-    task = 'relative pose'
+    task = RELATIVE_POSE
 
     def __init__(self) -> None:
         self._statistics = Statistics()

@@ -10,7 +10,7 @@ R(tau)^T R_mid, distort, K, with tau of the row of the original pixel. The trans
 readout is not corrected: the gyro does not measure it, and its effect depends on depth.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 import math
 from typing import Any, NamedTuple
@@ -20,13 +20,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import Parameters, sensor_model
+from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.geometry import timing
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.motion import FrameMotion
+from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import Sensor, to_nanoseconds
-from rs_relpose_ros.pipeline.pair import Frame
+from rs_relpose_ros.pipeline.assessment import Configured
+from rs_relpose_ros.pipeline.findings import Assessment, DEVIATIONS
+from rs_relpose_ros.pipeline.monitor import ConsistencyMonitor
+from rs_relpose_ros.pipeline.pair import Frame, GyroRotation
 from rs_relpose_ros.pipeline.pipeline import FrameLoop, Pipeline, Processor
+from rs_relpose_ros.pipeline.rotations import rotation_of_rays
 from rs_relpose_ros.pipeline.warm_up import made_up_frames, MADE_UP_SENSOR, warm_up_pipeline
+from rs_relpose_ros.tracking.features import make_tracker, Tracker
 from rs_relpose_ros.tracking.images import GrayLevels, Pixels
 
 # Pixels from node to node of the grid on which the map is exact; linear in between. At 3 rad/s
@@ -36,6 +43,8 @@ _STEP = 8
 _BAND = 64
 # Orientations over the readout; linear in between, to 1e-7 rad at 3 rad/s.
 _ORIENTATIONS = 129
+# Of a frame by itself.
+_NO_POSE = RelativePose(Status.TOO_FEW_MATCHES, 'no pair')
 
 
 class RowMap(NamedTuple):
@@ -118,6 +127,7 @@ class GlobalShutterFrame:
     map: RowMap
     border: str   # of `_BORDERS`
     applied_offset_ns: int   # tracked time offset in the stamp, beyond the parameter's
+    health: Assessment   # by the frames before, if they are watched or tracked
 
     def image(self) -> Pixels:
         """The derotated image, in the encoding of the original."""
@@ -146,25 +156,39 @@ class Unroller(Processor[GlobalShutterFrame]):
     """Derotates frames.
 
     With `track_time_offset` or `track_readout_time` the frames also pass through the pipeline of
-    relpose_node, after they are published, and its tracked corrections are applied here.
+    relpose_node, after they are published, and its tracked corrections are applied here. Else,
+    while `watched`, the rotation of the images is compared with the gyro now and then.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, watched: Callable[[], bool] = lambda: False) -> None:
         self._pipeline: Pipeline | None = None
+        self._watch, self._watched = RotationWatch(), watched
         self._levels = GrayLevels()
         self._due: tuple[Frame[Any], Parameters] | None = None   # for the pipeline
         self._middle: MiddleRow | None = None
 
     def prepare(self) -> None:
-        """Let the pipeline track the last frame."""
+        """Let the pipeline or the watch track the last frame."""
         due, self._due = self._due, None
-        if due is not None and self._pipeline is not None:
-            self._pipeline.process(*due)
+        if due is None:
+            return
+        frame, parameters = due
+        assert frame.encoded is not None
+        # The gray image of relpose_node, bit by bit.
+        if self._pipeline is not None:
+            self._pipeline.process(replace(
+                frame, image=frame.encoded.decoded(self._levels), encoded=None,
+                encoding='mono8'), parameters)
             self.applied = self._pipeline.applied
+        elif not self._watched():
+            self._watch = RotationWatch()
+        elif self._watch.needs(frame):
+            self._watch.add(frame, frame.encoded.decoded(self._levels), parameters)
 
     def reset(self) -> None:
         """Forget the frames so far: tracking restarts with the next one."""
         self._due = None
+        self._watch.reset()
         if self._pipeline is not None:
             self._pipeline.reset()
 
@@ -179,10 +203,7 @@ class Unroller(Processor[GlobalShutterFrame]):
         model = sensor_model(frame.intrinsics, sensor, self.applied.readout_time)
         if self._middle is None or self._middle.sensor != model:
             self._middle = MiddleRow(model)
-        if self._pipeline is not None:
-            # The gray image of relpose_node, bit by bit.
-            self._due = replace(frame, image=frame.encoded.decoded(self._levels), encoded=None,
-                                encoding='mono8'), parameters
+        self._due = frame, parameters
         reference_ns = imu.reference_ns
         if parameters.global_shutter.stamp_clock == 'camera':
             reference_ns = frame.stamp_ns + to_nanoseconds(
@@ -192,13 +213,71 @@ class Unroller(Processor[GlobalShutterFrame]):
             reference_ns + to_nanoseconds(self._middle.delay),
             Pixels(frame.image, frame.encoding), frame.stamp_ns, frame.frame_id, frame.intrinsics,
             frame.encoded.is_png, self._middle.map(imu.motion), parameters.global_shutter.border,
-            imu.applied_offset_ns)
+            imu.applied_offset_ns,
+            self._watch.health if self._pipeline is None else self._pipeline.health)
 
 
-def unrolling_loop(parameters: Parameters, *,
-                   offline: bool = False) -> FrameLoop[GlobalShutterFrame]:
-    """The loop that derotates frames."""
-    return FrameLoop(parameters, Unroller(), offline=offline, colors=True)
+# Time from one comparison to the next [ns].
+_WATCH_NS = to_nanoseconds(0.2)
+
+
+class RotationWatch:
+    """Compares the rotation between two frames, now and then, with the gyro: gross errors.
+
+    Two that follow each other: further apart a gyro in deg/s has turned more than once.
+
+    A few per cent of the processing time of relpose_node, which assesses all parameters.
+    """
+
+    def __init__(self) -> None:
+        self._tracker: Tracker | None = None
+        self._monitor = ConsistencyMonitor()
+        self._last_ns = 0
+        self.reset()
+
+    @property
+    def health(self) -> Assessment:
+        """By the frames so far."""
+        return self._monitor.health
+
+    def reset(self) -> None:
+        """Forget the first frame of an unfinished comparison."""
+        self._begin: Frame[Any] | None = None
+
+    def needs(self, frame: Frame[Any]) -> bool:
+        """Whether a frame ends a comparison or begins one; an earlier stamp begins one."""
+        return self._begin is not None or not 0 <= frame.stamp_ns - self._last_ns < _WATCH_NS
+
+    def add(self, frame: Frame[Any], image: NDArray[np.uint8], parameters: Parameters) -> None:
+        """Follow points into a frame with this gray `image` (H, W)."""
+        self._monitor.ahead.append(frame.imu.ahead)
+        begin = self._begin
+        if (self._tracker is None or begin is None or frame.imu.since_previous is None
+                or frame.intrinsics != begin.intrinsics):
+            self._tracker = self._tracker or make_tracker(parameters.tracking)
+            self._tracker.reset()
+            self._tracker.start(image)
+            self._begin, self._last_ns = frame, frame.stamp_ns
+            return
+        # Not predicted by the gyro, which may be wrong.
+        matches = self._tracker.track(image)
+        camera = sensor_model(frame.intrinsics, parameters.sensor).camera
+        by_images = rotation_of_rays(*(camera.unproject(frame.intrinsics.to_sensor(points))
+                                       for points in (matches.points1, matches.points2)))
+        if by_images is not None:
+            self._monitor.rotations.add(
+                frame.stamp_ns, timing.seconds_between(begin.stamp_ns, frame.stamp_ns), by_images,
+                log_so3(GyroRotation.of(frame.imu, parameters.imu).rotation))
+        self._monitor.add_pair(frame.stamp_ns, None, _NO_POSE, Configured(
+            parameters.sensor, camera, np.array(parameters.imu.gyro_bias),
+            parameters.imu.gyro_bias_sigma, np.zeros(DEVIATIONS)))
+        self.reset()
+
+
+def unrolling_loop(parameters: Parameters, *, offline: bool = False,
+                   watched: Callable[[], bool] = lambda: False) -> FrameLoop[GlobalShutterFrame]:
+    """The loop that derotates frames; `watched` is that of `Unroller`."""
+    return FrameLoop(parameters, Unroller(watched), offline=offline, colors=True)
 
 
 def warm_up_unroller(parameters: Parameters) -> None:
@@ -208,6 +287,6 @@ def warm_up_unroller(parameters: Parameters) -> None:
         warm_up_pipeline(parameters)
     parameters = parameters.updated({
         **MADE_UP_SENSOR, 'track_time_offset': False, 'track_readout_time': False})
-    for frame in made_up_frames(unrolling_loop(parameters, offline=True)):
+    for frame in made_up_frames(unrolling_loop(parameters, offline=True, watched=lambda: True)):
         assert frame.result is not None
         frame.result.image()

@@ -86,6 +86,11 @@ class Pipeline(Processor[PairResult]):
         self._stamps_ns: deque[int] = deque(maxlen=SCATTER_FRAMES)
         self.reset()
 
+    @property
+    def health(self) -> findings.Assessment:
+        """By the pairs so far."""
+        return self._monitor.health
+
     def reset(self) -> None:
         """Forget the reference keyframe: tracking restarts with the next frame."""
         self._tracker.reset()
