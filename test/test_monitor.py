@@ -264,6 +264,20 @@ def faults_of(sums):
     return assess(recursion.NOTHING_ESTIMATED, [], gross, CONFIGURED).faults
 
 
+@pytest.mark.parametrize(('axis', 'angle', 'named'), [
+    (2, 90.0, 'by 90 deg clockwise'), (2, -90.0, 'by 90 deg counterclockwise'), (1, 90.0, ''),
+    (2, 130.0, ''), (2, 180.0, 'upside down')])
+def test_images_on_their_side_are_offered_as_reason(axis, angle, named):
+    """Clockwise: a point right of the centre is below it then, as y points down."""
+    turn = Rotation.from_rotvec(math.radians(angle) * np.eye(3)[axis]).as_matrix()
+    if named.endswith(' clockwise'):
+        np.testing.assert_allclose(turn @ [1.0, 0.0, 1.0], [0.0, 1.0, 1.0], atol=1e-12)
+    faults = faults_of(rotations(turn))
+    assert faults[0].quantity == 'axes'
+    others = [fault.message for fault in faults if fault.quantity == 'image_geometry']
+    assert len(others) == bool(named) and all(text.endswith(named) for text in others)
+
+
 def test_a_gross_error_persists_until_it_is_contradicted():
     degrees, unknown = rotations(np.eye(3), math.radians(1.0), size=3.0).compared(), None
     independent = rotations(np.zeros((3, 3)), size=0.2, noise=0.05).compared()

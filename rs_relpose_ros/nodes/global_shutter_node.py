@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 import re
 import time
-from typing import Any
+from typing import Any, Self
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import QoSProfile
@@ -57,7 +57,7 @@ class Health:
         return {FindingState.WRONG: ERROR, FindingState.SUSPECT: WARN}.get(self.state, OK)
 
     @classmethod
-    def of_status(cls, status: Any) -> Health:
+    def of_status(cls, status: Any) -> Self:
         """That of a status of relpose_node on /diagnostics."""
         values = {item.key: item.value for item in status.values}
         findings = [text for text in values.get('health_findings', '').split('; ')

@@ -19,7 +19,7 @@ from rs_relpose_ros.config.settings import SensorConfig
 from rs_relpose_ros.estimator.priors import inverse, log_determinant
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import REFERENCE_ROWS, RollingShutterCamera
-from rs_relpose_ros.geometry.so3 import exp_so3
+from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
 from rs_relpose_ros.geometry.timing import clocks_apart
 from rs_relpose_ros.pipeline import findings
 from rs_relpose_ros.pipeline.findings import BIAS, Finding, FindingState, OFFSET, Quantity
@@ -38,6 +38,8 @@ _UNIT_FACTOR = 5.0
 _LONG_ROTATION, _INDEPENDENT = 2.0, 0.85
 # Rotations within this [rad] of half a turn about an axis of the image also are flipped images.
 _HALF_TURN = 0.6
+# The same for a quarter of a turn about the optical axis.
+_QUARTER_TURN = 0.3
 # Quantile of the pairs' shifts that decides whether a deviation matters: pairs of little motion
 # hide it.
 _OBSERVABLE_IN = 0.9
@@ -394,6 +396,12 @@ def _wrong_axes(rotations: RotationComparison, configured: Configured) -> Iterat
                  f'those of the gyro by quat_cam_imu_xyzw; about {xyzw} fits', 'refine it with '
                  '"rs_relpose calibrate" (a static transform with parent imu holds the inverse)',
                  configured=0.0, estimated=math.degrees(angle), unit='deg')
+    about_view = float(log_so3(Q)[2])
+    if abs(abs(about_view) - 0.5 * math.pi) < _QUARTER_TURN > angle - abs(about_view):
+        yield _fault('image_geometry', 'alternatively, the images are rotated by 90 deg '
+                     + ('clockwise' if about_view > 0.0 else 'counterclockwise'), 'publish them '
+                     'as the sensor provides them, with its CameraInfo: no other has rows that '
+                     'are read one by one')
     if abs(angle - math.pi) < _HALF_TURN:
         axis_of = np.abs(np.linalg.eigh(Q + Q.T)[1][:, -1])
         if float(axis_of.max()) > math.cos(_HALF_TURN):
