@@ -1,8 +1,16 @@
 """Files of results: pictures, and their folder."""
 
+<<<<<<< HEAD
 from collections.abc import Sequence
+=======
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+>>>>>>> 3210a6a (wip export)
 import os
 from pathlib import Path
+import tempfile
 
 import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -42,3 +50,19 @@ def prepare_folder(folder: Path, replaced: Sequence[str]) -> None:
             (folder / name).unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f'{folder} cannot be written: {error.strerror}') from error
+
+
+@contextmanager
+def beside(out: Path) -> Iterator[Path]:
+    """Path to write before it is renamed to `out`, so that this appears when it is complete.
+
+    It has the same name, in a temporary folder beside, which is removed with what is left.
+    """
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        temporary = tempfile.TemporaryDirectory(prefix=f'.{out.name}.', suffix='.part',
+                                                dir=out.parent)
+    except OSError as error:
+        raise InputError(f'{out} cannot be written: {error.strerror}') from error
+    with temporary as folder:
+        yield Path(folder) / out.name

@@ -3,8 +3,9 @@
 import argparse
 from collections import Counter
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from rs_relpose_ros.bags.reader import Bag, SensorTopics
 from rs_relpose_ros.cli.main import Command, FAILED, make_parser
@@ -23,6 +24,9 @@ from rs_relpose_ros.offline.pairs import pairs_into, read_pairs
 from rs_relpose_ros.offline.replay import read_stamps, replay_into, ReplayOutcome
 from rs_relpose_ros.offline.tables import POSES
 from rs_relpose_ros.output_files import SUMMARY_FILE
+
+if TYPE_CHECKING:   # it imports gtsam
+    from rs_relpose_ros.odometry.offline import OdometryOutcome
 
 _MOST_REASONS = 5
 
@@ -205,16 +209,30 @@ PAIRS = Command(
 # -- odometry --------------------------------------------------------------------------------
 
 
+def _add_odometry_arguments(parser: argparse.ArgumentParser) -> None:
+    add_run_arguments(parser, 'odometry')
+    parser.add_argument('--rate', metavar='HZ', type=rate_in_hertz, default=0.0,
+                        help='also write trajectory_rows.tum: smoothed poses at this rate')
+
+
+def rate_in_hertz(text: str) -> float:
+    """Type of an option."""
+    rate = float(text)
+    if not 1e-3 <= rate <= 1e5:
+        raise argparse.ArgumentTypeError(f'must be from 0.001 to 100000 Hz, got {text}')
+    return rate
+
+
 def _odometry(args: argparse.Namespace) -> int:
     need_gtsam()
     from rs_relpose_ros.odometry.offline import (
         LIVE_FILE,
         odometry_into,
         PICTURE,
-        ROWS_FILE,
         SMOOTHED_FILE,
     )
-    folder, outcome = run_on_bag(args, 'odometry', odometry_into)
+    from rs_relpose_ros.odometry.rows import ROWS_FILE
+    folder, outcome = run_on_bag(args, 'odometry', partial(odometry_into, rate=args.rate))
     for text in outcome.warnings:
         print(text)
     metrics = outcome.metrics
@@ -230,19 +248,25 @@ def _odometry(args: argparse.Namespace) -> int:
             print(f'{trajectory}, against the ground truth: ATE {errors["ate_m"]:.3f} m over '
                   f'{errors["length_m"]:.1f} m, scale {100.0 * errors["scale_error"]:+.2f} %')
     if not outcome.live:
-        print('odometry did not start: ' + (
-            outcome.blocking_reason
-            or 'it needs some seconds of motion, or standstill, and informative pairs'))
+        print(start_failure(outcome))
         return FAILED
     print(f'in {folder}: {LIVE_FILE}, {SMOOTHED_FILE}, {ROWS_FILE}, {PICTURE}, {SUMMARY_FILE}')
     return 0
+
+
+def start_failure(outcome: OdometryOutcome) -> str:
+    """Message on an odometry that did not start."""
+    return 'odometry did not start: ' + (
+        outcome.blocking_reason
+        or 'it needs some seconds of motion, or standstill, and informative pairs')
 
 
 ODOMETRY = Command(
     'Metric odometry from a bag: the relative poses of its keyframe pairs and its IMU in one '
     'graph (gtsam, an extra), as in odometry_node. Writes trajectory.tum (live estimates of the '
     "camera, z up, stamped with the image's middle row on the camera's clock), "
-    'trajectory_smoothed.tum (estimates from all data), summary.json and a picture; with errors '
+    'trajectory_smoothed.tum (estimates from all data), trajectory_rows.npz (poses at any time, '
+    'RowTrajectory in Python), tracks.npz (for export), summary.json and a picture; with errors '
     'if the bag contains ground truth of the camera. The parameter imu_position should be '
     'configured. Exit code 1: odometry did not start.',
-    lambda parser: add_run_arguments(parser, 'odometry'), _odometry)
+    _add_odometry_arguments, _odometry)

@@ -342,6 +342,15 @@ def image_message(stamp_ns: int, frame_id: str, pixels: Pixels, types: MessageTy
 def compressed_image_message(stamp_ns: int, frame_id: str, pixels: Pixels, *, png: bool,
                              types: MessageTypes) -> Any:
     """sensor_msgs/CompressedImage: JPEG, or PNG, the only one for 16 bits."""
+    kind, data = encode_pixels(pixels, png=png)
+    values, name = pixels
+    # The format string of image_transport.
+    text = f'{name}; {kind} compressed {"" if values.ndim == 2 else f"bgr{8 * values.itemsize}"}'
+    return encoded_image_message(stamp_ns, frame_id, data, types, text)
+
+
+def encode_pixels(pixels: Pixels, *, png: bool) -> tuple[str, bytes]:
+    """Kind, 'jpeg' or 'png', and content of a file; 16 bits are always PNG."""
     values, name = pixels
     if name.startswith('rgb'):
         values = cv2.cvtColor(values, cv2.COLOR_RGBA2BGRA if name == 'rgba8'
@@ -349,9 +358,7 @@ def compressed_image_message(stamp_ns: int, frame_id: str, pixels: Pixels, *, pn
     kind = 'png' if png or values.dtype != np.uint8 else 'jpeg'
     _, data = cv2.imencode(f'.{kind}', values, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
                            if kind == 'jpeg' else [])
-    # The format string of image_transport.
-    text = f'{name}; {kind} compressed {"" if values.ndim == 2 else f"bgr{8 * values.itemsize}"}'
-    return encoded_image_message(stamp_ns, frame_id, data, types, text)
+    return kind, data.tobytes()
 
 
 def encoded_image_message(stamp_ns: int, frame_id: str, data: bytes | NDArray[np.uint8],

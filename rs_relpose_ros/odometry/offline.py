@@ -18,11 +18,11 @@ from rs_relpose_ros.geometry.so3 import aligning_rotation
 from rs_relpose_ros.geometry.timing import seconds_between
 from rs_relpose_ros.imu.buffer import ImuSample, ImuSamples
 from rs_relpose_ros.messages.incoming import PARTS, Role, sensor_messages, stamp_ns
-from rs_relpose_ros.messages.outgoing import quat_xyzw
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.graph import KeyframeState
+from rs_relpose_ros.odometry.landmarks import Tracks, TRACKS_FILE
 from rs_relpose_ros.odometry.pair import KeyframePair
-from rs_relpose_ros.odometry.rows import Knot, RowTrajectory
+from rs_relpose_ros.odometry.rows import camera_poses, Knot, ROWS_FILE, RowTrajectory, write_tum
 from rs_relpose_ros.odometry.states import Base, Odometry, OdometryState
 from rs_relpose_ros.offline.replay import read_truth, Replay
 from rs_relpose_ros.offline.truth import TrueTrajectory
@@ -34,7 +34,7 @@ _STYLES: Mapping[str, Mapping[str, Any]] = {
     'smoothed': {'color': '#0072B2', 'lw': 1.2}}
 
 LIVE_FILE, SMOOTHED_FILE, PICTURE = 'trajectory.tum', 'trajectory_smoothed.tum', 'path.png'
-ROWS_FILE = 'trajectory_rows.npz'
+RATE_FILE = 'trajectory_rows.tum'
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,21 +48,24 @@ class OdometryOutcome:
     blocking_reason: str   # fault of the accelerometer that prevented a start
 
 
-def odometry_into(folder: Path, bag: Bag, topics: SensorTopics,
-                  parameters: Parameters) -> OdometryOutcome:
-    """Run a bag, and write trajectories and a picture into `folder`.
+def odometry_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parameters,
+                  rate: float = 0.0) -> OdometryOutcome:
+    """Run a bag, and write trajectories, tracks and a picture into `folder`.
 
-    Files of an earlier run are replaced.
+    Files of an earlier run are replaced. `rate`: of the poses of an additional file [Hz].
     """
-    prepare_folder(folder, (LIVE_FILE, SMOOTHED_FILE, ROWS_FILE, PICTURE, SUMMARY_FILE))
+    prepare_folder(folder, (LIVE_FILE, SMOOTHED_FILE, ROWS_FILE, RATE_FILE, TRACKS_FILE,
+                            PICTURE, SUMMARY_FILE))
     estimator = OdometryEstimator(parameters, keep=True)
     replay = Replay(bag, topics, parameters)
     health = FindingState.UNKNOWN
+    observed: list[Tracks] = []
 
     def pairs() -> Iterator[tuple[int, KeyframePair]]:
         nonlocal health
         for pair in replay.pairs():
             health = pair.health.state
+            observed.append(Tracks.of_pair(pair))
             yield replay.counts.last_ns, KeyframePair.of_result(pair)
 
     samples = _samples(bag, topics)
@@ -95,9 +98,12 @@ def odometry_into(folder: Path, bag: Bag, topics: SensorTopics,
     write_tum(folder / LIVE_FILE, live)
     write_tum(folder / SMOOTHED_FILE, smoothed)
     if paths:
-        row_trajectory(paths, base, parameters, [
-            sample for _, sample in samples if isinstance(sample, ImuSample)]).save(
-                folder / ROWS_FILE)
+        rows = row_trajectory(paths, base, parameters, [
+            sample for _, sample in samples if isinstance(sample, ImuSample)])
+        rows.save(folder / ROWS_FILE)
+        Tracks.merged(observed).save(folder / TRACKS_FILE)
+        if rate:
+            write_tum(folder / RATE_FILE, camera_poses(rows, rate))
     draw_paths(drawn, folder / PICTURE)
     return OdometryOutcome(live, smoothed, metrics, warnings, estimator.blocking_reason)
 
@@ -181,15 +187,6 @@ class ComparedPath(NamedTuple):
     positions: Array
     truth: Array | None = None
     errors: TrajectoryErrors | None = None
-
-
-def write_tum(path: Path, trajectory: Sequence[Odometry]) -> None:
-    """Lines ``seconds x y z qx qy qz qw``, seconds being those of the stamps."""
-    with path.open('w', encoding='ascii') as file:
-        for pose in trajectory:
-            values = [*pose.position, *quat_xyzw(pose.R)]
-            file.write(f'{pose.stamp_ns // 10**9}.{pose.stamp_ns % 10**9:09d} '
-                       + ' '.join(f'{value:.9f}' for value in values) + '\n')
 
 
 def aligned(positions: Array, truth: Array) -> tuple[Array, Array, float]:

@@ -26,6 +26,10 @@ from rs_relpose_ros.geometry.so3 import integrated_rotations, log_so3, STANDARD_
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.imu.buffer import ImuInterval, ImuSamples
 from rs_relpose_ros.imu.integration import force_integrals
+from rs_relpose_ros.messages.outgoing import quat_xyzw
+from rs_relpose_ros.odometry.states import Odometry
+
+ROWS_FILE = 'trajectory_rows.npz'
 
 Stamps = NDArray[np.int64]
 
@@ -242,3 +246,32 @@ def _between(one: Knot, two: Knot, interval: ImuInterval) -> tuple[Any, ...]:
                                + 3.0 * s * (change - 2.0 * way)) / duration
     stamps = one.imu_ns + np.rint(NANOSECONDS * seconds).astype(np.int64)
     return (stamps, R.as_quat(), position, velocity, closing.inv().apply(rates) + error / duration)
+
+
+# -- files of poses ---------------------------------------------------------------------------
+
+class StampedPose(NamedTuple):
+    """The camera in the world."""
+
+    stamp_ns: int   # on the clock of the camera
+    R: Array
+    position: Array
+
+
+def camera_poses(rows: RowTrajectory, rate: float) -> list[StampedPose]:
+    """Poses of the camera at a rate [Hz], from the begin of each span; 0: at the keyframes."""
+    times = rows.keyframes_ns[:, 1] if not rate else np.concatenate([
+        first + np.rint(np.arange(0.0, last - first + 1.0, NANOSECONDS / rate)).astype(np.int64)
+        for first, last in rows.spans])
+    times = times[rows.covers(times)]
+    return [StampedPose(int(stamp_ns), *pose) for stamp_ns, *pose in zip(
+        rows.camera_ns(times), *rows.pose(times), strict=True)]
+
+
+def write_tum(path: Path, trajectory: Sequence[Odometry | StampedPose]) -> None:
+    """Lines ``seconds x y z qx qy qz qw``, seconds being those of the stamps."""
+    with path.open('w', encoding='ascii') as file:
+        for pose in trajectory:
+            values = [*pose.position, *quat_xyzw(pose.R)]
+            file.write(f'{pose.stamp_ns // 10**9}.{pose.stamp_ns % 10**9:09d} '
+                       + ' '.join(f'{value:.9f}' for value in values) + '\n')

@@ -4,17 +4,17 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-import tempfile
 from typing import Any, NamedTuple
 
 from rs_relpose_ros.bags import reader
 from rs_relpose_ros.bags.reader import Bag, BagMessage, RawMessage, SensorTopics, Topic
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.config.settings import Parameters
-from rs_relpose_ros.errors import InputError, RsRelposeError
+from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.messages.incoming import Intake, PARTS, ReasonCounts, Role, stamp_ns
 from rs_relpose_ros.offline.replay import MessageRefused, outcomes, unused_reason
+from rs_relpose_ros.output_files import beside
 from rs_relpose_ros.pipeline.global_shutter import GlobalShutterFrame, unrolling_loop
 from rs_relpose_ros.pipeline.pair import Frame
 
@@ -56,15 +56,7 @@ def unroll(bag: Bag, topics: SensorTopics, parameters: Parameters, out: Path) ->
 
     Nothing is written if no image can be derotated.
     """
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        # In the same folder, so that it can be renamed; of the same name, as its files.
-        temporary = tempfile.TemporaryDirectory(prefix=f'.{out.name}.', suffix='.part',
-                                                dir=out.parent)
-    except OSError as error:
-        raise InputError(f'{out} cannot be written: {error.strerror}') from error
-    with temporary as folder:
-        part = Path(folder) / out.name
+    with beside(out) as part:
         with BagWriter(part) as writer:
             report = _Unrolling(bag, topics, parameters, writer).run()
         if report.images:
