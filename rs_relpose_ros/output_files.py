@@ -1,13 +1,7 @@
 """Files of results: pictures, and their folder."""
 
-<<<<<<< HEAD
-from collections.abc import Sequence
-=======
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
->>>>>>> 3210a6a (wip export)
 import os
 from pathlib import Path
 import tempfile
