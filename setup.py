@@ -93,6 +93,7 @@ setup(
         'test': ['pytest'],
         'odometry': ['gtsam>=4.3,<4.4'],
         'video': ['av>=13,<19', 'telemetry-parser>=0.3,<0.4'],
+        'ncore': ['nvidia-ncore>=19.8'],
         'batch': ['dask[distributed]>=2024.5'],
     },
     zip_safe=False,

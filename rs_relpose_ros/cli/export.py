@@ -1,7 +1,5 @@
 """Command `export`: a recording for reconstruction and splatting."""
 
-from __future__ import annotations
-
 import argparse
 import logging
 from pathlib import Path
@@ -78,7 +76,7 @@ def _export(args: argparse.Namespace) -> int:
             _, outcome = options.run_on_bag(argparse.Namespace(
                 **{**vars(args), 'out': trajectory}), 'odometry', odometry_into)
             for text in outcome.warnings:
-                _logger.warning('%s', text)
+                print(text)
             if not outcome.live:
                 print(start_failure(outcome))
                 return FAILED
@@ -102,7 +100,7 @@ def _with_images(args: argparse.Namespace, part: Path, trajectory: Path) -> Expo
     with open_bag(args.bag) as bag:
         topics = bag.find_topics(options.topic_options(args),
                                  needs_camera_info=not parameters.intrinsics.given)
-        options.check_parameters(parameters, args)
+        parameters = options.completed(bag, topics, parameters, args)
         with options.image_progress(bag, topics.image, args.out.name):
             return export_into(part, bag, topics, parameters, trajectory, Options(
                 args.format, args.images, args.rate, args.points,

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from rs_relpose_ros.bags.reader import Bag, SensorTopics
 from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.timing import NANOSECONDS, Sensor, to_nanoseconds
 from rs_relpose_ros.messages.incoming import Intake, sensor_messages
@@ -32,7 +33,6 @@ from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrameLoop
 from rs_relpose_ros.tracking.images import CompressedImage, Pixels
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 RAW, UNROLLED, NO_IMAGES = IMAGE_CHOICES = ('raw', 'unrolled', 'none')
@@ -109,7 +109,7 @@ def export_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
     report = run.report
     exported = model
     if options.images == UNROLLED:
-        exported = _derotated(model, rows)
+        exported = derotated(model, rows)
     exported = replace(exported, camera=formats.fitted(exported.camera, chosen.radial))
     _measure(report, model, exported, rows, chosen)
     chosen.write(exported, folder)
@@ -320,7 +320,7 @@ def _shown(model: Model, rows: RowTrajectory, k: Ints, pixels: Array) -> Array:
     return model.camera.project(np.einsum('nji,nj->ni', model.R[k, formats.MIDDLE], rays))
 
 
-def _derotated(model: Model, rows: RowTrajectory) -> Model:
+def derotated(model: Model, rows: RowTrajectory) -> Model:
     """The model of derotated images."""
     middle = [formats.MIDDLE] * 3
     return replace(
@@ -349,7 +349,7 @@ def _draw(model: Model, rows: RowTrajectory, path: Path) -> None:
     axes = picture.subplots()
     axes.scatter(model.points[:, 0], model.points[:, 1], s=1.0, color='0.6', label='points')
     for first, last in rows.spans:
-        _, p = rows.pose(np.linspace(first, last, 2000).astype(np.int64))
+        _, p = rows.pose(first + np.linspace(0, last - first, 2000).astype(np.int64))
         axes.plot(p[:, 0], p[:, 1], color=BLUE, lw=1.2,
                   label='path' if first == rows.spans[0, 0] else None)
     middle = model.positions[:, formats.MIDDLE]

@@ -4,8 +4,6 @@ Each exporter cites the source whose convention it follows, with its commit. All
 centre of the first pixel as (0.5, 0.5), so the principal point is OpenCV's plus 0.5.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 import json
@@ -17,11 +15,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.errors import MissingInputError
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.odometry.rows import RowTrajectory
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 # Rows of `Model.R` and `Model.positions`.

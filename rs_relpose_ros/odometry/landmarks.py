@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.timing import NANOSECONDS, Sensor
 from rs_relpose_ros.odometry.rows import read_arrays, RowTrajectory
 from rs_relpose_ros.pipeline.pair import PairResult
 
 TRACKS_FILE = 'tracks.npz'
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 # Fewest keyframes of a point, and the largest deviation of an observation from it [px].
@@ -111,11 +111,13 @@ def triangulated(tracks: Tracks, rows: RowTrajectory, sensor: Sensor, most: int)
         weights = np.where(good & enough, weights, 0.0)
         A = np.nan_to_num(normals) * weights[:, None, None]
         # Points without observations stay at the origin.
-        positions = np.linalg.solve(summed(A) + 1e-12 * np.eye(3), summed(
-            np.einsum('nij,nj->ni', A, p))[..., None])[..., 0]
+        towards = summed(np.einsum('nij,nj->ni', A, p))[..., None]
+        positions = np.asarray(np.linalg.solve(
+            summed(A) + 1e-12 * np.eye(3), towards)[..., 0], dtype=np.float64)
         local = np.einsum('nji,nj->ni', R, positions[points] - p)
         pixels = intrinsics.to_image(camera.project(local))
-        errors = np.nan_to_num(np.linalg.norm(pixels - tracks.pixels, axis=1), nan=np.inf)
+        errors = np.asarray(np.nan_to_num(
+            np.linalg.norm(pixels - tracks.pixels, axis=1), nan=np.inf))
         # By the distance, angles count instead of lengths.
         distances = np.maximum(np.linalg.norm(local, axis=1), 1e-3)
         weights = 1.0 / (distances * (1.0 + (errors / _SCALE)**2))**2
