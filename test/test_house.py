@@ -34,7 +34,7 @@ BUDGETS = {
     'rs_relpose_lab': (9740, 44),
     'test': (20130, 60),
 }
-MOST_MODULES, MOST_FOLDERS = 113, 15
+MOST_MODULES, MOST_FOLDERS = 114, 15
 LONGEST_MODULE, SHORTEST_MODULE, LONGEST_FUNCTION = 700, 80, 60
 # Body of a private function that has one caller: shorter ones belong into the caller.
 SHORTEST_HELPER = 4

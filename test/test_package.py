@@ -112,7 +112,7 @@ LIBRARIES = {
     'llvmlite': ('numba', 'python3-numba'),
     'lz4': ('rosbags', 'python3-rosbags-pip'),
 }
-OPTIONAL = {'av', 'dask', 'distributed', 'gtsam', 'telemetry_parser'}
+OPTIONAL = {'av', 'dask', 'distributed', 'gtsam', 'ncore', 'telemetry_parser'}
 
 
 def test_pip_and_rosdep_install_every_library_that_is_imported():
@@ -173,7 +173,7 @@ MAY_IMPORT = {
     'nodes': BASE | {'tracking', 'pipeline', 'messages', 'calibrate', 'odometry'},
     'calibrate': CORE | {'pipeline', 'messages', 'bags'},
     'offline': CORE | {'pipeline', 'messages', 'bags', 'calibrate'},
-    'odometry': BASE | {'estimator', 'imu', 'pipeline', 'messages', 'bags', 'offline'},
+    'odometry': BASE | {'estimator', 'imu', 'tracking', 'pipeline', 'messages', 'bags', 'offline'},
     'cli': BASE | {'messages', 'bags', 'offline', 'calibrate', 'odometry'},
 }
 # The laboratory uses all of the product, and nothing of the product imports it.

@@ -78,7 +78,7 @@ def _export(args: argparse.Namespace) -> int:
             for text in outcome.warnings:
                 print(text)
             if not outcome.live:
-                print(start_failure(outcome))
+                print(start_failure(outcome.blocking_reason))
                 return FAILED
         if args.format == TUM:
             poses = camera_poses(RowTrajectory.load(trajectory / ROWS_FILE), args.rate)

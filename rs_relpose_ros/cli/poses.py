@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from rs_relpose_ros.bags.reader import Bag, SensorTopics
 from rs_relpose_ros.cli.main import Command, FAILED, make_parser
@@ -24,9 +24,6 @@ from rs_relpose_ros.offline.pairs import pairs_into, read_pairs
 from rs_relpose_ros.offline.replay import read_stamps, replay_into, ReplayOutcome
 from rs_relpose_ros.offline.tables import POSES
 from rs_relpose_ros.output_files import SUMMARY_FILE
-
-if TYPE_CHECKING:   # it imports gtsam
-    from rs_relpose_ros.odometry.offline import OdometryOutcome
 
 _MOST_REASONS = 5
 
@@ -248,17 +245,16 @@ def _odometry(args: argparse.Namespace) -> int:
             print(f'{trajectory}, against the ground truth: ATE {errors["ate_m"]:.3f} m over '
                   f'{errors["length_m"]:.1f} m, scale {100.0 * errors["scale_error"]:+.2f} %')
     if not outcome.live:
-        print(start_failure(outcome))
+        print(start_failure(outcome.blocking_reason))
         return FAILED
     print(f'in {folder}: {LIVE_FILE}, {SMOOTHED_FILE}, {ROWS_FILE}, {PICTURE}, {SUMMARY_FILE}')
     return 0
 
 
-def start_failure(outcome: OdometryOutcome) -> str:
+def start_failure(blocking_reason: str) -> str:
     """Message on an odometry that did not start."""
     return 'odometry did not start: ' + (
-        outcome.blocking_reason
-        or 'it needs some seconds of motion, or standstill, and informative pairs')
+        blocking_reason or 'it needs some seconds of motion, or standstill, and informative pairs')
 
 
 ODOMETRY = Command(
