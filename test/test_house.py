@@ -19,7 +19,7 @@ BUDGETS = {
     'rs_relpose_ros': (270, 5),
     'rs_relpose_ros/bags': (1870, 6),
     'rs_relpose_ros/calibrate': (2910, 9),
-    'rs_relpose_ros/cli': (1240, 7),
+    'rs_relpose_ros/cli': (1230, 7),
     'rs_relpose_ros/config': (880, 4),
     'rs_relpose_ros/estimator': (3750, 12),
     'rs_relpose_ros/geometry': (1260, 7),
