@@ -49,6 +49,18 @@ def sigmas(R, truth, covariance):
     return np.sqrt(error @ np.linalg.solve(covariance, error))
 
 
+def test_a_pair_without_consensus_has_few_samples():
+    """Matches at random with the gyro's rotation; without it, each solver has all samples."""
+    scene, rng = make_scene(5, outliers=0.0), np.random.default_rng(5)
+    scene = replace(scene, points2=rng.permutation(scene.points2))
+    aided = estimate(scene, relative_rotation=scene.R,
+                     relative_rotation_covariance=1e-6 * np.eye(3))
+    alone = estimate(scene)
+    assert aided.status is alone.status is Status.NO_CONSENSUS
+    limit = CONFIG.max_iterations
+    assert aided.iterations <= limit + 500 < 2 * limit == alone.iterations
+
+
 # Limits: twice the prototype's medians (design, section 4); the 5-point on derotated rays has
 # 0.071 deg and 2.5 deg in the first, 1.4 and 34 in the second.
 @pytest.mark.parametrize(('cell', 'rotation', 'translation'), [

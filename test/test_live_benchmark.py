@@ -99,6 +99,48 @@ def test_drift_of_memory_and_latency_by_minutes(slope):
     assert [latency.p50 for _, latency in windows] == [10.0] * 5 + [11.0] * 5
 
 
+# A command line that notes its runs and measures a latency of `value`, then twice that.
+CHECKOUT = """
+from pathlib import Path
+import sys
+folder = Path(sys.argv[sys.argv.index('--output') + 1])
+runs = Path(__file__).parents[3] / 'runs'
+runs.open('a').write(f'{value} {{sys.argv[4]}} {{sys.argv[-1]}}\\n')
+value = {value} * 2**(runs.read_text().count('{value} ') - 1)
+folder.mkdir(parents=True, exist_ok=True)
+(folder / 'live.csv').write_text('{columns}\\n' + ','.join(['7', '', *[str(value)] * 7]))
+sys.exit({code})
+"""
+
+
+@pytest.fixture
+def checkout(tmp_path):
+    def made(name, value, code=0):
+        command = tmp_path / name / 'rs_relpose_ros' / 'cli' / 'main.py'
+        command.parent.mkdir(parents=True)
+        (command.parents[1] / '__init__.py').touch()
+        command.write_text(CHECKOUT.format(value=value, code=code,
+                                           columns=','.join(['cell', *live.COMPARED])))
+        return tmp_path / name
+    return made
+
+
+def test_two_checkouts_run_by_turns(tmp_path, checkout):
+    calls = []
+    report = live.compare_checkouts(
+        checkout('a', 3), checkout('b', 2), ['x'], ['--duration', '5'], 3, tmp_path / 'out',
+        lambda: calls.append(1))
+    assert (tmp_path / 'runs').read_text() == '3 x 5\n2 x 5\n' * 3 and len(calls) == 6
+    assert report.count('1.50 (1.50 to 1.50)') == 7 and report.count('nan (nan to nan)') == 1
+    with pytest.raises(InputError, match=r'c: benchmark live ended with code 3'):
+        live.compare_checkouts(checkout('c', 1, 3), checkout('d', 1), ['x'], [], 1, tmp_path)
+
+
+def test_against_a_folder_without_the_package(tmp_path, refused):
+    refused('is no checkout', 'benchmark', 'live', '--against', tmp_path, '--output',
+            tmp_path / 'out')
+
+
 def test_without_ros_nothing_is_rendered(monkeypatch, tmp_path, refused):
     monkeypatch.setitem(sys.modules, 'rs_relpose_lab.live.live_run', None)
     refused('needs ROS 2', 'benchmark', 'live', '--output', tmp_path / 'out')

@@ -741,6 +741,29 @@ def test_a_wrong_parameter_is_reported_by_its_name(bundled_bag, monkeypatch, cas
             assert max(beyond_covariance(result, truth, round(1e9 * case.stamps_late))) < 1.0, k
 
 
+def test_a_pair_is_published_before_its_assessment(bundled_bag, monkeypatch):
+    """Its health is that of the pairs before; the one that reveals a fault has a pose."""
+    assessed, assess = [], ConsistencyMonitor.assess
+
+    def noted(self):
+        assess(self)
+        assessed.append(self.health)
+
+    monkeypatch.setattr(ConsistencyMonitor, 'assess', noted)
+    parameters = read_parameters(bundled_bag.with_name('hand_held.yaml'), ['readout_time=0.015'])
+    published = []
+    with open_bag(bundled_bag) as bag:
+        run = Replay(bag, bag.find_topics(), parameters)
+        for pair in run.pairs():
+            assert pair.health is assessed[-1]
+            published.append(pair)
+        assert run.health is assessed[-1] is not published[-1].health
+    wrong = [pair.health.state is FindingState.WRONG for pair in published]
+    first = wrong.index(True)
+    assert first > 0 and published[first - 1].pose
+    assert published[first].pose.status is Status.WITHHELD
+
+
 @pytest.fixture(scope='module')
 def correct(bundled_bag):
     return replayed(bundled_bag)[0]
@@ -785,6 +808,7 @@ def test_a_pose_is_within_its_covariance_before_a_deviation_is_detected(c):
         off = Rotation.from_matrix(pose.R @ pair.R.T).as_rotvec()
         alone = max(alone, off @ np.linalg.solve(pose.covariance[3:, 3:], off))
         pose = monitor.add_pair(stamp_ns, replace(pair, R=pose.R, t=pose.t), pose, CONFIGURED)
+        monitor.assess()
         within = max(within, off @ np.linalg.solve(pose.covariance[3:, 3:], off))
     assert alone > 14.2
     assert within < 14.2
@@ -795,6 +819,7 @@ def test_a_deviation_so_large_that_no_pair_has_a_translation():
     for stamp_ns, pair, pose in estimated_pairs(deviation(focal=-0.08), 12):
         rotation = pose.without_translation(Status.LOW_PARALLAX, 'none')
         monitor.add_pair(stamp_ns, replace(pair, R=pose.R, t=rotation.t), rotation, CONFIGURED)
+        monitor.assess()
     assert {fault.quantity for fault in monitor.health.faults} == {'focal_length'}
 
 

@@ -217,6 +217,10 @@ def _live_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--profile', type=Path, metavar='FILE',
                         help='Fast DDS profile for images above 512 KB (default: the shipped '
                              'config/fastdds.xml)')
+    parser.add_argument('--against', type=Path, metavar='PATH',
+                        help='instead, compare this checkout with the one at PATH by turns in '
+                             'one run: ratios of latency, processor time, memory and errors')
+    _number(parser, '--turns', 3, 'turns of --against')
 
 
 def _run_live(args: argparse.Namespace) -> int:
@@ -228,6 +232,8 @@ def _run_live(args: argparse.Namespace) -> int:
     _check_at_least(0, args, 'soak')
     cells = [live.CELLS[name] for name in matching_cells(args.cells, live.CELLS)]
     _need_ros()
+    if args.against is not None:
+        return _compare_live(args, [cell.name for cell in cells])
     duration = 60.0 * args.soak or args.duration
     profile = args.profile or _shipped('fastdds.xml')
     if not profile.is_file():
@@ -253,6 +259,21 @@ def _run_live(args: argparse.Namespace) -> int:
     if results:
         _print_report(live.write_report(args.output, results), args.output)
     return int(failed)
+
+
+def _compare_live(args: argparse.Namespace, cells: Sequence[str]) -> int:
+    from rs_relpose_lab.experiments import live
+
+    _check_at_least(1, args, 'turns')
+    if not (args.against / 'rs_relpose_ros' / 'cli' / 'main.py').is_file():
+        raise InputError(f'--against {args.against} is no checkout of this package: give the '
+                         'folder that contains rs_relpose_ros')
+    profile = [] if args.profile is None else ['--profile', str(args.profile.resolve())]
+    with progress_bar(2 * args.turns * len(cells), 'run') as bar:
+        return _print_report(live.compare_checkouts(
+            Path(__file__).resolve().parents[2], args.against, cells,
+            ['--duration', str(args.duration), *profile], args.turns, args.output, bar.update),
+            args.output)
 
 
 def _consistency_arguments(parser: argparse.ArgumentParser) -> None:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+import csv
 from dataclasses import dataclass
 import os
 from pathlib import Path
 import platform
+import subprocess
+import sys
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +21,7 @@ from rs_relpose_lab.experiments.harness import markdown_table, write_csv, write_
 from rs_relpose_lab.experiments.scoring import pose_error
 from rs_relpose_lab.live.processes import ProcessMetrics
 from rs_relpose_ros.bags.reader import CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, RAW_TOPIC
+from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
@@ -319,6 +323,56 @@ def memory_drift(course: Course) -> float:
         return float('nan')
     slope, _ = np.polyfit(course.memory_seconds[settled], course.private[settled], 1)
     return float(slope * 3600.0)
+
+
+# -- two checkouts by turns: times of one run compare, those of two hours do not ------------------
+
+# Columns of live.csv, the same in all releases.
+COMPARED = ('latency_p50', 'latency_p99', 'end_to_end_p50', 'end_to_end_p99', 'cpu',
+            'memory_end', 'rotation_error_p50', 'translation_error_p50')
+
+
+def compare_checkouts(this: Path, other: Path, cells: Sequence[str], options: Sequence[str],
+                      turns: int, folder: Path,
+                      on_run: Callable[[], object] = lambda: None) -> str:
+    """Run the live benchmark of two checkouts by turns; the report of the ratios this / other.
+
+    `options`: of ``benchmark live``. Each checkout runs its own command, with this interpreter,
+    and has its tables in a folder of its own.
+    """
+    ratios = []
+    for turn in range(turns):
+        for cell in cells:
+            measured = []
+            for name, checkout in (('this', this), ('other', other)):
+                measured.append(_measured_by(checkout, cell, options, folder / name))
+                on_run()
+            ratios.append({'cell': cell, 'turn': turn, **{
+                column: a / b for column, a, b in zip(COMPARED, *measured, strict=True)}})
+    rows = []
+    for cell in cells:
+        of_cell = [[turn[column] for column in COMPARED] for turn in ratios
+                   if turn['cell'] == cell]
+        rows.append((cell, *(f'{median:.2f} ({low:.2f} to {high:.2f})' for low, median, high in
+                             np.percentile(of_cell, (0.0, 50.0, 100.0), axis=0).T)))
+    return write_table(folder, 'against', ratios, '\n'.join([
+        f'# This checkout / {other}\n', f'Median ratio of {turns} turns, least and largest.\n',
+        markdown_table(('cell', *COMPARED), rows)]))
+
+
+def _measured_by(checkout: Path, cell: str, options: Sequence[str], folder: Path) -> list[float]:
+    """The `COMPARED` columns of a cell."""
+    done = subprocess.run(
+        [sys.executable, '-m', 'rs_relpose_ros.cli.main', 'benchmark', 'live', '--cells', cell,
+         '--output', str(folder.resolve()), *options], cwd=checkout, check=False, text=True,
+        env={**os.environ, 'PYTHONPATH': str(checkout.resolve())}, stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL)
+    if done.returncode:
+        raise InputError(f'{checkout}: benchmark live ended with code {done.returncode}: '
+                         + done.stderr.strip().rpartition('\n')[2])
+    with (folder / 'live.csv').open(newline='', encoding='utf-8') as file:
+        row = next(csv.DictReader(file))
+    return [float(row[column] or 'nan') for column in COMPARED]
 
 
 def _two(values: Percentiles, digits: int = 1) -> str:

@@ -241,6 +241,9 @@ def samples_needed(ratio: float, size: int, sampling: Sampling) -> float:
 
 # Hypotheses that are optimised further.
 POOL_SIZE = 6
+# Most samples (20 us each) of a further solver where the gyro's rotation is known: a pair without
+# consensus ends within half an interval of 30 Hz, and repeatably.
+_MOST_WITHOUT_GYRO = 250
 # With a time limit: samples between two readings of the clock (about 0.2 ms).
 _TIMED_BLOCK = 20
 
@@ -307,6 +310,9 @@ def draw_hypotheses(problem: TwoViewProblem, mode: SolverMode, config: Estimator
         if solvers_skipped:
             break
         out = common.empty_solutions(solver.most_solutions)
+        if samples > 0 and known.predicted:
+            sampling = sampling._replace(
+                max_samples=min(config.max_iterations, _MOST_WITHOUT_GYRO))
         drawn, new = 0, block
         while new == block:
             before = drawn

@@ -94,16 +94,19 @@ class Series:
 
         The values at the two borders are interpolated; one entry where they are equal.
         """
-        inner = slice(int(np.searchsorted(self.stamps, start_ns, side='right')),
-                      int(np.searchsorted(self.stamps, end_ns, side='left')))
-        borders = np.unique(np.array([start_ns, end_ns], dtype=np.int64))
-        values = np.array([self._interpolated(int(border)) for border in borders])
-        return (np.concatenate([borders[:1], self.stamps[inner], borders[1:]]),
-                np.concatenate([values[:1], self.values[inner], values[1:]]))
+        first, last = (int(self.stamps.searchsorted(start_ns, 'right')),
+                       int(self.stamps.searchsorted(end_ns)))
+        if start_ns == end_ns:
+            return np.array([start_ns]), self._interpolated(start_ns)[None]
+        stamps, values = np.empty(last - first + 2, np.int64), np.empty((last - first + 2, 3))
+        stamps[0], stamps[1:-1], stamps[-1] = start_ns, self.stamps[first:last], end_ns
+        values[0], values[-1] = self._interpolated(start_ns), self._interpolated(end_ns)
+        values[1:-1] = self.values[first:last]
+        return stamps, values
 
     def _interpolated(self, at_ns: int) -> Array:
         stamps, values = self.stamps, self.values
-        after = int(np.searchsorted(stamps, at_ns))
+        after = int(stamps.searchsorted(at_ns))
         if stamps[after] == at_ns:
             return values[after]
         before = after - 1
@@ -112,16 +115,17 @@ class Series:
 
     def enclosing(self, start_ns: int, end_ns: int) -> Stamps:
         """Stamps within an interval, and one on either side of it."""
-        first = max(int(np.searchsorted(self.stamps, start_ns, side='right')) - 1, 0)
-        return self.stamps[first:int(np.searchsorted(self.stamps, end_ns)) + 1]
+        stamps = self.stamps
+        first = max(int(stamps.searchsorted(start_ns, 'right')) - 1, 0)
+        return stamps[first:int(stamps.searchsorted(end_ns)) + 1]
 
     def coverage(self, start_ns: int, end_ns: int) -> Coverage:
         """Whether the samples cover [start_ns, end_ns] without a gap."""
         stamps = self.stamps
         if len(stamps) == 0:
             return Coverage.NOT_YET
-        if start_ns < stamps[0] or (np.diff(self.enclosing(start_ns, end_ns))
-                                    > self._gap_ns).any():
+        around = self.enclosing(start_ns, end_ns)
+        if start_ns < stamps[0] or (around[1:] - around[:-1] > self._gap_ns).any():
             return Coverage.NEVER
         return Coverage.NOT_YET if stamps[-1] < end_ns else Coverage.AVAILABLE
 

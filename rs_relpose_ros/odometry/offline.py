@@ -27,7 +27,6 @@ from rs_relpose_ros.odometry.states import Base, Odometry, OdometryState
 from rs_relpose_ros.offline.replay import read_truth, Replay
 from rs_relpose_ros.offline.truth import TrueTrajectory
 from rs_relpose_ros.output_files import prepare_folder, save_picture, SUMMARY_FILE
-from rs_relpose_ros.pipeline.findings import FindingState
 
 _STYLES: Mapping[str, Mapping[str, Any]] = {
     'truth': {'color': 'black', 'lw': 2.5}, 'live': {'color': '#E69F00', 'lw': 1.2},
@@ -58,13 +57,10 @@ def odometry_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Para
                             PICTURE, SUMMARY_FILE))
     estimator = OdometryEstimator(parameters, keep=True)
     replay = Replay(bag, topics, parameters)
-    health = FindingState.UNKNOWN
     observed: list[Tracks] = []
 
     def pairs() -> Iterator[tuple[int, KeyframePair]]:
-        nonlocal health
         for pair in replay.pairs():
-            health = pair.health.state
             observed.append(Tracks.of_pair(pair))
             yield replay.counts.last_ns, KeyframePair.of_result(pair)
 
@@ -88,7 +84,8 @@ def odometry_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Para
            for state in (OdometryState.UNCERTAIN, OdometryState.LOST)},
         **{name: value.tolist() for name, value in zip(
             ('imu_position', 'imu_position_sigma'), estimator.imu_position, strict=True)},
-        'starts': [asdict(started) for started in estimator.starts], 'health': health.value,
+        'starts': [asdict(started) for started in estimator.starts],
+        'health': replay.health.state.value,
         'length_m': float(np.linalg.norm(np.diff(np.reshape(positions, (-1, 3)), axis=0),
                                          axis=1).sum())}
     for name, path in drawn.items():

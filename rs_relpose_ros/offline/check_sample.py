@@ -198,9 +198,7 @@ class SampleRun:
     @property
     def health(self) -> Assessment:
         """Of each quantity the worst finding of all parts."""
-        if self._last is None:
-            return self._before
-        return findings.worst_of(self._before, self._last.health)
+        return findings.worst_of(self._before, self._front_end.health)
 
     @property
     def is_refused(self) -> bool:
@@ -245,7 +243,8 @@ class SampleRun:
             self.poseless.add(pair.pose.reason)
         last = self._last
         if last is None or not 0 <= pair.stamp_ns - last.stamp_ns < _APART_NS:
-            self._before, self._part_since_ns = self.health, pair.stamp_ns
+            self._before = findings.worst_of(self._before, pair.health)
+            self._part_since_ns = pair.stamp_ns
         self._last = pair
         if pair.stamp_ns - self._part_since_ns >= _SETTLED_NS:
             self._before = self.health

@@ -145,6 +145,11 @@ class Replay:
         self.counts.seconds = time.perf_counter() - started
         self._check_outcome()
 
+    @property
+    def health(self) -> Assessment:
+        """Consistency of the configuration after all pairs so far."""
+        return self._front_end.health
+
     def _messages(self) -> Iterator[tuple[Role, BagMessage]]:
         for role, message in sensor_messages(self._bag, self._topics):
             self.counts.first_ns = self.counts.first_ns or message.bag_time_ns
@@ -217,6 +222,7 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
             on_pair(pair)
             if pictures and (shown is None or _picture_rank(pair) > _picture_rank(shown)):
                 shown = pair
+    health = worst_of(health, run.health)
     files = [folder / table.file for table in written] + [out_bag] * with_bag
     if shown is not None:
         # Imports Matplotlib, which takes a second.

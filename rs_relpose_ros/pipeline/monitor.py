@@ -41,7 +41,8 @@ _REMEMBERED, _PRIOR_PAIRS, _LARGEST_DISAGREEMENT = 20.0, 10.0, 20.0
 class ConsistencyMonitor:
     """Compares the configuration with frames and pairs in the order of time.
 
-    Live and in replay, results are equal bit by bit.
+    Each pair is added before its pose is published, and assessed after it. Live and in replay,
+    results are equal bit by bit.
     """
 
     def __init__(self) -> None:
@@ -57,6 +58,8 @@ class ConsistencyMonitor:
         # Seconds by which stamps of the IMU are ahead as images arrive, of the last frames.
         self.ahead: deque[float] = deque(maxlen=_ARRIVALS)
         self._wrong_configuration = False   # by the last pair
+        # The last pair until it is assessed.
+        self._due: tuple[recursion.PairInformation | None, RelativePose, Configured] | None = None
         self.health, self.calibration = findings.NOT_EVALUATED, recursion.NOTHING_ESTIMATED
 
     def add_acceleration(self, stamp_ns: int, evidence: InertialEvidence) -> None:
@@ -67,16 +70,29 @@ class ConsistencyMonitor:
 
     def add_pair(self, stamp_ns: int, data: recursion.PairData | None, pose: RelativePose,
                  configured: Configured) -> RelativePose:
-        """Add a pair and assess all quantities; return the pose with a consistent covariance.
+        """Add a pair; the pose with a covariance consistent with all pairs so far.
 
-        `data` is None if the pair has no rotation or no gyro.
+        `data` is None if the pair has no rotation or no gyro. `assess` completes it.
         """
-        self.latest = None
+        self.latest, estimated = None, pose
         if data is not None:
             try:
                 pose = self._add(stamp_ns, data, pose, configured)
             except np.linalg.LinAlgError:
                 # A pair without rank has no information on the calibration; its pose is kept.
+                self._inconsistent = []
+        self._due = self.latest, estimated, configured
+        return pose
+
+    def assess(self) -> None:
+        """Assess all quantities after the last pair, for the next one: its pose does not wait."""
+        if self._due is None:
+            return
+        (information, pose, configured), self._due = self._due, None
+        if information is not None:
+            try:
+                self._find_inconsistencies(information, pose, configured)
+            except np.linalg.LinAlgError:
                 self._inconsistent = []
         self._gross = assessment.gross_errors(
             self.rotations.compared(), self._ahead(), configured, self._gross)
@@ -87,7 +103,15 @@ class ConsistencyMonitor:
             self.acceleration.clear()
         if (finding := self.acceleration.finding()) is not None:
             self.health = Assessment((*self.health.findings, finding))
-        return pose
+
+    def _find_inconsistencies(self, information: recursion.PairInformation, pose: RelativePose,
+                              configured: Configured) -> None:
+        if self._recursion.relinearise():
+            self.calibration = self._recursion.solved()
+        (self._on_poses if pose else self._on_rotations).append(_effect(information, pose))
+        # A deviation may be so large that no pair has a pose.
+        self._inconsistent = assessment.find_inconsistencies(
+            self.calibration, self._on_poses or self._on_rotations, configured.active)
 
     def _add(self, stamp_ns: int, data: recursion.PairData, pose: RelativePose,
              configured: Configured) -> RelativePose:
@@ -101,10 +125,6 @@ class ConsistencyMonitor:
             return pose
         self.latest = information
         self.calibration = self._recursion.solved()
-        (self._on_poses if pose else self._on_rotations).append(_effect(information, pose))
-        # A deviation may be so large that no pair has a pose.
-        self._inconsistent = assessment.find_inconsistencies(
-            self.calibration, self._on_poses or self._on_rotations, active)
         by_deviation = information.pose_by_deviation
         shift = by_deviation @ self._deviation()
         # The inconsistency, and deviations that the pairs so far have not excluded.

@@ -120,8 +120,8 @@ class PairResult:
     gyro_rotation: Array | None = None   # (3, 3) R_1^T R_2 integrated from the gyro
     # (3,) [rad] rotation by the images alone against the gyro's; None without either
     images_against_gyro: Array | None = None
-    health: Assessment = NOT_EVALUATED   # this, tracked and applied: as after this pair
-    tracked: Tracked | None = None
+    health: Assessment = NOT_EVALUATED   # by the pairs before: published before its assessment
+    tracked: Tracked | None = None   # this and applied: as after this pair
     applied: Applied = field(default_factory=Applied)
     gyro_bias: Array | None = None   # (3,) [rad/s] that was removed, IMU frame
     image1: NDArray[np.uint8] | None = None   # both only if the front end keeps images

@@ -86,13 +86,9 @@ class Pipeline(Processor[PairResult]):
         self._stamps_ns: deque[int] = deque(maxlen=SCATTER_FRAMES)
         self.reset()
 
-    @property
-    def health(self) -> findings.Assessment:
-        """By the pairs so far."""
-        return self._monitor.health
-
     def reset(self) -> None:
         """Forget the reference keyframe: tracking restarts with the next frame."""
+        self._monitor.assess()   # live it is done by now
         self._tracker.reset()
         self._stamps_ns.clear()
         self._reference: Frame[Any] | None = None
@@ -156,10 +152,17 @@ class Pipeline(Processor[PairResult]):
         return result
 
     def prepare(self) -> None:
-        """Search new corners in a keyframe, after its pair is published."""
+        """Assess the configuration and search new corners, after a pair is published."""
         if self._promotion_due:
             self._promotion_due = False
+            self._monitor.assess()
             self._tracker.promote()
+
+    @property
+    def health(self) -> findings.Assessment:
+        """Consistency of the configuration after all pairs so far."""
+        self.prepare()
+        return self._monitor.health
 
     def _restart_from(self, frame: Frame[Any]) -> None:
         self._reference = self._previous = frame
@@ -226,7 +229,7 @@ class Pipeline(Processor[PairResult]):
 
     def _pair(self, reference: Frame[Any], frame: Frame[Any], gyro: GyroRotation, sensor: Sensor,
               parameters: Parameters) -> PairResult:
-        """The pair with its pose as assessed; updates the tracked corrections."""
+        """The pair, suppressed by the state before it; updates the tracked corrections."""
         matches, monitor = self._tracker.refined_matches(), self._monitor
         pose = self._estimated(reference, frame, matches, gyro, sensor, parameters)
         measurement, segment, to_sensor = None, gyro.segment, sensor.intrinsics.to_sensor
@@ -361,5 +364,10 @@ class FrontEnd(FrameLoop[PairResult]):
     def __init__(self, parameters: Parameters, *, offline: bool = False,
                  keep_images: bool = False, tracker: Tracker | None = None,
                  clock: Callable[[], int] = time.monotonic_ns) -> None:
-        super().__init__(parameters, Pipeline(parameters, keep_images, tracker), offline=offline,
-                         clock=clock)
+        self._pipeline = Pipeline(parameters, keep_images, tracker)
+        super().__init__(parameters, self._pipeline, offline=offline, clock=clock)
+
+    @property
+    def health(self) -> findings.Assessment:
+        """Consistency of the configuration after all pairs so far: each is published before."""
+        return self._pipeline.health

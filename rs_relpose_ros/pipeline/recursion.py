@@ -386,31 +386,33 @@ class Recursion:
         """Add a pair, in the order of time; an earlier stamp restarts.
 
         It is linearised about the deviations `about` (11,), which differ from those `active`
-        once a quantity is inconsistent. Some of the older pairs are linearised there, too, the
-        furthest first. Returns the information of the pair, None if it has none.
+        once a quantity is inconsistent. Returns the information of the pair, None if it has none.
         """
         if self._pairs and stamp_ns < self._pairs[-1].stamp_ns:
             self.clear()
         information = pair_information(data, active, about)
         if information is None or not np.isfinite(information.S).all():
             return None
-        if self._pairs:
-            self._relinearise(about)
         self._pairs.append(_Entry(stamp_ns, data, active, about, information))
         while self._pairs[0].stamp_ns < stamp_ns - WINDOW_NS:
             self._pairs.popleft()
         return information
 
-    def _relinearise(self, about: Array) -> None:
+    def relinearise(self) -> bool:
+        """Linearise some older pairs about the last one's deviations, the furthest first.
+
+        Whether there were any.
+        """
+        about = self._pairs[-1].about
         apart = np.linalg.norm(
             (np.array([pair.about for pair in self._pairs]) - about) / PRIOR_SIGMA, axis=1)
-        for k in np.argsort(apart, kind='stable')[::-1][:_AGAIN]:
-            if apart[k] < _NEAR:
-                break
+        chosen = [k for k in np.argsort(apart, kind='stable')[::-1][:_AGAIN] if apart[k] >= _NEAR]
+        for k in chosen:
             pair = self._pairs[k]
             information = pair_information(pair.data, pair.active, about)
             if information is not None:
                 self._pairs[k] = pair._replace(about=about, information=information)
+        return bool(chosen)
 
     def solved(self) -> Calibration:
         """The calibration that fits all pairs."""
