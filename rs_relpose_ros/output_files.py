@@ -10,6 +10,7 @@ import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from rs_relpose_ros.config.files import written
 from rs_relpose_ros.errors import InputError
 
 
@@ -18,7 +19,8 @@ def save_picture(picture: Figure, path: Path) -> None:
     # Independent of the version of matplotlib and of the user's settings.
     with mpl.rc_context({'savefig.facecolor': 'white'}):
         FigureCanvasAgg(picture)
-        picture.savefig(path, metadata={'Software': None})
+        with written(path, 'wb') as file:
+            picture.savefig(file, format=path.suffix[1:], metadata={'Software': None})
 
 
 SUMMARY_FILE = 'summary.json'

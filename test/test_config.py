@@ -1,8 +1,11 @@
 """The shipped configuration: parameter template, Fast DDS profile, launch file."""
 
 import ast
+import errno
 from importlib.metadata import distribution
 import json
+import os
+from pathlib import Path
 import re
 from xml.etree import ElementTree
 
@@ -11,7 +14,8 @@ import pytest
 import yaml
 
 from rs_relpose_lab.live.processes import node_process, Process
-from rs_relpose_ros.config.files import parameter_template, read_parameters
+from rs_relpose_ros.bags.writer import BagWriter
+from rs_relpose_ros.config.files import parameter_template, read_parameters, written
 from rs_relpose_ros.config.settings import Parameters, SensorConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.messages.outgoing import PAIR_TOPICS
@@ -167,3 +171,32 @@ def test_layouts_show_topics_that_the_nodes_publish(layout):
 def test_an_exposure_is_given_once():
     with pytest.raises(InputError, match='exposure_time or exposure_margin'):
         SensorConfig(exposure_time=0.01, exposure_margin=0.008)
+
+
+# -- files that are complete, or not there -------------------------------------------------------
+
+
+def test_a_file_has_its_name_once_it_is_complete(tmp_path):
+    path = tmp_path / 'table.csv'
+    path.write_text('old')
+    with pytest.raises(KeyboardInterrupt), written(path) as file:   # as if it were killed
+        file.write('half\n')
+        assert (tmp_path / 'table.csv.part').read_text() == 'half\n'
+        raise KeyboardInterrupt
+    assert path.read_text() == 'old'
+    with written(path) as file:
+        file.write('new\n')
+    assert [(item.name, item.read_text()) for item in tmp_path.iterdir()] == [
+        ('table.csv', 'new\n')]
+
+
+@pytest.mark.skipif(not Path('/dev/full').exists(), reason='Linux has a device that is full')
+def test_an_error_of_a_full_disk_has_the_path(tmp_path):
+    path = tmp_path / 'table.csv'
+    (tmp_path / 'table.csv.part').symlink_to('/dev/full')
+    with pytest.raises(OSError, match='No space left') as found, written(path) as file:
+        file.write('row\n')
+    assert found.value.filename == str(path) and not list(tmp_path.iterdir())
+    with pytest.raises(OSError, match='No space left') as found, BagWriter(tmp_path / 'bag'):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert found.value.filename == str(tmp_path / 'bag') and not list(tmp_path.iterdir())

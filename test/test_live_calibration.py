@@ -1,6 +1,7 @@
 """A node without parameters: it calibrates itself, stores the result, and uses the file."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 import os
 from pathlib import Path
 from typing import Any
@@ -77,6 +78,47 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path):
     config = StoredCalibrationConfig(calibration_file=str(tmp_path / 'file' / 'c.yaml'))
     with pytest.raises(InputError, match=r'c\.yaml.*calibration_file'):
         stored.save(stored.path_of(config, CAMERA), CAMERA, TEXT)
+
+
+def test_a_typo_in_an_edited_file_is_named(tmp_path):
+    path = tmp_path / 'file.yaml'
+    stored.save(path, CAMERA, TEXT)
+    good = path.read_text()
+    for old, new, named in (('readout_time:', 'readout_tim:', 'did you mean readout_time'),
+                            ('0.02', "'fast'", 'readout_time must be'), (':', '', 'YAML'),
+                            ('  ros__parameters:', '  parameters:', 'ros__parameters')):
+        path.write_text(good.replace(old, new, 1))
+        with pytest.raises(InputError, match=named) as error:
+            stored.load(path, CAMERA)
+        assert str(path) in str(error.value)
+        assert path.exists()
+
+
+def test_two_cameras_of_one_frame_id_do_not_share_a_file(tmp_path):
+    path = tmp_path / 'file.yaml'
+    left, right = (replace(CAMERA, topic=topic) for topic in ('/left/image', '/right/image'))
+    stored.save(path, left, TEXT)
+    assert stored.load(path, left)[0]['readout_time'] == 0.02
+    with pytest.raises(InputError, match=r'on /left/image, not on /right/image.*camera_name'):
+        stored.load(path, right)
+    assert stored.load(path, CAMERA)   # the user has named it
+
+
+def test_a_user_without_a_home_directory(monkeypatch, bag):
+    def without() -> Path:
+        raise RuntimeError('Could not determine home directory.')
+    monkeypatch.delenv('ROS_HOME', raising=False)
+    monkeypatch.setattr(Path, 'home', without)
+    calibration = LiveCalibration(Parameters(), use_stored=True)
+    found = next(outcome for outcome in outcomes(bag, calibration) if outcome is not None)
+    calibration.close()
+    assert isinstance(found, InputError) and 'ROS_HOME' in str(found)
+    # A result is used all the same.
+    node = MagicMock(calibrates=True)
+    node._settings.current = Parameters.from_mapping(KNOWN)
+    SensorNode._use_calibration(node, Calibrated(CAMERA, TEXT, ''))
+    assert 'ROS_HOME' in node._error.call_args.args[0]
+    assert node._adopt.call_args.args[0] == TEXT and node._begin.called
 
 
 # -- without ROS ---------------------------------------------------------------------------------
@@ -201,6 +243,44 @@ def test_a_node_waits_for_the_transform_and_names_the_missing_frame(
         faults.play(publishers, messages, later=100.0)
         wait_until(lambda: poses, 'a pose', node)
         assert 'Traceback' not in node.output
+
+
+def test_services_that_cannot_be_done_say_why(tmp_path):
+    node = MagicMock(_cannot_start='', _loop=None, _calibrated=None)
+
+    def called(service: Any) -> Any:
+        response = service(node, None, Trigger.Response())
+        assert not response.success
+        return response.message
+
+    assert 'calibrating' in called(SensorNode._reset)
+    assert '~/calibrate' in called(SensorNode._save_now)
+    (tmp_path / 'file').touch()
+    node._calibrated = Calibrated(CAMERA, TEXT, '')
+    node._settings.current = Parameters.from_mapping(
+        {'calibration_file': str(tmp_path / 'file' / 'c.yaml')})
+    assert 'c.yaml' in called(SensorNode._save_now)
+    node._cannot_start = 'a rectified image'
+    for service in (SensorNode._reset, SensorNode._calibrate_now):
+        assert called(service) == 'a rectified image'
+
+
+@pytest.mark.live
+def test_two_nodes_of_one_name_and_messages_without_frame_id_are_reported(
+        ros_domain_id, bundled_bag):
+    messages = faults.read_messages(bundled_bag, 1.0)
+    for _, message in messages:
+        message.header.frame_id = ''
+    with Graph() as graph, node_process(
+            BUNDLED_PARAMETERS, remap=faults.BAG_TOPICS,
+            parameters={'image_transport': 'raw'}) as node:
+        node.wait_for('ready')
+        assert 'another node' not in node.output
+        faults.play(faults.drivers(graph), messages)
+        node.wait_for(f'messages on {faults.BAG_TOPICS["image"]} have no frame_id')
+        with node_process(BUNDLED_PARAMETERS, remap=faults.BAG_TOPICS) as other:
+            for one in (node, other):
+                one.wait_for('another node has the name /relpose_node')
 
 
 @pytest.mark.live

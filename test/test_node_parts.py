@@ -24,7 +24,15 @@ from rs_relpose_ros.config.declare import Declared
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.nodes import diagnostics
-from rs_relpose_ros.nodes.diagnostics import ERROR, OK, ReasonLog, Silence, Statistics, WARN
+from rs_relpose_ros.nodes.diagnostics import (
+    ERROR,
+    OK,
+    ReasonLog,
+    Silence,
+    STARTING,
+    Statistics,
+    WARN,
+)
 from rs_relpose_ros.nodes.parameters import NodeParameters
 from rs_relpose_ros.nodes.relpose_node import RelposeNode
 from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState
@@ -301,6 +309,16 @@ def test_level_and_text(statistics):
     assert 'LOW_PARALLAX: at rest' in found.text
     statistics.add_pair(pair(), 0)
     assert report(statistics).level == OK
+
+
+def test_a_start_is_no_error_and_lost_images_are_a_warning(statistics):
+    starting = statistics.report(Counter(), None, problem=STARTING, missing=())
+    assert (starting.level, dict(starting.values)['state']) == (OK, 'not estimating')
+    statistics.add_pair(pair(), 0)
+    lost = statistics.report(Counter(image=9), counts(9, 9), problem='', missing=(), lost='lost')
+    assert (lost.level, lost.text, dict(lost.values)['state']) == (WARN, 'lost', 'degraded')
+    worse = statistics.report(Counter(), None, problem='no image', missing=(), lost='lost')
+    assert worse.text == 'no image'
 
 
 @pytest.mark.parametrize(('state', 'level', 'shown'), [

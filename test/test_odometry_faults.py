@@ -13,6 +13,7 @@ import re
 import signal
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 from conftest import BUNDLED_PARAMETERS, ROOT
 from diagnostic_msgs.msg import DiagnosticArray
@@ -24,6 +25,7 @@ from nav_msgs.msg import Path as PathMessage
 import numpy as np
 import pytest
 import rclpy
+from rclpy.clock import Clock, ClockType
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
@@ -470,3 +472,14 @@ def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag, tmp_p
         assert nis < 20.0
         path, _ = fused(part, [False] * 6 + [True] * 6)
         assert np.linalg.norm(path - poses, axis=1).max() < 0.15
+
+
+def test_a_lost_path_is_an_error_in_the_log():
+    node = MagicMock(_sensors=[], _steady=Clock(clock_type=ClockType.STEADY_TIME))
+    node._sample_at = node._steady.now()
+    node._estimator.take.return_value = []
+    node._estimator.warnings.return_value = ['imu_position is zero', 'lost: no pair', 'tracking']
+    OdometryNode._read_sensors(node)
+    assert [call.args[0] for call in node._info.call_args_list] == ['imu_position is zero',
+                                                                    'tracking']
+    node._error.assert_called_once_with('lost: no pair')

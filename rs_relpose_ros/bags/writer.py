@@ -42,7 +42,8 @@ class BagWriter:
             ) from error
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 _: object) -> None:
         whole = False
         try:
             if kind is None:
@@ -53,6 +54,8 @@ class BagWriter:
                 with suppress(Exception):
                     self._writer.abort()
                 shutil.rmtree(self.path, ignore_errors=True)
+        if isinstance(error, OSError) and error.filename is None:   # a full disk
+            raise type(error)(error.errno, error.strerror, str(self.path)) from error
 
     def type(self, msgtype: str) -> Any:
         """Message class of a type name such as ``'sensor_msgs/msg/Imu'``."""

@@ -15,7 +15,7 @@ from rs_relpose_ros.calibrate.procedure import calibrate, CalibrationInput, Reco
 from rs_relpose_ros.calibrate.result import CalibrationResult, parameter_file, quantities
 from rs_relpose_ros.calibrate.stored import Calibrated, CameraId, Progress
 from rs_relpose_ros.config.settings import CalibrationConfig, Parameters, TRACKED_IN_IMAGES
-from rs_relpose_ros.errors import RsRelposeError
+from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.messages.incoming import Role
 from rs_relpose_ros.messages.transforms import AXES_SIGMA
@@ -46,11 +46,12 @@ class LiveCalibration:
 
     `receive` is for the thread of the subscriptions, `step` for the worker. With `use_stored` the
     file of the camera is used, if there is one. `waits_for`: what others will give, in place of
-    a fit. `quat_prior`: rotation IMU to camera of a transform, +- 5 deg.
+    a fit. `topic`: of the images. `quat_prior`: rotation IMU to camera of a transform, +- 5 deg.
     """
 
-    def __init__(self, parameters: Parameters, *, use_stored: bool, waits_for: str = '') -> None:
-        self._parameters = parameters
+    def __init__(self, parameters: Parameters, *, use_stored: bool, waits_for: str = '',
+                 topic: str = '') -> None:
+        self._parameters, self._topic = parameters, topic
         self._use_stored, self.waits_for = use_stored, waits_for
         self.quat_prior: tuple[float, ...] | None = None
         self._queue: Queue[tuple[Role, Any]] = Queue()
@@ -132,9 +133,13 @@ class LiveCalibration:
 
     def _first_image(self, frame_id: str) -> Progress | Calibrated | RsRelposeError:
         """The stored calibration of the camera, if there is one, or the error of its file."""
-        name = self._parameters.calibration.camera_name or frame_id
-        self._camera = CameraId(name, *self._recorder.size)
-        path = stored.path_of(self._parameters.calibration, self._camera)
+        config, size = self._parameters.calibration, self._recorder.size
+        self._camera = (CameraId(config.camera_name, *size) if config.camera_name
+                        else CameraId(frame_id, *size, self._topic))
+        try:
+            path = stored.path_of(config, self._camera)
+        except InputError as error:
+            return error
         if not (self._use_stored and path.is_file()):
             return Progress('calibrating: rotate the camera about all three axes, 20 to 60 deg/s, '
                             'for some 20 s' if not self.waits_for else

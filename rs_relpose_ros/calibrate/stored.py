@@ -7,7 +7,7 @@ from pathlib import Path
 import re
 from typing import Any
 
-from rs_relpose_ros.config.files import file_values
+from rs_relpose_ros.config.files import file_values, read_parameters, written
 from rs_relpose_ros.config.settings import StoredCalibrationConfig
 from rs_relpose_ros.errors import InputError
 
@@ -18,11 +18,15 @@ _ILLEGAL = re.compile(r'[^\w.-]+')
 
 @dataclass(frozen=True, slots=True)
 class CameraId:
-    """Name and image size [px] of a camera."""
+    """Name and image size [px] of a camera.
+
+    `topic`: of its images, '' if the user has named it; another one with its name has another.
+    """
 
     name: str
     width: int
     height: int
+    topic: str = ''
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,31 +50,32 @@ class Calibrated:
 
 
 def path_of(config: StoredCalibrationConfig, camera: CameraId) -> Path:
-    """File of a camera's calibration, where camera_info_manager has that of its CameraInfo."""
+    """File of a camera's calibration, where camera_info_manager has that of its CameraInfo.
+
+    InputError without a home directory.
+    """
     if config.calibration_file:
         return Path(config.calibration_file).expanduser()
-    home = Path(os.environ.get('ROS_HOME') or Path.home() / '.ros')
+    try:
+        home = Path(os.environ.get('ROS_HOME') or Path.home() / '.ros')
+    except RuntimeError as error:   # HOME is not set, and the user has no entry
+        raise InputError('there is no home directory for the calibration: set HOME or ROS_HOME, '
+                         'or give calibration_file') from error
     name = _ILLEGAL.sub('_', camera.name) or 'camera'
     return home / 'rs_relpose' / f'{name}_{camera.width}x{camera.height}.yaml'
 
 
 def save(path: Path, camera: CameraId, parameters: str) -> None:
-    """Write a parameter file with its camera; InputError if it cannot be written.
-
-    It is written beside and renamed: a file with this name is complete.
-    """
+    """Write a parameter file with its camera; InputError if it cannot be written."""
     name = camera.name.replace("'", "''")
     text = (f"{parameters}{_SECTION}:\n  ros__parameters:\n    camera_name: '{name}'\n"
             f'    image_width: {camera.width}\n    image_height: {camera.height}\n'
+            f"    image_topic: '{camera.topic}'\n"
             f"    date: '{datetime.now().astimezone().date().isoformat()}'\n")
-    part = path.with_name(f'.{path.name}.{os.getpid()}')
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            part.write_text(text, encoding='utf-8')
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
+        with written(path) as file:
+            file.write(text)
     except OSError as error:
         raise InputError(f'the calibration cannot be stored in {path}: {error.strerror}; give '
                          'another calibration_file') from error
@@ -85,13 +90,18 @@ def load(path: Path, camera: CameraId) -> tuple[dict[str, Any], str]:
         The file is damaged, or of another camera or image size.
     """
     try:
-        own = file_values(path, _SECTION)
+        own, values = file_values(path, _SECTION), file_values(path)
+        read_parameters(path)   # a name or value that was edited by hand may be illegal
     except OSError as error:
         raise InputError(f'{path} cannot be read: {error.strerror}') from error
     if not {'camera_name', 'image_width', 'image_height', 'date'} <= own.keys():
         raise InputError(f'{path} is no stored calibration: it has no section {_SECTION}')
-    of = CameraId(own['camera_name'], own['image_width'], own['image_height'])
+    of = CameraId(own['camera_name'], own['image_width'], own['image_height'], camera.topic)
+    topic = own.get('image_topic')
+    if topic and camera.topic and camera.topic != topic:
+        raise InputError(f'{path} is of the images on {topic}, not on {camera.topic}, which have '
+                         'the same frame_id: give each camera_name, or that of this file')
     if of != camera:
         raise InputError(f'{path} is for the camera {of.name!r} of {of.width}x{of.height}, not '
                          f'for {camera.name!r} of {camera.width}x{camera.height}')
-    return file_values(path), str(own['date'])
+    return values, str(own['date'])

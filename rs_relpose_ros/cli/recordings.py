@@ -19,7 +19,7 @@ from rs_relpose_ros.calibrate.procedure import calibrate, read_recording
 from rs_relpose_ros.cli import options
 from rs_relpose_ros.cli.main import Command, FAILED, import_of
 from rs_relpose_ros.config import settings
-from rs_relpose_ros.config.files import read_parameters, write_parameters
+from rs_relpose_ros.config.files import read_parameters, write_parameters, written
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.distortion import DISTORTION_MODELS
@@ -108,7 +108,8 @@ def calibrate_bag(
         camera=recording.camera, compressed=topics.image.msgtype == COMPRESSED_IMAGE,
         feature_rows=tuple(args.rows), placed=values)
     parameters, metrics, curve = (folder / name for name in _CALIBRATION_FILES)
-    parameters.write_text(text, encoding='utf-8')
+    with written(parameters) as file:
+        file.write(text)
     mapping = calibration.as_mapping(result, recording.camera)
     metrics.write_text(json.dumps(mapping, indent=1) + '\n', encoding='utf-8')
     calibration.draw_curve(result, curve)

@@ -108,6 +108,7 @@ def lost_images(stamps_ns: Sequence[int], size: int) -> str:
 # -- Fields of /diagnostics -----------------------------------------------------------------------
 
 OK, WARN, ERROR = 0, 1, 2
+STARTING = 'starting: kernels are compiled or loaded'
 # Task in the name of the status of relpose_node.
 RELATIVE_POSE = 'relative pose'
 
@@ -204,12 +205,14 @@ class FrameStatistics(ABC):
             self._last_refusal = reason
 
     def report(self, inputs: Counter[str], counts: SequencerCounts | None, *, problem: str,
-               missing: tuple[str, ...], progress: Progress | None = None) -> Report:
+               missing: tuple[str, ...], progress: Progress | None = None,
+               lost: str = '') -> Report:
         """The state since the last report.
 
         `inputs` are the numbers of messages so far, by role, and of the invalid ones. `counts` is
         None while no frame is processed; `problem` is the reason for that, or empty; `missing` are
-        names of missing parameters and inputs; `progress` is that of a calibration.
+        names of missing parameters and inputs; `progress` is that of a calibration, `lost` a
+        warning of lost images.
         """
         now_ns = self._clock()
         with self._lock:
@@ -224,6 +227,8 @@ class FrameStatistics(ABC):
                 problem = f'{self.idle}: no frame can be used: {self._last_refusal}'
             level, text = (self._evaluate(problem, dropped) if progress is None
                            else (OK, progress.text))
+            if lost and level == OK:
+                level, text = WARN, lost
             values: dict[str, object] = {
                 'state': self.idle if problem else {
                     OK: 'ok', WARN: 'degraded', ERROR: self.wrong}[level],
@@ -262,7 +267,7 @@ class FrameStatistics(ABC):
 
     def _evaluate(self, problem: str, dropped: Counter[Refusal]) -> tuple[int, str]:
         if problem:
-            return ERROR, problem
+            return OK if problem == STARTING else ERROR, problem
         level, text = self._evaluate_results()
         if level == ERROR or not dropped:
             return level, text

@@ -205,8 +205,9 @@ class OdometryNode(StoppableNode):
         silent = (self._steady.now() - self._sample_at).nanoseconds * 1e-9
         if silent > _SILENT_IMU:
             self._estimator.imu_is_silent(silent)
-        for warning in self._estimator.warnings():
-            self._info(warning)
+        for text in self._estimator.warnings():
+            # A change of the state has the level of the state.
+            (self._info, self._warn, self._error)[_LEVELS.get(text.partition(':')[0], 0)](text)
 
     def _pose(self, odometry: Any) -> Any:
         return outgoing.pose_stamped_message(odometry.stamp_ns, self._config.odometry_frame,
@@ -240,6 +241,7 @@ class OdometryNode(StoppableNode):
                 header=self._path[-1].header, poses=list(self._path)))
 
     def _report(self) -> None:
+        self.warn_of_namesake()
         estimator = self._estimator
         level, state = _LEVELS[estimator.state.value], estimator.state.value
         if estimator.reason:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 import gc
 import logging
 import os
+from pathlib import Path
 import sys
 import threading
 import time
@@ -16,6 +17,7 @@ import traceback
 from typing import Any, ClassVar, NoReturn, TextIO, TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticArray
+from numba.core.event import RecordingListener, register
 import rclpy
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -37,7 +39,7 @@ from rs_relpose_ros.messages.incoming import Intake, PARTS, Role
 from rs_relpose_ros.messages.transforms import extrinsics
 from rs_relpose_ros.nodes import diagnostics
 from rs_relpose_ros.nodes import parameters as ros_parameters
-from rs_relpose_ros.nodes.diagnostics import PATIENCE, ReasonLog, SILENCE
+from rs_relpose_ros.nodes.diagnostics import PATIENCE, ReasonLog, SILENCE, STARTING
 from rs_relpose_ros.nodes.inputs import (
     LATCHED,
     message_class,
@@ -73,6 +75,13 @@ class StoppableNode(Node):
 
     def _on_parameters(self, parameters: Parameters) -> None:
         """A live parameter was set."""
+
+    def warn_of_namesake(self) -> None:
+        """Warn of another node of this name, whose topics and services cannot be told apart."""
+        own = self.get_name(), self.get_namespace()
+        if self.get_node_names_and_namespaces().count(own) > 1:
+            self._warn(f'another node has the name {self.get_fully_qualified_name()}: services '
+                       'and parameters reach either of them; start one with -r __node:=NAME')
 
     def stop(self) -> bool:
         """End its threads; whether they ended. Called before `destroy_node`."""
@@ -196,6 +205,9 @@ class Worker(threading.Thread):
 _JOIN_TIMEOUT = 0.4
 # Time [s] of a start above which kernels are being compiled, not loaded from the cache.
 _REPORT_COMPILING = 4.0
+# Kernels that are compiled, not loaded: begin and end of each; a few may be at any start.
+_COMPILED, _SOME_KERNELS = RecordingListener(), 10
+register('numba:compile', _COMPILED)
 
 
 def _camera(parameters: Parameters) -> list[Any]:
@@ -308,7 +320,8 @@ class SensorNode(StoppableNode):
             self._calibration = LiveCalibration(
                 parameters, use_stored=not calibrate and config.load_calibration
                 and config.calibrate_at_start != 'never',
-                waits_for='' if fits else ' or '.join(others))
+                waits_for='' if fits else ' or '.join(others),
+                topic=self.resolve_topic_name('image'))
             self._calibration.quat_prior = self._quat_prior
             self._intake: Any = self._calibration
             self._progress = Progress('calibrating: waiting for images and gyro')
@@ -325,7 +338,8 @@ class SensorNode(StoppableNode):
     def _subscribe_when_warm(self) -> None:
         assert self._worker is not None
         if not self._worker.warm.is_set():
-            if time.monotonic_ns() - self._started_ns > _REPORT_COMPILING * NANOSECONDS:
+            if (time.monotonic_ns() - self._started_ns > _REPORT_COMPILING * NANOSECONDS
+                    and len(_COMPILED.buffer) > _SOME_KERNELS):
                 self._info('compiling kernels, as the build has none for this machine: this start '
                            'takes a minute or two, later ones some seconds')
             return
@@ -360,7 +374,7 @@ class SensorNode(StoppableNode):
     def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Restart tracking; intrinsics and counters are kept."""
         response.success = self._loop is not None
-        response.message = self._cannot_start
+        response.message = self._cannot_start or 'calibrating: nothing is estimated yet'
         if self._loop is not None:
             self._loop.sequencer.reset()
             response.message = 'restarting with the next frame'
@@ -391,8 +405,9 @@ class SensorNode(StoppableNode):
         """Store and publish a calibration, and estimate with it."""
         self._calibrated, config = found, self._settings.current.calibration
         self._info(found.summary)
-        path = stored.path_of(config, found.camera)
+        path: Path | str = 'this calibration'
         try:
+            path = stored.path_of(config, found.camera)
             if found.new and config.save_calibration:
                 stored.save(path, found.camera, found.parameters)
                 self._info(f'the calibration is stored in {path}')
@@ -514,10 +529,13 @@ class SensorNode(StoppableNode):
         if self._lookup is not None and self._inputs is not None:
             self._use_transform(self._inputs.frame_ids)
         problem, missing = self._problem()
+        self.warn_of_namesake()
+        lost = '' if self._inputs is None else diagnostics.lost_images(
+            self._inputs.stamps_ns, self._inputs.image_bytes)
         counts: Counter[str] = Counter() if self._inputs is None else self._inputs.counts.copy()
         report = self._frame_statistics.report(
             counts, None if self._loop is None else self._loop.sequencer.counts(),
-            problem=problem, missing=missing, progress=self._progress)
+            problem=problem, missing=missing, progress=self._progress, lost=lost)
         status = outgoing.status_message(
             report.level, f'{self.get_fully_qualified_name()}: {self.task}', report.text,
             self._image_topic(), report.values, message_class)
@@ -525,7 +543,11 @@ class SensorNode(StoppableNode):
             self.get_clock().now().nanoseconds, status, message_class))
         if self._inputs is not None:
             self._log_silence(self._inputs, report.silence, problem)
-            lost = diagnostics.lost_images(self._inputs.stamps_ns, self._inputs.image_bytes)
+            for role, frame_id in self._inputs.frame_ids.items():
+                if not frame_id:
+                    self._warn(f'messages on {self._inputs.topics[role]} have no frame_id: no '
+                               'transform is found for them, and RViz shows no result; set it in '
+                               'the driver')
             if lost:
                 self._warn(lost)
 
@@ -568,7 +590,7 @@ class SensorNode(StoppableNode):
         if not self._worker.is_alive():
             return f'{self._frame_statistics.idle}: the worker ended, see the log', ()
         if self._inputs is None or not self._worker.warm.is_set():
-            return 'starting: kernels are compiled or loaded', ()
+            return STARTING, ()
         return self._missing_input(self._inputs)
 
     def _missing_input(self, inputs: SensorInputs) -> tuple[str, tuple[str, ...]]:

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_ros.config.files import written
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.geometry.so3 import integrated_rotations, log_so3, STANDARD_GRAVITY
@@ -198,7 +199,7 @@ class RowTrajectory:
 
     def save(self, path: Path | str) -> None:
         """Write an npz file of the attributes, exactly."""
-        with Path(path).open('wb') as file:
+        with written(Path(path), 'wb') as file:
             np.savez_compressed(file, **{
                 one.name: getattr(self, one.name) for one in fields(self)})
 
@@ -270,7 +271,7 @@ def camera_poses(rows: RowTrajectory, rate: float) -> list[StampedPose]:
 
 def write_tum(path: Path, trajectory: Sequence[Odometry | StampedPose]) -> None:
     """Lines ``seconds x y z qx qy qz qw``, seconds being those of the stamps."""
-    with path.open('w', encoding='ascii') as file:
+    with written(path) as file:
         for pose in trajectory:
             values = [*pose.position, *quat_xyzw(pose.R)]
             file.write(f'{pose.stamp_ns // 10**9}.{pose.stamp_ns % 10**9:09d} '

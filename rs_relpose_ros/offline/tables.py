@@ -18,6 +18,7 @@ import numpy as np
 import scipy
 
 from rs_relpose_ros.bags.reader import SensorTopics
+from rs_relpose_ros.config.files import written
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.geometry import Array
@@ -113,12 +114,11 @@ ERRORS = Table('errors.csv', (
 def table_writer(folder: Path, tables: Sequence[Table]) -> Iterator[Callable[[PairRecord], None]]:
     """Create the files of tables; the result appends a record to all of them.
 
-    A row is complete in its file even if the process ends after it.
+    Until the end of the context the files are those of `written`, in which each row is complete.
     """
     with ExitStack() as stack:
         writers = [csv.writer(stack.enter_context(
-            (folder / table.file).open('w', buffering=1, newline='', encoding='ascii')),
-            lineterminator='\n') for table in tables]
+            written(folder / table.file)), lineterminator='\n') for table in tables]
 
         def write(record: PairRecord) -> None:
             for table, writer in zip(tables, writers, strict=True):
@@ -168,7 +168,8 @@ def write_summary(path: Path, metrics: dict[str, Any], *, bag: Path, topics: Sen
                      'numpy': np.__version__, 'scipy': scipy.__version__,
                      'opencv': cv2.__version__, 'numba': numba.__version__},
     }
-    path.write_text(json.dumps(summary, indent=2, allow_nan=False) + '\n', encoding='utf-8')
+    with written(path) as file:
+        file.write(json.dumps(summary, indent=2, allow_nan=False) + '\n')
 
 
 def baselines(answered: Sequence[PairRecord]) -> dict[str, Any]:
