@@ -1,21 +1,23 @@
 """Files of results: pictures, and their folder."""
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 import os
 from pathlib import Path
 import tempfile
+from typing import Any, IO, TYPE_CHECKING
 
-import matplotlib as mpl
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-
-from rs_relpose_ros.config.files import written
 from rs_relpose_ros.errors import InputError
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
-def save_picture(picture: Figure, path: Path) -> None:
+
+def save_picture(picture: 'Figure', path: Path) -> None:
     """Write a plot as PNG on white; the file is the same for every backend."""
+    # A node stores its calibration, and draws nothing: Matplotlib takes a second.
+    import matplotlib as mpl
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     # Independent of the version of matplotlib and of the user's settings.
     with mpl.rc_context({'savefig.facecolor': 'white'}):
         FigureCanvasAgg(picture)
@@ -35,6 +37,27 @@ def refuse_unwritable(folder: Path) -> None:
         raise InputError(f'{nearest} is a file: choose another directory for the results')
     if not os.access(nearest, os.W_OK | os.X_OK):
         raise InputError(f'{nearest} cannot be written: choose another directory for the results')
+
+
+@contextmanager
+def written(path: Path, mode: str = 'w') -> Iterator[IO[Any]]:
+    """A file that is written beside, line by line, and has its name once it is complete.
+
+    An OSError names it; that of a full disk does not by itself.
+    """
+    part = path.with_name(f'{path.name}.part')
+    text: dict[str, Any] = {} if 'b' in mode else {
+        'encoding': 'utf-8', 'newline': '', 'buffering': 1}
+    try:
+        with part.open(mode, **text) as file:
+            yield file
+        part.replace(path)
+    except Exception as error:
+        with suppress(OSError):
+            part.unlink()
+        if isinstance(error, OSError):
+            raise type(error)(error.errno, error.strerror, str(path)) from error
+        raise
 
 
 def prepare_folder(folder: Path, replaced: Sequence[str]) -> None:

@@ -15,11 +15,12 @@ import yaml
 
 from rs_relpose_lab.live.processes import node_process, Process
 from rs_relpose_ros.bags.writer import BagWriter
-from rs_relpose_ros.config.files import parameter_template, read_parameters, written
+from rs_relpose_ros.config.files import parameter_template, read_parameters
 from rs_relpose_ros.config.settings import Parameters, SensorConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.messages.outgoing import PAIR_TOPICS
 from rs_relpose_ros.nodes import relpose_node as node_module
+from rs_relpose_ros.output_files import written
 
 CONFIG = ROOT / 'config'
 LAUNCH_FILE = ROOT / 'launch' / 'relpose.launch.py'

@@ -7,9 +7,10 @@ from pathlib import Path
 import re
 from typing import Any
 
-from rs_relpose_ros.config.files import file_values, read_parameters, written
+from rs_relpose_ros.config.files import file_values, read_parameters
 from rs_relpose_ros.config.settings import StoredCalibrationConfig
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.output_files import written
 
 # Section of the file that identifies the camera; a node of another name ignores it.
 _SECTION = 'rs_relpose_calibration'

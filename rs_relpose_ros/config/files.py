@@ -7,13 +7,13 @@
 writes all parameters at their defaults, with descriptions.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 import sys
 import textwrap
-from typing import Any, IO
+from typing import Any
 
 import yaml
 
@@ -90,27 +90,6 @@ def write_parameters(path: Path, title: str, values: Sequence[SourcedValue]) -> 
         raise InputError(f'{path} already exists: remove it or choose another path') from None
     except OSError as error:
         raise InputError(f'cannot write {path}: {error.strerror}') from error
-
-
-@contextlib.contextmanager
-def written(path: Path, mode: str = 'w') -> Iterator[IO[Any]]:
-    """A file that is written beside, line by line, and has its name once it is complete.
-
-    An OSError names it; that of a full disk does not by itself.
-    """
-    part = path.with_name(f'{path.name}.part')
-    text: dict[str, Any] = {} if 'b' in mode else {
-        'encoding': 'utf-8', 'newline': '', 'buffering': 1}
-    try:
-        with part.open(mode, **text) as file:
-            yield file
-        part.replace(path)
-    except Exception as error:
-        with contextlib.suppress(OSError):
-            part.unlink()
-        if isinstance(error, OSError):
-            raise type(error)(error.errno, error.strerror, str(path)) from error
-        raise
 
 
 def comment(text: str, indent: str = '') -> list[str]:

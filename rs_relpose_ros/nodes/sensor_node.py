@@ -77,7 +77,7 @@ class StoppableNode(Node):
         """A live parameter was set."""
 
     def warn_of_namesake(self) -> None:
-        """Warn of another node of this name, whose topics and services cannot be told apart."""
+        """Warn of another node of this name: services and parameters reach either of them."""
         own = self.get_name(), self.get_namespace()
         if self.get_node_names_and_namespaces().count(own) > 1:
             self._warn(f'another node has the name {self.get_fully_qualified_name()}: services '

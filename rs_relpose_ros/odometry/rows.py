@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.config.files import written
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.geometry.so3 import integrated_rotations, log_so3, STANDARD_GRAVITY
@@ -29,6 +28,7 @@ from rs_relpose_ros.imu.buffer import ImuInterval, ImuSamples
 from rs_relpose_ros.imu.integration import force_integrals
 from rs_relpose_ros.messages.outgoing import quat_xyzw
 from rs_relpose_ros.odometry.states import Odometry
+from rs_relpose_ros.output_files import written
 
 ROWS_FILE = 'trajectory_rows.npz'
 

@@ -18,13 +18,13 @@ import numpy as np
 import scipy
 
 from rs_relpose_ros.bags.reader import SensorTopics
-from rs_relpose_ros.config.files import written
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.messages.incoming import ReasonCounts
 from rs_relpose_ros.messages.outgoing import number, published_covariance, quat_xyzw
 from rs_relpose_ros.offline.truth import median_and_p90, PairErrors, TrueTrajectory
+from rs_relpose_ros.output_files import written
 from rs_relpose_ros.pipeline.pair import PAIR_METRICS, PairResult
 
 
