@@ -1,5 +1,7 @@
 """Files of results: pictures, and their folder."""
 
+from __future__ import annotations   # Matplotlib is imported where it draws
+
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 import os
@@ -13,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def save_picture(picture: 'Figure', path: Path) -> None:
+def save_picture(picture: Figure, path: Path) -> None:
     """Write a plot as PNG on white; the file is the same for every backend."""
     # A node stores its calibration, and draws nothing: Matplotlib takes a second.
     import matplotlib as mpl
