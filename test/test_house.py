@@ -16,11 +16,11 @@ OF_PACKAGE = {path: text for path, text in MODULES.items() if path.parts[0] == P
 
 # Folder -> most lines and modules. A larger number needs its reason in the commit that raises it.
 BUDGETS = {
-    'rs_relpose_ros': (270, 5),
+    'rs_relpose_ros': (300, 5),
     'rs_relpose_ros/bags': (1870, 6),
     'rs_relpose_ros/calibrate': (2920, 9),
     'rs_relpose_ros/cli': (1230, 7),
-    'rs_relpose_ros/config': (900, 4),
+    'rs_relpose_ros/config': (880, 4),
     'rs_relpose_ros/estimator': (3750, 12),
     'rs_relpose_ros/geometry': (1260, 7),
     'rs_relpose_ros/imu': (1300, 4),
@@ -32,7 +32,7 @@ BUDGETS = {
     'rs_relpose_ros/solvers': (1740, 6),
     'rs_relpose_ros/tracking': (1230, 5),
     'rs_relpose_lab': (9810, 44),
-    'test': (20350, 60),
+    'test': (20360, 60),
 }
 MOST_MODULES, MOST_FOLDERS = 114, 15
 LONGEST_MODULE, SHORTEST_MODULE, LONGEST_FUNCTION = 700, 80, 60
