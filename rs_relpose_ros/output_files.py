@@ -1,6 +1,6 @@
 """Files of results: pictures, and their folder."""
 
-from __future__ import annotations   # Matplotlib is imported where it draws
+from __future__ import annotations  # Matplotlib is imported where it draws
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
