@@ -206,7 +206,6 @@ def with_stamp(message: Any, new_stamp_ns: int) -> Any:
 
 # -- faults ----------------------------------------------------------------------------------
 
-
 def nothing(message: Any, _: float) -> Iterator[tuple[float, Any]]:
     """No fault."""
     yield 0.0, message

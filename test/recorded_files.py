@@ -35,7 +35,6 @@ def write_table(path: Path, header: str, rows: Sequence[Sequence[object]],
 
 # --- damage
 
-
 def replaced(name: str, old: str, new: str) -> Callable[[Path], None]:
     """Replace the first place of a text, which must be there."""
     def damage(folder: Path) -> None:

@@ -51,7 +51,6 @@ def check_content(bag: Bag) -> None:
 
 # --- storages
 
-
 @pytest.mark.parametrize('kind', bag_kinds.KINDS)
 def test_every_storage_gives_the_same(tmp_path, kind):
     expected = {STAMP_NS + time: bytes(JAZZY.serialize_cdr(message, msgtype))
@@ -186,7 +185,6 @@ def test_topics_without_messages(tmp_path):
 
 
 # --- what is no bag, or not a complete one
-
 
 def recorder_killed(folder: Path) -> Path:
     bag = write_kind('mcap', folder)
@@ -353,7 +351,6 @@ def test_a_definition_of_ros_1_that_takes_any_time_or_memory(tmp_path):
 
 
 # --- bounded sizes
-
 
 @pytest.mark.parametrize('kind, limit, text', [
     ('mcap', 'MAX_MESSAGE_BYTES', 'at most 1048576 are read'),

@@ -11,14 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.experiments import calibration_tracks
 from rs_relpose_lab.experiments.calibration_tracks import drawn, record, Recorded, Truth
-from rs_relpose_ros.calibrate.coplanarity import (
-    EXPOSURE,
-    GLOBAL,
-    LENS,
-    Problem,
-    Unknowns,
-    View,
-)
+from rs_relpose_ros.calibrate import coplanarity
+from rs_relpose_ros.calibrate.coplanarity import EXPOSURE, GLOBAL
 from rs_relpose_ros.calibrate.fit import evaluate, initial, LOCAL, redirected, stepped
 from rs_relpose_ros.calibrate.observations import (
     frame_times,
@@ -280,7 +274,6 @@ def test_readout_longer_than_the_interval_is_refused():
 
 # -- parts ------------------------------------------------------------------------------------
 
-
 def test_every_axis_map_is_recognised():
     maps = axis_maps()
     assert len({m.tobytes() for m in maps}) == 24
@@ -319,7 +312,7 @@ def test_gyro_path_is_the_rotation_of_an_even_turn():
 
 
 @lru_cache(maxsize=1)
-def few_pairs() -> tuple[Problem, Unknowns, Truth]:
+def few_pairs() -> tuple[coplanarity.Problem, coplanarity.Unknowns, Truth]:
     """Pairs, and a calibration a little off the truth."""
     rng = np.random.default_rng(1)
     recorded = record(drawn(rng, frames=10, outliers=0.0), rng)
@@ -334,7 +327,7 @@ def few_pairs() -> tuple[Problem, Unknowns, Truth]:
     unknowns = initial(
         problem, truth.R_cam_imu.T, truth.time_offset + middle_row * truth.readout_time + 1e-3,
         truth.readout_time + 2e-3, np.array(truth.gyro_bias), noise=1.0)
-    unknowns.parameters[LENS] = 0.01, 0.02, 1.0, -2.0
+    unknowns.parameters[coplanarity.LENS] = 0.01, 0.02, 1.0, -2.0
     return problem, unknowns, truth
 
 
@@ -377,7 +370,7 @@ def test_steps_of_calibration_and_pairs_together_converge():
 def test_residual_is_the_distance_in_pixels_to_the_nearest_pair_that_fits():
     problem, unknowns, truth = few_pairs()
     unknowns = unknowns._replace(parameters=unknowns.parameters.copy())
-    unknowns.parameters[LENS] = 0.0     # the points are moved in front of it
+    unknowns.parameters[coplanarity.LENS] = 0.0     # the points are moved in front of it
     residuals = evaluate(problem, unknowns, derivatives=False).residuals
     # Moved against its gradient by the residual, a match of two ends fits: first order in 0.3 px.
     h, n = 1e-4, 17
@@ -409,7 +402,7 @@ def test_rays_are_the_same_through_every_camera_model(model):
     tracks = few_frames(recorded.tracks, 3)
     camera = dataclasses.replace(pinhole, distortion_model=model, distortion=MODELS[model])
 
-    def view(points: np.ndarray, camera: RollingShutterCamera) -> View:
+    def view(points: np.ndarray, camera: RollingShutterCamera) -> coplanarity.View:
         estimated = dataclasses.replace(tracks, points=points)
         data = Observations.of(estimated, recorded.gyro, camera)
         pairs = make_pairs(data.tracks, (1,), PairSelection((), 500, 1, 99), 1.0,
@@ -447,7 +440,6 @@ def stamps_of(intervals_ms: list[float]) -> np.ndarray:
 
 
 # -- why intervals vary ------------------------------------------------------------------------
-
 
 def test_exposure_keeps_its_intervals_and_jitter_does_not():
     rng = np.random.default_rng(1)

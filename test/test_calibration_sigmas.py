@@ -14,6 +14,7 @@ from test_calibration import camera_of, simulated
 from rs_relpose_lab.experiments import calibration as benchmark
 from rs_relpose_lab.experiments.calibration_tracks import Recorded
 from rs_relpose_ros.calibrate import fit as fitting
+from rs_relpose_ros.calibrate import observations
 from rs_relpose_ros.calibrate.coplanarity import (
     BIAS,
     CENTER,
@@ -26,13 +27,6 @@ from rs_relpose_ros.calibrate.coplanarity import (
     SLOPE,
 )
 from rs_relpose_ros.calibrate.fit import Fit, ModelErrors, widened
-from rs_relpose_ros.calibrate.observations import (
-    exposed_rates,
-    Exposure,
-    frame_times,
-    Observations,
-    PairSelection,
-)
 from rs_relpose_ros.calibrate.procedure import calibrate, CalibrationInput
 from rs_relpose_ros.calibrate.result import CalibrationResult, CostCurve, parameter_file
 from rs_relpose_ros.calibrate.start import GyroSeries, noise_density
@@ -52,13 +46,14 @@ def free_of(*held: int) -> np.ndarray:
     return free
 
 
-def fitted(free: np.ndarray, **changes: object) -> tuple[Fit, Observations]:
+def fitted(free: np.ndarray, **changes: object) -> tuple[Fit, observations.Observations]:
     """Fit from the truth of the recording, with changed tracks or gyro."""
     source = dataclasses.replace(recorded(), **changes)
     truth = source.truth
-    data = Observations.of(source.tracks, source.gyro, camera_of(truth))
+    data = observations.Observations.of(source.tracks, source.gyro, camera_of(truth))
     offset = truth.time_offset + 0.5 * truth.readout_time
-    pairs = data.pairs(PairSelection((0.033, 0.1), 60, 20, 999), np.random.default_rng(0))
+    pairs = data.pairs(observations.PairSelection((0.033, 0.1), 60, 20, 999),
+                       np.random.default_rng(0))
     problem = data.problem(pairs, offset)
     begin = fitting.initial(problem, truth.R_cam_imu.T, offset, truth.readout_time,
                             np.array(truth.gyro_bias), noise=1.0)
@@ -66,7 +61,7 @@ def fitted(free: np.ndarray, **changes: object) -> tuple[Fit, Observations]:
 
 
 @lru_cache(maxsize=1)
-def undisturbed() -> tuple[Fit, Observations]:
+def undisturbed() -> tuple[Fit, observations.Observations]:
     return fitted(free_of(EXPOSURE))
 
 
@@ -134,7 +129,8 @@ def test_effect_of_an_exposure_on_a_quadratic_rate():
     stamps = np.arange(0, 2_000_000_000, 2_000_000)
     rates = np.repeat((1e-9 * stamps[:, None])**2, 3, axis=1)
     for exposure in (0.0, 0.04):
-        mean, by_square = exposed_rates(GyroSeries(stamps, rates), np.full(len(stamps), exposure))
+        mean, by_square = observations.exposed_rates(GyroSeries(stamps, rates),
+                                                     np.full(len(stamps), exposure))
         np.testing.assert_allclose((mean - rates)[30:-30], exposure**2 / 12.0, atol=1e-6)
         np.testing.assert_allclose(by_square[30:-30], 2.0 / 24.0, rtol=0.03)
 
@@ -142,7 +138,7 @@ def test_effect_of_an_exposure_on_a_quadratic_rate():
 def sharper(square: float) -> GyroSeries:
     """The recording's gyro, sharper than its images as these would be by an exposure."""
     gyro = recorded().gyro
-    _, by_square = exposed_rates(gyro, np.zeros(len(gyro)))
+    _, by_square = observations.exposed_rates(gyro, np.zeros(len(gyro)))
     return GyroSeries(gyro.stamps_ns, gyro.rates - square * by_square)
 
 
@@ -174,11 +170,11 @@ def test_exposure_is_taken_in_by_the_readout_and_written(given, tmp_path):
 def test_automatic_exposure_is_the_interval_less_a_margin():
     intervals = np.repeat([0.0332, 0.045], 40)
     times = np.cumsum(intervals) - intervals[0]
-    stamps = frame_times(np.rint(times * 1e9).astype(np.int64))
-    exposure = Exposure.of(times, stamps, TRACKED_IN_IMAGES)
+    stamps = observations.frame_times(np.rint(times * 1e9).astype(np.int64))
+    exposure = observations.Exposure.of(times, stamps, TRACKED_IN_IMAGES)
     np.testing.assert_allclose(exposure.assumed[1:], intervals[1:] - exposure.margin, atol=1e-8)
     assert 0.005 < exposure.margin < 0.012 and exposure.square_sigma > 0.0
-    known = Exposure.of(times, stamps, dataclasses.replace(
+    known = observations.Exposure.of(times, stamps, dataclasses.replace(
         TRACKED_IN_IMAGES, exposure_margin=0.01))
     np.testing.assert_allclose(known.assumed[1:], intervals[1:] - 0.01, atol=1e-8)
     assert known.square_sigma == 0.0
@@ -268,7 +264,6 @@ def test_a_readout_for_certain_beyond_the_interval_is_refused():
 
 
 # -- parts of a recording ----------------------------------------------------------------------
-
 
 def test_stretches_of_a_simulated_camera_agree(tmp_path):
     source = recorded()

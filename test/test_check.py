@@ -268,7 +268,6 @@ def test_missing_parameters_are_a_warning(tmp_path):
 
 # -- images against the gyro -----------------------------------------------------------------
 
-
 @pytest.fixture(scope='module')
 def parameters(bundled_bag):
     return read_parameters(bundled_bag.with_name('hand_held.yaml'))
@@ -463,7 +462,6 @@ def test_a_calibration_contradicts_wrong_parameters_in_every_convention(conventi
 
 # -- recordings ------------------------------------------------------------------------------
 
-
 @pytest.fixture(scope='module')
 def converted(recordings, tmp_path_factory):
     """Bags of the real recordings by name, converted once."""
@@ -538,7 +536,6 @@ def test_gross_errors_in_little_light(converted, changes, name, estimated, toler
 
 
 # -- containers, options, output -------------------------------------------------------------
-
 
 BEST_EFFORT = Qos(QosHistory.KEEP_LAST, 5, QosReliability.BEST_EFFORT, QosDurability.VOLATILE,
                   QosTime(0, 0), QosTime(0, 0), QosLiveliness.AUTOMATIC, QosTime(0, 0), False)

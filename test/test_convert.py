@@ -100,7 +100,6 @@ def refused(source: str, path: Path, bag: Path, words: str, *options: str,
 
 # --- videos
 
-
 def test_frames_keep_their_varying_times(tmp_path):
     read = converted('video', made.make_video(tmp_path), tmp_path / 'bag')
     assert [stamp - START_NS for stamp in read.stamps()] == [
@@ -250,7 +249,6 @@ def test_video_that_is_refused(tmp_path, make, words):
 
 # --- phones
 
-
 def test_posecam(tmp_path):
     read = converted('android', made.make_posecam(tmp_path / 'in'), tmp_path / 'bag')
     assert read.stamps() == [stamp for number, stamp in enumerate(made.STAMPS) if number != 2]
@@ -363,7 +361,6 @@ def test_tables(tmp_path, as_video):
 
 # --- public data sets
 
-
 def check_delays(read: Converted, readout_ns: int) -> None:
     for topic, messages in read.messages.items():
         delay_ns = 2 * made.MILLISECOND if 'imu' in topic else readout_ns + 5 * made.MILLISECOND
@@ -438,7 +435,6 @@ def test_decimal_stamps_keep_every_nanosecond(tmp_path):
 
 
 # --- what cannot be used
-
 
 def portrait(name: str):
     return lambda folder: made.write_video(folder / name, made.VIDEO_TICKS, width=48, height=64)
@@ -539,7 +535,6 @@ def test_paths_that_cannot_be_used(tmp_path, refused):
 
 # --- parameter files of the data sets
 
-
 @pytest.mark.parametrize(('dataset', 'title', 'values', 'axes', 'degrees'), [
     ('realsense_rgb_rs', datasets.REALSENSE_TITLE, datasets.REALSENSE_PARAMETERS,
      Rotation.identity(), pytest.approx(1.0, abs=1.0)),
@@ -563,7 +558,6 @@ def test_parameter_file_is_that_of_the_command(tmp_path, dataset, title, values,
 
 
 # --- recordings
-
 
 @pytest.mark.recordings
 def test_axes_of_the_realsense_and_of_its_calibration(recordings):

@@ -44,7 +44,6 @@ PARAMETERS = Parameters.from_mapping({'readout_time': 0.02,
 
 # -- errors ----------------------------------------------------------------------------------
 
-
 def front_end_of(images: list[RawImage], parameters: Parameters = PARAMETERS, *,
                  offline: bool = True) -> FrontEnd:
     """Frames that are ready, with all of their IMU samples."""
@@ -136,7 +135,6 @@ def test_a_refusal_is_an_outcome():
 
 # -- pairs -----------------------------------------------------------------------------------
 
-
 POLICY = KeyframeConfig(min_keyframe_parallax=10.0, max_keyframe_interval=0.5,
                         max_keyframe_frames=12, min_tracked_fraction=0.3)
 
@@ -158,7 +156,6 @@ def test_a_keyframe_is_made_by_motion_or_time(parallax, interval, frames, fracti
 
 
 # -- parameters that may change while running ------------------------------------------------
-
 
 # Of each a value that must have an effect on the pairs after it was set.
 CHANGED: dict[str, Any] = {
@@ -276,7 +273,6 @@ def test_publishing_of_debug_images_can_be_switched_while_running(recorded, para
         assert publishers['~/debug_image'].publish.call_count == pictures
 
 # -- the walk of one image -------------------------------------------------------------------
-
 
 IMAGE_MESSAGE = type(build.compressed(build.rosbags_types, b''))
 CARRIERS = (IMAGE_MESSAGE, RawImage, CompressedImage, QueuedFrame, Frame, PairResult)

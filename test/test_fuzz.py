@@ -179,7 +179,6 @@ def test_damaged_messages(count):
 
 # --- pairs
 
-
 def chain(plan: list[tuple[int, list[Any]]]) -> Counter[str]:
     """Outcomes of published pairs, of which one message each, or none, has other bytes."""
     flight, outcomes = simulated_flight(4, points=30).pairs, Counter[str]()
@@ -214,7 +213,6 @@ def test_damaged_pairs(count):
 
 
 # --- bags
-
 
 def sensor_messages() -> list[bags.Entry]:
     """A few frames of a camera with an IMU."""
@@ -268,7 +266,6 @@ def test_damaged_bags(tmp_path, count):
 
 
 # --- recordings
-
 
 @pytest.mark.parametrize('make, reader', [
     (make_tables, read_tables), (make_posecam, read_posecam), (make_realsense, read_realsense)])

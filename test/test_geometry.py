@@ -27,7 +27,6 @@ vectors = hnp.arrays(np.float64, 3, elements=st.floats(-3.0, 3.0))
 
 # --- small vectors and rotations
 
-
 @given(hnp.arrays(np.float64, (5, 3), elements=st.floats(-10.0, 10.0)), st.booleans())
 def test_products_equal_numpy(values, as_tuples):
     a, b, M = values[0], values[1], values[2:]
@@ -76,7 +75,6 @@ def test_every_rank_and_the_median(values):
 
 
 # --- the camera
-
 
 # EuRoC's factory calibration, a wide rational model, a fisheye lens.
 MODELS = [
@@ -148,7 +146,6 @@ def test_no_mirror_images():
 
 # --- time
 
-
 SPAN = 0.024 * 479 / 480
 
 
@@ -200,7 +197,6 @@ def test_camera_and_clock_of_a_parameter_set():
 
 # --- motion during the readout
 
-
 def wobble(t):
     return np.array([0.6 * np.sin(9.0 * t + 0.3), -0.8 * np.cos(7.0 * t), 0.5 + 2.0 * t])
 
@@ -250,7 +246,6 @@ def test_shift_of_the_reference_row():
 
 
 # --- a pose between other rows, and its inverse
-
 
 def make_state(rng):
     t = rng.normal(size=3)
@@ -347,7 +342,6 @@ def test_inverse_pose_and_its_covariance():
 
 
 # --- illegal values
-
 
 NAN, STEADY = float('nan'), np.zeros((2, 3))
 

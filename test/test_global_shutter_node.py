@@ -106,7 +106,6 @@ def session(module_ros_domain_id: int, bundled_bag: Path) -> Iterator[SimpleName
 
 # -- undisturbed images ----------------------------------------------------------------------
 
-
 def test_images_are_those_of_the_replay_bit_by_bit(session, expected):
     by_stamp = {frame.stamp_ns: frame for frame in expected.values()}
     stamps = stamps_of(session.undisturbed)
@@ -166,7 +165,6 @@ def test_diagnostics_count_all_frames(session):
 
 
 # -- faults ----------------------------------------------------------------------------------
-
 
 def source(stream: Stream, image: Image) -> int | None:
     """Stamp of the received image that was derotated."""

@@ -64,7 +64,6 @@ def wobbling(count=100):
 
 # -- Buffer and gyro integration ----------------------------------------------------------------
 
-
 def test_constant_rate_is_the_exponential_of_rate_times_time_without_its_bias():
     rate, bias = np.array([0.2, -1.1, 0.7]), (0.01, -0.02, 0.03)
     buffer = filled(samples(at_200_hz(), rate + bias), gyro_bias=bias)
@@ -374,7 +373,6 @@ def test_buffer_and_frame_use_the_bias(gravity_filter):
 
 
 # -- Gravity --------------------------------------------------------------------------------------
-
 
 def upright(times):
     return np.broadcast_to(np.eye(3), (len(times), 3, 3))

@@ -57,7 +57,6 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 # -- the file ------------------------------------------------------------------------------------
 
-
 def test_a_stored_calibration_is_of_its_camera_only(tmp_path, monkeypatch):
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
     path = stored.path_of(StoredCalibrationConfig(), CAMERA)
@@ -123,7 +122,6 @@ def test_a_user_without_a_home_directory(monkeypatch, bag):
 
 # -- without ROS ---------------------------------------------------------------------------------
 
-
 def outcomes(bag: Path, calibration: LiveCalibration, *, moving: bool = True) -> Iterator[Any]:
     """Outcomes of the messages, the fits awaited; not `moving`: of the first image and a gyro."""
     first: Any = None
@@ -168,7 +166,6 @@ def test_a_camera_at_rest_is_never_calibrated_and_the_motion_is_named(bag):
 
 
 # -- the node ------------------------------------------------------------------------------------
-
 
 @pytest.mark.parametrize('given', [{}, {'readout_time': 0.02,
                                         'quat_cam_imu_xyzw': (0.0, 0.0, 0.0, 1.0)}])

@@ -40,7 +40,6 @@ def packed_yuv(luma_at: int) -> tuple[bytes, int]:
 
 # -- images ----------------------------------------------------------------------------------
 
-
 def decoded(message: object) -> np.ndarray:
     return incoming.image_from_message(message).decoded()
 
@@ -202,7 +201,6 @@ def test_unusable_compressed_image_is_refused(data, expected):
 
 # -- calibration -----------------------------------------------------------------------------
 
-
 @build.both_types
 @pytest.mark.parametrize(('change', 'size', 'corners'), [
     ({}, (640, 480), [[0.0, 0.0], [199.0, 149.0]]),
@@ -255,7 +253,6 @@ def test_unusable_calibration_is_refused(change, expected):
 
 
 # -- IMU -------------------------------------------------------------------------------------
-
 
 @build.both_types
 @pytest.mark.parametrize(('change', 'gyro', 'force'), [

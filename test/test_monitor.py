@@ -25,14 +25,7 @@ from rs_relpose_ros.messages import incoming
 from rs_relpose_ros.messages.incoming import Intake, Role, sensor_messages
 from rs_relpose_ros.nodes.sensor_node import Worker
 from rs_relpose_ros.offline.replay import read_truth, Replay
-from rs_relpose_ros.pipeline import findings, recursion
-from rs_relpose_ros.pipeline.assessment import (
-    assess,
-    Configured,
-    Effect,
-    find_inconsistencies,
-    gross_errors,
-)
+from rs_relpose_ros.pipeline import assessment, findings, recursion
 from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState, worst_of
 from rs_relpose_ros.pipeline.monitor import Agreement, Applied, ConsistencyMonitor, Tracked
 from rs_relpose_ros.pipeline.pair import Frame
@@ -53,7 +46,7 @@ PARAMETERS = Parameters.from_mapping({
     'readout_time': 0.03, 'time_offset': 0.004, 'quat_cam_imu_xyzw': tuple(R_CAM_IMU.as_quat())})
 # Small deviations: rad, s, s, rad/s, -, -, -.
 SMALL = np.array([3e-3] * 3 + [2e-3, 2e-3] + [3e-3] * 3 + [0.01, 0.01, 0.01])
-CONFIGURED = Configured(PARAMETERS.sensor, CAMERA, np.zeros(3), 0.003, NONE)
+CONFIGURED = assessment.Configured(PARAMETERS.sensor, CAMERA, np.zeros(3), 0.003, NONE)
 
 
 def deviation(**values):
@@ -65,7 +58,6 @@ def deviation(**values):
 
 
 # -- exact pairs: an image is exposed by search, without derivatives of the monitor -------------
-
 
 # A camera that shakes while it flies past points; positions in metres.
 RNG, TIMES = np.random.default_rng(0), np.arange(-1.0, 6.0, 0.4)
@@ -207,7 +199,6 @@ def test_derivative_by_the_rates_by_finite_differences():
 
 # -- the pairs of the last seconds ---------------------------------------------------------------
 
-
 def recursion_of(pairs, stamps_ns):
     sums = Recursion()
     for stamp_ns, pair in zip(stamps_ns, pairs, strict=True):
@@ -247,7 +238,6 @@ def test_older_pairs_are_linearised_again_at_a_deviation():
 
 # -- rotations of images and gyro ----------------------------------------------------------------
 
-
 def rotations(Q, scale=1.0, size=0.05, count=40, seed=0, weights=(1.0, 1.0, 1.0), noise=1e-3):
     """Images rotate by `scale` times Q times the gyro's rotation, about axes by `weights`."""
     rng, sums = np.random.default_rng(seed), RotationSums()
@@ -260,8 +250,8 @@ def rotations(Q, scale=1.0, size=0.05, count=40, seed=0, weights=(1.0, 1.0, 1.0)
 
 def faults_of(sums):
     """Gross errors by rotations alone."""
-    gross = gross_errors(sums.compared(), 0.0, CONFIGURED)
-    return assess(recursion.NOTHING_ESTIMATED, [], gross, CONFIGURED).faults
+    gross = assessment.gross_errors(sums.compared(), 0.0, CONFIGURED)
+    return assessment.assess(recursion.NOTHING_ESTIMATED, [], gross, CONFIGURED).faults
 
 
 @pytest.mark.parametrize(('axis', 'angle', 'named'), [
@@ -284,9 +274,9 @@ def test_a_gross_error_persists_until_it_is_contradicted():
     found = ()
     for compared, named in ((independent, 'image_geometry'), (degrees, 'gyro_unit'),
                             (unknown, 'gyro_unit'), (independent, 'gyro_unit')):
-        found = gross_errors(compared, 0.0, CONFIGURED, found)
+        found = assessment.gross_errors(compared, 0.0, CONFIGURED, found)
         assert found[0].quantity == named
-    assert not gross_errors(rotations(np.eye(3)).compared(), 0.0, CONFIGURED, found)
+    assert not assessment.gross_errors(rotations(np.eye(3)).compared(), 0.0, CONFIGURED, found)
 
 
 @pytest.mark.parametrize('ahead, message', [
@@ -294,10 +284,10 @@ def test_a_gross_error_persists_until_it_is_contradicted():
     (-2.0, "the clock of the IMU is 2.0 s behind the images'"), (0.3, '')])
 def test_clocks_that_differ_by_seconds_are_named(ahead, message):
     independent = rotations(np.zeros((3, 3)), size=0.2, noise=0.05).compared()
-    fault = gross_errors(independent, ahead, CONFIGURED)[0]
+    fault = assessment.gross_errors(independent, ahead, CONFIGURED)[0]
     assert (fault.message == message and fault.quantity == 'time_offset') is bool(message)
     # An image that comes late, with a stamp that is right.
-    assert not gross_errors(rotations(np.eye(3)).compared(), ahead, CONFIGURED)
+    assert not assessment.gross_errors(rotations(np.eye(3)).compared(), ahead, CONFIGURED)
 
 
 def test_an_accelerometer_in_g_is_named_after_a_second():
@@ -406,7 +396,6 @@ def test_rotation_of_rays_withstands_near_points():
 
 # -- assessment ----------------------------------------------------------------------------------
 
-
 def calibration(c, sigma, coupled=0.0):
     """Of the deviations c; OFFSET and READOUT are alike by `coupled`."""
     correlation = np.eye(DEVIATIONS)
@@ -418,11 +407,13 @@ def calibration(c, sigma, coupled=0.0):
 
 SIGMA = np.array([1e-3] * 3 + [5e-4, 1e-3] + [1e-3] * 3 + [5e-3, 5e-3, 0.01])
 # Ten sigmas of a deviation turn a pose by its own sigma.
-EFFECT = Effect(*(np.vstack([np.zeros((n - 1, DEVIATIONS)), 0.1 / SIGMA]) for n in (5, 6)))
+EFFECT = assessment.Effect(
+    *(np.vstack([np.zeros((n - 1, DEVIATIONS)), 0.1 / SIGMA]) for n in (5, 6)))
 
 
 def assessed(estimated, effect=EFFECT, configured=CONFIGURED):
-    return assess(estimated, find_inconsistencies(estimated, [effect], NONE), (), configured)
+    return assessment.assess(
+        estimated, assessment.find_inconsistencies(estimated, [effect], NONE), (), configured)
 
 
 @pytest.mark.parametrize(('c', 'coupled', 'named'), [
@@ -431,15 +422,15 @@ def assessed(estimated, effect=EFFECT, configured=CONFIGURED):
     (deviation(offset=0.01, readout=-0.008), 0.6, {'time_offset', 'readout_time'}),
     (3.0 * deviation(focal=SIGMA[FOCAL]), 0.0, set())])   # not certain
 def test_the_fewest_deviations_are_found_and_solved_together(c, coupled, named):
-    found = find_inconsistencies(calibration(c, SIGMA, coupled), [EFFECT], NONE)
+    found = assessment.find_inconsistencies(calibration(c, SIGMA, coupled), [EFFECT], NONE)
     assert {one.quantity.name for one in found} == named
     if named:
         np.testing.assert_allclose(sum(one.deviation for one in found), c, atol=1e-9)
     if len(named) == 1:
         assert found[0].shift == pytest.approx(2.0, rel=0.01)   # 20 sigmas
     # Active deviations are no inconsistency.
-    assert not find_inconsistencies(calibration(c, SIGMA), [EFFECT], c)
-    assert not find_inconsistencies(recursion.NOTHING_ESTIMATED, [], NONE)
+    assert not assessment.find_inconsistencies(calibration(c, SIGMA), [EFFECT], c)
+    assert not assessment.find_inconsistencies(recursion.NOTHING_ESTIMATED, [], NONE)
 
 
 @pytest.mark.parametrize('correlation, named', [
@@ -480,7 +471,7 @@ def test_the_state_follows_the_shift_of_the_pose(size, state):
 def test_tracking_is_suggested_if_it_is_off_and_reaches_the_estimate(quantity, size, on, offered):
     tracking = {'offset': 'track_time_offset', 'readout': 'track_readout_time'}[quantity]
     fault = assessed(calibration(deviation(**{quantity: size}), SIGMA),
-                     Effect(2.0 * EFFECT.shift, 2.0 * EFFECT.claimed_shift),
+                     assessment.Effect(2.0 * EFFECT.shift, 2.0 * EFFECT.claimed_shift),
                      replace(CONFIGURED, sensor=sensor(**{tracking: on}))).faults[0]
     assert (f'{tracking}: true' in fault.fix) is offered
 
@@ -495,8 +486,8 @@ def test_messages_have_no_negative_zero():
 
 def test_gross_errors_leave_the_other_quantities_unknown():
     turned = rotations(Rotation.from_rotvec([1.5, 0.0, 0.0]).as_matrix()).compared()
-    health = assess(calibration(deviation(offset=0.03), SIGMA), [], gross_errors(
-        turned, 0.0, CONFIGURED), CONFIGURED)
+    health = assessment.assess(calibration(deviation(offset=0.03), SIGMA), [],
+                               assessment.gross_errors(turned, 0.0, CONFIGURED), CONFIGURED)
     assert [finding.quantity for finding in health.faults] == ['axes']
     assert {finding.state for finding in health.findings[1:]} == {FindingState.UNKNOWN}
 
@@ -535,7 +526,6 @@ def test_traces_of_a_gross_error_are_left_out_of_a_run():
 
 
 # -- tracked parameters --------------------------------------------------------------------------
-
 
 def tracked(offset=0.0, sigma=1e-3, readout=0.03):
     return Tracked(np.zeros(3), np.ones(3), offset, sigma, readout, sigma, 10)
@@ -588,8 +578,8 @@ def test_tracked_values_are_those_of_the_parameters(direction, sign):
     """The offset is that of the middle row, with the active readout time: 2 ms more."""
     camera = replace(CAMERA, readout_direction=direction, readout_time=0.032)
     active = deviation(readout=sign * 0.002)
-    configured = Configured(sensor(readout_direction=direction), camera, np.full(3, 0.1), 0.003,
-                            active)
+    configured = assessment.Configured(sensor(readout_direction=direction), camera,
+                                       np.full(3, 0.1), 0.003, active)
     c = deviation(offset=0.004, readout=sign * 0.006)
     c[BIAS] = 0.01, 0.02, 0.03
     estimated = Tracked.of(calibration(c, SIGMA), configured)
@@ -616,7 +606,6 @@ def test_pairs_that_contradict_the_accelerometer():
 
 
 # -- wrong parameters, end to end: the bundled bag ------------------------------------------------
-
 
 @dataclass(frozen=True)
 class Wrong:
@@ -825,7 +814,6 @@ def test_a_deviation_so_large_that_no_pair_has_a_translation():
 
 # -- errors that the tracks of a pair share ------------------------------------------------------
 
-
 def agreeing_pairs(scatter, count=60, seed=0, frames=5, gyro_square=0.0):
     """Poses of a straight motion, directions at the ends off by `scatter` times their sigma."""
     rng, sigma = np.random.default_rng(seed), 0.01
@@ -893,7 +881,6 @@ def test_a_rotation_that_contradicts_the_gyro_enlarges_its_own_covariance():
 
 
 # -- tracked parameters, on the bundled bag ------------------------------------------------------
-
 
 # Parameters, and what is estimated and applied at the end, with the largest errors of both.
 @pytest.mark.parametrize(('assignments', 'name', 'estimated', 'applied', 'errors', 'sigmas'), [

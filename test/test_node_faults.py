@@ -348,7 +348,6 @@ def test_debug_images_show_pairs(session):
 
 # -- two nodes -------------------------------------------------------------------------------
 
-
 def poses_with_references(node: Node, known: tuple[int, int]) -> list[tuple[Any, set[int]]]:
     """Poses since `known`, each with the references of its stamp.
 

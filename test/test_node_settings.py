@@ -80,7 +80,6 @@ def running(module_ros_domain_id: int, bundled_bag: Path) -> Iterator[Running]:
 
 # -- settings of a running node --------------------------------------------------------------
 
-
 def test_quality_of_service_can_be_overridden_topic_by_topic(running):
     for topic in [*BAG_TOPICS.values(), '/accel']:
         # Of CameraInfo there is another one, for what was latched.
@@ -145,7 +144,6 @@ def test_parameters_are_described(running):
 
 
 # -- settings that keep a node from estimating -----------------------------------------------
-
 
 NEVER = {'calibrate_at_start': 'never'}
 QUATERNION = {'quat_cam_imu_xyzw': '[0.0, 0.0, 0.0, 1.0]'}

@@ -148,7 +148,6 @@ def ate(keyframes, truth):
 
 # --- residuals
 
-
 def test_derivatives_of_deviations_are_those_of_finite_differences():
     rng = np.random.default_rng(0)
     C = Rotation.random(random_state=1).as_matrix()
@@ -195,7 +194,6 @@ def test_square_root_leaves_out_what_is_not_observed():
 
 
 # --- paths
-
 
 def test_path_is_metric(walked, tracked):
     estimator, out = tracked
@@ -410,7 +408,6 @@ def test_without_the_position_of_the_camera_on_the_base_nothing_starts(walked):
 
 
 # --- faults
-
 
 def contradicting(pairs):
     bad = len(pairs) - 12
@@ -775,7 +772,6 @@ def test_without_gtsam_the_error_has_the_command_to_install_it(monkeypatch):
 
 
 # --- files
-
 
 def test_the_plot_has_one_time_axis_and_the_whole_truth(walked, tracked, tmp_path):
     """A live path starts later than the smoothed one, and the truth may end before both."""

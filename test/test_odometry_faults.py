@@ -337,7 +337,6 @@ def test_samples_of_another_frame_are_refused_until_reset(own_node, monkeypatch)
 
 # -- next to relpose_node and a player, on the bundled bag ---------------------------------------
 
-
 def fused(messages: list[Odometry], used: list[bool]) -> tuple[np.ndarray, float]:
     """Positions by a Kalman filter of a constant twist, and its innovations squared.
 

@@ -258,7 +258,6 @@ def test_usage_is_checked(call, expected):
 
 # -- poses chained with their scale: against a simulated flight, and where it is lost ---------
 
-
 def published(pairs: list[PairResult]) -> list[module.PublishedPair]:
     """As a subscriber gets them: float32 matches."""
     return [published_pair(pair_messages(pair, build.rosbags_types)) for pair in pairs]

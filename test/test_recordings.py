@@ -269,7 +269,6 @@ def test_global_and_rolling_path_are_equal_at_readout_0(corners, given, imu, R_c
 
 # -- ten frames in flight ---------------------------------------------------------------------
 
-
 @pytest.fixture(scope='module')
 def flight(recordings, body_from_camera):
     """Stamp, image, R (camera from world) and position of the camera."""

@@ -46,7 +46,6 @@ def numbers(row: dict[str, str], names: str) -> np.ndarray:
 
 # -- the bundled bag -------------------------------------------------------------------------
 
-
 @pytest.fixture(scope='module')
 def replayed(bundled_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Outputs of a replay of the bundled bag with everything on."""
@@ -297,7 +296,6 @@ def test_a_wrong_parameter_is_reported_and_is_exit_code_1(bundled_bag, tmp_path,
 
 # -- recordings of real cameras --------------------------------------------------------------
 
-
 @pytest.mark.recordings
 @pytest.mark.parametrize('name', ['realsense_rgb_rs', 'xiaomi_cc9_rs'])
 def test_recordings(recordings, tmp_path, name):
@@ -323,7 +321,6 @@ def test_recordings(recordings, tmp_path, name):
 
 
 # -- truth -----------------------------------------------------------------------------------
-
 
 def test_truth_of_a_known_motion():
     """A camera on a circle of radius 2 m that turns with it, w = 0.5 rad/s about its y axis."""
@@ -366,7 +363,6 @@ def test_unusable_truth_is_refused(count, quat):
 
 
 # -- parameter files -------------------------------------------------------------------------
-
 
 def test_parameter_file_and_assignments(tmp_path):
     file = tmp_path / 'parameters.yaml'
@@ -412,7 +408,6 @@ def test_bad_parameter_files(tmp_path, text, words):
 
 
 # -- bad input, from end to end --------------------------------------------------------------
-
 
 def write_bag(path: Path, spoil: Callable[[str, Any, int], object] = lambda *_: None,
               topics: tuple[str, ...] = ('image', 'camera_info', 'imu')) -> Path:

@@ -106,7 +106,6 @@ def test_generated_matches_obey_the_rolling_shutter_essential_matrix():
 
 # --- exact data
 
-
 @each_exact_case
 def test_solutions_of_exact_matches(solver, motion):
     """The truth is among them; all are distinct, satisfy the constraint and know gravity."""
@@ -226,7 +225,6 @@ def test_11_points_from_a_start_that_is_off(off, reached):
 
 # --- noise
 
-
 @each_exact_case
 def test_error_is_proportional_to_small_noise(solver, motion):
     """With a bounded factor: a solver must not amplify rounding."""
@@ -241,7 +239,6 @@ def test_error_is_proportional_to_small_noise(solver, motion):
 
 
 # --- degenerate motion and readout
-
 
 @pytest.mark.parametrize('solver', [linear_9pt, uniform_9pt], ids=case_name)
 @pytest.mark.parametrize('motion', [{'constant_velocity': True}, STILL],
@@ -272,7 +269,6 @@ def test_a_global_shutter_has_no_velocities(solver, tau1, tau2):
 
 # --- invariance
 
-
 @each_solver
 def test_solvers_are_pure_and_independent_of_lengths(solver):
     """Equal input, equal bits; arguments are not changed, lists are equivalent to arrays."""
@@ -298,7 +294,6 @@ def test_solvers_are_pure_and_independent_of_lengths(solver):
 
 
 # --- other code
-
 
 def essential_matrix(R, t):
     """Of ``x_2^T E x_1 = 0``, OpenCV's way, of length 1 and without a sign."""
@@ -332,7 +327,6 @@ def test_5_points_against_opencv():
 
 
 # --- the table
-
 
 @each_solver
 def test_table_functions_and_modes_of_the_estimator_agree(solver):

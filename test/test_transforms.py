@@ -96,7 +96,6 @@ def test_configured_values_win_and_a_contradiction_has_both(given, found, names,
 
 # -- bags ----------------------------------------------------------------------------------------
 
-
 STATIC = tf_message(('base_link', 'mount', (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)))
 TRUE = tf_message(
     ('mount', CAMERA_FRAME, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)),

@@ -54,7 +54,6 @@ def test_tracks_are_where_the_renderer_shows_the_points_with_errors_since_the_re
 
 # -- rows --------------------------------------------------------------------------------------
 
-
 @pytest.mark.parametrize('name', [name for name in ROWS if name != RIGHT])
 def test_a_row_changes_something(name, recording):
     right, sample = recording.configured, recording.samples[40]
@@ -95,7 +94,6 @@ def test_image_and_points_are_mapped_alike(geometry):
 
 
 # -- information: the oracle of what the motion of a recording determines ------------------------
-
 
 CAMERA = RollingShutterCamera(width=640, height=480, fx=450.0, fy=450.0, cx=319.5, cy=239.5,
                               readout_time=0.02)
@@ -159,7 +157,6 @@ def test_informative_seconds(injected, expected):
 
 
 # -- results of a bag ----------------------------------------------------------------------------
-
 
 def pair_at(at, state='unknown', named=(), chi=1.0):
     return EvaluatedPair(at, 'OK', Verdict(state, named), 0.01, chi_direction=chi,

@@ -100,7 +100,6 @@ def _report_of(items: Sequence[Any], work: Callable[[Any], Any],
 
 # -- options of several benchmarks ------------------------------------------------------------
 
-
 def _number(parser: argparse.ArgumentParser, option: str, default: int, text: str) -> None:
     parser.add_argument(option, type=int, default=default, metavar='N',
                         help=f'{text} (default: %(default)s)')
@@ -136,7 +135,6 @@ def _shipped(name: str) -> Path:
 
 
 # -- the benchmarks ---------------------------------------------------------------------------
-
 
 def _accuracy_arguments(parser: argparse.ArgumentParser) -> None:
     _number(parser, '--trials', 200, 'problems a cell')

@@ -28,7 +28,6 @@ from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
 # -- simulated tracks -------------------------------------------------------------------------
 
-
 @dataclass(frozen=True, slots=True)
 class Found:
     """Error of a quantity, its reported 1 sigma, and whether it was reported as observable."""

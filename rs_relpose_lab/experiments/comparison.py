@@ -9,12 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_lab.experiments.methods import (
-    OPENCV_ESTIMATORS,
-    opencv_five_point,
-    Pose,
-    undistorted,
-)
+from rs_relpose_lab.experiments import methods
 from rs_relpose_ros.bags.reader import Bag, open_bag, SensorTopics
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import Parameters
@@ -85,7 +80,7 @@ class LiveComparison:
         """Scores of OpenCV's estimators on the matches of the replay's poses."""
         answered = [pair for pair in self.pairs if pair.pose]
         return [best_opencv_score(estimator, answered, self.intrinsics, self.truth)
-                for estimator in OPENCV_ESTIMATORS]
+                for estimator in methods.OPENCV_ESTIMATORS]
 
 
 def compare_live(table: Path, stamps_file: Path, bag_path: Path, parameter_file: Path,
@@ -175,12 +170,12 @@ def best_opencv_score(estimator: str, pairs: Sequence[PairResult], intrinsics: I
 
 
 def opencv_pose(pair: PairResult, intrinsics: Intrinsics, threshold: float,
-                estimator: str = 'USAC_MAGSAC') -> Pose | None:
+                estimator: str = 'USAC_MAGSAC') -> methods.Pose | None:
     """Pose by an OpenCV estimator from the matches of a pair, as of a global shutter."""
     camera = intrinsics.global_shutter_camera()
-    pixels1, pixels2 = (undistorted(intrinsics.to_sensor(points), camera) for points in
+    pixels1, pixels2 = (methods.undistorted(intrinsics.to_sensor(points), camera) for points in
                         (pair.matches.points1, pair.matches.points2))
-    return opencv_five_point(pixels1, pixels2, camera, threshold, estimator=estimator)
+    return methods.opencv_five_point(pixels1, pixels2, camera, threshold, estimator=estimator)
 
 
 def score_table(scores: Sequence[Score]) -> list[str]:

@@ -30,12 +30,7 @@ from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.timing import seconds_between
-from rs_relpose_ros.messages.incoming import (
-    image_from_message,
-    Intake,
-    Role,
-    sensor_messages,
-)
+from rs_relpose_ros.messages import incoming
 from rs_relpose_ros.offline.replay import MessageRefused, outcomes, read_truth, Replay
 from rs_relpose_ros.pipeline.pair import Frame, PairResult
 from rs_relpose_ros.pipeline.pipeline import FrontEnd
@@ -216,7 +211,7 @@ def chosen_pairs(path: Path, parameters: Parameters,
         {'min_keyframe_parallax': 1000.0, 'max_keyframe_interval': 60.0,
          'min_tracked_fraction': 0.0, 'max_keyframe_frames': 1000}))
     front_end = FrontEnd(parameters, offline=True)
-    intake = Intake(front_end.sequencer, parameters)
+    intake = incoming.Intake(front_end.sequencer, parameters)
 
     def prepare_for(stamp: int | None) -> None:
         front_end.parameters = (at_once if stamp in keyframes else
@@ -226,7 +221,7 @@ def chosen_pairs(path: Path, parameters: Parameters,
     prepare_for(following.get(done))
     with open_bag(path) as bag:
         topics = bag.find_topics(needs_camera_info=not parameters.intrinsics.given)
-        for outcome in outcomes(front_end, intake, sensor_messages(bag, topics)):
+        for outcome in outcomes(front_end, intake, incoming.sensor_messages(bag, topics)):
             if isinstance(outcome, MessageRefused):
                 raise outcome.error
             done = outcome.stamp_ns or done
@@ -242,8 +237,8 @@ def image_stamps(path: Path) -> list[int]:
     """Stamps of all images of a bag [ns]."""
     with open_bag(path) as bag:
         topics = bag.find_topics(needs_camera_info=False)
-        return [image_from_message(message.message).stamp_ns
-                for _, message in sensor_messages(bag, topics, (Role.IMAGE,))]
+        return [incoming.image_from_message(message.message).stamp_ns
+                for _, message in incoming.sensor_messages(bag, topics, (incoming.Role.IMAGE,))]
 
 
 def write_report(folder: Path, pairs: Sequence[PairConsistency]) -> str:

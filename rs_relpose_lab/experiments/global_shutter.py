@@ -187,7 +187,6 @@ def map_cases(walks: int, first_seed: int) -> list[Case]:
 
 # -- OpenCV's 5-point on raw and derotated images ---------------------------------------------
 
-
 @dataclass(frozen=True, slots=True)
 class FivePoint:
     """Median errors [deg] of OpenCV's 5-point, at its best threshold and estimator.

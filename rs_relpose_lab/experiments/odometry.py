@@ -16,19 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_lab.experiments import trust_runs
 from rs_relpose_lab.experiments.harness import markdown_table, write_table
 from rs_relpose_lab.experiments.trust_rows import Configured
-from rs_relpose_lab.experiments.trust_runs import (
-    Arrival,
-    numbered_image,
-    Recording,
-    run,
-    Sightings,
-    simulated,
-    Source,
-    TrackNoise,
-    TRACKS,
-)
+from rs_relpose_lab.experiments.trust_runs import Recording, Source
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.bag import intrinsics_of
 from rs_relpose_lab.simulation.scene import SCENES
@@ -39,14 +30,9 @@ from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuSample
+from rs_relpose_ros.odometry import offline
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
-from rs_relpose_ros.odometry.offline import (
-    aligned,
-    draw_paths,
-    follow,
-    path_of,
-    TrajectoryErrors,
-)
+from rs_relpose_ros.odometry.offline import TrajectoryErrors
 from rs_relpose_ros.odometry.pair import KeyframePair, warm_up_odometry
 from rs_relpose_ros.odometry.states import Odometry
 from rs_relpose_ros.offline.truth import TrueTrajectory
@@ -103,18 +89,19 @@ def read_euroc(folder: Path) -> tuple[Recording, TrueTrajectory]:
         'quat_cam_imu_xyzw': tuple(Rotation.from_matrix(C).as_quat().tolist()),
         'imu_position': tuple((-C @ _BODY_FROM_CAMERA[:, 3]).tolist())}, intrinsics_of(_CAMERA))
     zeros = np.zeros((_CORNERS, 2))
-    sightings = Sightings(
+    sightings = trust_runs.Sightings(
         tuple(frame.ids for frame in frames), tuple(frame.pixels for frame in frames),
         tuple(np.zeros_like(frame.pixels) for frame in frames), np.zeros(len(frames)), zeros,
-        zeros, TrackNoise(white=0.0))
+        zeros, trust_runs.TrackNoise(white=0.0))
     delay_ns, shape = to_nanoseconds(IMAGE_DELAY), (_CAMERA.height, _CAMERA.width)
     recording = Recording(
-        Source(NAME, TRACKS), configured, _CAMERA,
-        [Arrival(k, frame.stamp_ns, frame.stamp_ns + delay_ns) for k, frame in enumerate(frames)],
+        Source(NAME, trust_runs.TRACKS), configured, _CAMERA,
+        [trust_runs.Arrival(k, frame.stamp_ns, frame.stamp_ns + delay_ns)
+         for k, frame in enumerate(frames)],
         [ImuSample(int(ns), tuple(row[:3].tolist()), tuple(row[3:].tolist()))
          for ns, row in zip(imu_ns, imu, strict=True)],
-        lambda number: numbered_image(number, shape), sightings, truth.relative_pose, imu_ns,
-        imu[:, :3] @ C.T)
+        lambda number: trust_runs.numbered_image(number, shape), sightings,
+        truth.relative_pose, imu_ns, imu[:, :3] @ C.T)
     return recording, truth
 
 
@@ -180,8 +167,9 @@ def on_walk(config: SimulationConfig) -> PathMetrics:
     """Odometry of a simulated recording."""
     simulation = simulate(config)
     source = Source(f'{config.scene} {config.seed}' + (', in motion' if config.plan else ''),
-                    TRACKS, 'walk', config.scene, config.seed)
-    recording = simulated(source, simulation, TrackNoise(), np.random.default_rng(config.seed))
+                    trust_runs.TRACKS, 'walk', config.scene, config.seed)
+    recording = trust_runs.simulated(source, simulation, trust_runs.TrackNoise(),
+                                     np.random.default_rng(config.seed))
     states = simulation.states(simulation.imu.stamps_ns)
     truth = TrueTrajectory(simulation.imu.stamps_ns, states.position,
                            Rotation.from_matrix(states.R_world_cam).as_quat())
@@ -201,21 +189,21 @@ def on_recording(recording: Recording, truth: TrueTrajectory, *, exact: bool = T
     arrives = {arrival.stamp_ns: arrival.arrives_ns for arrival in recording.arrivals}
     # A list, so that the time of the front end does not count.
     pairs = [(arrives[pair.stamp_ns], KeyframePair.of_result(pair))
-             for pair, _ in run(recording, recording.configured)]
+             for pair, _ in trust_runs.run(recording, recording.configured)]
     delay_ns = to_nanoseconds(IMU_DELAY)
     samples = [(sample.stamp_ns + delay_ns, sample) for sample in recording.samples]
     warm_up_odometry()
     estimator = OdometryEstimator(parameters, keep=True)
     started = time.thread_time()
-    live = follow(estimator, pairs, samples)
+    live = offline.follow(estimator, pairs, samples)
     processor = time.thread_time() - started
     smoothed = estimator.smoothed()
-    paths = {'live': path_of(live, truth), 'smoothed': path_of(smoothed, truth)}
+    paths = {'live': offline.path_of(live, truth), 'smoothed': offline.path_of(smoothed, truth)}
     errors = [path.errors for path in paths.values() if path.errors is not None]
     if len(errors) < 2:
         raise InputError(f'{recording.source.name}: odometry did not start')
     if picture is not None:
-        draw_paths(paths, picture)
+        offline.draw_paths(paths, picture)
     first = estimator.starts[0]
     return PathMetrics(
         recording.source.name, 1e3 * recording.camera.readout_time, recording.seconds,
@@ -257,7 +245,7 @@ def drift(live: Sequence[Odometry], truth: TrueTrajectory) -> float:
     places = np.array([pose.position for pose in covered])
     true = np.array([truth.position(pose.imu_ns) for pose in covered])
     early = [seconds_between(covered[0].imu_ns, pose.imu_ns) < _ALIGNED for pose in covered]
-    R, t, _ = aligned(places[early], true[early])
+    R, t, _ = offline.aligned(places[early], true[early])
     length = np.linalg.norm(np.diff(true, axis=0), axis=1).sum()
     return float(100.0 * np.linalg.norm(R @ places[-1] + t - true[-1]) / length)
 

@@ -16,16 +16,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from rs_relpose_lab.experiments import trust_runs
 from rs_relpose_lab.experiments.harness import grouped, markdown_table, write_table
-from rs_relpose_lab.experiments.trust_runs import (
-    Recording,
-    run,
-    Sightings,
-    simulated,
-    Source,
-    TrackNoise,
-    TRACKS,
-)
+from rs_relpose_lab.experiments.trust_runs import Recording
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.scene import SCENES
 from rs_relpose_lab.simulation.simulation import Simulation
@@ -98,8 +91,8 @@ def disturbed(recording: Recording, simulation: Simulation, what: Disturbance,
         int(np.argmax(within)), what, 0.5 * simulation.config.width, rng))
 
 
-def _other_sightings(known: Sightings, seconds: Array, first: int, what: Disturbance,
-                     half: float, rng: np.random.Generator) -> Sightings:
+def _other_sightings(known: trust_runs.Sightings, seconds: Array, first: int, what: Disturbance,
+                     half: float, rng: np.random.Generator) -> trust_runs.Sightings:
     """Sightings with those of a disturbance from frame `first` on, at `seconds` (K,).
 
     Its corners, and those after it, are other ones than before.
@@ -129,7 +122,6 @@ def _other_sightings(known: Sightings, seconds: Array, first: int, what: Disturb
 
 # -- states as the node publishes them --------------------------------------------------------
 
-
 @dataclass(frozen=True, slots=True, eq=False)
 class TrueStates:
     """The camera at the stamps (K,) of the samples: position, R to the world, velocity in it."""
@@ -154,12 +146,13 @@ def feed_of(config: SimulationConfig, what: Disturbance) -> Feed:
     """Pairs of the front end on the tracks of a disturbed walk."""
     simulation = simulate(config)
     rng = np.random.default_rng(config.seed)
-    recording = simulated(Source(f'{config.scene} {config.seed}', TRACKS), simulation,
-                          TrackNoise(), rng)
+    recording = trust_runs.simulated(
+        trust_runs.Source(f'{config.scene} {config.seed}', trust_runs.TRACKS), simulation,
+        trust_runs.TrackNoise(), rng)
     recording = disturbed(recording, simulation, what, rng)
     arrives = {arrival.stamp_ns: arrival.arrives_ns for arrival in recording.arrivals}
     pairs = [(arrives[pair.stamp_ns], KeyframePair.of_result(pair))
-             for pair, _ in run(recording, recording.configured)]
+             for pair, _ in trust_runs.run(recording, recording.configured)]
     delay_ns = to_nanoseconds(IMU_DELAY)
     states = simulation.states(simulation.imu.stamps_ns)
     return Feed(recording.configured.values, pairs,
@@ -222,7 +215,6 @@ def _interpolated(truth: TrueStates, at_ns: int) -> tuple[Array, Array]:
 
 
 # -- results ----------------------------------------------------------------------------------
-
 
 @dataclass(frozen=True, slots=True)
 class DisturbedRun:

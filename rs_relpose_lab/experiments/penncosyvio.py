@@ -33,7 +33,6 @@ from rs_relpose_ros.imu.filters import mean_gravity
 
 # -- motion of a pair by an IMU: the paper's means, and the continuous gyro -------------------
 
-
 @dataclass(frozen=True, slots=True, eq=False)
 class MeanMotion:
     """Motion of a frame by the paper's means, at its reference row; sigmas [rad], [rad/s]."""

@@ -95,7 +95,6 @@ class Row:
 
 # -- errors of the configuration --------------------------------------------------------------
 
-
 def _error(quantity: str, value: float) -> Error:
     return lambda right, rng: Injected(quantity, np.array([value]))
 
@@ -148,7 +147,6 @@ def _distortion_error(right: Configured, rng: np.random.Generator) -> Injected:
 
 
 # -- errors of the messages -------------------------------------------------------------------
-
 
 def _received(sample: Callable[[ImuSample], ImuSample]) -> Change:
     return lambda right, rng: replace(right, sample=sample)

@@ -8,14 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from rs_relpose_ros.bags.reader import Bag, SensorTopics
+from rs_relpose_ros.cli import options
 from rs_relpose_ros.cli.main import Command, FAILED, make_parser
-from rs_relpose_ros.cli.options import (
-    add_run_arguments,
-    out_folder,
-    run_on_bag,
-    topic_options,
-    warn_unused,
-)
 from rs_relpose_ros.config.files import file_values
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError
@@ -30,9 +24,8 @@ _MOST_REASONS = 5
 
 # -- replay ----------------------------------------------------------------------------------
 
-
 def _add_replay_arguments(parser: argparse.ArgumentParser) -> None:
-    add_run_arguments(parser, 'relpose')
+    options.add_run_arguments(parser, 'relpose')
     parser.add_argument('--stamps', metavar='FILE', type=Path,
                         help='use only the frames whose stamps [ns] are in FILE, one per line, as '
                         'the parameter stamps_file of a live node wrote them: the poses are then '
@@ -48,7 +41,7 @@ def _add_replay_arguments(parser: argparse.ArgumentParser) -> None:
 def replay_bag(args: argparse.Namespace) -> tuple[Path, ReplayOutcome]:
     """Replay and write the files of the command, into the folder that is returned."""
     stamps = None if args.stamps is None else read_stamps(args.stamps)
-    return run_on_bag(
+    return options.run_on_bag(
         args, 'relpose', lambda folder, bag, topics, parameters: replay_into(
             folder, bag, topics, parameters, stamps=stamps, pictures=not args.no_pictures,
             with_bag=args.with_bag), _calibration(args) if args.calibrate else {})
@@ -57,9 +50,9 @@ def replay_bag(args: argparse.Namespace) -> tuple[Path, ReplayOutcome]:
 def _calibration(args: argparse.Namespace) -> dict[str, Any]:
     """Calibrate from the bag of `args`; the parameters. InputError if one is not determined."""
     from rs_relpose_ros.cli.recordings import calibrate_bag, CALIBRATION_FILE
-    folder = out_folder(args, 'relpose') / 'calibration'
+    folder = options.out_folder(args, 'relpose') / 'calibration'
     words = ['calibrate', str(args.bag), '--out', str(folder)]
-    for role, topic in topic_options(args).items():
+    for role, topic in options.topic_options(args).items():
         if topic and role in ('image', 'camera_info', 'imu'):
             words += [f'--{role.replace("_", "-")}-topic', topic]
     result, _ = calibrate_bag(make_parser('calibrate').parse_args(words))
@@ -78,7 +71,7 @@ def has_good_poses(outcome: ReplayOutcome) -> bool:
 def _replay(args: argparse.Namespace) -> int:
     folder, outcome = replay_bag(args)
     metrics = outcome.metrics
-    warn_unused(metrics['not_used'])
+    options.warn_unused(metrics['not_used'])
     _print_replay(outcome)
     print(f'in {folder}: {", ".join([*(path.name for path in outcome.files), SUMMARY_FILE])}')
     return 0 if has_good_poses(outcome) else FAILED
@@ -162,9 +155,8 @@ REPLAY = Command(
 
 # -- pairs -----------------------------------------------------------------------------------
 
-
 def _add_pairs_arguments(parser: argparse.ArgumentParser) -> None:
-    add_run_arguments(parser, 'pairs')
+    options.add_run_arguments(parser, 'pairs')
     parser.add_argument('--list', metavar='FILE', type=Path, required=True,
                         help='the pairs (CSV): stamps of their images [ns]')
 
@@ -179,7 +171,7 @@ def _pairs(args: argparse.Namespace) -> int:
                              'directory with --out')
         return pairs_into(folder, bag, topics, parameters, pairs)
 
-    folder, outcome = run_on_bag(args, 'pairs', work)
+    folder, outcome = options.run_on_bag(args, 'pairs', work)
     counts = outcome.metrics['pairs']
     print(f'{counts["total"]} pairs, {counts["answered"]} with a pose')
     reasons = Counter(record.pose.reason for record in outcome.records if not record.pose)
@@ -205,9 +197,8 @@ PAIRS = Command(
 
 # -- odometry --------------------------------------------------------------------------------
 
-
 def _add_odometry_arguments(parser: argparse.ArgumentParser) -> None:
-    add_run_arguments(parser, 'odometry')
+    options.add_run_arguments(parser, 'odometry')
     parser.add_argument('--rate', metavar='HZ', type=rate_in_hertz, default=0.0,
                         help='also write trajectory_rows.tum: smoothed poses at this rate')
 
@@ -222,14 +213,9 @@ def rate_in_hertz(text: str) -> float:
 
 def _odometry(args: argparse.Namespace) -> int:
     need_gtsam()
-    from rs_relpose_ros.odometry.offline import (
-        LIVE_FILE,
-        odometry_into,
-        PICTURE,
-        SMOOTHED_FILE,
-    )
-    from rs_relpose_ros.odometry.rows import ROWS_FILE
-    folder, outcome = run_on_bag(args, 'odometry', partial(odometry_into, rate=args.rate))
+    from rs_relpose_ros.odometry import offline, rows
+    folder, outcome = options.run_on_bag(args, 'odometry',
+                                         partial(offline.odometry_into, rate=args.rate))
     for text in outcome.warnings:
         print(text)
     metrics = outcome.metrics
@@ -247,7 +233,8 @@ def _odometry(args: argparse.Namespace) -> int:
     if not outcome.live:
         print(start_failure(outcome.blocking_reason))
         return FAILED
-    print(f'in {folder}: {LIVE_FILE}, {SMOOTHED_FILE}, {ROWS_FILE}, {PICTURE}, {SUMMARY_FILE}')
+    print(f'in {folder}: {offline.LIVE_FILE}, {offline.SMOOTHED_FILE}, {rows.ROWS_FILE}, '
+          f'{offline.PICTURE}, {SUMMARY_FILE}')
     return 0
 
 

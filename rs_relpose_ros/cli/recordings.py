@@ -36,7 +36,6 @@ _logger = logging.getLogger(__name__)
 
 # -- calibrate -------------------------------------------------------------------------------
 
-
 def _add_calibrate_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_bag_argument(parser)
     options.add_out_argument(parser, 'calibration')
@@ -138,7 +137,6 @@ CALIBRATE = Command(
 
 # -- check -----------------------------------------------------------------------------------
 
-
 def _add_check_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_bag_argument(parser)
     options.add_parameter_arguments(parser)
@@ -179,7 +177,6 @@ CHECK = Command(
 
 
 # -- convert ---------------------------------------------------------------------------------
-
 
 class Source(NamedTuple):
     """A format of recordings."""
@@ -265,7 +262,6 @@ CONVERT = Command(
 
 
 # -- unroll ----------------------------------------------------------------------------------
-
 
 def _add_unroll_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_bag_argument(parser)

@@ -171,7 +171,6 @@ TOPICS_KEY = 'topics'
 
 # -- the messages of a pair ------------------------------------------------------------------
 
-
 def pair_messages(result: PairResult, types: MessageTypes,
                   reference_frame: str = '') -> dict[str, Any]:
     """Messages of a pair by topic, in the order of `PAIR_TOPICS`.
@@ -262,7 +261,6 @@ def inlier_records(result: PairResult) -> NDArray[np.void]:
 
 
 # -- messages of any kind --------------------------------------------------------------------
-
 
 def header(stamp_ns: int, frame_id: str, types: MessageTypes) -> Any:
     """std_msgs/Header."""

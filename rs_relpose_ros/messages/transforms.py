@@ -102,7 +102,6 @@ def _text(values: tuple[float, ...]) -> str:
 
 # -- Bags -----------------------------------------------------------------------------------------
 
-
 class BagFrames(NamedTuple):
     """Frames of a bag: names of camera and IMU, '' if unknown, and the transforms."""
 

@@ -513,7 +513,6 @@ def _texture(sample: SampleRun, health: Assessment) -> Finding:
 
 # -- Configured parameters --------------------------------------------------------------------
 
-
 def _with_calibration(sample: SampleRun, scan: Scan, completion: Completion) -> Assessment:
     """Findings of the sample; if it is lost, the parameters that a calibration contradicts."""
     found, health = completion.found, sample.health
@@ -586,7 +585,6 @@ def _not_configured(name: str, completion: Completion, scan: Scan) -> Finding:
 
 
 # -- Rolling shutter --------------------------------------------------------------------------
-
 
 def _effect(scan: Scan, health: Assessment, parameters: Parameters) -> Finding | None:
     """Displacement of the last row relative to the first by rotation alone [px]."""

@@ -15,12 +15,8 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics
 from rs_relpose_ros.calibrate.procedure import calibrate, read_recording
 from rs_relpose_ros.calibrate.result import CalibrationResult
-from rs_relpose_ros.config.settings import (
-    Parameters,
-    SensorConfig,
-    TRACKED_IN_IMAGES,
-    TrackingConfig,
-)
+from rs_relpose_ros.config import settings
+from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.geometry.timing import NANOSECONDS, Sensor, to_nanoseconds
 from rs_relpose_ros.messages.incoming import Intake, ReasonCounts, Role, stamp_ns
@@ -66,15 +62,15 @@ def _calibrated(bag: Bag, topics: SensorTopics, parameters: Parameters) -> Calib
     tracking, images = parameters.tracking, topics.image.count
     first = max(images - _CALIBRATED_IMAGES, 0) // 2
     recording = read_recording(
-        bag, topics, TrackingConfig(detector=tracking.detector,
-                                    feature_rows=tracking.feature_rows),
+        bag, topics, settings.TrackingConfig(detector=tracking.detector,
+                                             feature_rows=tracking.feature_rows),
         images=range(first, first + min(images, _CALIBRATED_IMAGES)))
     if parameters.intrinsics.given:
         size = recording.camera.width, recording.camera.height
         recording = replace(recording, focal_known=True, camera=parameters.intrinsics.of_image(
             *size).global_shutter_camera())
     return calibrate(recording.tracks, recording.gyro, recording.camera,
-                     focal_known=recording.focal_known, config=TRACKED_IN_IMAGES)
+                     focal_known=recording.focal_known, config=settings.TRACKED_IN_IMAGES)
 
 
 def completed(bag: Bag, topics: SensorTopics, parameters: Parameters) -> Completion:
@@ -88,13 +84,13 @@ def completed(bag: Bag, topics: SensorTopics, parameters: Parameters) -> Complet
         return Completion(parameters, None, str(error))
     readout, problem = found.readout_time, ''
     values: dict[str, Any] = {}
-    for name, estimate, settings in (
+    for name, estimate, found_values in (
             ('quat_cam_imu_xyzw', found.rotation, {'quat_cam_imu_xyzw': found.quat_cam_imu_xyzw}),
             ('readout_time', readout, {
                 'readout_time': abs(readout.value),
                 'readout_direction': 'up' if readout.value < 0.0 else 'down'})):
         if name in missing and estimate.observable:
-            values.update(settings)
+            values.update(found_values)
         elif name in missing:
             problem = problem or estimate.remark
     return Completion(parameters.updated(values), found, problem)
@@ -108,7 +104,7 @@ def recalibrated(bag: Bag, topics: SensorTopics, completion: Completion) -> Comp
         return completion
 
 
-def contradicted(found: CalibrationResult, sensor: SensorConfig,
+def contradicted(found: CalibrationResult, sensor: settings.SensorConfig,
                  model: Sensor) -> tuple[Finding, ...]:
     """Parameters that are far from the calibration `found`; `model` as configured.
 

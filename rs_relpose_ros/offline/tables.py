@@ -59,7 +59,6 @@ class PairRecord:
 
 # -- tables ----------------------------------------------------------------------------------
 
-
 class Table(NamedTuple):
     """A CSV file, its columns, and the row of a record; no row for None."""
 
@@ -152,7 +151,6 @@ def rotation_sigmas(covariance: Array) -> tuple[float, float, float]:
 
 
 # -- summary.json ----------------------------------------------------------------------------
-
 
 def write_summary(path: Path, metrics: dict[str, Any], *, bag: Path, topics: SensorTopics,
                   parameters: Parameters, command: Sequence[str], package_version: str) -> None:

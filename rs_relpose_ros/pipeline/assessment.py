@@ -298,7 +298,6 @@ def _fault(quantity: str, message: str, fix: str, state: FindingState = FindingS
 
 # -- Values of a quantity from its deviation -------------------------------------------------
 
-
 def _values(quantity: Quantity, left: Array, sigmas: Array,
             configured: Configured) -> tuple[Finding, object]:
     """A consistent finding with the values of a quantity, and the value to set.
@@ -335,7 +334,6 @@ def _values(quantity: Quantity, left: Array, sigmas: Array,
 
 
 # -- Gross errors ----------------------------------------------------------------------------
-
 
 def gross_errors(rotations: RotationComparison | None, ahead: float, configured: Configured,
                  before: tuple[Finding, ...] = ()) -> tuple[Finding, ...]:

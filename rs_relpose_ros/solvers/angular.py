@@ -275,32 +275,6 @@ def _decompose(E: Array, sample: Sample, R: Array, x: Array) -> bool:
 
 
 @kernel
-def _solve5(J: Array, r: Array) -> bool:
-    """Solve ``J x = r`` in place of `r` (5,) by Gauss elimination with row pivoting."""
-    for k in range(5):
-        pivot = k
-        for i in range(k + 1, 5):
-            if abs(J[i, k]) > abs(J[pivot, k]):
-                pivot = i
-        if not abs(J[pivot, k]) > 1e-14:
-            return False
-        if pivot != k:
-            for j in range(k, 5):
-                J[k, j], J[pivot, j] = J[pivot, j], J[k, j]
-            r[k], r[pivot] = r[pivot], r[k]
-        for i in range(k + 1, 5):
-            factor = J[i, k] / J[k, k]
-            for j in range(k + 1, 5):
-                J[i, j] -= factor * J[k, j]
-            r[i] -= factor * r[k]
-    for k in range(4, -1, -1):
-        for j in range(k + 1, 5):
-            r[k] -= J[k, j] * r[j]
-        r[k] /= J[k, k]
-    return True
-
-
-@kernel
 def _linearise(sample: Sample, R: Array, t: Array, u: Array, v: Array, J: Array,
                right: Array) -> float:
     """Write ``-e``, ``e = (f_1 x R f_2) . t``, and ``J = de / d(theta, t_u, t_v)``; max |e|."""
@@ -323,19 +297,21 @@ def _polish(sample: Sample, R: Array, t: Array) -> bool:
     # Of e, with unit rays and unit t: rounding, and the largest value of a solution.
     converged, accepted = 1e-15, 1e-10
     steps = 4
-    J, step = np.empty((5, 5)), np.empty(5)
+    J, step, pivots = np.empty((5, 5)), np.empty(5), np.empty(5, dtype=np.int64)
     for attempt in range(steps + 1):
         basis = so3.tangent_basis(t)
         u, v = basis[:, 0], basis[:, 1]
         worst = _linearise(sample, R, t, u, v, J, step)
-        if worst < converged or attempt == steps or not _solve5(J, step):
+        if worst < converged or attempt == steps:
             return worst < accepted
+        algebra.lu_factor(J, pivots)
+        algebra.lu_solve(J, pivots, step)
         length2 = 0.0
         for k in range(5):
             length2 += step[k] * step[k]
-        # Only rounding is corrected: a longer step leads to another solution.
+        # Only rounding is corrected: a longer step is that of a singular J, or leads elsewhere.
         if not length2 < 0.01:
-            return False
+            return worst < accepted
         so3.copy_matrix(so3.exp_so3(step[:3]) @ R, R)
         length = so3.norm((1.0, step[3], step[4]))
         for i in range(3):

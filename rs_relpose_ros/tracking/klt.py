@@ -112,7 +112,6 @@ def _near(image1: Image, image2: Image, points1: Array, guess: Array, side: int,
 # -- Alignment removes the drift of a track: the error of one alignment is left. The current image
 # -- is resampled to the geometry of the reference, by a homography fitted to the tracks.
 
-
 def aligned(matches: Matches, reference: Image, current: Image,
             config: TrackingConfig) -> tuple[Matches, NDArray[np.bool_]]:
     """`matches` (N) with their second points aligned, and a mask (N,) of those that correlate."""
