@@ -56,7 +56,6 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
     of a module are set up once.
     """
     from xdist.scheduler import LoadScopeScheduling
-
     live = {path.name for path in Path(__file__).parent.glob('test_*.py')
             if 'pytest.mark.live' in path.read_text(encoding='utf-8')}
 

@@ -108,7 +108,6 @@ def test_node_starts_and_stops(install_space, ros_domain_id):
 
     from rs_relpose_lab.live.graph import Graph
     from rs_relpose_lab.live.processes import Process, wait_until
-
     command = in_install_space(install_space, executable(install_space, 'relpose_node'),
                                '--ros-args', '-r', '__node:=installed', '-p', 'readout_time:=0.03')
     with Graph() as graph, Process(

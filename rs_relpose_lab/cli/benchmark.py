@@ -154,7 +154,6 @@ def _accuracy_arguments(parser: argparse.ArgumentParser) -> None:
 def _run_accuracy(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments import accuracy
     from rs_relpose_lab.experiments.problems import CELLS
-
     _check_at_least(1, args, 'trials')
     if min(args.sigma_factor) <= 0.0:
         raise InputError(f'--sigma-factor must be positive, got {min(args.sigma_factor)}')
@@ -183,7 +182,6 @@ def _speed_arguments(parser: argparse.ArgumentParser) -> None:
 def _run_speed(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments import speed
     from rs_relpose_lab.experiments.problems import Cell, CELLS
-
     _check_at_least(1, args, 'trials', 'repeats')
     _check_at_least(0, args, 'processes', 'soak')
     _check_at_least(50, args, 'matches')
@@ -224,7 +222,6 @@ def _live_arguments(parser: argparse.ArgumentParser) -> None:
 def _run_live(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments import live
     from rs_relpose_lab.experiments.live_clip import FPS, PERIOD, prepare_clip
-
     # Shorter than one period of the motion, hardly anything is measured.
     _check_at_least(5, args, 'duration')
     _check_at_least(0, args, 'soak')
@@ -290,7 +287,6 @@ def _consistency_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run_consistency(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments import consistency
-
     _check_at_least(0, args, 'bags')
     if not args.bags and not args.recording:
         raise InputError('--bags 0 needs a --recording: there is nothing to measure')
@@ -308,7 +304,6 @@ def _run_consistency(args: argparse.Namespace) -> int:
 
 def _run_calibration(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments import calibration
-
     _check_at_least(1, args, 'runs')
     return _report_of(range(args.seed, args.seed + args.runs), calibration.run_calibration,
                       calibration.write_tracks_report, args, 'recording')
@@ -316,7 +311,6 @@ def _run_calibration(args: argparse.Namespace) -> int:
 
 def _run_calibration_bags(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments import calibration
-
     _check_at_least(1, args, 'bags')
     return _report_of(
         calibration.bag_runs(args.bags, args.seed),
@@ -333,7 +327,6 @@ def _lenses_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run_lenses(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments import lenses
-
     _check_at_least(1, args, 'bags')
     return _report_of(
         range(args.seed, args.seed + args.bags),
@@ -352,7 +345,6 @@ def _stretches_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run_calibration_stretches(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments import calibration
-
     if args.seconds <= 0.0:
         raise InputError(f'--seconds must be positive, got {args.seconds:g}')
     parts = [part for bag in args.bags for part in calibration.calibrated_parts(
@@ -379,7 +371,6 @@ def _trust_arguments(parser: argparse.ArgumentParser) -> None:
 def _run_trust(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments import trust
     from rs_relpose_lab.experiments.trust_rows import ROWS
-
     _check_at_least(0, args, 'bags', 'right', 'rendered')
     # A shorter bag has not enough information for gross errors.
     _check_at_least(6, args, 'seconds')
@@ -398,7 +389,6 @@ def _global_shutter_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run_global_shutter(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments import global_shutter
-
     _check_at_least(0, args, 'bags', 'walks')
     args.output.mkdir(parents=True, exist_ok=True)
     speeds = [global_shutter.frame_times(*size) for size in global_shutter.SIZES]
@@ -431,7 +421,6 @@ def _run_odometry(args: argparse.Namespace) -> int:
     from rs_relpose_ros.odometry import need_gtsam
     need_gtsam()
     from rs_relpose_lab.experiments import odometry, odometry_disturbances
-
     if args.disturbances:
         return _report_of(odometry_disturbances.tasks(args.disturbances, args.seed),
                           odometry_disturbances.measure, odometry_disturbances.write_report,

@@ -152,7 +152,6 @@ def run_cell(cell: LiveCell, clip: live_clip.Clip, duration: float, folder: Path
     """
     # Here, so that the names of cells are known without ROS.
     from rs_relpose_lab.live.live_run import measure, Play
-
     folder.mkdir(parents=True, exist_ok=True)
     compressed = cell.image_format == 'jpeg'
     topics = (COMPRESSED_TOPIC, CAMERA_INFO_TOPIC, live_clip.imu_topic(cell.imu_rate))

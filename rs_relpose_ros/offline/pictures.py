@@ -45,7 +45,9 @@ def draw_replay(paths: Sequence[Path], records: Sequence[PairRecord], shown: Pai
 def draw_matches(result: PairResult, path: Path) -> None:
     """Both images of a pair with its matches, coloured by row time; needs the pair's images."""
     assert result.image1 is not None and result.image2 is not None
-    inliers = _inliers(result)
+    inliers, points1, points2 = result.pose.inliers, result.matches.points1, result.matches.points2
+    if len(inliers) != len(points1):   # a pair that failed early
+        inliers = np.zeros(len(points1), dtype=bool)
     height, width = result.image1.shape
     tau1, tau2 = 1e3 * result.row_times1, 1e3 * result.row_times2
     row_times = np.concatenate([tau1, tau2, [0.0]])
@@ -55,7 +57,6 @@ def draw_matches(result: PairResult, path: Path) -> None:
     _image(left, result.image1, 'reference keyframe: inliers, coloured by their row time')
     _image(right, result.image2,
            'current image: the same, with their displacement since the keyframe')
-    points1, points2 = result.matches.points1, result.matches.points2
     paths = LineCollection(list(np.stack([points1[inliers], points2[inliers]], axis=1)),
                            cmap=_COLORMAP, norm=norm, linewidths=1.3)
     paths.set_array(tau2[inliers])
@@ -171,14 +172,6 @@ def draw_rotation(records: Sequence[PairRecord], path: Path,
     _shade_no_pose(below, [r for r in records if np.isnan(r.pose.R).any()], start_ns,
                    'no rotation: gyro instead')
     _save_over_time(picture, path)
-
-
-def _inliers(result: PairResult) -> NDArray[np.bool_]:
-    """Mask over the matches; empty for a pair that failed early."""
-    inliers = result.pose.inliers
-    if len(inliers) == len(result.matches.points1):
-        return inliers
-    return np.zeros(len(result.matches.points1), dtype=bool)
 
 
 def _pair_title(result: PairResult, inliers: int) -> str:

@@ -91,10 +91,8 @@ class _Unrolling:
         for outcome in outcomes(self._loop, self._intake, self._messages(self._announce())):
             if isinstance(outcome, MessageRefused) and not self._report.images:
                 outcome.raise_without_intrinsics()
-            result = None
-            if isinstance(outcome, Frame):
-                result = outcome.result
-            else:
+            result = outcome.result if isinstance(outcome, Frame) else None
+            if not isinstance(outcome, Frame):
                 self._reasons.add(unused_reason(outcome))
             if outcome.stamp_ns is not None:
                 self._settle(outcome.stamp_ns, result)
@@ -190,9 +188,8 @@ class _Unrolling:
             result.stamp_ns, result.frame_id, result.intrinsics,
             self._intake.camera_info_of(result.intrinsics), self._writer.type)
         topic = self._topics.camera_info
-        if topic is not None:
-            return _New(topic.name, reader.CAMERA_INFO, message)
-        return _New(self._topics.image.camera_info, reader.CAMERA_INFO, message)
+        name = self._topics.image.camera_info if topic is None else topic.name
+        return _New(name, reader.CAMERA_INFO, message)
 
     def _flush(self) -> None:
         while self._places and self._places[0].messages is not None:
