@@ -217,7 +217,6 @@ def test_the_odometry_is_run_if_it_is_not_given(bundled_bag, parameters, traject
 
 # -- faults ------------------------------------------------------------------------------------
 
-
 @pytest.mark.parametrize(('options', 'words'), [
     (('--format', 'tum', '--images', 'raw'), '--format tum has no images'),
     (('--format', 'colmap', '--link'), '--link is for raw images'),

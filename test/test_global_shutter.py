@@ -438,7 +438,6 @@ def test_bad_input_is_one_line(bag, tmp_path, refused, options, expected):
 
 # -- the own watch of the rotation ---------------------------------------------------------------
 
-
 def watched(bag: Path, parameters: Parameters, change: Callable[[Any], None], *,
             is_watched: bool = True) -> list[Assessment]:
     """States of the calibration with each frame."""

@@ -19,7 +19,7 @@ BUDGETS = {
     'rs_relpose_ros': (300, 5),
     'rs_relpose_ros/bags': (1870, 6),
     'rs_relpose_ros/calibrate': (2920, 9),
-    'rs_relpose_ros/cli': (1230, 7),
+    'rs_relpose_ros/cli': (1220, 7),
     'rs_relpose_ros/config': (880, 4),
     'rs_relpose_ros/estimator': (3750, 12),
     'rs_relpose_ros/geometry': (1260, 7),
@@ -27,12 +27,12 @@ BUDGETS = {
     'rs_relpose_ros/messages': (1470, 5),
     'rs_relpose_ros/nodes': (2270, 9),
     'rs_relpose_ros/odometry': (2800, 10),
-    'rs_relpose_ros/offline': (2930, 12),
+    'rs_relpose_ros/offline': (2910, 12),
     'rs_relpose_ros/pipeline': (3520, 13),
-    'rs_relpose_ros/solvers': (1740, 6),
+    'rs_relpose_ros/solvers': (1720, 6),
     'rs_relpose_ros/tracking': (1230, 5),
-    'rs_relpose_lab': (9810, 44),
-    'test': (20360, 60),
+    'rs_relpose_lab': (9770, 44),
+    'test': (20260, 60),
 }
 MOST_MODULES, MOST_FOLDERS = 114, 15
 LONGEST_MODULE, SHORTEST_MODULE, LONGEST_FUNCTION = 700, 80, 60
