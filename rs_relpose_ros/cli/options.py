@@ -16,7 +16,7 @@ from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.messages.transforms import with_extrinsics
 from rs_relpose_ros.offline.replay import need_sensor_parameters
 from rs_relpose_ros.offline.tables import write_summary
-from rs_relpose_ros.output_files import SUMMARY_FILE
+from rs_relpose_ros.output_files import refuse_unwritable, SUMMARY_FILE
 
 _TOPICS = {
     'image': 'Image or CompressedImage',
@@ -88,6 +88,7 @@ def run_on_bag(args: argparse.Namespace, suffix: str, work: Work[Made],
     parameters = read_parameters(args.params, args.set)
     parameters = Parameters().updated({**(calibration or {}), **parameters.given()})
     folder = out_folder(args, suffix)
+    refuse_unwritable(folder)
     with open_bag(args.bag) as bag:
         topics = bag.find_topics(topic_options(args),
                                  needs_camera_info=not parameters.intrinsics.given)

@@ -274,6 +274,7 @@ def _add_unroll_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _unroll(args: argparse.Namespace) -> int:
     refuse_existing(args.out_bag)
+    refuse_unwritable(args.out_bag.parent)
     parameters = read_parameters(args.params, args.set, node='global_shutter_node')
     with open_bag(args.bag) as bag:
         topics = bag.find_topics(options.topic_options(args),
