@@ -482,3 +482,17 @@ def test_a_lost_path_is_an_error_in_the_log():
     assert [call.args[0] for call in node._info.call_args_list] == ['imu_position is zero',
                                                                     'tracking']
     node._error.assert_called_once_with('lost: no pair')
+
+
+def test_the_position_of_the_imu_is_that_of_tf_before_the_path_begins():
+    def placed(starts: list[Any], camera: str = 'camera') -> Any:
+        node = MagicMock(_imu_lookup=lambda parent, child: (0.1, 0.2, 0.3, *QUAT))
+        node._settings.current = PARAMETERS.updated({'imu_position': (0.0, 0.0, 0.0),
+                                                     'quat_cam_imu_xyzw': tuple(QUAT)})
+        node._estimator.starts = starts
+        OdometryNode._place_imu(node, camera, 'imu')
+        return node._settings.adopt
+
+    placed([]).assert_called_once_with(
+        {'imu_position': (0.1, 0.2, 0.3), 'imu_position_sigma': 0.02})
+    assert not placed([object()]).called and not placed([], 'imu').called
