@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 import itertools
+from pathlib import Path
 import re
 import threading
 from typing import Any
@@ -26,6 +27,7 @@ from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.nodes import diagnostics
 from rs_relpose_ros.nodes.diagnostics import (
     ERROR,
+    LineFile,
     OK,
     ReasonLog,
     Silence,
@@ -521,3 +523,13 @@ def test_a_busy_worker_costs_the_node_no_imu(module_ros_domain_id, monkeypatch):
         driver.destroy_node()
         rclpy.try_shutdown()
         context.try_shutdown()
+
+
+@pytest.mark.skipif(not Path('/dev/full').exists(), reason='Linux has a device that is full')
+def test_a_file_ends_with_an_error_that_names_it():
+    errors = []
+    file = LineFile('stamps_file', '/dev/full', errors.append)
+    for _ in range(3):
+        file.write('1')
+    file.close()
+    assert errors == ['stamps_file /dev/full ends here: No space left on device']

@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 import threading
@@ -352,12 +353,38 @@ class Statistics(FrameStatistics):
 COLUMNS = ('stamp_ns', 'ready_ns', 'taken_ns', 'done_ns', 'cpu_ns', 'outcome')
 
 
-def opened(parameter: str, path: str) -> TextIO:
-    """File of the parameter of this name, written line by line; InputError if it cannot be."""
-    try:
-        return Path(path).open('w', buffering=1, encoding='ascii')
-    except OSError as error:
-        raise InputError(f'{parameter} {path} cannot be written: {error.strerror}') from error
+class LineFile:
+    """File of the parameter of this name, written line by line; InputError if it cannot be opened.
+
+    It ends with an error, as of a full disk, which `report` gets; the node continues.
+    """
+
+    def __init__(self, parameter: str, path: str,
+                 report: Callable[[str], object] = lambda text: None) -> None:
+        self._name, self._report = f'{parameter} {path}', report
+        try:
+            self._file: TextIO | None = Path(path).open(   # noqa: SIM115 closed by close
+                'w', buffering=1, encoding='ascii')
+        except OSError as error:
+            raise InputError(f'{self._name} cannot be written: {error.strerror}') from error
+
+    def write(self, line: str) -> None:
+        """Write a line without its end."""
+        file = self._file
+        if file is None:
+            return
+        try:
+            file.write(f'{line}\n')
+        except OSError as error:
+            self._file = None
+            with suppress(OSError):   # of what is left to be written
+                file.close()
+            self._report(f'{self._name} ends here: {error.strerror}')
+
+    def close(self) -> None:
+        """No more lines."""
+        if self._file is not None:
+            self._file.close()
 
 
 class FrameTimings:
@@ -368,9 +395,10 @@ class FrameTimings:
     of its keyframe pair, or ``none``.
     """
 
-    def __init__(self, path: str) -> None:
-        self._file = opened('timings_file', path)
-        self._file.write(','.join(COLUMNS) + '\n')
+    def __init__(self, path: str, report: Callable[[str], object] = lambda text: None) -> None:
+        self._file = LineFile('timings_file', path, report)
+        self.close = self._file.close
+        self._file.write(','.join(COLUMNS))
         self._spent_ns = 0
 
     def start(self) -> None:
@@ -382,12 +410,8 @@ class FrameTimings:
         done_ns, spent_ns = time.monotonic_ns(), time.thread_time_ns()
         outcome = 'none' if frame.result is None else frame.result.pose.status.value
         self._file.write(f'{frame.stamp_ns},{frame.ready_ns},{frame.taken_ns},{done_ns},'
-                         f'{spent_ns - self._spent_ns},{outcome}\n')
+                         f'{spent_ns - self._spent_ns},{outcome}')
         self._spent_ns = spent_ns
-
-    def close(self) -> None:
-        """No more frames."""
-        self._file.close()
 
 
 # -- Log lines once per reason, repetitions now and then with their number ------------------------

@@ -14,7 +14,7 @@ from rs_relpose_ros.messages.outgoing import DEBUG_IMAGE, PAIR_TOPICS
 from rs_relpose_ros.nodes.diagnostics import (
     FrameTimings,
     HealthLog,
-    opened,
+    LineFile,
     RELATIVE_POSE,
     Statistics,
 )
@@ -53,9 +53,9 @@ class RelposeNode(SensorNode):
     def _make_loop(self, parameters: Parameters) -> FrontEnd:
         files = parameters.pair
         if files.stamps_file and self._stamps is None:
-            self._stamps = opened('stamps_file', files.stamps_file)
+            self._stamps = LineFile('stamps_file', files.stamps_file, self._error)
         if files.timings_file and self._timings is None:
-            self._timings = FrameTimings(files.timings_file)
+            self._timings = FrameTimings(files.timings_file, self._error)
         # The images are for ~/debug_image; only references to them are kept.
         return FrontEnd(parameters, keep_images=True)
 

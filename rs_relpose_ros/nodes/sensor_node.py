@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 import traceback
-from typing import Any, ClassVar, NoReturn, TextIO, TYPE_CHECKING
+from typing import Any, ClassVar, NoReturn, TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticArray
 from numba.core.event import RecordingListener, register
@@ -39,7 +39,7 @@ from rs_relpose_ros.messages.incoming import Intake, PARTS, Role
 from rs_relpose_ros.messages.transforms import extrinsics
 from rs_relpose_ros.nodes import diagnostics
 from rs_relpose_ros.nodes import parameters as ros_parameters
-from rs_relpose_ros.nodes.diagnostics import PATIENCE, ReasonLog, SILENCE, STARTING
+from rs_relpose_ros.nodes.diagnostics import LineFile, PATIENCE, ReasonLog, SILENCE, STARTING
 from rs_relpose_ros.nodes.inputs import (
     LATCHED,
     message_class,
@@ -229,7 +229,7 @@ class SensorNode(StoppableNode):
     def __init__(self, name: str, statistics: diagnostics.FrameStatistics) -> None:
         super().__init__(name)
         self._frame_statistics = statistics
-        self._stamps: TextIO | None = None   # of the frames that were processed or failed
+        self._stamps: LineFile | None = None   # of the frames that were processed or failed
         self._loop: FrameLoop[Any] | None = None
         self._inputs: SensorInputs | None = None
         self._worker: Worker | None = None
@@ -487,7 +487,7 @@ class SensorNode(StoppableNode):
             self._log_refused(outcome)
             return
         if self._stamps is not None and outcome.stamp_ns is not None:
-            self._stamps.write(f'{outcome.stamp_ns}\n')
+            self._stamps.write(str(outcome.stamp_ns))
         if isinstance(outcome, Frame):
             try:
                 self._on_processed(outcome)
