@@ -186,6 +186,8 @@ def force_fault(forces: Array) -> str:
     if fault := length_fault(float(np.linalg.norm(forces, axis=1).mean())):
         return fault
     size = np.abs(forces)
+    if size.max() < _LEAST_RANGE * STANDARD_GRAVITY:
+        return ''
     equal = (forces[1:] == forces[:-1]) & (size[1:] >= np.maximum(
         0.999 * size.max(axis=0), _LEAST_RANGE * STANDARD_GRAVITY))
     run = np.lib.stride_tricks.sliding_window_view(equal, _CLIPPED_SAMPLES - 1, axis=0) \

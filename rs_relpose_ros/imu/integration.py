@@ -168,6 +168,8 @@ def rotation_sensitivity(stamps_ns: NDArray[np.int64], rates: Array,
 def at_common_times(times1: Array, values1: Array, times2: Array,
                     values2: Array) -> tuple[Array, Array, Array]:
     """Times (K,) of two series, and the values (K, 3) of both, linearly interpolated."""
+    if np.array_equal(times1, times2):   # one topic
+        return times1, values1, values2
     times = np.union1d(times1, times2)
     resampled1, resampled2 = (
         np.column_stack([np.interp(times, of_series, axis) for axis in values.T])
@@ -221,6 +223,10 @@ def force_integrals(steps: Array, forces: Array) -> tuple[Array, Array]:
     return once, np.vstack([np.zeros(3), np.cumsum(moved, axis=0)])
 
 
+# Cross-product matrix of each axis, in a row: ``skew(v) = (v @ _SKEW).reshape(3, 3)``.
+_SKEW = np.array([skew(axis).ravel() for axis in np.eye(3)])
+
+
 def _error_derivatives(seconds: Array, rates: Array, rotations: Array, once: Array,
                        twice: Array) -> tuple[Array, Array]:
     """Derivatives of (alpha, beta) by a bias of the force (6, 3), and by each step's rate.
@@ -239,8 +245,7 @@ def _error_derivatives(seconds: Array, rates: Array, rotations: Array, once: Arr
     later = once[-1] - 0.5 * (once[1:] + once[:-1])
     later_way = (twice[-1] - 0.5 * (twice[1:] + twice[:-1])
                  - 0.5 * (once[1:] + once[:-1]) * left[:, None])
-    by_rotation = np.stack([np.vstack([-skew(way), -skew(force)])
-                            for way, force in zip(later_way, later, strict=True)])
+    by_rotation = -np.hstack([(force @ _SKEW).reshape(-1, 3, 3) for force in (later_way, later)])
     return by_bias, by_rotation @ halfway * steps[:, None, None]
 
 

@@ -15,7 +15,7 @@ from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.motion import InertialMotion
 from rs_relpose_ros.geometry.timing import seconds_between, Sensor
 from rs_relpose_ros.imu.integration import FrameImu, motions_on_the_way
-from rs_relpose_ros.pipeline.pair import GyroRotation
+from rs_relpose_ros.pipeline.pair import GyroRotation, positions
 from rs_relpose_ros.tracking.features import Matches
 
 Frames = TypeVar('Frames')
@@ -77,6 +77,9 @@ class TrackHistory:
 
 def _points(tracked: Matches, wanted: Matches) -> Array:
     """Second points (N, 2) of the `wanted` tracks (N); NaN where one was not tracked."""
+    rows = positions(tracked.track_ids, wanted.track_ids)
+    if len(rows) == len(wanted):   # no track was lost meanwhile, or changed its place
+        return tracked.points2[rows]
     points = np.full((len(wanted), 2), np.nan)
     _, here, there = np.intersect1d(wanted.track_ids, tracked.track_ids, assume_unique=True,
                                     return_indices=True)

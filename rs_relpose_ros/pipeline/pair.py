@@ -189,7 +189,7 @@ class DerotatedRays:
 
     def of(self, track_ids: Ids) -> DerotatedRays | None:
         """Those of some of the tracks, in the same order; None if one is missing."""
-        rows = _positions(self.track_ids, track_ids)
+        rows = positions(self.track_ids, track_ids)
         if len(rows) < len(track_ids):
             return None
         if len(rows) == len(self.track_ids):
@@ -199,7 +199,7 @@ class DerotatedRays:
 
 
 @kernel
-def _positions(ids: Ids, wanted: Ids) -> NDArray[np.int64]:
+def positions(ids: Ids, wanted: Ids) -> NDArray[np.int64]:
     """Positions of `wanted` among the ids, up to the first one that is not there in order."""
     found = np.empty(len(wanted), dtype=np.int64)
     k = 0

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, replace
+import functools
 import math
 from typing import NamedTuple
 
@@ -211,6 +212,7 @@ def _at_stamped_row(pair: PairData, problem: TwoViewProblem, state: TwoViewState
     return moved
 
 
+@functools.lru_cache(maxsize=8)
 def _lens(camera: RollingShutterCamera, focal: float, distortion: float) -> RollingShutterCamera:
     """The camera with deviations of FOCAL and DISTORTION."""
     if not (focal or distortion):
