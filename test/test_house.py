@@ -23,7 +23,7 @@ BUDGETS = {
     'rs_relpose_ros/config': (880, 4),
     'rs_relpose_ros/estimator': (3750, 12),
     'rs_relpose_ros/geometry': (1260, 7),
-    'rs_relpose_ros/imu': (1300, 4),
+    'rs_relpose_ros/imu': (1310, 4),
     'rs_relpose_ros/messages': (1470, 5),
     'rs_relpose_ros/nodes': (2300, 9),
     'rs_relpose_ros/odometry': (2800, 10),
