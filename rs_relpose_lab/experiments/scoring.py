@@ -1,11 +1,9 @@
 """Errors of a pose against the truth, in degrees and in the estimate's own sigmas."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -97,7 +95,7 @@ class Quantiles:
     p90: float
 
     @classmethod
-    def of(cls, values: Iterable[float]) -> Quantiles:
+    def of(cls, values: Iterable[float]) -> Self:
         """Quantiles of values, infinite ones among them."""
         # Not interpolated: not defined between a number and infinity.
         median, p90 = np.quantile(list(values), [0.5, 0.9], method='higher')

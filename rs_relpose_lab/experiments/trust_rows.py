@@ -4,13 +4,11 @@ A row changes the configuration (parameters, CameraInfo) or the messages (IMU, i
 the parameter that the consistency monitor must report.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import accumulate
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import cv2
 import numpy as np
@@ -57,7 +55,7 @@ class Configured:
         """The configured rotation."""
         return Rotation.from_quat(self.values['quat_cam_imu_xyzw'])
 
-    def with_values(self, **changed: Any) -> Configured:
+    def with_values(self, **changed: Any) -> Self:
         """With other parameters."""
         return replace(self, values={**self.values, **changed})
 

@@ -1,7 +1,5 @@
 """The rig's own part of the ROS graph: a private DDS domain, and a node that subscribes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 import fcntl
@@ -11,7 +9,7 @@ from pathlib import Path
 import sys
 import tempfile
 import threading
-from typing import Any
+from typing import Any, Self
 from unittest import mock
 
 import rclpy
@@ -66,7 +64,7 @@ class Graph:
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._spin)
 
-    def __enter__(self) -> Graph:
+    def __enter__(self) -> Self:
         self._thread.start()
         return self
 

@@ -1,7 +1,5 @@
 """Processes of a live run, the nodes and a player: start, log, wait, signals, end, load."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 import os
@@ -12,7 +10,7 @@ import sys
 import tempfile
 import time
 from types import TracebackType
-from typing import BinaryIO, TypeVar
+from typing import BinaryIO, Self, TypeVar
 
 from rs_relpose_ros.errors import RsRelposeError
 
@@ -43,7 +41,7 @@ class Process:
             [sys.executable, *arguments], stdout=self._log, stderr=subprocess.STDOUT,
             env={**os.environ, 'PYTHONUNBUFFERED': '1'})
 
-    def __enter__(self) -> Process:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,

@@ -1,10 +1,9 @@
 """A hand-held walk as a trajectory: gait, sway and tremor, with stretches of simpler motion."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import itertools
 import math
+from typing import Self
 
 import numpy as np
 
@@ -40,7 +39,7 @@ class Plan:
     parts: tuple[tuple[str, float], ...]
 
     @classmethod
-    def parse(cls, text: str) -> Plan:
+    def parse(cls, text: str) -> Self:
         """Plan of a text such as ``'walk:1.5,still:0.6'``."""
         parts = []
         for item in text.split(','):
@@ -57,7 +56,7 @@ class Plan:
         return cls(tuple(parts))
 
     @classmethod
-    def drawn(cls, rng: np.random.Generator, duration: float) -> Plan:
+    def drawn(cls, rng: np.random.Generator, duration: float) -> Self:
         """Walks, with each of the simpler motions once in 6 s, in an order that is drawn."""
         parts: list[tuple[str, float]] = []
         total = -_TRANSITION

@@ -1,7 +1,5 @@
 """Records of pairs, their rows in the tables, and ``summary.json``."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, ExitStack
 import csv
@@ -10,7 +8,7 @@ import json
 import math
 from pathlib import Path
 import platform
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import cv2
 import numba
@@ -43,7 +41,7 @@ class PairRecord:
     errors: PairErrors | None = None   # also None without ground truth
 
     @classmethod
-    def of(cls, result: PairResult, truth: TrueTrajectory | None = None) -> PairRecord:
+    def of(cls, result: PairResult, truth: TrueTrajectory | None = None) -> Self:
         """Record of a pair, with its errors if there is ground truth."""
         pose, ns1, ns2 = result.pose, result.reference_ns1, result.reference_ns2
         return cls(result.reference_stamp_ns, result.stamp_ns, pose, ns1, ns2,

@@ -4,10 +4,8 @@ No field is trusted: sizes are checked before memory is allocated, and an unusab
 `InputError`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import cv2
 import numpy as np
@@ -174,7 +172,7 @@ class RawImage:
     is_png: ClassVar[bool] = False
 
     @classmethod
-    def of_gray(cls, image: Image, stamp_ns: int, frame_id: str = '') -> RawImage:
+    def of_gray(cls, image: Image, stamp_ns: int, frame_id: str = '') -> Self:
         """A mono8 image of an array (H, W)."""
         height, width = image.shape
         return cls(np.ascontiguousarray(image).ravel(), 'mono8', width, height, width, False,
