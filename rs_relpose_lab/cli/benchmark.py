@@ -415,16 +415,20 @@ def _odometry_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--euroc', type=Path, metavar='FOLDER',
                         help='also corners of a real recording, euroc_imu_april_corners')
     _number(parser, '--disturbances', 0, 'instead, walks with each disturbance')
+    _number(parser, '--loops', 0, 'instead, closed walks of 60 s, with and without loop closures')
 
 
 def _run_odometry(args: argparse.Namespace) -> int:
     from rs_relpose_ros.odometry import need_gtsam
     need_gtsam()
-    from rs_relpose_lab.experiments import odometry, odometry_disturbances
+    from rs_relpose_lab.experiments import odometry, odometry_disturbances, odometry_loops
     if args.disturbances:
         return _report_of(odometry_disturbances.tasks(args.disturbances, args.seed),
                           odometry_disturbances.measure, odometry_disturbances.write_report,
                           args, 'walk')
+    if args.loops:
+        return _report_of([args.seed + k for k in range(args.loops)], odometry_loops.on_seed,
+                          odometry_loops.write_report, args, 'walk')
     _check_at_least(0, args, 'walks', 'global_shutter', 'in_motion', 'long')
     walks, seed = odometry.walks, args.seed
     chosen = [*walks(args.walks, seed), *walks(args.global_shutter, seed, readout=0.0),

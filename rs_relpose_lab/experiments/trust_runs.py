@@ -31,8 +31,8 @@ from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, to_nano
 from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.messages.incoming import PARTS, Role, sensor_messages
 from rs_relpose_ros.offline.replay import read_truth
-from rs_relpose_ros.pipeline.pair import Frame, PairResult
-from rs_relpose_ros.pipeline.pipeline import FrontEnd
+from rs_relpose_ros.pipeline.pair import Frame, PairResult, Result
+from rs_relpose_ros.pipeline.pipeline import FrameLoop, FrontEnd
 from rs_relpose_ros.tracking.features import keep_apart, Matches, TrackIds
 from rs_relpose_ros.tracking.images import Image, RawImage
 
@@ -379,6 +379,15 @@ def run(recording: Recording, configured: trust_rows.Configured, until: float = 
         known, lambda points: configured.geometry.points(points, camera),
         parameters.tracking.max_features)
     front_end = FrontEnd(parameters, offline=True, tracker=tracker)
+    for frame in processed(recording, configured, front_end, until):
+        if frame.result is not None:
+            yield frame.result, frame.seconds
+
+
+def processed(recording: Recording, configured: trust_rows.Configured, loop: FrameLoop[Result],
+              until: float = math.inf) -> Iterator[Frame[Result]]:
+    """Frames of a run with a configuration, processed by a loop; `until` as of `run`."""
+    camera = recording.camera
     first_ns = recording.arrivals[0].stamp_ns
     imu_delay_ns = to_nanoseconds(IMU_DELAY)
     samples: Sequence[ImuSample | Arrival] = recording.samples
@@ -390,22 +399,22 @@ def run(recording: Recording, configured: trust_rows.Configured, until: float = 
 
     for arrived in heapq.merge(samples, frames, key=arrival_ns):
         if isinstance(arrived, ImuSample):
-            front_end.sequencer.add_imu(configured.sample(arrived))
+            loop.sequencer.add_imu(configured.sample(arrived))
         else:
             image = recording.image(arrived.number)
-            if known is None:
+            if recording.sightings is None:
                 image = configured.geometry.image(image, camera)
-            front_end.sequencer.add_frame(
+            loop.sequencer.add_frame(
                 RawImage.of_gray(image, arrived.stamp_ns, CAMERA_FRAME), configured.intrinsics)
-        yield from _closed(front_end)
-    front_end.sequencer.close()
-    yield from _closed(front_end)
+        yield from _taken(loop)
+    loop.close()
+    yield from _taken(loop)
 
 
-def _closed(front_end: FrontEnd) -> Iterator[tuple[PairResult, float]]:
-    while (outcome := front_end.step()) is not None:
-        if isinstance(outcome, Frame) and outcome.result is not None:
-            yield outcome.result, outcome.seconds
+def _taken(loop: FrameLoop[Result]) -> Iterator[Frame[Result]]:
+    while (outcome := loop.step()) is not None:
+        if isinstance(outcome, Frame):
+            yield outcome
 
 
 def evaluated(recording: Recording, pair: PairResult, seconds: float) -> EvaluatedPair:

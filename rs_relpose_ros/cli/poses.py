@@ -199,6 +199,9 @@ PAIRS = Command(
 
 def _add_odometry_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_run_arguments(parser, 'odometry')
+    parser.add_argument('--loops', action='store_true',
+                        help='add loop closures to the smoothed path: keyframes far apart in time '
+                        'with a common view, related as by `rs_relpose pairs`')
     parser.add_argument('--rate', metavar='HZ', type=rate_in_hertz, default=0.0,
                         help='also write trajectory_rows.tum: smoothed poses at this rate')
 
@@ -214,8 +217,8 @@ def rate_in_hertz(text: str) -> float:
 def _odometry(args: argparse.Namespace) -> int:
     need_gtsam()
     from rs_relpose_ros.odometry import offline, rows
-    folder, outcome = options.run_on_bag(args, 'odometry',
-                                         partial(offline.odometry_into, rate=args.rate))
+    folder, outcome = options.run_on_bag(args, 'odometry', partial(
+        offline.odometry_into, rate=args.rate, loops=args.loops))
     for text in outcome.warnings:
         print(text)
     metrics = outcome.metrics
@@ -226,6 +229,12 @@ def _odometry(args: argparse.Namespace) -> int:
           + (f', lost {len(metrics["lost"])} times' if metrics['lost'] else ''))
     if metrics['health'] in ('suspect', 'wrong'):
         print(f'health: {metrics["health"]}: "rs_relpose replay" reports the parameter')
+    if loops := metrics['loops']:
+        print(f'loops: {loops["offered"]} offered, {loops["related"]} related, {loops["taken"]} '
+              f'taken; keyframes shift by {loops["shift_m"]:.3f} m (rms), at most '
+              f'{loops["largest_shift_m"]:.3f} m; from the end to the start '
+              f'{loops["end_to_start_without_m"]:.3f} m without, {loops["end_to_start_m"]:.3f} m '
+              'with loops')
     for trajectory in ('live', 'smoothed'):
         if errors := metrics[trajectory]:
             print(f'{trajectory}, against the ground truth: ATE {errors["ate_m"]:.3f} m over '

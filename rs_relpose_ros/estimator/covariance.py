@@ -8,7 +8,7 @@ part from the agreement of gyro and images.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -210,8 +210,8 @@ def pair_state(problem: TwoViewProblem, state: TwoViewState, log_scale: float,
 # H may be singular: a global shutter does not observe velocities. The prior of the gyro's rate
 # during the readout stays in it: without, rays have no common row.
 
-# Deviations of a pose with velocities, and of a rotation alone.
-POSE, ROTATION = DW1, 3
+# Deviations of a pose with velocities, without them, and of a rotation alone.
+POSE, DIRECTION, ROTATION = DW1, 5, 3
 # Share of the largest eigenvalue below which a direction counts as not observable.
 _RANK = 1e-12
 
@@ -222,29 +222,38 @@ class ImageInformation:
 
     ``e = (theta, s, v_1 - d_1, v_2 - d_2)``, in the axes of camera 1: ``R_true = Exp(theta) R``,
     ``t_true`` along ``t + B s`` with ``B = tangent_basis(t)``, and the velocities of the two
-    cameras [baselines per second]; or ``e = theta``. All of it between the **middle** rows, with
-    which the direction hardly depends on the velocities.
+    cameras [baselines per second]; or its first 5 or 3. All of it between the **middle** rows,
+    with which the direction hardly depends on the velocities.
     """
 
     row_time: float   # [s] of the middle row, after the stamped one
     R: Array   # (3, 3) R_1^T R_2
     t: Array   # (3,) unit direction; NaN of a rotation alone
     velocities: Array   # (6,) d_1, d_2, in camera 1; NaN likewise
-    information: Array   # (11, 11) or (3, 3) H
-    gradient: Array   # (11,) or (3,) g
+    information: Array   # (11, 11), (5, 5) or (3, 3) H
+    gradient: Array   # (11,), (5,) or (3,) g
 
     def of_rotation(self) -> ImageInformation:
         """The same of the rotation alone, the rest eliminated."""
         if len(self.gradient) == ROTATION:
             return self
-        H, g, k = self.information, self.gradient, ROTATION
+        unknown = np.full(9, np.nan)
+        return replace(self._reduced(ROTATION), t=unknown[:3], velocities=unknown[3:])
+
+    def without_velocities(self) -> ImageInformation:
+        """The same of rotation and direction (5,), the velocities eliminated."""
+        return self._reduced(DIRECTION)
+
+    def _reduced(self, k: int) -> ImageInformation:
+        """Of the first k deviations."""
+        H, g = self.information, self.gradient
         # Scaled, so that the rank does not depend on units.
         scale = 1.0 / np.sqrt(np.maximum(np.diag(H)[k:], np.finfo(float).tiny))
         rest = np.linalg.pinv(H[k:, k:] * np.outer(scale, scale), rcond=_RANK, hermitian=True)
         gain = H[:k, k:] @ (rest * np.outer(scale, scale))
         reduced = H[:k, :k] - gain @ H[k:, :k]
-        return ImageInformation(self.row_time, self.R, np.full(3, np.nan), np.full(6, np.nan),
-                                0.5 * (reduced + reduced.T), g[:k] - gain @ g[k:])
+        return replace(self, information=0.5 * (reduced + reduced.T),
+                       gradient=g[:k] - gain @ g[k:])
 
 
 def image_information(matches: FitMatches, state: TwoViewState, prior: Priors,

@@ -5,6 +5,7 @@ arrival within `_LATE_NS`.
 """
 
 from collections import Counter, deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 import math
@@ -25,6 +26,7 @@ from rs_relpose_ros.odometry.graph import (
     GYRO_BIAS,
     KeyframeGraph,
     KeyframeState,
+    Loop,
     POSE,
     Step,
     VELOCITY,
@@ -65,8 +67,8 @@ _REST_VELOCITY, _ANY_VELOCITY, _GAUGE_SIGMA = 0.01, 3.0, 1e-4
 # Largest 1 sigma of the logarithm of a baseline that starts a graph, and the initial speed without
 # one [m/s]: pairs of a global shutter have no baseline.
 _START_LOG_SIGMA, _GUESSED_SPEED = 0.7, 1.0
-# Variance of pairs by that of each alone: consecutive ones share tracks, whose errors persist
-# (docs/lab/odometry.md).
+# Variance of pairs by that of each alone: consecutive ones share tracks, whose errors persist, and
+# loops share images (docs/lab/odometry.md).
 _SHARED = 2.5
 # Innovation of a contradicting pair, in units of recent ones, and chi squared per degree of
 # freedom of a wrong start.
@@ -239,7 +241,7 @@ class OdometryEstimator:
             self._unusable_ns = pair.current_ns
             return
         if pair.images is not None:
-            self._row_ns = to_nanoseconds(pair.images.row_time)
+            self._row_ns = pair.row_ns
         # Keyframes are at the middle rows, also for pairs without information.
         pair = pair.later(self._row_ns)
         if self._last_ns is not None and pair.current_ns <= self._last_ns:
@@ -315,6 +317,24 @@ class OdometryEstimator:
             out.append([(state, self._odometry(run, state, np.full(3, math.nan), *stamps))
                         for state, stamps in zip(states, run.stamps, strict=True)])
         return out
+
+    def close_loops(self, pairs: Iterable[KeyframePair]) -> list[KeyframePair]:
+        """Add pairs of keyframes far apart in time to what is smoothed; needs `keep`.
+
+        Returns those that agree with the path and count, at their middle rows. Pairs of two runs
+        do not.
+        """
+        loops = [loop for pair in pairs if (loop := pair.as_loop(_SHARED)) is not None]
+        taken: list[KeyframePair] = []
+        for run in self._runs:
+            numbers = {imu_ns: k for k, (_, imu_ns) in enumerate(run.stamps)}
+            try:
+                taken += [loop.pair for loop in run.graph.add_loops([
+                    Loop(numbers[pair.reference_ns], numbers[pair.current_ns], pair)
+                    for pair in loops if {pair.reference_ns, pair.current_ns} <= numbers.keys()])]
+            except GraphError as error:
+                self._warnings.append(f'loops of {len(run.stamps)} keyframes not added: {error}')
+        return taken
 
     def smoothed_steps(self) -> list[tuple[int, int, Step]]:
         """Steps between consecutive keyframes, with both times on the IMU clock."""
@@ -479,8 +499,7 @@ class OdometryEstimator:
         covariance[ARM, ARM] = self._arm_covariance
         start = KeyframeState(R, path_end.position, velocity, bias, np.zeros(3), self._arm,
                               covariance)
-        graph = KeyframeGraph(start, interval.rates[0], C, self._imu, self._config,
-                              keep=self._keep)
+        graph = KeyframeGraph(start, C, self._imu, self._config, keep=self._keep)
         self._first_R = R if self._first_R is None else self._first_R
         offset = pair.current_ns - pair.stamp_ns
         stamps = deque([(pair.reference_ns - offset, pair.reference_ns)],

@@ -6,7 +6,7 @@ consecutive keyframes, and for a pair the information of its images alone (`esti
 so that no IMU sample counts twice.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 import math
@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import gtsam
 from gtsam.symbol_shorthand import B, L, V, X
 import numpy as np
+from scipy.stats import chi2
 
 from rs_relpose_ros.config.settings import ImuConfig, OdometryConfig
 from rs_relpose_ros.errors import RsRelposeError
@@ -29,6 +30,8 @@ _REST_VELOCITY_SIGMA = 0.005
 _LONGEST_STEP = 0.25
 # Integration error of the samples, as a noise density of the position [m/sqrt(s)].
 _INTEGRATION = 1e-4
+# Share of right loops within the bound of chi squared.
+_LOOP_QUANTILE = 0.99
 
 
 # Columns of a pair's derivatives: pose and velocity of the first body, of the second one, camera.
@@ -57,6 +60,14 @@ class KeyframeState:
     covariance: Array
 
 
+class Loop(NamedTuple):
+    """A pair of two keyframes of a graph, far apart in time."""
+
+    first: int   # their numbers since the start
+    second: int
+    pair: KeyframePair
+
+
 class Step(NamedTuple):
     """From one keyframe's camera to the next one's, in the axes of the former."""
 
@@ -79,10 +90,10 @@ def _preintegration(imu: ImuConfig, config: OdometryConfig) -> Any:
 class KeyframeGraph:
     """Keyframes since a start; each new one optimises the newest window.
 
-    `rate`: of the body at the start; `keep`: whether all is recorded for `smoothed`.
+    `keep`: whether all is recorded for `smoothed`.
     """
 
-    def __init__(self, start: KeyframeState, rate: Array, R_cam_body: Array, imu: ImuConfig,
+    def __init__(self, start: KeyframeState, R_cam_body: Array, imu: ImuConfig,
                  config: OdometryConfig, *, keep: bool = False) -> None:
         self._R_cam_body, self._config = R_cam_body, config
         self._preintegration = _preintegration(imu, config)
@@ -95,7 +106,6 @@ class KeyframeGraph:
         self._smoother = gtsam.BatchFixedLagSmoother(config.smoothing_lag, params)
         # All factors and states since the start, for the final smoothing.
         self._record = (gtsam.NonlinearFactorGraph(), gtsam.Values()) if keep else None
-        self._rate = rate   # of the body at the newest keyframe, as measured
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         pose = gtsam.Pose3(gtsam.Rot3(start.R), start.position)
         bias = gtsam.imuBias.ConstantBias(start.accel_bias, start.gyro_bias)
@@ -134,7 +144,7 @@ class KeyframeGraph:
         i, j = self._count - 1, self._count
         pim = self._preintegrated(interval)
         state = self._predicted(pim)
-        rates, self._rate = (self._rate, interval.rates[-1]), interval.rates[-1]
+        rates = interval.rates[[0, -1]] - self._bias.gyroscope()
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         values.insert(X(j), state.pose())
         values.insert(V(j), state.velocity())
@@ -142,7 +152,7 @@ class KeyframeGraph:
         factors.add(_imu_factor(i, j, pim))
         innovation = 0.0
         if pair is not None and pair.images is not None:
-            innovation = self._innovation(pim, self._pair_factor(i, j, pair, rates, 1.0))
+            innovation = self._innovation(pim, self._pair_factor(i, j, pair, rates))
             if innovation <= gate:
                 factors.add(self._pair_factor(i, j, pair, rates, math.sqrt(inflation)))
                 if pair.is_pure_rotation:
@@ -195,7 +205,62 @@ class KeyframeGraph:
             steps.append(Step(C @ way, C @ by @ covariance @ by.T @ C.T))
         return steps
 
+    def add_loops(self, loops: Sequence[Loop]) -> list[Loop]:
+        """Add pairs of keyframes far apart to what is smoothed, and return those that count.
+
+        They agree with the path without any of them, given its covariance, and then with that by
+        all of them; needs `keep`.
+        """
+        assert self._record is not None
+        with _solving():
+            values, marginals = self._smoothed()
+            misfits = [self._misfit(loop, values, marginals) for loop in loops]
+            bound = 1.0
+            while True:
+                loops = [loop for loop, misfit in zip(loops, misfits, strict=True)
+                         if misfit <= bound]
+                graph, values = self._closed(loops, values)
+                misfits = [self._misfit(loop, values) for loop in loops]
+                worst = max(misfits, default=0.0)
+                if worst <= 1.0:
+                    break
+                # The worst ones first: others may disagree because of them.
+                bound = max(1.0, 0.5 * worst)
+        self._record = graph, values
+        return list(loops)
+
     # -- inside ------------------------------------------------------------------------------
+
+    def _closed(self, loops: Sequence[Loop], values: Any) -> tuple[Any, Any]:
+        """The record with loops, optimised."""
+        assert self._record is not None
+        graph = gtsam.NonlinearFactorGraph(self._record[0])
+        for loop in loops:
+            graph.add(self._pair_factor(*loop, robust=True))
+        return graph, gtsam.LevenbergMarquardtOptimizer(
+            _compact(graph), values, self._params).optimize()
+
+    def _misfit(self, loop: Loop, values: Any, marginals: Any = None) -> float:
+        """Chi squared of a loop by its bound; `marginals`: of a path without it."""
+        factor = self._pair_factor(*loop)
+        _, e = factor.linearize(values).jacobian()
+        S = np.eye(len(e))
+        if marginals is not None:
+            # About the predicted pose: the tangents of other directions have steeper derivatives.
+            A, _ = self._pair_factor(*self._predicted_loop(loop, values)).linearize(
+                values).jacobian()
+            S += A @ _joint(marginals, list(factor.keys())) @ A.T
+        return float(e @ np.linalg.solve(S, e)) / _loop_bound(len(e))**2
+
+    def _predicted_loop(self, loop: Loop, values: Any) -> Loop:
+        """The same of the poses of a path."""
+        images, C, c = loop.pair.images, self._R_cam_body, values.atVector(L(0))
+        assert images is not None
+        way = values.atPose3(X(loop.first)).between(values.atPose3(X(loop.second)))
+        R, q = way.rotation().matrix(), way.transformFrom(c) - c
+        return loop._replace(pair=replace(loop.pair, images=replace(
+            images, R=C @ R @ C.T, t=C @ q / np.linalg.norm(q) if loop.pair.has_direction
+            else images.t)))
 
     def _smoothed(self) -> tuple[Any, Any]:
         """Values and marginals of the whole record."""
@@ -252,8 +317,8 @@ class KeyframeGraph:
              + second @ noise @ second.T)
         return float(e @ np.linalg.solve(S, e)) / len(e)
 
-    def _pair_factor(self, i: int, j: int, pair: KeyframePair, measured: tuple[Array, Array],
-                     sigma: float) -> Any:
+    def _pair_factor(self, i: int, j: int, pair: KeyframePair, rates: Array | None = None,
+                     sigma: float = 1.0, *, robust: bool = False) -> Any:
         images = pair.images
         assert images is not None
         C = self._R_cam_body
@@ -262,8 +327,12 @@ class KeyframeGraph:
         # A pure rotation has no other deviations.
         t, velocities = (images.t, images.velocities) if pair.has_direction else (
             np.array([0.0, 0.0, 1.0]), np.zeros(6))
-        bias = self._bias.gyroscope()
-        rates = measured[0] - bias, measured[1] - bias
+        # Only velocities depend on the rates.
+        rates = np.zeros((2, 3)) if rates is None else rates
+        noise = _diagonal([sigma] * len(offset))
+        if robust:
+            noise = gtsam.noiseModel.Robust.Create(
+                gtsam.noiseModel.mEstimator.Huber.Create(_loop_bound(len(offset))), noise)
 
         def error(factor: Any, values: Any, jacobians: Any) -> Array:
             x1, v1, x2, v2, arm = factor.keys()
@@ -275,8 +344,7 @@ class KeyframeGraph:
                     jacobians[block] = whole[:, columns]
             return np.asarray(root @ e[:n] + offset)
 
-        return gtsam.CustomFactor(_diagonal([sigma] * len(offset)),
-                                  [X(i), V(i), X(j), V(j), L(0)], error)
+        return gtsam.CustomFactor(noise, [X(i), V(i), X(j), V(j), L(0)], error)
 
     def _still_factor(self, i: int, j: int) -> Any:
         """The camera keeps its position under any rotation of the body."""
@@ -314,6 +382,11 @@ class KeyframeGraph:
             _compact(self._smoother.getFactors()), self._values), newest)
         if self._record is not None:
             self._record[1].insert_or_assign(self._values)
+
+
+def _loop_bound(dimension: int) -> float:
+    """Largest normalised residual of a loop."""
+    return math.sqrt(chi2.ppf(_LOOP_QUANTILE, dimension))
 
 
 @contextmanager

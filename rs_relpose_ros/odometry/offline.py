@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 import numpy as np
 
 from rs_relpose_ros.bags.reader import Bag, SensorTopics
-from rs_relpose_ros.config.settings import Parameters
+from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import aligning_rotation
@@ -21,12 +21,15 @@ from rs_relpose_ros.messages.incoming import PARTS, Role, sensor_messages, stamp
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.graph import KeyframeState
 from rs_relpose_ros.odometry.landmarks import Tracks, TRACKS_FILE
+from rs_relpose_ros.odometry.loops import close_loops, View
 from rs_relpose_ros.odometry.pair import KeyframePair
 from rs_relpose_ros.odometry.rows import camera_poses, Knot, ROWS_FILE, RowTrajectory, write_tum
 from rs_relpose_ros.odometry.states import Base, Odometry, OdometryState
+from rs_relpose_ros.offline.pairs import related
 from rs_relpose_ros.offline.replay import read_truth, Replay
 from rs_relpose_ros.offline.truth import TrueTrajectory
 from rs_relpose_ros.output_files import prepare_folder, save_picture, SUMMARY_FILE
+from rs_relpose_ros.pipeline.pair import PairResult
 
 _STYLES: Mapping[str, Mapping[str, Any]] = {
     'truth': {'color': 'black', 'lw': 2.5}, 'live': {'color': '#E69F00', 'lw': 1.2},
@@ -48,25 +51,35 @@ class OdometryOutcome:
 
 
 def odometry_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parameters,
-                  rate: float = 0.0) -> OdometryOutcome:
+                  rate: float = 0.0, *, loops: bool = False) -> OdometryOutcome:
     """Run a bag, and write trajectories, tracks and a picture into `folder`.
 
-    Files of an earlier run are replaced. `rate`: of the poses of an additional file [Hz].
+    Files of an earlier run are replaced. `rate`: of the poses of an additional file [Hz]. `loops`:
+    whether the smoothed path has loop closures.
     """
     prepare_folder(folder, (LIVE_FILE, SMOOTHED_FILE, ROWS_FILE, RATE_FILE, TRACKS_FILE,
                             PICTURE, SUMMARY_FILE))
     estimator = OdometryEstimator(parameters, keep=True)
     replay = Replay(bag, topics, parameters)
     observed: list[Tracks] = []
+    views: dict[int, View] = {}
 
     def pairs() -> Iterator[tuple[int, KeyframePair]]:
         for pair in replay.pairs():
             observed.append(Tracks.of_pair(pair))
-            yield replay.counts.last_ns, KeyframePair.of_result(pair)
+            given = KeyframePair.of_result(pair)
+            views[given.current_ns + given.row_ns] = View(pair.stamp_ns, pair.parallax)
+            yield replay.counts.last_ns, given
 
     samples = _samples(bag, topics)
     live = follow(estimator, pairs(), samples)
-    paths = estimator.smoothed_paths()
+    paths, closed = estimator.smoothed_paths(), None
+    if loops and paths:
+        assert replay.intake.intrinsics is not None
+        sensor = sensor_model(replay.intake.intrinsics, parameters.sensor)
+        paths, closed, _ = close_loops(estimator, paths, views, sensor, lambda stamps: [
+            pair for pair in related(bag, topics, parameters, stamps)[0]
+            if isinstance(pair, PairResult)])
     smoothed = [keyframe for path in paths for _, keyframe in path]
     warnings = estimator.warnings()
     truth = read_truth(bag, topics)
@@ -74,24 +87,9 @@ def odometry_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Para
     base = estimator.base or Base()
     drawn = {name: path_of([base.camera(pose) for pose in trajectory], truth)
              for name, trajectory in (('live', live), ('smoothed', smoothed))}
-    positions = [pose.position for pose in live]
-    metrics: dict[str, Any] = {
-        'keyframes': len(live), 'pairs': {name: estimator.counts[name] for name in (
-            'pairs', 'contradicting', 'late', 'without images', 'calibration contradicted')},
-        **{state.value: [
-            {'begin_ns': one.begin_ns, 'end_ns': one.end_ns, 'reason': one.reason}
-            for one in estimator.intervals if one.state is state]
-           for state in (OdometryState.UNCERTAIN, OdometryState.LOST)},
-        **{name: value.tolist() for name, value in zip(
-            ('imu_position', 'imu_position_sigma'), estimator.imu_position, strict=True)},
-        'starts': [asdict(started) for started in estimator.starts],
-        'health': replay.health.state.value,
-        'length_m': float(np.linalg.norm(np.diff(np.reshape(positions, (-1, 3)), axis=0),
-                                         axis=1).sum())}
-    for name, path in drawn.items():
-        metrics[name] = path.errors and {
-            key: value if math.isfinite(value) else None
-            for key, value in asdict(path.errors).items()}
+    metrics = {**_metrics(estimator, live), 'loops': closed and asdict(closed),
+               'health': replay.health.state.value,
+               **{name: path.errors and path.errors.as_json() for name, path in drawn.items()}}
     write_tum(folder / LIVE_FILE, live)
     write_tum(folder / SMOOTHED_FILE, smoothed)
     if paths:
@@ -103,6 +101,23 @@ def odometry_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Para
             write_tum(folder / RATE_FILE, camera_poses(rows, rate))
     draw_paths(drawn, folder / PICTURE)
     return OdometryOutcome(live, smoothed, metrics, warnings, estimator.blocking_reason)
+
+
+def _metrics(estimator: OdometryEstimator, live: Sequence[Odometry]) -> dict[str, Any]:
+    """Counts, intervals, starts and the estimated lever arm, for summary.json."""
+    positions = [pose.position for pose in live]
+    return {
+        'keyframes': len(live), 'pairs': {name: estimator.counts[name] for name in (
+            'pairs', 'contradicting', 'late', 'without images', 'calibration contradicted')},
+        **{state.value: [
+            {'begin_ns': one.begin_ns, 'end_ns': one.end_ns, 'reason': one.reason}
+            for one in estimator.intervals if one.state is state]
+           for state in (OdometryState.UNCERTAIN, OdometryState.LOST)},
+        **{name: value.tolist() for name, value in zip(
+            ('imu_position', 'imu_position_sigma'), estimator.imu_position, strict=True)},
+        'starts': [asdict(started) for started in estimator.starts],
+        'length_m': float(np.linalg.norm(np.diff(np.reshape(positions, (-1, 3)), axis=0),
+                                         axis=1).sum())}
 
 
 def row_trajectory(paths: Sequence[Sequence[tuple[KeyframeState, Odometry]]], base: Base,
@@ -175,6 +190,11 @@ class TrajectoryErrors:
     scale_error: float   # of the best similarity, less 1
     relative_translation_error_percent: float   # median over segments of 1 m
     length_m: float   # of the true path
+
+    def as_json(self) -> dict[str, float | None]:
+        """For summary.json, which has no NaN."""
+        return {name: value if math.isfinite(value) else None
+                for name, value in asdict(self).items()}
 
 
 class ComparedPath(NamedTuple):

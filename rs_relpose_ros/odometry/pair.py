@@ -16,6 +16,7 @@ from rs_relpose_ros.estimator.covariance import ImageInformation
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import log_so3, norm, tangent_basis
+from rs_relpose_ros.geometry.timing import to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuInterval
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.messages.incoming import stamp_ns
@@ -69,6 +70,24 @@ class KeyframePair:
         return replace(self, stamp_ns=self.stamp_ns + delay_ns,
                        reference_ns=self.reference_ns + delay_ns,
                        current_ns=self.current_ns + delay_ns)
+
+    @property
+    def row_ns(self) -> int:
+        """From the stamped to the middle row, at which keyframes are; 0 without information."""
+        return 0 if self.images is None else to_nanoseconds(self.images.row_time)
+
+    def as_loop(self, inflation: float) -> KeyframePair | None:
+        """The same at the middle rows, for frames far apart in time; None without information.
+
+        Without velocities: they are estimated far from the true ones there, and the information
+        about them does not hold. `inflation`: of the covariance.
+        """
+        if self.images is None:
+            return None
+        images = self.images.without_velocities() if self.has_direction else self.images
+        return replace(self, images=replace(
+            images, information=images.information / inflation,
+            gradient=images.gradient / inflation)).later(self.row_ns)
 
     @property
     def is_pure_rotation(self) -> bool:

@@ -48,7 +48,7 @@ def pairs_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Paramet
     """
     prepare_folder(folder, (POSES.file, ERRORS.file, SUMMARY_FILE))
     truth = replay.read_truth(bag, topics)
-    results, intrinsics = _results(bag, topics, parameters, pairs)
+    results, intrinsics = related(bag, topics, parameters, pairs)
     records = [
         PairRecord.of(result, truth) if isinstance(result, PairResult)
         else PairRecord(*pair, RelativePose(status=Status.BAD_INPUT, reason=result))
@@ -64,8 +64,8 @@ def pairs_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Paramet
                                 [folder / table.file for table in written], intrinsics)
 
 
-def _results(bag: Bag, topics: SensorTopics, parameters: Parameters,
-             pairs: Sequence[Stamps]) -> tuple[list[PairResult | str], Intrinsics | None]:
+def related(bag: Bag, topics: SensorTopics, parameters: Parameters,
+            pairs: Sequence[Stamps]) -> tuple[list[PairResult | str], Intrinsics | None]:
     """Results of the pairs, or the reasons why they were not estimated; active intrinsics."""
     warm_up(parameters.estimator)
     wanted = [pair for pair in pairs if pair[0] < pair[1]]

@@ -88,11 +88,10 @@ def estimate_wide_pair(first: Frame[Any], second: Frame[Any], parameters: Parame
                                 else tracking)
     tracker.start(first.image)
     gyro = _gyro(first, second, parameters)
-    inertial = pair.inertial_of(first.imu, second.imu, gyro, second.imu, parameters)
     interval = pair.interval_of(first.imu, second.imu)
     near = interval <= parameters.keyframes.max_keyframe_interval
-    if not near and not isinstance(inertial, str):
-        inertial = 'the frames are further apart than max_keyframe_interval'
+    inertial = pair.inertial_of(first.imu, second.imu, gyro, second.imu, parameters) if near else (
+        'the frames are further apart than max_keyframe_interval')
     history = TrackHistory(first.imu)
     if gyro is not None and near:
         for frame in used_frames(between):

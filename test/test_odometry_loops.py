@@ -1,0 +1,130 @@
+"""Loop closures of the smoothed path: which are proposed, which count, and what they change."""
+
+from dataclasses import replace
+import json
+import math
+
+from conftest import BUNDLED_PARAMETERS
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from test_odometry import ROW, run, SECOND, walk
+
+from rs_relpose_lab.experiments import odometry_loops
+from rs_relpose_lab.simulation import simulate, SimulationConfig
+from rs_relpose_ros.cli.main import main
+from rs_relpose_ros.estimator.covariance import ImageInformation
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.so3 import exp_so3, tangent_basis
+from rs_relpose_ros.odometry import loops
+from rs_relpose_ros.odometry.states import Odometry
+
+ROW_NS = round(ROW * SECOND)
+SIGMA = 1e-3   # [rad] of the loops' rotations and directions
+NAN = np.full(3, math.nan)
+
+
+def loop_of(given, one, two, rng, *, wrong=0.0):
+    """The pair of two keyframes by the truth, its direction `wrong` by an angle [rad]."""
+    R, way = given.truth.relative_pose(one.imu_ns, two.imu_ns)
+    R = exp_so3(SIGMA * rng.standard_normal(3)) @ R
+    t = way / np.linalg.norm(way)
+    t = t + tangent_basis(t) @ (SIGMA * rng.standard_normal(2) + (math.tan(wrong), 0.0))
+    information = np.zeros((11, 11))
+    information[:5, :5] = np.eye(5) / SIGMA**2
+    # Velocities that contradict, as those of frames far apart do.
+    information[5:, 5:] = np.eye(6) / SIGMA**2
+    images = ImageInformation(ROW, R, t / np.linalg.norm(t), np.full(6, 9.0), information,
+                              np.zeros(11))
+    return replace(given.pairs[0], stamp_ns=two.imu_ns - ROW_NS, images=images,
+                   reference_ns=one.imu_ns - ROW_NS, current_ns=two.imu_ns - ROW_NS)
+
+
+def end_error(path, truth):
+    _, way = truth.relative_pose(path[0].imu_ns, path[-1].imu_ns)
+    return np.linalg.norm(path[0].R.T @ (path[-1].position - path[0].position) - way)
+
+
+def test_loops_that_agree_with_the_path_correct_it():
+    given, rng = walk('walk:20', 20.0, imu_rate=100.0), np.random.default_rng(3)
+    estimator, _ = run(given)
+    before = estimator.smoothed()
+    ends = list(zip(before[:24:3], before[:-25:-3], strict=True))
+    right = [loop_of(given, one, two, rng) for one, two in ends]
+    wrong = [loop_of(given, *ends[k], rng, wrong=1.2) for k in (1, 4)]
+    # Within the covariance of the path, but not with the right ones.
+    wrong_among = [loop_of(given, *ends[k], rng, wrong=0.3) for k in (1, 4)]
+    nowhere = replace(right[0], current_ns=right[0].current_ns + 7)   # at no keyframe
+    empty = replace(right[0], images=None)
+    assert estimator.close_loops([*wrong, nowhere, empty]) == []
+    np.testing.assert_allclose([pose.position for pose in estimator.smoothed()],
+                               [pose.position for pose in before], atol=1e-6)
+    taken = estimator.close_loops([*wrong_among, *right, *wrong])
+    after = estimator.smoothed()
+    assert [pair.current_ns - ROW_NS for pair in taken] == [pair.current_ns for pair in right]
+    assert end_error(after, given.truth) < 0.3 * end_error(before, given.truth)
+    error = given.truth.relative_pose(after[0].imu_ns, after[-1].imu_ns)[1] - after[0].R.T @ (
+        after[-1].position - after[0].position)
+    covariance = after[0].R.T @ after[-1].pose_covariance[:3, :3] @ after[0].R
+    assert error @ np.linalg.solve(covariance, error) < 14.2   # 3 sigma of three
+    assert np.trace(covariance) < 0.2 * np.trace(before[-1].pose_covariance[:3, :3])
+
+
+def test_views_that_come_back_are_proposed():
+    """Out and back along a line without turning; then the same with the camera turned round."""
+    camera = RollingShutterCamera(width=640, height=480, fx=450.0, fy=450.0, cx=320.0, cy=240.0,
+                                  distortion=(), readout_time=0.0)
+    facing = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+    def path_of(turned):
+        return [Odometry(at, at, 'camera', 0, Rotation.from_euler(
+            'z', 180.0 if turned and k > 30 else 0.0, degrees=True).as_matrix() @ facing,
+            np.array([0.0, 4.0 - abs(k - 30) * 0.1, 1.5]), np.eye(6), NAN, NAN, np.eye(6))
+            for k in range(61) for at in [k * SECOND // 2]]
+
+    found = loops.proposed_loops(path_of(False), 5.0, camera)
+    assert len(found) == 30   # one per second
+    seconds = np.array(found) / 2.0
+    assert (seconds[:, 1] - seconds[:, 0] >= 10.0).all()
+    # The same places, k and 60 - k, come first, and no two loops are within a second.
+    assert {i + j for i, j in found[:10]} == {60}
+    apart = np.abs(seconds[:, None] - seconds).max(axis=2) + 9.0 * np.eye(len(found))
+    assert apart.min() >= 1.0
+    assert loops.proposed_loops(path_of(True), 5.0, camera) == []
+    # Another path of the same recording has no common frame with the first one.
+    other = [replace(pose, path=int(k > 30)) for k, pose in enumerate(path_of(False))]
+    assert all((i <= 30) == (j <= 30) for i, j in loops.proposed_loops(other, 5.0, camera))
+
+
+def test_depth_of_the_scene_is_that_of_parallaxes():
+    poses = [Odometry(k, k, 'camera', 0, np.eye(3), np.array([0.1 * k, 0.0, 0.0]), np.eye(6), NAN,
+                      NAN, np.eye(6)) for k in range(4)]
+    views = {k: loops.View(k, parallax) for k, parallax in enumerate((9.0, 9.0, 9.0, 0.1))}
+    assert loops.scene_depth(poses, views, 450.0) == pytest.approx(5.0)
+    assert math.isnan(loops.scene_depth(poses[:1], views, 450.0))
+
+
+def test_odometry_of_a_bag_with_loops(bundled_bag, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(loops, '_APART', 2.0)   # the bag has 6 s
+    assert main(['odometry', str(bundled_bag), '--params', str(BUNDLED_PARAMETERS), '--out',
+                 str(tmp_path), '--loops']) == 0
+    printed = capsys.readouterr().out
+    summary = json.loads((tmp_path / 'summary.json').read_text())
+    found = summary['loops']
+    assert found['offered'] >= found['related'] >= found['taken'] > 0
+    assert f'loops: {found["offered"]} offered, {found["related"]} related' in printed
+    assert 0.0 < found['shift_m'] <= found['largest_shift_m'] < 0.05
+    assert summary['smoothed']['ate_m'] < 0.02
+
+
+def test_metrics_of_a_closed_walk(monkeypatch):
+    monkeypatch.setattr(loops, '_APART', 4.0)
+    config = SimulationConfig(seed=9101, duration=6.0, plan='walk:6', fps=20.0, readout_time=0.02)
+    path = odometry_loops.closed(simulate(config).trajectory, 6.0)
+    (begin, end), (R1, R2) = path.poses([0.0, 6.0])
+    np.testing.assert_allclose(begin, end, atol=1e-9)
+    assert abs((R1.T @ R2)[2, 2] - 1.0) < 0.02   # the same view, but for nodding
+    metrics = odometry_loops.on_walk(config, path)
+    assert metrics.offered >= metrics.related >= metrics.taken > 0
+    assert metrics.worst < 1.0
+    assert metrics.end < metrics.end_without < 0.2
