@@ -176,7 +176,6 @@ def test_an_exposure_is_given_once():
 
 # -- files that are complete, or not there -------------------------------------------------------
 
-
 def test_a_file_has_its_name_once_it_is_complete(tmp_path):
     path = tmp_path / 'table.csv'
     path.write_text('old')
