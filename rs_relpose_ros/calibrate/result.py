@@ -6,7 +6,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -345,6 +344,8 @@ def as_mapping(result: CalibrationResult, camera: RollingShutterCamera) -> dict[
 
 def draw_curve(result: CalibrationResult, path: Path) -> None:
     """Draw the cost over the readout time."""
+    # A node draws nothing, and starts sooner.
+    from matplotlib.figure import Figure
     picture = Figure(figsize=(7.5, 4.5), dpi=110, layout='constrained')
     axes = picture.subplots()
     readout = result.readout_time
