@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_lab.experiments.odometry import walks
+from rs_relpose_lab.experiments.reconstruction import on_walk
 from rs_relpose_ros import RowTrajectory
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.cli.main import main as command_line
@@ -91,6 +93,14 @@ def test_poses_of_rows_are_as_good_as_those_of_keyframes(bundled_bag, trajectory
         position, rotation = compared(stamps + offset)
         assert position < 1.2 * at_keyframes
         assert rotation < 0.03
+
+
+def test_a_benchmark_measures_rows_of_a_walk():
+    found = on_walk(walks(1, 9001, 5.0)[0])
+    assert max(found.first, found.middle, found.last) < 1.2
+    assert found.turned < 0.03
+    # Frames from linear poses, by those from one pose: issue 25 allows 0.3.
+    assert found.rendered < 0.3
 
 
 def test_a_tum_file_at_any_rate(bundled_bag, parameters, trajectory, tmp_path):

@@ -194,6 +194,7 @@ def read_ncore(folder, model, lens):
     """camera.py: poses at both times, t = floor(y) / (H - 1) of the translation to the camera."""
     from ncore.data import v4
     reader = v4.SequenceComponentGroupsReader(list(folder.glob('*.itar')))
+    assert v4.SequenceLoaderV4(reader).camera_ids == ['camera']
     one, = reader.open_component_readers(v4.CameraSensorComponent.Reader).values()
     lenses, poses, clouds = (next(iter(reader.open_component_readers(part.Reader).values()))
                              for part in (v4.IntrinsicsComponent, v4.PosesComponent,

@@ -445,6 +445,20 @@ def _run_odometry(args: argparse.Namespace) -> int:
         folder, [*known, *paths]), args, 'recording')
 
 
+def _reconstruction_arguments(parser: argparse.ArgumentParser) -> None:
+    _number(parser, '--walks', 6, 'walks with standstills and pure rotations')
+    parser.add_argument('--seconds', type=float, default=20.0, help='of each (default: 20)')
+
+
+def _run_reconstruction(args: argparse.Namespace) -> int:
+    from rs_relpose_ros.odometry import need_gtsam
+    need_gtsam()
+    from rs_relpose_lab.experiments import odometry, reconstruction
+
+    return _report_of(odometry.walks(args.walks, args.seed, args.seconds), reconstruction.on_walk,
+                      reconstruction.write_report, args, 'walk')
+
+
 def _all_arguments(parser: argparse.ArgumentParser) -> None:
     _number(parser, '--trials', 200, 'problems a cell of the accuracy benchmark')
     _number(parser, '--soak', 100_000, 'measure the growth of memory over N estimates')
@@ -487,6 +501,10 @@ BENCHMARKS = {
         'walks (tracks without images, readouts of 12 to 35 ms). Needs gtsam',
         _odometry_arguments, _run_odometry, 'odometry', first_seed=7101, seed_of='walk',
         jobs='processes'),
+    'reconstruction': Benchmark(
+        'poses of rows, as exported by `rs_relpose export`, against the truth, and frames '
+        'rendered with them. Needs gtsam', _reconstruction_arguments, _run_reconstruction,
+        'reconstruction', first_seed=9101, seed_of='walk', jobs='processes'),
     'calibration': Benchmark(
         '`rs_relpose calibrate` on simulated tracks of 300 frames, against the truth; the focal '
         'length is unknown in every other round of the 24 axis maps',

@@ -182,6 +182,7 @@ class _Frames:
             self._landmarks = triangulated(self._tracks, self._rows, sensor,
                                            self._options.most_points)
             self._colors = np.full((len(self._landmarks.positions), 3), 128, dtype=np.uint8)
+            self._order = np.argsort(self._landmarks.observations.keyframes_ns, kind='stable')
             self._sensor = sensor
         at_ns = frame.imu.reference_ns
         self._sample_colors(frame)
@@ -213,7 +214,11 @@ class _Frames:
         """Indices of the landmarks' observations in an image."""
         assert self._landmarks is not None
         nearest = _nearest(self._keyframes, at_ns)
-        return np.flatnonzero(self._landmarks.observations.keyframes_ns == nearest)
+        if nearest is None:
+            return np.zeros(0, dtype=np.int64)
+        first, last = np.searchsorted(self._landmarks.observations.keyframes_ns,
+                                      [nearest, nearest + 1], sorter=self._order)
+        return self._order[first:last]
 
     def _sample_colors(self, frame: Frame[Any]) -> None:
         found = self._observations(frame.imu.reference_ns)

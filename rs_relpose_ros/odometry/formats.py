@@ -371,6 +371,8 @@ def _write_ncore(model: Model, folder: Path) -> None:
         v4.IntrinsicsComponent.Writer, 'default').store_camera_intrinsics(CAMERA_ID, parameters)
     writer.register_component_writer(
         v4.MasksComponent.Writer, 'default').store_camera_masks(CAMERA_ID, {})
+    # Its loader requires them, if only empty.
+    writer.register_component_writer(v4.CuboidsComponent.Writer, 'default').store_observations([])
     frames = writer.register_component_writer(v4.CameraSensorComponent.Writer, CAMERA_ID)
     for name, span in zip(model.names, times, strict=True):
         image = folder / IMAGES / name

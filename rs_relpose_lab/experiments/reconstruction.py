@@ -1,0 +1,153 @@
+"""`rs_relpose benchmark reconstruction`: poses of rows of simulated walks, against the truth.
+
+Tracks without images go through front end and graph, as in `rs_relpose_lab.experiments.odometry`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from rs_relpose_lab.experiments.harness import markdown_table, write_table
+from rs_relpose_lab.experiments.trust_runs import run, simulated, Source, TrackNoise, TRACKS
+from rs_relpose_lab.simulation import simulate, Simulation, SimulationConfig
+from rs_relpose_ros.bags.reader import IMU_DELAY
+from rs_relpose_ros.config.settings import Parameters
+from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
+from rs_relpose_ros.odometry.estimator import OdometryEstimator
+from rs_relpose_ros.odometry.offline import aligned, follow, row_trajectory
+from rs_relpose_ros.odometry.pair import KeyframePair
+from rs_relpose_ros.odometry.rows import RowTrajectory
+from rs_relpose_ros.odometry.states import Base
+
+Times = NDArray[np.int64]
+
+# Interval of rotations that are compared [s]; frames that are rendered, their least motion over
+# the rows [px] at a depth of 4 m.
+_WITHIN, _RENDERED, _LEAST_MOTION, _DEPTH = 0.5, 4, 3.0, 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class RowMetrics:
+    """Poses of a walk.
+
+    `keyframes`: root mean square error of the keyframes' positions after rigid alignment [m];
+    `first`, `middle`, `last`: that of the frames' rows by it; `turned`: largest of the three rows'
+    rms errors of rotations within 0.5 s [deg]. `rendered`: mean gray difference of frames rendered
+    with linear poses between first and last row, by that with the middle one, aligned at the
+    middle row; `rendered_on_path`: the same with the alignment of the whole path.
+    """
+
+    name: str
+    readout_ms: float
+    keyframes: float
+    first: float
+    middle: float
+    last: float
+    turned: float
+    rendered: float
+    rendered_on_path: float
+
+
+class _Linear(NamedTuple):
+    """A trajectory between two poses, as the renderer uses it."""
+
+    begin: float
+    end: float
+    R: Array   # (2, 3, 3)
+    positions: Array   # (2, 3)
+
+    def poses(self, times: Array) -> tuple[Array, Array]:
+        """Positions and orientations at times."""
+        share = (np.atleast_1d(times) - self.begin) / (self.end - self.begin)
+        first = Rotation.from_matrix(self.R[0])
+        turn = (first.inv() * Rotation.from_matrix(self.R[1])).as_rotvec()
+        return (self.positions[0] + share[:, None] * (self.positions[1] - self.positions[0]),
+                (first * Rotation.from_rotvec(share[:, None] * turn)).as_matrix())
+
+
+def on_walk(config: SimulationConfig) -> RowMetrics:
+    """Poses of rows of a simulated recording."""
+    simulation = simulate(config)
+    source = Source(f'{config.scene} {config.seed}', TRACKS, 'walk', config.scene, config.seed)
+    recording = simulated(source, simulation, TrackNoise(), np.random.default_rng(config.seed))
+    parameters = Parameters.from_mapping(recording.configured.values)
+    arrives = {arrival.stamp_ns: arrival.arrives_ns for arrival in recording.arrivals}
+    estimator = OdometryEstimator(parameters, keep=True)
+    follow(estimator, [(arrives[pair.stamp_ns], KeyframePair.of_result(pair))
+                       for pair, _ in run(recording, recording.configured)],
+           [(sample.stamp_ns + to_nanoseconds(IMU_DELAY), sample) for sample in recording.samples])
+    paths = estimator.smoothed_paths()
+    if not paths:
+        raise InputError(f'{source.name}: odometry did not start')
+    rows = row_trajectory(paths, estimator.base or Base(), parameters, recording.samples)
+    keyframes = rows.keyframes_ns[:, 1]
+    error, A, t = _position_error(simulation, rows, keyframes)
+    span = round((config.height - 1) / config.height * config.readout_time * NANOSECONDS)
+    firsts = np.array([simulation.reference_ns(k) for k in range(config.frame_count)])
+    firsts = firsts[rows.covers(firsts) & rows.covers(firsts + span)]
+    times = [firsts + part for part in (0, span // 2, span)]
+    first, middle, last = (_position_error(simulation, rows, at)[0] / error for at in times)
+    turned = max(_rotation_error(simulation, rows, at) for at in times)
+    return RowMetrics(source.name, 1e3 * config.readout_time, error, first, middle, last,
+                      turned, *_rendered(simulation, rows, times, A, t))
+
+
+def _position_error(simulation: Simulation, rows: RowTrajectory,
+                    times: Times) -> tuple[float, Array, Array]:
+    """Root mean square [m] after rigid alignment, with its rotation and translation."""
+    _, p = rows.pose(times)
+    true = simulation.states(times).position
+    A, t, _ = aligned(p, true)
+    return float(np.sqrt(((p @ A.T + t - true)**2).sum(axis=1).mean())), A, t
+
+
+def _rotation_error(simulation: Simulation, rows: RowTrajectory, times: Times) -> float:
+    """Root mean square [deg] of rotations over up to half a second."""
+    R, true = rows.pose(times)[0], simulation.states(times).R_world_cam
+    later = np.searchsorted(times, times + round(_WITHIN * NANOSECONDS)) - 1
+    steps = [np.einsum('nji,njk->nik', one, one[later]) for one in (R, true)]
+    angles = Rotation.from_matrix(np.einsum('nji,njk->nik', *steps)).magnitude()
+    return float(np.degrees(np.sqrt((angles**2).mean())))
+
+
+def _rendered(simulation: Simulation, rows: RowTrajectory, times: Sequence[Times], A: Array,
+              t: Array) -> tuple[float, float]:
+    """Ratios of the gray differences, of frames with enough motion."""
+    sums, config = np.zeros((2, 2)), simulation.config
+    stamps = np.column_stack(times)
+    truth = simulation.states(stamps.ravel())
+    R_true = truth.R_world_cam.reshape(*stamps.shape, 3, 3)
+    p_true = truth.position.reshape(*stamps.shape, 3)
+    turns = Rotation.from_matrix(np.einsum(
+        'nji,njk->nik', R_true[:, 0], R_true[:, 2])).magnitude()
+    ways = np.linalg.norm(p_true[:, 2] - p_true[:, 0], axis=1)
+    moving = np.flatnonzero(config.fx * (turns + ways / _DEPTH) > _LEAST_MOTION)
+    for k in np.random.default_rng(config.seed).permutation(moving)[:_RENDERED]:
+        begin, _, end = (simulation.seconds(int(at)) for at in stamps[k])
+        R, p = rows.pose(stamps[k])
+        true = simulation.renderer.render(begin)
+        # At the middle row, and on the whole path.
+        own = R_true[k, 1] @ R[1].T
+        for i, (turn, move) in enumerate(((own, p_true[k, 1] - own @ p[1]), (A, t))):
+            for j, places in enumerate(([0, 2], [1, 1])):
+                fake: Any = _Linear(begin, end, turn @ R[places], p[places] @ turn.T + move)
+                drawn = replace(simulation.renderer, trajectory=fake).render(begin)
+                sums[i, j] += np.abs(drawn - true).mean()
+    return float(sums[0, 0] / sums[0, 1]), float(sums[1, 0] / sums[1, 1])
+
+
+def write_report(folder: Path, walks: Sequence[RowMetrics]) -> str:
+    """Write the metrics (CSV) and the report (Markdown), and return the latter."""
+    return write_table(folder, 'reconstruction', walks, markdown_table(
+        ('walk', 'readout [ms]', 'keyframes [mm]', 'first row by that', 'middle', 'last',
+         'rotation [deg]', 'rendered', 'on the path'),
+        [(one.name, f'{one.readout_ms:.1f}', f'{1e3 * one.keyframes:.1f}', f'{one.first:.2f}',
+          f'{one.middle:.2f}', f'{one.last:.2f}', f'{one.turned:.4f}', f'{one.rendered:.2f}',
+          f'{one.rendered_on_path:.2f}') for one in walks]))
