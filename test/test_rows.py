@@ -64,6 +64,10 @@ def test_times_may_be_scalars_and_arrays(rows):
     np.testing.assert_array_equal(one[0], R[1, 3])
     np.testing.assert_array_equal(one[1], p[1, 3])
     assert rows.covariance(TIMES.reshape(20, 20)).shape == (20, 20, 6, 6)
+    nothing = TIMES[:0]
+    assert [part.shape for part in rows.pose(nothing)] == [(0, 3, 3), (0, 3)]
+    assert rows.velocity(nothing)[0].shape == (0, 3)
+    assert rows.covariance(nothing).shape == (0, 6, 6)
 
 
 def test_velocity_is_the_derivative_of_the_pose(rows):

@@ -170,7 +170,7 @@ class _Frames:
             elif outcome.stamp_ns is not None:
                 self.report.left_out.append((outcome.stamp_ns, unused_reason(outcome)))
         if not self._views or self._sensor is None or self._landmarks is None:
-            reason = next(iter(self.report.reasons()), 'it has no images')
+            reason = next(iter(self.report.reasons()), 'none is a keyframe of the trajectory')
             raise InputError(f'no image of {self._bag.path} can be exported: {reason}. Is the '
                              'trajectory that of this bag?')
         return self._made(self._sensor, self._landmarks)

@@ -179,6 +179,9 @@ class RowTrajectory:
             spans = ', '.join(f'{first} to {last}' for first, last in self.spans)
             raise InputError(f'there is no pose at {int(times[~known].flat[0])} ns: the '
                              f'trajectory extends from {spans} ns on the clock of the IMU')
+        if not times.size:   # SciPy 1.11 has no empty rotations
+            nothing = np.zeros((*times.shape, 3))
+            return mount, times, np.zeros((*times.shape, 3, 3)), nothing, nothing, nothing
         k = np.clip(np.searchsorted(self.stamps_ns, times, side='right') - 1, 0,
                     len(self.stamps_ns) - 2)
         step = np.maximum(self.stamps_ns[k + 1] - self.stamps_ns[k], 1)[..., None] / NANOSECONDS
