@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import gtsam
 from gtsam.symbol_shorthand import B, L, V, X
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from rs_relpose_ros.config.settings import ImuConfig, OdometryConfig
 from rs_relpose_ros.errors import RsRelposeError
@@ -386,7 +386,8 @@ class KeyframeGraph:
 
 def _loop_bound(dimension: int) -> float:
     """Largest normalised residual of a loop."""
-    return math.sqrt(chi2.ppf(_LOOP_QUANTILE, dimension))
+    # The quantile of chi squared; scipy.stats takes a second to import.
+    return math.sqrt(2.0 * gammaincinv(0.5 * dimension, _LOOP_QUANTILE))
 
 
 @contextmanager
