@@ -4,7 +4,7 @@ Each walk has 6 s before and 6 s after its disturbance; states are those that od
 publish, at 30 Hz.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 import math
@@ -304,6 +304,12 @@ def _step(one: Odometry, two: Odometry) -> float:
     return float(np.linalg.norm(moved) / math.sqrt(np.trace(one.pose_covariance[:3, :3])))
 
 
+def _largest(values: Iterable[float]) -> str:
+    """As a text; NaN does not count."""
+    known = [value for value in values if not math.isnan(value)]
+    return f'{max(known):.2f}' if known else '-'
+
+
 def write_report(folder: Path, runs: Sequence[DisturbedRun]) -> str:
     """Write the runs (CSV) and a table of the disturbances (Markdown), and return the latter."""
     rows = []
@@ -313,7 +319,7 @@ def write_report(folder: Path, runs: Sequence[DisturbedRun]) -> str:
             name, str(len(of_one)), *(
                 f'{100.0 * sum(getattr(one, f"beyond_{key}") for one in of_one) / states:.1f}'
                 for key in ('position', 'rotation', 'velocity')),
-            *(f'{max(getattr(one, key) for one in of_one):.2f}' for key in (
+            *(_largest(getattr(one, key) for one in of_one) for key in (
                 'velocity_ratio', 'tilt_ratio', 'uncertain_after')),
             str(sum(one.lost for one in of_one)),
             f'{max(one.largest_step for one in of_one):.2f}'))
