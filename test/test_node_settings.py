@@ -150,7 +150,7 @@ QUATERNION = {'quat_cam_imu_xyzw': '[0.0, 0.0, 0.0, 1.0]'}
 CANNOT_ESTIMATE = {
     'no_readout': ({**QUATERNION, **NEVER, 'readout_tme': 0.03}, {},
                    'not estimating: readout_time must be given', 'readout_time'),
-    'no_rotation': ({'readout_time': 0.03, **NEVER}, {},
+    'no_rotation': ({'readout_time': 0.03, **NEVER, 'use_tf': False}, {},
                     'not estimating: quat_cam_imu_xyzw must be given',
                     'quat_cam_imu_xyzw'),
     'rectified': ({'readout_time': 0, **QUATERNION}, {'image': '/camera/image_rect'},

@@ -29,7 +29,7 @@ from rs_relpose_lab.experiments.problems import (
     LINE_DELAY,
     TwoViewProblem,
 )
-from rs_relpose_ros.geometry import Array
+from rs_relpose_lab.simulation.rows import Array
 
 Values = NDArray[Any]  # real, or complex under a complex step
 

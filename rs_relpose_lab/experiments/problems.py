@@ -20,8 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_lab.simulation.rows import in_both_views, in_front, measured, uniform_motion, View
-from rs_relpose_ros.geometry import Array
+from rs_relpose_lab.simulation.rows import (
+    Array,
+    in_both_views,
+    in_front,
+    measured,
+    uniform_motion,
+    View,
+)
 
 Noise = Literal['paper', 'gaussian']
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.geometry import Array
+Array = NDArray[np.float64]
 
 # Points (N, 3) of the world [m] and times (N,) [s] -> points (N, 3) in the camera frame at each
 # one's time. Time 0 is that of the reference row.
