@@ -17,6 +17,7 @@ from rs_relpose_ros.estimator.covariance import ImageInformation
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.so3 import exp_so3, tangent_basis
 from rs_relpose_ros.odometry import loops
+from rs_relpose_ros.odometry.rows import ROWS_FILE, RowTrajectory
 from rs_relpose_ros.odometry.states import Odometry
 
 ROW_NS = round(ROW * SECOND)
@@ -115,6 +116,11 @@ def test_odometry_of_a_bag_with_loops(bundled_bag, tmp_path, monkeypatch, capsys
     assert f'loops: {found["offered"]} offered, {found["related"]} related' in printed
     assert 0.0 < found['shift_m'] <= found['largest_shift_m'] < 0.05
     assert summary['smoothed']['ate_m'] < 0.02
+    # Export draws them.
+    rows = RowTrajectory.load(tmp_path / ROWS_FILE)
+    assert len(rows.loops_ns) == found['taken']
+    assert np.isin(rows.loops_ns, rows.keyframes_ns[:, 1]).all()
+    assert (np.diff(rows.loops_ns) > 1.9e9).all()
 
 
 def test_metrics_of_a_closed_walk(monkeypatch):

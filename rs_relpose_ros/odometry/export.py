@@ -27,7 +27,7 @@ from rs_relpose_ros.odometry.formats import Format, FORMATS, IMAGES, Model
 from rs_relpose_ros.odometry.landmarks import Landmarks, Tracks, TRACKS_FILE, triangulated
 from rs_relpose_ros.odometry.rows import ROWS_FILE, RowTrajectory
 from rs_relpose_ros.offline.replay import MessageRefused, outcomes, unused_reason
-from rs_relpose_ros.output_files import BLUE, ORANGE, save_picture
+from rs_relpose_ros.output_files import BLUE, GREEN, ORANGE, save_picture
 from rs_relpose_ros.pipeline.global_shutter import GlobalShutterFrame, Unroller
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrameLoop
@@ -349,7 +349,7 @@ def _measure(report: ExportReport, model: Model, exported: Model, rows: RowTraje
 
 
 def _draw(model: Model, rows: RowTrajectory, path: Path) -> None:
-    """Path from above with the images' cameras and the points."""
+    """Path with its loops from above, the images' cameras and the points."""
     picture = Figure(figsize=(8.0, 8.0), dpi=110, layout='constrained')
     axes = picture.subplots()
     axes.scatter(model.points[:, 0], model.points[:, 1], s=1.0, color='0.6', label='points')
@@ -357,6 +357,10 @@ def _draw(model: Model, rows: RowTrajectory, path: Path) -> None:
         _, p = rows.pose(first + np.linspace(0, last - first, 2000).astype(np.int64))
         axes.plot(p[:, 0], p[:, 1], color=BLUE, lw=1.2,
                   label='path' if first == rows.spans[0, 0] else None)
+    if len(rows.loops_ns):
+        _, ends = rows.pose(rows.loops_ns)
+        axes.plot(*ends[..., :2].transpose(2, 1, 0), color=GREEN, lw=0.8)
+        axes.plot([], color=GREEN, lw=0.8, label=f'{len(ends)} loops')
     middle = model.positions[:, formats.MIDDLE]
     forward = model.R[:, formats.MIDDLE, :, 2]
     axes.quiver(middle[:, 0], middle[:, 1], forward[:, 0], forward[:, 1], color=ORANGE,

@@ -73,11 +73,11 @@ def odometry_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Para
 
     samples = _samples(bag, topics)
     live = follow(estimator, pairs(), samples)
-    paths, closed = estimator.smoothed_paths(), None
+    paths, closed, taken = estimator.smoothed_paths(), None, list[KeyframePair]()
     if loops and paths:
         assert replay.intake.intrinsics is not None
         sensor = sensor_model(replay.intake.intrinsics, parameters.sensor)
-        paths, closed, _ = close_loops(estimator, paths, views, sensor, lambda stamps: [
+        paths, closed, taken = close_loops(estimator, paths, views, sensor, lambda stamps: [
             pair for pair in related(bag, topics, parameters, stamps)[0]
             if isinstance(pair, PairResult)])
     smoothed = [keyframe for path in paths for _, keyframe in path]
@@ -94,7 +94,7 @@ def odometry_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Para
     write_tum(folder / SMOOTHED_FILE, smoothed)
     if paths:
         rows = row_trajectory(paths, base, parameters, [
-            sample for _, sample in samples if isinstance(sample, ImuSample)])
+            sample for _, sample in samples if isinstance(sample, ImuSample)], taken)
         rows.save(folder / ROWS_FILE)
         Tracks.merged(observed).save(folder / TRACKS_FILE)
         if rate:
@@ -121,8 +121,12 @@ def _metrics(estimator: OdometryEstimator, live: Sequence[Odometry]) -> dict[str
 
 
 def row_trajectory(paths: Sequence[Sequence[tuple[KeyframeState, Odometry]]], base: Base,
-                   parameters: Parameters, samples: Iterable[ImuSample]) -> RowTrajectory:
-    """Poses at any time, of `OdometryEstimator.smoothed_paths` and the samples of the IMU."""
+                   parameters: Parameters, samples: Iterable[ImuSample],
+                   loops: Iterable[KeyframePair] = ()) -> RowTrajectory:
+    """Poses at any time, of `OdometryEstimator.smoothed_paths` and the samples of the IMU.
+
+    `loops`: those that the paths have, of `close_loops`.
+    """
     buffer = ImuSamples(parameters.imu.max_imu_gap)
     for sample in samples:
         with suppress(InputError):   # not finite: the replay counts and reports it
@@ -136,7 +140,8 @@ def row_trajectory(paths: Sequence[Sequence[tuple[KeyframeState, Odometry]]], ba
         Knot(keyframe.stamp_ns, keyframe.imu_ns, state.R,
              base.camera(keyframe).position - state.R @ arm, state.velocity, state.gyro_bias,
              state.accel_bias, keyframe.pose_covariance)
-        for state, keyframe in path] for path in paths], buffer, mounts)
+        for state, keyframe in path] for path in paths], buffer, mounts, [
+            (loop.reference_ns, loop.current_ns) for loop in loops])
 
 
 def follow(estimator: OdometryEstimator, pairs: Iterable[tuple[int, KeyframePair]],

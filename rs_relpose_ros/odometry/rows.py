@@ -74,6 +74,8 @@ class RowTrajectory:
         Of the base's position [m] and rotation [rad] at the keyframes, in the world's axes.
     mounts : (3, 3, 4) ndarray
         R and p of camera, IMU and base on the IMU: ``X_imu = R X_frame + p``.
+    loops_ns : (L, 2) ndarray of int64
+        Times of the two keyframes that each loop closure relates.
     """
 
     spans: Stamps
@@ -85,10 +87,11 @@ class RowTrajectory:
     keyframes_ns: Stamps
     covariances: Array
     mounts: Array
+    loops_ns: Stamps
 
     @classmethod
-    def of_paths(cls, paths: Iterable[Sequence[Knot]], samples: ImuSamples,
-                 mounts: Array) -> RowTrajectory:
+    def of_paths(cls, paths: Iterable[Sequence[Knot]], samples: ImuSamples, mounts: Array,
+                 loops_ns: Sequence[tuple[int, int]] = ()) -> RowTrajectory:
         """From the keyframes of consecutive paths and the samples of the IMU.
 
         Raises
@@ -119,7 +122,8 @@ class RowTrajectory:
             np.concatenate(column) for column in zip(*parts, strict=True))
         return cls(np.array(spans), stamps, quats, positions, velocities, rates,
                    np.array([(knot.camera_ns, knot.imu_ns) for knot in knots]),
-                   np.array([knot.covariance for knot in knots]), mounts)
+                   np.array([knot.covariance for knot in knots]), mounts,
+                   np.array(loops_ns, dtype=np.int64).reshape(-1, 2))
 
     # -- queries ---------------------------------------------------------------------------------
 
