@@ -348,7 +348,7 @@ def test_the_walk_of_one_image_is_short(recorded, parameters):
     assert walk['pipeline/sequencer.py', 'Sequencer.take']
     assert walk['messages/outgoing.py', 'pair_messages']
     assert sum(walk.values()) <= 12
-    assert len(walk) <= 23
+    assert len(walk) <= 20
 
 
 # -- derotated rays and their parallax ------------------------------------------------------------

@@ -28,7 +28,7 @@ BUDGETS = {
     'rs_relpose_ros/nodes': (2300, 9),
     'rs_relpose_ros/odometry': (3100, 11),
     'rs_relpose_ros/offline': (2910, 12),
-    'rs_relpose_ros/pipeline': (3520, 13),
+    'rs_relpose_ros/pipeline': (3530, 13),
     'rs_relpose_ros/solvers': (1720, 6),
     'rs_relpose_ros/tracking': (1230, 5),
     'rs_relpose_lab': (10130, 46),

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.covariance import ImageInformation
+from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.timing import NANOSECONDS
@@ -181,7 +182,9 @@ def pair_messages(result: PairResult, types: MessageTypes,
     """
     pose, stamp_ns = result.pose, result.stamp_ns
     reference_frame = reference_frame or f'{result.frame_id}_reference'
-    messages = _pose_messages(result, reference_frame, types) if pose else {}
+    messages = {} if not pose else _pose_messages(
+        pose, header(stamp_ns, reference_frame, types), header(stamp_ns, result.frame_id, types),
+        result.reference_stamp_ns, inlier_records(result), types)
     if pose.rotation_known:
         # Errors of the rotation are about the axes of the reference camera, as in
         # ``~/relative_pose``; the angular velocity is in the current camera's, as in
@@ -203,12 +206,9 @@ def pair_messages(result: PairResult, types: MessageTypes,
     return messages
 
 
-def _pose_messages(result: PairResult, reference_frame: str,
-                   types: MessageTypes) -> dict[str, Any]:
-    """Messages of `POSE_TOPICS`."""
-    pose = result.pose
-    in_reference = header(result.stamp_ns, reference_frame, types)
-    in_camera = header(result.stamp_ns, result.frame_id, types)
+def _pose_messages(pose: RelativePose, in_reference: Any, in_camera: Any, reference_ns: int,
+                   inliers: NDArray[np.void], types: MessageTypes) -> dict[str, Any]:
+    """Messages of `POSE_TOPICS`; `in_reference`, `in_camera`: headers."""
     return {
         # The covariance needs no conversion: (dt, dtheta) with R_true = Exp(dtheta) R in camera 1
         # is ROS's order x, y, z and rotations about the fixed axes of the header's frame.
@@ -217,13 +217,13 @@ def _pose_messages(result: PairResult, reference_frame: str,
                 pose=_pose(pose.R, pose.t, types),
                 covariance=published_covariance(pose.covariance))),
         'reference': types('sensor_msgs/msg/TimeReference')(
-            header=in_camera, time_ref=_time(result.reference_stamp_ns, types),
+            header=in_camera, time_ref=_time(reference_ns, types),
             source='reference_keyframe'),
         # Of the current camera: angular in rad/s, linear in baselines per second.
         'velocity': types('geometry_msgs/msg/TwistWithCovarianceStamped')(
             header=in_camera, twist=twist_message(pose.linear_velocity2, pose.angular_velocity2,
                                                   pose.velocity_covariance, types)),
-        'matches': _matches_message(inlier_records(result), in_reference, types)}
+        'matches': _matches_message(inliers, in_reference, types)}
 
 
 def _matches_message(points: NDArray[np.void], in_reference: Any, types: MessageTypes) -> Any:

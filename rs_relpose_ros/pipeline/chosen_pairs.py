@@ -102,7 +102,8 @@ def estimate_wide_pair(first: Frame[Any], second: Frame[Any], parameters: Parame
     if gyro is not None:
         history.add(second.imu, gyro, matches)
     pose = pair.estimate_pair(
-        first, second, matches, sensor, gyro, inertial, parameters,
+        first.imu, second.imu, (first.stamp_ns, second.stamp_ns), matches, sensor, gyro, inertial,
+        parameters,
         interval=interval if near else None,
         between=() if gyro is None else history.between(matches, sensor, second.imu, inertial))
     rays1, rays2 = (

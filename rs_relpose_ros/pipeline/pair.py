@@ -289,18 +289,19 @@ def inertial_of(first: FrameImu, second: FrameImu, gyro: GyroRotation | None, si
                                        parameters.imu)
 
 
-def estimate_pair(first: Frame[Any], second: Frame[Any], matches: Matches, sensor: Sensor,
-                  gyro: GyroRotation | None, inertial: InertialMotion | str,
+def estimate_pair(first: FrameImu, second: FrameImu, stamps_ns: tuple[int, int], matches: Matches,
+                  sensor: Sensor, gyro: GyroRotation | None, inertial: InertialMotion | str,
                   parameters: Parameters, *, interval: float | None, stamp_sigma: float = 0.0,
                   between: Sequence[IntermediateFrame] = ()) -> RelativePose:
     """The relative pose of two frames from all that is known of them.
 
+    `stamps_ns`: of both; they and the parameter `seed` are that of the samples.
     `interval` [s]: None if it does not constrain the velocities.
     `stamp_sigma` [s]: scatter of the stamps, used if it is larger than the parameter.
     `between`: the frames between the two.
     """
     configured = gyro if parameters.pair.use_gyro_rotation else None
-    motion1, motion2, gravity_sigma = _with_gravity(first.imu, second.imu, parameters)
+    motion1, motion2, gravity_sigma = _with_gravity(first, second, parameters)
     pose = estimate_relative_pose(
         sensor.intrinsics.to_sensor(matches.points1), sensor.intrinsics.to_sensor(matches.points2),
         sensor.camera, motion1, motion2,
@@ -312,11 +313,9 @@ def estimate_pair(first: Frame[Any], second: Frame[Any], matches: Matches, senso
         quality=matches.quality,
         inertial=None if isinstance(inertial, str) else inertial,
         between=() if configured is None or interval is None else between,
-        rng=np.random.default_rng([parameters.pair.seed, first.stamp_ns, second.stamp_ns]))
+        rng=np.random.default_rng([parameters.pair.seed, *stamps_ns]))
     if isinstance(inertial, str):
         pose = pose.without_baseline(f'baseline not known: {inertial}')
-    if pose.status in _LACK_OF_MATCHES and is_dark(second.image):
-        pose = replace(pose, reason=f'the image is dark: {pose.reason}')
     return pose
 
 
@@ -346,6 +345,8 @@ def pair_result(first: Frame[Any], second: Frame[Any], matches: Matches, rays1: 
                 sensor: Sensor, parameters: Parameters) -> PairResult:
     """The pair with its pose and the values derived from it."""
     later_ns, points = to_nanoseconds(sensor.pose_row_delay), None
+    if pose.status in _LACK_OF_MATCHES and is_dark(second.image):
+        pose = replace(pose, reason=f'the image is dark: {pose.reason}')
     if pose:
         points = landmarks(pose, rays1.rays, rays2.rays, rays1.row_times, rays2.row_times,
                            sensor.camera)

@@ -231,7 +231,8 @@ class Pipeline(Processor[PairResult]):
               parameters: Parameters) -> PairResult:
         """The pair, suppressed by the state before it; updates the tracked corrections."""
         matches, monitor = self._tracker.refined_matches(), self._monitor
-        pose = self._estimated(reference, frame, matches, gyro, sensor, parameters)
+        pose = self._estimated(reference.imu, frame.imu, (reference.stamp_ns, frame.stamp_ns),
+                               matches, gyro, sensor, parameters)
         measurement, segment, to_sensor = None, gyro.segment, sensor.intrinsics.to_sensor
         if np.isfinite(pose.R).all():
             measurement = PairData(
@@ -264,29 +265,30 @@ class Pipeline(Processor[PairResult]):
             image1=reference.image if self._keep_images else None,
             image2=frame.image if self._keep_images else None)
 
-    def _estimated(self, reference: Frame[Any], frame: Frame[Any], matches: Matches,
-                   gyro: GyroRotation, sensor: Sensor, parameters: Parameters) -> RelativePose:
+    def _estimated(self, first: FrameImu, second: FrameImu, stamps_ns: tuple[int, int],
+                   matches: Matches, gyro: GyroRotation, sensor: Sensor,
+                   parameters: Parameters) -> RelativePose:
         """The pose, without the accelerometer if the images contradict it."""
         since, history, sigma = self._since, self._history, stamp_sigma(self._stamps_ns)
         assert since is not None
 
         def estimate(inertial: InertialMotion | str) -> RelativePose:
             return pair.estimate_pair(
-                reference, frame, matches, sensor, gyro, inertial, parameters,
-                interval=pair.interval_of(reference.imu, frame.imu), stamp_sigma=sigma,
+                first, second, stamps_ns, matches, sensor, gyro, inertial, parameters,
+                interval=pair.interval_of(first, second), stamp_sigma=sigma,
                 between=history.between(matches, sensor, since, inertial))
 
-        inertial = pair.inertial_of(reference.imu, frame.imu, gyro, since, parameters)
+        inertial = pair.inertial_of(first, second, gyro, since, parameters)
         acceleration = self._monitor.acceleration
-        acceleration.report(frame.stamp_ns, inertial)
+        acceleration.report(stamps_ns[1], inertial)
         if isinstance(inertial, str):
             return estimate(inertial)
         used = acceleration.uses(None)
         pose = estimate(inertial if used else _CONTRADICTED)
         evidence = pose.inertial_evidence if used else pair.evidence_without(
-            pose, reference.imu, frame.imu, sensor, gyro, inertial, parameters)
+            pose, first, second, sensor, gyro, inertial, parameters)
         if evidence is not None:
-            self._monitor.add_acceleration(frame.stamp_ns, evidence)
+            self._monitor.add_acceleration(stamps_ns[1], evidence)
             if used and not acceleration.uses(evidence):
                 pose = estimate(_CONTRADICTED)
         return pose
