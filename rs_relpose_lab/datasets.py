@@ -17,26 +17,35 @@ REALSENSE_TITLE = (
     'realsense_rgb_rs_c (`rs_relpose convert realsense_rgb_rs`): one rolling-shutter colour '
     'camera of a RealSense, 1280x720.')
 _REALSENSE_READOUT = 0.0315
+_ASSUMED = 'ASSUMED: about that of these adjustments.'
+_OF_TARGET = 'ASSUMED: that of a target calibration.'
 REALSENSE_PARAMETERS = (
     convert.COMPRESSED,
     SourcedValue(
         'readout_time', _REALSENSE_READOUT,
         'Not documented by the maker. Estimated from the images and the gyro, averaged over the '
         'exposure, in adjustments of 11 to 15 frames: 31.2 to 31.7 ms in every recording.'),
+    SourcedValue('readout_time_sigma', 0.0003, 'Of these adjustments.'),
     _READOUT_DOWN,
     SourcedValue('stamp_row', 'first', 'Convention of readout_time and time_offset here.'),
     SourcedValue(
         'time_offset', -0.0653,
         'Estimated with readout_time, for frames of 50 ms. Negative: the rows were exposed before '
         'the stamp.'),
+    SourcedValue('time_offset_sigma', 0.0005, _ASSUMED),
     SourcedValue('time_offset_per_interval', -0.54,
                  'Auto exposure moves it: -56.3 ms for frames of 33.4 ms.'),
+    SourcedValue('time_offset_per_interval_sigma', 0.05, _ASSUMED),
     SourcedValue('time_offset_reference_interval', 0.05, 'Of time_offset.'),
     SourcedValue('exposure_margin', 0.008,
                  'In little light it exposes nearly as long as its frame interval.'),
     SourcedValue('quat_cam_imu_xyzw', (-0.0018, -0.0021, 0.0016, 1.0),
                  'By the same adjustment: the camchain.yaml of the dataset is 1.2 deg off about x '
                  'and 0.7 deg about z.'),
+    SourcedValue('axes_sigma', 0.004, _ASSUMED),
+    SourcedValue('focal_length_sigma', 0.003, _OF_TARGET),
+    SourcedValue('distortion_sigma', 0.01, _OF_TARGET),
+    SourcedValue('principal_point_sigma', 3.0, _OF_TARGET),
     SourcedValue('imu_position', (0.0121, -0.0023, -0.0023),
                  'Translation of T_cam_imu in that camchain.yaml (p_cam = T p_imu).'),
     SourcedValue('gyro_bias', (-0.0015, 0.0002, 0.0019), 'Mean of the gyro at rest, about.'),

@@ -273,9 +273,9 @@ def test_intrinsics_by_parameters_are_as_good(replayed, bundled_bag, tmp_path, c
 
 
 def test_a_wrong_parameter_is_reported_and_is_exit_code_1(bundled_bag, tmp_path, capsys):
-    """The first second with a time offset that is 15 ms off, to earlier rows: no row's."""
+    """The first 1.2 s with a time offset that is 15 ms off, to earlier rows: no row's."""
     stamps, out = tmp_path / 'stamps.txt', tmp_path / 'out'
-    stamps.write_text('\n'.join(map(str, image_stamps(bundled_bag)[:33])))
+    stamps.write_text('\n'.join(map(str, image_stamps(bundled_bag)[:37])))
     code, shown, _ = replay(capsys, bundled_bag, *PARAMETERS, '--stamps', stamps,
                             '--set', 'time_offset=-0.015', '--out', out)
     assert code == 1

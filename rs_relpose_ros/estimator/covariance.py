@@ -87,7 +87,7 @@ def score_of_matches(matches: FitMatches, state: TwoViewState, data_hessian: Arr
     it, ``(I - H_g H^-1)^-1 s_g``, is too large. For independent residuals the mean of the two is
     right to first order in H_g (as CR2: Bell and McCaffrey, Survey Methodology 28, 2002).
     """
-    regions = _regions(matches)
+    regions = image_regions(matches)
     weight = 1.0 / (matches.sigma * matches.sigma)
     n = len(hessian)
     total, rest, factor = np.zeros((n, n)), np.empty((n, n)), np.zeros((n, n))
@@ -120,7 +120,7 @@ def score_of_matches(matches: FitMatches, state: TwoViewState, data_hessian: Arr
 
 
 @kernel
-def _regions(matches: FitMatches) -> NDArray[np.int64]:
+def image_regions(matches: FitMatches) -> NDArray[np.int64]:
     """Region number of each match (N,), by its first ray; -1 for those that are not used."""
     n = len(matches.weights)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)

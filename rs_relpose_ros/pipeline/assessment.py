@@ -15,15 +15,25 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.config.settings import SensorConfig
+from rs_relpose_ros.config.settings import Parameters, SensorConfig
 from rs_relpose_ros.estimator.priors import inverse, log_determinant
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import REFERENCE_ROWS, RollingShutterCamera
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
 from rs_relpose_ros.geometry.timing import clocks_apart
 from rs_relpose_ros.pipeline import findings
-from rs_relpose_ros.pipeline.findings import BIAS, Finding, FindingState, OFFSET, Quantity
-from rs_relpose_ros.pipeline.recursion import Calibration, PRIOR_INFORMATION, PRIOR_SIGMA
+from rs_relpose_ros.pipeline.findings import (
+    AXES,
+    BIAS,
+    DISTORTION,
+    Finding,
+    FindingState,
+    FOCAL,
+    OFFSET,
+    Quantity,
+    READOUT,
+)
+from rs_relpose_ros.pipeline.recursion import Calibration, PRIOR_SIGMA
 from rs_relpose_ros.pipeline.rotations import RotationComparison
 
 # Sigmas beyond which a deviation is certain.
@@ -65,13 +75,27 @@ class Configured:
     sensor: SensorConfig
     camera: RollingShutterCamera
     gyro_bias: Array   # (3,) parameter [rad/s]
-    gyro_bias_sigma: float
+    sigmas: Array   # (11,) configured, of the deviations; 0 if not known
     active: Array   # (11,) deviations applied already: tracked parameters, bias at rest
 
     @property
     def direction(self) -> float:
         """1 if row 0 is configured to be read first, -1 if it is the last."""
         return 1.0 if self.sensor.readout_direction == 'down' else -1.0
+
+
+def configured_sigmas(parameters: Parameters, from_reference: float) -> Array:
+    """1 sigma (11,) of the deviations by the parameters, 0 where they are not known.
+
+    `from_reference` [s]: interval between frames less that to which the time offset refers.
+    """
+    sensor, lens, sigmas = parameters.sensor, parameters.intrinsics, np.zeros(findings.DEVIATIONS)
+    sigmas[AXES], sigmas[BIAS] = sensor.axes_sigma, parameters.imu.gyro_bias_sigma
+    sigmas[OFFSET] = math.hypot(sensor.time_offset_sigma, (
+        from_reference * sensor.time_offset_per_interval_sigma))
+    sigmas[READOUT] = sensor.readout_time_sigma
+    sigmas[FOCAL], sigmas[DISTORTION] = lens.focal_length_sigma, lens.distortion_sigma
+    return sigmas
 
 
 class Effect(NamedTuple):
@@ -82,8 +106,8 @@ class Effect(NamedTuple):
     claimed_shift: Array
 
 
-# Deviations of each quantity, and the log-determinant of their prior.
-_PRIORS = tuple((quantity.part, -2.0 * float(np.log(PRIOR_SIGMA[quantity.part]).sum()))
+# Each quantity, and the log-determinant of the information of its prior.
+_PRIORS = tuple((quantity, -2.0 * float(np.log(PRIOR_SIGMA[quantity.part]).sum()))
                 for quantity in findings.QUANTITIES)
 
 
@@ -101,107 +125,143 @@ class Inconsistency(NamedTuple):
     alternative: Inconsistency | None = None   # hypothesis that fits the pairs as well
 
     def matters(self, configured: Configured) -> bool:
-        """Whether it moves the pose by its sigma, and exceeds the configured sigma."""
-        beyond = np.abs(self.deviation[BIAS]) > _AS_CONFIGURED * configured.gyro_bias_sigma
-        return self.shift > _MATTERS and (self.quantity.part != BIAS or bool(beyond.any()))
+        """Whether it moves the pose by its sigma, and exceeds its configured sigma."""
+        beyond = np.abs(self.deviation) > _AS_CONFIGURED * configured.sigmas
+        return self.shift > _MATTERS and bool(beyond[self.quantity.part].any())
 
 
 def find_inconsistencies(estimated: Calibration, effects: Sequence[Effect],
-                         active: Array) -> list[Inconsistency]:
+                         configured: Configured) -> list[Inconsistency]:
     """The fewest deviations that fit the pairs, by forward selection; the strongest first.
 
     A fit of all quantities would distribute a deviation of one among all that few pairs cannot
-    distinguish. A quantity alone gains ``b_k^T S_kk^-1 b_k`` in chi-square; the one of the largest
-    gain is selected, and the others are evaluated on the remainder. If none is certain, one that
-    is certain jointly with all others is selected. An alternative hypothesis is kept if it fits as
-    well as the only quantity.
+    distinguish. The quantity that gains most in chi-square is selected, and the others are
+    evaluated together with it. An alternative hypothesis is kept if it fits as well as the only
+    quantity.
     """
-    if not estimated.pairs:
-        return []
-    jointly = np.abs(estimated.c - active) / estimated.sigma
     found: list[tuple[Quantity, float]] = []
     alternative: tuple[Quantity, float] | None = None
-    together = sigma = np.zeros(findings.DEVIATIONS)
     selected = np.zeros(findings.DEVIATIONS, dtype=bool)
+    together = _solved(selected, estimated, configured)
     while len(found) < _MOST_QUANTITIES:
-        left = estimated.b - estimated.S @ (active + together)
-        alone = sorted(((quantity, _certainty_alone(quantity, estimated, left, selected))
-                        for quantity in findings.QUANTITIES if not selected[quantity.part].any()),
-                       key=lambda item: -item[1])
-        quantity, certainty = alone[0]
-        if certainty < _CERTAIN:
-            quantity, certainty = max(
-                ((quantity, float(jointly[quantity.part].max())) for quantity, _ in alone),
-                key=lambda item: item[1])
-        elif not found and certainty**2 - alone[1][1]**2 < _AS_GOOD:
-            alternative = alone[1]
-        if certainty < _CERTAIN:
+        (quantity, solution), (second, other) = sorted(
+            ((quantity, _solved(selected | _parts_of(quantity), estimated, configured))
+             for quantity in findings.QUANTITIES if not selected[quantity.part].any()),
+            key=lambda item: -item[1].gain(item[0].part))[:2]
+        if (certainty := solution.certainty(quantity.part)) < _CERTAIN:
             break
+        if not found and solution.gain(quantity.part) - other.gain(second.part) < _AS_GOOD:
+            alternative = second, other.certainty(second.part)
         found.append((quantity, certainty))
-        selected[quantity.part] = True
-        together, sigma = _solved(estimated, selected, active)
-    inconsistent = [_inconsistency(quantity, together, sigma, certainty, effects)
+        selected, together = selected | _parts_of(quantity), solution
+    inconsistent = [_inconsistency(quantity, together, certainty, effects)
                     for quantity, certainty in found]
     if alternative is not None and len(found) == 1:
-        instead = np.zeros(findings.DEVIATIONS, dtype=bool)
-        instead[alternative[0].part] = True
         inconsistent[0] = inconsistent[0]._replace(alternative=_inconsistency(
-            alternative[0], *_solved(estimated, instead, active), alternative[1], effects))
+            alternative[0], _solved(_parts_of(alternative[0]), estimated, configured),
+            alternative[1], effects))
     return inconsistent
 
 
-def undetermined(estimated: Calibration, active: Array) -> Array:
-    """Second moment (11, 11) of undetected deviations, by the odds that there is one.
+def undetermined(estimated: Calibration, configured: Configured) -> Array:
+    """Second moment (11, 11) of undetected deviations.
 
-    Before the first pair these are even, and each quantity as likely. Consistent pairs lower the
-    odds of a quantity as they lower its sigma against its prior P; others raise them (Bayes
-    factor; Kass and Raftery, JASA 1995)::
+    Those within configured sigmas exist for certain (the gyro bias is in the covariance of a pair
+    already). Whether another quantity is off is not known: before the first pair the odds are
+    even, and each quantity as likely. Consistent pairs lower the odds of a quantity as they lower
+    its sigma against its prior P; others raise them (Bayes factor; Kass and Raftery, JASA 1995)::
 
         odds_k = (|Sigma_k| / |P_k|)^1/2 exp(b_k^T Sigma_k b_k / 2),  Sigma_k = (S_kk + P_k^-1)^-1
     """
-    odds = 0.0
-    posterior = estimated.S / estimated.scatter + PRIOR_INFORMATION
-    left = (estimated.b - estimated.S @ active) / estimated.scatter
-    for part, of_prior in _PRIORS:
-        information = np.ascontiguousarray(posterior[part, part])
-        gain = min(float(left[part] @ inverse(information) @ left[part]), _LARGEST_GAIN)
-        odds += math.exp(0.5 * (of_prior - log_determinant(information) + gain)) / len(_PRIORS)
-    off = estimated.c - active
-    return (estimated.undetermined + off[:, None] * off) * odds / (1.0 + odds)
+    odds, known = 0.0, configured.sigmas > 0.0
+    known[BIAS] = False
+    estimated = replace(estimated, shared=1.0)
+    for quantity, of_prior in _PRIORS:
+        part = quantity.part
+        if not known[part].any():
+            solution = _solved(_parts_of(quantity), estimated, configured)
+            covariance = np.ascontiguousarray(solution.covariance[part, part])
+            gain = min(float(solution.off[part] @ inverse(covariance) @ solution.off[part]),
+                       _LARGEST_GAIN)
+            odds += math.exp(0.5 * (log_determinant(covariance) + of_prior + gain)) / len(_PRIORS)
+    share = odds / (1.0 + odds)
+    within = _solved(np.zeros_like(known), estimated, configured).moment
+    within[BIAS] = within[:, BIAS] = 0.0
+    return share * _solved(~known, estimated, configured).moment + (1.0 - share) * within
 
 
-def _solved(estimated: Calibration, selected: NDArray[np.bool_],
-            active: Array) -> tuple[Array, Array]:
-    """Deviations (11,) from the active values if only those `selected` differ; 1 sigma each."""
-    together, sigma = np.zeros(findings.DEVIATIONS), np.zeros(findings.DEVIATIONS)
-    covariance = inverse(estimated.S[np.ix_(selected, selected)])
-    together[selected] = covariance @ (estimated.b - estimated.S @ active)[selected]
-    sigma[selected] = np.sqrt(estimated.misfit * np.diag(covariance))
-    return together, sigma
+def _parts_of(quantity: Quantity) -> NDArray[np.bool_]:
+    """Which deviations (11,) are those of a quantity."""
+    parts = np.zeros(findings.DEVIATIONS, dtype=bool)
+    parts[quantity.part] = True
+    return parts
 
 
-def _certainty_alone(quantity: Quantity, estimated: Calibration, left: Array,
-                     selected: NDArray[np.bool_]) -> float:
-    """Deviation in sigmas if only this quantity and those `selected` are free."""
-    part = quantity.part
-    S = estimated.S[part, part] + PRIOR_INFORMATION[part, part]
-    if selected.any():
-        cross = estimated.S[part][:, selected]
-        S = S - cross @ inverse(estimated.S[np.ix_(selected, selected)]) @ cross.T
-    of_part = left[part] / S[0] if len(S) == 1 else np.linalg.solve(S, left[part])
-    gain = float(left[part] @ of_part) / estimated.misfit
-    # A vector gains more by chance.
-    return math.sqrt(max(gain - 2.0 * (part.stop - part.start - 1), 0.0))
+class _Solution(NamedTuple):
+    """Deviations that fit the pairs, if some are free."""
+
+    off: Array   # (11,) from the active values
+    covariance: Array   # (11, 11)
+    estimated: Calibration
+    active: Array   # (11,)
+
+    @property
+    def by_pair(self) -> Array:
+        """(N, 11) part of each pair in the error of `off`, with common errors."""
+        estimated = self.estimated
+        scores = estimated.b - estimated.S @ (self.active + self.off)
+        return scores @ self.covariance * (
+            math.sqrt(estimated.widened / estimated.shared) / estimated.scatter)
+
+    @property
+    def sigma(self) -> Array:
+        """(11,) 1 sigma, at least as the parts of the pairs scatter."""
+        return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance),
+                                             (self.by_pair**2).sum(axis=0))))
+
+    @property
+    def moment(self) -> Array:
+        """Second moment (11, 11) with these sigmas."""
+        widths = self.sigma / np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
+        return self.covariance * np.outer(widths, widths) + np.outer(self.off, self.off)
+
+    def _along(self, part: slice) -> Array:
+        """Direction of some deviations in which they are most certain, times their gain."""
+        return inverse(np.ascontiguousarray(self.covariance[part, part])) @ self.off[part]
+
+    def gain(self, part: slice) -> float:
+        """Gain in chi-square by some deviations."""
+        # A vector gains more by chance.
+        return float(self.off[part] @ self._along(part)) - 2.0 * (part.stop - part.start - 1)
+
+    def certainty(self, part: slice) -> float:
+        """Some deviations in sigmas, as the parts of the pairs scatter in their direction."""
+        along, gain = self._along(part), max(self.gain(part), 0.0)
+        scattered = float(((self.by_pair[:, part] @ along)**2).sum())
+        return math.sqrt(gain * min(gain / max(scattered, 1e-12), 1.0))
 
 
-def _inconsistency(quantity: Quantity, together: Array, sigma: Array, certainty: float,
+def _solved(free: NDArray[np.bool_], estimated: Calibration, configured: Configured) -> _Solution:
+    """Deviations if those `free` (11,) are within their wide prior.
+
+    All others are within their configured sigmas, and zero where there is none.
+    """
+    sigmas, active = np.where(free, PRIOR_SIGMA, configured.sigmas), configured.active
+    S, misfit = estimated.S.sum(axis=0), estimated.scatter * estimated.shared
+    # Scaled: the deviations have different units.
+    scale = np.outer(sigmas, sigmas)
+    covariance = inverse(scale * S / misfit + np.eye(len(sigmas))) * scale
+    off = covariance @ (estimated.b.sum(axis=0) - S @ active) / misfit
+    return _Solution(off, covariance, estimated, active)
+
+
+def _inconsistency(quantity: Quantity, solution: _Solution, certainty: float,
                    effects: Sequence[Effect]) -> Inconsistency:
     def length(shifts: list[Array], quantile: float) -> float:
         return float(np.quantile([np.linalg.norm(s) for s in shifts], quantile)) if shifts else 0.0
 
-    deviation = np.zeros(findings.DEVIATIONS)
-    deviation[quantity.part] = together[quantity.part]
-    return Inconsistency(quantity, deviation, sigma, certainty,
+    deviation = np.where(_parts_of(quantity), solution.off, 0.0)
+    return Inconsistency(quantity, deviation, solution.sigma, certainty,
                          length([effect.shift @ deviation for effect in effects], _OBSERVABLE_IN),
                          length([effect.claimed_shift @ deviation for effect in effects], 0.5))
 

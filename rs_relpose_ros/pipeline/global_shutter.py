@@ -270,7 +270,7 @@ class RotationWatch:
                 log_so3(GyroRotation.of(frame.imu, parameters.imu).rotation))
         self._monitor.add_pair(frame.stamp_ns, None, _NO_POSE, Configured(
             parameters.sensor, camera, np.array(parameters.imu.gyro_bias),
-            parameters.imu.gyro_bias_sigma, np.zeros(DEVIATIONS)))
+            np.zeros(DEVIATIONS), np.zeros(DEVIATIONS)))
         self._monitor.assess()
         self.reset()
 

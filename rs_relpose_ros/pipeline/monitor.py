@@ -111,7 +111,7 @@ class ConsistencyMonitor:
         (self._on_poses if pose else self._on_rotations).append(_effect(information, pose))
         # A deviation may be so large that no pair has a pose.
         self._inconsistent = assessment.find_inconsistencies(
-            self.calibration, self._on_poses or self._on_rotations, configured.active)
+            self.calibration, self._on_poses or self._on_rotations, configured)
 
     def _add(self, stamp_ns: int, data: recursion.PairData, pose: RelativePose,
              configured: Configured) -> RelativePose:
@@ -129,7 +129,7 @@ class ConsistencyMonitor:
         shift = by_deviation @ self._deviation()
         # The inconsistency, and deviations that the pairs so far have not excluded.
         doubt = np.outer(shift, shift) + (
-            by_deviation @ assessment.undetermined(self.calibration, active) @ by_deviation.T)
+            by_deviation @ assessment.undetermined(self.calibration, configured) @ by_deviation.T)
         pose = replace(pose, covariance=pose.covariance + doubt)
         # The effect of an inconsistent parameter on the baseline is not known.
         return pose.without_baseline('baseline not known: a configured parameter is inconsistent '

@@ -19,7 +19,7 @@ from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, Sensor
 from rs_relpose_ros.imu.integration import FrameImu, rotation_sensitivity
 from rs_relpose_ros.pipeline import findings, pair
-from rs_relpose_ros.pipeline.assessment import Configured
+from rs_relpose_ros.pipeline.assessment import Configured, configured_sigmas
 from rs_relpose_ros.pipeline.between import TrackHistory
 from rs_relpose_ros.pipeline.monitor import Applied, ConsistencyMonitor, suppressed, Tracked
 from rs_relpose_ros.pipeline.pair import DerotatedRays, Frame, GyroRotation, PairResult, Result
@@ -244,8 +244,9 @@ class Pipeline(Processor[PairResult]):
                 (segment.angular_velocities[0], segment.angular_velocities[-1]),
                 parameters.sensor.R_cam_imu, parameters.estimator.gyro_sigma)
         bias, active = np.array(parameters.imu.gyro_bias), np.zeros(findings.DEVIATIONS)
-        configured = Configured(parameters.sensor, sensor.camera, bias,
-                                parameters.imu.gyro_bias_sigma, active)
+        configured = Configured(parameters.sensor, sensor.camera, bias, configured_sigmas(
+            parameters, seconds_between(*list(self._stamps_ns)[-2:])
+            - parameters.sensor.time_offset_reference_interval), active)
         active[findings.OFFSET] = frame.imu.applied_offset_ns / NANOSECONDS
         active[findings.READOUT] = configured.direction * self._readout
         active[findings.BIAS] = parameters.sensor.R_cam_imu.T @ segment.bias - bias

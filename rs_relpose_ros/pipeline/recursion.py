@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from rs_relpose_ros.estimator import priors
+from rs_relpose_ros.estimator.covariance import image_regions, REGIONS
 from rs_relpose_ros.estimator.fit import FitMatches, gauss_newton
 from rs_relpose_ros.estimator.priors import inverse, PARAMETERS, TANGENT, THETA, TwoViewState
 from rs_relpose_ros.estimator.problem import build_problem, observed, TwoViewProblem
@@ -148,6 +149,9 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
     S = (J_c.T * weights) @ J_c + D.T @ information @ D - C.T @ solved[:, :-1]
     b = C.T @ solved[:, -1] - (J_c.T * weights) @ r + D.T @ (information @ theta)
     S = 0.5 * (S + S.T)
+    ratio = _common_noise(FitMatches(observations, weights, 1.0), J_c - J_x @ solved[:, :-1],
+                          r - J_x @ solved[:, -1], S)
+    S, b = S / ratio, b / ratio
     shifts = _shifts(pair, problem, state, H.copy(), C, D)
     # The rotation by the images: the step without the gyro's prior.
     H[THETA:THETA + 3, THETA:THETA + 3] -= information
@@ -174,6 +178,21 @@ def _shifts(pair: PairData, problem: TwoViewProblem, state: TwoViewState, H: Arr
     by_deviation = np.vstack([to_stamped @ tangent_basis(state.t) @ moved[TANGENT:TANGENT + 2],
                               to_stamped @ moved[THETA:THETA + 3]])
     return by_deviation, solve_triangular(spread, moved[_POSE], lower=True)
+
+
+def _common_noise(matches: FitMatches, J: Array, r: Array, S: Array) -> float:
+    """Variance of the score of the matches by image regions, over that by S; at least 1.
+
+    Residuals of neighbours are similar where images are dark or blurred. J (N, 11), r (N,):
+    derivatives and residuals of the fitted matches, S (11, 11): information of the pair.
+    """
+    in_region = image_regions(matches) == np.arange(REGIONS[0] * REGIONS[1])[:, None]
+    sums = (in_region * (matches.weights * r)) @ J
+    scale = np.outer(PRIOR_SIGMA, PRIOR_SIGMA)
+    covariance = inverse(S * scale + np.eye(DEVIATIONS)) * scale
+    by_regions = float(((sums @ covariance) * sums).sum())
+    independent = float((covariance * ((J.T * matches.weights) @ J)).sum())
+    return max((1.0 + by_regions) / (1.0 + independent), 1.0)
 
 
 def _noise(r: Array) -> float:
@@ -333,10 +352,9 @@ _AGAIN, _NEAR = 3, 0.02
 # Sigmas of n pairs are widened by (n + 6) / n: few scores scatter less than they should. Share of
 # a pair's sigma that is common to all pairs, and not reduced by averaging: blur, the tracker's
 # bias, a lens that the model does not fit.
-_FEW_PAIRS, _SHARED = 6, 0.25
+_FEW_PAIRS, _SHARED = 6, 0.15
 # Deviations before the first pair, 1 sigma: rad, s, s, rad/s, -, -, -.
 PRIOR_SIGMA = np.array([0.2] * 3 + [0.05, 0.03] + [0.1] * 3 + [0.2, 0.3, 0.5])
-PRIOR_INFORMATION = np.diag(PRIOR_SIGMA**-2.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -345,12 +363,16 @@ class Calibration:
 
     c: Array   # (11,)
     covariance: Array   # (11, 11)
-    undetermined: Array   # (11, 11) the same without common errors: reduced by more pairs
-    S: Array   # (11, 11) and (11,): sums of the pairs, without a prior
+    S: Array   # (N, 11, 11) and (N, 11): of the pairs, without a prior
     b: Array
     scatter: float   # variance of the scores over that by S: 1 where residuals are independent
-    misfit: float   # the same with common errors
-    pairs: int
+    shared: float   # factor of the variances by errors that are common to all pairs
+    widened: float   # and by the number of pairs
+
+    @property
+    def pairs(self) -> int:
+        """Number of pairs."""
+        return len(self.b)
 
     @property
     def sigma(self) -> Array:
@@ -359,8 +381,8 @@ class Calibration:
 
 
 NOTHING_ESTIMATED = Calibration(
-    np.zeros(DEVIATIONS), np.diag(PRIOR_SIGMA**2), np.diag(PRIOR_SIGMA**2),
-    np.zeros((DEVIATIONS, DEVIATIONS)), np.zeros(DEVIATIONS), 1.0, 1.0, 0)
+    np.zeros(DEVIATIONS), np.diag(PRIOR_SIGMA**2), np.zeros((0, DEVIATIONS, DEVIATIONS)),
+    np.zeros((0, DEVIATIONS)), 1.0, 1.0, 1.0)
 
 
 class _Entry(NamedTuple):
@@ -430,9 +452,7 @@ class Recursion:
         c = covariance @ b.sum(axis=0)
         scores = b - S @ c
         sandwich = covariance @ (scores.T @ scores) @ covariance
-        ratios = np.maximum(np.diag(sandwich) / np.diag(covariance), 1.0) * (
-            (n + _FEW_PAIRS) / n) ** 2
-        shared, scatter = 1.0 + _SHARED**2 * n, float(np.median(ratios))
-        undetermined = covariance * np.sqrt(np.outer(ratios, ratios))
-        return Calibration(c, shared * undetermined, undetermined, S.sum(axis=0), b.sum(axis=0),
-                           scatter, shared * scatter, n)
+        widened, shared = ((n + _FEW_PAIRS) / n)**2, 1.0 + _SHARED**2 * n
+        ratios = np.maximum(np.diag(sandwich) / np.diag(covariance), 1.0) * widened
+        return Calibration(c, shared * covariance * np.sqrt(np.outer(ratios, ratios)), S, b,
+                           float(np.median(ratios)), shared, widened)
