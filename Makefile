@@ -34,10 +34,10 @@ demo: $(stamp)
 	$(bin)/python demo/run_demo.py
 
 # One thread of OpenBLAS, as nodes and commands have: with more, results differ in the last bits
-# (NumPy 1.26). Message types are checked in tests; in Jazzy that is off unless asked for. Two
-# processes: one runs the live tests, which wait most of the time (test/conftest.py);
-# PYTEST_ARGS='-n 0 ...' for one.
-pytest := OPENBLAS_NUM_THREADS=1 ROS_PYTHON_CHECK_FIELDS=1 $(bin)/python -m pytest -n 2 \
+# (NumPy 1.26). Message types are checked in tests; in Jazzy that is off unless asked for. Three
+# processes for two cores: one runs the live tests, which wait half of the time, the others with
+# lower priority (test/conftest.py); PYTEST_ARGS='-n 0 ...' for one.
+pytest := OPENBLAS_NUM_THREADS=1 ROS_PYTHON_CHECK_FIELDS=1 $(bin)/python -m pytest -n 3 \
     --no-loadscope-reorder
 
 test: $(test_stamp)

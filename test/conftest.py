@@ -48,29 +48,30 @@ os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 
 
+# Modules with live tests.
+LIVE = {path.name for path in Path(__file__).parent.glob('test_*.py')
+        if 'pytest.mark.live' in path.read_text(encoding='utf-8')}
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
-    """Of two processes of pytest, one runs all modules with live tests; no module is shared out.
+    """One process of pytest runs all modules with live tests; no module is shared out.
 
-    Live tests wait more than they calculate, so the other process hardly slows them down. Fixtures
-    of a module are set up once.
+    Fixtures of a module are set up once.
     """
     from xdist.scheduler import LoadScopeScheduling
-    live = {path.name for path in Path(__file__).parent.glob('test_*.py')
-            if 'pytest.mark.live' in path.read_text(encoding='utf-8')}
 
     class LiveTogether(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
             name = Path(nodeid.partition('::')[0]).name
-            return 'live' if name in live else name
+            return 'live' if name in LIVE else name
 
     return LiveTogether(config, log)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Modules with live tests first, which are the longest part."""
-    live = {item.path for item in items if item.get_closest_marker('live')}
-    items.sort(key=lambda item: item.path not in live)
+    items.sort(key=lambda item: item.path.name not in LIVE)
 
 
 def recordings_folder() -> Path:
@@ -84,6 +85,8 @@ def recordings_folder() -> Path:
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
+    if 'PYTEST_XDIST_WORKER' in os.environ and item.path.name not in LIVE:
+        os.nice(max(10 - os.nice(0), 0))   # live tests first
     if item.get_closest_marker('recordings'):
         recordings_folder()
 
@@ -92,6 +95,20 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 def recordings() -> Path:
     """Folder of the recorded data (RS_RELPOSE_DATA)."""
     return recordings_folder()
+
+
+@pytest.fixture(scope='session')
+def converted(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Bag of a recording by its name, and by the converter's name; converted once."""
+    folder = tmp_path_factory.mktemp('recordings')
+
+    def bag(name: str, source: str = '') -> Path:
+        path = folder / name
+        if not path.exists():
+            assert command_line.main(['convert', source or name.removesuffix('_b'),
+                                      str(recordings / name), str(path)]) == 0
+        return path
+    return bag
 
 
 @pytest.fixture(scope='session')

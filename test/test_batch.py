@@ -29,7 +29,7 @@ pytest.importorskip('distributed', reason='needs the extra batch')
 pytestmark = pytest.mark.timeout(300)
 
 VERSION = batch.package_version()
-SECONDS = 2.5   # of a bag
+SECONDS = 1.6   # of a bag
 
 
 def make_bag(path: Path, size: int = 10) -> Path:

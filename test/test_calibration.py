@@ -53,7 +53,7 @@ def camera_of(truth: Truth, focal: float | None = None) -> RollingShutterCamera:
 
 def simulated(seed: int, movement: object = None, **values: object) -> Recorded:
     rng = np.random.default_rng(seed)
-    truth = drawn(rng, **({'readout_time': 0.02, 'frames': 120} | values))
+    truth = drawn(rng, **({'readout_time': 0.02, 'frames': 90} | values))
     return record(truth, rng) if movement is None else record(truth, rng, movement)
 
 
@@ -65,6 +65,11 @@ def calibrated(recorded: Recorded, **options: object) -> CalibrationResult:
 def usual() -> tuple[Recorded, CalibrationResult]:
     recorded = simulated(11, readout_time=0.022)
     return recorded, calibrated(recorded)
+
+
+@lru_cache(maxsize=1)
+def one_axis() -> Recorded:
+    return simulated(15, calibration_tracks.about_one_axis(0, 6.0), frames=70)
 
 
 def assert_right(result: CalibrationResult, truth: Truth) -> None:
@@ -203,7 +208,7 @@ def test_lens_is_estimated(model, coefficients, tmp_path):
 
 
 def test_rotation_about_one_axis_is_not_observable(tmp_path):
-    recorded = simulated(15, calibration_tracks.about_one_axis(0, 6.0))
+    recorded = one_axis()
     result = calibrated(recorded)
     assert not result.rotation.observable and not result.observable
     assert 'nearly y (yaw)' in result.rotation.remark
@@ -214,7 +219,7 @@ def test_rotation_about_one_axis_is_not_observable(tmp_path):
 
 def test_a_transform_gives_the_rotation_that_the_motion_does_not():
     """Of a robot on wheels; one that contradicts the images is not used."""
-    recorded = simulated(15, calibration_tracks.about_one_axis(0, 6.0))
+    recorded = one_axis()
     true = Rotation.from_matrix(recorded.truth.R_cam_imu)
     result = calibrated(recorded, quat_prior=(
         Rotation.from_rotvec([0.03, -0.04, 0.02]) * true).as_quat())

@@ -196,16 +196,10 @@ def test_corners_of_a_global_shutter(recordings):
     np.testing.assert_allclose(biases, (-0.0016, 0.0250, 0.0777), atol=0.02)
 
 
-def of_recording(recordings: Path, name: str, tmp_path: Path, *options: str) -> dict[str, Any]:
-    bag = tmp_path / name
-    assert main(['convert', name, str(recordings / name), str(bag)]) == 0
-    return calibrated(bag, tmp_path / 'out', *options)[1]
-
-
 @pytest.mark.recordings
-def test_phone_in_a_car(recordings, tmp_path):
+def test_phone_in_a_car(converted, tmp_path):
     """Its README: readout 31.1 ms, offset -2.4 ms, and these axes."""
-    values = of_recording(recordings, 'xiaomi_cc9_rs', tmp_path, '--rows', '0', '420')
+    _, values = calibrated(converted('xiaomi_cc9_rs'), tmp_path, '--rows', '0', '420')
     assert values['readout_time_s']['value'] == pytest.approx(0.031, abs=1.5e-3)
     assert values['time_offset_s']['value'] == pytest.approx(-0.0024, abs=2e-3)
     assert values['axis_map'] == [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]
@@ -213,13 +207,13 @@ def test_phone_in_a_car(recordings, tmp_path):
 
 
 @pytest.mark.recordings
-def test_slow_hand(recordings, tmp_path):
+def test_slow_hand(converted, tmp_path):
     """Its README: 31.5 ms; offset -56 to -60 ms by the exposure.
 
     4.8 s at 3 to 4 deg/s are too little for the readout time and the rotation: neither is
     observable, and the estimate agrees with the README within its sigma.
     """
-    values = of_recording(recordings, 'realsense_rgb_rs', tmp_path)
+    _, values = calibrated(converted('realsense_rgb_rs'), tmp_path)
     readout = values['readout_time_s']
     assert not readout['observable']
     assert abs(readout['value'] - 0.0315) < 2.0 * readout['sigma'] < 15e-3

@@ -8,10 +8,10 @@ import importlib.util
 import json
 
 import cv2
-from known_path import knots, known_path, MOUNTS, samples, START_NS
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
+from test_rows import knots, known_path, MOUNTS, samples, START_NS
 
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.odometry import formats

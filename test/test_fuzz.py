@@ -166,7 +166,7 @@ def receive(seed: int, plan: list[Any]) -> Counter[str]:
     return outcomes
 
 
-@share_and_all(100, 1250, 1300)
+@share_and_all(50, 1250, 1300)
 def test_damaged_messages(count):
     outcomes = outcomes_of(receive, count, st.integers(0, 2**32 - 1),
                            st.lists(damages, min_size=80, max_size=80))
@@ -243,7 +243,7 @@ def read(bag: Path) -> str:
 
 
 @pytest.mark.timeout(600)   # the kernels may not be compiled yet
-@share_and_all(200, 10_000, 3700)
+@share_and_all(100, 10_000, 3700)
 def test_damaged_bags(tmp_path, count):
     messages = sensor_messages()
     originals = {kind: bags.write_kind(kind, tmp_path, messages) for kind in bags.KINDS}
@@ -269,7 +269,7 @@ def test_damaged_bags(tmp_path, count):
 
 @pytest.mark.parametrize('make, reader', [
     (make_tables, read_tables), (make_posecam, read_posecam), (make_realsense, read_realsense)])
-@share_and_all(60, 1000, 1300)
+@share_and_all(30, 1000, 1300)
 def test_damaged_recordings(tmp_path, count, make, reader):
     folder = make(tmp_path / 'in')
     contents = {file: file.read_bytes() for file in sorted(folder.rglob('*')) if file.is_file()}

@@ -33,7 +33,7 @@ pytestmark = [pytest.mark.live, pytest.mark.timeout(600)]
 
 ERROR = b'\x02'
 # Of the bag [s].
-PLAYED = 2.6
+PLAYED = 1.5
 # Reliable subscriptions, which a publisher of best effort does not match.
 RELIABLE = ('/camera/image_raw', '/camera/camera_info')
 UNKNOWN_OVERRIDE = 'qos_overrides./camera/nothing.subscription.depth'
@@ -100,7 +100,7 @@ def test_missing_inputs_are_reported(running):
     running.play(Image, Imu)
     values = diagnostic_values(running.diagnostics[-1])
     assert (values['missing'], values['poses']) == ('/camera/camera_info', '0')
-    assert int(values['frames_refused_no_calibration']) > 50
+    assert int(values['frames_refused_no_calibration']) > 25
     running.publishers[CameraInfo].publish(CameraInfo(width=640, height=480))
     assert running.wait_for_status('uncalibrated')['missing'] == 'calibration'
     time.sleep(1.0)   # more than two seconds without an IMU, with what is played next

@@ -39,6 +39,7 @@ LEVER = (0.03, 0.01, -0.02)
 GYRO_BIAS, ACCEL_BIAS = (0.011, -0.007, 0.005), (0.06, -0.04, 0.05)
 PARAMETERS = Parameters.from_mapping({
     'quat_cam_imu_xyzw': QUAT, 'imu_position': LEVER, 'readout_time': 0.03, 'max_coast': 2.0,
+    'smoothing_lag': 2.0,   # faster than with the default
     'gyro_bias': tuple(b + 3e-4 for b in GYRO_BIAS)})
 
 

@@ -18,7 +18,6 @@ from two_view_scene import direction_error, rotation_error
 import yaml
 
 from rs_relpose_ros.bags.reader import open_bag
-from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import EstimatorConfig, ImuConfig, sensor_model, TrackingConfig
 from rs_relpose_ros.estimator.estimate import estimate_relative_pose
@@ -373,15 +372,13 @@ def robust_cost(rays1, rays2, focal_length, row_times=None):
 # The RealSense has 0.0999 with OpenCV 4.6.
 @pytest.mark.parametrize(('name', 'required'), [
     ('realsense_rgb_rs', 0.095), ('xiaomi_cc9_rs', 0.4)])
-def test_derotated_rays_fit_one_pose_better_than_measured_rays(name, required, recordings,
-                                                               tmp_path):
+def test_derotated_rays_fit_one_pose_better_than_measured_rays(name, required, converted):
     """The requirement: by 40 % (Xiaomi), and by 20 % (RealSense), or half of what is possible.
 
     The RealSense rotates little during the readout: the full model, with six more parameters,
     reduces the cost by 21 %. The rotation alone, with as many parameters, must reach half of that.
     """
-    path = tmp_path / name
-    assert main(['convert', name, str(recordings / name), str(path)]) == 0
+    path = converted(name)
     parameters = read_parameters(f'{path}.yaml', EVERY_SECOND)
     costs = []
     with open_bag(path) as bag:
@@ -389,7 +386,7 @@ def test_derotated_rays_fit_one_pose_better_than_measured_rays(name, required, r
         pairs = list(replay.pairs())
         intrinsics = replay.intake.intrinsics
         camera = sensor_model(intrinsics, parameters.sensor).camera
-    for pair in pairs:
+    for pair in pairs[::2]:
         points = pair.matches.points1, pair.matches.points2
         use = (np.maximum(points[0], points[1])[:, 1] < LAST_ROW.get(name, np.inf))
         measured = [camera.unproject(intrinsics.to_sensor(p[use])) for p in points]
@@ -400,7 +397,7 @@ def test_derotated_rays_fit_one_pose_better_than_measured_rays(name, required, r
         times = [times[use] for times in (pair.row_times1, pair.row_times2)]
         costs.append([*(robust_cost(*rays, camera.fx) for rays in (measured, derotated, wrong)),
                       robust_cost(*derotated, camera.fx, times)])
-    assert len(costs) >= 40
+    assert len(costs) >= 20
     measured, derotated, wrong_sign, with_velocities = np.sum(costs, axis=0)
     assert wrong_sign > 1.1 * measured
     assert 1.0 - derotated / measured >= required

@@ -298,15 +298,14 @@ def test_a_wrong_parameter_is_reported_and_is_exit_code_1(bundled_bag, tmp_path,
 
 @pytest.mark.recordings
 @pytest.mark.parametrize('name', ['realsense_rgb_rs', 'xiaomi_cc9_rs'])
-def test_recordings(recordings, tmp_path, name):
+def test_recordings(converted, tmp_path, name):
     """With the gyro for the rows only, the rotation between the frames comes from the images.
 
     Without that of the gyro directions are less certain: 4 of 28 by more than 10 deg. Without the
     exposure of the RealSense's file, with which the monitor reports a wrong gyro bias in this
     mode: a false alarm (docs/lab/benchmarks.md).
     """
-    bag, out = tmp_path / name, tmp_path / 'out'
-    assert main(['convert', name, str(recordings / name), str(bag)]) == 0
+    bag, out = converted(name), tmp_path / 'out'
     assert main(['replay', str(bag), '--params', f'{bag}.yaml', '--set',
                  'use_gyro_rotation=false', '--set', 'max_translation_sigma=30',
                  '--set', 'exposure_margin=0.0', '--out', str(out)]) == 0

@@ -194,13 +194,13 @@ def test_seconds_without_information_and_flagged_poses_do_not_count(recording):
 
 
 @pytest.mark.recordings
-def test_a_phone_that_rotates_on_the_spot_has_no_finding(recordings, tmp_path):
+def test_a_phone_that_rotates_on_the_spot_has_no_finding(converted):
     """At 3.4 s a pair of 27 deg has no translation; an invented one contradicted the axes.
 
     With a focal length of 500 px, 18 more than the right one: with that it has one.
     """
-    name, bag = 'android_phone_rs', tmp_path / 'bag'
-    assert main(['convert', 'android', str(recordings / name), str(bag)]) == 0
+    name = 'android_phone_rs'
+    bag = converted(name, 'android')
     right = (ROOT / 'rs_relpose_lab' / 'recordings' / f'{name}.yaml').read_text()
     bag.with_suffix('.yaml').write_text(right.replace('482.0', '500.0'))
     recording = trust_runs.recording_at(bag)

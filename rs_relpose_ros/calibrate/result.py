@@ -13,7 +13,7 @@ from rs_relpose_ros.calibrate.start import axes_text
 from rs_relpose_ros.config.files import parameter_text, SourcedValue
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
-from rs_relpose_ros.output_files import save_picture
+from rs_relpose_ros.output_files import BLUE, ORANGE, save_picture
 from rs_relpose_ros.pipeline.findings import BY_NAME
 
 AXES = ('x (pitch)', 'y (yaw)', 'z (roll)')
@@ -127,7 +127,6 @@ class CalibrationResult:
 # Change of a gyro's bias from one start to the next [rad/s].
 _BIAS_CHANGE = 1e-3
 _FOUR_ZEROS = (0.0,) * 4
-_BLUE, _ORANGE = '#0072B2', '#E69F00'
 _MS = 1e3
 
 
@@ -351,11 +350,11 @@ def draw_curve(result: CalibrationResult, path: Path) -> None:
     readout = result.readout_time
     # The root of a parabola is straight on both sides of the best.
     axes.plot(_MS * result.curve.readout_times, np.sqrt(2.0 * result.curve.costs), 'o-',
-              color=_BLUE)
+              color=BLUE)
     axes.axvline(0.0, color='0.6', linewidth=0.8)
-    axes.axvline(_MS * readout.value, color=_ORANGE, label=_shown('readout_time', readout))
+    axes.axvline(_MS * readout.value, color=ORANGE, label=_shown('readout_time', readout))
     axes.axvspan(_MS * (readout.value - 3 * readout.sigma),
-                 _MS * (readout.value + 3 * readout.sigma), color=_ORANGE, alpha=0.25,
+                 _MS * (readout.value + 3 * readout.sigma), color=ORANGE, alpha=0.25,
                  label='3 sigma')
     axes.set_ylim(bottom=0.0)
     axes.set_xlabel('readout time [ms], negative: upwards; to +- one frame interval')

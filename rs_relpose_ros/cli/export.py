@@ -4,7 +4,6 @@ import argparse
 import logging
 from pathlib import Path
 
-from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.bags.writer import refuse_existing
 from rs_relpose_ros.cli import options
 from rs_relpose_ros.cli.main import Command, FAILED
@@ -96,15 +95,10 @@ def _export(args: argparse.Namespace) -> int:
 
 
 def _with_images(args: argparse.Namespace, part: Path, trajectory: Path) -> ExportReport:
-    parameters = read_parameters(args.params, args.set)
-    with open_bag(args.bag) as bag:
-        topics = bag.find_topics(options.topic_options(args),
-                                 needs_camera_info=not parameters.intrinsics.given)
-        parameters = options.completed(bag, topics, parameters, args)
-        with options.image_progress(bag, topics.image, args.out.name):
-            return export_into(part, bag, topics, parameters, trajectory, Options(
-                args.format, args.images, args.rate, args.points,
-                trajectory / IMAGES if args.link else None))
+    with options.opened(args, read_parameters(args.params, args.set)) as opened:
+        return export_into(part, *opened, trajectory, Options(
+            args.format, args.images, args.rate, args.points,
+            trajectory / IMAGES if args.link else None))
 
 
 def _print_report(args: argparse.Namespace, report: ExportReport) -> None:

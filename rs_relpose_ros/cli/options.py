@@ -1,7 +1,8 @@
 """Common parts of the commands: options, progress bar, version, a run over a bag."""
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 import logging
 from pathlib import Path
@@ -89,12 +90,8 @@ def run_on_bag(args: argparse.Namespace, suffix: str, work: Work[Made],
     parameters = Parameters().updated({**(calibration or {}), **parameters.given()})
     folder = out_folder(args, suffix)
     refuse_unwritable(folder)
-    with open_bag(args.bag) as bag:
-        topics = bag.find_topics(topic_options(args),
-                                 needs_camera_info=not parameters.intrinsics.given)
-        parameters = completed(bag, topics, parameters, args)
-        with image_progress(bag, topics.image, bag_name(args.bag)):
-            results = work(folder, bag, topics, parameters)
+    with opened(args, parameters) as (bag, topics, parameters):
+        results = work(folder, bag, topics, parameters)
     write_summary(folder / SUMMARY_FILE, results.metrics, bag=args.bag, topics=topics,
                   parameters=parameters, command=sys.argv, package_version=package_version())
     return folder, results
@@ -117,20 +114,25 @@ def topic_options(args: argparse.Namespace) -> dict[str, str]:
             if name.endswith('_topic')}
 
 
-def completed(bag: Bag, topics: SensorTopics, parameters: Parameters,
-              args: argparse.Namespace) -> Parameters:
-    """`parameters` with the extrinsics of the bag's transforms where they have none.
+@contextmanager
+def opened(args: argparse.Namespace,
+           parameters: Parameters) -> Iterator[tuple[Bag, SensorTopics, Parameters]]:
+    """A bag and its topics, and `parameters` with the extrinsics of its transforms.
 
-    MissingInputError for required parameters that no message contains. `args` have `bag` and the
-    options of `add_parameter_arguments`.
+    A progress bar shows its images. MissingInputError for required parameters that no message
+    contains. `args` have `bag` and the options of topics and parameters.
     """
-    parameters, contradiction = with_extrinsics(bag, topics, parameters)
-    if contradiction:
-        _logger.warning('%s', contradiction)
-    neighbour = args.bag.resolve().with_name(f'{bag_name(args.bag)}.yaml')
-    need_sensor_parameters(parameters, f'use --params {neighbour}, the file next to the bag'
-                           if args.params is None and neighbour.is_file() else '')
-    return parameters
+    with open_bag(args.bag) as bag:
+        topics = bag.find_topics(topic_options(args),
+                                 needs_camera_info=not parameters.intrinsics.given)
+        parameters, contradiction = with_extrinsics(bag, topics, parameters)
+        if contradiction:
+            _logger.warning('%s', contradiction)
+        neighbour = args.bag.resolve().with_name(f'{bag_name(args.bag)}.yaml')
+        need_sensor_parameters(parameters, f'use --params {neighbour}, the file next to the bag'
+                               if args.params is None and neighbour.is_file() else '')
+        with image_progress(bag, topics.image, bag_name(args.bag)):
+            yield bag, topics, parameters
 
 
 def bag_name(bag: Path) -> str:

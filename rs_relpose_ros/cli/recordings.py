@@ -276,12 +276,8 @@ def _unroll(args: argparse.Namespace) -> int:
     refuse_existing(args.out_bag)
     refuse_unwritable(args.out_bag.parent)
     parameters = read_parameters(args.params, args.set, node='global_shutter_node')
-    with open_bag(args.bag) as bag:
-        topics = bag.find_topics(options.topic_options(args),
-                                 needs_camera_info=not parameters.intrinsics.given)
-        parameters = options.completed(bag, topics, parameters, args)
-        with options.image_progress(bag, topics.image, options.bag_name(args.bag)):
-            report = unroll(bag, topics, parameters, args.out_bag)
+    with options.opened(args, parameters) as opened:
+        report = unroll(*opened, args.out_bag)
     for line in report.warnings:
         _logger.warning('%s', line)
     options.warn_unused(report.reasons, 'omitted')

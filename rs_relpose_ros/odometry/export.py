@@ -27,7 +27,7 @@ from rs_relpose_ros.odometry.formats import Format, FORMATS, IMAGES, Model
 from rs_relpose_ros.odometry.landmarks import Landmarks, Tracks, TRACKS_FILE, triangulated
 from rs_relpose_ros.odometry.rows import ROWS_FILE, RowTrajectory
 from rs_relpose_ros.offline.replay import MessageRefused, outcomes, unused_reason
-from rs_relpose_ros.output_files import BLUE, GREEN, ORANGE, save_picture
+from rs_relpose_ros.output_files import BLUE, GREEN, ORANGE, save_picture, written
 from rs_relpose_ros.pipeline.global_shutter import GlobalShutterFrame, Unroller
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrameLoop
@@ -293,9 +293,8 @@ def _link(source: Path, target: Path, data: bytes) -> None:
     try:
         if not source.exists():
             source.parent.mkdir(exist_ok=True)
-            part = source.with_name(f'.{source.name}.part')
-            part.write_bytes(data)
-            part.rename(source)
+            with written(source, 'wb') as file:
+                file.write(data)
         os.link(source, target)
     except OSError as error:
         raise InputError(f'{target.name} cannot be linked to {source.parent} '
