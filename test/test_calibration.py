@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.experiments import calibration_tracks
 from rs_relpose_lab.experiments.calibration_tracks import drawn, record, Recorded, Truth
-from rs_relpose_ros.calibrate import coplanarity
+from rs_relpose_ros.calibrate import coplanarity, start
 from rs_relpose_ros.calibrate.coplanarity import EXPOSURE, GLOBAL
 from rs_relpose_ros.calibrate.fit import evaluate, initial, LOCAL, redirected, stepped
 from rs_relpose_ros.calibrate.observations import (
@@ -24,13 +24,6 @@ from rs_relpose_ros.calibrate.observations import (
 )
 from rs_relpose_ros.calibrate.procedure import calibrate
 from rs_relpose_ros.calibrate.result import CalibrationResult, parameter_file, report
-from rs_relpose_ros.calibrate.start import (
-    axis_maps,
-    find_starts,
-    GyroPath,
-    GyroSeries,
-    nearest_axis_map,
-)
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError
@@ -250,13 +243,13 @@ def few_points(tracks: Tracks) -> Tracks:
 
 UNUSABLE = {
     'too short: 10 frames': lambda tracks, gyro: (few_frames(tracks, 10), gyro),
-    'hardly rotates': lambda tracks, gyro: (tracks, GyroSeries(
+    'hardly rotates': lambda tracks, gyro: (tracks, start.GyroSeries(
         gyro.stamps_ns, 0.05 + 1e-3 * np.random.default_rng(0).standard_normal(
             gyro.rates.shape))),
     'too few points': lambda tracks, gyro: (few_points(tracks), gyro),
     'short exposure': lambda tracks, gyro: (
         dataclasses.replace(tracks, ids=np.arange(len(tracks.ids))), gyro),
-    'the gyro covers 0.0 s': lambda tracks, gyro: (tracks, GyroSeries(
+    'the gyro covers 0.0 s': lambda tracks, gyro: (tracks, start.GyroSeries(
         gyro.stamps_ns + 3600 * NANOSECONDS, gyro.rates)),
 }
 
@@ -280,12 +273,12 @@ def test_readout_longer_than_the_interval_is_refused():
 # -- parts ------------------------------------------------------------------------------------
 
 def test_every_axis_map_is_recognised():
-    maps = axis_maps()
+    maps = start.axis_maps()
     assert len({m.tobytes() for m in maps}) == 24
     np.testing.assert_allclose(np.linalg.det(maps), 1.0)
     tilt = Rotation.from_rotvec([0.1, -0.2, 0.15]).as_matrix()
     for matrix in maps:
-        np.testing.assert_array_equal(nearest_axis_map(tilt @ matrix), matrix)
+        np.testing.assert_array_equal(start.nearest_axis_map(tilt @ matrix), matrix)
 
 
 @pytest.mark.parametrize('rotation, axes', [
@@ -301,16 +294,16 @@ def test_search_finds_offset_and_rotation(rotation, axes):
     ends = begins + 0.033
     estimated = np.stack([np.interp(0.5 * (begins + ends) + 0.05, times, rates[:, i])
                           for i in range(3)], axis=1) @ R.T + 0.01 * rng.standard_normal((120, 3))
-    start, = find_starts(estimated, begins, ends, times, rates, max_offset=0.2, step=5e-3,
-                         focal_factors=np.ones(1), count=1)
-    assert start.offset == pytest.approx(0.05, abs=5e-3)
-    assert start.misfit < 0.02
-    np.testing.assert_allclose(start.R_cam_imu, R, atol=0.03)
+    found, = start.find_starts(estimated, begins, ends, times, rates, max_offset=0.2, step=5e-3,
+                               focal_factors=np.ones(1), count=1)
+    assert found.offset == pytest.approx(0.05, abs=5e-3)
+    assert found.misfit < 0.02
+    np.testing.assert_allclose(found.R_cam_imu, R, atol=0.03)
 
 
 def test_gyro_path_is_the_rotation_of_an_even_turn():
     times = np.linspace(0.0, 2.0, 41)
-    path = GyroPath.integrated(times, np.tile([0.3, -0.4, 0.5], (41, 1)), [0.1, 0.0, 0.0])
+    path = start.GyroPath.integrated(times, np.tile([0.3, -0.4, 0.5], (41, 1)), [0.1, 0.0, 0.0])
     at = np.array([0.0, 0.333, 1.7])
     expected = Rotation.from_rotvec(at[:, None] * [0.2, -0.4, 0.5]).as_matrix()
     np.testing.assert_allclose(path.at(at), expected, atol=1e-9)

@@ -11,14 +11,7 @@ import cv2
 import message_builders as build
 import numpy as np
 import pytest
-from rosbags.interfaces import (
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
+from rosbags import interfaces as ros
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.bags.reader import open_bag
@@ -527,8 +520,10 @@ def test_gross_errors_in_little_light(converted, changes, name, estimated, toler
 
 # -- containers, options, output -------------------------------------------------------------
 
-BEST_EFFORT = Qos(QosHistory.KEEP_LAST, 5, QosReliability.BEST_EFFORT, QosDurability.VOLATILE,
-                  QosTime(0, 0), QosTime(0, 0), QosLiveliness.AUTOMATIC, QosTime(0, 0), False)
+NO_TIME = ros.QosTime(0, 0)
+BEST_EFFORT = ros.Qos(
+    ros.QosHistory.KEEP_LAST, 5, ros.QosReliability.BEST_EFFORT, ros.QosDurability.VOLATILE,
+    NO_TIME, NO_TIME, ros.QosLiveliness.AUTOMATIC, NO_TIME, False)
 
 
 @pytest.mark.parametrize('kind, offered, reliability', [

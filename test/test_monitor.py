@@ -686,7 +686,7 @@ FAST = [
           math.degrees(ROTATED.magnitude()), 0.1, pairs=14),
     Wrong('gyro 0.95', 'gyro_scale', (), imu_with(gyro=1.0 / 0.95), 0.95, 3e-3, pairs=14),
     Wrong('K 1.3', 'focal_length', (), camera_with(fx=1.3, fy=1.3), 450.0, 5.0, pairs=12),
-    Wrong('acceleration, other sign', 'accel_axes', (), imu_with(force=-UNCHANGED)),
+    Wrong('acceleration, other sign', 'accel_axes', (), imu_with(force=-UNCHANGED), pairs=20),
 ]
 LONG = [
     Wrong('readout twice', 'readout_time', ('readout_time=0.06',), None, 0.03, 1e-3, pairs=12),

@@ -10,15 +10,7 @@ from rs_relpose_ros.cli.main import Command, FAILED
 from rs_relpose_ros.cli.poses import rate_in_hertz, start_failure
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.odometry import need_gtsam
-from rs_relpose_ros.odometry.export import (
-    export_into,
-    ExportReport,
-    IMAGE_CHOICES,
-    Options,
-    RAW,
-    REPORT_FILE,
-)
+from rs_relpose_ros.odometry import export, need_gtsam
 from rs_relpose_ros.odometry.formats import FORMATS, IMAGES
 from rs_relpose_ros.odometry.rows import camera_poses, ROWS_FILE, RowTrajectory, write_tum
 from rs_relpose_ros.output_files import beside, refuse_unwritable
@@ -37,7 +29,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--rate', metavar='HZ', type=rate_in_hertz, default=0.0,
                         help='images, at most so many a second, or poses (tum); default: those of '
                         'the keyframes, in which points are observed')
-    parser.add_argument('--images', choices=IMAGE_CHOICES, default='',
+    parser.add_argument('--images', choices=export.IMAGE_CHOICES, default='',
                         help='as recorded, derotated to their middle row, or none; default: '
                         'unrolled for colmap, which has one pose per image, else raw')
     parser.add_argument('--trajectory', metavar='DIR', type=Path,
@@ -45,7 +37,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
                         'into OUT/odometry')
     parser.add_argument('--link', action='store_true',
                         help='keep raw images once in DIR/images of --trajectory and link them')
-    parser.add_argument('--points', metavar='N', type=int, default=Options('').most_points,
+    parser.add_argument('--points', metavar='N', type=int, default=export.Options('').most_points,
                         help='at most so many points, the best ones (default: %(default)s)')
     options.add_parameter_arguments(parser)
     options.add_topic_arguments(parser, 'image', 'camera_info', 'imu', 'accel', 'truth')
@@ -61,7 +53,7 @@ def _check(args: argparse.Namespace) -> None:
     if args.link and args.trajectory is None:
         raise InputError('--link needs --trajectory DIR: the images of a bag are no files, so '
                          'they are kept in DIR/images')
-    if args.link and (args.images or FORMATS[args.format].images) != RAW:
+    if args.link and (args.images or FORMATS[args.format].images) != export.RAW:
         raise InputError('--link is for raw images: use --images raw')
 
 
@@ -94,21 +86,21 @@ def _export(args: argparse.Namespace) -> int:
     return 0
 
 
-def _with_images(args: argparse.Namespace, part: Path, trajectory: Path) -> ExportReport:
+def _with_images(args: argparse.Namespace, part: Path, trajectory: Path) -> export.ExportReport:
     with options.opened(args, read_parameters(args.params, args.set)) as opened:
-        return export_into(part, *opened, trajectory, Options(
+        return export.export_into(part, *opened, trajectory, export.Options(
             args.format, args.images, args.rate, args.points,
             trajectory / IMAGES if args.link else None))
 
 
-def _print_report(args: argparse.Namespace, report: ExportReport) -> None:
+def _print_report(args: argparse.Namespace, report: export.ExportReport) -> None:
     print(f'{report.images} images, {report.points} points in {report.observations} observations')
     if report.reprojection is None or report.formula is None:
         print('no points: no track over three keyframes with a pose and enough parallax')
     else:
         print(f'points in the images, at the poses of their rows: {report.reprojection.text}')
         print(f'{args.format} has {FORMATS[args.format].poses}: off that by {report.formula.text}')
-    options.warn_unused(report.reasons(), f'left out (stamps in {REPORT_FILE})')
+    options.warn_unused(report.reasons(), f'left out (stamps in {export.REPORT_FILE})')
     for begin_ns, end_ns in report.gaps:
         _logger.warning('no poses from %d to %d ns on the clock of the IMU', begin_ns, end_ns)
 
@@ -117,6 +109,7 @@ EXPORT = Command(
     'Export a bag for reconstruction and splatting: images, cameras with the pose of each row or '
     'what the format has for it, and points, metric with z up. Poses are those of `rs_relpose '
     'odometry`, at the times of the rows: smoothed keyframes with the IMU between. Frames without '
-    f'a pose are left out and listed in {REPORT_FILE}. Prints how far the points are from their '
-    'pixels, and how far the interpolation of the format is from the trajectory. The directory '
-    'appears when it is complete. Exit code 1: odometry did not start.', _add_arguments, _export)
+    f'a pose are left out and listed in {export.REPORT_FILE}. Prints how far the points are from '
+    'their pixels, and how far the interpolation of the format is from the trajectory. The '
+    'directory appears when it is complete. Exit code 1: odometry did not start.', _add_arguments,
+    _export)

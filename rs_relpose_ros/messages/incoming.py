@@ -22,12 +22,7 @@ from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuSample, Orientation
 from rs_relpose_ros.pipeline.sequencer import Refusal, Sequencer
-from rs_relpose_ros.tracking.images import (
-    check_image_size,
-    CompressedImage,
-    EncodedImage,
-    RawImage,
-)
+from rs_relpose_ros.tracking import images
 
 # Largest values of an IMU: far above any sensor, far below an overflow of the filters.
 MAX_ANGULAR_VELOCITY = 1e3   # rad/s
@@ -55,7 +50,7 @@ def time_ns(stamp: Any) -> int:
     return seconds * NANOSECONDS + nanoseconds
 
 
-def image_from_message(msg: Any) -> EncodedImage:
+def image_from_message(msg: Any) -> images.EncodedImage:
     """Image of a sensor_msgs/Image or CompressedImage; its `data` is a view of the message's.
 
     Only the stamp is checked here; the other fields are checked when the image is decoded.
@@ -63,8 +58,8 @@ def image_from_message(msg: Any) -> EncodedImage:
     data = np.frombuffer(msg.data, dtype=np.uint8)
     stamp, frame_id = stamp_ns(msg.header), str(msg.header.frame_id)
     if hasattr(msg, 'format'):
-        return CompressedImage(data, str(msg.format), stamp, frame_id)
-    return RawImage(data, str(msg.encoding), int(msg.width), int(msg.height), int(msg.step),
+        return images.CompressedImage(data, str(msg.format), stamp, frame_id)
+    return images.RawImage(data, str(msg.encoding), int(msg.width), int(msg.height), int(msg.step),
                     bool(msg.is_bigendian), stamp, frame_id)
 
 
@@ -87,7 +82,7 @@ def intrinsics_from_info(msg: Any) -> Intrinsics:
             'driver publish the result, or give camera_matrix')
     pinhole = pinhole_of_matrix('k of CameraInfo', k)
     width, height = int(msg.width), int(msg.height)
-    check_image_size(width, height)
+    images.check_image_size(width, height)
     coefficients = info_field(msg, 'd')
     if len(coefficients) > 64:
         raise InputError(f'd of CameraInfo has {len(coefficients)} coefficients')
@@ -317,7 +312,7 @@ class Intake:
         self._camera_info: Any = None
         configured = None if parameters is None else parameters.intrinsics
         self._configured = configured if configured is not None and configured.given else None
-        self._held: list[EncodedImage] = []   # wait for the first CameraInfo
+        self._held: list[images.EncodedImage] = []   # wait for the first CameraInfo
         self._camera = StuckCamera()
         self._gyro = StuckGyro(0.0 if parameters is None else parameters.imu.stuck_gyro_time)
 
@@ -368,7 +363,7 @@ class Intake:
         while self._held:
             self._add_frame(self._held.pop(0))
 
-    def _add_image(self, image: EncodedImage) -> None:
+    def _add_image(self, image: images.EncodedImage) -> None:
         if self._chosen is not None:
             if image.stamp_ns not in self._chosen:
                 self.images_skipped += 1
@@ -382,7 +377,7 @@ class Intake:
         if len(self._held) > _HELD_IMAGES:
             self._add_frame(self._held.pop(0))
 
-    def _add_frame(self, image: EncodedImage) -> None:
+    def _add_frame(self, image: images.EncodedImage) -> None:
         try:
             if self._configured is not None:
                 size, last = image.size, self.intrinsics

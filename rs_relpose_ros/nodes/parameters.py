@@ -6,12 +6,7 @@ from contextlib import contextmanager
 import sys
 from typing import Any
 
-from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
-    SetParametersResult,
-)
+from rcl_interfaces import msg
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -59,13 +54,13 @@ class NodeParameters:
         if not result.successful:
             raise InputError(f'the calibration cannot be used: {result.reason}')
 
-    def _validate(self, parameters: list[Parameter]) -> SetParametersResult:
+    def _validate(self, parameters: list[Parameter]) -> msg.SetParametersResult:
         """Whether the new values are legal; without side effects, as others may refuse them."""
         try:
             self.current.updated(self._known(parameters))
         except InputError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
+            return msg.SetParametersResult(successful=False, reason=str(error))
+        return msg.SetParametersResult(successful=True)
 
     def _apply(self, parameters: list[Parameter]) -> None:
         changed = self._known(parameters)
@@ -121,9 +116,9 @@ def _declare(node: Node, name: str, default: Any, declared: Declared) -> Any:
     return _plain(parameter.value)
 
 
-def _descriptor(declared: Declared) -> ParameterDescriptor:
+def _descriptor(declared: Declared) -> msg.ParameterDescriptor:
     unit = f' [{declared.unit}]' if declared.unit else ''
-    descriptor = ParameterDescriptor(
+    descriptor = msg.ParameterDescriptor(
         description=declared.description + unit, additional_constraints=declared.legal,
         read_only=not declared.live,
         # YAML reads "0" and "[0, 0, 0, 1]" as integers; `Parameters` checks the types.
@@ -131,11 +126,11 @@ def _descriptor(declared: Declared) -> ParameterDescriptor:
     bounds = (max(declared.low, -sys.float_info.max), min(declared.high, sys.float_info.max))
     if declared.kind is float:
         descriptor.floating_point_range = [
-            FloatingPointRange(from_value=bounds[0], to_value=bounds[1], step=0.0)]
+            msg.FloatingPointRange(from_value=bounds[0], to_value=bounds[1], step=0.0)]
     elif declared.kind is int:
         limit = 2**63 - 1
         low, high = (int(min(max(bound, -limit), limit)) for bound in bounds)
-        descriptor.integer_range = [IntegerRange(from_value=low, to_value=high, step=1)]
+        descriptor.integer_range = [msg.IntegerRange(from_value=low, to_value=high, step=1)]
     return descriptor
 
 

@@ -11,13 +11,7 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_ros.config.settings import PairConfig, Parameters
 from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.messages.outgoing import DEBUG_IMAGE, PAIR_TOPICS
-from rs_relpose_ros.nodes.diagnostics import (
-    FrameTimings,
-    HealthLog,
-    LineFile,
-    RELATIVE_POSE,
-    Statistics,
-)
+from rs_relpose_ros.nodes import diagnostics
 from rs_relpose_ros.nodes.inputs import message_class, transform_broadcaster
 from rs_relpose_ros.nodes.sensor_node import run_node, SensorNode
 from rs_relpose_ros.pipeline.pair import Frame, PairResult
@@ -39,23 +33,23 @@ _DESCRIPTION = (
 class RelposeNode(SensorNode):
     """Relative poses of a rolling-shutter camera with an IMU."""
 
-    task = RELATIVE_POSE
+    task = diagnostics.RELATIVE_POSE
 
     def __init__(self) -> None:
-        self._statistics = Statistics()
-        self._timings: FrameTimings | None = None
+        self._statistics = diagnostics.Statistics()
+        self._timings: diagnostics.FrameTimings | None = None
         super().__init__(NAME, self._statistics)
 
     def _open_outputs(self, parameters: Parameters) -> None:
         self._outputs = PairPublishers(self, parameters.pair)
-        self._log_health = HealthLog(self._info, self._warn, self._error)
+        self._log_health = diagnostics.HealthLog(self._info, self._warn, self._error)
 
     def _make_loop(self, parameters: Parameters) -> FrontEnd:
         files = parameters.pair
         if files.stamps_file and self._stamps is None:
-            self._stamps = LineFile('stamps_file', files.stamps_file, self._error)
+            self._stamps = diagnostics.LineFile('stamps_file', files.stamps_file, self._error)
         if files.timings_file and self._timings is None:
-            self._timings = FrameTimings(files.timings_file, self._error)
+            self._timings = diagnostics.FrameTimings(files.timings_file, self._error)
         # The images are for ~/debug_image; only references to them are kept.
         return FrontEnd(parameters, keep_images=True)
 
