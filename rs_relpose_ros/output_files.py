@@ -58,8 +58,12 @@ def written(path: Path, mode: str = 'w') -> Iterator[IO[Any]]:
         with suppress(OSError):
             part.unlink()
         if isinstance(error, OSError):
-            raise type(error)(error.errno, error.strerror, str(path)) from error
+            raise _named(error, path) from error
         raise
+
+
+def _named(error: OSError, path: Path) -> OSError:
+    return type(error)(error.errno, error.strerror, str(path))
 
 
 def prepare_folder(folder: Path, replaced: Sequence[str]) -> None:
@@ -77,7 +81,8 @@ def prepare_folder(folder: Path, replaced: Sequence[str]) -> None:
 def beside(out: Path) -> Iterator[Path]:
     """Path to write before it is renamed to `out`, so that this appears when it is complete.
 
-    It has the same name, in a temporary folder beside, which is removed with what is left.
+    It has the same name, in a temporary folder beside, which is removed with what is left. An
+    OSError of writing names `out`.
     """
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -86,4 +91,9 @@ def beside(out: Path) -> Iterator[Path]:
     except OSError as error:
         raise InputError(f'{out} cannot be written: {error.strerror}') from error
     with temporary as folder:
-        yield Path(folder) / out.name
+        try:
+            yield Path(folder) / out.name
+        except OSError as error:
+            if folder in str(error.filename or folder):   # not of an input
+                raise _named(error, out) from error
+            raise

@@ -84,6 +84,20 @@ def test_result_is_reused_only_if_it_is_one_and_nothing_changed(tmp_path, state)
     assert store.done(job) is None
 
 
+@pytest.mark.skipif(not Path('/dev/full').exists(), reason='Linux has a device that is full')
+@pytest.mark.parametrize('file', ['a/check.json', 'a/job.json', 'results.csv'])
+def test_a_full_disk_is_reported_with_the_file(tmp_path, file):
+    store, bag = Store(tmp_path), Bag('/bags/a', 5, 7, '')
+    outcome = Outcome(Job('check', bag, 'a', '', (), '1'), State.DONE, files={'check.json': b'{}'})
+    (tmp_path / 'a').mkdir()
+    (tmp_path / f'{file}.part').symlink_to('/dev/full')
+    with pytest.raises(OSError, match='No space left') as found:
+        store.add(outcome)
+        store.write_table([outcome])
+    assert found.value.filename == str(tmp_path / file)
+    assert not (tmp_path / file).exists()
+
+
 @pytest.mark.parametrize('values, sigmas, mean, sigma, chi2, outliers', [
     # Bevington, Data Reduction, section 4.1: weights 1 / sigma^2; the sigma is 1 / (1 + 1/4) times
     # the scatter of one degree of freedom.

@@ -20,7 +20,7 @@ from rs_relpose_ros.config.settings import Parameters, SensorConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.messages.outgoing import PAIR_TOPICS
 from rs_relpose_ros.nodes import relpose_node as node_module
-from rs_relpose_ros.output_files import written
+from rs_relpose_ros.output_files import beside, written
 
 CONFIG = ROOT / 'config'
 LAUNCH_FILE = ROOT / 'launch' / 'relpose.launch.py'
@@ -200,3 +200,9 @@ def test_an_error_of_a_full_disk_has_the_path(tmp_path):
     with pytest.raises(OSError, match='No space left') as found, BagWriter(tmp_path / 'bag'):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert found.value.filename == str(tmp_path / 'bag') and not list(tmp_path.iterdir())
+    with pytest.raises(OSError, match='No space left') as found, beside(tmp_path / 'out'):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert found.value.filename == str(tmp_path / 'out') and not list(tmp_path.iterdir())
+    with pytest.raises(FileNotFoundError) as found, beside(tmp_path / 'out'):   # of an input
+        (tmp_path / 'input').read_text()
+    assert found.value.filename == str(tmp_path / 'input')

@@ -30,7 +30,7 @@ from rs_relpose_ros.bags.reader import (
     IMU_TOPIC,
     open_bag,
 )
-from rs_relpose_ros.calibrate import stored
+from rs_relpose_ros.calibrate import live, stored
 from rs_relpose_ros.calibrate.live import LiveCalibration
 from rs_relpose_ros.calibrate.stored import Calibrated, CameraId, Progress
 from rs_relpose_ros.config.files import read_parameters, text_values
@@ -39,6 +39,7 @@ from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.messages.incoming import Role, sensor_messages
 from rs_relpose_ros.nodes.inputs import LATCHED
 from rs_relpose_ros.nodes.sensor_node import SensorNode
+from rs_relpose_ros.pipeline.sequencer import Refusal
 
 QUATERNION = (0.0, 0.0, 0.0, 1.0)
 CAMERA = CameraId('a/b:c', 320, 240)
@@ -122,12 +123,16 @@ def test_a_user_without_a_home_directory(monkeypatch, bag):
 
 # -- without ROS ---------------------------------------------------------------------------------
 
-def outcomes(bag: Path, calibration: LiveCalibration, *, moving: bool = True) -> Iterator[Any]:
+def outcomes(bag: Path, calibration: LiveCalibration, *, moving: bool = True,
+             images: int = 1000) -> Iterator[Any]:
     """Outcomes of the messages, the fits awaited; not `moving`: of the first image and a gyro."""
     first: Any = None
     with open_bag(bag) as opened:
         for role, message in sensor_messages(opened, opened.find_topics({})):
             content = message.message
+            images -= role is Role.IMAGE
+            if images < 0:
+                return
             if not moving and role is Role.IMAGE:
                 first = content if first is None else first
                 content.data = first.data
@@ -155,6 +160,32 @@ def test_a_calibration_comes_of_seven_seconds_and_ends(bag):
     assert isinstance(found[-1], Calibrated)
     assert found[-1].camera == CameraId('camera_optical_frame', 320, 240)
     assert is_near_the_truth(found[-1].parameters)
+
+
+def test_a_recording_that_is_too_short_counts_when_it_is_looped(bag, monkeypatch):
+    """The stamps begin again, and so does a clock that is set back."""
+    monkeypatch.setattr(live, '_SILENCE', 0.0)
+    calibration = LiveCalibration(Parameters(), use_stored=False)
+    assert not any(isinstance(outcome, Calibrated)
+                   for outcome in outcomes(bag, calibration, images=120))
+    short = calibration.step()
+    assert 'after 4.0 s, too short' in short.text
+    assert calibration.step() is None
+    found = list(outcomes(bag, calibration, images=120))
+    assert is_near_the_truth(next(
+        outcome.parameters for outcome in found if isinstance(outcome, Calibrated)))
+
+
+def test_images_that_come_too_fast_are_counted(bag):
+    calibration = LiveCalibration(Parameters(), use_stored=False)
+    with open_bag(bag) as opened:
+        for role, message in sensor_messages(opened, opened.find_topics({}), (Role.IMAGE,)):
+            calibration.receive(role, message.message)
+    while calibration.step() is not None or calibration.counts().frames_taken < 8:
+        pass
+    counts = calibration.counts()
+    assert (counts.frames, counts.frames_taken) == (210, 8)
+    assert counts.refused == {Refusal.OVERLOAD: 202}
 
 
 def test_a_camera_at_rest_is_never_calibrated_and_the_motion_is_named(bag):

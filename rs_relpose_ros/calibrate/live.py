@@ -1,5 +1,6 @@
 """Calibration of a running camera: its tracks and gyro in memory, the fit in its own process."""
 
+from collections import Counter
 from dataclasses import replace
 import os
 import pickle
@@ -17,8 +18,9 @@ from rs_relpose_ros.calibrate.stored import Calibrated, CameraId, Progress
 from rs_relpose_ros.config.settings import CalibrationConfig, Parameters, TRACKED_IN_IMAGES
 from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.geometry.camera import Intrinsics
-from rs_relpose_ros.messages.incoming import Role
+from rs_relpose_ros.messages.incoming import Role, stamp_ns
 from rs_relpose_ros.messages.transforms import AXES_SIGMA
+from rs_relpose_ros.pipeline.sequencer import Refusal, SequencerCounts
 
 # Length of the recording [s]: of the first fit, kept at most, and added before the next fit.
 _FIRST, _LONGEST, _STEP = 6.0, 60.0, 2.0
@@ -32,10 +34,12 @@ _LIMITS = ('max_readout_sigma', 'max_offset_sigma', 'max_rotation_sigma', 'max_b
 _WHEELS = 20.0
 # Images that wait to be tracked; more are left out.
 _WAITING = 8
+# Time without an image [s] after which a recording that is too short is reported.
+_SILENCE = 2.0
 # Images without a usable CameraInfo after which the lens counts as uncalibrated.
 _WITHOUT_INFO = 15
-# Consecutive images that cannot be used after which the recording starts again: another size, or
-# a clock that was set back.
+# Consecutive images that cannot be used after which the recording starts again, of another size,
+# or goes on with a clock that was set back.
 _MOST_REFUSED = 15
 # Niceness of the process of the fit: the node's own work goes first.
 _NICE = 15
@@ -55,8 +59,10 @@ class LiveCalibration:
         self._use_stored, self.waits_for = use_stored, waits_for
         self.quat_prior: tuple[float, ...] | None = None
         self._queue: Queue[tuple[Role, Any]] = Queue()
-        # Images put into the queue by `receive`, and taken by `step`: a thread each.
-        self._put = self._taken = 0
+        # Images put into the queue by `receive`, or not, and taken by `step`: a thread each.
+        self._put = self._left_out = self._taken = 0
+        self._image_s = 0.0   # time of the last image on the monotonic clock
+        self._short = 0.0   # length of a recording that was reported as too short [s]
         self._done = False
         self._camera: CameraId | None = None
         self._fit: _Fit | None = None
@@ -84,12 +90,20 @@ class LiveCalibration:
     def receive(self, role: Role, message: Any) -> RsRelposeError | None:
         """Hand a message over; errors are those of `step`."""
         configured = self._parameters.intrinsics.given
-        if (self._done or role is Role.ACCEL or (role is Role.CAMERA_INFO and configured)
-                or (role is Role.IMAGE and self._put - self._taken >= _WAITING)):
+        if self._done or role is Role.ACCEL or (role is Role.CAMERA_INFO and configured):
             return None
-        self._put += role is Role.IMAGE
+        if role is Role.IMAGE:
+            if self._put - self._taken >= _WAITING:
+                self._left_out += 1
+                return None
+            self._put += 1
         self._queue.put((role, message))
         return None
+
+    def counts(self) -> SequencerCounts:
+        """Images that were used and left out."""
+        return SequencerCounts(self._put + self._left_out, self._taken,
+                               Counter({Refusal.OVERLOAD: self._left_out}))
 
     def step(self, timeout: float = 0.0) -> Progress | Calibrated | RsRelposeError | None:
         """Use a message; the state after a fit, the error of the message, or None.
@@ -107,15 +121,16 @@ class LiveCalibration:
         try:
             role, message = self._queue.get(timeout=timeout)
         except Empty:
-            return self._after_fit()
+            return self._after_fit() or self._too_short()
         if role is not Role.IMAGE:
             return self._recorder.add(role, message)
         self._taken += 1
         self._images += 1
+        self._image_s = time.monotonic()
         error = self._recorder.add(role, message)
         self._refused = 0 if error is None else self._refused + 1
         if self._refused > _MOST_REFUSED:
-            self._restart()
+            self._use_clock_of(message)
         if error is not None:
             return error
         configured = self._parameters.intrinsics
@@ -125,6 +140,25 @@ class LiveCalibration:
         if self._camera is None:
             return self._first_image(message.header.frame_id)
         return self._after_fit()
+
+    def _use_clock_of(self, message: Any) -> None:
+        """Go on with a clock that was set back, as by a bag that is looped, or begin again."""
+        recorder, self._refused = self._recorder, 0
+        if not recorder.seconds or stamp_ns(message.header) > recorder.last_ns:
+            self._restart()
+            return
+        before_ns = recorder.last_ns
+        recorder.set_back(stamp_ns(message.header))
+        self._fitted_ns += recorder.last_ns - before_ns
+
+    def _too_short(self) -> Progress | None:
+        seconds = self._recorder.seconds
+        if (not self._short < seconds < _FIRST or self.waits_for
+                or time.monotonic() - self._image_s < _SILENCE):
+            return None
+        self._short = seconds
+        return Progress(f'calibrating: the images ended after {seconds:.1f} s, too short: '
+                        f'at least {_FIRST:.0f} s are needed, 10 s or more are good')
 
     def close(self) -> None:
         """End the process of the fit."""
@@ -187,7 +221,7 @@ class LiveCalibration:
             assert self._camera is not None
             return Calibrated(self._camera, parameter_file(
                 result, f'Calibration of {self._camera.name} by {seconds:.0f} s while running.',
-                camera=recording.camera, compressed=False), f'calibrated: {known}')
+                camera=recording.camera), f'calibrated: {known}')
         missing = [of.remark for of in result.needed if not of.observable]
         needed = '; '.join(dict.fromkeys(missing))
         return Progress(

@@ -348,6 +348,19 @@ class Recorder:
             while self._gyro and (first := next(iter(self._gyro))) < self._stamps[0] - _MARGIN_NS:
                 del self._gyro[first]
 
+    def set_back(self, stamp_ns: int) -> None:
+        """Move all that is recorded to end a second before `stamp_ns`, on a clock set back."""
+        earlier_ns = self.last_ns - stamp_ns + _MARGIN_NS
+        self._stamps = deque(stamp - earlier_ns for stamp in self._stamps)
+        moved: dict[int, tuple[float, float, float]] = {}
+        last_ns = next(iter(self._gyro), 0)
+        for stamp, rates in self._gyro.items():
+            if stamp < last_ns - _MARGIN_NS:   # since then
+                break
+            last_ns = stamp
+            moved[stamp - earlier_ns] = rates
+        self._gyro = moved
+
     def recording(self) -> CalibrationInput:
         """All that was recorded; InputError or MissingInputError if something is missing."""
         unused = self.unused.most_common()

@@ -214,12 +214,13 @@ def _shutter_text(result: CalibrationResult) -> str:
 
 
 def parameter_file(result: CalibrationResult, title: str, *, camera: RollingShutterCamera,
-                   compressed: bool, feature_rows: tuple[float, ...] = (0.0, 0.0),
+                   compressed: bool | None = None,
+                   feature_rows: tuple[float, ...] = (0.0, 0.0),
                    placed: Mapping[str, Any] | None = None) -> str:
     """The node's parameter file: each value with its sigma; undetermined ones are named only.
 
-    `camera` is that of the calibration: a guess if the lens was not known. `placed`: parameters
-    of a transform.
+    `camera` is that of the calibration: a guess if the lens was not known. `compressed`: the
+    images of a bag. `placed`: parameters of a transform.
     """
     # Parameters of each quantity, if it is determined.
     groups = [
@@ -239,8 +240,8 @@ def parameter_file(result: CalibrationResult, title: str, *, camera: RollingShut
                f'Of the worst axis, and {_BIAS_CHANGE:g} rad/s from one start to the next.')])]
     if result.focal_factor is not None:
         groups.append((result.focal_factor, 'camera_matrix', _lens_values(result, camera)))
-    values = [SourcedValue('image_transport', 'compressed' if compressed else 'raw',
-                           'As the bag has them.')]
+    values = [] if compressed is None else [SourcedValue(
+        'image_transport', 'compressed' if compressed else 'raw', 'As the bag has them.')]
     values += [value for part, _, group in groups if part.determined for value in group]
     if feature_rows[1] > 0.0:
         values.append(SourcedValue('feature_rows', tuple(feature_rows), 'As given to calibrate.'))

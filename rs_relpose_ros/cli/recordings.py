@@ -107,10 +107,10 @@ def calibrate_bag(
         camera=recording.camera, compressed=topics.image.msgtype == COMPRESSED_IMAGE,
         feature_rows=tuple(args.rows), placed=values)
     parameters, metrics, curve = (folder / name for name in _CALIBRATION_FILES)
-    with written(parameters) as file:
-        file.write(text)
     mapping = calibration.as_mapping(result, recording.camera)
-    metrics.write_text(json.dumps(mapping, indent=1) + '\n', encoding='utf-8')
+    for path, content in ((parameters, text), (metrics, json.dumps(mapping, indent=1) + '\n')):
+        with written(path) as file:
+            file.write(content)
     calibration.draw_curve(result, curve)
     return result, recording.camera
 

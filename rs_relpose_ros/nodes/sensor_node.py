@@ -533,8 +533,9 @@ class SensorNode(StoppableNode):
         lost = '' if self._inputs is None else diagnostics.lost_images(
             self._inputs.stamps_ns, self._inputs.image_bytes)
         counts: Counter[str] = Counter() if self._inputs is None else self._inputs.counts.copy()
+        source = self._calibration if self._loop is None else self._loop.sequencer
         report = self._frame_statistics.report(
-            counts, None if self._loop is None else self._loop.sequencer.counts(),
+            counts, None if source is None else source.counts(),
             problem=problem, missing=missing, progress=self._progress, lost=lost)
         status = outgoing.status_message(
             report.level, f'{self.get_fully_qualified_name()}: {self.task}', report.text,

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.timing import NANOSECONDS, Sensor
 from rs_relpose_ros.odometry.rows import read_arrays, RowTrajectory
+from rs_relpose_ros.output_files import written
 from rs_relpose_ros.pipeline.pair import PairResult
 
 TRACKS_FILE = 'tracks.npz'
@@ -64,7 +65,7 @@ class Tracks:
 
     def save(self, path: Path) -> None:
         """Write an npz file."""
-        with path.open('wb') as file:
+        with written(path, 'wb') as file:
             np.savez_compressed(file, **{
                 one.name: getattr(self, one.name) for one in fields(self)})
 

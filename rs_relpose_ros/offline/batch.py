@@ -15,7 +15,7 @@ from typing import Any
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.offline import batch_results
 from rs_relpose_ros.offline.batch_results import Bag, Job, Outcome, State, Store
-from rs_relpose_ros.output_files import SUMMARY_FILE
+from rs_relpose_ros.output_files import SUMMARY_FILE, written
 
 # How many workers may die over one bag before it is given up, less one.
 _ALLOWED_DEATHS = 1
@@ -86,7 +86,8 @@ def run_batch(client: Any, request: Request, folder: Path, work: Callable[[Job],
         'version': request.version, 'bags': len(rows),
         'states': {state.value: result.states[state] for state in State},
         'combined': combined.as_json()}
-    (folder / SUMMARY_FILE).write_text(json.dumps(summary, indent=1) + '\n', encoding='utf-8')
+    with written(folder / SUMMARY_FILE) as file:
+        file.write(json.dumps(summary, indent=1) + '\n')
     batch_results.draw(request.command, rows, combined.metrics,
                        folder / batch_results.PICTURE_FILE)
     return result

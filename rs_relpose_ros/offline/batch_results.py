@@ -16,7 +16,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.output_files import BLUE, GREEN, ORANGE, RED, save_picture, SUMMARY_FILE
+from rs_relpose_ros.output_files import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    RED,
+    save_picture,
+    SUMMARY_FILE,
+    written,
+)
 
 RESULT_FILES = {'check': 'check.json', 'calibrate': 'calibration.json', 'replay': SUMMARY_FILE}
 RESULTS_FILE = 'results.csv'
@@ -163,27 +171,25 @@ class Store:
         folder.mkdir(exist_ok=True)
         for name, data in outcome.files.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).write_bytes(data)
+            with written(folder / name, 'wb') as file:
+                file.write(data)
         entry = {'bag': outcome.job.bag.path, 'fingerprint': outcome.job.fingerprint,
                  'state': outcome.state.value, 'message': outcome.message,
                  'seconds': outcome.seconds, 'metrics': outcome.metrics,
                  'files': sorted(outcome.files)}
-        part = folder / f'.{_JOB_FILE}'
-        part.write_text(json.dumps(entry, indent=1) + '\n', encoding='utf-8')
-        part.replace(folder / _JOB_FILE)
+        with written(folder / _JOB_FILE) as file:
+            file.write(json.dumps(entry, indent=1) + '\n')
 
     def write_table(self, outcomes: Sequence[Outcome]) -> None:
         """One row for each bag; metrics that a bag does not have are empty."""
         columns = list(dict.fromkeys(name for outcome in outcomes for name in outcome.metrics))
-        path = self.folder / f'.{RESULTS_FILE}'
-        with path.open('w', encoding='utf-8', newline='') as file:
+        with written(self.folder / RESULTS_FILE) as file:
             writer = csv.writer(file, lineterminator='\n')
             writer.writerow(['bag', 'name', 'state', 'message', 'seconds', *columns])
             for row in outcomes:
                 writer.writerow([row.job.bag.path, row.job.name, row.state.value,
                                  ' '.join(row.message.split()), f'{row.seconds:.3f}',
                                  *(_text(row.metrics.get(name)) for name in columns)])
-        path.replace(self.folder / RESULTS_FILE)
 
 
 def _text(value: object) -> str:
