@@ -160,16 +160,25 @@ def test_silence_is_counted_from_the_last_result(clock, statistics):
 
 
 @pytest.mark.parametrize(('share', 'size', 'jitter', 'expected'), [
-    (0.5, 921_600, 0, True), (0.95, 921_600, 0, False), (0.5, 300_000, 0, False),
+    (0.5, 921_600, 0, 'config/fastdds.xml'), (0.95, 921_600, 0, ''), (0.5, 300_000, 0, ''),
     # Of a rhythm with jitter; of a slow start, before the last seconds.
-    (0.5, 921_600, 2_000_000, True), (1.0, 921_600, 2_000_000, False)])
-def test_lost_images_are_reported(share, size, jitter, expected):
+    (0.5, 921_600, 2_000_000, 'config/fastdds.xml'), (1.0, 921_600, 200_000, ''),
+    (1.0, 921_600, 2_000_000, 'jitter by 1.9'), (0.9, 300_000, 2_000_000, 'jitter by ')])
+def test_lost_images_and_jitter_are_reported(share, size, jitter, expected):
     rng = np.random.default_rng(0)
     stamps = [k * SECOND // 30 + int(jitter * rng.normal()) for k in range(300)
               if k < 100 or rng.random() < share]
-    text = diagnostics.lost_images(stamps, size)
-    assert bool(text) == expected
-    assert ('config/fastdds.xml' in text) == expected
+    text = diagnostics.stamps_warning(stamps, size)
+    assert expected in text
+    assert bool(text) == bool(expected)
+
+
+@pytest.mark.parametrize('change', [
+    lambda k: 0 if k % 6 == 0 else k * SECOND // 30,              # no stamp
+    lambda k: (k % 100) * SECOND // 30,                           # a bag that is looped
+    lambda k: k * SECOND // 30 + k // 40 % 2 * (k % 40) * 4_000_000])   # exposure that changes
+def test_other_changes_of_stamps_are_no_jitter(change):
+    assert not diagnostics.stamps_warning([change(k) for k in range(300)], 300_000)
 
 
 def pair(status: Status = Status.OK, reason: str = '') -> PairResult:
@@ -317,9 +326,10 @@ def test_a_start_is_no_error_and_lost_images_are_a_warning(statistics):
     starting = statistics.report(Counter(), None, problem=STARTING, missing=())
     assert (starting.level, dict(starting.values)['state']) == (OK, 'not estimating')
     statistics.add_pair(pair(), 0)
-    lost = statistics.report(Counter(image=9), counts(9, 9), problem='', missing=(), lost='lost')
+    lost = statistics.report(Counter(image=9), counts(9, 9), problem='', missing=(),
+                             warning='lost')
     assert (lost.level, lost.text, dict(lost.values)['state']) == (WARN, 'lost', 'degraded')
-    worse = statistics.report(Counter(), None, problem='no image', missing=(), lost='lost')
+    worse = statistics.report(Counter(), None, problem='no image', missing=(), warning='lost')
     assert worse.text == 'no image'
 
 

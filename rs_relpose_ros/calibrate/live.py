@@ -22,8 +22,9 @@ from rs_relpose_ros.messages.incoming import Role, stamp_ns
 from rs_relpose_ros.messages.transforms import AXES_SIGMA
 from rs_relpose_ros.pipeline.sequencer import Refusal, SequencerCounts
 
-# Length of the recording [s]: of the first fit, kept at most, and added before the next fit.
-_FIRST, _LONGEST, _STEP = 6.0, 60.0, 2.0
+# Length of the recording [s]: of the first fit, and of a lens that is not known, whose fit takes
+# longer than the two seconds; kept at most; added before the next fit.
+_FIRST, _FIRST_OF_LENS, _LONGEST, _STEP = 6.0, 8.0, 60.0, 2.0
 # From this length on [s] values with wider sigmas suffice, as their doubt is in the covariances:
 # factor and names of the limits.
 _LONG, _WIDER = 10.0, 2.0
@@ -77,6 +78,10 @@ class LiveCalibration:
     def intrinsics(self) -> Intrinsics | None:
         """Those of the last CameraInfo."""
         return self._recorder.intrinsics
+
+    @property
+    def _first(self) -> float:
+        return _FIRST if self.intrinsics is not None else _FIRST_OF_LENS
 
     @property
     def camera_info_problem(self) -> str:
@@ -153,12 +158,12 @@ class LiveCalibration:
 
     def _too_short(self) -> Progress | None:
         seconds = self._recorder.seconds
-        if (not self._short < seconds < _FIRST or self.waits_for
+        if (not self._short < seconds < self._first or self.waits_for
                 or time.monotonic() - self._image_s < _SILENCE):
             return None
         self._short = seconds
         return Progress(f'calibrating: the images ended after {seconds:.1f} s, too short: '
-                        f'at least {_FIRST:.0f} s are needed, 10 s or more are good')
+                        f'at least {self._first:.0f} s are needed, 10 s or more are good')
 
     def close(self) -> None:
         """End the process of the fit."""
@@ -194,7 +199,7 @@ class LiveCalibration:
             return self._evaluated(result, recording)
         recorder = self._recorder
         grown = 1e-9 * (recorder.last_ns - self._fitted_ns) if self._fitted_ns else _STEP
-        if self.waits_for or recorder.seconds < _FIRST or grown < _STEP:
+        if self.waits_for or recorder.seconds < self._first or grown < _STEP:
             return None
         self._fitted_ns = recorder.last_ns
         sensor = self._parameters.sensor

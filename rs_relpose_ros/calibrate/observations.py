@@ -32,7 +32,7 @@ from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.distortion import DISTORTION_MODELS
-from rs_relpose_ros.geometry.timing import FrameIntervals, NANOSECONDS
+from rs_relpose_ros.geometry.timing import correlation_of_steps, FrameIntervals, NANOSECONDS
 from rs_relpose_ros.imu.integration import mean_rates
 
 
@@ -122,8 +122,6 @@ def make_pairs(tracks: Tracks, gaps: Sequence[int], selection: PairSelection,
 _VARYING = 0.02
 # Correlation of successive intervals beyond which, up or down, they are distinguished.
 _DISTINCT = 0.15
-# Steps of so many medians have an image missing.
-_MISSING = 1.8
 # The smooth line: straight within so many frames (1 sigma of the weights).
 _SMOOTH = 10.0
 
@@ -158,27 +156,13 @@ def frame_times(stamps_ns: NDArray[np.int64]) -> FrameTimes:
     low, high = np.quantile(longer, (0.1, 0.9))
     if high - low <= _VARYING * median:
         return FrameTimes(Varying.NOT, np.zeros(len(stamps_ns)))
-    correlation = _of_successive(steps / median)
+    correlation = correlation_of_steps(steps / median)
     if correlation > _DISTINCT:
         return FrameTimes(Varying.EXPOSURE, longer)
     if correlation < -_DISTINCT:
         late = _smooth(stamps_ns, median)
         return FrameTimes(Varying.JITTER, late, float(np.sqrt((late**2).mean())))
     return FrameTimes(Varying.UNCLEAR, np.zeros(len(stamps_ns)))
-
-
-def _of_successive(steps: Array) -> float:
-    """Correlation of successive steps, shares of their median; with no image missing between."""
-    whole = steps < _MISSING
-    if not whole.any():
-        return 0.0
-    # A few frames, as those after the start of a camera, must not decide.
-    low, high = np.quantile(steps[whole], (0.05, 0.95))
-    deviations = np.clip(steps, low, high)
-    deviations -= deviations[whole].mean()
-    both = whole[1:] & whole[:-1]
-    first, second = deviations[:-1][both], deviations[1:][both]
-    return float(first @ second) / max(0.5 * float(first @ first + second @ second), 1e-24)
 
 
 def _smooth(stamps_ns: NDArray[np.int64], interval: float) -> Array:

@@ -47,6 +47,28 @@ def clocks_apart(ahead: float) -> str:
         "the images'")
 
 
+# Steps of so many medians have an image missing.
+MISSING = 1.8
+
+
+def correlation_of_steps(steps: Array) -> float:
+    """Correlation of successive steps between images, with none missing between.
+
+    `steps` (N,): as shares of their median. About 1 of an exposure that changes, -0.5 of stamps
+    that jitter: a late one makes one step longer and the next one shorter.
+    """
+    whole = (steps > 0.0) & (steps < MISSING)
+    if not whole.any():
+        return 0.0
+    # A few frames, as those after the start of a camera, must not decide.
+    low, high = np.quantile(steps[whole], (0.05, 0.95))
+    deviations = np.clip(steps, low, high)
+    deviations -= deviations[whole].mean()
+    both = whole[1:] & whole[:-1]
+    first, second = deviations[:-1][both], deviations[1:][both]
+    return float(first @ second) / max(0.5 * float(first @ first + second @ second), 1e-24)
+
+
 def exposure_shift(stamp_exposure: str, exposure_time: float) -> float:
     """From the stamp to the middle of the stamped row's exposure [s]; of `STAMP_EXPOSURES`."""
     return {'start': 0.5, 'middle': 0.0, 'end': -0.5}[stamp_exposure] * exposure_time

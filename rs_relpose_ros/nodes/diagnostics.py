@@ -5,6 +5,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+import math
 from pathlib import Path
 import threading
 import time
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.calibrate.stored import Progress
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry.timing import NANOSECONDS
+from rs_relpose_ros.geometry.timing import correlation_of_steps, MISSING, NANOSECONDS
 from rs_relpose_ros.messages.incoming import MOST_REASONS, reason_key, Role
 from rs_relpose_ros.pipeline.findings import Assessment, FindingState, NOT_EVALUATED
 from rs_relpose_ros.pipeline.monitor import Applied, Tracked
@@ -34,6 +35,9 @@ _LOST, _FEWEST = 0.7, 10
 # not fit into its segment of shared memory.
 _BIG = 512 * 1024
 _COMPRESSED = '/compressed'
+# Jitter of stamps that is reported [s], and the correlation of successive intervals below which
+# it is jitter, not an exposure that changes.
+_JITTER, _ALTERNATING = 5e-4, -0.15
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,25 +89,35 @@ def why_nothing(silence: Silence) -> Reason:
     return Reason('nothing', f'nothing came of {silence.images} images in {PATIENCE:g} s')
 
 
-def lost_images(stamps_ns: Sequence[int], size: int) -> str:
-    """A warning if large images are lost, by the rhythm of their stamps; else ''.
+def stamps_warning(stamps_ns: Sequence[int], size: int) -> str:
+    """A warning if large images are lost, or stamps jitter, by the rhythm of the stamps; else ''.
 
     `stamps_ns`: of the recent images; `size`: of an image [bytes].
     """
     recent = np.array([stamp for stamp in stamps_ns
                        if stamp > stamps_ns[-1] - PATIENCE * NANOSECONDS])
-    if size < _BIG or len(recent) < _FEWEST:
+    if len(recent) < _FEWEST:
         return ''
+    steps = np.diff(recent) / NANOSECONDS
     # A quarter of the intervals has no lost image between, unless most images are lost.
-    period = float(np.quantile(np.diff(recent), 0.25, method='lower'))
-    sent = (recent[-1] - recent[0]) / max(period, 1.0) + 1.0
-    if len(recent) >= _LOST * sent:
+    period = max(float(np.quantile(steps, 0.25, method='lower')), 1e-9)
+    sent = 1e-9 * (recent[-1] - recent[0]) / period + 1.0
+    if size >= _BIG and len(recent) < _LOST * sent:
+        return (f'about {100.0 * (1.0 - len(recent) / sent):.0f} % of the images, of '
+                f'{size / 1e6:.1f} MB, are lost, by their stamps: Fast DDS loses big messages. '
+                'Give the driver and this node the shipped profile, FASTRTPS_DEFAULT_PROFILES_FILE'
+                '=$(ros2 pkg prefix --share rs_relpose_ros)/config/fastdds.xml; ros2 launch '
+                'rs_relpose_ros relpose.launch.py does it for the node')
+    shares = steps / max(float(np.median(steps)), 1e-9)
+    whole = steps[(shares > 0.0) & (shares < MISSING)]
+    # Of a normal distribution, 80 % of the differences of two stamps are within 2.56 sigma.
+    spread = float(np.subtract(*np.quantile(whole, (0.9, 0.1)))) if len(whole) else 0.0
+    jitter = spread / 2.56 / math.sqrt(2.0)
+    if jitter < _JITTER or correlation_of_steps(shares) > _ALTERNATING:
         return ''
-    return (f'about {100.0 * (1.0 - len(recent) / sent):.0f} % of the images, of '
-            f'{size / 1e6:.1f} MB, are lost, by their stamps: Fast DDS loses big messages. Give '
-            'the driver and this node the shipped profile, FASTRTPS_DEFAULT_PROFILES_FILE='
-            '$(ros2 pkg prefix --share rs_relpose_ros)/config/fastdds.xml; ros2 launch '
-            'rs_relpose_ros relpose.launch.py does it for the node')
+    return (f'the stamps of the images jitter by {1e3 * jitter:.1f} ms rms, as times of arrival '
+            'do: a pose is wrong by the rotation within that time. Let the driver stamp by the '
+            'clock of the sensor')
 
 
 # -- Fields of /diagnostics -----------------------------------------------------------------------
@@ -207,13 +221,13 @@ class FrameStatistics(ABC):
 
     def report(self, inputs: Counter[str], counts: SequencerCounts | None, *, problem: str,
                missing: tuple[str, ...], progress: Progress | None = None,
-               lost: str = '') -> Report:
+               warning: str = '') -> Report:
         """The state since the last report.
 
         `inputs` are the numbers of messages so far, by role, and of the invalid ones. `counts` is
         None while no frame is processed; `problem` is the reason for that, or empty; `missing` are
-        names of missing parameters and inputs; `progress` is that of a calibration, `lost` a
-        warning of lost images.
+        names of missing parameters and inputs; `progress` is that of a calibration, `warning` is
+        one of the images' stamps.
         """
         now_ns = self._clock()
         with self._lock:
@@ -228,8 +242,8 @@ class FrameStatistics(ABC):
                 problem = f'{self.idle}: no frame can be used: {self._last_refusal}'
             level, text = (self._evaluate(problem, dropped) if progress is None
                            else (OK, progress.text))
-            if lost and level == OK:
-                level, text = WARN, lost
+            if warning and level == OK:
+                level, text = WARN, warning
             values: dict[str, object] = {
                 'state': self.idle if problem else {
                     OK: 'ok', WARN: 'degraded', ERROR: self.wrong}[level],

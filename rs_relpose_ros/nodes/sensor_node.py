@@ -530,13 +530,13 @@ class SensorNode(StoppableNode):
             self._use_transform(self._inputs.frame_ids)
         problem, missing = self._problem()
         self.warn_of_namesake()
-        lost = '' if self._inputs is None else diagnostics.lost_images(
+        warning = '' if self._inputs is None else diagnostics.stamps_warning(
             self._inputs.stamps_ns, self._inputs.image_bytes)
         counts: Counter[str] = Counter() if self._inputs is None else self._inputs.counts.copy()
         source = self._calibration if self._loop is None else self._loop.sequencer
         report = self._frame_statistics.report(
             counts, None if source is None else source.counts(),
-            problem=problem, missing=missing, progress=self._progress, lost=lost)
+            problem=problem, missing=missing, progress=self._progress, warning=warning)
         status = outgoing.status_message(
             report.level, f'{self.get_fully_qualified_name()}: {self.task}', report.text,
             self._image_topic(), report.values, message_class)
@@ -549,8 +549,8 @@ class SensorNode(StoppableNode):
                     self._warn(f'messages on {self._inputs.topics[role]} have no frame_id: no '
                                'transform is found for them, and RViz shows no result; set it in '
                                'the driver')
-            if lost:
-                self._warn(lost)
+            if warning:
+                self._warn(warning)
 
     def _log_silence(self, inputs: SensorInputs, silence: diagnostics.Silence,
                      problem: str) -> None:
