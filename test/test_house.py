@@ -16,23 +16,23 @@ OF_PACKAGE = {path: text for path, text in MODULES.items() if path.parts[0] == P
 
 # Folder -> most lines and modules. A larger number needs its reason in the commit that raises it.
 BUDGETS = {
-    'rs_relpose_ros': (300, 5),
+    'rs_relpose_ros': (310, 5),
     'rs_relpose_ros/bags': (1870, 6),
-    'rs_relpose_ros/calibrate': (2920, 9),
+    'rs_relpose_ros/calibrate': (2960, 9),
     'rs_relpose_ros/cli': (1210, 7),
     'rs_relpose_ros/config': (880, 4),
     'rs_relpose_ros/estimator': (3760, 12),
-    'rs_relpose_ros/geometry': (1260, 7),
+    'rs_relpose_ros/geometry': (1280, 7),
     'rs_relpose_ros/imu': (1310, 4),
     'rs_relpose_ros/messages': (1460, 5),
-    'rs_relpose_ros/nodes': (2290, 9),
+    'rs_relpose_ros/nodes': (2300, 9),
     'rs_relpose_ros/odometry': (3100, 11),
     'rs_relpose_ros/offline': (2910, 12),
     'rs_relpose_ros/pipeline': (3610, 13),
     'rs_relpose_ros/solvers': (1720, 6),
     'rs_relpose_ros/tracking': (1230, 5),
     'rs_relpose_lab': (10140, 46),
-    'test': (20430, 60),
+    'test': (20490, 60),
 }
 MOST_MODULES, MOST_FOLDERS = 115, 15
 LONGEST_MODULE, SHORTEST_MODULE, LONGEST_FUNCTION = 700, 80, 60
