@@ -17,8 +17,8 @@ from fault_stream import BAG_TOPICS, stamp_of
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 import numpy as np
 import pytest
-from rcl_interfaces.msg import Parameter, ParameterDescriptor, ParameterType, ParameterValue
-from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
@@ -130,17 +130,6 @@ def test_a_live_parameter_takes_effect(running):
     count = len(running.diagnostics)
     wait_until(lambda: len(running.diagnostics) >= count + 2, 'diagnostics')
     assert 1 <= int(diagnostic_values(running.diagnostics[-1])['pairs']) <= PLAYED / 0.9 + 1
-
-
-def test_parameters_are_described(running):
-    [threshold, levels] = running.graph.call(
-        DescribeParameters, '/relpose_node/describe_parameters',
-        DescribeParameters.Request(names=['threshold', 'klt_levels'])).descriptors
-    assert isinstance(threshold, ParameterDescriptor)
-    assert (threshold.read_only, levels.read_only) == (False, True)
-    assert threshold.description.endswith('[px]')
-    [bounds] = threshold.floating_point_range
-    assert (bounds.from_value, bounds.to_value) == (0.05, 50.0)
 
 
 # -- settings that keep a node from estimating -----------------------------------------------
