@@ -92,7 +92,7 @@ _OPTIONS: dict[str, Any] = {'cache': True, 'nogil': True, 'error_model': 'numpy'
                             'no_cfunc_wrapper': True}   # it takes a tenth of the compilation
 kernel = numba.njit(**_OPTIONS)
 inlined_kernel = numba.njit(**_OPTIONS, forceinline=True)   # as machine code: innermost loops
-small_kernel = numba.njit(**_OPTIONS, inline='always')      # as statements: a few lines
+small_kernel = numba.njit(**_OPTIONS, inline='always')   # as statements: a few lines, one call
 
 
 class KernelInterface:

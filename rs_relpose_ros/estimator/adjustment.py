@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from rs_relpose_ros.estimator.priors import inverse
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import (
+    copy_matrix,
     copy_vector,
     cross,
     dot,
@@ -123,7 +124,7 @@ def _bends(s: float, T: float) -> tuple[float, float, float]:
             0.5 * T * T * x * x * (x * x - 2.0 * x + 1.0))
 
 
-@kernel
+@small_kernel
 def _observe(tracks: Tracks, state: PathState, k: float, R: Array, basis: Array, v: int, i: int,
              columns: Array, jac: Array) -> tuple[float, float]:
     """Residual [px] of an observation; `jac` (2, 12 + 3 K) by its track, the path and phi_v.
@@ -274,7 +275,7 @@ def linearised(tracks: Tracks, priors: PathPriors, state: PathState, sigma: floa
     jac, basis = np.empty((2, _TRACK + path + 3)), tangent_basis(state.t)
     rotations, k = np.empty((V, 3, 3)), math.exp(state.log_scale)
     for v in range(V):
-        rotations[v] = exp_so3(state.rotations[v]) @ tracks.rotations[v]
+        copy_matrix(exp_so3(state.rotations[v]) @ tracks.rotations[v], rotations[v])
     for i in range(N):
         own[:], own_gradient[:], mixed[:] = 0.0, 0.0, 0.0
         columns = tangent_basis(state.directions[i])
@@ -313,7 +314,7 @@ def _cost(normal: Normal, tracks: Tracks, sigma: float) -> tuple[float, float]:
     return cost, weighted / count
 
 
-@kernel
+@small_kernel
 def moved_state(state: PathState, step: Array, tracks: Array) -> PathState:
     """The state after a step (n,) of the path, each track moved with it (`Normal.tracks`)."""
     n, count = len(step), len(tracks)

@@ -18,7 +18,7 @@ from rs_relpose_ros.estimator.fit import FitMatches, linearised, with_priors
 from rs_relpose_ros.estimator.priors import DW1, PARAMETERS, Priors, SCALE, THETA, TwoViewState
 from rs_relpose_ros.estimator.problem import PairState, TwoViewProblem
 from rs_relpose_ros.geometry import Array, so3
-from rs_relpose_ros.jit import kernel
+from rs_relpose_ros.jit import kernel, small_kernel
 from rs_relpose_ros.solvers.algebra import cholesky, newton_step
 
 # Regions of the field that the matches cover: columns and rows.
@@ -32,7 +32,7 @@ PRIOR_FREEDOM = 1.0
 LEAST_DISAGREEMENT = 1e-3
 
 
-@kernel
+@small_kernel
 def sandwich(matches: FitMatches, state: TwoViewState, data_hessian: Array, hessian: Array,
              covariance: Array, prior: Priors, gyro_error: Array) -> Array:
     """``H^-1 S H^-1`` (n, n) at an optimum `state` with the Hessian H, `covariance` being H^-1.
@@ -55,7 +55,7 @@ def sandwich(matches: FitMatches, state: TwoViewState, data_hessian: Array, hess
     return covariance @ (of_matches + (hessian - data_hessian) + excess) @ covariance
 
 
-@kernel
+@small_kernel
 def scaled_like(covariance: Array, before: Array, after: Array) -> Array:
     """``T C T^T`` with ``T before T^T = after``: C scaled as `before` is to `after`.
 
@@ -140,7 +140,7 @@ def image_regions(matches: FitMatches) -> NDArray[np.int64]:
     return regions
 
 
-@kernel
+@small_kernel
 def gyro_variance_ratio(state: TwoViewState, prior: Priors, covariance: Array) -> float:
     """Variance of the gyro, as estimated from one pair, by the configured one.
 

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.estimator import priors, sampson
@@ -159,6 +158,7 @@ def _with_rotation_refined(used: Array, state: TwoViewState, sigma: float) -> Tw
         return state._replace(R=np.ascontiguousarray(
             Rotation.from_rotvec(theta).as_matrix() @ state.R))
 
+    from scipy.optimize import least_squares  # a tenth of the imports of a node
     # At Exp(theta) R the local derivative is by another rotation on the left, J(theta) dtheta.
     found = least_squares(
         lambda theta: sampson.residuals(used, rotated(theta)) / sigma, np.zeros(3), method='lm',
@@ -169,6 +169,8 @@ def _with_rotation_refined(used: Array, state: TwoViewState, sigma: float) -> Tw
 
 def _with_translation_refined(used: Array, state: TwoViewState, sigma: float,
                               velocities: bool) -> tuple[TwoViewState, float]:
+    from scipy.optimize import least_squares
+
     def placed(x: Array) -> TwoViewState:
         d = x[3:] if velocities else np.zeros(6)
         return state._replace(t=x[:3].copy(), d1=d[:3].copy(), d2=d[3:].copy())

@@ -26,7 +26,7 @@ import numpy as np
 
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import cross, dot, exp_so3, log_so3, norm, tangent_basis
-from rs_relpose_ros.jit import kernel
+from rs_relpose_ros.jit import kernel, small_kernel
 from rs_relpose_ros.solvers.algebra import cholesky
 
 # First local parameter of each unknown: a rotation on the left of R, two steps of t in its tangent
@@ -136,7 +136,7 @@ def with_velocity(priors: Priors, velocity: VelocityPrior) -> Priors:
                   priors.rotation_information, velocity)
 
 
-@kernel
+@small_kernel
 def at_scale(priors: Priors, log_scale: float, centre: float, freedom: float) -> Priors:
     """The priors with another ``log b``, its prior mean, and g."""
     prior = priors.velocity
@@ -150,13 +150,13 @@ def isotropic(sigma: float, rate: float) -> VelocityPrior:
     return VelocityPrior(rate, np.zeros(6), np.eye(6), log_scale, log_scale, 0.0, 0.0)
 
 
-@kernel
+@small_kernel
 def unknowns(priors: Priors) -> int:
     """Number of unknowns: those of a state, and the velocities' scale if it is unknown."""
     return PARAMETERS + 1 if priors.velocity.weight > 0.0 else PARAMETERS
 
 
-@kernel
+@small_kernel
 def _add_gravity(state: TwoViewState, priors: Priors, hessian: Array, gradient: Array) -> float:
     """``r = g x k`` of the two directions in frame 1."""
     # From the row of the measurement to the middle row, with the errors of the gyro.

@@ -19,7 +19,7 @@ from rs_relpose_ros.estimator.priors import Priors, TwoViewState
 from rs_relpose_ros.estimator.problem import TwoViewProblem
 from rs_relpose_ros.estimator.sampson import RayMatches
 from rs_relpose_ros.geometry import Array, so3
-from rs_relpose_ros.jit import kernel
+from rs_relpose_ros.jit import kernel, small_kernel
 from rs_relpose_ros.solvers import common
 from rs_relpose_ros.solvers.api import GYRO_2PT, SOLVERS, UNIFORM
 from rs_relpose_ros.solvers.common import Knowledge, Model, Sample, Solutions, Solver
@@ -39,7 +39,7 @@ SCALES = np.array([1.0, 4.0, 12.0])
 BLOCK = 64
 
 
-@kernel
+@small_kernel
 def multi_scale_cost(points: Array, R: Array, x: Array, threshold2: Array,
                      limit: float) -> tuple[float, int]:
     """Sum over matches and scales of ``min(r^2 / T^2, 1)``, and the inliers of the middle scale.
@@ -110,7 +110,7 @@ class Pool(NamedTuple):
     cost: Array
 
 
-@kernel
+@small_kernel
 def _random(state: NDArray[np.uint64]) -> np.uint64:
     """Next number of splitmix64 (Steele et al., OOPSLA 2014): the state is one word."""
     state[0] += np.uint64(0x9E3779B97F4A7C15)
@@ -136,7 +136,7 @@ def draw(order: NDArray[np.int64], head: int, sample: NDArray[np.int64],
         sample[k] = candidate
 
 
-@kernel
+@small_kernel
 def _write_sample(points: Array, chosen: NDArray[np.int64], sample: Sample) -> bool:
     """Write unit rays and row times of the chosen matches; False if one is not usable."""
     for k in range(chosen.shape[0]):
@@ -152,7 +152,7 @@ def _write_sample(points: Array, chosen: NDArray[np.int64], sample: Sample) -> b
     return True
 
 
-@kernel
+@small_kernel
 def _same(Ra: Array, xa: Array, Rb: Array, xb: Array) -> bool:
     """Whether two hypotheses are equal: R within 0.01 rad, the direction of t within 0.1 rad."""
     trace = 0.0
@@ -164,7 +164,7 @@ def _same(Ra: Array, xa: Array, Rb: Array, xb: Array) -> bool:
     return abs(so3.dot(xa, xb)) > 1.0 - 0.5 * 0.1 * 0.1
 
 
-@kernel
+@small_kernel
 def _offer(R: Array, x: Array, cost: float, pool: Pool) -> None:
     """Replace an equal hypothesis of the pool, or the worst one, by this one if it is better."""
     place = -1
@@ -225,7 +225,7 @@ def sample_hypotheses(solver: int, size: int, sampling: Sampling, known: Knowled
     return drawn, best_inliers
 
 
-@kernel
+@small_kernel
 def samples_needed(ratio: float, size: int, sampling: Sampling) -> float:
     """Samples after which one is free of outliers with probability `sampling.confidence`."""
     good = ratio**size
@@ -343,7 +343,7 @@ def _truncated_cost(r: Array, valid: NDArray[np.bool_], threshold: float, sigma:
     return cost / (sigma * sigma)
 
 
-@kernel
+@small_kernel
 def _take_least(costs: Array) -> int:
     """Index of the least cost, the first of equal ones, which becomes infinite."""
     least = 0

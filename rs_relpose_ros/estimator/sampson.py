@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.estimator.priors import PARAMETERS, TwoViewState
 from rs_relpose_ros.geometry import Array, so3
-from rs_relpose_ros.jit import inlined_kernel, kernel
+from rs_relpose_ros.jit import inlined_kernel, kernel, small_kernel
 
 # Matches of a block: enough to vectorise, few enough for the nearest cache.
 BLOCK = 64
@@ -285,7 +285,7 @@ def cheirality_sign(observations: Array, use: Flags, state: TwoViewState) -> flo
     return 1.0 if vote >= 0.0 else -1.0
 
 
-@kernel
+@small_kernel
 def count_behind(matches: RayMatches, use: Flags, state: TwoViewState) -> int:
     """How many of the matches in `use` lie behind a camera, with a significant parallax."""
     count = 0

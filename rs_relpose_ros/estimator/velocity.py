@@ -22,7 +22,7 @@ from rs_relpose_ros.estimator.problem import TwoViewProblem
 from rs_relpose_ros.estimator.sampson import Flags, RayMatches
 from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.geometry.motion import InertialMotion
-from rs_relpose_ros.jit import kernel
+from rs_relpose_ros.jit import kernel, small_kernel
 
 ROUNDS = 3
 ITERATIONS = 6
@@ -103,7 +103,7 @@ def fit_with_evidence(matches: RayMatches, start: TwoViewState, prior: Priors, s
                     threshold, gyro_error)
 
 
-@kernel
+@small_kernel
 def _selected(matches: RayMatches, state: TwoViewState, threshold: float,
               prior_sigma: float) -> FitMatches:
     """Inliers of a state, with their noise."""
@@ -113,7 +113,7 @@ def _selected(matches: RayMatches, state: TwoViewState, threshold: float,
     return FitMatches(matches.observations, weights, sigma)
 
 
-@kernel
+@small_kernel
 def _known_velocities(data: DataTerm, state: TwoViewState, prior: Priors) -> float:
     """How many of the six velocities the matches determine rather than their prior.
 
@@ -150,7 +150,7 @@ def _candidate(matches: RayMatches, used: FitMatches, start: TwoViewState, data:
     return state, log_scale, data, hessian, evidence
 
 
-@kernel
+@small_kernel
 def _average(matches: RayMatches, used: FitMatches, start: TwoViewState, steps: Array,
              likely: Flags, prior: Priors, scales: Scales, threshold: float,
              gyro_error: Array) -> Refined:

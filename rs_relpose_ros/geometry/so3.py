@@ -84,7 +84,7 @@ def tangent_basis(t: Array) -> Array:
     return basis
 
 
-@kernel
+@small_kernel
 def rodrigues(theta2: float) -> tuple[float, float]:
     """``sin(theta) / theta`` and ``(1 - cos(theta)) / theta^2`` of a squared angle [rad^2]."""
     if theta2 < 1e-8:
@@ -228,7 +228,7 @@ def median(values: Array) -> float:
 #
 # Magnus expansion to fourth order (Blanes, Casas, Oteo and Ros, Physics Reports 470, 2009).
 
-@kernel
+@small_kernel
 def step_rotation(rate1: Array, rate2: Array, dt: float) -> Array:
     """Rotation vector ``phi`` (3,) of a step of `dt` [s] between two rates (3,) [rad/s]."""
     phi = np.empty(3)

@@ -29,7 +29,7 @@ from rs_relpose_ros.config.settings import ImuConfig
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import cross, dot, exp_so3, norm, rotated, STANDARD_GRAVITY
 from rs_relpose_ros.geometry.timing import to_nanoseconds
-from rs_relpose_ros.jit import kernel
+from rs_relpose_ros.jit import kernel, small_kernel
 
 # -- Bias of the gyro, measured at rest -----------------------------------------------------------
 #
@@ -304,7 +304,7 @@ def _direction_variance(length: float, acceleration: float) -> float:
     return (acceleration + 4.0 * excess * excess) / (STANDARD_GRAVITY * STANDARD_GRAVITY)
 
 
-@kernel
+@small_kernel
 def _predict(state: _State, noise: _Noise, turn: Array, dt: float) -> None:
     """Rotate by ``E = Exp(turn)`` of ``turn = -(w - b) dt`` (3,).
 
@@ -330,7 +330,7 @@ def _predict(state: _State, noise: _Noise, turn: Array, dt: float) -> None:
             P[3 + i, 3 + i] += noise.bias * dt
 
 
-@kernel
+@small_kernel
 def _correct(state: _State, noise: _Noise, force: Array, dt: float) -> None:
     """Kalman update by a specific force (3,), its direction with some variance per axis.
 
@@ -390,7 +390,7 @@ def _correct(state: _State, noise: _Noise, force: Array, dt: float) -> None:
         up[i] /= length
 
 
-@kernel
+@small_kernel
 def _rotate(R: Array, v: Array) -> None:
     """``v <- R v`` of a vector (3,)."""
     product = rotated(R, v)
@@ -420,7 +420,7 @@ def _write_product_transposed(A: Array, B: Array, out: Array) -> None:
             out[i, j] = total
 
 
-@kernel
+@small_kernel
 def _mirror(S: Array) -> None:
     """Copy the upper triangle of a matrix into the lower one, against rounding."""
     for i in range(1, len(S)):

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import cross, dot, Vector
-from rs_relpose_ros.jit import kernel
+from rs_relpose_ros.jit import kernel, small_kernel
 
 
 @kernel
@@ -65,7 +65,7 @@ def lu_solve(LU: Array, pivots: NDArray[np.int64], b: Array) -> None:
         b[k] = total * LU[k, k]
 
 
-@kernel
+@small_kernel
 def lu_solve_transposed(LU: Array, pivots: NDArray[np.int64], b: Array) -> None:
     """Solve ``A^T x = b`` in place of `b` (n,), with the result of `lu_factor`."""
     n = LU.shape[0]
@@ -212,7 +212,7 @@ def value(p: Array, degree: int, x: float) -> float:
     return y
 
 
-@kernel
+@small_kernel
 def _root_between(p: Array, degree: int, low: float, high: float, at_low: float,
                   last_step: float) -> float:
     """Root in a bracket with a monotonic polynomial: Newton's method, bisection outside of it."""
@@ -239,7 +239,7 @@ def _root_between(p: Array, degree: int, low: float, high: float, at_low: float,
     return x
 
 
-@kernel
+@small_kernel
 def _half_gap2(derivatives: Array, extremum: float, at_extremum: float, rule: PairRule) -> float:
     """``h^2`` of the pair ``extremum +- ih`` of the polynomial in the last row; -1 if not counted.
 
@@ -252,7 +252,7 @@ def _half_gap2(derivatives: Array, extremum: float, at_extremum: float, rule: Pa
     return h2 if 0.0 <= h2 < limit * limit else -1.0
 
 
-@kernel
+@small_kernel
 def _roots_between_cuts(derivatives: Array, m: int, cuts: Array, rule: PairRule, roots: Array,
                         half_gaps: Array) -> int:
     """Roots in [-1, 1] of row m of the derivatives, ascending; -1 if a value is not finite.
@@ -313,7 +313,7 @@ def roots_in_unit_interval(p: Array, rule: PairRule, roots: Array, half_gaps: Ar
     return count
 
 
-@kernel
+@small_kernel
 def real_roots(p: Array, pair_tolerance: float, roots: Array) -> int:
     """All real roots of a polynomial with ascending coefficients `p` (n + 1,) into `roots` (n,).
 
@@ -381,7 +381,7 @@ def sample_angle(node: Array, zoom: float) -> tuple[float, float, float]:
     return (c * c - s * s) / weight, 2.0 * c * s / weight, weight
 
 
-@kernel
+@small_kernel
 def is_known_angle(angle: float, angles: Array, tolerance: float) -> bool:
     """Whether an angle equals one of `angles` (K,), up to whole turns."""
     for known in angles:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.geometry import Array, so3
-from rs_relpose_ros.jit import kernel
+from rs_relpose_ros.jit import kernel, small_kernel
 from rs_relpose_ros.solvers import algebra, common
 from rs_relpose_ros.solvers.common import Knowledge, Sample, Solutions
 
@@ -36,7 +36,7 @@ _TO_QUADRATIC = _product_table(list(_ORDER), _QUADRATIC)
 _TO_CUBIC = _product_table(_QUADRATIC, _CUBIC)
 
 
-@kernel
+@small_kernel
 def _null_space(rows: Array, basis: Array) -> None:
     """Orthonormal basis (4, 9) of the null space of `rows` (5, 9), which are overwritten.
 
@@ -60,7 +60,7 @@ def _add_product(p: Array, q: Array, factor: float, table: NDArray[np.int64], ou
             out[table[i, j]] += factor * p[i] * q[j]
 
 
-@kernel
+@small_kernel
 def _cubic_constraints(basis: Array, M: Array) -> None:
     """``det E = 0`` and ``(E E^T - trace(E E^T) / 2) E = 0`` in the 20 monomials: `M` (10, 20).
 
@@ -94,7 +94,7 @@ def _cubic_constraints(basis: Array, M: Array) -> None:
                 _add_product(EET[3 * i + k], E[3 * k + j], 1.0, _TO_CUBIC, M[1 + 3 * i + j])
 
 
-@kernel
+@small_kernel
 def _rotate_basis(basis: Array) -> None:
     """Another orthonormal basis (4, 9) of the same space, in place: a rotation by 60 degrees.
 
@@ -144,7 +144,7 @@ def _eliminate(M: Array) -> float:
     return largest
 
 
-@kernel
+@small_kernel
 def _reduced_constraints(basis: Array, M: Array) -> bool:
     """Constraints in `M` (10, 20) after elimination, with another `basis` (4, 9) if necessary.
 
@@ -171,7 +171,7 @@ def _multiply_add(p: Array, p_size: int, q: Array, q_size: int, factor: float,
             out[i + j] += factor * p[i] * q[j]
 
 
-@kernel
+@small_kernel
 def _degree_10(M: Array, B: Array, p: Array) -> None:
     """The 3x3 matrix of polynomials in z, `B` (3, 3, 5), with ``B(z) (x, y, 1) = 0``; its det."""
     B[:] = 0.0
@@ -195,7 +195,7 @@ def _degree_10(M: Array, B: Array, p: Array) -> None:
         _multiply_add(minor, 7, B[r, 2], 5, 1.0, p)
 
 
-@kernel
+@small_kernel
 def _essential_matrix(B: Array, z: float, basis: Array, E: Array) -> bool:
     """E (3, 3) with ``|E| = sqrt(2)`` at a root z: (x, y, 1) is the null vector of B(z)."""
     V = np.zeros((3, 3))
@@ -216,7 +216,7 @@ def _essential_matrix(B: Array, z: float, basis: Array, E: Array) -> bool:
     return True
 
 
-@kernel
+@small_kernel
 def _orthonormalise(R: Array) -> bool:
     """Nearest rotation by Newton's iteration of the polar decomposition; False if far away."""
     G = np.empty((3, 3))
@@ -241,7 +241,7 @@ def _orthonormalise(R: Array) -> bool:
     return True
 
 
-@kernel
+@small_kernel
 def _decompose(E: Array, sample: Sample, R: Array, x: Array) -> bool:
     """R and t (in `x`) of ``E = [t]x R`` with most points in front of both cameras.
 
@@ -319,7 +319,7 @@ def _polish(sample: Sample, R: Array, t: Array) -> bool:
     return False
 
 
-@kernel
+@small_kernel
 def _is_known(R: Array, x: Array, rotations: Array, vectors: Array) -> bool:
     """Whether a solution repeats one of `rotations` (K, 3, 3) and `vectors` (K, 9)."""
     for j in range(len(rotations)):
@@ -377,7 +377,7 @@ DEGREE = 2
 HALF_ANGLE, NODES = algebra.half_angle_matrix(DEGREE), algebra.half_angle_nodes(DEGREE)
 
 
-@kernel
+@small_kernel
 def _triple(a: Array, b: Array, c: Array) -> float:
     """``a . (b x c)``."""
     return so3.dot(a, so3.cross(b, c))

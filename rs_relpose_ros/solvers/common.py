@@ -14,7 +14,7 @@ import numpy as np
 
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import copy_matrix, cross, dot, norm, rotated, rotated_back
-from rs_relpose_ros.jit import kernel, KernelInterface
+from rs_relpose_ros.jit import kernel, KernelInterface, small_kernel
 
 
 class Sample(NamedTuple):
@@ -127,7 +127,7 @@ def cheirality_votes(sample: Sample, R: Array, x: Array) -> tuple[int, int]:
     return front, behind
 
 
-@kernel
+@small_kernel
 def point_forward(sample: Sample, R: Array, x: Array) -> None:
     """Give `x` (9,) the sign with more points in front of both cameras."""
     front, behind = cheirality_votes(sample, R, x)
