@@ -85,7 +85,7 @@ def test_lens_of_a_nominal_camera_info_ends_in_poses(bag, tmp_path):
     code, values = calibrated(path, out, '--lens')
     assert code == 0
     assert values['focal_px']['value'] == pytest.approx(225.0, rel=0.02)
-    poses = []
+    poses, errors = [], []
     for parameters in (out / 'calibration.yaml', tmp_path / 'without.yaml'):
         if not parameters.exists():   # the same with the lens of the CameraInfo
             document = yaml.safe_load((out / 'calibration.yaml').read_text())
@@ -97,7 +97,10 @@ def test_lens_of_a_nominal_camera_info_ends_in_poses(bag, tmp_path):
                      '--out', str(tmp_path / parameters.stem)]) in (0, 1)
         rows = rows_of(tmp_path / parameters.stem / 'relative_poses.csv')
         poses.append(sum(row['tx'] != '' for row in rows) / len(rows))
-    assert poses[0] >= 0.9 and poses[0] > poses[1]
+        errors.append(np.median([float(row['translation_error_deg']) for row in rows_of(
+            tmp_path / parameters.stem / 'errors.csv')]))
+    assert poses[0] >= 0.9
+    assert errors[0] < 0.5 * errors[1]
 
 
 @pytest.mark.parametrize(('change', 'reason'), [
