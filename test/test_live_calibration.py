@@ -141,7 +141,7 @@ def outcomes(bag: Path, calibration: LiveCalibration, *, moving: bool = True,
                 content.angular_velocity.z = 0.0
             calibration.receive(role, content)
             yield calibration.step()
-            while calibration._fit is not None:
+            while calibration.fitting:
                 yield calibration.step(0.02)
 
 

@@ -323,6 +323,9 @@ def _lenses_arguments(parser: argparse.ArgumentParser) -> None:
     _seconds(parser, '--seconds', 20.0, 'length of a bag')
     parser.add_argument('--model', choices=('plumb_bob', 'equidistant'), default='plumb_bob',
                         help='distortion model (default: %(default)s)')
+    parser.add_argument('--live', action='store_true',
+                        help='calibrate as a running node does, from the first seconds that '
+                             'suffice (plumb_bob)')
 
 
 def _run_lenses(args: argparse.Namespace) -> int:
@@ -331,7 +334,8 @@ def _run_lenses(args: argparse.Namespace) -> int:
     return _report_of(
         range(args.seed, args.seed + args.bags),
         lambda seed: lenses.on_lens(seed, args.model, args.seconds,
-                                    args.output / f'{args.model}_{seed}_{args.seconds:g}s'),
+                                    args.output / f'{args.model}_{seed}_{args.seconds:g}s',
+                                    live=args.live),
         lenses.write_report, args, 'bag')
 
 

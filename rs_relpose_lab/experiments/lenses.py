@@ -1,6 +1,7 @@
-"""Whether an uncalibrated lens ends in poses: `calibrate`, and the pairs with its file."""
+"""Whether an uncalibrated lens ends in poses: calibration, and the pairs with its file."""
 
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 import math
 from pathlib import Path
@@ -19,9 +20,14 @@ from rs_relpose_lab.experiments.harness import markdown_table, write_table
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.bag import made_once, right_parameters, write_bag
 from rs_relpose_lab.simulation.scene import SCENES
+from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.calibrate.live import LiveCalibration
+from rs_relpose_ros.calibrate.stored import Calibrated
 from rs_relpose_ros.cli.main import main as rs_relpose
 from rs_relpose_ros.config.files import read_parameters, SourcedValue, write_parameters
+from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.messages.incoming import Role, sensor_messages, stamp_ns
 
 # First coefficient of each model: least and largest.
 MODELS = {'plumb_bob': (-0.2, 0.1), 'equidistant': (-0.05, 0.05)}
@@ -43,7 +49,8 @@ class Poses:
 class LensRun:
     """One bag: errors of the lens with their 1 sigma, and poses with it and with the true one.
 
-    Focal length in per cent; principal point: the larger of both errors [px].
+    Focal length in per cent; principal point: the larger of both errors [px]; the images that
+    were used [s].
     """
 
     model: str
@@ -59,6 +66,7 @@ class LensRun:
     center_sigma: float = math.nan
     calibrated: Poses = Poses()
     truth: Poses = Poses()
+    seconds: float = math.nan
 
 
 def lens_of(seed: int, model: str) -> tuple[SimulationConfig, RollingShutterCamera]:
@@ -76,8 +84,33 @@ def lens_of(seed: int, model: str) -> tuple[SimulationConfig, RollingShutterCame
         distortion_model=model, distortion=(float(rng.uniform(*MODELS[model])), *others))
 
 
-def on_lens(seed: int, model: str, seconds: float, folder: Path) -> LensRun:
-    """Render a bag without CameraInfo unless it exists, calibrate, and replay with both lenses."""
+def calibrated_live(bag: Path, parameters: Path) -> float:
+    """Write the file of a node that calibrates itself on a bag; the images until then [s].
+
+    The bag waits for each fit: not a measurement of its time. NaN: not calibrated.
+    """
+    calibration = LiveCalibration(Parameters.from_mapping({'image_transport': 'compressed'}),
+                                  use_stored=False)
+    with closing(calibration), open_bag(bag) as opened:
+        first_ns = 0
+        for role, message in sensor_messages(opened, opened.find_topics(needs_camera_info=False)):
+            calibration.receive(role, message.message)
+            found = calibration.step()
+            while calibration.fitting and not isinstance(found, Calibrated):
+                found = calibration.step(0.02)
+            if role is Role.IMAGE:
+                first_ns = first_ns or stamp_ns(message.message.header)
+            if isinstance(found, Calibrated):
+                parameters.write_text(found.parameters, encoding='utf-8')
+                return 1e-9 * (stamp_ns(message.message.header) - first_ns)
+    return math.nan
+
+
+def on_lens(seed: int, model: str, seconds: float, folder: Path, *, live: bool) -> LensRun:
+    """Render a bag without CameraInfo unless it exists, calibrate, and replay with both lenses.
+
+    live: by the calibration of a running node, which ends as soon as its result suffices.
+    """
     config, camera = lens_of(seed, model)
     config = replace(config, duration=seconds, plan=f'walk:{seconds}')
 
@@ -92,12 +125,18 @@ def on_lens(seed: int, model: str, seconds: float, folder: Path) -> LensRun:
                          [SourcedValue(name, value, '') for name, value in values.items()])
 
     bag, truth = made_once(folder, 'bag', render)
-    out = folder / 'calibration'
-    code = rs_relpose(['calibrate', str(bag), '--lens', model, '--out', str(out)])
-    run = LensRun(model, seed, code, camera.fx, camera.distortion[0], truth=_poses(bag, truth))
+    parameters = folder / 'calibration' / 'calibration.yaml'
+    if live:
+        parameters = folder / 'live.yaml'
+        seconds = calibrated_live(bag, parameters)
+        code = int(math.isnan(seconds))
+    else:
+        code = rs_relpose(['calibrate', str(bag), '--lens', model,
+                           '--out', str(parameters.parent)])
+    run = LensRun(model, seed, code, camera.fx, camera.distortion[0], truth=_poses(bag, truth),
+                  seconds=seconds)
     if code:
         return run
-    parameters = out / 'calibration.yaml'
     lens = read_parameters(parameters).intrinsics
     found = lens.of_image(camera.width, camera.height)
     return replace(
@@ -118,15 +157,16 @@ def _poses(bag: Path, parameters: Path) -> Poses:
 
 def write_report(folder: Path, runs: Sequence[LensRun]) -> str:
     """Write the runs (CSV) and the table (Markdown), and return the latter."""
-    rows = [[f'{run.model} {run.seed}', str(run.exit_code), f'{run.focal_true:.0f}',
+    rows = [[f'{run.model} {run.seed}', str(run.exit_code), f'{run.seconds:.1f}',
+             f'{run.focal_true:.0f}',
              f'{run.focal:.2f} +- {run.focal_sigma:.2f}', f'{run.radial_true:.3f}',
              f'{run.radial:.3f} +- {run.radial_sigma:.3f}',
              f'{run.center:.1f} +- {run.center_sigma:.1f}', *_cells([run.calibrated]),
              *_cells([run.truth])] for run in runs]
-    rows.append(['all', *6 * [''], *_cells([run.calibrated for run in runs]),
+    rows.append(['all', *7 * [''], *_cells([run.calibrated for run in runs]),
                  *_cells([run.truth for run in runs])])
     return write_table(folder, 'lenses', runs, markdown_table(
-        ['bag', 'exit code', 'f [px]', 'error [%]', 'first coefficient', 'error',
+        ['bag', 'exit code', 'images [s]', 'f [px]', 'error [%]', 'first coefficient', 'error',
          'principal point: error [px]', 'poses of pairs', 'beyond 99.7 %: t / R', 'true lens',
          'beyond'], rows))
 

@@ -88,6 +88,11 @@ class LiveCalibration:
         """An uncalibrated CameraInfo is none: the lens is calibrated, too."""
         return ''
 
+    @property
+    def fitting(self) -> bool:
+        """Whether the process of a fit runs."""
+        return self._fit is not None
+
     def waits_for_imu(self) -> bool:
         """Samples may come in batches."""
         return False
