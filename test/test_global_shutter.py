@@ -252,7 +252,7 @@ def test_on_a_walk_the_translation_is_left_and_nothing_else():
 def test_a_tracked_time_offset_is_applied():
     """The pairs show it, as to relpose_node, and the stamps move by it."""
     simulation = simulate(SimulationConfig(
-        seed=9304, duration=5.0, plan='walk:5.0', time_offset=0.008, width=320, height=240,
+        seed=9304, duration=4.0, plan='walk:4.0', time_offset=0.008, width=320, height=240,
         fx=225.0))
     parameters = lab.configured(simulation).updated(
         {'time_offset': 0.0, 'track_time_offset': True})

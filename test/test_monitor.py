@@ -20,7 +20,11 @@ from rs_relpose_ros.estimator.velocity import InertialEvidence
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.imu.buffer import force_fault
-from rs_relpose_ros.imu.integration import integrate_rotation, rotation_sensitivity
+from rs_relpose_ros.imu.integration import (
+    GyroSegment,
+    integrate_rotation,
+    rotation_sensitivity,
+)
 from rs_relpose_ros.messages import incoming
 from rs_relpose_ros.messages.incoming import Intake, Role, sensor_messages
 from rs_relpose_ros.nodes.sensor_node import Worker
@@ -113,7 +117,8 @@ def pair_data(start, end, c, camera=CAMERA):
     return PairData(
         places[0][0][estimated], places[1][0][estimated], camera, *motions, end - start,
         (first.inv() * second).as_matrix(), t / np.linalg.norm(t), rotation, covariance,
-        rotation_sensitivity(stamps_ns, rates, ImuConfig()), (rates[0], rates[-1]),
+        rotation_sensitivity(stamps_ns, rates, ImuConfig()),
+        GyroSegment(stamps_ns, rates, np.zeros(3), 3e-3),
         R_CAM_IMU.as_matrix(), 0.01)
 
 
@@ -124,6 +129,18 @@ def flight(c, pairs=9, camera=CAMERA):
 def solved(pairs, active, about):
     found = [pair_information(pair, active, about) for pair in pairs]
     return np.linalg.solve(sum(one.S for one in found), sum(one.b for one in found))
+
+
+def test_pairs_are_exact_at_times_that_are_far_off():
+    """Linearised about the truth, they are solved to it, once the gyro after them is known."""
+    c, linear, exact = deviation(offset=0.03), *(
+        recursion.Recursion() for _ in range(2))
+    for k in range(9):
+        for found in linear, exact:
+            found.add(k, pair_data(0.3 * k, 0.3 * (k + 1), c), NONE, c)
+        exact.relinearise()
+    assert abs(linear.solved().c - c)[OFFSET] > 1e-3
+    np.testing.assert_allclose((exact.solved().c - c)[[OFFSET, READOUT]], 0.0, atol=1e-4)
 
 
 @pytest.mark.parametrize('signs', [*np.eye(DEVIATIONS), [1, -1, 1, 1, -1, 1, 1, -1, 1, -1, 1]],
@@ -171,6 +188,32 @@ def test_a_deviation_shifts_the_pose_as_a_new_estimate(row, k):
         assert apart < 0.45 * np.linalg.norm(moved[3:]) + 1e-4
         sigma = math.sqrt(np.trace(pose.covariance[:3, :3]))
         assert np.linalg.norm(moved[:3] - expected[:3]) < sigma
+
+
+def test_a_doubtful_principal_point_widens_the_covariance_as_it_moves_the_estimate():
+    for start in (0.4, 1.2, 2.0):
+        pair = pair_data(start, start + 0.3, NONE)
+
+        def estimated(right=0.0, down=0.0, pair=pair):
+            camera = replace(CAMERA, cx=CAMERA.cx + right, cy=CAMERA.cy + down)
+            return estimate_relative_pose(
+                pair.points1, pair.points2, camera, pair.motion1, pair.motion2,
+                pair.gyro_rotation, pair.gyro_covariance, pair.interval,
+                EstimatorConfig(pixel_sigma=0.3))
+
+        pose = estimated()
+        exact, doubtful = (ConsistencyMonitor().add_pair(
+            0, replace(pair, R=pose.R, t=pose.t), pose,
+            replace(CONFIGURED, center_sigma=sigma)).covariance for sigma in (0.0, 2.0))
+        shifts = np.array([[*(moved.t - pose.t),
+                            *Rotation.from_matrix(moved.R @ pose.R.T).as_rotvec()]
+                           for moved in (estimated(right=2.0), estimated(down=2.0))])
+        added, expected = doubtful - exact, shifts.T @ shifts
+        # Of t, which other priors of the velocities move otherwise, within its sigma.
+        np.testing.assert_allclose(added[3:, 3:], expected[3:, 3:],
+                                   atol=0.2 * np.trace(expected[3:, 3:]))
+        assert abs(math.sqrt(np.trace(added[:3, :3])) - math.sqrt(np.trace(
+            expected[:3, :3]))) < 0.5 * math.sqrt(np.trace(pose.covariance[:3, :3]))
 
 
 def test_the_rotation_of_the_images_does_not_follow_the_gyro():
@@ -404,7 +447,8 @@ def calibration(c, sigma, coupled=0.0):
     S = correlation / np.outer(sigma, sigma)
     covariance = np.linalg.inv(S + np.diag(recursion.PRIOR_SIGMA**-2.0))
     pairs = np.tile(S / 20, (20, 1, 1))
-    return recursion.Calibration(np.asarray(c), covariance, pairs, pairs @ c, 1.0, 1.0, 1.0)
+    return recursion.Calibration(np.asarray(c), covariance, pairs, pairs @ c, np.ones(20),
+                                 np.asarray(c), 1.0, 1.0, 1.0)
 
 
 SIGMA = np.array([1e-3] * 3 + [5e-4, 1e-3] + [1e-3] * 3 + [5e-3, 5e-3, 0.01])
@@ -444,6 +488,22 @@ def test_an_alternative_hypothesis_that_fits_as_well_is_named(correlation, named
     assert {fault.quantity for fault in faults} == named
     assert all(('time_offset or readout_time' in fault.fix) is (len(named) > 1)
                for fault in faults)
+
+
+def test_the_error_that_linearisation_leaves_is_in_the_sigma():
+    c = deviation(offset=0.02)
+    estimated = replace(calibration(c, SIGMA), about=deviation(offset=0.014))
+    found, = assessment.find_inconsistencies(estimated, [EFFECT], CONFIGURED)
+    assert found.sigma[OFFSET] == pytest.approx(math.hypot(SIGMA[OFFSET], 0.006), rel=0.01)
+
+
+@pytest.mark.parametrize(('size', 'likely'), [(1.5, 0.0), (3.0, 3.0)])
+def test_times_that_are_likely_to_be_off_are_linearised_there(size, likely):
+    """Before they are certain; another parameter is not."""
+    c = deviation(offset=size * SIGMA[OFFSET], focal=3.9 * SIGMA[FOCAL])
+    np.testing.assert_allclose(
+        assessment.likely(calibration(c, SIGMA), CONFIGURED),
+        deviation(offset=likely * SIGMA[OFFSET]), rtol=0.01)
 
 
 def test_configured_sigmas_bound_what_a_deviation_may_explain():
@@ -914,7 +974,7 @@ def test_a_rotation_that_contradicts_the_gyro_enlarges_its_own_covariance():
     # The bag was written with a bias of (0.011, -0.007, 0.005) rad/s, an offset of 0, and a
     # readout time of 30 ms.
     (('time_offset=0.01', 'gyro_bias=[0.0, 0.0, 0.0]', 'gyro_bias_sigma=0.01',
-      'track_time_offset=true'), 'time_offset', 0.0, -0.01, 1e-3, 2.0),
+      'track_time_offset=true'), 'time_offset', 0.0, -0.01, 1e-3, 1.2),
     # Pairs from before the readout time was applied must not keep it as configured.
     pytest.param(('readout_time=0.027', 'track_readout_time=true'), 'readout_time', 0.03, 0.003,
                  6e-4, 1.0, marks=pytest.mark.long),

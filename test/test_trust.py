@@ -216,12 +216,10 @@ def test_a_missing_lens_is_named_although_a_little_more_of_it_would_not_move_the
     pairs = [trust_runs.evaluated(recording, *result)
              for result in trust_runs.run(recording, configured, 1.6)]
     assert {pair.verdict.named for pair in pairs if pair.at > 1.0} == {('distortion',)}
-    # Suppressed from the pair after the first certain one on; earlier poses are off by 1 to 4 deg,
-    # all within their covariance: residuals of a wrong lens are similar in each image region,
-    # which is taken for noise until several pairs agree.
+    # Poses are uncertain at first, then suppressed, from the pair after the first certain one on.
     believed = [pair for pair in pairs if pair.has_pose]
-    assert believed and all(pair.at < 0.9 and pair.direction_error < pair.direction_sigma
-                            for pair in believed)
+    assert all(pair.at < 0.45 and pair.direction_error < pair.direction_sigma
+               for pair in believed)
 
 
 def test_command_distinguishes_wrong_from_right(tmp_path):

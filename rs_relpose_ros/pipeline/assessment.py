@@ -38,6 +38,8 @@ from rs_relpose_ros.pipeline.rotations import RotationComparison
 
 # Sigmas beyond which a deviation is certain.
 _CERTAIN = 4.0
+# The same that suffices to linearise about a deviation.
+_LIKELY = 2.5
 # Shift of the pose in its own sigmas (Mahalanobis) that matters, and that leaves its covariance.
 _MATTERS, _OUTSIDE = 1.0, 3.0
 # Axes and unit are wrong if a correction leaves less than this share of the images' rotation.
@@ -55,6 +57,10 @@ _QUARTER_TURN = 0.3
 _OBSERVABLE_IN = 0.9
 # Sigmas within which a parameter that was configured with a sigma is as configured.
 _AS_CONFIGURED = 3.0
+# Error that linearisation leaves, 1 sigma as a share of the last step: on recordings with times
+# that are far off steps are 0.4 to 0.8 of the error, with other parameters 0.9.
+_REMAINS = np.full(findings.DEVIATIONS, 0.25)
+_REMAINS[[OFFSET, READOUT]] = 1.0
 # Gain in chi-square beyond which there is no doubt.
 _LARGEST_GAIN = 100.0
 # Most inconsistent quantities: traces of a gross error need some, too.
@@ -77,6 +83,7 @@ class Configured:
     gyro_bias: Array   # (3,) parameter [rad/s]
     sigmas: Array   # (11,) configured, of the deviations; 0 if not known
     active: Array   # (11,) deviations applied already: tracked parameters, bias at rest
+    center_sigma: float = 0.0   # [px] of the principal point, per axis
 
     @property
     def direction(self) -> float:
@@ -163,6 +170,19 @@ def find_inconsistencies(estimated: Calibration, effects: Sequence[Effect],
     return inconsistent
 
 
+def likely(estimated: Calibration, configured: Configured) -> Array:
+    """Deviation (11,) of the times that the pairs suggest, though not for certain; or zero.
+
+    Far from an error of the times, pairs show little of it: they are linearised there, to see.
+    """
+    (quantity, solution), _ = sorted(
+        ((quantity, _solved(_parts_of(quantity), estimated, configured))
+         for quantity in findings.QUANTITIES if quantity.tracking),
+        key=lambda item: -item[1].gain(item[0].part))
+    return np.where(_parts_of(quantity) & (solution.certainty(quantity.part) > _LIKELY),
+                    solution.off, 0.0)
+
+
 def undetermined(estimated: Calibration, configured: Configured) -> Array:
     """Second moment (11, 11) of undetected deviations.
 
@@ -220,6 +240,11 @@ class _Solution(NamedTuple):
                                              (self.by_pair**2).sum(axis=0))))
 
     @property
+    def step(self) -> Array:
+        """(11,) from the deviations about which the pairs are linearised."""
+        return self.active + self.off - self.estimated.about
+
+    @property
     def moment(self) -> Array:
         """Second moment (11, 11) with these sigmas."""
         widths = self.sigma / np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
@@ -247,6 +272,10 @@ def _solved(free: NDArray[np.bool_], estimated: Calibration, configured: Configu
     All others are within their configured sigmas, and zero where there is none.
     """
     sigmas, active = np.where(free, PRIOR_SIGMA, configured.sigmas), configured.active
+    if free[DISTORTION]:
+        factors = estimated.if_distorted
+        estimated = replace(estimated, S=factors[:, None, None] * estimated.S,
+                            b=factors[:, None] * estimated.b)
     S, misfit = estimated.S.sum(axis=0), estimated.scatter * estimated.shared
     # Scaled: the deviations have different units.
     scale = np.outer(sigmas, sigmas)
@@ -261,7 +290,8 @@ def _inconsistency(quantity: Quantity, solution: _Solution, certainty: float,
         return float(np.quantile([np.linalg.norm(s) for s in shifts], quantile)) if shifts else 0.0
 
     deviation = np.where(_parts_of(quantity), solution.off, 0.0)
-    return Inconsistency(quantity, deviation, solution.sigma, certainty,
+    return Inconsistency(quantity, deviation, np.hypot(solution.sigma, _REMAINS * solution.step),
+                         certainty,
                          length([effect.shift @ deviation for effect in effects], _OBSERVABLE_IN),
                          length([effect.claimed_shift @ deviation for effect in effects], 0.5))
 

@@ -54,6 +54,7 @@ class ConsistencyMonitor:
         self._on_rotations: deque[Effect] = deque(maxlen=_EFFECTS)
         self.latest: recursion.PairInformation | None = None   # of the last pair
         self._inconsistent: list[Inconsistency] = []
+        self._likely = np.zeros(DEVIATIONS)   # about which pairs are linearised
         self._gross: tuple[Finding, ...] = ()
         # Seconds by which stamps of the IMU are ahead as images arrive, of the last frames.
         self.ahead: deque[float] = deque(maxlen=_ARRIVALS)
@@ -112,23 +113,24 @@ class ConsistencyMonitor:
         # A deviation may be so large that no pair has a pose.
         self._inconsistent = assessment.find_inconsistencies(
             self.calibration, self._on_poses or self._on_rotations, configured)
+        self._likely = self._deviation() if self._inconsistent else assessment.likely(
+            self.calibration, configured)
 
     def _add(self, stamp_ns: int, data: recursion.PairData, pose: RelativePose,
              configured: Configured) -> RelativePose:
-        active = about = configured.active
-        if self._inconsistent:
-            # The effect of an inconsistent quantity is evaluated at its estimate: where poses are
-            # off already, a little more or less may hardly move them.
-            about = np.asarray(active + np.clip(self._deviation(), -_LARGEST, _LARGEST))
-        information = self._recursion.add(stamp_ns, data, active, about)
+        # The effect of an inconsistent quantity is evaluated at its estimate: where poses are
+        # off already, a little more or less may hardly move them.
+        information = self._recursion.add(stamp_ns, data, configured.active, np.asarray(
+            configured.active + np.clip(self._likely, -_LARGEST, _LARGEST)))
         if information is None:
             return pose
         self.latest = information
         self.calibration = self._recursion.solved()
         by_deviation = information.pose_by_deviation
         shift = by_deviation @ self._deviation()
-        # The inconsistency, and deviations that the pairs so far have not excluded.
-        doubt = np.outer(shift, shift) + (
+        # The inconsistency, deviations that the pairs so far have not excluded, and the center.
+        by_center = configured.center_sigma * information.pose_by_center
+        doubt = np.outer(shift, shift) + by_center @ by_center.T + (
             by_deviation @ assessment.undetermined(self.calibration, configured) @ by_deviation.T)
         pose = replace(pose, covariance=pose.covariance + doubt)
         # The effect of an inconsistent parameter on the baseline is not known.

@@ -241,12 +241,12 @@ class Pipeline(Processor[PairResult]):
                 pair.interval_of(reference.imu, frame.imu), pose.R, pose.t, gyro.rotation,
                 gyro.covariance, rotation_sensitivity(
                     segment.stamps_ns, segment.angular_velocities, parameters.imu),
-                (segment.angular_velocities[0], segment.angular_velocities[-1]),
-                parameters.sensor.R_cam_imu, parameters.estimator.gyro_sigma)
+                segment, parameters.sensor.R_cam_imu, parameters.estimator.gyro_sigma)
         bias, active = np.array(parameters.imu.gyro_bias), np.zeros(findings.DEVIATIONS)
         configured = Configured(parameters.sensor, sensor.camera, bias, configured_sigmas(
             parameters, seconds_between(*list(self._stamps_ns)[-2:])
-            - parameters.sensor.time_offset_reference_interval), active)
+            - parameters.sensor.time_offset_reference_interval), active,
+            parameters.intrinsics.principal_point_sigma)
         active[findings.OFFSET] = frame.imu.applied_offset_ns / NANOSECONDS
         active[findings.READOUT] = configured.direction * self._readout
         active[findings.BIAS] = parameters.sensor.R_cam_imu.T @ segment.bias - bias

@@ -35,14 +35,22 @@ from rs_relpose_ros.estimator.sampson import jacobian, residuals
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
-from rs_relpose_ros.geometry.so3 import exp_so3, log_so3, median, skew, tangent_basis
-from rs_relpose_ros.geometry.timing import to_nanoseconds
-from rs_relpose_ros.imu.integration import RotationSensitivity
+from rs_relpose_ros.geometry.so3 import (
+    exp_so3,
+    integrated_rotations,
+    log_so3,
+    median,
+    skew,
+    tangent_basis,
+)
+from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
+from rs_relpose_ros.imu.integration import GyroSegment, RotationSensitivity
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.pipeline.findings import (
     AXES,
     BIAS,
     DEVIATIONS,
+    DISTORTION,
     FOCAL,
     OFFSET,
     READOUT,
@@ -60,6 +68,8 @@ _LEAST_ROTATION_SIGMA = 1e-5
 _MOST_MATCHES = 120
 # Step of numerical derivatives: far below the noise of a residual, far above rounding.
 _STEP = 1e-5
+# Gyro beyond the rows [s].
+_LEAST_SPAN = 1e-4
 # Steps of a new fit of a pair.
 _NEW_STEPS = 3
 # Of a state: rotation and direction of translation.
@@ -81,9 +91,14 @@ class PairData:
     gyro_rotation: Array   # (3, 3) between the stamped rows
     gyro_covariance: Array   # (3, 3) of that, as in the estimate
     gyro_sensitivity: RotationSensitivity   # of that
-    rates: tuple[Array, Array]   # (3,) at the two stamped rows [rad/s]
+    segment: GyroSegment   # of that
     R_cam_imu: Array
     gyro_sigma: float   # [rad/s] of the rate within a frame
+
+    @property
+    def rates(self) -> tuple[Array, Array]:
+        """Of the gyro, (3,) at the two stamped rows [rad/s]."""
+        return self.segment.angular_velocities[0], self.segment.angular_velocities[-1]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,7 +107,9 @@ class PairInformation:
 
     S: Array   # (11, 11)
     b: Array   # (11,)
+    if_distorted: float   # factor of both if the distortion is free: its residuals are no noise
     pose_by_deviation: Array   # (6, 11) of (dt, dtheta) in camera 1, first order
+    pose_by_center: Array   # (6, 2) the same by the principal point [px]
     # (5, 11) the same in sigmas of a correctly configured pose, whitened; rotation in the first 3.
     shift_by_deviation: Array
     images_against_gyro: Array   # (3,) [rad] Log of the rotation by images alone and R_gyro^T
@@ -118,18 +135,13 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
     observations = np.ascontiguousarray(problem.observations[keep])
     D, rows = _gyro(pair), _Rows.of(pair, problem, keep)
     rotation, information = problem.rotation, problem.rotation_information
-    state = _state(pair, problem, observations)
     if at.any():
-        rotation = exp_so3(D @ at) @ rotation
+        rotation = exp_so3(D[:, :DEVIATIONS] @ at) @ rotation
         observations = rows.displaced(observations, at)
     prior = priors.Priors(np.zeros(3), np.zeros(3), 0.0, 0.0, pair.gyro_sigma**-2,
                           np.ascontiguousarray(rotation), information,
                           priors.isotropic(_VELOCITY_SIGMA, 1.0 / pair.interval))
-    # Without a translation there is no estimate about which a pair could be linearised.
-    if at.any() or not np.isfinite(pair.t).all():
-        r = np.abs(residuals(observations, state))
-        state = gauss_newton(FitMatches(observations, (r < 4.0 * np.median(r)).astype(float),
-                                        _noise(r)), state, prior, _NEW_STEPS)
+    state = _state(pair, problem, observations, prior, fit=bool(at.any()))
     r = residuals(observations, state)
     sigma = _noise(r)
     weights = 1.0 / (1.0 + (r / (_CAUCHY_SIGMAS * sigma)) ** 2) / sigma**2
@@ -148,21 +160,25 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
     solved = inverse(H) @ np.column_stack([C, gradient])
     S = (J_c.T * weights) @ J_c + D.T @ information @ D - C.T @ solved[:, :-1]
     b = C.T @ solved[:, -1] - (J_c.T * weights) @ r + D.T @ (information @ theta)
-    S = 0.5 * (S + S.T)
-    ratio = _common_noise(FitMatches(observations, weights, 1.0), J_c - J_x @ solved[:, :-1],
-                          r - J_x @ solved[:, -1], S)
+    # The principal point is not estimated: axes of the IMU have nearly the same effect.
+    S, b = 0.5 * (S + S.T)[:DEVIATIONS, :DEVIATIONS], b[:DEVIATIONS]
+    ratio, if_distorted = _common_noise(
+        FitMatches(observations, weights, 1.0), (J_c - J_x @ solved[:, :-1])[:, :DEVIATIONS],
+        r - J_x @ solved[:, -1], S)
     S, b = S / ratio, b / ratio
-    shifts = _shifts(pair, problem, state, H.copy(), C, D)
+    by_deviation, whitened = _shifts(pair, problem, state, H.copy(), C, D)
     # The rotation by the images: the step without the gyro's prior.
     H[THETA:THETA + 3, THETA:THETA + 3] -= information
     gradient[THETA:THETA + 3] -= information @ theta
     rotation_step = np.asarray(-(inverse(H) @ gradient)[THETA:THETA + 3])
-    return PairInformation(S, b + S @ about, *shifts, theta + rotation_step)
+    return PairInformation(
+        S, b + S @ about, ratio / if_distorted, by_deviation[:, :DEVIATIONS],
+        by_deviation[:, DEVIATIONS:], whitened[:, :DEVIATIONS], theta + rotation_step)
 
 
 def _shifts(pair: PairData, problem: TwoViewProblem, state: TwoViewState, H: Array, C: Array,
             D: Array) -> tuple[Array, Array]:
-    """Shift of the estimated pose by deviations, (6, 11), and whitened, (5, 11).
+    """Shift of the estimated pose by deviations and center, (6, 13), and whitened, (5, 13).
 
     With the prior of the estimate for the gyro's rotation; H and C are changed.
     """
@@ -180,19 +196,28 @@ def _shifts(pair: PairData, problem: TwoViewProblem, state: TwoViewState, H: Arr
     return by_deviation, solve_triangular(spread, moved[_POSE], lower=True)
 
 
-def _common_noise(matches: FitMatches, J: Array, r: Array, S: Array) -> float:
+def _common_noise(matches: FitMatches, J: Array, r: Array, S: Array) -> tuple[float, float]:
     """Variance of the score of the matches by image regions, over that by S; at least 1.
 
-    Residuals of neighbours are similar where images are dark or blurred. J (N, 11), r (N,):
+    Residuals of neighbours are similar where images are dark or blurred, or where the distortion
+    is wrong: the second value is without those that a distortion explains. J (N, 11), r (N,):
     derivatives and residuals of the fitted matches, S (11, 11): information of the pair.
     """
-    in_region = image_regions(matches) == np.arange(REGIONS[0] * REGIONS[1])[:, None]
-    sums = (in_region * (matches.weights * r)) @ J
     scale = np.outer(PRIOR_SIGMA, PRIOR_SIGMA)
     covariance = inverse(S * scale + np.eye(DEVIATIONS)) * scale
-    by_regions = float(((sums @ covariance) * sums).sum())
-    independent = float((covariance * ((J.T * matches.weights) @ J)).sum())
-    return max((1.0 + by_regions) / (1.0 + independent), 1.0)
+    in_region = image_regions(matches) == np.arange(REGIONS[0] * REGIONS[1])[:, None]
+    along = J[:, DISTORTION]
+    information = J.T * matches.weights @ J
+    without = r - along * ((along * matches.weights) @ r / (
+        information[DISTORTION, DISTORTION] + PRIOR_SIGMA[DISTORTION]**-2.0))
+    independent = float((covariance * information).sum())
+
+    def ratio(left: Array) -> float:
+        sums = (in_region * (matches.weights * left)) @ J
+        return max((1.0 + float(((sums @ covariance) * sums).sum())) / (1.0 + independent), 1.0)
+
+    by_regions = ratio(r)
+    return by_regions, min(ratio(without), by_regions)
 
 
 def _noise(r: Array) -> float:
@@ -200,8 +225,9 @@ def _noise(r: Array) -> float:
     return max(1.4826 * median(np.abs(r)), _LEAST_SIGMA)
 
 
-def _state(pair: PairData, problem: TwoViewProblem, observations: Array) -> TwoViewState:
-    """The estimate at the middle rows, at constant velocity."""
+def _state(pair: PairData, problem: TwoViewProblem, observations: Array, prior: priors.Priors,
+           fit: bool) -> TwoViewState:
+    """The estimate at the middle rows, at constant velocity; fitted again if there is no t."""
     delay = problem.reference_row_time
     R = np.ascontiguousarray(problem.motion1.rotations([delay])[0] @ pair.R
                              @ problem.motion2.rotations([delay])[0].T)
@@ -210,13 +236,19 @@ def _state(pair: PairData, problem: TwoViewProblem, observations: Array) -> TwoV
         # The direction nearest to all epipolar planes.
         normals = np.cross(observations[:, :3], observations[:, 9:12] @ R.T)
         t = np.ascontiguousarray(np.linalg.eigh(normals.T @ normals)[1][:, 0])
+        fit = True
     velocity = t / pair.interval
-    return TwoViewState(R, t, velocity, velocity.copy(), np.zeros(3), np.zeros(3))
+    state = TwoViewState(R, t, velocity, velocity.copy(), np.zeros(3), np.zeros(3))
+    if not fit:
+        return state
+    r = np.abs(residuals(observations, state))
+    matches = FitMatches(observations, (r < 4.0 * np.median(r)).astype(float), _noise(r))
+    return gauss_newton(matches, state, prior, _NEW_STEPS)
 
 
 def _at_stamped_row(pair: PairData, problem: TwoViewProblem, state: TwoViewState,
                     moved: Array) -> Array:
-    """Moved states (17, 11) at the middle row, with its movement relative to the stamped row.
+    """Moved states (17, 13) at the middle row, with its movement relative to the stamped row.
 
     A longer readout time delays the middle row, by D = share c, but not the stamped one:
     ``t = Exp(w_1 D) t_middle, R = Exp(w_1 D) R_middle Exp(w_2 D)^T``; w in middle-row axes.
@@ -231,20 +263,22 @@ def _at_stamped_row(pair: PairData, problem: TwoViewProblem, state: TwoViewState
     return moved
 
 
-@functools.lru_cache(maxsize=8)
-def _lens(camera: RollingShutterCamera, focal: float, distortion: float) -> RollingShutterCamera:
-    """The camera with deviations of FOCAL and DISTORTION."""
-    if not (focal or distortion):
+@functools.lru_cache(maxsize=16)
+def _lens(camera: RollingShutterCamera, focal: float, distortion: float, right: float = 0.0,
+          down: float = 0.0) -> RollingShutterCamera:
+    """The camera with deviations of FOCAL and DISTORTION, and of its principal point [px]."""
+    if not (focal or distortion or right or down):
         return camera
     coefficients = list(camera.distortion) or [0.0] * 4
     coefficients[0] += distortion
     return replace(camera, fx=camera.fx / (1.0 + focal), fy=camera.fy / (1.0 + focal),
+                   cx=camera.cx + right, cy=camera.cy + down,
                    distortion=tuple(coefficients) if any(coefficients) else camera.distortion)
 
 
 def _gyro(pair: PairData) -> Array:
-    """Left derivative (3, 11) of the gyro's rotation between the middle rows, by deviations."""
-    D = np.zeros((3, DEVIATIONS))
+    """Left derivative (3, 13) of the gyro's rotation between the middle rows, as of the rays."""
+    D = np.zeros((3, DEVIATIONS + 2))
     D[:, AXES] = np.eye(3) - pair.gyro_rotation
     D[:, OFFSET] = pair.gyro_rotation @ pair.rates[1] - pair.rates[0]
     D[:, READOUT] = middle_share(pair.camera) * D[:, OFFSET]
@@ -255,16 +289,15 @@ def _gyro(pair: PairData) -> Array:
 
 def _by_lens(pair: PairData, problem: TwoViewProblem, rows: _Rows, keep: NDArray[np.bool_],
              at: Array, state: TwoViewState, r: Array) -> Array:
-    """Derivatives (N, 2) of the residuals by FOCAL and by DISTORTION.
+    """Derivatives (N, 4) of the residuals by FOCAL, DISTORTION, and the principal point [px].
 
     Rays and their derivatives by the pixel change together: with smaller rays alone, residuals in
     pixels would shrink with a longer focal length.
     """
     columns, points1, points2 = [], pair.points1[keep], pair.points2[keep]
-    for focal, distortion in ((_STEP, 0.0), (0.0, _STEP)):
-        observations = observed(
-            points1, points2, _lens(pair.camera, focal, distortion), problem.motion1,
-            problem.motion2)
+    for step in _STEP * np.eye(4):
+        observations = observed(points1, points2, _lens(pair.camera, *step), problem.motion1,
+                                problem.motion2)
         if at.any():
             observations = rows.displaced(observations, at)
         columns.append((residuals(observations, state) - r) / _STEP)
@@ -341,6 +374,49 @@ def _displace(observations: Array, turns: Array, delays: Array, out: Array) -> N
                                         - turn[q] * observations[i, base + p])
 
 
+# -- Other times of the rows -------------------------------------------------------------------
+
+_TIMES = [OFFSET, READOUT]
+
+
+def _at_other_times(pair: PairData, gyro: GyroSegment, deviations: Array) -> PairData | None:
+    """The pair with rows at the times of the deviations OFFSET and READOUT, not yet fitted.
+
+    By the deviations alone, rotations at other times are known to first order only: here `gyro`,
+    which extends beyond the pair, is integrated again. None if it does not cover all rows.
+    """
+    signed = pair.camera.line_delay * pair.camera.height + float(deviations[READOUT])
+    camera = replace(pair.camera, readout_time=abs(signed),
+                     readout_direction='down' if signed >= 0.0 else 'up')
+    known, (begin, end) = (gyro.stamps_ns - gyro.stamps_ns[0]) * 1e-9, camera.row_time_span
+    begin, end = begin - _LEAST_SPAN, end + _LEAST_SPAN
+    first, second = (seconds_between(gyro.stamps_ns[0], pair.segment.stamps_ns[k])
+                     + float(deviations[OFFSET]) for k in (0, -1))
+    if first + begin < 0.0 or second + end > known[-1]:
+        return None
+
+    def between(start: float, stop: float) -> tuple[Array, Array]:
+        times = np.concatenate([[start], known[(known > start) & (known < stop)], [stop]])
+        return times, np.column_stack(
+            [np.interp(times, known, axis) for axis in gyro.angular_velocities.T])
+
+    times, rates = between(first, second)
+    rotation = integrated_rotations(times, rates)[-1]
+    motions = []
+    for stamped in (first, second):
+        rows, row_rates = between(stamped + begin, stamped + end)
+        motions.append(FrameMotion.from_gyro(rows - stamped, row_rates))
+    return replace(
+        pair, camera=camera, motion1=motions[0], motion2=motions[1], R=rotation,
+        t=np.full(3, np.nan), gyro_rotation=rotation, segment=replace(
+            pair.segment, angular_velocities=rates,
+            stamps_ns=gyro.stamps_ns[0] + np.round(times * 1e9).astype(np.int64)))
+
+
+def _far_in_time(deviations: Array) -> bool:
+    return float(np.linalg.norm((deviations / PRIOR_SIGMA)[_TIMES])) >= _NEAR
+
+
 # -- Sums over pairs ---------------------------------------------------------------------------
 
 # Pairs of the last seconds, at most so many.
@@ -365,6 +441,8 @@ class Calibration:
     covariance: Array   # (11, 11)
     S: Array   # (N, 11, 11) and (N, 11): of the pairs, without a prior
     b: Array
+    if_distorted: Array   # (N,) factors of these
+    about: Array   # (11,) about which they are linearised, in the mean by their information
     scatter: float   # variance of the scores over that by S: 1 where residuals are independent
     shared: float   # factor of the variances by errors that are common to all pairs
     widened: float   # and by the number of pairs
@@ -382,7 +460,7 @@ class Calibration:
 
 NOTHING_ESTIMATED = Calibration(
     np.zeros(DEVIATIONS), np.diag(PRIOR_SIGMA**2), np.zeros((0, DEVIATIONS, DEVIATIONS)),
-    np.zeros((0, DEVIATIONS)), 1.0, 1.0, 1.0)
+    np.zeros((0, DEVIATIONS)), np.zeros(0), np.zeros(DEVIATIONS), 1.0, 1.0, 1.0)
 
 
 class _Entry(NamedTuple):
@@ -427,16 +505,33 @@ class Recursion:
 
         Whether there were any.
         """
-        about = self._pairs[-1].about
+        last = self._pairs[-1]
         apart = np.linalg.norm(
-            (np.array([pair.about for pair in self._pairs]) - about) / PRIOR_SIGMA, axis=1)
+            (np.array([pair.about for pair in self._pairs]) - last.about) / PRIOR_SIGMA, axis=1)
+        if len(apart) > 1 and _far_in_time(last.about - last.active):
+            apart[-2] = math.inf   # now the gyro after it is known
         chosen = [k for k in np.argsort(apart, kind='stable')[::-1][:_AGAIN] if apart[k] >= _NEAR]
         for k in chosen:
-            pair = self._pairs[k]
-            information = pair_information(pair.data, pair.active, about)
+            information = self._linearised(k, last.about)
             if information is not None:
-                self._pairs[k] = pair._replace(about=about, information=information)
+                self._pairs[k] = self._pairs[k]._replace(about=last.about, information=information)
         return bool(chosen)
+
+    def _linearised(self, k: int, about: Array) -> PairInformation | None:
+        """Information of a pair about deviations, if these are of its times by the gyro there."""
+        data, active = self._pairs[k].data, self._pairs[k].active
+        if _far_in_time(about - active):
+            gyro = data.segment
+            if k and self._pairs[k - 1].data.segment.stamps_ns[-1] == gyro.stamps_ns[0]:
+                gyro = self._pairs[k - 1].data.segment.joined(gyro)
+            if k + 1 < len(self._pairs) and (
+                    later := self._pairs[k + 1].data.segment).stamps_ns[0] == gyro.stamps_ns[-1]:
+                gyro = gyro.joined(later)
+            moved = _at_other_times(data, gyro, about - active)
+            if moved is not None:
+                data, active = moved, active.copy()
+                active[_TIMES] = about[_TIMES]
+        return pair_information(data, active, about)
 
     def solved(self) -> Calibration:
         """The calibration that fits all pairs."""
@@ -454,5 +549,9 @@ class Recursion:
         sandwich = covariance @ (scores.T @ scores) @ covariance
         widened, shared = ((n + _FEW_PAIRS) / n)**2, 1.0 + _SHARED**2 * n
         ratios = np.maximum(np.diag(sandwich) / np.diag(covariance), 1.0) * widened
+        weights = np.einsum('pii->pi', S)
+        about = (weights * [pair.about for pair in self._pairs]).sum(axis=0) / np.maximum(
+            weights.sum(axis=0), np.finfo(float).tiny)
         return Calibration(c, shared * covariance * np.sqrt(np.outer(ratios, ratios)), S, b,
-                           float(np.median(ratios)), shared, widened)
+                           np.array([pair.information.if_distorted for pair in self._pairs]),
+                           about, float(np.median(ratios)), shared, widened)
