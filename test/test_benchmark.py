@@ -2,6 +2,7 @@
 
 import csv
 from dataclasses import replace
+import math
 import re
 import subprocess
 import sys
@@ -13,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from two_view_scene import rotation_error
 
 from rs_relpose_lab.cli.benchmark import matching_cells
-from rs_relpose_lab.experiments import accuracy, comparison, methods, speed
+from rs_relpose_lab.experiments import accuracy, comparison, methods, speed, suggestions
 from rs_relpose_lab.experiments import consistency as pair_errors
 from rs_relpose_lab.experiments.harness import grouped
 from rs_relpose_lab.experiments.methods import METHODS
@@ -231,6 +232,35 @@ def test_chosen_pairs_of_a_recording_and_of_its_table(bundled_bag, tmp_path):
     table.write_text('stamp,x\n1,2\n', encoding='utf-8')
     with pytest.raises(InputError, match='is no table of true pairs'):
         list(pair_errors.on_recording(bundled_bag, BUNDLED_PARAMETERS, table))
+
+
+@pytest.mark.long
+def test_suggested_values_of_wrong_parameters(bundled_bag, tmp_path, monkeypatch):
+    """Its file is right: a focal length that the CameraInfo does not have is named."""
+    monkeypatch.setattr(suggestions, 'ROWS', {'focal x1.05': suggestions.ROWS['focal x1.05']})
+    assert main(['benchmark', 'suggestions', '--recording', str(bundled_bag),
+                 str(BUNDLED_PARAMETERS), '--output', str(tmp_path)]) == 0
+    right, wrong = rows_of(tmp_path / 'suggestions.csv')
+    assert right['others'] == '' and right['estimated'] == ''
+    assert float(wrong['size']) > 6.0
+    assert float(wrong['estimated']) == pytest.approx(float(wrong['right']), rel=0.01)
+    report = (tmp_path / 'suggestions.md').read_text()
+    assert re.search(r'^\| right +\| +ok \|$', report, re.MULTILINE)
+    assert '1 of 1 errors of over 6 sigmas named' in report
+
+
+def test_errors_of_suggested_values_are_counted_by_their_sigmas(tmp_path):
+    def found(row, size, estimated, others=''):
+        return suggestions.Suggestion('bag', row, size, 10.0, estimated, 2.0, others)
+
+    text = suggestions.write_report(tmp_path, [
+        found('right', 0.0, math.nan, 'axes'), found('axes 3 deg', 7.0, math.nan),
+        found('readout x2', 7.0, 13.0), found('readout x0.5', 7.0, 15.0),
+        found('focal x1.05', 5.0, math.nan)])
+    assert ('2 of 3 errors of over 6 sigmas named, 1 of their values within 2 sigmas; 1 right '
+            'runs with a finding') in text
+    assert re.search(r'^\| readout x2 +\| +\+1\.5 \(7\) \|$', text, re.MULTILINE)
+
 
 
 START_NS = 1_700_000_000_000_000_000

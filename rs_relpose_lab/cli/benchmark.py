@@ -386,6 +386,18 @@ def _run_trust(args: argparse.Namespace) -> int:
     return _report_of(chosen, trust.measure, trust.write_report, args, 'recording')
 
 
+def _suggestions_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('--recording', nargs=2, type=Path, action='append', required=True,
+                        metavar=('BAG', 'PARAMETERS'), help='a recording and its right parameter '
+                        'file; may be given several times')
+
+
+def _run_suggestions(args: argparse.Namespace) -> int:
+    from rs_relpose_lab.experiments import suggestions
+    return _report_of(args.recording, lambda one: suggestions.on_recording(*one),
+                      suggestions.write_report, args, 'recording')
+
+
 def _global_shutter_arguments(parser: argparse.ArgumentParser) -> None:
     _number(parser, '--walks', 6, 'walks of 2 s on which the map is compared with the truth')
     _number(parser, '--bags', 6, "rendered bags for OpenCV's 5-point")
@@ -531,6 +543,10 @@ BENCHMARKS = {
         'wrong configurations: which the consistency monitor flags, and errors of the published '
         'poses, over simulated bags (tracks without images) and recordings; docs/lab/trust.md',
         _trust_arguments, _run_trust, 'trust', first_seed=1001, seed_of='bag', jobs='processes'),
+    'suggestions': Benchmark(
+        'one wrong parameter at a time on recordings: which the consistency monitor names, and '
+        'errors of its suggested values; docs/lab/trust.md',
+        _suggestions_arguments, _run_suggestions, 'suggestions'),
     'all': Benchmark(
         'accuracy (sigmas also half and twice the true ones) and speed (memory over 100,000 '
         'estimates), as the project reports them: some hours on one core',
