@@ -8,8 +8,15 @@ from scipy.spatial.transform import Rotation
 from test_odometry import PARAMETERS, START_NS, walk, without
 
 from rs_relpose_lab.experiments import odometry_disturbances as disturbances
+from rs_relpose_lab.experiments import odometry_recordings
 from rs_relpose_lab.experiments.odometry_disturbances import Disturbance
-from rs_relpose_lab.experiments.trust_runs import simulated, Source, TrackNoise, TRACKS
+from rs_relpose_lab.experiments.trust_runs import (
+    Arrival,
+    simulated,
+    Source,
+    TrackNoise,
+    TRACKS,
+)
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 
 
@@ -48,9 +55,9 @@ def test_states_through_a_disturbance():
     velocity = np.gradient(given.positions, (given.stamps - START_NS) * 1e-9, axis=0)
     feed = disturbances.Feed(
         PARAMETERS.updated({'max_coast': 10.0}).to_mapping(),
-        [(pair.current_ns, pair) for pair in without(given.pairs, 6.0, 8.0)], samples, [],
-        disturbances.TrueStates(given.stamps, given.positions, R, velocity))
-    found = disturbances.on_feed('no images, 2 s', 1, feed)
+        [(pair.current_ns, pair) for pair in without(given.pairs, 6.0, 8.0)], samples, [])
+    truth = disturbances.TrueStates(given.stamps, given.positions, R, velocity)
+    found = disturbances.on_feed('no images, 2 s', 1, feed, truth)
     # At 25 Hz, of an IMU with 100 Hz, and until the last sample.
     assert found.states == pytest.approx(25 * 8.4, abs=10)
     assert found.beyond_position + found.beyond_rotation + found.beyond_velocity < 10
@@ -59,6 +66,36 @@ def test_states_through_a_disturbance():
     assert found.lost == 0 and found.largest_step < 1.0
     # A truth that is elsewhere by 1 m after the disturbance.
     elsewhere = given.positions + (given.stamps > START_NS + 8e9)[:, None] * [1.0, 0.0, 0.0]
-    other = disturbances.on_feed('no images, 2 s', 1, feed._replace(
-        truth=replace(feed.truth, position=elsewhere)))
+    other = disturbances.on_feed('no images, 2 s', 1, feed, replace(
+        truth, position=elsewhere))
     assert other.beyond_position > 100
+
+
+def test_a_recording_in_parts(monkeypatch, tmp_path):
+    """A path and its halves, of which the first one has no pairs in its last second."""
+    given = walk('walk:9', 9.0, imu_rate=100.0)
+    of_frames = simulated(Source('walk', TRACKS), simulate(SimulationConfig(duration=0.2)),
+                          TrackNoise(), np.random.default_rng(0))
+    recording = replace(
+        of_frames, samples=given.samples, arrivals=[
+            Arrival(k, ns, ns) for k, ns in enumerate(given.stamps[::5].tolist())])
+
+    def feed_of(part):
+        first, last = part.arrivals[0].stamp_ns, part.arrivals[-1].stamp_ns
+        is_first = last < START_NS + 6e9
+        return disturbances.Feed(
+            PARAMETERS.to_mapping(), [(pair.current_ns, pair) for pair in given.pairs if (
+                first <= pair.reference_ns and pair.current_ns < last - is_first * 1e9)],
+            [(sample.stamp_ns, sample) for sample in part.samples], [])
+
+    monkeypatch.setattr(odometry_recordings, 'recording_at', lambda path: recording)
+    monkeypatch.setattr(odometry_recordings, 'feed_of', feed_of)
+    _, first, _ = found = list(odometry_recordings.on_recording(tmp_path / 'walk', 4.4))
+    assert [one.begin for one in found] == [0.0, 0.0, 4.4]
+    for one in found:
+        assert 0.0 < one.start < 2.0 and abs(one.speed) < 3.0 and one.step < 1.0
+        assert abs(one.scale) < 3.0 * one.claimed and abs(one.drift) < 3.0 and one.beyond < 5.0
+        assert one.lost == 0
+    assert first.uncertain == 1 and first.state == 'uncertain'
+    report = odometry_recordings.write_report(tmp_path, found)
+    assert report.count('| walk') == 3

@@ -432,12 +432,25 @@ def _odometry_arguments(parser: argparse.ArgumentParser) -> None:
                         help='also corners of a real recording, euroc_imu_april_corners')
     _number(parser, '--disturbances', 0, 'instead, walks with each disturbance')
     _number(parser, '--loops', 0, 'instead, closed walks of 60 s, with and without loop closures')
+    parser.add_argument('--recordings', type=Path, nargs='+', metavar='BAG',
+                        help='instead, bags with the right parameters next to them (BAG.yaml), '
+                             'whole and in parts')
+    _seconds(parser, '--part', 4.5, 'length of a part of these')
 
 
 def _run_odometry(args: argparse.Namespace) -> int:
     from rs_relpose_ros.odometry import need_gtsam
     need_gtsam()
-    from rs_relpose_lab.experiments import odometry, odometry_disturbances, odometry_loops
+    from rs_relpose_lab.experiments import (
+        odometry,
+        odometry_disturbances,
+        odometry_loops,
+        odometry_recordings,
+    )
+    if args.recordings:
+        return _report_of(
+            args.recordings, lambda bag: list(odometry_recordings.on_recording(bag, args.part)),
+            odometry_recordings.write_report, args, 'bag')
     if args.disturbances:
         return _report_of(odometry_disturbances.tasks(args.disturbances, args.seed),
                           odometry_disturbances.measure, odometry_disturbances.write_report,

@@ -18,12 +18,19 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.experiments import trust_runs
 from rs_relpose_lab.experiments.harness import markdown_table, write_table
+from rs_relpose_lab.experiments.odometry_disturbances import (
+    errors_squared,
+    feed_of,
+    published,
+    true_states,
+    TrueStates,
+)
 from rs_relpose_lab.experiments.trust_rows import Configured
 from rs_relpose_lab.experiments.trust_runs import Recording, Source
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.bag import intrinsics_of
 from rs_relpose_lab.simulation.scene import SCENES
-from rs_relpose_ros.bags.reader import IMAGE_DELAY, IMU_DELAY
+from rs_relpose_ros.bags.reader import IMAGE_DELAY
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry import Array
@@ -33,7 +40,7 @@ from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.odometry import offline
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.offline import TrajectoryErrors
-from rs_relpose_ros.odometry.pair import KeyframePair, warm_up_odometry
+from rs_relpose_ros.odometry.pair import warm_up_odometry
 from rs_relpose_ros.odometry.states import Odometry
 from rs_relpose_ros.offline.truth import TrueTrajectory
 
@@ -129,10 +136,10 @@ class PathMetrics:
     """Odometry of a recording.
 
     `start`: seconds from the first pair to the first published keyframe. `step_nees`: mean of
-    the smoothed steps between keyframes, `live_nees`: median of the live positions against the
-    start, both in units of their covariances, by degrees of freedom; NaN where the truth has
-    errors of its own. `drift`: error of the end after the first 5 s are aligned, by the length of
-    the path [%]. `processor`: of one core, by the graph alone, without messages [%].
+    the smoothed steps between keyframes in units of their covariances, by degrees of freedom;
+    `nees_*`: of the states that odometry_node publishes, against the start; NaN where the truth
+    has errors of its own. `drift`: error of the end after the first 5 s are aligned, by the length
+    of the path [%]. `processor`: of one core, by the graph alone, without messages [%].
     """
 
     name: str
@@ -146,7 +153,9 @@ class PathMetrics:
     live: TrajectoryErrors
     smoothed: TrajectoryErrors
     step_nees: float
-    live_nees: float
+    nees_position: float
+    nees_rotation: float
+    nees_velocity: float
     drift: float
     processor: float
 
@@ -170,34 +179,32 @@ def on_walk(config: SimulationConfig) -> PathMetrics:
                     trust_runs.TRACKS, 'walk', config.scene, config.seed)
     recording = trust_runs.simulated(source, simulation, trust_runs.TrackNoise(),
                                      np.random.default_rng(config.seed))
-    states = simulation.states(simulation.imu.stamps_ns)
-    truth = TrueTrajectory(simulation.imu.stamps_ns, states.position,
-                           Rotation.from_matrix(states.R_world_cam).as_quat())
-    return on_recording(recording, truth)
+    return on_recording(recording, true_states(simulation))
 
 
 def on_euroc(folder: Path, picture: Path) -> PathMetrics:
     """Odometry of EuRoC's corners, and a picture of the path."""
-    recording, truth = read_euroc(folder)
-    return on_recording(recording, truth, exact=False, picture=picture)
+    return on_recording(*read_euroc(folder), picture=picture)
 
 
-def on_recording(recording: Recording, truth: TrueTrajectory, *, exact: bool = True,
+def on_recording(recording: Recording, truth: TrueStates | TrueTrajectory, *,
                  picture: Path | None = None) -> PathMetrics:
-    """Odometry of a recording's pairs and samples; `exact`: whether the truth is."""
-    parameters = Parameters.from_mapping(recording.configured.values)
-    arrives = {arrival.stamp_ns: arrival.arrives_ns for arrival in recording.arrivals}
-    # A list, so that the time of the front end does not count.
-    pairs = [(arrives[pair.stamp_ns], KeyframePair.of_result(pair))
-             for pair, _ in trust_runs.run(recording, recording.configured)]
-    delay_ns = to_nanoseconds(IMU_DELAY)
-    samples = [(sample.stamp_ns + delay_ns, sample) for sample in recording.samples]
+    """Odometry of a recording's pairs and samples; NEES if the truth is that of a simulation."""
+    feed = feed_of(recording)   # before: the time of the front end does not count
+    parameters = Parameters.from_mapping(feed.values)
     warm_up_odometry()
     estimator = OdometryEstimator(parameters, keep=True)
     started = time.thread_time()
-    live = offline.follow(estimator, pairs, samples)
+    live = offline.follow(estimator, feed.pairs, feed.samples)
     processor = time.thread_time() - started
-    smoothed = estimator.smoothed()
+    smoothed, nees = estimator.smoothed(), (math.nan,) * 4
+    if isinstance(truth, TrueStates):
+        states = list(published(OdometryEstimator(parameters), feed))
+        position, rotation, velocity = (
+            errors_squared(states, smoothed[0], truth).mean(axis=0) / 3.0).tolist()
+        truth = TrueTrajectory(truth.stamps_ns, truth.position,
+                               Rotation.from_matrix(truth.R).as_quat())
+        nees = step_nees(estimator, truth), position, rotation, velocity
     paths = {'live': offline.path_of(live, truth), 'smoothed': offline.path_of(smoothed, truth)}
     errors = [path.errors for path in paths.values() if path.errors is not None]
     if len(errors) < 2:
@@ -207,10 +214,8 @@ def on_recording(recording: Recording, truth: TrueTrajectory, *, exact: bool = T
     first = estimator.starts[0]
     return PathMetrics(
         recording.source.name, 1e3 * recording.camera.readout_time, recording.seconds,
-        len(pairs), estimator.counts['contradicting'], estimator.counts['lost'], first.at_rest,
-        first.seconds, errors[0], errors[1],
-        step_nees(estimator, truth) if exact else math.nan,
-        live_nees(live, smoothed[0], truth) if exact else math.nan, drift(live, truth),
+        len(feed.pairs), estimator.counts['contradicting'], estimator.counts['lost'],
+        first.at_rest, first.seconds, errors[0], errors[1], *nees, drift(live, truth),
         100.0 * processor / recording.seconds)
 
 
@@ -223,20 +228,6 @@ def step_nees(estimator: OdometryEstimator, truth: TrueTrajectory) -> float:
             error = step.translation - known[1]
             found.append(error @ np.linalg.solve(step.covariance, error) / 3.0)
     return float(np.mean(found))
-
-
-def live_nees(live: Sequence[Odometry], first: Odometry, truth: TrueTrajectory) -> float:
-    """The same of live positions against the `first` one, smoothed, which is that of the truth."""
-    if not truth.covers(first.imu_ns):
-        return math.nan
-    R_path_truth = first.R @ truth.rotation(first.imu_ns).T
-    found = []
-    for pose in live:
-        if truth.covers(pose.imu_ns):
-            error = pose.position - first.position - R_path_truth @ (
-                truth.position(pose.imu_ns) - truth.position(first.imu_ns))
-            found.append(error @ np.linalg.solve(pose.pose_covariance[:3, :3], error) / 3.0)
-    return float(np.median(found))
 
 
 def drift(live: Sequence[Odometry], truth: TrueTrajectory) -> float:
@@ -255,10 +246,11 @@ def write_report(folder: Path, paths: Sequence[PathMetrics]) -> str:
     return write_table(folder, 'odometry', paths, markdown_table(
         ('recording', 'readout [ms]', 'length [m]', 'started [s]', 'live: ATE [m]', 'scale [%]',
          'over 1 m [%]', 'smoothed: ATE', 'scale', 'over 1 m', 'NEES of steps',
-         'of live positions', 'drift [%]', 'core [%]', 'left out'),
+         'position', 'rotation', 'velocity', 'drift [%]', 'core [%]', 'left out'),
         [(f'{p.name}, {p.seconds:.0f} s', f'{p.readout_ms:.1f}', f'{p.live.length_m:.1f}',
           f'{p.start:.1f}' + (' at rest' if p.at_rest else ''), *_errors(p.live),
-          *_errors(p.smoothed), _known(p.step_nees), _known(p.live_nees), f'{p.drift:.3f}',
+          *_errors(p.smoothed), *(_known(value) for value in (
+              p.step_nees, p.nees_position, p.nees_rotation, p.nees_velocity)), f'{p.drift:.3f}',
           f'{p.processor:.1f}',
           f'{p.contradicting} of {p.pairs}' + (f', lost {p.lost} times' if p.lost else ''))
          for p in paths]))

@@ -133,33 +133,30 @@ class TrueStates:
 
 
 class Feed(NamedTuple):
-    """Input of the odometry, with arrivals [ns]: pairs, samples, stamps of frames; the truth."""
+    """Input of the odometry, with arrivals [ns]: pairs, samples, stamps of frames."""
 
     values: Mapping[str, Any]   # of the parameters
     pairs: list[tuple[int, KeyframePair]]
     samples: list[tuple[int, ImuSample]]
     frames: list[tuple[int, int]]
-    truth: TrueStates
 
 
-def feed_of(config: SimulationConfig, what: Disturbance) -> Feed:
-    """Pairs of the front end on the tracks of a disturbed walk."""
-    simulation = simulate(config)
-    rng = np.random.default_rng(config.seed)
-    recording = trust_runs.simulated(
-        trust_runs.Source(f'{config.scene} {config.seed}', trust_runs.TRACKS), simulation,
-        trust_runs.TrackNoise(), rng)
-    recording = disturbed(recording, simulation, what, rng)
+def feed_of(recording: Recording) -> Feed:
+    """Pairs of the front end on a recording, and its samples."""
     arrives = {arrival.stamp_ns: arrival.arrives_ns for arrival in recording.arrivals}
     pairs = [(arrives[pair.stamp_ns], KeyframePair.of_result(pair))
              for pair, _ in trust_runs.run(recording, recording.configured)]
     delay_ns = to_nanoseconds(IMU_DELAY)
-    states = simulation.states(simulation.imu.stamps_ns)
     return Feed(recording.configured.values, pairs,
                 [(sample.stamp_ns + delay_ns, sample) for sample in recording.samples],
-                [(arrives_ns, stamp_ns) for stamp_ns, arrives_ns in arrives.items()],
-                TrueStates(simulation.imu.stamps_ns, states.position, states.R_world_cam,
-                           states.velocity))
+                [(arrives_ns, stamp_ns) for stamp_ns, arrives_ns in arrives.items()])
+
+
+def true_states(simulation: Simulation) -> TrueStates:
+    """The camera of a simulation."""
+    states = simulation.states(simulation.imu.stamps_ns)
+    return TrueStates(simulation.imu.stamps_ns, states.position, states.R_world_cam,
+                      states.velocity)
 
 
 def published(estimator: OdometryEstimator, feed: Feed) -> Iterator[Odometry]:
@@ -248,7 +245,13 @@ def measure(task: tuple[str, int]) -> DisturbedRun:
     """A disturbance on the walk of a seed."""
     name, seed = task
     what = DISTURBANCES[name]
-    return on_feed(name, seed, feed_of(configuration(what, seed), what))
+    config = configuration(what, seed)
+    simulation, rng = simulate(config), np.random.default_rng(seed)
+    recording = trust_runs.simulated(
+        trust_runs.Source(f'{config.scene} {seed}', trust_runs.TRACKS), simulation,
+        trust_runs.TrackNoise(), rng)
+    feed = feed_of(disturbed(recording, simulation, what, rng))
+    return on_feed(name, seed, feed, true_states(simulation))
 
 
 def configuration(what: Disturbance, seed: int) -> SimulationConfig:
@@ -259,14 +262,14 @@ def configuration(what: Disturbance, seed: int) -> SimulationConfig:
         plan=f'walk:{_MARGIN:g},{what.plan}:{what.seconds:g},walk:{_MARGIN:g}')
 
 
-def on_feed(name: str, seed: int, feed: Feed) -> DisturbedRun:
+def on_feed(name: str, seed: int, feed: Feed, truth: TrueStates) -> DisturbedRun:
     """The odometry of a disturbed walk."""
     estimator = OdometryEstimator(Parameters.from_mapping(feed.values), keep=True)
     states = list(published(estimator, feed))
     smoothed = estimator.smoothed()
     if not states or not smoothed:
         raise InputError(f'{name}, seed {seed}: odometry did not start')
-    beyond = errors_squared(states, smoothed[0], feed.truth) > BEYOND
+    beyond = errors_squared(states, smoothed[0], truth) > BEYOND
     at = np.array([_seconds(state.imu_ns) for state in states])
     begin, end = _MARGIN, _MARGIN + DISTURBANCES[name].seconds
     before = _sigmas(states, at, begin - 0.5)

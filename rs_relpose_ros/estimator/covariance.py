@@ -244,6 +244,11 @@ class ImageInformation:
         """The same of rotation and direction (5,), the velocities eliminated."""
         return self._reduced(DIRECTION)
 
+    def enlarged(self, factor: float) -> ImageInformation:
+        """The same with its covariance times a factor."""
+        return replace(self, information=self.information / factor,
+                       gradient=self.gradient / factor)
+
     def _reduced(self, k: int) -> ImageInformation:
         """Of the first k deviations."""
         H, g = self.information, self.gradient

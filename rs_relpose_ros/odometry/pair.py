@@ -85,9 +85,7 @@ class KeyframePair:
         if self.images is None:
             return None
         images = self.images.without_velocities() if self.has_direction else self.images
-        return replace(self, images=replace(
-            images, information=images.information / inflation,
-            gradient=images.gradient / inflation)).later(self.row_ns)
+        return replace(self, images=images.enlarged(inflation)).later(self.row_ns)
 
     @property
     def is_pure_rotation(self) -> bool:

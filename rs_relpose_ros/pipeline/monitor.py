@@ -214,7 +214,8 @@ class Agreement:
         values, vectors = np.linalg.eigh(solve_triangular(root, half.T, lower=True))
         axes = root @ vectors
         return replace(assessed, velocity_covariance=velocities, covariance=(
-            axes * np.maximum(values, 1.0)) @ axes.T - along)
+            axes * np.maximum(values, 1.0)) @ axes.T - along,
+            images=assessed.images and assessed.images.enlarged(factor))
 
 
 def _disagreement(before: RelativePose, after: RelativePose) -> float:
