@@ -491,10 +491,13 @@ def test_an_alternative_hypothesis_that_fits_as_well_is_named(correlation, named
 
 
 def test_the_error_that_linearisation_leaves_is_in_the_sigma():
+    """And, in the published one, that of matches which were selected with the wrong value."""
     c = deviation(offset=0.02)
     estimated = replace(calibration(c, SIGMA), about=deviation(offset=0.014))
     found, = assessment.find_inconsistencies(estimated, [EFFECT], CONFIGURED)
     assert found.sigma[OFFSET] == pytest.approx(math.hypot(SIGMA[OFFSET], 0.006), rel=0.01)
+    fault, = assessed(estimated).faults
+    assert fault.sigma == pytest.approx(math.hypot(found.sigma[OFFSET], 0.002), rel=0.01)
 
 
 @pytest.mark.parametrize(('size', 'likely'), [(1.5, 0.0), (3.0, 3.0)])
