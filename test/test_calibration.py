@@ -27,8 +27,7 @@ from rs_relpose_ros.calibrate.result import CalibrationResult, parameter_file, r
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry.camera import RollingShutterCamera
-from rs_relpose_ros.geometry.distortion import DISTORTION_MODELS
+from rs_relpose_ros.geometry.camera import DISTORTION_MODELS, RollingShutterCamera
 from rs_relpose_ros.geometry.timing import FrameIntervals, NANOSECONDS
 
 # Coefficients of each camera model that bend a picture visibly.

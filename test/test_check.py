@@ -23,9 +23,9 @@ from rs_relpose_ros.config.settings import Parameters, sensor_model
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.messages import outgoing
-from rs_relpose_ros.offline import check_sample
+from rs_relpose_ros.offline import check_recording
 from rs_relpose_ros.offline.check import check_bag, CheckReport, choose_topics, quantity_findings
-from rs_relpose_ros.offline.check_streams import Stamps
+from rs_relpose_ros.offline.check_recording import Stamps
 from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState, QUANTITIES
 from rs_relpose_ros.tracking.images import Pixels
 
@@ -414,7 +414,7 @@ def contradictions(found, row, direction, exposure, **changes):
     """Findings on parameters of a convention, by a calibration."""
     configured = Parameters.from_mapping(TRUE | {
         'stamp_row': row, 'readout_direction': direction, 'stamp_exposure': exposure} | changes)
-    return check_sample.contradicted(found, configured.sensor,
+    return check_recording.contradicted(found, configured.sensor,
                                      sensor_model(INTRINSICS, configured.sensor))
 
 
@@ -459,23 +459,21 @@ def test_a_calibration_contradicts_wrong_parameters_in_every_convention(conventi
 
 # -- recordings ------------------------------------------------------------------------------
 
-# Parameters of the converter, of the second RealSense recording its own offset; permitted
-# warnings: three gaps of up to 0.3 s; no accelerometer, and no bias known; little light.
-LITTLE_LIGHT = {'time_offset': -0.064}
+# Permitted warnings: three gaps of up to 0.3 s; no accelerometer, and no bias known; little light.
 REAL = {
-    'realsense_rgb_rs': ({}, {'image rate'}),
-    'realsense_rgb_rs_b': (LITTLE_LIGHT, {'image rate'}),
-    'xiaomi_cc9_rs': ({}, {'gravity', 'gyro_bias'}),
+    'realsense_rgb_rs': {'image rate'},
+    'realsense_rgb_rs_b': {'image rate'},
+    'xiaomi_cc9_rs': {'gravity', 'gyro_bias'},
 }
 
 
 @pytest.mark.recordings
 @pytest.mark.parametrize('name', REAL)
 def test_recordings_of_real_cameras(converted, name):
-    path, (changes, warned) = converted(name), REAL[name]
-    findings, report = checked(path, read_parameters(f'{path}.yaml').updated(changes))
+    path = converted(name)
+    findings, report = checked(path, read_parameters(f'{path}.yaml'))
     assert not report.failed
-    assert {f.quantity for f in report.findings if f.state is W} <= warned
+    assert {f.quantity for f in report.findings if f.state is W} <= REAL[name]
     assert findings['axes'].state in (FindingState.OK, FindingState.UNKNOWN)
     if 'realsense' in name:
         # Automatic exposure: stamps of varying interval are no times of arrival.
@@ -487,7 +485,7 @@ def test_recordings_of_real_cameras(converted, name):
 @pytest.fixture(scope='module')
 def only_calibration():
     """A calibration starts from nothing: it is the same for all wrong parameters."""
-    calibrated, found = check_sample._calibrated, {}
+    calibrated, found = check_recording._calibrated, {}
 
     def once(bag, *more):
         if bag.path not in found:
@@ -506,8 +504,8 @@ def test_gross_errors_in_little_light(converted, changes, name, estimated, toler
                                       monkeypatch, only_calibration):
     """Too far off for pairs: a calibration estimates them, and nothing else is blamed."""
     path = converted('realsense_rgb_rs_b')
-    monkeypatch.setattr(check_sample, '_calibrated', only_calibration)
-    configured = read_parameters(f'{path}.yaml').updated(LITTLE_LIGHT | changes)
+    monkeypatch.setattr(check_recording, '_calibrated', only_calibration)
+    configured = read_parameters(f'{path}.yaml').updated(changes)
     findings, report = checked(path, configured)
     # The stamp of another row makes nearly the same offset.
     assert {f.quantity for f in report.findings if f.state is F} - {'stamp_row'} == {name}

@@ -16,8 +16,12 @@ from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.estimator.problem import PairState, to_reference_row
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.geometry import so3
-from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
-from rs_relpose_ros.geometry.distortion import DISTORTION_MODELS, DistortionModel
+from rs_relpose_ros.geometry.camera import (
+    DISTORTION_MODELS,
+    DistortionModel,
+    Intrinsics,
+    RollingShutterCamera,
+)
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 from rs_relpose_ros.geometry.timing import ImageClock, seconds_between, to_nanoseconds
 from rs_relpose_ros.jit import kernel

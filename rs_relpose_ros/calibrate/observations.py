@@ -30,8 +30,7 @@ from rs_relpose_ros.calibrate.start import GyroSeries, noise_density, rotation_b
 from rs_relpose_ros.config.settings import CalibrationConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array
-from rs_relpose_ros.geometry.camera import RollingShutterCamera
-from rs_relpose_ros.geometry.distortion import DISTORTION_MODELS
+from rs_relpose_ros.geometry.camera import DISTORTION_MODELS, RollingShutterCamera
 from rs_relpose_ros.geometry.timing import correlation_of_steps, FrameIntervals, NANOSECONDS
 from rs_relpose_ros.imu.integration import mean_rates
 

@@ -31,7 +31,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
                 'convert a recording of a camera or phone to a bag and its parameter file'),
     'evaluate': ('rs_relpose_lab.cli.evaluate',
                  'run the experiments of the paper: tables and box plots'),
-    'export': ('rs_relpose_ros.cli.export:EXPORT',
+    'export': ('rs_relpose_ros.cli.poses:EXPORT',
                'images, poses of rows and points for COLMAP, nerfstudio, gsplat and others'),
     'odometry': ('rs_relpose_ros.cli.poses:ODOMETRY',
                  'a metric path from a bag: relative poses and IMU in one graph'),

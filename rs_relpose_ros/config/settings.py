@@ -17,8 +17,12 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_ros.config.declare import Declared, declared, setting, Settings
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry import validate
-from rs_relpose_ros.geometry.camera import Intrinsics, READOUT_DIRECTIONS, REFERENCE_ROWS
-from rs_relpose_ros.geometry.distortion import DISTORTION_MODELS
+from rs_relpose_ros.geometry.camera import (
+    DISTORTION_MODELS,
+    Intrinsics,
+    READOUT_DIRECTIONS,
+    REFERENCE_ROWS,
+)
 from rs_relpose_ros.geometry.timing import ImageClock, Sensor, STAMP_EXPOSURES
 from rs_relpose_ros.solvers.api import SOLVERS
 

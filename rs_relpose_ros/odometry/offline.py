@@ -25,8 +25,7 @@ from rs_relpose_ros.odometry.loops import close_loops, View
 from rs_relpose_ros.odometry.pair import KeyframePair
 from rs_relpose_ros.odometry.rows import camera_poses, Knot, ROWS_FILE, RowTrajectory, write_tum
 from rs_relpose_ros.odometry.states import Base, Odometry, OdometryState
-from rs_relpose_ros.offline.pairs import related
-from rs_relpose_ros.offline.replay import read_truth, Replay
+from rs_relpose_ros.offline.replay import read_truth, related, Replay
 from rs_relpose_ros.offline.truth import TrueTrajectory
 from rs_relpose_ros.output_files import prepare_folder, save_picture, SUMMARY_FILE
 from rs_relpose_ros.pipeline.pair import PairResult

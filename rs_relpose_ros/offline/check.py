@@ -17,9 +17,15 @@ from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.imu.buffer import length_fault
 from rs_relpose_ros.messages.incoming import PARTS, Role, sensor_messages
 from rs_relpose_ros.messages.transforms import with_extrinsics
-from rs_relpose_ros.offline import check_sample
-from rs_relpose_ros.offline.check_sample import Completion, SampleRun
-from rs_relpose_ros.offline.check_streams import Chosen, Inertial, Scan, Stamps
+from rs_relpose_ros.offline import check_recording
+from rs_relpose_ros.offline.check_recording import (
+    Chosen,
+    Completion,
+    Inertial,
+    SampleRun,
+    Scan,
+    Stamps,
+)
 from rs_relpose_ros.pipeline.assessment import not_evaluated
 from rs_relpose_ros.pipeline.findings import (
     Assessment,
@@ -122,7 +128,7 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
     completion, sample, topics = Completion(parameters, None, ''), None, None
     if chosen.image is not None and chosen.imu is not None:
         topics = SensorTopics(chosen.image, chosen.camera_info, chosen.imu, chosen.accel, None)
-        completion = check_sample.completed(bag, topics, parameters)
+        completion = check_recording.completed(bag, topics, parameters)
         if not completion.parameters.sensor.missing():
             sample = SampleRun(images, completion.parameters)
 
@@ -146,7 +152,7 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
         findings += imu_findings(scan, bag.reliability(chosen.imu), parameters)
     if topics is not None:
         if sample is not None and sample.is_lost and completion.found is None:
-            completion = check_sample.recalibrated(bag, topics, completion)
+            completion = check_recording.recalibrated(bag, topics, completion)
         findings += joint_findings(scan, sample, completion, parameters)
     return CheckReport(str(bag.path), tuple(findings))
 
@@ -522,7 +528,7 @@ def _with_calibration(sample: SampleRun, scan: Scan, completion: Completion) -> 
                  for fault in health.faults)
     if found is None or scan.intrinsics is None or beyond or not sample.is_lost:
         return health
-    wrong = check_sample.contradicted(found, completion.parameters.sensor,
+    wrong = check_recording.contradicted(found, completion.parameters.sensor,
                          sensor_model(scan.intrinsics, completion.parameters.sensor))
     if not wrong:
         return health

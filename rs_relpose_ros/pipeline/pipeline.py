@@ -20,9 +20,15 @@ from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, Sensor
 from rs_relpose_ros.imu.integration import FrameImu, rotation_sensitivity
 from rs_relpose_ros.pipeline import findings, pair
 from rs_relpose_ros.pipeline.assessment import Configured, configured_sigmas
-from rs_relpose_ros.pipeline.between import TrackHistory
 from rs_relpose_ros.pipeline.monitor import Applied, ConsistencyMonitor, suppressed, Tracked
-from rs_relpose_ros.pipeline.pair import DerotatedRays, Frame, GyroRotation, PairResult, Result
+from rs_relpose_ros.pipeline.pair import (
+    DerotatedRays,
+    Frame,
+    GyroRotation,
+    PairResult,
+    Result,
+    TrackHistory,
+)
 from rs_relpose_ros.pipeline.recursion import PairData
 from rs_relpose_ros.pipeline.rotations import rotation_of_rays
 from rs_relpose_ros.pipeline.sequencer import FrameRefused, SCATTER_FRAMES, Sequencer, stamp_sigma
