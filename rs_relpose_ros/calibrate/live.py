@@ -27,7 +27,7 @@ from rs_relpose_ros.pipeline.sequencer import Refusal, SequencerCounts
 _FIRST, _FIRST_OF_LENS, _LONGEST, _STEP = 6.0, 8.0, 60.0, 2.0
 # From this length on [s] values with wider sigmas suffice, as their doubt is in the covariances:
 # factor and names of the limits.
-_LONG, _WIDER = 10.0, 2.0
+_LONG, _WIDER = 8.0, 2.0
 _LIMITS = ('max_readout_sigma', 'max_offset_sigma', 'max_rotation_sigma', 'max_bias_sigma',
            'max_focal_sigma')
 # From this length on [s] a rotation as exact as that of a transform suffices: a robot on wheels
