@@ -449,6 +449,22 @@ def test_contradicting_pairs_end_a_path_as_missing_ones_do(walked):
     assert 'lost: no usable pair for 2 s' in estimator.warnings()
 
 
+def test_pairs_that_are_wrong_together_count_by_their_innovations():
+    """Directions that are off by 9 deg for 2.5 s: chi squared of the position."""
+    given, squares = walk('walk:7', 7.0, imu_rate=100.0), []
+    turn = exp_so3(np.array([0.0, 0.0, 0.16]))
+    _, out = run(given, pairs=[
+        replace(pair, images=replace(pair.images, t=turn @ pair.images.t))
+        if 4.0 < seconds_of(pair.current_ns) < 6.5 else pair for pair in given.pairs])
+    for one in out[1:]:
+        _, way = given.truth.relative_pose(out[0].imu_ns, one.imu_ns)
+        error = out[0].R.T @ (one.position - out[0].position) - way
+        covariance = out[0].R.T @ one.pose_covariance[:3, :3] @ out[0].R
+        squares.append(error @ np.linalg.solve(covariance, error))
+    # 3 sigma of three; 21 if all count alike.
+    assert len(out) > 30 and max(squares) < 14.2
+
+
 def test_the_end_of_a_path_at_a_keyframe_is_no_gap_of_the_imu(walked):
     """The next pair starts where the last one ended: the interval between them is empty."""
     turn = exp_so3(np.array([0.0, 0.3, 0.0]))

@@ -18,6 +18,7 @@ from rs_relpose_lab.experiments.trust_runs import (
     TRACKS,
 )
 from rs_relpose_lab.simulation import simulate, SimulationConfig
+from rs_relpose_ros.errors import InputError
 
 
 def test_tracks_of_a_disturbance(monkeypatch):
@@ -50,7 +51,9 @@ def test_tracks_of_a_disturbance(monkeypatch):
 
 def test_states_through_a_disturbance():
     given = walk('walk:14', 14.0, imu_rate=100.0)
-    samples = [(sample.stamp_ns, sample) for sample in given.samples]
+    # Gyro and accelerometer in messages of their own.
+    samples = [(sample.stamp_ns, part) for sample in given.samples for part in (
+        replace(sample, linear_acceleration=None), replace(sample, angular_velocity=None))]
     R = Rotation.from_quat(given.quats).as_matrix()
     velocity = np.gradient(given.positions, (given.stamps - START_NS) * 1e-9, axis=0)
     feed = disturbances.Feed(
@@ -69,6 +72,12 @@ def test_states_through_a_disturbance():
     other = disturbances.on_feed('no images, 2 s', 1, feed, replace(
         truth, position=elsewhere))
     assert other.beyond_position > 100
+
+
+def test_one_disturbance_is_chosen():
+    assert disturbances.tasks(2, 7, 'blur, 2 s') == [('blur, 2 s', 7), ('blur, 2 s', 8)]
+    with pytest.raises(InputError, match='blur, 3 s'):
+        disturbances.tasks(2, 7, 'blur, 3 s')
 
 
 def test_a_recording_in_parts(monkeypatch, tmp_path):

@@ -431,6 +431,7 @@ def _odometry_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--euroc', type=Path, metavar='FOLDER',
                         help='also corners of a real recording, euroc_imu_april_corners')
     _number(parser, '--disturbances', 0, 'instead, walks with each disturbance')
+    parser.add_argument('--disturbance', metavar='NAME', help='only this one: "object, 3 s"')
     _number(parser, '--loops', 0, 'instead, closed walks of 60 s, with and without loop closures')
     parser.add_argument('--recordings', type=Path, nargs='+', metavar='BAG',
                         help='instead, bags with the right parameters next to them (BAG.yaml), '
@@ -452,7 +453,8 @@ def _run_odometry(args: argparse.Namespace) -> int:
             args.recordings, lambda bag: list(odometry_recordings.on_recording(bag, args.part)),
             odometry_recordings.write_report, args, 'bag')
     if args.disturbances:
-        return _report_of(odometry_disturbances.tasks(args.disturbances, args.seed),
+        return _report_of(odometry_disturbances.tasks(args.disturbances, args.seed,
+                                                      args.disturbance),
                           odometry_disturbances.measure, odometry_disturbances.write_report,
                           args, 'walk')
     if args.loops:

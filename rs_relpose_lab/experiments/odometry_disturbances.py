@@ -175,7 +175,7 @@ def published(estimator: OdometryEstimator, feed: Feed) -> Iterator[Odometry]:
         estimator.add_imu(sample)
         if arrives_ns >= next_ns:
             next_ns = arrives_ns + _PERIOD_NS
-            if (state := path.at(sample.stamp_ns)) is not None:
+            if (state := path.at(estimator.newest_ns)) is not None:
                 yield state
             estimator.take(most=1)
 
@@ -236,9 +236,12 @@ class DisturbedRun:
     largest_step: float
 
 
-def tasks(seeds: int, first_seed: int) -> list[tuple[str, int]]:
-    """All disturbances on as many walks."""
-    return [(name, first_seed + k) for name in DISTURBANCES for k in range(seeds)]
+def tasks(seeds: int, first_seed: int, only: str | None = None) -> list[tuple[str, int]]:
+    """All disturbances, or one of them, on as many walks."""
+    if only not in (None, *DISTURBANCES):
+        raise InputError(f'there is no disturbance {only}: {"; ".join(DISTURBANCES)}')
+    return [(name, first_seed + k) for name in DISTURBANCES if only in (None, name)
+            for k in range(seeds)]
 
 
 def measure(task: tuple[str, int]) -> DisturbedRun:

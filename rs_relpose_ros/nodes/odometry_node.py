@@ -87,7 +87,6 @@ class OdometryNode(StoppableNode):
     def _begin(self, parameters: Parameters) -> None:
         self._begun, self._config = True, parameters.odometry
         self._use(parameters)
-        self._newest_ns = 0   # of the samples, on the IMU clock
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._sample_at = self._steady.now()
         self._frames: dict[Role, str] = {}   # of the samples
@@ -179,19 +178,18 @@ class OdometryNode(StoppableNode):
         if role is Role.IMU:
             self._silent[self._imu] = 0
         try:
-            sample = PARTS[role].read(message)
-            self._estimator.add_imu(sample)
+            self._estimator.add_imu(PARTS[role].read(message))
         except InputError as error:
             self._warn(str(error))
             return
         if role is Role.IMU:
-            self._newest_ns, self._sample_at = sample.stamp_ns, self._steady.now()
+            self._sample_at = self._steady.now()
 
     def _publish_propagated(self) -> None:
         """Publish the newest keyframe, propagated by the IMU, before the next pair takes time."""
         for subscription in self._sensors:
             subscription.drain()
-        self._publish(self._newest_ns)
+        self._publish(self._estimator.newest_ns)
         self._read_sensors()
 
     def _read_sensors(self) -> None:

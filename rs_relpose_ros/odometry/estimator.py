@@ -185,6 +185,11 @@ class OdometryEstimator:
         return bool(self._waiting)
 
     @property
+    def newest_ns(self) -> int:
+        """Time up to which both sensors of the IMU are known, on its clock; 0 without samples."""
+        return self._samples.both_until_ns or 0
+
+    @property
     def blocking_reason(self) -> str:
         """Unknown base or fault of the accelerometer that prevents a start; empty for none."""
         if self.base is None:

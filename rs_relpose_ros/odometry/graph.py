@@ -139,7 +139,8 @@ class KeyframeGraph:
 
         `inflation`: of the pair's covariance. Returns the innovation of the pair: its chi squared
         per degree of freedom before it is used, without `inflation`; 0 without information. A
-        pair above `gate` is not used.
+        pair above `gate` is not used; with a gate, its covariance is larger by an innovation
+        above 1, too.
         """
         i, j = self._count - 1, self._count
         pim = self._preintegrated(interval)
@@ -154,7 +155,9 @@ class KeyframeGraph:
         if pair is not None and pair.images is not None:
             innovation = self._innovation(pim, self._pair_factor(i, j, pair, rates))
             if innovation <= gate:
-                factors.add(self._pair_factor(i, j, pair, rates, math.sqrt(inflation)))
+                # Without a gate, at a start, the misfit shows what is wrong.
+                own = max(innovation, 1.0) if gate < math.inf else 1.0
+                factors.add(self._pair_factor(i, j, pair, rates, math.sqrt(inflation * own)))
                 if pair.is_pure_rotation:
                     factors.add(self._still_factor(i, j))
         if at_rest and innovation <= gate:
