@@ -47,7 +47,7 @@ def end_error(path, truth):
 
 
 def test_loops_that_agree_with_the_path_correct_it():
-    given, rng = walk('walk:20', 20.0, imu_rate=100.0), np.random.default_rng(3)
+    given, rng = walk('walk:12', 12.0, imu_rate=100.0), np.random.default_rng(3)
     estimator, _ = run(given)
     before = estimator.smoothed()
     ends = list(zip(before[:24:3], before[:-25:-3], strict=True))
