@@ -133,5 +133,4 @@ def test_metrics_of_a_closed_walk(monkeypatch):
     metrics = odometry_loops.on_walk(config, path)
     assert metrics.offered >= metrics.related >= metrics.taken > 0
     assert metrics.worst < 1.0
-    # 4 s leave little to correct; `test_loops_that_agree_with_the_path_correct_it` has that.
-    assert 0.0 < metrics.end < 0.015 and 0.0 < metrics.end_without < 0.015
+    assert metrics.end < metrics.end_without < 0.2

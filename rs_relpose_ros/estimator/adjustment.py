@@ -109,16 +109,11 @@ class Normal(NamedTuple):
 
 
 class Adjusted(NamedTuple):
-    """An adjusted state, the noise of an observation [px], the covariance (n, n) of the path.
-
-    `common`: of the tracks' scatter, by the noise alone. `normal`: the equations there.
-    """
+    """An adjusted state, the noise of an observation [px], the covariance (n, n) of the path."""
 
     state: PathState
     sigma: float
     covariance: Array
-    common: float
-    normal: Normal
 
 
 @small_kernel
@@ -395,8 +390,7 @@ def adjust(tracks: Tracks, priors: PathPriors, start: PathState, expected: float
                 break
         else:
             damping = max(100.0 * damping, 1e-2)
-    common = (sigma / noise)**2
-    return Adjusted(state, noise, _covariance(normal, state, priors, common), common, normal)
+    return Adjusted(state, noise, _covariance(normal, state, priors, (sigma / noise)**2))
 
 
 @kernel

@@ -27,7 +27,6 @@ from rs_relpose_ros.estimator.adjustment import (
     TANGENT,
     Tracks,
 )
-from rs_relpose_ros.estimator.covariance import ImageInformation
 from rs_relpose_ros.estimator.result import depths_of_rays, RelativePose
 from rs_relpose_ros.estimator.velocity import CORRELATION_TIME, span_of_scales
 from rs_relpose_ros.geometry import Array, validate
@@ -53,9 +52,6 @@ _LARGEST_NOISE = 0.5
 # Sine squared of the parallax below which the distance of a track starts at a small value.
 _PARALLEL, _FAR = 1e-8, 1e-2
 _LARGEST_PIXEL = 1e6
-# At both ends: B_j' by T, and B_j'' (`adjustment`).
-_SLOPES = np.array([[-0.5, 1.0 / 6.0, 0.0], [0.5, 1.0 / 6.0, 0.0]])
-_VALUES = np.array([[1.0, -1.0, 1.0], [1.0, 1.0, 1.0]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -190,11 +186,6 @@ def refined(pose: RelativePose, points1: Array, motion1: FrameMotion, second: tu
     if adjusted.sigma > max(_LARGEST_NOISE * config.threshold, config.pixel_sigma):
         return replace(pose, frames_reason='tracks and gyro of the frames between contradict each '
                        f'other: {adjusted.sigma:.1f} px')
-    if pose.images is not None:
-        pose = replace(pose, images=_images(
-            adjusted, tracks, path, views,
-            float(camera.row_times(0.5 * (camera.height - 1.0))),
-            _by_tracks(adjusted, priors), config.stamp_sigma))
     return _result(pose, adjusted, tracks, priors, path, len(views))
 
 
@@ -341,83 +332,6 @@ def _start(pose: RelativePose, views: Sequence[_View], tracks: Tracks,
                      np.where(near, 1.0 / np.where(near, depths, 1.0), _FAR))
 
 
-# -- Information of the images alone, for graphs ------------------------------------------------
-
-# 1 sigma of a constant acceleration that the images alone determine [m/s^2].
-_ANY_ACCELERATION = 100.0
-# Deviations of `ImageInformation`: rotation, direction, and the difference of both velocities.
-_OBSERVED = np.zeros((8, 11))
-_OBSERVED[:5, :5] = np.eye(5)
-_OBSERVED[5:, 5:8], _OBSERVED[5:, 8:] = -np.eye(3), np.eye(3)
-
-
-def _by_tracks(adjusted: Adjusted, priors: PathPriors) -> tuple[Array, Array]:
-    """Estimate of t (2,), e and phi by the tracks, less the state's, and its covariance.
-
-    Of the IMU only the shape of path and rotation within the pair remains: the gyro's rotations
-    given the last one, and the acceleration but for a constant. Preintegrated samples from
-    keyframe to keyframe contain neither.
-    """
-    state, normal, n = adjusted.state, adjusted.normal, len(adjusted.covariance)
-    H = np.tril(normal.hessian) + np.tril(normal.hessian, -1).T
-    weights = np.repeat(priors.acceleration_weights, 3)
-    first, last = ACCELERATION + len(weights), slice(n - 3, n)
-    # Priors of e and phi: as adjusted, and those that remain.
-    before, after = np.zeros((n, n)), np.zeros((n, n))
-    e = np.arange(ACCELERATION, first)
-    before[e, e], after[e, e] = weights, weights
-    after[e[:3], e[:3]] = _ANY_ACCELERATION**-2
-    before[first:, first:] = after[first:, first:] = priors.rotation_information
-    after[last, last] -= np.linalg.inv(np.linalg.inv(priors.rotation_information)[-3:, -3:])
-    mean = np.concatenate([np.zeros(ACCELERATION), state.accelerations.ravel(),
-                           state.rotations[1:].ravel()])
-    free = np.r_[:LOG_SCALE, ACCELERATION:n]
-    g, H = (normal.gradient + (after - before) @ mean)[free], (H + after - before)[:, free][free]
-    # As the covariance of the pose.
-    N = len(normal.scores)
-    scale = adjusted.common * N / max(N - n / 3.0, 1.0)
-    scatter = (scale * normal.scores.T @ normal.scores + after)[:, free][free]
-    C = np.linalg.inv(H)
-    return -C @ g, C @ scatter @ C
-
-
-def _images(adjusted: Adjusted, tracks: Tracks, path: _Path, views: Sequence[_View],
-            delay: float, by_tracks: tuple[Array, Array],
-            stamp_sigma: float) -> ImageInformation:
-    """Information of rotation, direction and change of the velocity, of rank 8.
-
-    `delay` [s] of the middle rows, after the reference rows; `by_tracks`: result of the function.
-    """
-    state, T, k = adjusted.state, tracks.duration, math.exp(adjusted.state.log_scale)
-    step, C = by_tracks
-    count = len(state.accelerations)
-    # Velocities and accelerations in both frames, in the axes of camera 1.
-    ends = state.t / T + k * (np.array(path.ends) - path.chord / T
-                              + T * _SLOPES[:, :count] @ state.accelerations)
-    accelerations = k * (path.accelerations[[0, -1]] + _VALUES[:, :count] @ state.accelerations)
-    later = ends + delay * accelerations
-    change = later[1] - later[0]
-    E1, E2 = (view.motion.rotations([delay])[0] for view in (views[0], views[-1]))
-    q = E1.T @ (state.t + 0.5 * delay * (change + ends[1] - ends[0]))
-    length = np.linalg.norm(q)
-    t, velocities = q / length, later @ E1 / length
-    by_q, by_change = np.zeros((3, len(C))), np.zeros((3, len(C)))
-    by_change[:, 2:5] = k * T * E1.T   # by e_0
-    by_q[:, :2] = E1.T @ tangent_basis(state.t)
-    by_q += delay * by_change
-    by = np.zeros((8, len(C)))
-    by[:3, -3:] = E1.T
-    by[3:5] = tangent_basis(t).T @ by_q / length
-    by[5:] = (by_change - np.outer(E1.T @ change / length, t @ by_q)) / length
-    R = E1.T @ exp_so3(T * state.bias + state.rotations[-1]) @ tracks.rotations[-1] @ E2
-    covariance = by @ C @ by.T
-    for rate in (views[0].motion.angular_velocity, R @ views[-1].motion.angular_velocity):
-        covariance[:3, :3] += stamp_sigma**2 * np.outer(rate, rate)
-    root = np.linalg.inv(covariance) @ _OBSERVED
-    return ImageInformation(delay, R, t, velocities.ravel(), _OBSERVED.T @ root,
-                            -root.T @ by @ step)
-
-
 def _result(pose: RelativePose, adjusted: Adjusted, tracks: Tracks, priors: PathPriors,
             path: _Path, views: int) -> RelativePose:
     """The two-view result with the pose, its covariance and the velocities of all frames."""
@@ -428,7 +342,9 @@ def _result(pose: RelativePose, adjusted: Adjusted, tracks: Tracks, priors: Path
     by_state = np.zeros((6, n))
     by_state[:3, TANGENT:LOG_SCALE] = tangent_basis(state.t)
     by_state[3:, BIAS:BIAS + 3], by_state[3:, -3:] = T * np.eye(3), np.eye(3)
-    bends = T * _SLOPES[:, :len(state.accelerations)]
+    # B_j' at both ends.
+    bends = T * np.array([[-0.5, 1.0 / 6.0, 0.0], [0.5, 1.0 / 6.0, 0.0]])[
+        :, :len(state.accelerations)]
     # p' at both ends (2, 3), in the axes of camera 1, and its derivatives.
     of_scale = k * (np.array(path.ends) - path.chord / T + bends @ state.accelerations)
     velocities, derivatives = state.t / T + of_scale, np.zeros((2, 3, n))
