@@ -9,13 +9,8 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import chi2
 
-from rs_relpose_lab.experiments.consistency import (
-    QUANTILE,
-    R_FREEDOM,
-    replayed,
-    SIMULATED,
-    T_FREEDOM,
-)
+from rs_relpose_lab.experiments import consistency
+from rs_relpose_lab.experiments.consistency import QUANTILE, R_FREEDOM, SIMULATED, T_FREEDOM
 from rs_relpose_lab.experiments.harness import markdown_table, write_table
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.bag import made_once, right_parameters, write_bag
@@ -148,7 +143,8 @@ def on_lens(seed: int, model: str, seconds: float, folder: Path, *, live: bool) 
 
 
 def _poses(bag: Path, parameters: Path) -> Poses:
-    pairs = list(replayed(bag, read_parameters(parameters), SIMULATED, bag.parent.name))
+    pairs = list(consistency.replayed(bag, read_parameters(parameters), SIMULATED,
+                                      bag.parent.name))
     squares = np.array([(T_FREEDOM * pair.translation_nees, R_FREEDOM * pair.rotation_nees)
                         for pair in pairs if not math.isnan(pair.rotation)]).reshape(-1, 2)
     beyond = squares > chi2([T_FREEDOM, R_FREEDOM]).ppf(QUANTILE)

@@ -12,17 +12,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from rs_relpose_lab.experiments import trust_runs
 from rs_relpose_lab.experiments.harness import markdown_table, write_table
-from rs_relpose_lab.experiments.trust_runs import (
-    Gray,
-    processed,
-    Recording,
-    run,
-    simulated,
-    Source,
-    TrackNoise,
-    TRACKS,
-)
+from rs_relpose_lab.experiments.trust_runs import Gray, Recording, Source, TrackNoise, TRACKS
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.simulation import Simulation
 from rs_relpose_lab.simulation.trajectory import Trajectory
@@ -92,12 +84,12 @@ def on_seed(seed: int) -> LoopMetrics:
 def on_walk(config: SimulationConfig, trajectory: Trajectory) -> LoopMetrics:
     """Odometry of a walk with loop closures."""
     simulation = simulate(config, trajectory=trajectory)
-    recording = simulated(Source(f'{config.scene} {config.seed}', TRACKS), simulation,
+    recording = trust_runs.simulated(Source(f'{config.scene} {config.seed}', TRACKS), simulation,
                           TrackNoise(), np.random.default_rng(config.seed))
     parameters = Parameters.from_mapping(recording.configured.values)
     arrives = {arrival.stamp_ns: arrival.arrives_ns for arrival in recording.arrivals}
     pairs, views = [], {}
-    for pair, _ in run(recording, recording.configured):
+    for pair, _ in trust_runs.run(recording, recording.configured):
         given = KeyframePair.of_result(pair)
         views[given.current_ns + given.row_ns] = View(pair.stamp_ns, pair.parallax)
         pairs.append((arrives[pair.stamp_ns], given))
@@ -133,7 +125,7 @@ def _related(recording: Recording, simulation: Simulation,
     warm_up(parameters.estimator)
     loop = FrameLoop(parameters, ChosenPairs(stamps), offline=True)
     found: dict[Stamps, PairResult | str] = {}
-    for frame in processed(replace(recording, image=image, sightings=None),
+    for frame in trust_runs.processed(replace(recording, image=image, sightings=None),
                            recording.configured, loop):
         found.update(frame.result or {})
     return [pair for pair in found.values() if isinstance(pair, PairResult)]

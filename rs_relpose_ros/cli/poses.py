@@ -18,13 +18,7 @@ from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.odometry import export, need_gtsam
 from rs_relpose_ros.odometry.formats import FORMATS, IMAGES
 from rs_relpose_ros.odometry.rows import camera_poses, ROWS_FILE, RowTrajectory, write_tum
-from rs_relpose_ros.offline.replay import (
-    pairs_into,
-    read_pairs,
-    read_stamps,
-    replay_into,
-    ReplayOutcome,
-)
+from rs_relpose_ros.offline import replay
 from rs_relpose_ros.offline.tables import POSES
 from rs_relpose_ros.output_files import beside, refuse_unwritable, SUMMARY_FILE
 
@@ -51,11 +45,11 @@ def _add_replay_arguments(parser: argparse.ArgumentParser) -> None:
                         help="write the node's topics as an MCAP bag, too")
 
 
-def replay_bag(args: argparse.Namespace) -> tuple[Path, ReplayOutcome]:
+def replay_bag(args: argparse.Namespace) -> tuple[Path, replay.ReplayOutcome]:
     """Replay and write the files of the command, into the folder that is returned."""
-    stamps = None if args.stamps is None else read_stamps(args.stamps)
+    stamps = None if args.stamps is None else replay.read_stamps(args.stamps)
     return options.run_on_bag(
-        args, 'relpose', lambda folder, bag, topics, parameters: replay_into(
+        args, 'relpose', lambda folder, bag, topics, parameters: replay.replay_into(
             folder, bag, topics, parameters, stamps=stamps, pictures=not args.no_pictures,
             with_bag=args.with_bag), _calibration(args) if args.calibrate else {})
 
@@ -75,7 +69,7 @@ def _calibration(args: argparse.Namespace) -> dict[str, Any]:
     return file_values(folder / CALIBRATION_FILE)
 
 
-def has_good_poses(outcome: ReplayOutcome) -> bool:
+def has_good_poses(outcome: replay.ReplayOutcome) -> bool:
     """Whether a pair has a pose, and no parameter is wrong."""
     metrics = outcome.metrics
     return bool(metrics['pairs']['answered']) and metrics['health']['state'] != 'wrong'
@@ -90,7 +84,7 @@ def _replay(args: argparse.Namespace) -> int:
     return 0 if has_good_poses(outcome) else FAILED
 
 
-def _print_replay(outcome: ReplayOutcome) -> None:
+def _print_replay(outcome: replay.ReplayOutcome) -> None:
     metrics = outcome.metrics
     pairs, frames = metrics['pairs'], metrics['frames']
     refused = sum(frames['refused'].values()) + frames['failed']
@@ -124,7 +118,7 @@ def _print_replay(outcome: ReplayOutcome) -> None:
     _print_health(outcome)
 
 
-def _print_health(outcome: ReplayOutcome) -> None:
+def _print_health(outcome: replay.ReplayOutcome) -> None:
     """A line for each inconsistent parameter, or else one for all parameters."""
     health = outcome.health
     for fault in health.faults:
@@ -175,14 +169,14 @@ def _add_pairs_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _pairs(args: argparse.Namespace) -> int:
-    pairs = read_pairs(args.list)
+    pairs = replay.read_pairs(args.list)
 
     def work(folder: Path, bag: Bag, topics: SensorTopics,
-             parameters: Parameters) -> ReplayOutcome:
+             parameters: Parameters) -> replay.ReplayOutcome:
         if args.list.resolve() == (folder / POSES.file).resolve():
             raise InputError(f'the results would replace the list {args.list}: choose another '
                              'directory with --out')
-        return pairs_into(folder, bag, topics, parameters, pairs)
+        return replay.pairs_into(folder, bag, topics, parameters, pairs)
 
     folder, outcome = options.run_on_bag(args, 'pairs', work)
     counts = outcome.metrics['pairs']

@@ -17,12 +17,8 @@ from rs_relpose_ros.messages.incoming import PARTS, Role
 from rs_relpose_ros.nodes.diagnostics import ERROR, FrameStatistics, OK, RELATIVE_POSE, WARN
 from rs_relpose_ros.nodes.inputs import message_class
 from rs_relpose_ros.nodes.sensor_node import run_node, SensorNode
+from rs_relpose_ros.pipeline import global_shutter
 from rs_relpose_ros.pipeline.findings import FindingState
-from rs_relpose_ros.pipeline.global_shutter import (
-    GlobalShutterFrame,
-    unrolling_loop,
-    warm_up_unroller,
-)
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrameLoop
 
@@ -74,10 +70,10 @@ class _Statistics(FrameStatistics):
     def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
         super().__init__(clock)
         self._images = self._withheld = 0
-        self._last: GlobalShutterFrame | None = None
+        self._last: global_shutter.GlobalShutterFrame | None = None
         self._health = Health()
 
-    def add_image(self, frame: GlobalShutterFrame, ready_ns: int, health: Health, *,
+    def add_image(self, frame: global_shutter.GlobalShutterFrame, ready_ns: int, health: Health, *,
                   withheld: bool) -> None:
         """Count an image right after its publication; its data were complete at `ready_ns`."""
         with self._lock:
@@ -123,18 +119,19 @@ class GlobalShutterNode(SensorNode):
         self._mask = publisher(_IMAGE_TYPES[0], '~/mask')
         self._camera_info = publisher('sensor_msgs/msg/CameraInfo', '~/camera_info')
 
-    def _make_loop(self, parameters: Parameters) -> FrameLoop[GlobalShutterFrame]:
-        return unrolling_loop(parameters, watched=lambda: self._by_relpose() is None)
+    def _make_loop(self, parameters: Parameters) -> FrameLoop[global_shutter.GlobalShutterFrame]:
+        return global_shutter.unrolling_loop(
+            parameters, watched=lambda: self._by_relpose() is None)
 
     def _warm_up(self) -> None:
-        warm_up_unroller(self._settings.current)
+        global_shutter.warm_up_unroller(self._settings.current)
 
     def _on_ready(self) -> None:
         if self._settings.current.global_shutter.stamp_clock == 'imu':
             self._sibling_timer = self.create_timer(1.0, self._look_for_siblings,
                                                     clock=self._steady)
 
-    def _on_processed(self, frame: Frame[GlobalShutterFrame]) -> None:
+    def _on_processed(self, frame: Frame[global_shutter.GlobalShutterFrame]) -> None:
         result = frame.result
         assert result is not None
         own = result.health
@@ -165,7 +162,7 @@ class GlobalShutterNode(SensorNode):
                     and status.hardware_id.removesuffix('/compressed') == own):
                 self._of_others = time.monotonic(), Health.of_status(status)
 
-    def _publish(self, frame: GlobalShutterFrame) -> None:
+    def _publish(self, frame: global_shutter.GlobalShutterFrame) -> None:
         """Publish the topics that are subscribed."""
         header = frame.stamp_ns, frame.frame_id
         raw, compressed, mask = (topic.get_subscription_count() for topic in (

@@ -16,15 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.output_files import (
-    BLUE,
-    GREEN,
-    ORANGE,
-    RED,
-    save_picture,
-    SUMMARY_FILE,
-    written,
-)
+from rs_relpose_ros import output_files
+from rs_relpose_ros.output_files import BLUE, GREEN, ORANGE, RED, SUMMARY_FILE, written
 
 RESULT_FILES = {'check': 'check.json', 'calibrate': 'calibration.json', 'replay': SUMMARY_FILE}
 RESULTS_FILE = 'results.csv'
@@ -389,7 +382,7 @@ def draw(command: str, rows: Sequence[Outcome], combined: Sequence[Combined], pa
     left.set_title(' ', pad=9.0)
     left.legend(legend.values(), legend.keys(), loc='lower left', bbox_to_anchor=(0.0, 1.0),
                 ncols=5, fontsize='small', frameon=False).set_in_layout(False)
-    save_picture(picture, path)
+    output_files.save_picture(picture, path)
 
 
 def _label(row: Outcome) -> str:

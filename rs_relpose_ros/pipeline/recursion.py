@@ -32,17 +32,9 @@ from rs_relpose_ros.estimator.fit import FitMatches, gauss_newton
 from rs_relpose_ros.estimator.priors import inverse, PARAMETERS, TANGENT, THETA, TwoViewState
 from rs_relpose_ros.estimator.problem import build_problem, observed, TwoViewProblem
 from rs_relpose_ros.estimator.sampson import jacobian, residuals
-from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
-from rs_relpose_ros.geometry.so3 import (
-    exp_so3,
-    integrated_rotations,
-    log_so3,
-    median,
-    skew,
-    tangent_basis,
-)
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.integration import GyroSegment, RotationSensitivity
 from rs_relpose_ros.jit import kernel
@@ -136,7 +128,7 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
     D, rows = _gyro(pair), _Rows.of(pair, problem, keep)
     rotation, information = problem.rotation, problem.rotation_information
     if at.any():
-        rotation = exp_so3(D[:, :DEVIATIONS] @ at) @ rotation
+        rotation = so3.exp_so3(D[:, :DEVIATIONS] @ at) @ rotation
         observations = rows.displaced(observations, at)
     prior = priors.Priors(np.zeros(3), np.zeros(3), 0.0, 0.0, pair.gyro_sigma**-2,
                           np.ascontiguousarray(rotation), information,
@@ -149,7 +141,7 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
     J_c = np.hstack([rows.derivatives(observations, state, r),
                      _by_lens(pair, problem, rows, keep, at, state, r)])
     # The gyro's rotation: theta = Log(R R_gyro^T), which R_gyro rotated by D c makes smaller.
-    theta = log_so3(np.ascontiguousarray(state.R @ rotation.T))
+    theta = so3.log_so3(np.ascontiguousarray(state.R @ rotation.T))
     H, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
     priors.add_priors(state, prior, H, gradient)
     weighted = J_x.T * weights
@@ -191,7 +183,7 @@ def _shifts(pair: PairData, problem: TwoViewProblem, state: TwoViewState, H: Arr
     spread = np.linalg.cholesky(covariance[_POSE[:, None], _POSE])
     # In the axes of the stamped row.
     to_stamped = problem.motion1.rotations([problem.reference_row_time])[0].T
-    by_deviation = np.vstack([to_stamped @ tangent_basis(state.t) @ moved[TANGENT:TANGENT + 2],
+    by_deviation = np.vstack([to_stamped @ so3.tangent_basis(state.t) @ moved[TANGENT:TANGENT + 2],
                               to_stamped @ moved[THETA:THETA + 3]])
     return by_deviation, solve_triangular(spread, moved[_POSE], lower=True)
 
@@ -222,7 +214,7 @@ def _common_noise(matches: FitMatches, J: Array, r: Array, S: Array) -> tuple[fl
 
 def _noise(r: Array) -> float:
     """Sigma of the matches [px] from their residuals."""
-    return max(1.4826 * median(np.abs(r)), _LEAST_SIGMA)
+    return max(1.4826 * so3.median(np.abs(r)), _LEAST_SIGMA)
 
 
 def _state(pair: PairData, problem: TwoViewProblem, observations: Array, prior: priors.Priors,
@@ -257,7 +249,7 @@ def _at_stamped_row(pair: PairData, problem: TwoViewProblem, state: TwoViewState
     share, rate1 = middle_share(pair.camera), to_middle @ pair.rates[0]
     rate2 = to_middle @ (pair.gyro_rotation @ pair.rates[1])
     moved = moved.copy()
-    moved[TANGENT:TANGENT + 2, READOUT] += share * (tangent_basis(state.t).T @ skew(rate1)
+    moved[TANGENT:TANGENT + 2, READOUT] += share * (so3.tangent_basis(state.t).T @ so3.skew(rate1)
                                                     @ state.t)
     moved[THETA:THETA + 3, READOUT] += share * (rate1 - rate2)
     return moved
@@ -321,7 +313,7 @@ class _Rows(NamedTuple):
             rate, along = motion.angular_velocity, tau[:, None, None]
             later = tau[:, None] * _acceleration(motion, camera.row_time_span)
             # Exp(c) A Exp(-c) for the small rotation A = Exp(w tau): c x (w tau)
-            turn[:, :, AXES] = -along * skew(rate)
+            turn[:, :, AXES] = -along * so3.skew(rate)
             turn[:, :, OFFSET] = later
             turn[:, :, READOUT] = shares[k][:, None] * rate + middle_share(camera) * later
             turn[:, :, BIAS] = -along * pair.R_cam_imu
@@ -355,7 +347,7 @@ def _acceleration(motion: FrameMotion, span: tuple[float, float]) -> Array:
     if half <= 0.0 or motion.knot_times is None:
         return np.zeros(3)
     first, last = motion.rotations([-half, half])
-    forward, backward = log_so3(last), -log_so3(first)
+    forward, backward = so3.log_so3(last), -so3.log_so3(first)
     return np.asarray((forward - backward) / half**2)
 
 
@@ -401,7 +393,7 @@ def _at_other_times(pair: PairData, gyro: GyroSegment, deviations: Array) -> Pai
             [np.interp(times, known, axis) for axis in gyro.angular_velocities.T])
 
     times, rates = between(first, second)
-    rotation = integrated_rotations(times, rates)[-1]
+    rotation = so3.integrated_rotations(times, rates)[-1]
     motions = []
     for stamped in (first, second):
         rows, row_rates = between(stamped + begin, stamped + end)
