@@ -262,6 +262,18 @@ def test_check_on_a_running_cluster(client, bags, tmp_path):
     assert (tmp_path / 'overview.png').is_file()
 
 
+def test_each_worker_is_a_process_of_one_thread(client, tmp_path):
+    for name in ('a', 'b'):
+        make_bag(tmp_path / name)
+    client.wait_for_workers(2, timeout=60)
+    assert set(client.nthreads().values()) == {1} and len(client.nthreads()) == 2
+    assert all('//127.0.0.1:' in address for address in client.nthreads())
+    result = run_batch(client, request(tmp_path, 'a', 'b'), tmp_path / 'out', threads)
+    configured = [row.message.split() for row in result.rows]
+    assert [words[:2] for words in configured] == [['1', '1']] * 2
+    assert os.getpid() not in {int(words[2]) for words in configured}
+
+
 # Work for clusters; the folder for marks is in the job's options.
 
 
@@ -316,18 +328,6 @@ def test_bag_that_kills_every_worker(client, tmp_path):
     rows = results_of(tmp_path / 'out')
     assert 'workers died over this bag' in rows['mortal']['message']
     assert rows['faulty']['message'] == 'ZeroDivisionError: no such number'
-
-
-def test_each_worker_is_a_process_of_one_thread(client, tmp_path):
-    for name in ('a', 'b'):
-        make_bag(tmp_path / name)
-    client.wait_for_workers(2, timeout=60)
-    assert set(client.nthreads().values()) == {1} and len(client.nthreads()) == 2
-    assert all('//127.0.0.1:' in address for address in client.nthreads())
-    result = run_batch(client, request(tmp_path, 'a', 'b'), tmp_path / 'out', threads)
-    configured = [row.message.split() for row in result.rows]
-    assert [words[:2] for words in configured] == [['1', '1']] * 2
-    assert os.getpid() not in {int(words[2]) for words in configured}
 
 
 def work_of_calibrations(job: Job) -> Outcome:
