@@ -108,7 +108,7 @@ def test_a_benchmark_measures_rows_of_a_walk(monkeypatch):
     found = reconstruction.on_walk(walks(1, 9001, 3.0)[0])
     assert max(found.first, found.middle, found.last) < 1.2
     assert found.turned < 0.03
-    # Frames from linear poses, by those from one pose: issue 25 allows 0.3.
+    # Frames from linear poses, by those from one pose.
     assert found.rendered < 0.3
 
 

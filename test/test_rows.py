@@ -470,7 +470,7 @@ def test_a_reader_of_the_format_gets_the_same_pixels(name, lens, direction, roll
 @pytest.mark.parametrize('direction', ['down', 'up'])
 @pytest.mark.parametrize('name', ['gsplat', 'instant-ngp', 'nerfstudio'])
 def test_the_formula_of_a_rolling_shutter_is_near_the_trajectory(name, direction, trajectory):
-    """0.7 rad/s, 3 to 6 rad/s^2 and 1.6 m/s, 3 m in front: issue 25 allows 0.3 px."""
+    """0.7 rad/s, 3 to 6 rad/s^2 and 1.6 m/s, 3 m in front."""
     model = made(trajectory, 'pinhole', direction)
     k, guess = model.observed[:, 0], np.full(10, 240.0)
     true, linear, single = (formats.projected(place, model, k, model.points, guess) for place in (

@@ -82,7 +82,7 @@ def need_sensor_parameters(parameters: Parameters, fix: str = '') -> None:
     """Raise MissingInputError for required parameters that no message contains."""
     if missing := parameters.sensor.missing():
         fix = fix or f'use --params FILE or --set {missing[0]}=...: see config/relpose.yaml'
-        raise MissingInputError(f'parameter {" and ".join(missing)} must be given; {fix}')
+        raise MissingInputError(f'{" and ".join(missing)} must be given; {fix}')
 
 
 def unused_reason(outcome: FrameRefused | FrameFailed | MessageRefused) -> str:
