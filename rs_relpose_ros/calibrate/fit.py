@@ -550,14 +550,23 @@ _UNCLEAR = defaultdict(str, {Varying.UNCLEAR: (
     'offset is assumed to be the same in all frames')})
 # Sigma, in those of an observable value, beyond which a rotation or focal length is of no use.
 _USELESS = 10.0
-# Sigma of an observable slope of the offset [s/s].
-_MOST_SLOPE_SIGMA = 0.5
+# Largest sigmas of observable values: readout time and offset [s], its slope [s/s], bias [rad/s],
+# focal length (relative).
+_MOST_READOUT, _MOST_OFFSET, _MOST_SLOPE, _MOST_BIAS, _MOST_FOCAL = 1.5e-3, 3e-3, 0.5, 0.01, 0.03
+# Errors (2, GLOBAL) that are common to a recording and not part of its scatter, without and with a
+# tracker: its own, measured on rendered bags with KLT [s, rad, rad/s]; of the slope [s/s], as the
+# exposure also changes within one step of the interval.
+_COMMON = np.zeros((2, GLOBAL))
+_COMMON[:, model.FOCAL] = _LEAST_FOCAL_SIGMA
+_COMMON[1, [READOUT, model.OFFSET]], _COMMON[1, model.SLOPE] = 5e-5, 0.08
+_COMMON[1, ROTATION:ROTATION + 3], _COMMON[1, model.BIAS:model.BIAS + 3] = 1e-3, 2.5e-4
 
 
 def evaluated(data: Observations, final: Fit, curve: CostCurve,
               config: CalibrationConfig, *, axes_known: bool = False) -> CalibrationResult:
     """Result of a fit; `axes_known`: also of a transform. InputError for a readout too long."""
-    covariance = final.covariance + np.diag(np.where(final.free, _tracker_sigmas(config), 0.0)**2)
+    common = np.where(final.free, _COMMON[int(config.exposed)], 0.0)
+    covariance = final.covariance + np.diag(common**2)
     unknowns = final.unknowns
     if final.free[model.FOCAL]:
         # Widened, the sigmas of the lens may exceed those of its priors.
@@ -566,9 +575,8 @@ def evaluated(data: Observations, final: Fit, curve: CostCurve,
                                        1.0 / final.problem.prior[lens])
     bounded, covariance, beyond = _bounded(unknowns, covariance, data.interval)
     parameters, R_cam_imu = bounded.parameters, bounded.R_imu_cam.T
-    rates, one_axis, _ = data.excitation(parameters[model.BIAS:model.BIAS + 3], R_cam_imu,
-                                         config.min_rotation_rate)
-    sigmas = np.sqrt(np.diag(covariance))
+    rates, one_axis, _ = data.excitation(parameters[model.BIAS:model.BIAS + 3], R_cam_imu)
+    sigmas, wide = np.sqrt(np.diag(covariance)), config.tolerance
     # Row 0 is read this share of the readout before the middle row.
     to_first = np.zeros(GLOBAL)
     height = data.camera.height
@@ -578,31 +586,30 @@ def evaluated(data: Observations, final: Fit, curve: CostCurve,
     rotation_sigma = np.sqrt(np.diag(R_cam_imu @ covariance[part, part] @ R_cam_imu.T))
     axis_map = nearest_axis_map(R_cam_imu)
     cosine = (np.trace(R_cam_imu @ axis_map.T) - 1.0) / 2.0
-    bias_x, bias_y, bias_z = (_estimate(parameters[i], sigmas[i], config.max_bias_sigma)
+    bias_x, bias_y, bias_z = (_estimate(parameters[i], sigmas[i], wide * _MOST_BIAS)
                               for i in range(model.BIAS, model.BIAS + 3))
     focal = slope = radial = center = None
     if final.free[model.FOCAL]:
         camera = with_lens(data.camera, parameters[model.LENS])
         factor = math.exp(data.lens[0] + parameters[model.FOCAL])
-        focal = _estimate(factor, factor * sigmas[model.FOCAL], factor * config.max_focal_sigma,
+        focal = _estimate(factor, factor * sigmas[model.FOCAL], factor * wide * _MOST_FOCAL,
                           one_axis)
         radial, column, row = (Estimate(value, float(sigma), True) for value, sigma in zip(
             (camera.distortion[0], camera.cx, camera.cy), sigmas[model.LENS][1:], strict=True))
         center = column, row
     if final.free[model.SLOPE]:
-        slope = _estimate(parameters[model.SLOPE], sigmas[model.SLOPE], _MOST_SLOPE_SIGMA)
+        slope = _estimate(parameters[model.SLOPE], sigmas[model.SLOPE], _MOST_SLOPE)
     jitters = data.stamps.varying is Varying.JITTER
     unsettled = '' if final.converged else 'the fit has not converged'
     return CalibrationResult(
         readout_time=replace(_estimate(parameters[READOUT], sigmas[READOUT],
-                                       config.max_readout_sigma), determined=True),
+                                       wide * _MOST_READOUT), determined=True),
         fitted_readout=float(unknowns.parameters[READOUT]),
-        time_offset=_estimate(float(to_first @ parameters),
-                              math.sqrt(to_first @ covariance @ to_first),
-                              config.max_offset_sigma),
+        time_offset=_estimate(float(to_first @ parameters), math.sqrt(
+            to_first @ covariance @ to_first), wide * _MOST_OFFSET),
         R_cam_imu=R_cam_imu, rotation_sigma=rotation_sigma,
         rotation=_estimate(math.acos(np.clip(cosine, -1.0, 1.0)), rotation_sigma.max(),
-                           config.max_rotation_sigma, '' if axes_known else one_axis),
+                           wide * config.max_rotation_sigma, '' if axes_known else one_axis),
         axis_map=axis_map, gyro_bias=(bias_x, bias_y, bias_z), focal_factor=focal,
         radial=radial, center=center, exposure=_exposure(data, final, sigmas[model.EXPOSURE]),
         exposure_margin=data.exposure.margin,
@@ -614,16 +621,6 @@ def evaluated(data: Observations, final: Fit, curve: CostCurve,
         frames=len(data.tracks), pairs=final.problem.pairs, matches=int(final.problem.begin[-1]),
         frame_interval=data.interval,
         warnings=tuple(filter(None, (unsettled, one_axis, beyond, _UNCLEAR[data.stamps.varying]))))
-
-
-def _tracker_sigmas(config: CalibrationConfig) -> Array:
-    """Errors (GLOBAL,) of tracker and model that all of a recording has in common."""
-    sigmas = np.zeros(GLOBAL)
-    sigmas[[READOUT, model.OFFSET]] = config.tracking_time_sigma
-    sigmas[ROTATION:ROTATION + 3] = config.tracking_rotation_sigma
-    sigmas[model.BIAS:model.BIAS + 3] = config.tracking_bias_sigma
-    sigmas[[model.SLOPE, model.FOCAL]] = config.exposure_slope_sigma, _LEAST_FOCAL_SIGMA
-    return sigmas
 
 
 def _exposure(data: Observations, final: Fit, square_sigma: float) -> Estimate:

@@ -26,10 +26,8 @@ from rs_relpose_ros.pipeline.sequencer import Refusal, SequencerCounts
 # longer than the two seconds; kept at most; added before the next fit.
 _FIRST, _FIRST_OF_LENS, _LONGEST, _STEP = 6.0, 8.0, 60.0, 2.0
 # From this length on [s] values with wider sigmas suffice, as their doubt is in the covariances:
-# factor and names of the limits.
+# factor of the limits.
 _LONG, _WIDER = 8.0, 2.0
-_LIMITS = ('max_readout_sigma', 'max_offset_sigma', 'max_rotation_sigma', 'max_bias_sigma',
-           'max_focal_sigma')
 # From this length on [s] a rotation as exact as that of a transform suffices: a robot on wheels
 # rotates about one axis only.
 _WHEELS = 20.0
@@ -211,9 +209,9 @@ class LiveCalibration:
         config = replace(TRACKED_IN_IMAGES, exposure_time=sensor.exposure_time,
                          exposure_margin=sensor.exposure_margin)
         if recorder.seconds >= _LONG:
-            config = replace(config, **{name: _WIDER * getattr(config, name) for name in _LIMITS})
+            config = replace(config, tolerance=_WIDER)
         if recorder.seconds >= _WHEELS and self.quat_prior is not None:
-            config = replace(config, max_rotation_sigma=1.1 * AXES_SIGMA)
+            config = replace(config, max_rotation_sigma=1.1 * AXES_SIGMA / _WIDER)
         try:
             self._fit = _Fit(recorder.recording(), config, self.quat_prior)
         except RsRelposeError as error:

@@ -233,6 +233,9 @@ def with_lens(camera: RollingShutterCamera, lens: Array) -> RollingShutterCamera
 # Frames further apart than so many intervals have lost some in between.
 _LOST = 1.5
 _LEAST_PAIRS = 10
+# Longest step between samples of the gyro that is interpolated [s], and rms rate below which the
+# camera is at rest about an axis [rad/s].
+MAX_GYRO_GAP, LEAST_ROTATION = 0.03, math.radians(2.0)
 # Prior of `bend`, 1 sigma, before the parallax is known.
 _BEND_AT_START = 0.1
 # 1 sigma of a gyro's bias [rad/s]; of the offset's change by a covariate [s/s]; of an unknown
@@ -291,7 +294,7 @@ class Observations:
         """Steps (K - 1,) between samples of the gyro [s]."""
         return np.diff(self.gyro_times)
 
-    def excitation(self, bias: Array, R_cam_imu: Array, least: float) -> tuple[Array, str, Array]:
+    def excitation(self, bias: Array, R_cam_imu: Array) -> tuple[Array, str, Array]:
         """Rms rates (3,) about the camera's axes [rad/s], what is missing (empty: nothing), axis.
 
         The latter (3,) is that of the most rotation, a unit vector of the camera.
@@ -302,7 +305,7 @@ class Observations:
         rms = np.sqrt((rates**2).mean(axis=0))
         values, vectors = np.linalg.eigh(rates.T @ rates / len(rates))
         # Two axes fix a rotation.
-        if np.sqrt(max(values[1], 0.0)) >= least:
+        if np.sqrt(max(values[1], 0.0)) >= LEAST_ROTATION:
             return rms, '', vectors[:, 2]
         main = vectors[:, 2]
         lacking = [AXES[i] for i in np.argsort(np.abs(main))[:2]]
@@ -316,7 +319,7 @@ class Observations:
         gaps = sorted({max(1, round(span / self.interval)) for span in selection.spans})
         return make_pairs(self.tracks, gaps, selection, _LOST * self.interval, rng)
 
-    def selected_problem(self, selection: PairSelection, offset: float, max_gyro_gap: float,
+    def selected_problem(self, selection: PairSelection, offset: float,
                          rng: np.random.Generator) -> Problem:
         """Data of a fit to pairs all of whose rows lie within the gyro and touch no gap of it.
 
@@ -326,7 +329,7 @@ class Observations:
         begin = self.times[pairs.first] + offset - half
         end = self.times[pairs.second] + offset + half
         clear = (begin >= self.gyro_times[0]) & (end <= self.gyro_times[-1])
-        for k in np.flatnonzero(self.gyro_steps > max_gyro_gap):
+        for k in np.flatnonzero(self.gyro_steps > MAX_GYRO_GAP):
             clear &= (end <= self.gyro_times[k]) | (begin >= self.gyro_times[k + 1])
         pairs = pairs.chosen(clear)
         if len(pairs) < _LEAST_PAIRS:

@@ -26,7 +26,13 @@ from rs_relpose_ros.calibrate.coplanarity import (
     SLOPE,
     Unknowns,
 )
-from rs_relpose_ros.calibrate.observations import Observations, PairSelection, Tracks
+from rs_relpose_ros.calibrate.observations import (
+    LEAST_ROTATION,
+    MAX_GYRO_GAP,
+    Observations,
+    PairSelection,
+    Tracks,
+)
 from rs_relpose_ros.calibrate.result import CalibrationResult
 from rs_relpose_ros.calibrate.start import find_starts, GyroSeries, Start
 from rs_relpose_ros.config.settings import CalibrationConfig, TrackingConfig
@@ -40,7 +46,7 @@ from rs_relpose_ros.messages.transforms import AXES_SIGMA
 from rs_relpose_ros.tracking.features import make_tracker
 from rs_relpose_ros.tracking.images import EncodedImage, GrayLevels
 
-_LEAST_MATCHES = 20
+_LEAST_MATCHES, _LEAST_FRAMES = 20, 40
 # Spans [s]: over long ones the gyro's rates at the rows differ; over short ones the errors of the
 # tracker add up less and the velocity of the camera is constant. The noise of each pair determines
 # its weight.
@@ -91,37 +97,35 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
     free[[SLOPE, EXPOSURE]] = False
     free[LENS] = False
     free[FOCAL] = not focal_known
-    data, coarse = _coarse_fit(about, starts, free, config, rng)
+    data, coarse = _coarse_fit(about, starts, free, rng)
     free[LENS] = not focal_known
     if not focal_known:
-        data, settled = _fit_with_lens(about, data, coarse, free, _SOME_PAIRS, config, rng)
+        data, settled = _fit_with_lens(about, data, coarse, free, _SOME_PAIRS, rng)
         coarse = settled.unknowns
     progress(0.4)
     free[[SLOPE, EXPOSURE]] = data.stamps.covariates.any(), data.exposure.square_sigma > 0.0
-    data, final = _fit_with_lens(about, data, coarse, free, _ALL_PAIRS, config, rng)
+    data, final = _fit_with_lens(about, data, coarse, free, _ALL_PAIRS, rng)
     progress(0.7)
     errors = None
     if config.exposed:
         errors = fit.ModelErrors() if focal_known else fit.ESTIMATED_LENS
     final = fit.widened(final, errors)
     progress(0.8)
-    some = data.selected_problem(_SOME_PAIRS, final.unknowns.parameters[OFFSET],
-                                 config.max_gyro_gap, rng)
+    some = data.selected_problem(_SOME_PAIRS, final.unknowns.parameters[OFFSET], rng)
     curve = fit.cost_curve(fit.with_bends(some, final.unknowns), final, data.interval,
                            lambda share: progress(0.8 + 0.2 * share))
-    final, axes_known = _with_axes(data, final, R_prior, config)
+    final, axes_known = _with_axes(data, final, R_prior)
     return fit.evaluated(data, final, curve, config, axes_known=axes_known)
 
 
-def _with_axes(data: Observations, final: fit.Fit, R_prior: Array | None,
-               config: CalibrationConfig) -> tuple[fit.Fit, bool]:
+def _with_axes(data: Observations, final: fit.Fit,
+               R_prior: Array | None) -> tuple[fit.Fit, bool]:
     """The fit joined with the rotation of a transform, and whether: not if they contradict."""
     if R_prior is None:
         return final, False
     R, part = final.unknowns.R_imu_cam, slice(ROTATION, ROTATION + 3)
     covariance = final.covariance.copy()
-    _, one_axis, axis = data.excitation(final.unknowns.parameters[BIAS:BIAS + 3], R.T,
-                                        config.min_rotation_rate)
+    _, one_axis, axis = data.excitation(final.unknowns.parameters[BIAS:BIAS + 3], R.T)
     if one_axis:   # about which the fit means nothing
         axis = R @ axis
         covariance[part] -= np.outer(axis, axis @ covariance[part])
@@ -139,10 +143,10 @@ def _with_axes(data: Observations, final: fit.Fit, R_prior: Array | None,
 def _check_recording(data: Observations, config: CalibrationConfig) -> None:
     """Refuse recordings that do not determine a calibration, with what to record instead."""
     frames = len(data.tracks)
-    if frames < config.min_frames:
+    if frames < _LEAST_FRAMES:
         raise InputError(
             f'the recording is too short: {frames} frames in {data.times[-1]:.1f} s, at least '
-            f'{config.min_frames} are needed. Record 10 s or more while you rotate the camera '
+            f'{_LEAST_FRAMES} are needed. Record 10 s or more while you rotate the camera '
             'about all three axes')
     first = max(data.times[0], data.gyro_times[0] - config.max_time_offset)
     last = min(data.times[-1], data.gyro_times[-1] + config.max_time_offset)
@@ -151,10 +155,10 @@ def _check_recording(data: Observations, config: CalibrationConfig) -> None:
             f'the gyro covers {max(last - first, 0.0):.1f} s of the {data.times[-1]:.1f} s of '
             'images: record both together, and let the clocks differ by less than '
             f'{config.max_time_offset:g} s')
-    if np.median(data.gyro_steps) > config.max_gyro_gap:
+    if np.median(data.gyro_steps) > MAX_GYRO_GAP:
         raise InputError(
             f'the gyro has {1.0 / np.median(data.gyro_steps):.0f} samples per second, at least '
-            f'{1.0 / config.max_gyro_gap:.0f} are needed, 200 are good')
+            f'{1.0 / MAX_GYRO_GAP:.0f} are needed, 200 are good')
     counts = np.bincount(data.tracks.frames, minlength=frames)
     if np.median(counts) < _LEAST_MATCHES:
         raise InputError(
@@ -163,10 +167,10 @@ def _check_recording(data: Observations, config: CalibrationConfig) -> None:
             'light and focus')
     spread = data.gyro_rates - np.median(data.gyro_rates, axis=0)
     rate = float(np.sqrt((spread**2).sum(axis=1).mean()))
-    if rate < config.min_rotation_rate:
+    if rate < LEAST_ROTATION:
         raise InputError(
             f'the camera hardly rotates: {np.degrees(rate):.2f} deg/s rms by the gyro, at least '
-            f'{np.degrees(config.min_rotation_rate):.1f} are needed. Rotate it to and fro about '
+            f'{np.degrees(LEAST_ROTATION):.1f} are needed. Rotate it to and fro about '
             'all three axes, 20 to 60 deg/s')
 
 
@@ -188,13 +192,13 @@ def _starts(data: Observations, focal_known: bool, R_prior: Array | None,
 
 
 def _coarse_fit(about: Callable[[Array], Observations], starts: list[Start],
-                free: NDArray[np.bool_], config: CalibrationConfig,
-                rng: np.random.Generator) -> tuple[Observations, Unknowns]:
+                free: NDArray[np.bool_], rng: np.random.Generator,
+                ) -> tuple[Observations, Unknowns]:
     """The best of the fits to a few pairs from each of the starts, and its data."""
     fits = []
     for start in starts:
         data = about(np.array([np.log(start.focal_factor), 0.0, 0.0, 0.0]))
-        problem = data.selected_problem(_PAIRS_AT_START, start.offset, config.max_gyro_gap, rng)
+        problem = data.selected_problem(_PAIRS_AT_START, start.offset, rng)
         unknowns = fit.initial(problem, start.R_cam_imu.T, start.offset)
         fits.append((data, fit.fit(problem, unknowns, free, rounds=20, tolerance=0.3).unknowns))
     # By the noise of the matches: pairs and cost differ between the starts.
@@ -202,13 +206,12 @@ def _coarse_fit(about: Callable[[Array], Observations], starts: list[Start],
 
 
 def _fit_with_lens(about: Callable[[Array], Observations], data: Observations, coarse: Unknowns,
-                   free: NDArray[np.bool_], selection: PairSelection, config: CalibrationConfig,
+                   free: NDArray[np.bool_], selection: PairSelection,
                    rng: np.random.Generator) -> tuple[Observations, fit.Fit]:
     """Fit from `coarse`, linear in the lens, repeated about its own lens until that stays."""
     for _ in range(_LENS_ROUNDS):
         data = about(data.lens + coarse.parameters[LENS])
-        problem = data.selected_problem(selection, coarse.parameters[OFFSET],
-                                        config.max_gyro_gap, rng)
+        problem = data.selected_problem(selection, coarse.parameters[OFFSET], rng)
         begin = fit.restarted(problem, coarse, 2.0)
         found = fit.fit(fit.with_bends(problem, begin), begin, free)
         coarse = found.unknowns
@@ -287,21 +290,21 @@ class Recorder:
         self._longest = longest
         self._tracker, self._levels = make_tracker(tracking), GrayLevels()
         self._since_renewed = 0     # images
-        self._stamps: deque[int] = deque()
-        self._ids: deque[NDArray[np.uint32]] = deque()
-        self._points: deque[Array] = deque()
+        # Stamps of the images, ids and pixels (N, 2) of their points.
+        self._frames: deque[tuple[int, NDArray[np.uint32], Array]] = deque()
         self.size = (0, 0)   # of the images [px]
         self._gyro: dict[int, tuple[float, float, float]] = {}
 
     @property
     def seconds(self) -> float:
         """Time between the first and the last image."""
-        return seconds_between(self._stamps[0], self._stamps[-1]) if self._stamps else 0.0
+        frames = self._frames
+        return seconds_between(frames[0][0], frames[-1][0]) if frames else 0.0
 
     @property
     def last_ns(self) -> int:
         """Stamp of the last image."""
-        return self._stamps[-1]
+        return self._frames[-1][0]
 
     def add(self, role: Role, message: Any) -> RsRelposeError | None:
         """Use a message; the error of one that cannot be used."""
@@ -325,10 +328,10 @@ class Recorder:
 
     def follow(self, encoded: EncodedImage) -> None:
         """Track the points of the images before in another one; InputError if it is unusable."""
-        if self._stamps and encoded.stamp_ns <= self._stamps[-1]:
+        if self._frames and encoded.stamp_ns <= self.last_ns:
             raise InputError('the stamp of an image is not later than the previous one')
         image, tracker = encoded.decoded(self._levels), self._tracker
-        if not self._stamps:
+        if not self._frames:
             tracker.start(image)
         # Matches with the reference, so that errors do not add up from frame to frame.
         tracker.track(image)
@@ -337,20 +340,19 @@ class Recorder:
         if tracker.tracked_fraction < _KEPT or self._since_renewed >= _RENEWED_AFTER:
             tracker.promote()
             self._since_renewed = 0
-        self._stamps.append(encoded.stamp_ns)
-        self._ids.append(matches.track_ids)
-        self._points.append(matches.points2)
+        self._frames.append((encoded.stamp_ns, matches.track_ids, matches.points2))
         self.size = image.shape[1], image.shape[0]
         while self.seconds > self._longest:
-            for of_frames in (self._stamps, self._ids, self._points):
-                of_frames.popleft()
-            while self._gyro and (first := next(iter(self._gyro))) < self._stamps[0] - _MARGIN_NS:
+            self._frames.popleft()
+            begin_ns = self._frames[0][0] - _MARGIN_NS
+            while self._gyro and (first := next(iter(self._gyro))) < begin_ns:
                 del self._gyro[first]
 
     def set_back(self, stamp_ns: int) -> None:
         """Move all that is recorded to end a second before `stamp_ns`, on a clock set back."""
         earlier_ns = self.last_ns - stamp_ns + _MARGIN_NS
-        self._stamps = deque(stamp - earlier_ns for stamp in self._stamps)
+        self._frames = deque((stamp - earlier_ns, ids, points)
+                             for stamp, ids, points in self._frames)
         moved: dict[int, tuple[float, float, float]] = {}
         last_ns = next(iter(self._gyro), 0)
         for stamp, rates in self._gyro.items():
@@ -364,7 +366,7 @@ class Recorder:
         """All that was recorded; InputError or MissingInputError if something is missing."""
         unused = self.unused.most_common()
         why = ''.join(f'; {reason}' for reason in list(unused)[:2])
-        if not self._stamps:
+        if not self._frames:
             raise InputError(f'no image can be used{why}')
         if not self._gyro:
             raise MissingInputError(f'no message of the IMU has a gyro{why}: record the angular '
@@ -372,11 +374,12 @@ class Recorder:
         intrinsics = self.intrinsics
         if intrinsics is None and not self.uncalibrated:
             raise MissingInputError(f'no CameraInfo can be used{why}')
-        points, stamps = np.concatenate(self._points), sorted(self._gyro)
+        of_frames, ids, pixels = zip(*self._frames, strict=True)
+        points, stamps = np.concatenate(pixels), sorted(self._gyro)
         if intrinsics is not None:
             points = intrinsics.to_sensor(points)
-        frames = np.repeat(np.arange(len(self._ids)), [len(ids) for ids in self._ids])
-        tracks = Tracks(np.array(self._stamps), frames, np.concatenate(self._ids), points)
+        frames = np.repeat(np.arange(len(ids)), list(map(len, ids)))
+        tracks = Tracks(np.array(of_frames), frames, np.concatenate(ids), points)
         gyro = GyroSeries(np.array(stamps), np.array([self._gyro[stamp] for stamp in stamps]))
         camera = _camera(intrinsics, *self.size)
         return CalibrationInput(tracks, gyro, camera, intrinsics is not None, unused,

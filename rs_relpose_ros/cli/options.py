@@ -7,7 +7,7 @@ from importlib.metadata import PackageNotFoundError, version
 import logging
 from pathlib import Path
 import sys
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from tqdm import tqdm
 
@@ -28,17 +28,10 @@ _TOPICS = {
 }
 
 
-class Results(Protocol):
-    """Results of a bag; `metrics`: content of summary.json without provenance."""
-
-    @property
-    def metrics(self) -> dict[str, Any]:
-        """As in summary.json."""
-
-
 _logger = logging.getLogger(__name__)
 
-Made = TypeVar('Made', bound=Results)
+# Results of a bag; `metrics`: content of summary.json without provenance.
+Made = TypeVar('Made', bound=Any)
 # Called with a folder, a bag, its topics, and the parameters.
 Work = Callable[[Path, Bag, SensorTopics, Parameters], Made]
 

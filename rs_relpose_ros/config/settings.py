@@ -244,51 +244,25 @@ class TrackingConfig(Settings):
 
 @dataclass(frozen=True, slots=True)
 class CalibrationConfig(Settings):
-    """Calibration: needs of a recording, sigmas of observable parameters, tracker errors."""
+    """Calibration: search, exposure, and how certain an observable parameter must be."""
 
     max_time_offset: float = setting(
         0.25, 'largest clock offset that is searched for', 's', low=0.01, high=5.0)
-    min_frames: int = setting(40, 'frames that a recording must have', low=10, high=100_000)
-    min_rotation_rate: float = setting(
-        math.radians(2.0), 'rms rotation rate below which a camera is at rest', 'rad/s', low=0.0,
-        high=10.0)
-    max_gyro_gap: float = setting(
-        0.03, 'longest step between gyro samples that is interpolated', 's', low=1e-3, high=1.0)
-    max_readout_sigma: float = setting(
-        1.5e-3, 'largest sigma of an observable readout time', 's', low=1e-5, high=1.0)
-    max_offset_sigma: float = setting(
-        3e-3, 'largest sigma of an observable offset', 's', low=1e-5, high=1.0)
+    tolerance: float = setting(
+        1.0, 'factor of the largest sigmas of observable parameters', low=0.1, high=10.0)
     max_rotation_sigma: float = setting(
-        math.radians(0.7), 'largest sigma of an observable rotation, each axis', 'rad', low=1e-5,
-        high=1.0)
-    max_bias_sigma: float = setting(
-        0.01, 'largest sigma of an observable gyro bias', 'rad/s', low=1e-5, high=1.0)
-    max_focal_sigma: float = setting(
-        0.03, 'largest sigma of an observable focal length, relative', low=1e-4, high=1.0)
-
-    exposed: bool = setting(False, 'whether the points come from images with an exposure time')
+        math.radians(0.7), 'largest sigma of an observable rotation, each axis, at a tolerance of '
+        '1', 'rad', low=1e-5, high=1.0)
+    exposed: bool = setting(
+        False, 'whether a tracker followed the points in images with an exposure time')
     exposure_time: float = setting(
         0.0, 'exposure of a row; 0 if it is not known', 's', low=0.0, high=1.0)
     exposure_margin: float = setting(
         0.0, 'frame interval less exposure, where automatic exposure lengthens the interval; 0 if '
         'it is not known', 's', low=0.0, high=1.0)
-    exposure_slope_sigma: float = setting(
-        0.0, 'error of the offset per interval: the exposure also changes within one step of the '
-        'interval', 's/s', low=0.0, high=10.0)
-    tracking_time_sigma: float = setting(
-        0.0, 'error of readout time and offset by the tracker, beyond scatter', 's', low=0.0,
-        high=0.1)
-    tracking_rotation_sigma: float = setting(
-        0.0, 'error of the rotation by the tracker, beyond scatter', 'rad', low=0.0, high=1.0)
-    tracking_bias_sigma: float = setting(
-        0.0, 'error of the gyro bias by the tracker, beyond scatter', 'rad/s', low=0.0, high=1.0)
 
 
-# Errors of the tracker that are common to a recording and not part of its scatter, measured on
-# rendered bags with KLT.
-TRACKED_IN_IMAGES = CalibrationConfig(
-    exposed=True, exposure_slope_sigma=0.08, tracking_time_sigma=5e-5,
-    tracking_rotation_sigma=1e-3, tracking_bias_sigma=2.5e-4)
+TRACKED_IN_IMAGES = CalibrationConfig(exposed=True)
 
 
 @dataclass(frozen=True, slots=True)

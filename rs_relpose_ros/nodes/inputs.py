@@ -1,12 +1,14 @@
 """Subscriptions to camera and IMU, with counters; helpers for rclpy that all nodes share."""
 
+from __future__ import annotations
+
 from collections import Counter, deque
 from collections.abc import Callable
 import functools
 from functools import partial
 import importlib
 import time
-from typing import Any, Protocol
+from typing import Any, TYPE_CHECKING
 
 from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
@@ -19,11 +21,13 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import deserialize_message
 from rclpy.time import Time
 
-from rs_relpose_ros.errors import MissingInputError, RsRelposeError
-from rs_relpose_ros.geometry.camera import Intrinsics
+from rs_relpose_ros.errors import MissingInputError
 from rs_relpose_ros.geometry.timing import NANOSECONDS
-from rs_relpose_ros.messages.incoming import PARTS, Role, stamp_ns
+from rs_relpose_ros.messages.incoming import Intake, PARTS, Role, stamp_ns
 from rs_relpose_ros.nodes.diagnostics import INVALID, SILENCE, TOPICS
+
+if TYPE_CHECKING:
+    from rs_relpose_ros.calibrate.live import LiveCalibration
 
 # -- Subscriptions that are read on demand --------------------------------------------------------
 #
@@ -175,20 +179,6 @@ _RECENT_STAMPS = 600
 _DRAIN_PERIOD = 0.1
 
 
-class Receiver(Protocol):
-    """Takes the messages: `Intake`, or `LiveCalibration` before it."""
-
-    @property
-    def intrinsics(self) -> Intrinsics | None:
-        """Those of the last CameraInfo."""
-
-    def waits_for_imu(self) -> bool:
-        """Whether a frame needs samples that have not been read yet."""
-
-    def receive(self, role: Role, message: Any) -> RsRelposeError | None:
-        """Hand a message over; the error of an unusable one."""
-
-
 class SensorInputs:
     """Subscriptions to the topics of camera and IMU; passes messages to the intake.
 
@@ -198,7 +188,7 @@ class SensorInputs:
     if /clock does not advance.
     """
 
-    def __init__(self, node: Node, intake: Receiver, image_transport: str,
+    def __init__(self, node: Node, intake: Intake | LiveCalibration, image_transport: str,
                  on_invalid: Callable[[str], None]) -> None:
         self._intake, self._on_invalid = intake, on_invalid
         self._info: Any = None   # the last CameraInfo
@@ -241,7 +231,7 @@ class SensorInputs:
         node.create_timer(_DRAIN_PERIOD, self._drain,
                           clock=Clock(clock_type=ClockType.STEADY_TIME))
 
-    def hand_to(self, intake: Receiver) -> None:
+    def hand_to(self, intake: Intake | LiveCalibration) -> None:
         """Messages go to another receiver from here on, the last CameraInfo first."""
         self._intake = intake
         if self._info is not None:

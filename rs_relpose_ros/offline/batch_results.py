@@ -1,6 +1,6 @@
 """Results of many bags: a folder for each, one table, one picture, one combined calibration."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 import csv
 from dataclasses import asdict, dataclass, field, replace
 from enum import Enum
@@ -10,14 +10,13 @@ from pathlib import Path
 import shutil
 from typing import Any
 
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros import output_files
-from rs_relpose_ros.output_files import BLUE, GREEN, ORANGE, RED, SUMMARY_FILE, written
+from rs_relpose_ros.output_files import BLUE, ORANGE, RED, SUMMARY_FILE, written
 
 RESULT_FILES = {'check': 'check.json', 'calibrate': 'calibration.json', 'replay': SUMMARY_FILE}
 RESULTS_FILE = 'results.csv'
@@ -359,106 +358,41 @@ def combine(calibrations: Mapping[str, Metrics]) -> CombinedCalibration:
 
 # -- Picture --------------------------------------------------------------------------------------
 
-_GRAY = '0.75'
-_MS = 1e3
+# The two columns of each command that are drawn, their factors and labels.
+_DRAWN = {
+    'check': (('failure', 1.0, 'failures'), ('warning', 1.0, 'warnings')),
+    'calibrate': (('readout_time_s', 1e3, 'readout time [ms], 1 sigma'),
+                  ('time_offset_s', 1e3, 'time offset of row 0 [ms], 1 sigma')),
+    'replay': (('answered', 1.0, 'pairs with a pose'),
+               ('rotation_median_deg', 1.0, 'median error of the rotation [deg]'))}
 _NAME_LENGTH = 40
 _ROW_HEIGHT = 0.3   # [inch]
 
 
 def draw(command: str, rows: Sequence[Outcome], combined: Sequence[Combined], path: Path) -> None:
-    """Draw the outcomes, from top to bottom in their order."""
-    picture = Figure(figsize=(10.0, 1.8 + _ROW_HEIGHT * len(rows)), dpi=110, layout='constrained')
-    left, right = picture.subplots(1, 2, sharey=True)
-    _PICTURES[command](left, right, rows, {one.metric: one for one in combined})
-    left.set_yticks(range(len(rows)), [_label(row) for row in rows])
-    left.set_ylim(len(rows) - 0.4, -0.6)
-    legend: dict[str, Any] = {}
-    for axes in (left, right):
-        axes.grid(axis='x', color='0.9')
-        axes.set_axisbelow(True)
-        handles, labels = axes.get_legend_handles_labels()
-        legend |= dict(zip(labels, handles, strict=True))
-    # Above both, in the space of a title.
-    left.set_title(' ', pad=9.0)
-    left.legend(legend.values(), legend.keys(), loc='lower left', bbox_to_anchor=(0.0, 1.0),
-                ncols=5, fontsize='small', frameon=False).set_in_layout(False)
-    output_files.save_picture(picture, path)
+    """Draw the outcomes, from top to bottom in their order, and weighted means with their sigma.
 
-
-def _label(row: Outcome) -> str:
-    name = row.job.name
-    if len(name) > _NAME_LENGTH:
-        name = f'...{name[3 - _NAME_LENGTH:]}'
-    return name if row.metrics else f'{name} ({row.state.value})'
-
-
-def _draw_check(left: Axes, right: Axes, rows: Sequence[Outcome],
-                _: Mapping[str, Combined]) -> None:
-    _stack(left, {verdict: [row.metrics.get(verdict, 0) for row in rows]
-                  for verdict in _VERDICTS}, (GREEN, _GRAY, ORANGE, RED))
-    left.set_xlabel('findings')
-    _seconds(right, rows)
-
-
-def _draw_calibrate(left: Axes, right: Axes, rows: Sequence[Outcome],
-                    combined: Mapping[str, Combined]) -> None:
-    for axes, metric, label in ((left, 'readout_time_s', 'readout time [ms]'),
-                                (right, 'time_offset_s', 'time offset of row 0 [ms]')):
-        axes.set_xlabel(label)
-        axes.locator_params(axis='x', nbins=6)
-        mean = combined.get(metric)
+    Outliers of a mean are red, unobservable values orange.
+    """
+    picture = Figure(figsize=(10.0, 1.2 + _ROW_HEIGHT * len(rows)), dpi=110, layout='constrained')
+    both, means = picture.subplots(1, 2, sharey=True), {one.metric: one for one in combined}
+    for axes, (column, factor, label) in zip(both, _DRAWN[command], strict=True):
+        mean = means.get(column)
         if mean is not None:
-            axes.axvline(_MS * mean.mean, color=BLUE, linewidth=1.0)
-            axes.axvspan(_MS * (mean.mean - mean.sigma), _MS * (mean.mean + mean.sigma),
-                         color=BLUE, alpha=0.2, label='weighted mean, 1 sigma')
+            axes.axvline(factor * mean.mean, color=BLUE, linewidth=1.0)
+            axes.axvspan(factor * (mean.mean - mean.sigma), factor * (mean.mean + mean.sigma),
+                         color=BLUE, alpha=0.2)
         for y, row in enumerate(rows):
-            if row.metrics.get(metric) is None:
+            if row.metrics.get(column) is None:
                 continue
-            group, colour = 'in the mean', BLUE
-            if not row.metrics[f'{metric}_observable']:
-                group, colour = 'not observable', _GRAY
-            elif mean is not None and row.job.name in mean.outliers:
-                group, colour = 'outlier', RED
-            # Points of one label have one entry in the legend.
-            axes.errorbar(_MS * row.metrics[metric], y, xerr=_MS * row.metrics[f'{metric}_sigma'],
-                          fmt='o', markersize=4, color=colour, label=group)
-
-
-def _draw_replay(left: Axes, right: Axes, rows: Sequence[Outcome],
-                 _: Mapping[str, Combined]) -> None:
-    answered = [row.metrics.get('answered', 0) for row in rows]
-    _stack(left, {'pairs with a pose': answered,
-                  'pairs without': [row.metrics.get('pairs', 0) - count
-                                    for row, count in zip(rows, answered, strict=True)]},
-           (BLUE, _GRAY))
-    left.set_xlabel('pairs')
-    if not any(row.metrics.get('pairs_with_truth') for row in rows):
-        _seconds(right, rows)
-        return
-    for name, colour in (('rotation', GREEN), ('translation', ORANGE)):
-        chosen = [(y, row.metrics) for y, row in enumerate(rows)
-                  if row.metrics.get(f'{name}_median_deg') is not None]
-        medians = [metrics[f'{name}_median_deg'] for _, metrics in chosen]
-        right.hlines([y for y, _ in chosen], medians,
-                     [metrics[f'{name}_p90_deg'] for _, metrics in chosen], color=colour)
-        right.plot(medians, [y for y, _ in chosen], 'o', markersize=4, color=colour,
-                   label=f'{name}: median to 90 %')
-    right.set_xscale('log')
-    right.set_xlabel('error against the ground truth [deg]')
-
-
-def _seconds(axes: Axes, rows: Sequence[Outcome]) -> None:
-    axes.barh(range(len(rows)), [row.seconds for row in rows], color=BLUE)
-    axes.set_xlabel('time of the run [s]')
-
-
-def _stack(axes: Axes, groups: Mapping[str, list[int]], colours: Sequence[str]) -> None:
-    before = np.zeros(len(next(iter(groups.values()))))
-    for (name, counts), colour in zip(groups.items(), colours, strict=True):
-        axes.barh(range(len(counts)), counts, left=before, color=colour, label=name)
-        before = before + counts
-
-
-_Picture = Callable[[Axes, Axes, Sequence[Outcome], Mapping[str, Combined]], None]
-_PICTURES: Mapping[str, _Picture] = {
-    'check': _draw_check, 'calibrate': _draw_calibrate, 'replay': _draw_replay}
+            colour = (ORANGE if not row.metrics.get(f'{column}_observable', True) else
+                      RED if mean is not None and row.job.name in mean.outliers else BLUE)
+            axes.errorbar(factor * row.metrics[column], y, fmt='o', color=colour,
+                          xerr=factor * row.metrics.get(f'{column}_sigma', 0.0))
+        axes.set_xlabel(label)
+        axes.grid(axis='x', color='0.9')
+    both[0].set_yticks(range(len(rows)), [
+        row.job.name[-_NAME_LENGTH:] + ('' if row.metrics else f' ({row.state.value})')
+        for row in rows])
+    both[0].set_ylim(len(rows) - 0.4, -0.6)
+    output_files.save_picture(picture, path)
