@@ -278,4 +278,4 @@ def test_images_of_a_wrong_calibration_are_suppressed(ros_domain_id, bundled_bag
         wait_until(lambda: len(infos) > count + 5, 'images', node)
         relpose.publish(status_of_relpose('wrong'))
         faults.play(publishers, messages[:200], later=30.0)
-        node.wait_for('readout_time wrong: b')
+        node.wait_for('readout_time is wrong: b; images are suppressed')

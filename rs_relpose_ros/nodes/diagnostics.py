@@ -5,7 +5,6 @@ from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-import math
 from pathlib import Path
 import threading
 import time
@@ -16,12 +15,12 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.calibrate.stored import Progress
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry.timing import correlation_of_steps, MISSING, NANOSECONDS
+from rs_relpose_ros.geometry.timing import correlation_of_steps, NANOSECONDS
 from rs_relpose_ros.messages.incoming import MOST_REASONS, reason_key, Role
 from rs_relpose_ros.pipeline.findings import Assessment, FindingState, NOT_EVALUATED
 from rs_relpose_ros.pipeline.monitor import Applied, Tracked
 from rs_relpose_ros.pipeline.pair import Frame, PAIR_METRICS, PairResult
-from rs_relpose_ros.pipeline.sequencer import Refusal, SequencerCounts
+from rs_relpose_ros.pipeline.sequencer import Refusal, SequencerCounts, stamp_sigma
 
 # -- Reasons for no results or few images ---------------------------------------------------------
 
@@ -108,12 +107,9 @@ def stamps_warning(stamps_ns: Sequence[int], size: int) -> str:
                 'Give the driver and this node the shipped profile, FASTRTPS_DEFAULT_PROFILES_FILE'
                 '=$(ros2 pkg prefix --share rs_relpose_ros)/config/fastdds.xml; ros2 launch '
                 'rs_relpose_ros relpose.launch.py does it for the node')
-    shares = steps / max(float(np.median(steps)), 1e-9)
-    whole = steps[(shares > 0.0) & (shares < MISSING)]
-    # Of a normal distribution, 80 % of the differences of two stamps are within 2.56 sigma.
-    spread = float(np.subtract(*np.quantile(whole, (0.9, 0.1)))) if len(whole) else 0.0
-    jitter = spread / 2.56 / math.sqrt(2.0)
-    if jitter < _JITTER or correlation_of_steps(shares) > _ALTERNATING:
+    jitter = stamp_sigma(recent.tolist())
+    if jitter < _JITTER or correlation_of_steps(
+            steps / max(float(np.median(steps)), 1e-9)) > _ALTERNATING:
         return ''
     return (f'the stamps of the images jitter by {1e3 * jitter:.1f} ms rms, as times of arrival '
             'do: a pose is wrong by the rotation within that time. Let the driver stamp by the '
@@ -463,14 +459,15 @@ class ReasonLog:
 # -- Log of the calibration consistency -----------------------------------------------------------
 
 class HealthLog:
-    """Logs findings after each pair; at most a line per parameter and period of the logs."""
+    """Logs findings after each result; at most a line per parameter and period of the logs."""
 
-    def __init__(self, info: ReasonLog, warn: ReasonLog, error: ReasonLog) -> None:
-        self._info, self._warn, self._error = info, warn, error
+    def __init__(self, info: ReasonLog, warn: ReasonLog, error: ReasonLog,
+                 results: str = 'poses') -> None:
+        self._info, self._warn, self._error, self._results = info, warn, error, results
         self._reported_faults = False
 
     def __call__(self, health: Assessment, *, withhold: bool) -> None:
-        """Log the findings of a pair; `withhold`: whether inconsistent poses are suppressed."""
+        """Log the findings; `withhold`: whether inconsistent results are suppressed."""
         faults = health.faults
         if faults:
             # Numbers and lesser faults change from pair to pair, the worst parameter hardly.
@@ -480,9 +477,9 @@ class HealthLog:
                 kind += ', gross'
             if health.state is FindingState.WRONG:
                 self._error(f'{text}; ' + (
-                    'poses are suppressed: withhold_when_wrong: false publishes them all the same'
-                    if withhold else
-                    'poses are published all the same, as withhold_when_wrong is false'), kind)
+                    f'{self._results} are suppressed: withhold_when_wrong: false publishes them '
+                    'all the same' if withhold else f'{self._results} are published all the same, '
+                    'as withhold_when_wrong is false'), kind)
             else:
                 self._warn(text, kind)
         elif self._reported_faults:

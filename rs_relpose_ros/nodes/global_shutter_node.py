@@ -1,11 +1,10 @@
 """global_shutter_node: derotated images of a rolling-shutter camera."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 import re
 import time
-from typing import Any, Self
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import QoSProfile
@@ -14,11 +13,18 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.messages.incoming import PARTS, Role
-from rs_relpose_ros.nodes.diagnostics import ERROR, FrameStatistics, OK, RELATIVE_POSE, WARN
+from rs_relpose_ros.nodes.diagnostics import (
+    ERROR,
+    FrameStatistics,
+    HealthLog,
+    OK,
+    RELATIVE_POSE,
+    WARN,
+)
 from rs_relpose_ros.nodes.inputs import message_class
 from rs_relpose_ros.nodes.sensor_node import run_node, SensorNode
 from rs_relpose_ros.pipeline import global_shutter
-from rs_relpose_ros.pipeline.findings import FindingState
+from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState, NOT_EVALUATED
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrameLoop
 
@@ -39,27 +45,12 @@ _DESCRIPTION = (
     'service:    ~/reset')
 
 
-@dataclass(frozen=True, slots=True)
-class Health:
-    """State of the calibration, the worst finding, and which node found it."""
-
-    state: FindingState = FindingState.UNKNOWN
-    text: str = ''
-    source: str = ''
-
-    @property
-    def level(self) -> int:
-        """Of the diagnostic status."""
-        return {FindingState.WRONG: ERROR, FindingState.SUSPECT: WARN}.get(self.state, OK)
-
-    @classmethod
-    def of_status(cls, status: Any) -> Self:
-        """That of a status of relpose_node on /diagnostics."""
-        values = {item.key: item.value for item in status.values}
-        findings = [text for text in values.get('health_findings', '').split('; ')
-                    if re.match(r'\w+ (wrong|suspect): ', text)]
-        return cls(FindingState(values.get('health', 'unknown')), '; '.join(findings),
-                   status.name.partition(':')[0])
+def assessment_of(status: Any) -> Assessment:
+    """Findings of a status of relpose_node on /diagnostics."""
+    texts = {item.key: item.value for item in status.values}.get('health_findings', '')
+    return Assessment(tuple(
+        Finding(quantity, FindingState(state), message) for quantity, state, message in re.findall(
+            rf'(\w+) ({"|".join(FindingState)}): ([^;]*)', texts)))
 
 
 class _Statistics(FrameStatistics):
@@ -71,26 +62,29 @@ class _Statistics(FrameStatistics):
         super().__init__(clock)
         self._images = self._withheld = 0
         self._last: global_shutter.GlobalShutterFrame | None = None
-        self._health = Health()
+        self._health, self._source = NOT_EVALUATED, ''
 
-    def add_image(self, frame: global_shutter.GlobalShutterFrame, ready_ns: int, health: Health, *,
-                  withheld: bool) -> None:
-        """Count an image right after its publication; its data were complete at `ready_ns`."""
+    def add_image(self, frame: global_shutter.GlobalShutterFrame, ready_ns: int,
+                  health: Assessment, source: str, *, withheld: bool) -> None:
+        """Count an image right after its publication; its data were complete at `ready_ns`.
+
+        `source`: the node that made the assessment `health`.
+        """
         with self._lock:
             self._images += not withheld
             self._withheld += withheld
-            self._last, self._health = frame, health
+            self._last, self._health, self._source = frame, health, source
             self._published(ready_ns)
 
     def _evaluate_results(self) -> tuple[int, str]:
-        if self._health.level != OK:
-            return self._health.level, self._health.text
+        if faults := self._health.faults:
+            return ERROR if faults[0].state is FindingState.WRONG else WARN, faults[0].text
         return OK, f'publishing: {self._images} images' if self._images else 'no image yet'
 
     def _values(self) -> dict[str, object]:
         last = self._last
         return {'images_published': self._images, 'images_withheld': self._withheld,
-                'health': self._health.state.value, 'health_source': self._health.source,
+                'health': self._health.state.value, 'health_source': self._source,
                 'largest_shift_px': '' if last is None else f'{last.map.shift:.1f}',
                 'applied_time_offset_ms': '' if last is None else
                 f'{1e-6 * last.applied_offset_ns:.2f}'}
@@ -104,7 +98,8 @@ class GlobalShutterNode(SensorNode):
 
     def __init__(self) -> None:
         self._statistics = _Statistics()
-        self._of_others: tuple[float, Health] | None = None   # with its time [s]
+        # With its time [s] and the name of its node.
+        self._of_others: tuple[float, Assessment, str] | None = None
         super().__init__(NAME, self._statistics)
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
 
@@ -118,6 +113,7 @@ class GlobalShutterNode(SensorNode):
                 _IMAGE_TYPES, ('~/image', '~/image/compressed'), strict=True))
         self._mask = publisher(_IMAGE_TYPES[0], '~/mask')
         self._camera_info = publisher('sensor_msgs/msg/CameraInfo', '~/camera_info')
+        self._log_health = HealthLog(self._info, self._warn, self._error, 'images')
 
     def _make_loop(self, parameters: Parameters) -> FrameLoop[global_shutter.GlobalShutterFrame]:
         return global_shutter.unrolling_loop(
@@ -134,25 +130,18 @@ class GlobalShutterNode(SensorNode):
     def _on_processed(self, frame: Frame[global_shutter.GlobalShutterFrame]) -> None:
         result = frame.result
         assert result is not None
-        own = result.health
-        health = self._by_relpose() or Health(
-            own.state, '; '.join(fault.text for fault in own.faults), 'own watch')
+        health, source = self._by_relpose() or (result.health, 'own watch')
         withhold = self._settings.current.pair.withhold_when_wrong
         withheld = withhold and health.state is FindingState.WRONG
-        if health.level != OK:
-            text = health.text + ('' if health.level == WARN else (
-                '; images are suppressed: withhold_when_wrong: false publishes them all the same'
-                if withhold else '; images are published all the same, as withhold_when_wrong is '
-                'false'))
-            (self._error if health.level == ERROR else self._warn)(text, health.text[:20])
+        self._log_health(health, withhold=withhold)
         if not withheld:
             self._publish(result)
-        self._statistics.add_image(result, frame.ready_ns, health, withheld=withheld)
+        self._statistics.add_image(result, frame.ready_ns, health, source, withheld=withheld)
 
-    def _by_relpose(self) -> Health | None:
-        """The state of relpose_node; None if it does not run on these images."""
+    def _by_relpose(self) -> tuple[Assessment, str] | None:
+        """Assessment and name of relpose_node; None if it does not run on these images."""
         found = self._of_others
-        return found[1] if found and time.monotonic() - found[0] < _FRESH else None
+        return found[1:] if found and time.monotonic() - found[0] < _FRESH else None
 
     def _on_diagnostics(self, message: Any) -> None:
         """Keep the state of relpose_node on the same images."""
@@ -160,7 +149,8 @@ class GlobalShutterNode(SensorNode):
         for status in message.status:
             if (status.name.endswith(f': {RELATIVE_POSE}')
                     and status.hardware_id.removesuffix('/compressed') == own):
-                self._of_others = time.monotonic(), Health.of_status(status)
+                self._of_others = (time.monotonic(), assessment_of(status),
+                                   status.name.partition(':')[0])
 
     def _publish(self, frame: global_shutter.GlobalShutterFrame) -> None:
         """Publish the topics that are subscribed."""
