@@ -23,7 +23,7 @@ from rs_relpose_ros.calibrate.observations import (
     Varying,
 )
 from rs_relpose_ros.calibrate.procedure import calibrate
-from rs_relpose_ros.calibrate.result import CalibrationResult, parameter_file, report
+from rs_relpose_ros.calibrate.result import CalibrationResult, Estimate, parameter_file, report
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError
@@ -88,7 +88,7 @@ def test_usual_recording_is_calibrated_from_nothing(tmp_path):
     assert result.observable
     assert result.shutter == 'rolling'
     np.testing.assert_array_equal(result.axis_map, np.rint(recorded.truth.R_cam_imu))
-    assert result.focal_factor is None and result.offset_by_interval is None
+    assert result.lens is None and result.offset_by_interval is None
     curve = result.curve
     best = curve.readout_times[np.argmin(curve.costs)]
     assert best == pytest.approx(recorded.truth.readout_time, abs=4e-3)
@@ -123,21 +123,21 @@ def test_camera_read_upwards_with_unknown_focal_length(tmp_path):
     camera = camera_of(truth, guess)
     result = calibrate(recorded.tracks, recorded.gyro, camera, focal_known=False)
     assert_right(result, truth)
-    assert result.focal_factor.value * guess == pytest.approx(900.0, rel=0.02)
+    assert result.lens.focal_factor.value * guess == pytest.approx(900.0, rel=0.02)
     _, configured = written(result, camera, tmp_path)
     assert configured.sensor.readout_direction == 'up'
     # As in the node and replay without a CameraInfo.
     intrinsics = configured.intrinsics.of_image(camera.width, camera.height)
     assert intrinsics.fx == intrinsics.fy == pytest.approx(
-        result.focal_factor.value * guess, abs=0.01)
-    for found, estimate, true in ((intrinsics.distortion[0], result.radial, 0.0),
-                                  (intrinsics.cx, result.center[0], camera.cx),
-                                  (intrinsics.cy, result.center[1], camera.cy)):
+        result.lens.focal_factor.value * guess, abs=0.01)
+    for found, estimate, true in ((intrinsics.distortion[0], result.lens.radial, 0.0),
+                                  (intrinsics.cx, result.lens.column, camera.cx),
+                                  (intrinsics.cy, result.lens.row, camera.cy)):
         assert found == pytest.approx(estimate.value, abs=0.01)
         assert abs(found - true) < 4.0 * estimate.sigma
     # Left out, and named, if it is not determined.
-    unknown = dataclasses.replace(result, focal_factor=dataclasses.replace(
-        result.focal_factor, observable=False, determined=False, remark='too slow'))
+    unknown = dataclasses.replace(result, lens=result.lens._replace(focal_factor=Estimate(
+        1.0, 1.0, observable=False, determined=False, remark='too slow')))
     text, _ = written(unknown, camera, tmp_path)
     assert 'camera_matrix (too slow)' in text and 'camera_matrix:' not in text
 

@@ -220,7 +220,7 @@ def test_sigmas_of_the_lens_do_not_exceed_those_of_its_priors():
     wide = dataclasses.replace(final, covariance=covariance)
     curve = CostCurve(np.linspace(-0.03, 0.03, 3), np.zeros(3))
     result = fitting.evaluated(data, wide, curve, CalibrationConfig())
-    column, row = result.center
+    *_, column, row = result.lens
     assert 0.9 * sigma < column.sigma < sigma
     assert row.sigma == pytest.approx(math.sqrt(covariance[CENTER + 1, CENTER + 1]), rel=0.1)
     # Moved to the middle by all but a hundredth.

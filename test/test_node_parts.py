@@ -163,7 +163,7 @@ def test_silence_is_counted_from_the_last_result(clock, statistics):
     (0.5, 921_600, 0, 'config/fastdds.xml'), (0.95, 921_600, 0, ''), (0.5, 300_000, 0, ''),
     # Of a rhythm with jitter; of a slow start, before the last seconds.
     (0.5, 921_600, 2_000_000, 'config/fastdds.xml'), (1.0, 921_600, 200_000, ''),
-    (1.0, 921_600, 2_000_000, 'jitter by 1.9'), (0.9, 300_000, 2_000_000, 'jitter by ')])
+    (1.0, 921_600, 2_000_000, 'jitter by 2.0'), (0.9, 300_000, 2_000_000, 'jitter by ')])
 def test_lost_images_and_jitter_are_reported(share, size, jitter, expected):
     rng = np.random.default_rng(0)
     stamps = [k * SECOND // 30 + int(jitter * rng.normal()) for k in range(300)

@@ -111,7 +111,8 @@ def run_calibration(seed: int) -> CalibrationRun:
         rotation_error=float(np.linalg.norm(error)), rotation_x=rotation[0],
         rotation_y=rotation[1], rotation_z=rotation[2], bias_x=bias[0], bias_y=bias[1],
         bias_z=bias[2],
-        focal=found(result.focal_factor, truth.focal / focal, 100.0 * focal / truth.focal),
+        focal=found(result.lens and result.lens.focal_factor, truth.focal / focal,
+                    100.0 * focal / truth.focal),
         axis_map_right=bool((result.axis_map == axis_maps()[number]).all()),
         observable=result.observable, shutter=result.shutter)
 
@@ -327,7 +328,7 @@ def _quantities(part: Part, interval: float, slope: Estimate | None, reference: 
         yield (f'rotation, {axis} [deg]', replace(result.rotation, value=float(angle)),
                math.degrees(1.0))
         yield f'gyro bias, {axis} [mrad/s]', replace(bias, sigma=result.bias_sigma), 1e3
-    yield 'focal length [px]', result.focal_factor, part.focal
+    yield 'focal length [px]', result.lens and result.lens.focal_factor, part.focal
     yield 'offset by interval [ms/ms]', result.offset_by_interval, 1.0
     yield 'offset by jitter [ms/ms]', result.offset_by_jitter, 1.0
 

@@ -29,7 +29,12 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_ros.calibrate import coplanarity as model
 from rs_relpose_ros.calibrate.coplanarity import GLOBAL, Problem, READOUT, ROTATION, Unknowns
 from rs_relpose_ros.calibrate.observations import Observations, Varying, with_lens
-from rs_relpose_ros.calibrate.result import CalibrationResult, CostCurve, Estimate
+from rs_relpose_ros.calibrate.result import (
+    CalibrationResult,
+    CostCurve,
+    Estimate,
+    LensEstimates,
+)
 from rs_relpose_ros.calibrate.start import GyroPath, nearest_axis_map
 from rs_relpose_ros.config.settings import CalibrationConfig
 from rs_relpose_ros.errors import InputError
@@ -570,9 +575,9 @@ def evaluated(data: Observations, final: Fit, curve: CostCurve,
     unknowns = final.unknowns
     if final.free[model.FOCAL]:
         # Widened, the sigmas of the lens may exceed those of its priors.
-        lens = slice(model.RADIAL, model.EXPOSURE)
-        unknowns, covariance = joined(unknowns, covariance, lens, final.problem.center[lens],
-                                       1.0 / final.problem.prior[lens])
+        known = slice(model.RADIAL, model.EXPOSURE)
+        unknowns, covariance = joined(unknowns, covariance, known, final.problem.center[known],
+                                       1.0 / final.problem.prior[known])
     bounded, covariance, beyond = _bounded(unknowns, covariance, data.interval)
     parameters, R_cam_imu = bounded.parameters, bounded.R_imu_cam.T
     rates, one_axis, _ = data.excitation(parameters[model.BIAS:model.BIAS + 3], R_cam_imu)
@@ -588,15 +593,15 @@ def evaluated(data: Observations, final: Fit, curve: CostCurve,
     cosine = (np.trace(R_cam_imu @ axis_map.T) - 1.0) / 2.0
     bias_x, bias_y, bias_z = (_estimate(parameters[i], sigmas[i], wide * _MOST_BIAS)
                               for i in range(model.BIAS, model.BIAS + 3))
-    focal = slope = radial = center = None
+    slope = lens = None
     if final.free[model.FOCAL]:
         camera = with_lens(data.camera, parameters[model.LENS])
         factor = math.exp(data.lens[0] + parameters[model.FOCAL])
-        focal = _estimate(factor, factor * sigmas[model.FOCAL], factor * wide * _MOST_FOCAL,
-                          one_axis)
-        radial, column, row = (Estimate(value, float(sigma), True) for value, sigma in zip(
-            (camera.distortion[0], camera.cx, camera.cy), sigmas[model.LENS][1:], strict=True))
-        center = column, row
+        lens = LensEstimates(
+            _estimate(factor, factor * sigmas[model.FOCAL], factor * wide * _MOST_FOCAL, one_axis),
+            *(Estimate(value, float(sigma), True) for value, sigma in zip(
+                (camera.distortion[0], camera.cx, camera.cy), sigmas[model.LENS][1:],
+                strict=True)))
     if final.free[model.SLOPE]:
         slope = _estimate(parameters[model.SLOPE], sigmas[model.SLOPE], _MOST_SLOPE)
     jitters = data.stamps.varying is Varying.JITTER
@@ -610,8 +615,8 @@ def evaluated(data: Observations, final: Fit, curve: CostCurve,
         R_cam_imu=R_cam_imu, rotation_sigma=rotation_sigma,
         rotation=_estimate(math.acos(np.clip(cosine, -1.0, 1.0)), rotation_sigma.max(),
                            wide * config.max_rotation_sigma, '' if axes_known else one_axis),
-        axis_map=axis_map, gyro_bias=(bias_x, bias_y, bias_z), focal_factor=focal,
-        radial=radial, center=center, exposure=_exposure(data, final, sigmas[model.EXPOSURE]),
+        axis_map=axis_map, gyro_bias=(bias_x, bias_y, bias_z), lens=lens,
+        exposure=_exposure(data, final, sigmas[model.EXPOSURE]),
         exposure_margin=data.exposure.margin,
         offset_by_interval=None if jitters else slope,
         offset_by_jitter=slope if jitters else None, stamp_jitter=data.stamps.jitter,

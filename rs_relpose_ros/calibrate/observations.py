@@ -26,13 +26,14 @@ from rs_relpose_ros.calibrate.coplanarity import (
     View,
 )
 from rs_relpose_ros.calibrate.result import AXES
-from rs_relpose_ros.calibrate.start import GyroSeries, noise_density, rotation_between
+from rs_relpose_ros.calibrate.start import GyroSeries, noise_density
 from rs_relpose_ros.config.settings import CalibrationConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import DISTORTION_MODELS, RollingShutterCamera
 from rs_relpose_ros.geometry.timing import correlation_of_steps, FrameIntervals, NANOSECONDS
 from rs_relpose_ros.imu.integration import mean_rates
+from rs_relpose_ros.pipeline.rotations import rotation_of_rays
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -345,7 +346,7 @@ class Observations:
     def image_rates(self, pairs: Pairs) -> Array:
         """Angular velocity (P, 3) [rad/s], camera frame, that rotates the rays of each pair."""
         rays1, rays2 = map(self.camera.unproject, (pairs.points1, pairs.points2))
-        rotations = [rotation_between(rays1[begin:end], rays2[begin:end])
+        rotations = [rotation_of_rays(rays1[begin:end], rays2[begin:end])
                      for begin, end in itertools.pairwise(pairs.begin)]
         return np.array(rotations).reshape(-1, 3) / (
             self.times[pairs.second] - self.times[pairs.first])[:, None]

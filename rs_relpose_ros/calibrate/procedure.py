@@ -43,6 +43,7 @@ from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.messages.incoming import PARTS, ReasonCounts, Role, sensor_messages
 from rs_relpose_ros.messages.transforms import AXES_SIGMA
+from rs_relpose_ros.pipeline.rotations import LEAST_RAYS
 from rs_relpose_ros.tracking.features import make_tracker
 from rs_relpose_ros.tracking.images import EncodedImage, GrayLevels
 
@@ -53,7 +54,7 @@ _LEAST_MATCHES, _LEAST_FRAMES = 20, 40
 _ALL_PAIRS = PairSelection((0.033, 0.067, 0.133, 0.267), 80, _LEAST_MATCHES, 800)
 _SOME_PAIRS = _ALL_PAIRS._replace(max_matches=40, most_pairs=100)
 _PAIRS_AT_START = _SOME_PAIRS._replace(spans=(0.067,))
-_NEIGHBOURS = _ALL_PAIRS._replace(spans=(0.0,), min_matches=8)
+_NEIGHBOURS = _ALL_PAIRS._replace(spans=(0.0,), min_matches=LEAST_RAYS)
 # Changes of the lens within which the fit is linear in it, and fits at the most.
 _LENS_STAYS, _LENS_ROUNDS = (0.01, 0.02, 5.0, 5.0), 6
 # Sigma of an angle that is not known [rad].

@@ -1,10 +1,10 @@
 """Result of a calibration: values and sigmas, as report, parameter file, JSON and picture."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -33,6 +33,15 @@ class Estimate:
     determined: bool = True     # whether the value means anything
 
 
+class LensEstimates(NamedTuple):
+    """A lens that was not known."""
+
+    focal_factor: Estimate   # true over assumed focal length
+    radial: Estimate   # first coefficient of the distortion
+    column: Estimate   # principal point [px]
+    row: Estimate
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CostCurve:
     """Cost of the whole fit over the readout time, with all other parameters fitted again."""
@@ -58,11 +67,7 @@ class CalibrationResult:
     rotation: Estimate                      # angle to `axis_map` [rad], with the largest sigma
     axis_map: Array                         # (3, 3) the nearest rotation between axes
     gyro_bias: tuple[Estimate, Estimate, Estimate]   # IMU frame [rad/s]
-    # Lens, None if known: true over assumed focal length, first coefficient of the distortion,
-    # principal point [px].
-    focal_factor: Estimate | None
-    radial: Estimate | None
-    center: tuple[Estimate, Estimate] | None
+    lens: LensEstimates | None              # None if known
     exposure: Estimate                      # at the median interval between frames [s]
     exposure_margin: float                  # that interval less the exposure, if it follows it
     # Change of the offset by the interval between frames [s/s], as by automatic exposure; None if
@@ -86,7 +91,7 @@ class CalibrationResult:
     def needed(self) -> list[Estimate]:
         """All that a node needs."""
         parts = [self.readout_time, self.time_offset, self.rotation, *self.gyro_bias]
-        return parts if self.focal_factor is None else [*parts, self.focal_factor]
+        return parts if self.lens is None else [*parts, self.lens.focal_factor]
 
     @property
     def observable(self) -> bool:
@@ -133,7 +138,7 @@ _MS = 1e3
 def quantities(result: CalibrationResult,
                camera: RollingShutterCamera) -> list[tuple[str, str, Estimate]]:
     """Each quantity: its name, its value with 1 sigma in words, and its estimate."""
-    readout, focal = result.readout_time, result.focal_factor
+    readout, lens = result.readout_time, result.lens
     slope, jitter = result.offset_by_interval, result.offset_by_jitter
     sigmas = ', '.join(f'{np.degrees(sigma):.3f}' for sigma in result.rotation_sigma)
     rows = [('readout time', _shown('readout_time', readout, abs(readout.value))
@@ -163,13 +168,13 @@ def quantities(result: CalibrationResult,
             text += (f' (assumed: the interval less {_MS * result.exposure_margin:.0f} ms, as '
                      'automatic exposure lengthens it)')
         rows.append(('exposure', text, exposure))
-    if focal is not None and result.radial is not None and result.center is not None:
-        column, row = result.center
+    if lens is not None:
+        focal, radial, column, row = lens
         rows += [
             ('focal length', BY_NAME['focal_length'].with_sigma(
                 camera.fx * focal.value, camera.fx * focal.sigma), focal),
-            ('distortion', (f'{result.radial.value:.3f} +- {result.radial.sigma:.3f} (first '
-             f'coefficient of {camera.distortion_model})'), result.radial),
+            ('distortion', (f'{radial.value:.3f} +- {radial.sigma:.3f} (first '
+             f'coefficient of {camera.distortion_model})'), radial),
             ('principal point', (f'{column.value:.1f} +- {column.sigma:.1f}, {row.value:.1f} +- '
              f'{row.sigma:.1f} px'), column)]
     return rows
@@ -238,8 +243,9 @@ def parameter_file(result: CalibrationResult, title: str, *, camera: RollingShut
                      + ', '.join(f'{bias.sigma:.5f}' for bias in biases) + ' rad/s.'),
         _sigma('gyro_bias', result.bias_sigma, 5,
                f'Of the worst axis, and {_BIAS_CHANGE:g} rad/s from one start to the next.')])]
-    if result.focal_factor is not None:
-        groups.append((result.focal_factor, 'camera_matrix', _lens_values(result, camera)))
+    if result.lens is not None:
+        groups.append((result.lens.focal_factor, 'camera_matrix',
+                       _lens_values(result.lens, camera)))
     values = [] if compressed is None else [SourcedValue(
         'image_transport', 'compressed' if compressed else 'raw', 'As the bag has them.')]
     values += [value for part, _, group in groups if part.determined for value in group]
@@ -294,11 +300,8 @@ def _clock_values(result: CalibrationResult) -> list[SourcedValue]:
     return values
 
 
-def _lens_values(result: CalibrationResult, camera: RollingShutterCamera) -> list[SourcedValue]:
-    focal, radial, center = result.focal_factor, result.radial, result.center
-    if focal is None or radial is None or center is None:
-        return []
-    column, row = center
+def _lens_values(lens: LensEstimates, camera: RollingShutterCamera) -> list[SourcedValue]:
+    focal, radial, column, row = lens
     others = (0.0,) * (len(camera.distortion or _FOUR_ZEROS) - 1)
     return [
         SourcedValue('camera_matrix', (
@@ -316,10 +319,10 @@ def _lens_values(result: CalibrationResult, camera: RollingShutterCamera) -> lis
 def as_mapping(result: CalibrationResult, camera: RollingShutterCamera) -> dict[str, Any]:
     """The result for a JSON file; seconds, radians, pixels."""
     slope, jitter = result.offset_by_interval, result.offset_by_jitter
-    focal = result.focal_factor
-    if focal is not None:
-        focal = replace(focal, value=focal.value * camera.fx, sigma=focal.sigma * camera.fx)
-    radial, center = result.radial, result.center
+    focal = radial = center = None
+    if result.lens is not None:
+        focal, radial, *center = map(asdict, result.lens)
+        focal |= {name: focal[name] * camera.fx for name in ('value', 'sigma')}
     return {
         'observable': result.observable, 'shutter': result.shutter,
         'readout_time_s': asdict(result.readout_time),
@@ -331,8 +334,7 @@ def as_mapping(result: CalibrationResult, camera: RollingShutterCamera) -> dict[
         'rotation_from_axis_map_rad': asdict(result.rotation),
         'axis_map': result.axis_map.tolist(),
         'gyro_bias_rad_per_s': [asdict(bias) for bias in result.gyro_bias],
-        'focal_px': focal and asdict(focal), 'distortion_first': radial and asdict(radial),
-        'principal_point_px': center and [asdict(part) for part in center],
+        'focal_px': focal, 'distortion_first': radial, 'principal_point_px': center,
         'exposure_s': asdict(result.exposure), 'exposure_margin_s': result.exposure_margin,
         'rotation_rate_rms_rad_per_s': result.rotation_rates.tolist(),
         'frames': result.frames, 'pairs': result.pairs, 'matches': result.matches,

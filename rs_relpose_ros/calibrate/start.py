@@ -42,9 +42,6 @@ def axes_text(axis_map: Array) -> str:
     return ', '.join(parts)
 
 
-_ROUNDS = 12
-# Residual [rad] below which a ray has full weight.
-_LEAST_SCALE = 2e-4
 # If the second axis of the common rotation is weaker than this share of the first, an axis map
 # determines it.
 _ONE_AXIS = 0.05
@@ -57,27 +54,6 @@ class Start(NamedTuple):
     R_cam_imu: Array       # (3, 3)
     focal_factor: float
     misfit: float          # share of the variance of the rotation that is not common
-
-
-def rotation_between(rays1: Array, rays2: Array) -> Array:
-    """Rotation vector a with ``m_1 = m_2 + a x m_2``, by reweighted least squares (Cauchy).
-
-    Of unit rays (N, 3). Translation is not modelled: a robust fit follows the far points, and the
-    remainder averages out.
-    """
-    difference = rays1 - rays2
-    # a x m = -[m]x a; normal equations (m^T m - m m^T) a = m x d.
-    moments = np.eye(3) - rays2[:, :, None] * rays2[:, None, :]
-    sides = np.cross(rays2, difference)
-    weights = np.ones(len(rays1))
-    a = np.zeros(3)
-    for _ in range(_ROUNDS):
-        a = np.linalg.solve(np.einsum('n,nij->ij', weights, moments) + 1e-12 * np.eye(3),
-                            weights @ sides)
-        lengths = np.linalg.norm(difference - np.cross(a, rays2), axis=1)
-        scale = max(1.5 * float(np.median(lengths)), _LEAST_SCALE)
-        weights = 1.0 / (1.0 + (lengths / scale) ** 2)
-    return a
 
 
 def find_starts(rates: Array, begins: Array, ends: Array, gyro_times: Array, gyro_rates: Array, *,

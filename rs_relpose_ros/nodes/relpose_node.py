@@ -178,13 +178,11 @@ def _colors(times: NDArray[np.float64], first: float, last: float) -> list[tuple
 
 def _draw_bar(canvas: Color, result: PairResult, first: float, last: float) -> None:
     """Colours of the rows, with the times of the first and the last row."""
-    rows, times = result.matches.points2[:, 1], result.row_times2
-    top, bottom = int(np.argmin(rows)), int(np.argmax(rows))
-    if rows[bottom] - rows[top] < 1.0:
+    rows = result.matches.points2[:, 1]
+    if np.ptp(rows) < 1.0:
         return
     scale = canvas.shape[1] / result.image2.shape[1]  # type: ignore[union-attr]
-    slope = (times[bottom] - times[top]) / (rows[bottom] - rows[top])
-    of_rows = times[top] + slope * (np.arange(len(canvas)) / scale - rows[top])
+    of_rows = np.polyval(np.polyfit(rows, result.row_times2, 1), np.arange(len(canvas)) / scale)
     canvas[:, :_BAR_WIDTH] = np.array(_colors(of_rows, first, last), dtype=np.uint8)[:, None]
     for row, y in ((0, 14), (len(canvas) - 1, len(canvas) - 6)):
         cv2.putText(canvas, f'{1e3 * of_rows[row]:.1f} ms', (_BAR_WIDTH + 4, y),

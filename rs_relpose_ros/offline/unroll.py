@@ -1,13 +1,14 @@
 """A bag with its images derotated to their middle row, and all other messages unchanged."""
 
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from rs_relpose_ros.bags import reader
-from rs_relpose_ros.bags.reader import Bag, BagMessage, RawMessage, SensorTopics, Topic
+from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics, Topic
 from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import RsRelposeError
@@ -32,23 +33,15 @@ class UnrollReport:
     warnings: tuple[str, ...] = ()
 
 
-class _New(NamedTuple):
-    """A message in place of another one."""
-
-    topic: str
-    msgtype: str
-    message: Any
-
-
 @dataclass(slots=True, eq=False)
 class _Place:
     """A place in the new bag, in the order of receive times.
 
-    `messages`: none for an omitted image, None until they are known.
+    `writes`: one of each message, none for an omitted image, None until they are known.
     """
 
     bag_time_ns: int
-    messages: Sequence[_New | RawMessage] | None = None
+    writes: Sequence[Callable[[], None]] | None = None
 
 
 def unroll(bag: Bag, topics: SensorTopics, parameters: Parameters, out: Path) -> UnrollReport:
@@ -97,7 +90,7 @@ class _Unrolling:
             if outcome.stamp_ns is not None:
                 self._settle(outcome.stamp_ns, result)
         for place in self._places:
-            place.messages = place.messages or ()
+            place.writes = place.writes or ()
         self._flush()
         self._report.reasons = self._reasons.most_common()
         self._warn_of_shared_stamps()
@@ -133,7 +126,7 @@ class _Unrolling:
                     continue
             else:
                 self._report.copied += 1
-                self._places.append(_Place(raw.bag_time_ns, (raw,)))
+                self._places.append(_Place(raw.bag_time_ns, (partial(self._writer.copy, raw),)))
                 if role is None:
                     if raw.msgtype in (reader.IMAGE, reader.COMPRESSED_IMAGE):
                         # Whether an image of another topic has the stamp of an image.
@@ -166,39 +159,29 @@ class _Unrolling:
         place = places.popleft()
         if not places:
             del self._images[stamp]
-        place.messages = ()
+        place.writes = ()
         if result is not None:
-            place.messages = self._new_info(result), self._new_image(result)
+            place.writes = self._new_messages(result, place.bag_time_ns)
             self._report.images += 1
             self._report.largest_shift = max(self._report.largest_shift, result.map.shift)
 
-    def _new_image(self, result: GlobalShutterFrame) -> _New:
-        topic, types = self._topics.image, self._writer.type
-        place = result.stamp_ns, result.frame_id
-        pixels = result.image()
-        if topic.msgtype == reader.COMPRESSED_IMAGE:
-            message = outgoing.compressed_image_message(*place, pixels, png=result.is_png,
-                                                        types=types)
-        else:
-            message = outgoing.image_message(*place, pixels, types)
-        return _New(topic.name, topic.msgtype, message)
-
-    def _new_info(self, result: GlobalShutterFrame) -> _New:
-        message = outgoing.camera_info_message(
-            result.stamp_ns, result.frame_id, result.intrinsics,
-            self._intake.camera_info_of(result.intrinsics), self._writer.type)
-        topic = self._topics.camera_info
-        name = self._topics.image.camera_info if topic is None else topic.name
-        return _New(name, reader.CAMERA_INFO, message)
+    def _new_messages(self, result: GlobalShutterFrame,
+                      bag_time_ns: int) -> tuple[Callable[[], None], Callable[[], None]]:
+        topic, info, types = self._topics.image, self._topics.camera_info, self._writer.type
+        header, pixels = (result.stamp_ns, result.frame_id), result.image()
+        image = (outgoing.compressed_image_message(*header, pixels, png=result.is_png, types=types)
+                 if topic.msgtype == reader.COMPRESSED_IMAGE
+                 else outgoing.image_message(*header, pixels, types))
+        camera_info = outgoing.camera_info_message(
+            *header, result.intrinsics, self._intake.camera_info_of(result.intrinsics), types)
+        write, name = self._writer.write, topic.camera_info if info is None else info.name
+        return (partial(write, name, reader.CAMERA_INFO, camera_info, bag_time_ns),
+                partial(write, topic.name, topic.msgtype, image, bag_time_ns))
 
     def _flush(self) -> None:
-        while self._places and self._places[0].messages is not None:
-            place = self._places.popleft()
-            for message in place.messages or ():
-                if isinstance(message, RawMessage):
-                    self._writer.copy(message)
-                else:
-                    self._writer.write(*message, place.bag_time_ns)
+        while self._places and self._places[0].writes is not None:
+            for write in self._places.popleft().writes or ():
+                write()
 
     def _warn_of_shared_stamps(self) -> None:
         """Warn of other image topics with the camera's stamps."""

@@ -24,7 +24,7 @@ from rs_relpose_ros.pipeline.findings import Finding, FindingState
 from rs_relpose_ros.pipeline.recursion import MOST_PAIRS, WINDOW_NS
 
 # Fewer rays give no rotation.
-_LEAST_RAYS = 12
+LEAST_RAYS = 12
 # Rotations of the last seconds, at most so many.
 _WINDOW_NS = to_nanoseconds(8.0)
 _MOST_ROTATIONS = 160
@@ -45,7 +45,7 @@ def rotation_of_rays(rays1: Array, rays2: Array) -> Array | None:
     the median). None if there are too few rays.
     """
     finite = np.isfinite(rays1 + rays2).all(axis=1)
-    if np.count_nonzero(finite) < _LEAST_RAYS:
+    if np.count_nonzero(finite) < LEAST_RAYS:
         return None
     first, second = rays1[finite], rays2[finite]
     rotation = aligning_rotation(first.T @ second)
