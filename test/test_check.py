@@ -24,7 +24,7 @@ from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.offline import check_recording
-from rs_relpose_ros.offline.check import check_bag, CheckReport, choose_topics, quantity_findings
+from rs_relpose_ros.offline.check import check_bag, CheckReport, quantity_findings
 from rs_relpose_ros.offline.check_recording import Stamps
 from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState, QUANTITIES
 from rs_relpose_ros.tracking.images import Pixels
@@ -41,7 +41,7 @@ PIXELS = cv2.resize(np.random.default_rng(0).integers(0, 256, (30, 40), dtype=np
 def checked(path, parameters=None, **topics):
     """Findings by name, and the report."""
     with open_bag(path) as bag:
-        report = check_bag(bag, choose_topics(bag, topics),
+        report = check_bag(bag, bag.choose_topics(topics),
                            parameters or Parameters.from_mapping(GIVEN))
     return {finding.quantity: finding for finding in report.findings}, report
 

@@ -246,27 +246,45 @@ class SensorTopics:
     truth: Topic | None
 
 
+class Chosen(NamedTuple):
+    """The topics to read of a bag that may lack some: None if there is none of that kind."""
+
+    image: Topic | None
+    camera_info: Topic | None
+    imu: Topic | None
+    accel: Topic | None
+
+    @property
+    def all(self) -> list[Topic]:
+        """All that exist."""
+        return [topic for topic in self if topic]
+
+
 @dataclass(frozen=True, slots=True)
 class _TopicFinder:
-    """Finds the sensors' topics among all `topics` of a `bag`; `names`: those chosen, by role."""
+    """Finds the sensors' topics among all `topics` of a `bag`; `names`: those chosen, by role.
+
+    `complete`: a topic that is absent is an error.
+    """
 
     bag: Path
     topics: Sequence[Topic]
     names: Mapping[str, str]
+    complete: bool = True
 
-    def find(self, needs_camera_info: bool) -> SensorTopics:
+    def find(self, needs_camera_info: bool) -> Chosen:
         image = self._one('image', 'image', IMAGE, COMPRESSED_IMAGE)
-        if 'image_rect' in image.name:
+        if self.complete and image and 'image_rect' in image.name:
             raise InputError(f'{image.name} is a rectified image, in which a row no longer has '
                              'one time: choose the raw one with --image-topic')
         imu, accel = self._imu()
         camera_info = None
         if needs_camera_info or self.names.get('camera_info') or self._of_type(CAMERA_INFO):
             camera_info = self._camera_info(image)
-        return SensorTopics(image, camera_info, imu, accel, self._truth())
+        return Chosen(image, camera_info, imu, accel)
 
     def _one(self, role: str, content: str, *msgtypes: str, fix: str = '', hint: str = '',
-             without: Topic | None = None) -> Topic:
+             without: Topic | None = None) -> Topic | None:
         """The chosen topic, or the only one of these types.
 
         `fix` if there is none, `hint` if there are several.
@@ -274,6 +292,8 @@ class _TopicFinder:
         if chosen := self._chosen(role, *msgtypes):
             return chosen
         candidates = [topic for topic in self._of_type(*msgtypes) if topic != without]
+        if not (candidates or self.complete):
+            return None
         if not candidates:
             raise self._missing(f'{content} topic ({" or ".join(msgtypes)}){fix}')
         if len(candidates) > 1:
@@ -295,15 +315,15 @@ class _TopicFinder:
             raise MissingInputError(f'topic {name} ({option}) of {self.bag} has no messages')
         return found[0]
 
-    def _camera_info(self, image: Topic) -> Topic:
+    def _camera_info(self, image: Topic | None) -> Topic | None:
         for topic in self._of_type(CAMERA_INFO):
-            if topic.name == image.camera_info and not self.names.get('camera_info'):
+            if image and topic.name == image.camera_info and not self.names.get('camera_info'):
                 return topic
         return self._one('camera_info', 'CameraInfo', CAMERA_INFO,
                          fix='; give camera_matrix, whose focal length "rs_relpose calibrate" '
                          'estimates')
 
-    def _imu(self) -> tuple[Topic, Topic | None]:
+    def _imu(self) -> tuple[Topic | None, Topic | None]:
         """Topics of the gyro, and of a separate accelerometer."""
         accel = self._chosen('accel', IMU)
         candidates = self._of_type(IMU)
@@ -315,7 +335,7 @@ class _TopicFinder:
         return self._one('imu', 'IMU', IMU, without=accel,
                          hint=' (and --accel-topic for a separate accelerometer)'), accel
 
-    def _truth(self) -> Topic | None:
+    def truth(self) -> Topic | None:
         if chosen := self._chosen('truth', POSE_STAMPED):
             return chosen
         candidates = self._of_type(POSE_STAMPED)
@@ -442,7 +462,14 @@ class Bag:
         and one with 'accel' in its name make a pair (RealSense). MissingInputError if a topic is
         absent; InputError if several are possible, or one has another type.
         """
-        return _TopicFinder(self.path, self.topics, names or {}).find(needs_camera_info)
+        finder = _TopicFinder(self.path, self.topics, names or {})
+        found = finder.find(needs_camera_info)
+        assert found.image is not None and found.imu is not None
+        return SensorTopics(found.image, found.camera_info, found.imu, found.accel, finder.truth())
+
+    def choose_topics(self, names: Mapping[str, str]) -> Chosen:
+        """The same, but None for those that are absent; a rectified image is chosen, too."""
+        return _TopicFinder(self.path, self.topics, names, complete=False).find(False)
 
     def messages(self, topics: Sequence[Topic]) -> Iterator[BagMessage]:
         """Messages of `topics` in the order of bag time; their arrays are read-only.

@@ -23,7 +23,7 @@ from rs_relpose_ros.config.files import read_parameters, write_parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.camera import DISTORTION_MODELS, RollingShutterCamera
 from rs_relpose_ros.messages.transforms import bag_frames, extrinsics
-from rs_relpose_ros.offline.check import check_bag, CheckReport, choose_topics
+from rs_relpose_ros.offline.check import check_bag, CheckReport
 from rs_relpose_ros.offline.unroll import unroll
 from rs_relpose_ros.output_files import prepare_folder, refuse_unwritable, written
 
@@ -147,7 +147,7 @@ def inspect_bag(args: argparse.Namespace) -> CheckReport:
     """Check a bag, with a progress bar."""
     parameters = read_parameters(args.params, args.set)
     with open_bag(args.bag) as bag:
-        chosen = choose_topics(bag, options.topic_options(args))
+        chosen = bag.choose_topics(options.topic_options(args))
         messages = sum(topic.count for topic in chosen.all)
         if parameters.sensor.missing() and chosen.image is not None:
             messages *= 2   # the bag is read twice

@@ -9,23 +9,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rs_relpose_ros.bags import reader
-from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics, Topic
+from rs_relpose_ros.bags.reader import Bag, BagMessage, Chosen, SensorTopics, Topic
 from rs_relpose_ros.calibrate.observations import frame_times, Varying
 from rs_relpose_ros.calibrate.start import axes_text, nearest_axis_map
 from rs_relpose_ros.config.settings import Parameters, sensor_model
-from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.imu.buffer import length_fault
-from rs_relpose_ros.messages.incoming import PARTS, Role, sensor_messages
+from rs_relpose_ros.messages.incoming import Role, sensor_messages
 from rs_relpose_ros.messages.transforms import with_extrinsics
 from rs_relpose_ros.offline import check_recording
-from rs_relpose_ros.offline.check_recording import (
-    Chosen,
-    Completion,
-    Inertial,
-    SampleRun,
-    Scan,
-    Stamps,
-)
+from rs_relpose_ros.offline.check_recording import Completion, Inertial, SampleRun, Scan, Stamps
 from rs_relpose_ros.pipeline.assessment import not_evaluated
 from rs_relpose_ros.pipeline.findings import (
     Assessment,
@@ -86,34 +78,6 @@ class CheckReport:
         """The report as data for JSON."""
         return {'bag': self.bag, 'failed': self.failed,
                 'findings': [finding.as_check_json() for finding in self.findings]}
-
-
-def choose_topics(bag: Bag, names: Mapping[str, str]) -> Chosen:
-    """The topics to read: as `Bag.find_topics`, but None for those that are absent.
-
-    InputError or MissingInputError if several topics are possible, or one of `names` does not
-    exist.
-    """
-    try:
-        topics = bag.find_topics(names, needs_camera_info=False)
-    except (InputError, MissingInputError) as error:
-        # A wrong name is an error of the user; an absent or rectified topic is a finding.
-        chosen = Chosen(_first(bag, names, Role.IMAGE), _first(bag, names, Role.CAMERA_INFO),
-                        _first(bag, names, Role.IMU))
-        there = {topic.name.lstrip('/') for topic in bag.topics if topic.count}
-        absent = isinstance(error, MissingInputError) and all(
-            name.lstrip('/') in there for name in names.values() if name)
-        if not absent and 'image_rect' not in (chosen.image.name if chosen.image else ''):
-            raise
-        return chosen
-    return Chosen(topics.image, topics.camera_info, topics.imu, topics.accel)
-
-
-def _first(bag: Bag, names: Mapping[str, str], role: Role) -> Topic | None:
-    name = names.get(role.value, '').lstrip('/')
-    return next((topic for topic in bag.topics
-                 if topic.msgtype in PARTS[role].msgtypes and topic.count
-                 and name in ('', topic.name.lstrip('/'))), None)
 
 
 def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:

@@ -1,6 +1,6 @@
 """What `check` knows of a recording: statistics of one pass, and samples.
 
-Of a message the pass keeps numbers only: 16 bytes, and another 72 of an IMU. Samples go through
+Of a message the pass keeps numbers only: 16 bytes, and another 48 of an IMU. Samples go through
 the front end with the parameters as configured, and through a calibration: it completes
 parameters that are missing, and replaces those that are too far off for the front end.
 """
@@ -10,13 +10,13 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics, Topic
+from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics
 from rs_relpose_ros.calibrate.procedure import calibrate, read_recording
 from rs_relpose_ros.calibrate.result import CalibrationResult
 from rs_relpose_ros.config import settings
@@ -25,8 +25,8 @@ from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.timing import NANOSECONDS, Sensor, to_nanoseconds
-from rs_relpose_ros.imu.buffer import ImuSample, Vector
-from rs_relpose_ros.imu.filters import BiasTracker, GyroBias
+from rs_relpose_ros.imu.buffer import ImuBuffer, ImuSample
+from rs_relpose_ros.imu.filters import GyroBias
 from rs_relpose_ros.messages.incoming import Intake, PARTS, ReasonCounts, Role, stamp_ns
 from rs_relpose_ros.offline.replay import MessageRefused, outcomes
 from rs_relpose_ros.pipeline import findings
@@ -109,21 +109,15 @@ class Inertial:
 
     def __init__(self) -> None:
         self.orientations = 0    # orientations with a covariance
-        self._forces = array('d')    # of all samples of the accelerometer
-        self._stamps_ns, self._rates = array('q'), array('d')    # of the gyro
-        self._last_forces = array('d')    # at these stamps, NaN before the first one
-        self._last_force: Vector = (float('nan'),) * 3
+        self._forces, self._rates = array('d'), array('d')
+        self._buffer = ImuBuffer(ImuConfig(gyro_bias_sigma=_BIAS_SIGMA))
 
     def add(self, sample: ImuSample) -> None:
         """Add a sample."""
         self.orientations += sample.orientation is not None
-        if sample.linear_acceleration is not None:
-            self._last_force = sample.linear_acceleration
-            self._forces.extend(self._last_force)
-        if sample.angular_velocity is not None:
-            self._stamps_ns.append(sample.stamp_ns)
-            self._rates.extend(sample.angular_velocity)
-            self._last_forces.extend(self._last_force)
+        self._forces.extend(sample.linear_acceleration or ())
+        self._rates.extend(sample.angular_velocity or ())
+        self._buffer.add(sample)
 
     @property
     def rates(self) -> Array:
@@ -137,28 +131,8 @@ class Inertial:
 
     def rest(self) -> GyroBias | None:
         """Mean rate at rest; None if the IMU never was."""
-        stamps = np.array(self._stamps_ns, dtype=np.int64)
-        # The search requires increasing stamps.
-        later = np.diff(np.maximum.accumulate(stamps), prepend=-1) > 0
-        search = BiasTracker(ImuConfig(gyro_bias_sigma=_BIAS_SIGMA))
-        search.run(stamps[later], self.rates[later],
-                   np.array(self._last_forces).reshape(-1, 3)[later])
-        rest = search.estimate(int(stamps.max(initial=0)))
+        rest = self._buffer.bias(self._buffer.newest_ns or 0)
         return rest if rest.sigma < _BIAS_SIGMA else None
-
-
-class Chosen(NamedTuple):
-    """The topics to read; None if there is none of that kind."""
-
-    image: Topic | None
-    camera_info: Topic | None
-    imu: Topic | None
-    accel: Topic | None = None
-
-    @property
-    def all(self) -> list[Topic]:
-        """All that exist."""
-        return [topic for topic in self if topic]
 
 
 class Scan:
