@@ -7,25 +7,22 @@ from collections.abc import Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
 
+import cv2
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.collections import LineCollection
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.timing import seconds_between
+from rs_relpose_ros.messages.outgoing import draw_pair
 from rs_relpose_ros.offline.tables import PairRecord, rotation_sigmas, translation_sigmas
 from rs_relpose_ros.offline.truth import PairErrors, rotation_angle, TrueTrajectory
-from rs_relpose_ros.output_files import BLUE, GREEN, ORANGE, RED, save_picture
+from rs_relpose_ros.output_files import BLUE, GREEN, ORANGE, RED, save_picture, written
 from rs_relpose_ros.pipeline.pair import PairResult
 
-_COLORMAP = 'plasma'
 _DPI = 110
 
 
@@ -33,45 +30,14 @@ def draw_replay(paths: Sequence[Path], records: Sequence[PairRecord], shown: Pai
                 truth: TrueTrajectory | None) -> list[Path]:
     """Draw matches of one pair, errors (with ground truth), residuals and rotation; the files."""
     matches, errors, residuals, rotation = paths
-    draw_matches(shown, matches)
+    with written(matches, 'wb') as file:
+        file.write(cv2.imencode('.png', draw_pair(shown))[1].tobytes())
     draw_residuals(records, residuals)
     draw_rotation(records, rotation, truth)
     if truth is None:
         return [matches, residuals, rotation]
     draw_errors(records, errors)
     return [matches, errors, residuals, rotation]
-
-
-def draw_matches(result: PairResult, path: Path) -> None:
-    """Both images of a pair with its matches, coloured by row time; needs the pair's images."""
-    assert result.image1 is not None and result.image2 is not None
-    inliers, points1, points2 = result.pose.inliers, result.matches.points1, result.matches.points2
-    if len(inliers) != len(points1):   # a pair that failed early
-        inliers = np.zeros(len(points1), dtype=bool)
-    height, width = result.image1.shape
-    tau1, tau2 = 1e3 * result.row_times1, 1e3 * result.row_times2
-    row_times = np.concatenate([tau1, tau2, [0.0]])
-    norm = Normalize(row_times.min(), max(row_times.max(), row_times.min() + 1e-3))
-    picture = Figure(figsize=(13.0, 0.75 + 6.1 * height / width), dpi=_DPI, layout='constrained')
-    left, right = picture.subplots(1, 2)
-    _image(left, result.image1, 'reference keyframe: inliers, coloured by their row time')
-    _image(right, result.image2,
-           'current image: the same, with their displacement since the keyframe')
-    paths = LineCollection(list(np.stack([points1[inliers], points2[inliers]], axis=1)),
-                           cmap=_COLORMAP, norm=norm, linewidths=1.3)
-    paths.set_array(tau2[inliers])
-    right.add_collection(paths)
-    for axes, points, tau in ((left, points1, tau1), (right, points2, tau2)):
-        axes.scatter(*points[inliers].T, c=tau[inliers], cmap=_COLORMAP, norm=norm, s=16,
-                     edgecolors='black', linewidths=0.4)
-        axes.scatter(*points[~inliers].T, marker='x', color='cyan', s=26, linewidths=1.4,
-                     label=f'outliers ({np.count_nonzero(~inliers)})')
-    if not inliers.all():
-        right.legend(loc='lower right', framealpha=0.9, fontsize=9)
-    picture.colorbar(ScalarMappable(norm, _COLORMAP), ax=[left, right], shrink=0.8, pad=0.01,
-                     label='row time, from the stamped row [ms]')
-    picture.suptitle(_pair_title(result, int(inliers.sum())), fontsize=12)
-    save_picture(picture, path)
 
 
 def draw_errors(records: Sequence[PairRecord], path: Path,
@@ -172,33 +138,6 @@ def draw_rotation(records: Sequence[PairRecord], path: Path,
     _shade_no_pose(below, [r for r in records if np.isnan(r.pose.R).any()], start_ns,
                    'no rotation: gyro instead')
     _save_over_time(picture, path)
-
-
-def _pair_title(result: PairResult, inliers: int) -> str:
-    text = (f'{inliers} inliers of {len(result.matches.points1)} matches over '
-            f'{1e3 * result.interval:.0f} ms')
-    pose = result.pose
-    if np.isfinite(pose.R).all():
-        text += f', rotation {np.degrees(Rotation.from_matrix(pose.R).magnitude()):.2f} deg'
-    if pose:
-        x, y, z = pose.t
-        text += f', direction of translation ({x:+.2f}, {y:+.2f}, {z:+.2f})'
-        return text + f', residual {pose.residual_rms:.2f} px'
-    return f'{text}: {pose.status.value}'
-
-
-def _image(axes: Axes, image: NDArray[np.uint8], title: str) -> None:
-    height, width = image.shape
-    # Contrast stretched to the content, the brightest third unused, so that marks are visible.
-    low, high = np.percentile(image, [1.0, 99.0])
-    axes.imshow(image, cmap='gray', vmin=low, vmax=low + 1.4 * max(high - low, 1.0),
-                interpolation='antialiased')
-    axes.set_title(title, fontsize=10)
-    axes.set_xlim(-0.5, width - 0.5)
-    axes.set_ylim(height - 0.5, -0.5)
-    axes.set_xlabel('column [px]', fontsize=9)
-    axes.set_ylabel('row [px]', fontsize=9)
-    axes.tick_params(labelsize=8)
 
 
 def _over_time(count: int, title: str) -> Figure:
