@@ -362,6 +362,15 @@ def slerp(R1, R2, share):
     return Slerp([0.0, 1.0], Rotation.from_matrix([R1, R2]))(share).as_matrix()
 
 
+def in_whole_rows(first, last, shutter, point, *camera):
+    """Pixel of a point by two poses, world to camera, whose share is that of a whole row."""
+    def at(row):
+        t = {'down': np.floor(row), 'up': H - np.ceil(row), 'global': 0.0}[shutter] / (H - 1)
+        R = slerp(first[:3, :3], last[:3, :3], t)
+        return lens_pixel(R @ point + (1.0 - t) * first[:3, 3] + t * last[:3, 3], *camera)
+    return iterated(at, 240.0)
+
+
 def read_instant_ngp(folder, model, lens):
     """common_device.cuh: u, v from 0 to 1, t = A + B u + C v, camera to world."""
     value, K = read_json(folder)
@@ -394,18 +403,10 @@ def read_gsplat(folder, model, lens):
     assert str(value['camera_model']) == ('fisheye' if lens == 'fisheye' else 'pinhole')
     k, p = value['radial_coeffs'], value['tangential_coeffs']
     coefficients = k if lens == 'fisheye' else [*k[:2], *p, *k[2:], *value['thin_prism_coeffs']]
-    out = []
-    for f, point in model.observed:
-        first, last = value['viewmats'][f], value['viewmats_rs'][f]
-
-        def at(row, f=f, first=first, last=last, point=point):
-            t = {0: np.floor(row), 2: H - np.ceil(row), 4: 0.0}[
-                int(value['rolling_shutter'])] / (H - 1)
-            R = slerp(first[:3, :3], last[:3, :3], t)
-            return lens_pixel(R @ model.points[point] + (1.0 - t) * first[:3, 3]
-                              + t * last[:3, 3], value['Ks'][f], lens, coefficients)
-        out.append(iterated(at, 240.0))
-    return np.array(out)
+    shutter = {0: 'down', 2: 'up', 4: 'global'}[int(value['rolling_shutter'])]
+    return np.array([in_whole_rows(
+        value['viewmats'][f], value['viewmats_rs'][f], shutter, model.points[point],
+        value['Ks'][f], lens, coefficients) for f, point in model.observed])
 
 
 def read_ncore(folder, model, lens):
@@ -425,20 +426,15 @@ def read_ncore(folder, model, lens):
     k = camera.radial_coeffs.astype(float)
     coefficients = k if lens == 'fisheye' else [
         *k[:2], *camera.tangential_coeffs, *k[2:], *camera.thin_prism_coeffs]
-    kind = camera.shutter_type.name
+    shutter = {'ROLLING_TOP_TO_BOTTOM': 'down', 'ROLLING_BOTTOM_TO_TOP': 'up',
+               'GLOBAL': 'global'}[camera.shutter_type.name]
     out = []
     for f, point in model.observed:
         times = one.frames_timestamps_us[f]
         first, last = (np.linalg.inv(trajectory[stamps.tolist().index(time)]) for time in times)
         assert one.get_frame_image(int(times[1])).size == (W, H)
-
-        def at(row, first=first, last=last, point=point):
-            t = {'ROLLING_TOP_TO_BOTTOM': np.floor(row), 'ROLLING_BOTTOM_TO_TOP': H - np.ceil(row),
-                 'GLOBAL': 0.0}[kind] / (H - 1)
-            R = slerp(first[:3, :3], last[:3, :3], t)
-            return lens_pixel(R @ model.points[point] + (1.0 - t) * first[:3, 3]
-                              + t * last[:3, 3], K, lens, coefficients)
-        out.append(iterated(at, 240.0))
+        out.append(in_whole_rows(first, last, shutter, model.points[point], K, lens,
+                                 coefficients))
     return np.array(out)
 
 
