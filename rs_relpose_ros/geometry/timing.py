@@ -47,13 +47,17 @@ def clocks_apart(ahead: float) -> str:
         "the images'")
 
 
+# Steps of so many medians have an image missing.
+MISSING = 1.8
+
+
 def correlation_of_steps(steps: Array) -> float:
     """Correlation of successive steps between images, with none missing between.
 
     `steps` (N,): as shares of their median. About 1 of an exposure that changes, -0.5 of stamps
     that jitter: a late one makes one step longer and the next one shorter.
     """
-    whole = (steps > 0.0) & (steps < 1.8)   # with no image missing
+    whole = (steps > 0.0) & (steps < MISSING)
     if not whole.any():
         return 0.0
     # A few frames, as those after the start of a camera, must not decide.

@@ -481,7 +481,7 @@ def draw_pair(result: PairResult) -> Color:
 
     Each match is a line from its pixel in the reference keyframe to a dot at its current pixel.
     Inliers have the colour of their row time, explained by the bar on the left, outliers are cyan.
-    A caption has the status. Needs the pair's images.
+    A caption has the status. Needs the pair's image.
     """
     assert result.image2 is not None
     height, width = result.image2.shape

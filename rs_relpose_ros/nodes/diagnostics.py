@@ -5,6 +5,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+import math
 from pathlib import Path
 import threading
 import time
@@ -15,12 +16,12 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.calibrate.stored import Progress
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry.timing import correlation_of_steps, NANOSECONDS
+from rs_relpose_ros.geometry.timing import correlation_of_steps, MISSING, NANOSECONDS
 from rs_relpose_ros.messages.incoming import MOST_REASONS, reason_key, Role
 from rs_relpose_ros.pipeline.findings import Assessment, FindingState, NOT_EVALUATED
 from rs_relpose_ros.pipeline.monitor import Applied, Tracked
 from rs_relpose_ros.pipeline.pair import Frame, PAIR_METRICS, PairResult
-from rs_relpose_ros.pipeline.sequencer import Refusal, SequencerCounts, stamp_sigma
+from rs_relpose_ros.pipeline.sequencer import Refusal, SequencerCounts
 
 # -- Reasons for no results or few images ---------------------------------------------------------
 
@@ -107,9 +108,12 @@ def stamps_warning(stamps_ns: Sequence[int], size: int) -> str:
                 'Give the driver and this node the shipped profile, FASTRTPS_DEFAULT_PROFILES_FILE'
                 '=$(ros2 pkg prefix --share rs_relpose_ros)/config/fastdds.xml; ros2 launch '
                 'rs_relpose_ros relpose.launch.py does it for the node')
-    jitter = stamp_sigma(recent.tolist())
-    if jitter < _JITTER or correlation_of_steps(
-            steps / max(float(np.median(steps)), 1e-9)) > _ALTERNATING:
+    shares = steps / max(float(np.median(steps)), 1e-9)
+    whole = steps[(shares > 0.0) & (shares < MISSING)]
+    # Of a normal distribution, 80 % of the differences of two stamps are within 2.56 sigma.
+    spread = float(np.subtract(*np.quantile(whole, (0.9, 0.1)))) if len(whole) else 0.0
+    jitter = spread / 2.56 / math.sqrt(2.0)
+    if jitter < _JITTER or correlation_of_steps(shares) > _ALTERNATING:
         return ''
     return (f'the stamps of the images jitter by {1e3 * jitter:.1f} ms rms, as times of arrival '
             'do: a pose is wrong by the rotation within that time. Let the driver stamp by the '

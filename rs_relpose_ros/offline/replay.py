@@ -108,7 +108,7 @@ class Replay:
     """One run over an open bag; iterate over `pairs`, then read `counts` and `reasons`.
 
     With `stamps` only these frames are handed over, as those that a live node processed.
-    `keep_images`: whether pairs have their images.
+    `keep_images`: whether pairs have their current image.
     """
 
     def __init__(self, bag: Bag, topics: SensorTopics, parameters: Parameters, *,
@@ -197,7 +197,7 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
 
     Files of an earlier run in `folder` are replaced; it is created if necessary. `stamps`
     are those of `Replay`; `with_bag`: whether to write the node's topics as a bag.
-    `on_pair` is called with each pair, which has its images if `pictures` are drawn.
+    `on_pair` is called with each pair, which has its image if `pictures` are drawn.
     """
     run = Replay(bag, topics, parameters, stamps=stamps, keep_images=pictures)
     truth = read_truth(bag, topics)

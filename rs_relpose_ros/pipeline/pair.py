@@ -125,8 +125,7 @@ class PairResult:
     tracked: Tracked | None = None   # this and applied: as after this pair
     applied: Applied = field(default_factory=Applied)
     gyro_bias: Array | None = None   # (3,) [rad/s] that was removed, IMU frame
-    image1: NDArray[np.uint8] | None = None   # both only if the front end keeps images
-    image2: NDArray[np.uint8] | None = None
+    image2: NDArray[np.uint8] | None = None   # only if the front end keeps images
 
     @property
     def inlier_ratio(self) -> float:

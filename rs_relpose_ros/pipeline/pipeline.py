@@ -75,7 +75,7 @@ class Pipeline(Processor[PairResult]):
     """Tracks frames against a reference keyframe and estimates the pose of each keyframe pair.
 
     Parameters that may change while running (declared `live`) are not kept: `process` gets the
-    current ones with each frame. With `keep_images` results contain the two images. `tracker`:
+    current ones with each frame. With `keep_images` results contain the current image. `tracker`:
     instead of that of the parameters.
     """
 
@@ -269,7 +269,6 @@ class Pipeline(Processor[PairResult]):
                              parameters),
             images_against_gyro=None if latest is None else latest.images_against_gyro,
             health=monitor.health, tracked=tracked, applied=self.applied,
-            image1=reference.image if self._keep_images else None,
             image2=frame.image if self._keep_images else None)
 
     def _estimated(self, first: FrameImu, second: FrameImu, stamps_ns: tuple[int, int],
