@@ -185,31 +185,26 @@ def _add(jac: Array, r: tuple[float, float], weight: float, v: int, own: Array,
     """
     path = jac.shape[1] - _TRACK - 3
     first = path + 3 * (v - 1)   # of phi_v
-    for m in range(2):
-        row, residual = jac[m], r[m]
-        for y in range(_TRACK):
-            value = weight * row[y]
-            own_gradient[y] += value * residual
-            for x in range(_TRACK):
-                own[y, x] += value * row[x]
-            for x in range(path):
-                mixed[y, x] += value * row[_TRACK + x]
-            if v > 0:
-                for x in range(3):
-                    mixed[y, first + x] += value * row[_TRACK + path + x]
-        for y in range(path):
-            value = weight * row[_TRACK + y]
-            gradient[y] += value * residual
-            for x in range(path):
-                hessian[y, x] += value * row[_TRACK + x]
+    u, w = jac[0], jac[1]
+    for y in range(_TRACK):
+        by_u, by_w = weight * u[y], weight * w[y]
+        own_gradient[y] += by_u * r[0] + by_w * r[1]
+        for x in range(_TRACK):
+            own[y, x] += by_u * u[x] + by_w * w[x]
+        for x in range(path):
+            mixed[y, x] += by_u * u[_TRACK + x] + by_w * w[_TRACK + x]
         if v > 0:
-            for y in range(3):
-                value = weight * row[_TRACK + path + y]
-                gradient[first + y] += value * residual
-                for x in range(path):
-                    hessian[first + y, x] += value * row[_TRACK + x]
-                for x in range(3):
-                    hessian[first + y, first + x] += value * row[_TRACK + path + x]
+            for x in range(3):
+                mixed[y, first + x] += (by_u * u[_TRACK + path + x]
+                                        + by_w * w[_TRACK + path + x])
+    for y in range(path if v == 0 else path + 3):
+        by_u, by_w = weight * u[_TRACK + y], weight * w[_TRACK + y]
+        row = y if y < path else first + y - path
+        gradient[row] += by_u * r[0] + by_w * r[1]
+        for x in range(path):
+            hessian[row, x] += by_u * u[_TRACK + x] + by_w * w[_TRACK + x]
+        for x in range(path, y + 1):
+            hessian[row, first + x - path] += by_u * u[_TRACK + x] + by_w * w[_TRACK + x]
 
 
 @kernel
