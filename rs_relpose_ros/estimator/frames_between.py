@@ -215,7 +215,7 @@ class _Path(NamedTuple):
             np.array([zero, *(motion.beta for motion in given)]),
             np.array([given[-1].acceleration1, *(motion.acceleration2 for motion in given)]),
             given[-1].alpha - (R @ arm - arm),
-            (-np.cross(start, arm), given[-1].beta - R @ np.cross(end, arm)))
+            (-skew(start) @ arm, given[-1].beta - R @ (skew(end) @ arm)))
 
 
 def _tracks(views: Sequence[_View], path: _Path, camera: RollingShutterCamera) -> Tracks:
@@ -329,7 +329,7 @@ def _start(pose: RelativePose, views: Sequence[_View], tracks: Tracks,
     return PathState(pose.t.copy(), log_scale, 0.5 * off / T, np.zeros((accelerations, 3)),
                      rotations,
                      tracks.rays[0].copy(),
-                     np.where(near, 1.0 / np.where(near, depths, 1.0), _FAR))
+                     np.where(near, 1.0 / depths, _FAR))
 
 
 def _result(pose: RelativePose, adjusted: Adjusted, tracks: Tracks, priors: PathPriors,

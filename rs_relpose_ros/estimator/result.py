@@ -13,7 +13,8 @@ from rs_relpose_ros.estimator.covariance import ImageInformation
 from rs_relpose_ros.estimator.velocity import InertialEvidence
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
-from rs_relpose_ros.geometry.so3 import skew
+from rs_relpose_ros.geometry.so3 import cross, dot, skew
+from rs_relpose_ros.jit import kernel
 
 
 class Status(str, Enum):
@@ -192,21 +193,24 @@ class RelativePose:
 _PARALLEL = 4e-8
 
 
+@kernel
 def depths_of_rays(f1: Array, f2: Array, baselines: Array,
                    parallel: float) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Depths l (N,) of ``l_1 f_1 = b + l_2 f_2`` by least squares, and whether they are usable.
 
-    Rays (N, 3) are in one frame. Not usable behind a camera, or if the squared sine of the angle
-    between the rays is at most `parallel`.
+    Rays (N, 3) are in one frame. Not usable (1) behind a camera, or if the squared sine of the
+    angle between the rays is at most `parallel`.
     """
-    normals = np.cross(f1, f2)
-    squared = np.sum(normals**2, axis=1)
-    usable = squared > parallel
-    squared = np.where(usable, squared, 1.0)
-    # The cross products of that equation with f_2 and f_1.
-    l1 = np.sum(np.cross(baselines, f2) * normals, axis=1) / squared
-    l2 = np.sum(np.cross(baselines, f1) * normals, axis=1) / squared
-    return l1, l2, usable & (l1 > 0.0) & (l2 > 0.0)
+    l1, l2, usable = np.ones(len(f1)), np.ones(len(f1)), np.zeros(len(f1), dtype=np.bool_)
+    for i in range(len(f1)):
+        normal = cross(f1[i], f2[i])
+        squared = dot(normal, normal)
+        # The cross products of that equation with f_2 and f_1.
+        by_f2, by_f1 = (dot(cross(baselines[i], f2[i]), normal),
+                        dot(cross(baselines[i], f1[i]), normal))
+        if squared > parallel and by_f2 > 0.0 and by_f1 > 0.0:
+            l1[i], l2[i], usable[i] = by_f2 / squared, by_f1 / squared, True
+    return l1, l2, usable
 
 
 class Landmarks(NamedTuple):
@@ -235,9 +239,8 @@ def landmarks(pose: RelativePose, rays1: Array, rays2: Array, row_times1: Array,
     l1, l2, near = depths_of_rays(f1, in_first, pose.t + moved2 @ pose.R.T - moved1,
                                   _PARALLEL)
     # Inverse distances: 0 at infinity.
-    r1, r2 = (np.where(near, 1.0 / np.where(near, depth, 1.0), 0.0)[:, None]
-              for depth in (l1, l2))
-    equal1, equal2 = f1 + r1 * moved1, f2 + r2 * moved2
+    equal1 = f1 + (near / l1)[:, None] * moved1
+    equal2 = f2 + (near / l2)[:, None] * moved2
     middle = 0.5 * (l1[:, None] * equal1 + pose.t + (l2[:, None] * equal2) @ pose.R.T)
     out = Landmarks(*(np.full((len(inliers), size), np.nan) for size in (2, 2, 3)))
     out.pixels1[inliers], out.pixels2[inliers] = camera.project(equal1), camera.project(equal2)
