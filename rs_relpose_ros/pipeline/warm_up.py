@@ -15,9 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import EstimatorConfig, Parameters
+from rs_relpose_ros.estimator import frames_between
 from rs_relpose_ros.estimator.estimate import estimate_relative_pose, Estimation
 from rs_relpose_ros.estimator.frames_between import IntermediateFrame
 from rs_relpose_ros.estimator.problem import build_problem
+from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.estimator.sampling import MODES
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
@@ -37,15 +39,14 @@ _INTRINSICS = Intrinsics(width=_WIDTH, height=_HEIGHT, fx=250.0, fy=250.0, cx=15
 # What would keep made-up frames from being processed is replaced by these.
 MADE_UP_SENSOR = {'readout_time': 0.02, 'quat_cam_imu_xyzw': [0.0, 0.0, 0.0, 1.0],
                   'time_offset': 0.0, 'stamp_exposure': 'middle'}
+_ROTATION = np.eye(3), 1e-4 * np.eye(3)   # by the gyro, with its covariance
 
 
 def warm_up(config: EstimatorConfig | None = None) -> None:
     """Compile (or load from the cache) every kernel of an estimate with `config`."""
     points1, points2, camera, motion = _sideways()
-    rotation, covariance = np.eye(3), 1e-4 * np.eye(3)
-    halfway = IntermediateFrame(0.5 * (points1 + points2), motion, 0.1, rotation, covariance)
-    estimate_relative_pose(points1, points2, camera, motion, motion, rotation, covariance, 0.2,
-                           config=config, between=[halfway])
+    estimate_relative_pose(points1, points2, camera, motion, motion, *_ROTATION, 0.2,
+                           config=config, between=[_halfway()])
 
 
 def warm_up_pipeline(parameters: Parameters) -> None:
@@ -84,10 +85,14 @@ def _images() -> Iterator[NDArray[np.uint8]]:
         yield image
 
 
+def _halfway() -> IntermediateFrame:
+    points1, points2, _, motion = _sideways()
+    return IntermediateFrame(0.5 * (points1 + points2), motion, 0.1, *_ROTATION)
+
+
 def _estimation() -> Estimation:
     points1, points2, camera, motion = _sideways()
-    problem = build_problem(points1, points2, camera, motion, motion, np.eye(3),
-                            1e-4 * np.eye(3))
+    problem = build_problem(points1, points2, camera, motion, motion, *_ROTATION)
     return Estimation(problem, MODES['auto'], EstimatorConfig(), np.arange(len(points1)),
                       np.zeros(1, dtype=np.uint64), None)
 
@@ -116,16 +121,20 @@ def fill_cache() -> None:
             assert solver.address
         # No pair has that many matches: everything but the estimate.
         warm_up_pipeline(Parameters.from_mapping({'min_inliers': 10_000}))
+        points1, points2, camera, motion = _sideways()
+        pose = RelativePose(status=Status.OK, inliers=np.ones(len(points1), dtype=bool),
+                            R=np.eye(3), t=np.eye(3)[0], residual_rms=1.0)
+        frames_between.refined(pose, points1, motion, (points2, motion, 0.2, *_ROTATION),
+                               [_halfway()], camera, EstimatorConfig())
         other_half.result()
     warm_up_pipeline(Parameters())
 
 
 def _warm_up_estimate() -> None:
-    """Compile an estimate: all steps but the first, then sampling."""
+    """Compile a two-view estimate: all steps but the first, then sampling."""
     _estimation().refine(Solutions(np.eye(3)[None], np.eye(1, 9)))
     # By then the other process has compiled the solvers, which are most of it.
     _estimation().sample()
-    warm_up()
 
 
 if __name__ == '__main__':
