@@ -326,6 +326,8 @@ def _lenses_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--live', action='store_true',
                         help='calibrate as a running node does, from the first seconds that '
                              'suffice (plumb_bob)')
+    parser.add_argument('--known', action='store_true',
+                        help='bags with a CameraInfo that has the lens')
 
 
 def _run_lenses(args: argparse.Namespace) -> int:
@@ -333,9 +335,10 @@ def _run_lenses(args: argparse.Namespace) -> int:
     _check_at_least(1, args, 'bags')
     return _report_of(
         range(args.seed, args.seed + args.bags),
-        lambda seed: lenses.on_lens(seed, args.model, args.seconds,
-                                    args.output / f'{args.model}_{seed}_{args.seconds:g}s',
-                                    live=args.live),
+        lambda seed: lenses.on_lens(
+            seed, args.model, args.seconds, args.output / '_'.join(
+                ['known'] * args.known + [args.model, str(seed), f'{args.seconds:g}s']),
+            live=args.live, known=args.known),
         lenses.write_report, args, 'bag')
 
 
@@ -547,8 +550,8 @@ BENCHMARKS = {
         lambda parser: _number(parser, '--bags', 6, 'bags of a walk'), _run_calibration_bags,
         'calibration_bags', first_seed=301, seed_of='bag'),
     'calibration-lenses': Benchmark(
-        '`rs_relpose calibrate` on rendered bags without a CameraInfo, and the poses with its '
-        'file against those with the true calibration',
+        '`rs_relpose calibrate` on rendered bags, of unknown lenses if not --known, and the '
+        'poses with its file against those with the true calibration',
         _lenses_arguments, _run_lenses, 'calibration_lenses', first_seed=601, seed_of='bag'),
     'calibration-stretches': Benchmark(
         'whether parts of real recordings agree within the sigmas of `rs_relpose calibrate`: '

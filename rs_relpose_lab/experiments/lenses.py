@@ -1,12 +1,13 @@
-"""Whether an uncalibrated lens ends in poses: calibration, and the pairs with its file."""
+"""Whether an uncalibrated camera ends in poses: calibration, and the pairs with its file."""
 
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 import math
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from rs_relpose_lab.experiments import consistency
@@ -17,6 +18,7 @@ from rs_relpose_lab.simulation.bag import made_once, right_parameters, write_bag
 from rs_relpose_lab.simulation.scene import SCENES
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.calibrate.live import LiveCalibration
+from rs_relpose_ros.calibrate.start import axis_maps
 from rs_relpose_ros.calibrate.stored import Calibrated
 from rs_relpose_ros.cli.main import main as rs_relpose
 from rs_relpose_ros.config.files import read_parameters, SourcedValue, write_parameters
@@ -28,44 +30,47 @@ from rs_relpose_ros.messages.incoming import Role, sensor_messages, stamp_ns
 MODELS = {'plumb_bob': (-0.2, 0.1), 'equidistant': (-0.05, 0.05)}
 # Focal length over that assumed by `calibrate`, 0.8 widths; error of the principal point [px].
 FOCAL, CENTER = (0.8, 1.2), 10.0
+LENS = ('focal length [%]', 'first coefficient', 'principal point [px]')   # the larger of both
+# Largest rotation of the IMU about each axis, from one of the 24 axis maps [deg].
+MISALIGNED = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class Poses:
-    """Poses of a bag, and the share of them beyond the 99.7 % quantile."""
+    """Poses of a bag: median errors [deg], and the share beyond the 99.7 % quantile."""
 
     pairs: int = 0
     count: int = 0
+    median_t: float = math.nan
+    median_r: float = math.nan
     beyond_t: float = 0.0
     beyond_r: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class LensRun:
-    """One bag: errors of the lens with their 1 sigma, and poses with it and with the true one.
+    """One bag: errors of the written values, and poses with them and with the true ones.
 
-    Focal length in per cent; principal point: the larger of both errors [px]; the images that
-    were used [s].
+    `seconds`: of the images that were used. `errors`: error and 1 sigma by name, of `LENS` where
+    the lens was not known.
     """
 
     model: str
     seed: int
     exit_code: int
-    focal_true: float
-    radial_true: float
-    focal: float = math.nan
-    focal_sigma: float = math.nan
-    radial: float = math.nan
-    radial_sigma: float = math.nan
-    center: float = math.nan
-    center_sigma: float = math.nan
+    seconds: float
+    truth: Poses
     calibrated: Poses = Poses()
-    truth: Poses = Poses()
-    seconds: float = math.nan
+    errors: dict[str, tuple[float, float]] = field(default_factory=dict)
+
+    @property
+    def in_sigmas(self) -> list[float]:
+        """Magnitudes of the errors."""
+        return [abs(error) / sigma for error, sigma in self.errors.values()]
 
 
 def lens_of(seed: int, model: str) -> tuple[SimulationConfig, RollingShutterCamera]:
-    """Recording and camera of a bag: lens, readout and offset are drawn."""
+    """Recording and camera of a bag: lens, readout, offset and axes are drawn."""
     rng = np.random.default_rng([2, seed])
     width = SimulationConfig().width
     config = SimulationConfig(
@@ -74,9 +79,12 @@ def lens_of(seed: int, model: str) -> tuple[SimulationConfig, RollingShutterCame
         time_offset=round(rng.uniform(-0.08, 0.08), 4))
     camera, shift = config.camera, rng.uniform(-CENTER, CENTER, 2)
     others = (0.0,) * (3 if model == 'equidistant' else 4)
-    return config, replace(
+    camera = replace(
         camera, cx=0.5 * (camera.width - 1) + shift[0], cy=0.5 * (camera.height - 1) + shift[1],
         distortion_model=model, distortion=(float(rng.uniform(*MODELS[model])), *others))
+    axes = (Rotation.from_rotvec(rng.uniform(-MISALIGNED, MISALIGNED, 3), degrees=True)
+            * Rotation.from_matrix(axis_maps()[rng.integers(24)]))
+    return replace(config, quat_cam_imu_xyzw=tuple(axes.as_quat().tolist())), camera
 
 
 def calibrated_live(bag: Path, parameters: Path) -> float:
@@ -101,17 +109,19 @@ def calibrated_live(bag: Path, parameters: Path) -> float:
     return math.nan
 
 
-def on_lens(seed: int, model: str, seconds: float, folder: Path, *, live: bool) -> LensRun:
-    """Render a bag without CameraInfo unless it exists, calibrate, and replay with both lenses.
+def on_lens(seed: int, model: str, seconds: float, folder: Path, *, live: bool,
+            known: bool) -> LensRun:
+    """Render a bag unless it exists, calibrate, and replay with both calibrations.
 
-    live: by the calibration of a running node, which ends as soon as its result suffices.
+    live: by the calibration of a running node, which ends as soon as its result suffices. known:
+    the lens is that of the CameraInfo.
     """
     config, camera = lens_of(seed, model)
     config = replace(config, duration=seconds, plan=f'walk:{seconds}')
 
     def render(bag: Path, parameters: Path) -> None:
         simulation = simulate(config, camera=camera)
-        write_bag(simulation, bag, camera_info=False)
+        write_bag(simulation, bag, camera_info=known)
         values = {**right_parameters(simulation), 'image_transport': 'compressed',
                   'camera_matrix': tuple(camera.camera_matrix.ravel().tolist()),
                   'distortion_model': camera.distortion_model,
@@ -126,20 +136,35 @@ def on_lens(seed: int, model: str, seconds: float, folder: Path, *, live: bool) 
         seconds = calibrated_live(bag, parameters)
         code = int(math.isnan(seconds))
     else:
-        code = rs_relpose(['calibrate', str(bag), '--lens', model,
-                           '--out', str(parameters.parent)])
-    run = LensRun(model, seed, code, camera.fx, camera.distortion[0], truth=_poses(bag, truth),
-                  seconds=seconds)
+        code = rs_relpose(['calibrate', str(bag), '--out', str(parameters.parent),
+                           *([] if known else ['--lens', model])])
+    run = LensRun(model, seed, code, seconds, _poses(bag, truth))
     if code:
         return run
-    lens = read_parameters(parameters).intrinsics
-    found = lens.of_image(camera.width, camera.height)
-    return replace(
-        run, focal=100.0 * (found.fx / camera.fx - 1.0),
-        focal_sigma=100.0 * lens.focal_length_sigma,
-        radial=found.distortion[0] - camera.distortion[0], radial_sigma=lens.distortion_sigma,
-        center=max(abs(found.cx - camera.cx), abs(found.cy - camera.cy)),
-        center_sigma=lens.principal_point_sigma, calibrated=_poses(bag, parameters))
+    found = read_parameters(parameters)
+    return replace(run, calibrated=_poses(bag, parameters),
+                   errors=_errors(found, config) | ({} if known else _of_lens(found, camera)))
+
+
+def _errors(found: Parameters, truth: SimulationConfig) -> dict[str, tuple[float, float]]:
+    sensor, imu = found.sensor, found.imu
+    assert sensor.readout_time is not None
+    turn = Rotation.from_matrix(sensor.R_cam_imu @ truth.R_cam_imu.T).as_rotvec()
+    bias = np.array(imu.gyro_bias) - truth.gyro_bias
+    return {
+        'readout [s]': (sensor.readout_time - truth.readout_time, sensor.readout_time_sigma),
+        'offset [s]': (sensor.time_offset - truth.time_offset, sensor.time_offset_sigma),
+        **{f'axes {axis} [rad]': (turn[k], sensor.axes_sigma) for k, axis in enumerate('xyz')},
+        **{f'bias {axis} [rad/s]': (bias[k], imu.gyro_bias_sigma) for k, axis in enumerate('xyz')}}
+
+
+def _of_lens(found: Parameters, truth: RollingShutterCamera) -> dict[str, tuple[float, float]]:
+    sigmas, lens = found.intrinsics, found.intrinsics.of_image(truth.width, truth.height)
+    center = max(abs(lens.cx - truth.cx), abs(lens.cy - truth.cy))
+    return dict(zip(LENS, (
+        (100.0 * (lens.fx / truth.fx - 1.0), 100.0 * sigmas.focal_length_sigma),
+        (lens.distortion[0] - truth.distortion[0], sigmas.distortion_sigma),
+        (center, sigmas.principal_point_sigma)), strict=True))
 
 
 def _poses(bag: Path, parameters: Path) -> Poses:
@@ -148,27 +173,34 @@ def _poses(bag: Path, parameters: Path) -> Poses:
     squares = np.array([(T_FREEDOM * pair.translation_nees, R_FREEDOM * pair.rotation_nees)
                         for pair in pairs if not math.isnan(pair.rotation)]).reshape(-1, 2)
     beyond = squares > chi2([T_FREEDOM, R_FREEDOM]).ppf(QUANTILE)
-    return Poses(len(pairs), len(squares), *beyond.sum(axis=0) / max(len(squares), 1))
+    return Poses(len(pairs), len(squares),
+                 float(np.nanmedian([pair.translation for pair in pairs])),
+                 float(np.nanmedian([pair.rotation for pair in pairs])),
+                 *beyond.sum(axis=0) / max(len(squares), 1))
 
 
 def write_report(folder: Path, runs: Sequence[LensRun]) -> str:
     """Write the runs (CSV) and the table (Markdown), and return the latter."""
     rows = [[f'{run.model} {run.seed}', str(run.exit_code), f'{run.seconds:.1f}',
-             f'{run.focal_true:.0f}',
-             f'{run.focal:.2f} +- {run.focal_sigma:.2f}', f'{run.radial_true:.3f}',
-             f'{run.radial:.3f} +- {run.radial_sigma:.3f}',
-             f'{run.center:.1f} +- {run.center_sigma:.1f}', *_cells([run.calibrated]),
-             *_cells([run.truth])] for run in runs]
-    rows.append(['all', *7 * [''], *_cells([run.calibrated for run in runs]),
-                 *_cells([run.truth for run in runs])])
+             *('{:.3f} +- {:.3f}'.format(*run.errors[name]) if name in run.errors else ''
+               for name in LENS), *_cells([run])] for run in runs]
+    rows.append(['all', *5 * [''], *_cells(runs)])
     return write_table(folder, 'lenses', runs, markdown_table(
-        ['bag', 'exit code', 'images [s]', 'f [px]', 'error [%]', 'first coefficient', 'error',
-         'principal point: error [px]', 'poses of pairs', 'beyond 99.7 %: t / R', 'true lens',
-         'beyond'], rows))
+        ['bag', 'exit code', 'images [s]', *(f'{name}: error' for name in LENS),
+         'values within 3 sigma (largest)', 'median error over that with the truth: t / R',
+         'poses of pairs', 'beyond 99.7 %: t / R', 'with the truth', 'beyond'], rows))
 
 
-def _cells(found: Sequence[Poses]) -> list[str]:
-    pairs, count = sum(poses.pairs for poses in found), sum(poses.count for poses in found)
-    t, R = (sum(getattr(poses, name) * poses.count for poses in found) / max(count, 1)
-            for name in ('beyond_t', 'beyond_r'))
-    return [f'{count} of {pairs}', f'{t:.1%} / {R:.1%}']
+def _cells(runs: Sequence[LensRun]) -> list[str]:
+    """Of one or several bags; of several: medians of the ratios, sums of the rest."""
+    sizes = np.array([size for run in runs for size in run.in_sigmas])
+    ratios = [np.nanmedian([getattr(run.calibrated, name) / getattr(run.truth, name)
+                            for run in runs]) for name in ('median_t', 'median_r')]
+    cells = [f'{np.count_nonzero(sizes <= 3.0)} of {len(sizes)} ({sizes.max(initial=0.0):.1f})',
+             ' / '.join(f'{ratio:.2f}' for ratio in ratios)]
+    for found in ([run.calibrated for run in runs], [run.truth for run in runs]):
+        pairs, count = sum(poses.pairs for poses in found), sum(poses.count for poses in found)
+        t, R = (sum(getattr(poses, name) * poses.count for poses in found) / max(count, 1)
+                for name in ('beyond_t', 'beyond_r'))
+        cells += [f'{count} of {pairs}', f'{t:.1%} / {R:.1%}']
+    return cells
