@@ -309,15 +309,6 @@ def _run_calibration(args: argparse.Namespace) -> int:
                       calibration.write_tracks_report, args, 'recording')
 
 
-def _run_calibration_bags(args: argparse.Namespace) -> int:
-    from rs_relpose_lab.experiments import calibration
-    _check_at_least(1, args, 'bags')
-    return _report_of(
-        calibration.bag_runs(args.bags, args.seed),
-        lambda bag: calibration.calibrate_bag(bag[0], bag[1], args.output / f'{bag[0]}'),
-        calibration.write_bags_report, args, 'bag')
-
-
 def _lenses_arguments(parser: argparse.ArgumentParser) -> None:
     _number(parser, '--bags', 10, 'bags, each with a lens of its own')
     _seconds(parser, '--seconds', 20.0, 'length of a bag')
@@ -544,11 +535,6 @@ BENCHMARKS = {
         'length is unknown in every other round of the 24 axis maps',
         lambda parser: _number(parser, '--runs', 240, 'recordings'), _run_calibration,
         'calibration', seed_of='recording', jobs='processes'),
-    'calibration-bags': Benchmark(
-        '`rs_relpose calibrate` on rendered bags, end to end; after the walks one of a global '
-        'shutter and one with rotation about one axis only',
-        lambda parser: _number(parser, '--bags', 6, 'bags of a walk'), _run_calibration_bags,
-        'calibration_bags', first_seed=301, seed_of='bag'),
     'calibration-lenses': Benchmark(
         '`rs_relpose calibrate` on rendered bags, of unknown lenses if not --known, and the '
         'poses with its file against those with the true calibration',

@@ -1,8 +1,7 @@
-"""`rs_relpose calibrate` against the truth of tracks and rendered bags; parts of recordings."""
+"""Calibration on simulated tracks against their truth, and on parts of recordings."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-import json
 import math
 from pathlib import Path
 
@@ -11,17 +10,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from rs_relpose_lab.experiments.calibration_tracks import about_one_axis, drawn, record
+from rs_relpose_lab.experiments.calibration_tracks import drawn, record
 from rs_relpose_lab.experiments.harness import grouped, markdown_table, write_table
-from rs_relpose_lab.simulation import SimulationConfig
-from rs_relpose_lab.simulation.bag import render_once
-from rs_relpose_lab.simulation.scene import SCENES
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.calibrate.observations import Tracks
 from rs_relpose_ros.calibrate.procedure import calibrate, CalibrationInput, read_recording
 from rs_relpose_ros.calibrate.result import CalibrationResult, Estimate
 from rs_relpose_ros.calibrate.start import axis_maps
-from rs_relpose_ros.cli.main import main as rs_relpose
 from rs_relpose_ros.config.settings import TRACKED_IN_IMAGES, TrackingConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
@@ -149,81 +144,6 @@ def _statistics(errors: NDArray[np.float64], limit: float | None) -> list[str]:
     return [f'{np.median(errors):.3f}', f'{np.quantile(errors, 0.95):.3f}', f'{errors.max():.3f}',
             '' if limit is None else f'{limit:g}',
             '' if limit is None else f'{100 * (errors <= limit).mean():.1f}']
-
-
-# -- rendered bags ----------------------------------------------------------------------------
-
-DURATION = 6.0
-
-
-@dataclass(frozen=True, slots=True)
-class CalibratedBag:
-    """Calibration of a bag by the command, with the truth; ms and degrees."""
-
-    kind: str
-    seed: int
-    scene: str
-    exit_code: int
-    shutter: str
-    readout_true: float
-    readout: float
-    readout_sigma: float
-    offset_true: float
-    offset: float
-    offset_sigma: float
-    rotation_error: float
-    rotation_sigma: float
-    rotation_observable: bool
-
-
-def bag_configuration(seed: int, kind: str) -> SimulationConfig:
-    """Bags differ in scene, readout, offset and axes."""
-    rng = np.random.default_rng(seed)
-    axis = rng.standard_normal(3)
-    R = (Rotation.from_rotvec(math.radians(2.0) * axis / np.linalg.norm(axis))
-         * Rotation.from_matrix(axis_maps()[rng.integers(24)]))
-    readout_time = 0.0 if kind == 'global' else float(rng.uniform(0.010, 0.030))
-    return SimulationConfig(
-        seed=seed, duration=DURATION, scene=SCENES[seed % len(SCENES)], width=480, height=360,
-        fx=340.0, edge_samples=1, readout_time=readout_time, plan=f'walk:{DURATION}',
-        time_offset=float(rng.uniform(-0.08, 0.08)),
-        quat_cam_imu_xyzw=tuple(float(v) for v in R.as_quat()))
-
-
-def calibrate_bag(seed: int, kind: str, folder: Path) -> CalibratedBag:
-    """Render a bag into `folder` unless it exists, and calibrate."""
-    config = bag_configuration(seed, kind)
-    bag, _ = render_once(config, folder,
-                         about_one_axis(0, DURATION) if kind == 'one axis' else None)
-    code = rs_relpose(['calibrate', str(bag), '--out', str(folder / 'out')])
-    written = json.loads((folder / 'out' / 'calibration.json').read_text(encoding='utf-8'))
-    error = (Rotation.from_quat(written['quat_cam_imu_xyzw'])
-             * Rotation.from_matrix(config.R_cam_imu).inv())
-    readout, offset = written['readout_time_s'], written['time_offset_s']
-    rotation = written['rotation_from_axis_map_rad']
-    return CalibratedBag(
-        kind, seed, config.scene, code, written['shutter'], 1e3 * config.readout_time,
-        1e3 * readout['value'], 1e3 * readout['sigma'], 1e3 * config.time_offset,
-        1e3 * offset['value'], 1e3 * offset['sigma'], math.degrees(error.magnitude()),
-        math.degrees(rotation['sigma']), rotation['observable'])
-
-
-def bag_runs(bags: int, first_seed: int) -> list[tuple[int, str]]:
-    """Seed and kind of each bag: walks, then a global shutter and rotation about one axis only."""
-    kinds = ['walk'] * bags + ['global', 'one axis']
-    return [(first_seed + number, kind) for number, kind in enumerate(kinds)]
-
-
-def write_bags_report(folder: Path, bags: Sequence[CalibratedBag]) -> str:
-    """Write the bags (CSV) and the table (Markdown), and return the latter."""
-    return write_table(folder, 'calibration_bags', bags, markdown_table(
-        ['bag', 'scene', 'shutter', 'readout [ms]', 'estimated', 'offset [ms]', 'estimated',
-         'rotation off by [deg]', 'observable'],
-        [[f'{bag.kind} {bag.seed}', bag.scene, bag.shutter, f'{bag.readout_true:.2f}',
-          f'{bag.readout:.2f} +- {bag.readout_sigma:.2f}', f'{bag.offset_true:.2f}',
-          f'{bag.offset:.2f} +- {bag.offset_sigma:.2f}',
-          f'{bag.rotation_error:.2f} (sigma {bag.rotation_sigma:.2f})',
-          'yes' if bag.rotation_observable else 'no'] for bag in bags]))
 
 
 # -- parts of recordings ----------------------------------------------------------------------
