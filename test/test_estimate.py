@@ -1,6 +1,7 @@
 """The estimate of a pair: pose, covariance, degeneracy, image information, baseline, landmarks."""
 
 from dataclasses import replace
+import re
 
 import message_builders as build
 import numpy as np
@@ -171,6 +172,37 @@ def test_a_gyro_that_disagrees_with_the_images_widens_the_covariance():
     assert np.trace(after) > 4.0 * np.trace(before)
     assert rotation_nees(wrong, scene.R, after) < 3.0
     assert rotation_nees(wrong, scene.R, before) > 6.0
+
+
+@pytest.mark.parametrize('seed', [1, 2, 3])
+def test_a_gyro_that_contradicts_the_images_has_no_pose(seed):
+    """Beyond what a larger covariance expresses: an error of 100 sigmas, 1 deg."""
+    scene = make_scene(seed, outliers=0.1)
+    assert gyro_prior(scene, (0.0, 6e-4, 0.0))
+    wrong = gyro_prior(scene, (0.0, 0.02, 0.0))
+    assert wrong.status is Status.NO_CONSENSUS and np.isnan(wrong.R).all()
+    assert wrong.inliers.mean() > 0.8   # a wrong translation fits most matches
+    apart = float(re.search(r'rotation ([.\d]+) deg', wrong.reason)[1])
+    assert apart == pytest.approx(1.1, abs=0.2)
+    assert gyro_prior(scene, (0.0, 0.02, 0.0), sigma=0.02)
+
+
+@pytest.mark.parametrize(('share', 'status'), [(0.5, 'LOW_PARALLAX'), (0.7, 'OK')])
+def test_a_direction_whose_sign_the_depths_do_not_determine(share, status):
+    """Matches on exact epipolar lines, a share of them in front of the cameras."""
+    rng, camera = np.random.default_rng(0), RollingShutterCamera(
+        width=1280, height=720, fx=600.0, fy=600.0, cx=639.5, cy=359.5, readout_time=0.03)
+    R, t = Rotation.from_rotvec([0.02, -0.01, 0.03]).as_matrix(), np.array([0.8, 0.1, 0.6])
+    points = rng.uniform([-4, -2, 8], [4, 2, 20], (300, 3))
+    sign = np.where(rng.uniform(size=300) < share, 1.0, -1.0)[:, None]
+    pixels = [camera.project(rays) + rng.normal(0.0, 0.2, (300, 2))
+              for rays in (points, (points - sign * t) @ R)]
+    still = FrameMotion(np.zeros(3))
+    pose = estimate_relative_pose(*pixels, camera, still, still, relative_rotation=R,
+                                  relative_rotation_covariance=1e-8 * np.eye(3))
+    assert pose.status is Status[status]
+    assert rotation_error(pose.R, R) < 0.02
+    assert abs(pose.inliers.sum() - 300 * share) < 20
 
 
 def test_errors_of_the_stamps_are_in_the_covariance_and_not_in_the_pose():

@@ -197,7 +197,8 @@ def test_seconds_without_information_and_flagged_poses_do_not_count(recording):
 def test_a_phone_that_rotates_on_the_spot_has_no_finding(converted):
     """At 3.4 s a pair of 27 deg has no translation; an invented one contradicted the axes.
 
-    With a focal length of 500 px, 18 more than the right one: with that it has one.
+    With a focal length of 500 px, 18 more than the right one, images and gyro contradict each
+    other in that pair; with the right one it has a translation.
     """
     name = 'android_phone_rs'
     bag = converted(name, 'android')
@@ -205,7 +206,7 @@ def test_a_phone_that_rotates_on_the_spot_has_no_finding(converted):
     bag.with_suffix('.yaml').write_text(right.replace('482.0', '500.0'))
     recording = trust_runs.recording_at(bag)
     pairs = [pair for pair, _ in trust_runs.run(recording, recording.configured, 4.5)]
-    assert 'PURE_ROTATION' in {pair.pose.status.value for pair in pairs}
+    assert [pair.stamp_ns // 10**8 % 10**4 for pair in pairs if not pair.pose] == [4381]
     assert not [pair.health.faults for pair in pairs if pair.health.faults]
 
 

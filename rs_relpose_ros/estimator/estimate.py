@@ -101,6 +101,13 @@ ROTATION_ONLY_SIGMAS = 2.5
 # largest 1 sigma of the logarithm of the baseline with which a baseline is given.
 LEAST_ACCELERATION = 16.8
 MOST_LOG_SIGMA = 1.0
+# Of matches within the threshold, half have implausible depths by chance: inliers must exceed the
+# others by this many sigmas of that.
+SIGN_SIGMAS = 3.0
+# Log-likelihood that all matches may gain by a free rotation. Three unknowns gain above 10 in one
+# of 5000 pairs if residuals are independent; those of neighbours are similar (blur, stamps), which
+# on recordings is as a fifth of the matches (docs/estimator.md).
+CONTRADICTION = 50.0
 # Points lie on a line if their root mean square distance from it is below this many thresholds.
 DEGENERATE_THRESHOLDS = 2.0
 
@@ -242,15 +249,25 @@ class Estimation:
                                  'matches')
         # 3. Refinement on its inliers.
         refined = self._refined(state)
-        reason = self._no_consensus(refined.inliers)
-        if reason:
+        if reason := self._no_consensus(refined.inliers):
             return self._failure(Status.NO_CONSENSUS, reason)
+        if reason := self._contradiction(refined.state):
+            return replace(self._failure(Status.NO_CONSENSUS, reason), inliers=refined.inliers)
         # 4. Is the translation observable?
         rotation_only = self._rotation_only(refined)
         if rotation_only is not None:
             return rotation_only
         # 5. Covariance at the optimum, then from the middle to the reference row.
-        return self._result(refined)
+        pose = self._result(refined)
+        near = np.abs(sampson.residuals(self.problem.observations, refined.state))
+        implausible = (near < self.config.threshold) & ~refined.inliers
+        count, others = np.count_nonzero(refined.inliers), np.count_nonzero(implausible)
+        if self.config.refinement == 'map' and (
+                count - others < SIGN_SIGMAS * math.sqrt(count + others)):
+            return pose.without_translation(Status.LOW_PARALLAX, (
+                f'{others} of {count + others} matches on their epipolar lines lie behind the '
+                'cameras or far from the others, nearly as many as by chance'))
+        return pose
 
     def sample(self, enough: float = ENOUGH) -> Solutions:
         """The best hypotheses, by one solver after another until the inlier share is `enough`."""
@@ -333,6 +350,17 @@ class Estimation:
                for f in RAYS) < DEGENERATE_THRESHOLDS * cell:
             return f'the {count} matches that agree lie on one line: the pose is not observable'
         return ''
+
+    def _contradiction(self, state: TwoViewState) -> str:
+        """Reason why images and gyro cannot both be right; empty if they may."""
+        if self.config.refinement != 'map' or self.problem.rotation is None:
+            return ''
+        gain, R = sampling.gain_without_gyro(self.matches, state, self.priors, self.problem.focal)
+        if gain < CONTRADICTION:
+            return ''
+        apart = np.degrees(np.linalg.norm(so3.log_so3(R @ state.R.T)))
+        return (f'images and gyro contradict each other: a rotation {apart:.1f} deg from the '
+                f"gyro's fits the matches better (log-likelihood +{gain:.0f})")
 
     def _rotation_only(self, refined: Refined) -> RelativePose | None:
         """The result without a translation if none is observable, otherwise None.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import EstimatorConfig
 from rs_relpose_ros.estimator import priors, sampson
-from rs_relpose_ros.estimator.fit import FitMatches, gauss_newton
+from rs_relpose_ros.estimator.fit import fit_rotation, FitMatches, gauss_newton, transfer_errors
 from rs_relpose_ros.estimator.priors import Priors, TwoViewState
 from rs_relpose_ros.estimator.problem import TwoViewProblem
 from rs_relpose_ros.estimator.sampson import RayMatches
@@ -396,6 +396,52 @@ def optimise(matches: RayMatches, hypotheses: Solutions, prior: Priors, sigma: f
         better = [_take_least(costs) for _ in range((good + 1) // 2)]
         states, r = [states[k] for k in better], [r[k] for k in better]
     return states[0], True
+
+
+# -- The alternative to a pose whose rotation follows the gyro: any rotation ----------------------
+
+# Rounds of its fit, Gauss-Newton steps and weights of each (Cauchy, in sigmas), and the round by
+# which it must be the likelier one: it rarely is if the pose is right.
+_FREE_ROUNDS, _FREE_STEPS, _FREE_SIGMAS, _PROMISING = 6, 2, 2.4, 2
+_LEAST_SCALE = 0.05   # of residuals [px]
+
+
+@kernel
+def _unlikelihood(r: Array) -> float:
+    """Negative log-likelihood of residuals (N,), Cauchy about zero with their median as scale."""
+    scale = max(so3.median(np.abs(r)), _LEAST_SCALE)
+    return len(r) * math.log(scale) + np.log(1.0 + (r / scale)**2).sum()
+
+
+def gain_without_gyro(matches: RayMatches, state: TwoViewState, prior: Priors, focal: float,
+                      ) -> tuple[float, Array]:
+    """Log-likelihood that all matches gain by a free rotation, and that rotation (3, 3).
+
+    Negative if the pose `state`, whose `prior` is the gyro's rotation, is the likelier one.
+    """
+    observations = np.ascontiguousarray(matches.observations[matches.valid])
+    use = np.ones(len(observations), dtype=bool)
+    free = prior._replace(rotation_information=np.zeros((3, 3)))
+    known = _unlikelihood(sampson.residuals(observations, state))
+    start = so3.aligning_rotation(correlation(observations, use, 0, 9))
+    spread = so3.median(transfer_errors(observations, use, start, focal))
+    R, _ = fit_rotation(observations, use, start, free, focal, 0.5 * spread)
+    # The direction nearest to all epipolar planes.
+    normals = np.cross(observations[:, :3], observations[:, 9:12] @ R.T)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-3)[:, None]
+    t = np.ascontiguousarray(np.linalg.eigh(normals.T @ normals)[1][:, 0])
+    velocity = prior.velocity.rate * t
+    state = TwoViewState(R, t, velocity, velocity.copy(), np.zeros(3), np.zeros(3))
+    state = priors.signed(state, sampson.cheirality_sign(observations, use, state))
+    for k in range(_FREE_ROUNDS + 1):
+        r = sampson.residuals(observations, state)
+        gain = known - _unlikelihood(r)
+        if k == _FREE_ROUNDS or (k == _PROMISING and gain < 0.0):
+            break
+        sigma = max(1.4826 * so3.median(np.abs(r)), _LEAST_SCALE)
+        weights = 1.0 / (1.0 + (r / (_FREE_SIGMAS * sigma))**2)
+        state = gauss_newton(FitMatches(observations, weights, sigma), state, free, _FREE_STEPS)
+    return gain, state.R
 
 
 # -- Distribution of the inliers' rays: do they determine a pose? ---------------------------------

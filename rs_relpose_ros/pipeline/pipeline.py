@@ -240,11 +240,12 @@ class Pipeline(Processor[PairResult]):
         pose = self._estimated(reference.imu, frame.imu, (reference.stamp_ns, frame.stamp_ns),
                                matches, gyro, sensor, parameters)
         measurement, segment, to_sensor = None, gyro.segment, sensor.intrinsics.to_sensor
-        if np.isfinite(pose.R).all():
+        if pose.inliers.any():   # also where the gyro contradicts them
             measurement = PairData(
                 to_sensor(matches.points1), to_sensor(matches.points2), sensor.camera,
                 reference.imu.motion, frame.imu.motion,
-                pair.interval_of(reference.imu, frame.imu), pose.R, pose.t, gyro.rotation,
+                pair.interval_of(reference.imu, frame.imu),
+                pose.R if np.isfinite(pose.R).all() else gyro.rotation, pose.t, gyro.rotation,
                 gyro.covariance, rotation_sensitivity(
                     segment.stamps_ns, segment.angular_velocities, parameters.imu),
                 segment, parameters.sensor.R_cam_imu, parameters.estimator.gyro_sigma)

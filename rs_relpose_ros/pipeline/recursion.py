@@ -135,6 +135,8 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
                           priors.isotropic(_VELOCITY_SIGMA, 1.0 / pair.interval))
     state = _state(pair, problem, observations, prior, fit=bool(at.any()))
     r = residuals(observations, state)
+    if not np.isfinite(r).all():   # a fit far from the gyro's rotation diverged
+        return None
     sigma = _noise(r)
     weights = 1.0 / (1.0 + (r / (_CAUCHY_SIGMAS * sigma)) ** 2) / sigma**2
     J_x = jacobian(observations, state)
