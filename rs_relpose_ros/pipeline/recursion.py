@@ -112,7 +112,7 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
 
     The deviations `active` (11,) are applied to the data of the pair already. About others the
     pair is fitted again, since its estimate followed the active ones. None if there are too few
-    matches.
+    matches, or if a fit far from the gyro's rotation diverges.
     """
     at, step = about - active, math.ceil(len(pair.points1) / _MOST_MATCHES) or 1
     pair = replace(pair, camera=_lens(pair.camera, *at[FOCAL:]),
@@ -135,7 +135,7 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
                           priors.isotropic(_VELOCITY_SIGMA, 1.0 / pair.interval))
     state = _state(pair, problem, observations, prior, fit=bool(at.any()))
     r = residuals(observations, state)
-    if not np.isfinite(r).all():   # a fit far from the gyro's rotation diverged
+    if not np.isfinite(r).all():
         return None
     sigma = _noise(r)
     weights = 1.0 / (1.0 + (r / (_CAUCHY_SIGMAS * sigma)) ** 2) / sigma**2
@@ -147,9 +147,7 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
     H, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
     priors.add_priors(state, prior, H, gradient)
     weighted = J_x.T * weights
-    H += weighted @ J_x
-    gradient += weighted @ r
-    C = weighted @ J_c
+    H, gradient, C = H + weighted @ J_x, gradient + weighted @ r, weighted @ J_c
     C[THETA:THETA + 3] -= information @ D
     solved = inverse(H) @ np.column_stack([C, gradient])
     S = (J_c.T * weights) @ J_c + D.T @ information @ D - C.T @ solved[:, :-1]
@@ -164,10 +162,10 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
     # The rotation by the images: the step without the gyro's prior.
     H[THETA:THETA + 3, THETA:THETA + 3] -= information
     gradient[THETA:THETA + 3] -= information @ theta
-    rotation_step = np.asarray(-(inverse(H) @ gradient)[THETA:THETA + 3])
     return PairInformation(
         S, b + S @ about, ratio / if_distorted, by_deviation[:, :DEVIATIONS],
-        by_deviation[:, DEVIATIONS:], whitened[:, :DEVIATIONS], theta + rotation_step)
+        by_deviation[:, DEVIATIONS:], whitened[:, :DEVIATIONS],
+        np.asarray(theta - (inverse(H) @ gradient)[THETA:THETA + 3]))
 
 
 def _shifts(pair: PairData, problem: TwoViewProblem, state: TwoViewState, H: Array, C: Array,
@@ -487,7 +485,7 @@ class Recursion:
         if self._pairs and stamp_ns < self._pairs[-1].stamp_ns:
             self.clear()
         information = pair_information(data, active, about)
-        if information is None or not np.isfinite(information.S).all():
+        if information is None:
             return None
         self._pairs.append(_Entry(stamp_ns, data, active, about, information))
         while self._pairs[0].stamp_ns < stamp_ns - WINDOW_NS:
