@@ -21,7 +21,7 @@ BUDGETS = {
     'rs_relpose_ros/calibrate': (2950, 9),
     'rs_relpose_ros/cli': (1190, 6),
     'rs_relpose_ros/config': (860, 4),
-    'rs_relpose_ros/estimator': (3840, 12),
+    'rs_relpose_ros/estimator': (3850, 12),
     'rs_relpose_ros/geometry': (1270, 6),
     'rs_relpose_ros/imu': (1310, 4),
     'rs_relpose_ros/messages': (1550, 5),
@@ -32,7 +32,7 @@ BUDGETS = {
     'rs_relpose_ros/solvers': (1720, 6),
     'rs_relpose_ros/tracking': (1230, 5),
     'rs_relpose_lab': (10440, 48),
-    'test': (20630, 55),
+    'test': (20650, 55),
 }
 MOST_MODULES, MOST_FOLDERS = 110, 15
 LONGEST_MODULE, SHORTEST_MODULE, LONGEST_FUNCTION = 700, 80, 60

@@ -225,6 +225,7 @@ def test_the_rotation_of_the_images_does_not_follow_the_gyro():
     np.testing.assert_allclose(estimated, turn, atol=1e-3)
     few = replace(pair, points1=pair.points1[:12], points2=pair.points2[:12])
     assert pair_information(few, NONE, NONE) is None
+    assert pair_information(replace(pair, R=np.full((3, 3), np.nan)), NONE, NONE) is None
 
 
 def test_derivative_by_the_rates_by_finite_differences():

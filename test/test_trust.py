@@ -238,3 +238,16 @@ def test_command_distinguishes_wrong_from_right(tmp_path):
     # Published poses of it would be wrong; the monitor suppresses them.
     if int(cycled['poses']):
         assert float(cycled['direction_error']) > 10.0
+
+
+@pytest.mark.parametrize(('row', 'end', 'named'), [
+    ('gyro-degrees', 1.0, {'gyro_unit'}), ('upside-down', 1.0, {'axes', 'image_geometry'}),
+    ('K-1.3', 2.0, {'distortion', 'focal_length', 'image_geometry'})])
+def test_pairs_that_contradict_the_gyro_have_no_pose_but_reveal_the_reason(row, end, named):
+    """Of K-1.3 pairs alone reveal it, and none has a pose."""
+    recording = trust.recording_of(trust.BagPlan(1, 64005, 3.0, 0.0186))
+    pairs = [pair for pair, _ in trust_runs.run(
+        recording, ROWS[row].wrong(recording.configured, np.random.default_rng(0)), end)]
+    assert sum('contradict' in pair.pose.reason for pair in pairs) >= 4
+    assert not any(pair.pose or pair.pose.rotation_known for pair in pairs)
+    assert {fault.quantity for fault in pairs[-1].health.faults} & named

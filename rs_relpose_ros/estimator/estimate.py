@@ -252,7 +252,8 @@ class Estimation:
         if reason := self._no_consensus(refined.inliers):
             return self._failure(Status.NO_CONSENSUS, reason)
         if reason := self._contradiction(refined.state):
-            return replace(self._failure(Status.NO_CONSENSUS, reason), inliers=refined.inliers)
+            return replace(self._failure(Status.NO_CONSENSUS, reason),
+                           rejected=self._result(refined))
         # 4. Is the translation observable?
         rotation_only = self._rotation_only(refined)
         if rotation_only is not None:

@@ -73,6 +73,8 @@ class RelativePose:
     inertial_evidence : InertialEvidence or None
         Whether the images are consistent with the given acceleration (`inertial`); None if that
         is not observable.
+    rejected : RelativePose or None
+        The estimate of two views that images and gyro contradict; then this one is falsy.
     pixels1_gs, pixels2_gs : (N, 2) ndarray or None
         Equivalent global-shutter pixels of the matches at the times of the reference rows, on the
         sensor: NaN for outliers; None unless requested, and without a pose.
@@ -111,6 +113,7 @@ class RelativePose:
     baseline_log_sigma: float = float('nan')
     baseline_reason: str = ''
     images: ImageInformation | None = None
+    rejected: RelativePose | None = None
     inertial_evidence: InertialEvidence | None = None
     pixels1_gs: Array | None = None
     pixels2_gs: Array | None = None

@@ -160,8 +160,6 @@ def suppressed(pose: RelativePose, health: Assessment) -> RelativePose:
 def _effect(information: recursion.PairInformation, pose: RelativePose) -> Effect:
     rows, claimed = slice(3, None), pose.covariance[3:, 3:]
     shift = information.shift_by_deviation[:3]
-    if not np.isfinite(claimed).all():   # a pair without a rotation claims nothing
-        return Effect(shift, shift)
     if pose:
         # t is a direction: along itself it has no variance, and nothing moves it there.
         along = np.concatenate([pose.t, np.zeros(3)])

@@ -240,12 +240,12 @@ class Pipeline(Processor[PairResult]):
         pose = self._estimated(reference.imu, frame.imu, (reference.stamp_ns, frame.stamp_ns),
                                matches, gyro, sensor, parameters)
         measurement, segment, to_sensor = None, gyro.segment, sensor.intrinsics.to_sensor
-        if pose.inliers.any():   # also where the gyro contradicts them
+        fitted = pose.rejected or pose   # a contradiction shows what is wrong
+        if np.isfinite(fitted.R).all():
             measurement = PairData(
                 to_sensor(matches.points1), to_sensor(matches.points2), sensor.camera,
                 reference.imu.motion, frame.imu.motion,
-                pair.interval_of(reference.imu, frame.imu),
-                pose.R if np.isfinite(pose.R).all() else gyro.rotation, pose.t, gyro.rotation,
+                pair.interval_of(reference.imu, frame.imu), fitted.R, fitted.t, gyro.rotation,
                 gyro.covariance, rotation_sensitivity(
                     segment.stamps_ns, segment.angular_velocities, parameters.imu),
                 segment, parameters.sensor.R_cam_imu, parameters.estimator.gyro_sigma)
@@ -257,8 +257,9 @@ class Pipeline(Processor[PairResult]):
         active[findings.OFFSET] = frame.imu.applied_offset_ns / NANOSECONDS
         active[findings.READOUT] = configured.direction * self._readout
         active[findings.BIAS] = parameters.sensor.R_cam_imu.T @ segment.bias - bias
-        assessed = monitor.add_pair(frame.stamp_ns, measurement, pose, configured)
-        pose = monitor.agreement.enlarged(reference.stamp_ns, frame.stamp_ns, pose, assessed)
+        assessed = monitor.add_pair(frame.stamp_ns, measurement, fitted, configured)
+        if fitted is pose:
+            pose = monitor.agreement.enlarged(reference.stamp_ns, frame.stamp_ns, pose, assessed)
         tracked = Tracked.of(monitor.calibration, configured)
         self.applied = self.applied.moved(tracked, parameters.sensor)
         if parameters.pair.withhold_when_wrong:

@@ -135,8 +135,6 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
                           priors.isotropic(_VELOCITY_SIGMA, 1.0 / pair.interval))
     state = _state(pair, problem, observations, prior, fit=bool(at.any()))
     r = residuals(observations, state)
-    if not np.isfinite(r).all():
-        return None
     sigma = _noise(r)
     weights = 1.0 / (1.0 + (r / (_CAUCHY_SIGMAS * sigma)) ** 2) / sigma**2
     J_x = jacobian(observations, state)
@@ -150,6 +148,8 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
     H, gradient, C = H + weighted @ J_x, gradient + weighted @ r, weighted @ J_c
     C[THETA:THETA + 3] -= information @ D
     solved = inverse(H) @ np.column_stack([C, gradient])
+    if not np.isfinite(solved).all():
+        return None
     S = (J_c.T * weights) @ J_c + D.T @ information @ D - C.T @ solved[:, :-1]
     b = C.T @ solved[:, -1] - (J_c.T * weights) @ r + D.T @ (information @ theta)
     # The principal point is not estimated: axes of the IMU have nearly the same effect.
