@@ -211,9 +211,9 @@ def test_path_is_metric(walked, tracked):
 
 
 def test_metrics_of_the_laboratory(walked, tracked):
-    """NEES of steps is 0.4: noise of the pairs is white here, which `_SHARED` does not assume."""
+    """NEES of steps is 0.16: noise of pairs and IMU is white here, which the graph does not assume."""
     estimator, out = tracked
-    assert 0.2 < step_nees(estimator, walked.truth) < 0.8
+    assert 0.08 < step_nees(estimator, walked.truth) < 0.4
     assert drift(out, walked.truth) < 0.5
     moved = [*out[:-1], replace(out[-1], position=np.add(out[-1].position, (0.0, 0.0, 1.0)))]
     length = path_of(out, walked.truth).errors.length_m
@@ -597,7 +597,7 @@ def test_a_lost_path_continues_where_the_imu_propagated_it(walked):
     _, t = walked.truth.relative_pose(before[-1].imu_ns, after[0].imu_ns)
     error = before[-1].R.T @ (after[0].position - before[-1].position) - t
     assert np.linalg.norm(error) < 3.0 * math.sqrt(np.trace(after[0].pose_covariance[:3, :3]))
-    assert np.linalg.norm(error) < 0.5
+    assert np.linalg.norm(error) < 0.7
 
 
 @pytest.mark.parametrize('seconds', [-100.0, -0.5, 0.5, 100.0])
@@ -702,7 +702,7 @@ def test_frames_show_whether_a_pair_is_missing(walked, frames_end, state):
 
 def test_no_images_for_longer_than_the_window(walked, tracked):
     """The first pairs after a bridge contradict nothing, and velocities are right again."""
-    parameters = PARAMETERS.updated({'max_coast': 10.0, 'smoothing_lag': 2.0})
+    parameters = PARAMETERS.updated({'max_coast': 10.0, 'max_position_sigma': 3.0})
     estimator, out = run(walked, pairs=without(walked.pairs, 3.5, 9.0),
                          estimator=OdometryEstimator(parameters, keep=True))
     assert (estimator.counts['contradicting'], estimator.counts['lost']) == (0, 0)

@@ -61,6 +61,8 @@ _SAME_NS = 1_000_000
 _GRAVITY_WINDOW = 1.0
 # 1 sigma of that direction for a moving body [rad].
 _MOVING_TILT = 0.1
+# Least 1 sigma of the accelerometer's bias [m/s^2]: factory calibration leaves 0.2 to 0.4.
+_ACCEL_BIAS = 0.3
 # 1 sigma of the velocity at a start at rest and in motion [m/s], per axis; of its free heading and
 # position [rad, m].
 _REST_VELOCITY, _ANY_VELOCITY, _GAUGE_SIGMA = 0.01, 3.0, 1e-4
@@ -73,15 +75,15 @@ _SHARED = 2.5
 # Innovation of a contradicting pair, in units of recent ones, and chi squared per degree of
 # freedom of a wrong start.
 _CONTRADICTING, _WRONG_START = 4.0, 3.0
-# Number of wrong starts in motion, or of contradicting pairs after a start at rest, after which
-# rest is no start.
-_WRONG_STARTS = 3
+# Number of wrong starts in motion, or of contradicting pairs after a start, after which rest is no
+# start; of pairs that agree after it, in motion, after which axes of the IMU are not in doubt.
+_WRONG_STARTS, _PROVEN = 3, 20
 _CONTRADICTION = ('pairs and IMU contradict each other: are relpose_node/pairs and imu of one '
                   'camera, and quat_cam_imu_xyzw and imu_position those of this IMU?')
 # Longest propagation of a lost path by the IMU [s]; largest delay of a pair behind its samples.
 _LONGEST_PROPAGATED, _LONGEST_DELAY = 10.0, 10.0
 # Longest start [s]; then a new one begins.
-_LONGEST_START = 4.0
+_LONGEST_START = 8.0
 _GAP = 'the IMU has a gap, or its clock jumped: see its driver'
 # 1 sigma of an unknown acceleration [m/s^2] and rate [rad/s], of a body whose IMU had a gap.
 _UNKNOWN_ACCELERATION, _UNKNOWN_RATE = 3.0, 1.0
@@ -122,7 +124,7 @@ class _Run:
     recent: deque[tuple[int, float, float]] = field(default_factory=lambda: deque(maxlen=20))
     pairs: int = 0   # used
     contradicting: int = 0   # not used
-    confirmed: bool = False   # by a pair in motion
+    confirmed: int = 0   # since the start, by so many pairs in motion
     published: bool = False
     path: int = 0   # number of earlier starts
 
@@ -248,7 +250,7 @@ class OdometryEstimator:
         if pair.images is not None:
             self._row_ns = pair.row_ns
         # Keyframes are at the middle rows, also for pairs without information.
-        pair = pair.later(self._row_ns)
+        pair = pair.later(self._row_ns).without_far_velocities()
         if self._last_ns is not None and pair.current_ns <= self._last_ns:
             self.counts['late'] += 1
             return
@@ -361,10 +363,15 @@ class OdometryEstimator:
 
     def _process(self, pair: KeyframePair) -> Odometry | None:
         self._offset_ns = pair.stamp_ns - pair.current_ns
-        if pair.contradiction:
+        # Pairs that are wrong together, as of a moving object, do not disprove axes.
+        proven = self._run is not None and self._run.confirmed >= _PROVEN
+        if pair.contradiction and not (proven and pair.contradicts_axes):
             self._end(pair.contradiction, pair.current_ns)
             self._change(OdometryState.LOST, pair.contradiction, pair.current_ns)
             self.counts['calibration contradicted'] += 1
+            return None
+        if pair.images is None:
+            self._unusable_ns = pair.current_ns
             return None
         if self._run is not None and pair.reference_ns < self._run.newest_ns - _SAME_NS:
             self.counts['late'] += 1   # the IMU bridges it
@@ -402,7 +409,7 @@ class OdometryEstimator:
                 return None
         else:
             run.observed_ns, run.pairs = pair.current_ns, run.pairs + 1
-            run.confirmed |= pair.has_direction
+            run.confirmed += run.published and pair.has_direction
             run.variances = _variances(run.graph.newest)
             if run.published:
                 self._change(OdometryState.TRACKING, '', pair.current_ns)
@@ -496,10 +503,11 @@ class OdometryEstimator:
         C = self._R_cam_body
         R = _levelled(force, path_end, self.base.R @ C if self.base.frame_id else np.eye(3))
         velocity = np.zeros(3) if at_rest else R @ (C.T @ moving - np.cross(rate, self._arm))
-        tilt = self._imu.accel_bias_sigma / STANDARD_GRAVITY if at_rest else _MOVING_TILT
+        of_bias = max(self._imu.accel_bias_sigma, _ACCEL_BIAS)
+        tilt = of_bias / STANDARD_GRAVITY if at_rest else _MOVING_TILT
         covariance = np.diag(np.square(
             [_GAUGE_SIGMA] * 6 + [_REST_VELOCITY if at_rest else _ANY_VELOCITY] * 3
-            + [self._imu.accel_bias_sigma] * 3 + [self._imu.gyro_bias_sigma] * 3 + [0.0] * 3))
+            + [of_bias] * 3 + [self._imu.gyro_bias_sigma] * 3 + [0.0] * 3))
         covariance[:3, :3] = R.T @ np.diag(np.square([tilt, tilt, _GAUGE_SIGMA])) @ R
         covariance[ARM, ARM] = self._arm_covariance
         start = KeyframeState(R, path_end.position, velocity, bias, np.zeros(3), self._arm,

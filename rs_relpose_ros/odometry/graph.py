@@ -26,8 +26,13 @@ from rs_relpose_ros.odometry.pair import BodyState, deviations, KeyframePair, Mo
 
 # 1 sigma of the velocity of a body at rest [m/s], per axis.
 _REST_VELOCITY_SIGMA = 0.005
+# Speed [m/s] below which the uncertainty of a velocity is relative to it.
+_LEAST_SPEED = 0.1
 # Largest share of the window that one interval takes.
 _LONGEST_STEP = 0.25
+# Errors of an accelerometer that its noise density has not: scale, axes, vibration, clock
+# [m/s^2/sqrt(Hz)] (docs/lab/odometry.md, "Starts").
+_ACCEL_ERRORS = 8e-3
 # Integration error of the samples, as a noise density of the position [m/sqrt(s)].
 _INTEGRATION = 1e-4
 # Share of right loops within the bound of chi squared.
@@ -80,7 +85,7 @@ def _preintegration(imu: ImuConfig, config: OdometryConfig) -> Any:
     params = gtsam.PreintegrationCombinedParams.MakeSharedU(STANDARD_GRAVITY)
     eye = np.eye(3)
     params.setGyroscopeCovariance(imu.gyro_noise_density**2 * eye)
-    params.setAccelerometerCovariance(imu.accel_noise_density**2 * eye)
+    params.setAccelerometerCovariance((imu.accel_noise_density**2 + _ACCEL_ERRORS**2) * eye)
     params.setIntegrationCovariance(_INTEGRATION**2 * eye)
     params.setBiasOmegaCovariance(config.gyro_bias_walk**2 * eye)
     params.setBiasAccCovariance(config.accel_bias_walk**2 * eye)
@@ -169,13 +174,9 @@ class KeyframeGraph:
         return innovation
 
     def scale_sigma(self) -> float:
-        """Relative 1 sigma of the newest speed; 1 sigma of the velocity below 0.1 m/s."""
-        velocity, covariance = self._newest.velocity, self._newest.covariance[VELOCITY, VELOCITY]
-        speed = float(np.linalg.norm(velocity))
-        if speed < 0.1:
-            return math.sqrt(float(np.trace(covariance)))
-        along = velocity / speed
-        return math.sqrt(float(along @ covariance @ along)) / speed
+        """1 sigma of the newest velocity, along its least certain direction, by its length."""
+        sigma = math.sqrt(np.linalg.norm(self._newest.covariance[VELOCITY, VELOCITY], 2))
+        return sigma / max(float(np.linalg.norm(self._newest.velocity)), _LEAST_SPEED)
 
     def misfit(self) -> float:
         """Chi squared of the window per degree of freedom."""

@@ -16,7 +16,7 @@ from rs_relpose_ros.estimator.covariance import ImageInformation
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import log_so3, norm, tangent_basis
-from rs_relpose_ros.geometry.timing import to_nanoseconds
+from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuInterval
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.messages.incoming import stamp_ns
@@ -24,6 +24,9 @@ from rs_relpose_ros.messages.published_pair import PairStatus
 from rs_relpose_ros.pipeline.findings import FindingState
 from rs_relpose_ros.pipeline.pair import PairResult
 
+# Difference of a velocity from the mean one, in units of it, from which its information does not
+# hold: it is linearised at the estimated velocity.
+_FAR_VELOCITY = 1.5
 # Interval that no pair reaches [ns].
 _LONGEST_NS = 100_000_000_000
 
@@ -65,6 +68,11 @@ class KeyframePair:
                    status['baseline_log_sigma'], status['gyro_bias_rad_s'],
                    _contradiction(status['health'], status['health_findings']))
 
+    @property
+    def contradicts_axes(self) -> bool:
+        """Whether the finding is about the axes of the accelerometer."""
+        return self.contradiction.startswith(_AXES)
+
     def later(self, delay_ns: int) -> KeyframePair:
         """The same for rows that are read `delay_ns` later."""
         return replace(self, stamp_ns=self.stamp_ns + delay_ns,
@@ -75,6 +83,15 @@ class KeyframePair:
     def row_ns(self) -> int:
         """From the stamped to the middle row, at which keyframes are; 0 without information."""
         return 0 if self.images is None else to_nanoseconds(self.images.row_time)
+
+    def without_far_velocities(self) -> KeyframePair:
+        """The same, without velocities where one of them is far from the mean velocity."""
+        if self.images is None or not self.has_direction:
+            return self
+        ways = self.images.velocities.reshape(2, 3) * seconds_between(
+            self.reference_ns, self.current_ns)
+        far = np.linalg.norm(ways - self.images.t, axis=1).max() > _FAR_VELOCITY
+        return replace(self, images=self.images.without_velocities()) if far else self
 
     def as_loop(self, inflation: float) -> KeyframePair | None:
         """The same at the middle rows, for frames far apart in time; None without information.
@@ -98,13 +115,16 @@ class KeyframePair:
         return self.images is not None and bool(np.isfinite(self.images.t).all())
 
 
+_AXES = f'accel_axes {FindingState.SUSPECT.value}:'
+
+
 def _contradiction(state: str, findings: str) -> str:
     """The finding that ends a path: a parameter is wrong, or the accelerometer is contradicted.
 
     Pairs continue without the accelerometer, but a path has no other source of scale.
     """
     for finding in findings.split('; '):
-        if finding.startswith(f'accel_axes {FindingState.SUSPECT.value}:') or \
+        if finding.startswith(_AXES) or \
                 finding.partition(' ')[2].startswith(f'{FindingState.WRONG.value}:'):
             return finding
     return 'the calibration is wrong' if state == FindingState.WRONG.value else ''
