@@ -73,8 +73,8 @@ _START_LOG_SIGMA, _GUESSED_SPEED = 0.7, 1.0
 # loops share images (docs/lab/odometry.md).
 _SHARED = 2.5
 # Innovation of a contradicting pair, in units of recent ones, and chi squared per degree of
-# freedom of a wrong start.
-_CONTRADICTING, _WRONG_START = 4.0, 3.0
+# freedom of a wrong start; of one of its pairs, in units of that.
+_CONTRADICTING, _WRONG_START, _GROSS = 4.0, 3.0, 5.0
 # Number of wrong starts in motion, or of contradicting pairs after a start, after which rest is no
 # start; of pairs that agree after it, in motion, after which axes of the IMU are not in doubt.
 _WRONG_STARTS, _PROVEN = 3, 20
@@ -123,6 +123,7 @@ class _Run:
     # Of recent pairs: times, innovations (chi squared by degrees of freedom) and intervals [s].
     recent: deque[tuple[int, float, float]] = field(default_factory=lambda: deque(maxlen=20))
     pairs: int = 0   # used
+    largest: float = 0.0   # innovation before the start
     contradicting: int = 0   # not used
     confirmed: int = 0   # since the start, by so many pairs in motion
     published: bool = False
@@ -393,6 +394,7 @@ class OdometryEstimator:
         gate = inflation * _CONTRADICTING if run.published else math.inf
         innovation = run.graph.add(interval, pair, at_rest, inflation=_SHARED * inflation,
                                    gate=gate)
+        run.largest = max(run.largest, innovation)
         run.stamps.append((pair.stamp_ns, pair.current_ns))
         run.recent.append((pair.current_ns, min(innovation, _CONTRADICTING), interval.duration))
         if innovation > gate:
@@ -560,7 +562,7 @@ class OdometryEstimator:
                            f'{100.0 * self._config.max_scale_sigma:.0f} %: it needs motion that '
                            'changes its speed, or standstill')
         if run.at_rest or run.pairs >= _LEAST_PAIRS:
-            if run.graph.misfit() > _WRONG_START:
+            if max(run.graph.misfit(), run.largest / _GROSS) > _WRONG_START:
                 self.counts['wrong starts'] += 1
                 self._wrong_starts += 1
                 self._run = None

@@ -30,6 +30,8 @@ _REST_VELOCITY_SIGMA = 0.005
 _LEAST_SPEED = 0.1
 # Largest share of the window that one interval takes.
 _LONGEST_STEP = 0.25
+# Steps of the optimisation with a keyframe until the start; then one changes no path by 0.2 mm.
+_START_STEPS = 10
 # Errors of an accelerometer that its noise density has not: scale, axes, vibration, clock
 # [m/s^2/sqrt(Hz)] (docs/lab/odometry.md, "Starts").
 _ACCEL_ERRORS = 8e-3
@@ -92,6 +94,16 @@ def _preintegration(imu: ImuConfig, config: OdometryConfig) -> Any:
     return params
 
 
+def _optimizer(iterations: int = 10) -> Any:
+    """Parameters of gtsam's Levenberg-Marquardt optimiser."""
+    params = gtsam.LevenbergMarquardtParams()
+    params.setMaxIterations(iterations)
+    params.setRelativeErrorTol(1e-4)
+    # Sigmas range from 1e-5 (bias walks) to metres: too ill-conditioned for Cholesky.
+    params.setLinearSolverType('MULTIFRONTAL_QR')
+    return params
+
+
 class KeyframeGraph:
     """Keyframes since a start; each new one optimises the newest window.
 
@@ -102,13 +114,8 @@ class KeyframeGraph:
                  config: OdometryConfig, *, keep: bool = False) -> None:
         self._R_cam_body, self._config = R_cam_body, config
         self._preintegration = _preintegration(imu, config)
-        params = gtsam.LevenbergMarquardtParams()
-        params.setMaxIterations(10)
-        params.setRelativeErrorTol(1e-4)
-        # Sigmas range from 1e-5 (bias walks) to metres: too ill-conditioned for Cholesky.
-        params.setLinearSolverType('MULTIFRONTAL_QR')
-        self._params = params
-        self._smoother = gtsam.BatchFixedLagSmoother(config.smoothing_lag, params)
+        # Each update is one step of the optimisation, which the next keyframe continues.
+        self._smoother = gtsam.BatchFixedLagSmoother(config.smoothing_lag, _optimizer(1))
         # All factors and states since the start, for the final smoothing.
         self._record = (gtsam.NonlinearFactorGraph(), gtsam.Values()) if keep else None
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -170,7 +177,8 @@ class KeyframeGraph:
                 factors.addPriorVector(key, np.zeros(3), _diagonal([_REST_VELOCITY_SIGMA] * 3))
         # States before a long bridge stay: the first pairs after it correct them, too.
         self._update(factors, values, j, self._seconds + min(
-            interval.duration, _LONGEST_STEP * self._config.smoothing_lag))
+            interval.duration, _LONGEST_STEP * self._config.smoothing_lag),
+            _START_STEPS if gate == math.inf else 1)
         return innovation
 
     def scale_sigma(self) -> float:
@@ -242,7 +250,7 @@ class KeyframeGraph:
         for loop in loops:
             graph.add(self._pair_factor(*loop, robust=True))
         return graph, gtsam.LevenbergMarquardtOptimizer(
-            _compact(graph), values, self._params).optimize()
+            _compact(graph), values, _optimizer()).optimize()
 
     def _misfit(self, loop: Loop, values: Any, marginals: Any = None) -> float:
         """Chi squared of a loop by its bound; `marginals`: of a path without it."""
@@ -271,7 +279,7 @@ class KeyframeGraph:
         assert self._record is not None
         factors = _compact(self._record[0])
         values = gtsam.LevenbergMarquardtOptimizer(
-            factors, self._record[1], self._params).optimize()
+            factors, self._record[1], _optimizer()).optimize()
         return values, gtsam.Marginals(factors, values)
 
     def _preintegrated(self, interval: ImuInterval) -> Any:
@@ -367,12 +375,15 @@ class KeyframeGraph:
 
         return gtsam.CustomFactor(_diagonal([sigma] * 3), [X(i), X(j), L(0)], error)
 
-    def _update(self, factors: Any, values: Any, newest: int, seconds: float) -> None:
+    def _update(self, factors: Any, values: Any, newest: int, seconds: float,
+                steps: int = 1) -> None:
         """Add the newest keyframe, at `seconds` in the window; after a failure none is added."""
         with _solving():
             # The camera on the body stays in the window.
             self._smoother.update(factors, values,
                                   dict.fromkeys([*values.keys(), L(0)], seconds))
+            for _ in range(steps - 1):
+                self._smoother.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), {})
             self._read(newest)
         self._count, self._seconds = newest + 1, seconds   # keyframes; time of the newest
         if self._record is not None:
