@@ -70,7 +70,7 @@ def on_recording(path: Path, seconds: float) -> Iterator[RecordedPart]:
     estimator, states, feed = _run(recording)
     paths = estimator.smoothed_paths()
     rows = row_trajectory(paths, Base(), Parameters.from_mapping(feed.values),
-                          [sample for _, sample in feed.samples])
+                          [sample for _, sample in feed.samples]) if paths else None
     yield _metrics(path.name, 0.0, recording, estimator, states, feed, rows)
     first_ns = recording.arrivals[0].stamp_ns
     for k in range(int(recording.seconds / seconds)):
@@ -89,11 +89,12 @@ def _run(recording: Recording) -> tuple[OdometryEstimator, list[Odometry], Feed]
 
 
 def _metrics(name: str, begin: float, recording: Recording, estimator: OdometryEstimator,
-             states: Sequence[Odometry], feed: Feed, rows: RowTrajectory) -> RecordedPart:
+             states: Sequence[Odometry], feed: Feed, rows: RowTrajectory | None) -> RecordedPart:
+    """`rows`: of the whole recording; None if it does not start: nothing to compare with."""
     with_direction = [pair.reference_ns for _, pair in feed.pairs if pair.has_direction]
     start = claimed = speed = scale = end = beyond = step = math.nan
-    states = [state for state in states if rows.covers(state.imu_ns)]
-    if len(states) > 3:
+    states = [state for state in states if rows is not None and rows.covers(state.imu_ns)]
+    if rows is not None and len(states) > 3:
         truth = _true_states(rows, feed)
         first, numbers = states[0], np.searchsorted(truth.stamps_ns, [
             state.imu_ns for state in states])
