@@ -104,10 +104,10 @@ MOST_LOG_SIGMA = 1.0
 # Of matches within the threshold, half have implausible depths by chance: inliers must exceed the
 # others by this many sigmas of that.
 SIGN_SIGMAS = 3.0
-# Log-likelihood that all matches may gain by a free rotation. Three unknowns gain above 10 in one
-# of 5000 pairs if residuals are independent; those of neighbours are similar (blur, stamps), which
-# on recordings is as a fifth of the matches (docs/estimator.md).
-CONTRADICTION = 50.0
+# Log-likelihood that all matches may gain by a free rotation. Three unknowns gain above 13 in one
+# of 100 000 pairs if residuals are independent; those of neighbours are similar (blur, stamps), as
+# if a fifth of the matches were (docs/estimator.md).
+CONTRADICTION = 65.0
 # Points lie on a line if their root mean square distance from it is below this many thresholds.
 DEGENERATE_THRESHOLDS = 2.0
 
