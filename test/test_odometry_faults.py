@@ -305,7 +305,7 @@ def own_node(ros_domain_id: int) -> Iterator[OdometryNode]:
 
 
 def test_the_newest_state_is_published_before_pairs_are_used(own_node, monkeypatch):
-    """A pair takes the graph some 20 ms, which no state waits for."""
+    """A pair takes the graph some 8 ms, which no state waits for."""
     calls: list[str] = []
     monkeypatch.setattr(own_node._estimator, 'take', lambda most: calls.append('pair') or [])
     monkeypatch.setattr(own_node._continuous, 'at', lambda imu_ns: calls.append('state'))
