@@ -31,7 +31,7 @@ from rs_relpose_ros.odometry.graph import (
     Step,
     VELOCITY,
 )
-from rs_relpose_ros.odometry.pair import KeyframePair
+from rs_relpose_ros.odometry.pair import AXES, KeyframePair
 from rs_relpose_ros.odometry.states import (
     Base,
     Odometry,
@@ -366,7 +366,7 @@ class OdometryEstimator:
         self._offset_ns = pair.stamp_ns - pair.current_ns
         # Pairs that are wrong together, as of a moving object, do not disprove axes.
         proven = self._run is not None and self._run.confirmed >= _PROVEN
-        if pair.contradiction and not (proven and pair.contradicts_axes):
+        if pair.contradiction and not (proven and pair.contradiction.startswith(AXES)):
             self._end(pair.contradiction, pair.current_ns)
             self._change(OdometryState.LOST, pair.contradiction, pair.current_ns)
             self.counts['calibration contradicted'] += 1

@@ -27,6 +27,8 @@ from rs_relpose_ros.pipeline.pair import PairResult
 # Difference of a velocity from the mean one, in units of it, from which its information does not
 # hold: it is linearised at the estimated velocity.
 _FAR_VELOCITY = 1.5
+# Begin of a finding on the axes of the accelerometer.
+AXES = f'accel_axes {FindingState.SUSPECT.value}:'
 # Interval that no pair reaches [ns].
 _LONGEST_NS = 100_000_000_000
 
@@ -67,11 +69,6 @@ class KeyframePair:
                    status.frame_id, status['status'], status.images(), status['baseline_m'],
                    status['baseline_log_sigma'], status['gyro_bias_rad_s'],
                    _contradiction(status['health'], status['health_findings']))
-
-    @property
-    def contradicts_axes(self) -> bool:
-        """Whether the finding is about the axes of the accelerometer."""
-        return self.contradiction.startswith(_AXES)
 
     def later(self, delay_ns: int) -> KeyframePair:
         """The same for rows that are read `delay_ns` later."""
@@ -115,16 +112,13 @@ class KeyframePair:
         return self.images is not None and bool(np.isfinite(self.images.t).all())
 
 
-_AXES = f'accel_axes {FindingState.SUSPECT.value}:'
-
-
 def _contradiction(state: str, findings: str) -> str:
     """The finding that ends a path: a parameter is wrong, or the accelerometer is contradicted.
 
     Pairs continue without the accelerometer, but a path has no other source of scale.
     """
     for finding in findings.split('; '):
-        if finding.startswith(_AXES) or \
+        if finding.startswith(AXES) or \
                 finding.partition(' ')[2].startswith(f'{FindingState.WRONG.value}:'):
             return finding
     return 'the calibration is wrong' if state == FindingState.WRONG.value else ''
