@@ -187,7 +187,7 @@ class OdometryConfig(Settings):
     accel_bias_walk: float = setting(
         1e-3, 'random walk of the accelerometer bias', 'm/s^3/sqrt(Hz)', low=1e-9, high=1.0)
     pure_rotation_motion: float = setting(
-        0.02, 'largest displacement of a pair without visible translation, 1 sigma per axis: the '
+        0.005, 'largest displacement of a pair without visible translation, 1 sigma per axis: the '
         'noise of a match times the distance of the scene', 'm', low=1e-3, high=1e3)
 
     def __post_init__(self) -> None:
