@@ -328,22 +328,3 @@ def test_noise_density_of_a_moving_gyro():
     swing = np.sin(2.0 * np.pi * np.outer(times, [1.0, 0.7, 1.3]))
     rates = swing + 3e-4 * math.sqrt(200.0) * rng.standard_normal((2000, 3))
     assert noise_density(times, rates) == pytest.approx(3e-4, rel=0.1)
-
-
-def test_table_of_the_benchmark(tmp_path):
-    good = benchmark.Found(0.1, 0.2, True)
-    names = [name for name, *_ in benchmark.QUANTITIES]
-    run = benchmark.CalibrationRun(**dict.fromkeys(names, good) | {
-        'focal': benchmark.Found(math.nan, math.nan, False)}, **dict.fromkeys(
-            ('seed', 'axis_map', 'readout_time', 'time_offset', 'rotation_rate', 'speed',
-             'gyro_rate', 'rotation_error'), 0), axis_map_right=True, observable=True,
-        shutter='rolling')
-    off = dataclasses.replace(run, seed=1, readout=benchmark.Found(-0.6, 0.2, True),
-                              axis_map_right=False)
-    text = benchmark.write_tracks_report(tmp_path, [run, off])
-    row = next(line for line in text.splitlines() if line.lstrip('| ').startswith('read'))
-    # Within the limit, within 1 sigma and within 2 sigma [%].
-    assert [cell.strip() for cell in row.split('|')[-4:-1]] == ['50.0', '50.0', '50.0']
-    assert 'Axis map right in 1 of the 2 runs' in text
-    assert 'focal length' not in text
-    assert (tmp_path / 'calibration_runs.csv').read_text().count('\n') == 3

@@ -2,8 +2,6 @@
 
 from dataclasses import replace
 import json
-import re
-import shutil
 
 from conftest import rows_of
 import cv2
@@ -12,18 +10,14 @@ import pytest
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_lab.experiments import paper, penncosyvio
+from rs_relpose_lab.experiments import penncosyvio
 from rs_relpose_lab.experiments import penncosyvio_files as files
 from rs_relpose_lab.experiments.methods import run_method
 from rs_relpose_lab.experiments.paper import EXACT, paper_problem, SWEEPS
 from rs_relpose_lab.experiments.penncosyvio import Pair, PennCosyvioRun
 from rs_relpose_lab.experiments.problems import BASELINES
-from rs_relpose_lab.experiments.scoring import NO_POSE, PoseError
 from rs_relpose_ros.cli import main
-from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.result import Status
-from rs_relpose_ros.geometry.timing import ImageClock
-from rs_relpose_ros.imu.buffer import ImuSample
 
 
 def evaluate(folder, experiment, *arguments):
@@ -58,48 +52,6 @@ def test_exact_data_beat_the_papers_claim(method, direction):
             method, paper_problem(sweep.cell(level, EXACT), direction, 0, trial), trial)
         assert status is Status.OK
         assert error.rotation < 0.001
-
-
-@pytest.mark.parametrize(('name', 'field', 'most'), [
-    ('linear_velocity', 'speed', 10.0), ('angular_velocity', 'rate', 3.0),
-    ('pixel_noise', 'pixel_noise', 1.0), ('gravity_noise', 'gravity_noise', 1.0),
-    ('gyro_noise', 'gyro_noise', 3.0)])
-def test_ranges_are_those_of_the_paper(name, field, most):
-    cells = [SWEEPS[name].cell(level, EXACT) for level in SWEEPS[name].levels]
-    assert (getattr(cells[0], field), getattr(cells[-1], field)) == (0.0, most)
-    for cell in cells:
-        assert (cell.speed, cell.rate) == {
-            'linear_velocity': (cell.speed, 0.0), 'angular_velocity': (0.0, cell.rate),
-        }.get(name, (1.0, 1.0))
-    base = replace(EXACT, outliers=0.3)
-    assert SWEEPS[name].cell(0.2, base).outliers == 0.3
-
-
-def test_processes_do_not_change_the_result():
-    run = paper.PaperRun(('pixel_noise',), ('sideways',), ('auto', 'uniform_11pt'), trials=1,
-                         seed=0)
-    calls = []
-    assert paper.run_paper(run, jobs=2, on_problem=lambda: calls.append(1)) == paper.run_paper(run)
-    assert len(calls) == len(run.tasks()) == 6
-
-
-def boxes_of(errors):
-    """Boxes of one method; None is an estimate without a pose."""
-    return paper.by_case([
-        paper.Record('pixel_noise', 'forward', '0.2', 'auto', trial,
-                     Status.NO_CONSENSUS if error is None else Status.OK,
-                     NO_POSE if error is None else PoseError(error, 10.0 * error))
-        for trial, error in enumerate(errors)])
-
-
-def test_table_counts_what_has_no_pose_and_leaves_it_out():
-    titles = {('pixel_noise', 'forward'): 'title'}
-    text = paper.tables(boxes_of([0.1, 0.2, None, 0.3]), titles, 'px')
-    rows = [line for line in text.splitlines() if line.startswith('| 0.2')]
-    # Median and 90th percentile by hand.
-    assert rows == ['| 0.2 | 0.200 (0.280) |', '| 0.2 | 2.00 (2.80) |']
-    assert text.startswith('## title\n') and 'no pose: auto, 1 of 4\n' in text
-    assert '| 0.2 |    - |' in paper.tables(boxes_of([None]), titles, 'px')
 
 
 def test_command_writes_tables_pictures_and_its_arguments(tmp_path, capsys):
@@ -165,85 +117,6 @@ def made(tmp_path_factory):
     cells[0, :] = [SMALL] * 7
     savemat(folder / 'tools/intrinsic_calibration/cc.mat', {'cc': cells})
     return folder
-
-
-def by_the_toolbox(row, column):
-    """Ray of a pixel (from 1) by OCamCalib's cam2world, rotated to z forward."""
-    A = np.array([[C2['c'], C2['d']], [C2['e'], 1.0]])
-    x, y = np.linalg.solve(A, [row - C2['xc'], column - C2['yc']])
-    ray = np.array([y, x, -np.polyval(C2['ss'][::-1], np.hypot(x, y))])
-    return ray / np.linalg.norm(ray)
-
-
-def gopro():
-    return files.OmnidirectionalCamera(
-        width=1920, height=1080, fx=877.0, fy=877.0, cx=C2['yc'] - 1, cy=C2['xc'] - 1,
-        readout_time=READOUT, polynomial=tuple(C2['ss']), affine=(C2['c'], C2['d'], C2['e']))
-
-
-def test_camera_agrees_with_the_toolbox_and_with_itself():
-    camera = gopro()
-    pixels = np.stack(np.meshgrid(np.linspace(0, 1919, 13), np.linspace(0, 1079, 9)), -1)
-    pixels = pixels.reshape(-1, 2)
-    rays = camera.unproject(pixels)
-    expected = [by_the_toolbox(v + 1, u + 1) for u, v in pixels]
-    assert rays == pytest.approx(np.array(expected), abs=1e-12)
-    assert camera.project(3.0 * rays) == pytest.approx(pixels, abs=1e-8)
-    _, jacobian = camera.unproject_with_jacobian(pixels)
-    for axis in range(2):
-        step = 1e-3 * np.eye(2)[axis]
-        slope = (camera.unproject(pixels + step) - camera.unproject(pixels - step)) / 2e-3
-        assert jacobian[:, :, axis] == pytest.approx(slope, abs=1e-9)
-    assert camera.project([[0.0, 0.0, 2.0]])[0] == pytest.approx([camera.cx, camera.cy])
-    assert np.isnan(camera.project([[0.1, 0.0, -1.0], [1.0, 0.0, 0.0]])).all()
-    assert np.isnan(camera.unproject([[1e5, 0.0]])).all()
-
-
-@pytest.mark.parametrize(('name', 'text', 'message'), [
-    ('data/ground_truth/as/pose.txt', ''.join(
-        f'{k} 1 0 0 0  0 1 0 0  0 0 {z} 0\n' for k, z in enumerate([1, 1, 2, 1])),
-     'line 3: columns 2 to 13 must be a rotation'),
-    ('tools/intrinsic_calibration/cc.mat', 'no mat', 'does not hold the OCamCalib model of C2'),
-])
-def test_errors_of_a_folder_are_named(made, tmp_path, name, text, message):
-    folder = tmp_path / 'copy'
-    shutil.copytree(made, folder)
-    (folder / name).write_text(text)
-    with pytest.raises(InputError, match=re.escape(message)):
-        files.read_camera(folder, READOUT, 'first')
-        penncosyvio.SimulatedSequence(folder, 'as', PennCosyvioRun(('as',), ('auto',)))
-
-
-def test_pairs_are_the_papers():
-    """Its table 1 has 67, 66, 72, 43 and 86, 38, 39, 51: frames are lost at its borders."""
-    pairs = PennCosyvioRun(('as', 'af'), ()).pairs()
-    count = {key: sum((p.sequence, p.stretch) == key for p in pairs)
-             for key in ((name, k) for name in penncosyvio.STRETCHES for k in range(1, 5))}
-    assert list(count.values()) == [67, 67, 73, 43, 85, 37, 37, 49]
-    assert pairs[0] == Pair('as', 1, 206, 236)
-    assert all(p.second - p.first == 30 for p in pairs)
-
-
-def test_mean_of_the_imu_is_taken_about_the_middle_row():
-    """At a constant rate the means are exact, at the reference row."""
-    w, g0 = np.array([0.4, -0.3, 0.2]), np.array([0.0, 9.8, 1.0])
-    times = 0.9 + 0.001 * np.arange(260)
-    # Free fall in the rotating camera; the accelerometer measures the opposite. Samples more than
-    # 50 ms from the middle row do not count.
-    down = Rotation.from_rotvec(np.outer(times - 1.0, w)).inv().apply(g0)
-    near = np.abs(times - 1.0 - 0.5 * READOUT) < 0.051
-
-    def mean(shake):
-        samples = [ImuSample(round(t * 1e9), tuple(w + shake * (-1.0)**k), tuple(-g))
-                   if inside else ImuSample(round(t * 1e9), (9.0, 9.0, 9.0), (1.0, 0.0, 0.0))
-                   for k, (t, g, inside) in enumerate(zip(times, down, near, strict=True))]
-        return penncosyvio.PairImu(samples, ImageClock(gopro())).mean(1_000_000_000)
-
-    still = mean(0.0)
-    assert still.motion.angular_velocity == pytest.approx(w)
-    assert still.motion.gravity == pytest.approx(g0 / np.linalg.norm(g0), abs=5e-4)
-    assert still.rate_sigma == pytest.approx(0.0, abs=1e-12)
-    assert mean(0.1).rate_sigma == pytest.approx(0.1, rel=0.01)
 
 
 def test_simulated_points_without_noise_are_exact(made):

@@ -10,11 +10,9 @@ from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.experiments import oracle, problems
-from rs_relpose_lab.experiments.accuracy import OracleCache
 from rs_relpose_lab.experiments.oracle import Objective, oracle_estimate, start_at
-from rs_relpose_lab.experiments.paper import EXACT, paper_problem
 from rs_relpose_lab.experiments.problems import Cell, CELLS, FOCAL, LINE_DELAY, make_problem, VIEW
-from rs_relpose_lab.experiments.scoring import pose_error, PoseError
+from rs_relpose_lab.experiments.scoring import pose_error
 from rs_relpose_lab.simulation import rows
 from rs_relpose_lab.simulation.rows import observe, uniform_motion
 
@@ -65,55 +63,6 @@ def test_a_point_is_in_the_row_that_a_scan_of_all_rows_finds(w, v, reference_row
             assert found == pytest.approx(expected, abs=1e-3)
             compared += 1
     assert compared > 20
-
-
-@pytest.mark.parametrize(('point', 'w', 'visible'), [
-    ([0.0, 0.0, 10.0], [0.0] * 3, True), ([0.0, 0.0, -10.0], [0.0] * 3, False),
-    ([0.0, 0.0, 0.05], [0.0] * 3, False), ([100.0, 0.0, 10.0], [0.0] * 3, False),
-    ([0.0, 50.0, 10.0], [0.0] * 3, False), ([0.0, 1.0, 10.0], [6.0, 0.0, 0.0], True),
-    # The image runs faster than the rows are read: 640 * 60 * 60e-6 > 1.
-    ([0.0, 1.0, 10.0], [60.0, 0.0, 0.0], False)])
-def test_points_outside_of_the_image_or_faster_than_the_rows_are_nan(point, w, visible):
-    observed = observe(np.array([point]), constant(w, [0.0] * 3), VIEW)
-    assert np.isfinite(observed).all() == np.isfinite(observed).any() == visible
-    if point == [0.0, 0.0, 10.0]:
-        assert observed[0] == pytest.approx(CENTRE)
-
-
-@pytest.mark.parametrize('name', CELLS)
-def test_problems_are_those_of_their_cell(name):
-    cell = CELLS[name]
-    problem = make_problem(cell, 6)
-    assert problem.points1.shape == problem.points2.shape == (cell.matches, 2)
-    assert problem.is_outlier.sum() == round(cell.outliers * cell.matches)
-    assert np.linalg.norm(problem.t) == pytest.approx(1.0)
-    assert problem.t[{'forward': 2, 'sideways': 0}[cell.direction]] > 0.8
-    np.testing.assert_allclose(np.abs(problem.w1), cell.rate)
-    np.testing.assert_allclose(problem.w2, -problem.w1)
-    if cell.constant_velocity:
-        np.testing.assert_allclose(problem.R @ problem.v2, problem.v1)
-        np.testing.assert_allclose(np.cross(problem.v1, problem.t), 0.0, atol=1e-12)
-    else:
-        np.testing.assert_allclose(problem.v2, -problem.v1)
-    # The paper's error of gravity: equally large about each axis, opposite in the frames.
-    assert problem.measured_gravity1 @ problem.gravity1 == pytest.approx(
-        np.cos(np.radians(cell.gravity_noise) * np.linalg.norm(
-            np.cross(problem.gravity1, [1, 1, 1]))), abs=1e-3)
-    gravity2 = problem.R.T @ problem.gravity1
-    assert np.cross(problem.gravity1, problem.measured_gravity1) @ np.cross(
-        gravity2, problem.measured_gravity2) < 0.0
-
-
-def test_problems_depend_on_nothing_but_their_numbers():
-    cell = replace(EXACT, pixel_noise=0.5, gyro_noise=0.5, gravity_noise=0.5, outliers=0.3)
-    first, again = (paper_problem(cell, 'forward', 3, 7) for _ in range(2))
-    assert np.array_equal(first.points1, again.points1)
-    assert np.array_equal(first.points2, again.points2)
-    # Another cell has the same cameras, another number other ones.
-    for other, seed, trial in ((cell, 4, 7), (cell, 3, 8), (EXACT, 3, 7),
-                               (replace(cell, speed=7.0, rate=0.0), 3, 7)):
-        assert np.array_equal(first.R, paper_problem(other, 'forward', seed, trial).R) == (
-            (seed, trial) == (3, 7))
 
 
 def objective_of(problem):
@@ -167,24 +116,3 @@ def test_its_covariance_describes_its_errors():
         nees.append(pose_error(best.R, best.t, problem.R, problem.t, best.covariance).nees)
     # The mean of 30 chi-square(5) is 5 +- 0.58.
     assert np.mean(nees) == pytest.approx(5.0, abs=1.8)
-
-
-def test_error_in_sigmas_is_that_of_the_covariance():
-    R, t = np.eye(3), np.array([0.0, 0.0, 1.0])
-    true_R = Rotation.from_rotvec([0.01, 0.0, 0.0]).as_matrix()
-    true_t = np.array([0.0, np.sin(0.02), np.cos(0.02)])
-    covariance = np.diag([0.01, 0.01, 0.0, 0.005, 1.0, 1.0])**2
-    error = pose_error(R, t, true_R, true_t, covariance)
-    assert error.rotation == pytest.approx(np.degrees(0.01))
-    assert error.translation == pytest.approx(np.degrees(0.02))
-    assert error.nees == pytest.approx(2.0**2 + 2.0**2)
-
-
-def test_kept_errors_come_back_for_their_own_cell_only(tmp_path):
-    cache = OracleCache(tmp_path)
-    first, second = (PoseError(0.1 * k, 0.2, 4.0) for k in (1, 2))
-    cache.add(Cell(), 'paper', {3: first})
-    cache.add(Cell(), 'paper', {1: second})
-    assert cache.load(Cell(), 'paper') == {1: second, 3: first}
-    assert cache.load(Cell(), 'gaussian') == {}
-    assert cache.load(Cell(speed=2.0), 'paper') == {}

@@ -18,7 +18,7 @@ from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.bag import write_parameters
 from rs_relpose_lab.simulation.motions import hand_held, Plan
 from rs_relpose_lab.simulation.rows import observe, View
-from rs_relpose_lab.simulation.scene import make_scene, Scene, SCENES, Surface
+from rs_relpose_lab.simulation.scene import Scene, Surface
 from rs_relpose_ros.cli import main as cli
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError
@@ -153,44 +153,6 @@ def test_trajectory_derivatives_are_exact():
         trajectory.poses([100.0])
 
 
-@pytest.mark.parametrize('seed', range(5))
-def test_stretches_are_those_of_their_names(seed):
-    trajectory, lengths = on_wall(seed=seed).trajectory, {}
-    for segment in (segment for segment in trajectory.segments if segment.end <= 6.0):
-        states = trajectory.states(np.linspace(segment.start, segment.end, 50))
-        lengths[segment.kind] = segment.end - segment.start
-        rate = np.degrees(np.linalg.norm(states.angular_velocity, axis=1))
-        moves, speeds_up, rotates_unevenly = (
-            np.ptp(values, axis=0).max()
-            for values in (states.position, states.velocity, states.angular_velocity))
-        if segment.kind in ('still', 'rotate'):
-            assert moves < 1e-12
-            assert rate.max() < 1e-9 if segment.kind == 'still' else (rate**2).mean() > 25.0
-        elif segment.kind == 'constant':
-            assert max(speeds_up, rotates_unevenly) < 1e-9
-            assert np.linalg.norm(states.velocity[0]) > 0.5 and rate.min() > 5.0
-        else:
-            assert speeds_up > 0.02
-    assert lengths['constant'] >= 0.7 and lengths['still'] >= 0.5 and lengths['rotate'] >= 0.5
-
-
-def test_motion_is_hand_held_like_for_every_seed():
-    times = np.linspace(0.0, 6.0, 200)
-    for seed in range(30):
-        states = on_wall(seed=seed).trajectory.states(times)
-        speed = np.linalg.norm(states.velocity, axis=1)
-        moving = speed > 0.5
-        assert moving.mean() > 0.6
-        assert speed.max() < 2.0
-        rate = np.degrees(np.linalg.norm(states.angular_velocity[moving], axis=1))
-        assert 15.0 < np.sqrt((rate**2).mean()) < 60.0
-        # Clear of all surfaces; long walks, too, remain in the scene.
-        assert np.linalg.norm(states.position[:, :2], axis=1).max() < 3.3
-        assert np.abs(states.position[:, 2] - 1.6).max() < 0.2
-    positions, _ = walk(0, 60.0, 0.5).poses(np.linspace(0.0, 60.0, 1000))
-    assert np.linalg.norm(positions[:, :2], axis=1).max() < 4.8
-
-
 def test_imu_noise_and_bias_are_as_configured():
     exact, noisy = (on_wall(seed=1, duration=20.0, **changes) for changes in (NOISE_FREE, {}))
     config = noisy.config
@@ -242,33 +204,6 @@ def test_hidden_and_departed_points_have_no_match(bundled):
     # Points in both images match both ways.
     np.testing.assert_allclose(back, grid[~gone], atol=1e-6)
     assert np.isnan(hall.renderer.project(0.5, [[-50.0, 0.0, 1.6]])).all()
-
-
-@pytest.mark.parametrize('kind', SCENES)
-def test_scenes_have_many_depths_and_no_holes(kind):
-    scene = make_scene(kind, np.random.default_rng(5), 112.0)
-    simulation = simulate(SimulationConfig(width=160, height=120, fx=112.0, seed=5), scene=scene)
-    grid = np.stack(np.meshgrid(np.arange(160.0), np.arange(120.0)), axis=-1).reshape(-1, 2)
-    for index in (0, 60, 120):
-        time = simulation.seconds(simulation.reference_ns(index))
-        world, hits = simulation.renderer.locate(time, grid)
-        assert hits.min() >= 0
-        position, _ = simulation.trajectory.poses([time])
-        near, far = np.percentile(np.linalg.norm(world - position, axis=1), [10, 75])
-        assert 1.5 < near and 1.7 * near < far < 16.0
-        assert len(np.unique(hits)) > 5
-        assert simulation.renderer.render(time).std() > 8.0
-
-
-@pytest.mark.parametrize(('changes', 'message'), [
-    ({'readout_time': -0.01}, 'readout_time'), ({'scene': 'moon'}, 'scene'),
-    ({'plan': 'walk'}, 'plan'), ({'plan': 'fly:1'}, 'plan'), ({'plan': 'walk:nan'}, 'plan'),
-    ({'quat_cam_imu_xyzw': (0.0, 0.0, 0.0, 0.5)}, 'length 1'), ({'fps': 0.0}, 'fps'),
-    # It folds the image.
-    ({'distortion': (-0.9, 0.0, 0.0, 0.0, 0.0)}, 'distortion')])
-def test_impossible_configurations_are_refused(changes, message):
-    with pytest.raises(InputError, match=message):
-        on_wall(**changes)
 
 
 # -- bags ------------------------------------------------------------------------------------

@@ -1,7 +1,6 @@
 """The laboratory's matrix of wrong configurations: tracks, rows, information, results."""
 
 import csv
-from dataclasses import replace
 import json
 
 from conftest import ROOT
@@ -10,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.experiments import trust, trust_rows, trust_runs
-from rs_relpose_lab.experiments.trust_rows import Injected, PLACES, RIGHT, ROWS
-from rs_relpose_lab.experiments.trust_runs import EvaluatedPair, TrackNoise, Verdict
+from rs_relpose_lab.experiments.trust_rows import PLACES, RIGHT, ROWS
+from rs_relpose_lab.experiments.trust_runs import TrackNoise
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
@@ -63,36 +62,6 @@ def test_a_row_changes_something(name, recording):
             or configured.geometry is not trust_rows.AS_IT_IS)
 
 
-@pytest.mark.parametrize('name', ['axes-3deg', 'bias-0.05'])
-def test_the_error_is_the_one_that_was_injected(name, recording):
-    row, right = ROWS[name], recording.configured
-    configured = row.wrong(right, np.random.default_rng(5)).values
-    quantity, error = row.injected(right, np.random.default_rng(5))
-    R = Rotation.from_quat(right.values['quat_cam_imu_xyzw'])
-    if quantity == 'axes':
-        found = (Rotation.from_quat(configured['quat_cam_imu_xyzw']) * R.inv()).as_rotvec()
-        assert np.degrees(np.linalg.norm(found)) == pytest.approx(3.0)
-    else:
-        found = R.apply(np.subtract(configured['gyro_bias'], right.values['gyro_bias']))
-        assert np.linalg.norm(found) == pytest.approx(0.05)
-    np.testing.assert_allclose(error, found, atol=1e-6)
-
-
-@pytest.mark.parametrize('geometry', [trust_rows.RECTIFIED, trust_rows.UPSIDE_DOWN,
-                                      trust_rows.FLIPPED, trust_rows.MIRRORED])
-def test_image_and_points_are_mapped_alike(geometry):
-    camera = RollingShutterCamera(width=640, height=480, fx=450.0, fy=450.0, cx=325.9, cy=234.7,
-                                  distortion=(-0.2, 0.05, 0.001, 0.0), readout_time=0.02)
-    u, v = np.meshgrid(np.arange(640), np.arange(480))
-    for point in ((100.0, 90.0), (500.0, 400.0)):
-        blob = np.exp(-((u - point[0])**2 + (v - point[1])**2) / 50.0)
-        shown = geometry.image((255 * blob).astype(np.uint8), camera).astype(float)
-        centre = [(shown * u).sum() / shown.sum(), (shown * v).sum() / shown.sum()]
-        expected = geometry.points(np.array([point]), camera)[0]
-        assert np.linalg.norm(expected - point) > 5.0
-        np.testing.assert_allclose(centre, expected, atol=0.2)
-
-
 # -- information: the oracle of what the motion of a recording determines ------------------------
 
 CAMERA = RollingShutterCamera(width=640, height=480, fx=450.0, fy=450.0, cx=319.5, cy=239.5,
@@ -136,62 +105,7 @@ def test_information_of_a_rotation(quantity, axis, rates, low, high):
     assert low <= sigma_of(quantity, PAN, *rates)[axis] < high
 
 
-def test_the_readout_is_determined_by_rotation_meanwhile():
-    assert sigma_of('readout_time', PAN, *STEADY)[0] < 0.6 * sigma_of('readout_time', PAN)[0]
-
-
-@pytest.mark.parametrize(('injected', 'expected'), [
-    (('time_offset', 0.01), [False, False, True, False]),
-    (('time_offset', 0.02), [True, True, True, False]),
-    # Rotation about one axis does not determine the others.
-    (None, [False, False, True, False])])
-def test_informative_seconds(injected, expected):
-    information, offset = np.zeros((4, 11, 11)), PLACES['time_offset'].start
-    # Sigmas of 3 ms, then of 2.1 ms and 1.7 ms together; at last the camera rests.
-    information[:3, offset, offset] = 1.0 / 0.003**2
-    rotations = np.stack([np.diag(values) for values in (
-        [400.0, 0.0, 0.0], [400.0, 0.0, 0.0], [0.0, 30.0, 0.0], [0.0, 0.0, 0.0])])
-    motion = trust_rows.InformativeMotion(information, rotations)
-    assert motion.seconds(injected and Injected(
-        injected[0], np.array([injected[1]]))).tolist() == expected
-
-
 # -- results of a bag ----------------------------------------------------------------------------
-
-def pair_at(at, state='unknown', named=(), chi=1.0):
-    return EvaluatedPair(at, 'OK', Verdict(state, named), 0.01, chi_direction=chi,
-                         chi_rotation=chi, direction_error=1.0, rotation_error=0.1,
-                         direction_sigma=1.0)
-
-
-def row_of(recording, pairs, informative=(True,) * 8):
-    first = recording.arrivals[0]
-    last = first._replace(stamp_ns=first.stamp_ns + len(informative) * 10**9)
-    return trust.bag_row(replace(recording, arrivals=[first, last]), 'imu-late-30ms',
-                         np.array(informative), pairs)
-
-
-@pytest.mark.parametrize(('named', 'right'), [
-    (('time_offset',), True), (('axes', 'time_offset'), True), (('axes',), False), ((), False),
-    (('axes', 'gyro_bias', 'time_offset'), False)])
-def test_a_flag_counts_with_the_right_parameter_among_two(named, right, recording):
-    row = row_of(recording, [pair_at(1.5), pair_at(3.5, 'suspect', named)])
-    assert row.qualifies and row.flagged
-    assert row.flagged_after == pytest.approx(3.5)
-    assert row.named_right is right
-
-
-def test_seconds_without_information_and_flagged_poses_do_not_count(recording):
-    still = row_of(recording, [pair_at(6.5, 'wrong', ('time_offset',))],
-                   (True, False, False) + (True,) * 5)
-    assert still.flagged and still.flagged_after == pytest.approx(4.5)
-    row = row_of(recording, [
-        pair_at(0.5, chi=20.0), pair_at(1.5, chi=12.0), pair_at(2.0), pair_at(2.5, 'ok', chi=15.0),
-        pair_at(3.0, 'suspect', ('time_offset',), chi=99.0)], (True,) * 4 + (False,) * 4)
-    assert row.informative == 4.0 and not row.qualifies
-    assert (row.poses, row.direction_beyond, row.rotation_beyond) == (3, 2, 1)
-    assert (row.all_poses, row.all_direction_beyond, row.all_rotation_beyond) == (4, 3, 2)
-
 
 @pytest.mark.recordings
 def test_a_phone_that_rotates_on_the_spot_has_no_finding(converted):
