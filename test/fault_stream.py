@@ -78,7 +78,7 @@ class Stream:
         self.good: list[tuple[int, int]] = []
         self._faults = faults
         self._bag_first_ns = stamp_of(first)
-        self._later_ns = self._first_later_ns = first_stamp_ns - stamp_of(first)
+        self._later_ns = first_stamp_ns - stamp_of(first)
         self._phases = [self._phase(messages, fault) for fault in faults]
 
     def _phase(self, messages: list[tuple[int, Any]], fault: Fault) -> list[Sent]:
@@ -95,10 +95,6 @@ class Stream:
             sent += [Sent(time_ns + round(delay * SECOND), taken_ns, stamp_of(out), item)
                      for delay, item in (fault.edit(out, seconds) if faulty else [(0.0, out)])]
         return sorted(sent, key=lambda item: item.time_ns)
-
-    def rewind(self) -> None:
-        """The next phase has the first stamps again."""
-        self._later_ns = self._first_later_ns
 
     def play(self, publish: Callable[[int, Any], object], results: list[Any],
              phases: range | None = None, enough: int = 2) -> None:
@@ -165,10 +161,10 @@ def publish_in_time(messages: Iterable[tuple[Any, int, Any]]) -> None:
         publisher.publish(message)
 
 
-def drivers(graph: Graph, *kinds: type, namespace: str = '',
+def drivers(graph: Graph, *kinds: type,
             best_effort: Collection[type] = ()) -> dict[type, Any]:
     """Subscribed publishers of a camera and an IMU by type of message, all by default."""
-    return {kind: graph.publisher(kind, namespace + topic, kind in best_effort)
+    return {kind: graph.publisher(kind, topic, kind in best_effort)
             for kind, topic in TOPIC_OF.items() if kind in (kinds or TOPIC_OF)}
 
 

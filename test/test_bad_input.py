@@ -162,16 +162,6 @@ def test_points_on_a_line_in_space_give_no_pose(seed, config, gravity):
     assert not scene_pose(scene.points1, scene.points2, config | CONFIGURED, scene, gravity)
 
 
-@settings(max_examples=60)
-@given(hnp.arrays(np.float64, hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=20),
-                  elements=any_float | strange), seeds, st.booleans())
-def test_arrays_of_any_shape_and_value_as_matches(points, seed, first):
-    other = random_points(seed, 20)
-    pose = estimate(points, other) if first else estimate(other, points)
-    if np.shape(points) != (20, 2):
-        assert pose is None
-
-
 @settings(max_examples=100)
 @given(st.sampled_from(['nan', 'inf', '-inf', 'huge', 'far']), st.integers(0, 99), seeds, configs)
 def test_one_bad_value_among_good_matches_is_refused_or_no_inlier(kind, place, seed, config):
@@ -197,84 +187,40 @@ def scene_pose(points1, points2, config, scene=GOOD, gravity=True, **changes):
     return estimate(points1, points2, config=config, camera=SCENE_CAMERA, **motions, **changes)
 
 
-@settings(max_examples=100)
-@given(st.sampled_from(['width', 'height', 'fx', 'fy', 'cx', 'cy', 'readout_time']),
-       any_float | strange)
-@example('readout_time', -0.03)
-@example('fx', 1e-300)
-@example('fy', 1e300)
-@example('width', float('nan'))
-@example('height', float('inf'))
-def test_any_number_in_the_camera(name, value):
-    points = random_points(0, 30)
-    pose = estimate(points, random_points(1, 30), camera={name: value})
-    if not np.isfinite(value) or (value < 0.0 and not name.startswith('c')):
-        assert pose is None
-
-
-@settings(max_examples=100)
-@given(st.sampled_from(['plumb_bob', 'rational_polynomial', 'equidistant', 'fov']),
-       st.lists(finite | strange | st.floats(-2.0, 2.0), max_size=13), seeds)
-def test_any_distortion(model, coefficients, seed):
-    pose = estimate(random_points(seed, 30), random_points(seed + 1, 30),
-                    camera={'distortion_model': model, 'distortion': tuple(coefficients)})
-    assert not pose
-
-
 vectors = hnp.arrays(np.float64, 3, elements=any_float | strange)
+matrices = hnp.arrays(np.float64, (3, 3), elements=any_float | strange) | st.sampled_from(
+    [np.eye(3), np.zeros((3, 3)), np.full((3, 3), 1e154), 1e300 * np.eye(3), np.eye(2)])
+motions = st.fixed_dictionaries({'angular_velocity': vectors, 'gravity': st.none() | vectors})
+# Of each argument any value, of random matches: a refusal, or no pose.
+ANY = {
+    'points1': hnp.arrays(np.float64, hnp.array_shapes(min_dims=0, max_dims=3, min_side=0,
+                                                       max_side=30), elements=any_float | strange),
+    'camera': st.dictionaries(st.sampled_from(
+        ['width', 'height', 'fx', 'fy', 'cx', 'cy', 'readout_time']), any_float | strange,
+        min_size=1, max_size=1) | st.fixed_dictionaries({
+            'distortion_model': st.sampled_from([
+                'plumb_bob', 'rational_polynomial', 'equidistant', 'fov']),
+            'distortion': st.lists(finite | strange | st.floats(-2.0, 2.0),
+                                   max_size=13).map(tuple)}),
+    'motion2': motions | st.sampled_from([
+        {'angular_velocity': np.full(3, size)} for size in (1e-300, 1e6, 1e300)]),
+    'relative_rotation': matrices, 'relative_rotation_covariance': matrices,
+    'interval': any_float | strange,
+    'config': st.dictionaries(st.sampled_from([
+        'threshold', 'pixel_sigma', 'gravity_sigma', 'gyro_sigma', 'confidence', 'time_limit',
+        'min_inliers', 'min_parallax', 'max_translation_sigma']),
+        any_float | st.integers(-10**20, 10**20) | st.text(max_size=3) | st.none(), max_size=2)}
+USUAL = {'relative_rotation': np.eye(3), 'relative_rotation_covariance': 1e-4 * np.eye(3)}
 
 
-@settings(max_examples=100)
-@given(vectors, st.none() | vectors, seeds, configs)
-@example(np.full(3, 1e300), np.full(3, 1e300), 0, {})
-@example(np.zeros(3), np.full(3, 1e-300), 0, {})
-@example(np.full(3, 1e6), np.array([0.0, -1.0, 0.0]), 0, {})
-def test_any_motion(rate, gravity, seed, config):
-    pose = estimate(random_points(seed, 30), random_points(seed + 1, 30),
-                    motion2={'angular_velocity': rate, 'gravity': gravity}, config=config)
-    assert not pose
-    if not np.isfinite(rate).all():
-        assert pose is None
-
-
-matrices = st.one_of(
-    hnp.arrays(np.float64, (3, 3), elements=any_float | strange),
-    st.sampled_from([np.zeros((3, 3)), -np.eye(3), 2.0 * np.eye(3), np.diag([1.0, 1.0, -1.0]),
-                     np.ones((3, 3)), np.eye(3)[[1, 0, 2]], np.eye(2), np.eye(4), np.eye(3)]))
-
-
-@settings(max_examples=100)
-@given(matrices, matrices, configs)
-@example(np.eye(3), 1e300 * np.eye(3), {})
-@example(np.eye(3), np.zeros((3, 3)), {})
-@example(np.eye(3), np.full((3, 3), 1e154), {})
-def test_a_matrix_that_is_no_rotation_is_refused(rotation, covariance, config):
-    pose = scene_pose(GOOD.points1, GOOD.points2, config, relative_rotation=rotation,
-                      relative_rotation_covariance=covariance)
-    if np.shape(rotation) != (3, 3) or not np.allclose(rotation, np.eye(3)):
-        assert pose is None
-
-
+@pytest.mark.parametrize('name', ANY)
 @settings(max_examples=60)
-@given(any_float | strange, configs)
-def test_any_interval(interval, config):
-    pose = scene_pose(GOOD.points1, GOOD.points2, config, interval=interval)
-    if not (np.isfinite(interval) and interval > 0.0):
-        assert pose is None
-    elif pose and config.get('solver') == 'auto' and config.get('refinement') == 'map':
-        assert scenes.rotation_error(pose.R, GOOD.R) < 0.5
-
-
-@settings(max_examples=100)
-@given(st.sampled_from(['threshold', 'pixel_sigma', 'gravity_sigma', 'gyro_sigma', 'confidence',
-                        'max_iterations', 'time_limit', 'min_inliers', 'min_parallax',
-                        'max_translation_sigma']),
-       any_float | st.integers(-10**20, 10**20) | st.text(max_size=3) | st.none())
-def test_any_setting(name, value):
-    """Legal values give no pose from random matches either."""
-    if name == 'max_iterations' and isinstance(value, int):
-        value = min(value, 300)
-    assert not estimate(random_points(2, 40), random_points(3, 40), config={name: value})
+@given(st.data(), seeds)
+def test_any_value_of_an_argument(name, data, seed):
+    value = data.draw(ANY[name])
+    given_too = USUAL if name.startswith('relative') else {}
+    points = {'points1': random_points(seed, 30), 'points2': random_points(seed + 1, 30)}
+    assert not estimate(**points | given_too | {name: value})
 
 
 @settings(max_examples=60)

@@ -7,7 +7,6 @@ wrong: those of frames during the faults are compared with the truth as well.
 from collections.abc import Iterator
 from pathlib import Path
 import re
-import signal
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,13 +18,12 @@ from fault_stream import BAG_TOPICS, Fault, SECOND, Stream
 from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
 import pytest
-from rosgraph_msgs.msg import Clock
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image, Imu, TimeReference
 from std_srvs.srv import Trigger
 
 from rs_relpose_lab.live.graph import diagnostic_values, Graph
-from rs_relpose_lab.live.processes import node_process, Process, wait_until
+from rs_relpose_lab.live.processes import node_process, wait_until
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.messages.incoming import time_ns
 from rs_relpose_ros.offline.replay import read_truth
@@ -120,55 +118,9 @@ FAULTS = [
 ]
 
 
-class Node:
-    """relpose_node in a namespace, its drivers, and what it publishes."""
-
-    def __init__(self, graph: Graph, name: str) -> None:
-        self.graph, self.name = graph, name
-        self.own = f'/{name}/relpose_node'
-        self.poses = graph.listen(PoseWithCovarianceStamped, f'{self.own}/relative_pose')
-        self.references = graph.listen(TimeReference, f'{self.own}/reference')
-        self.publishers: list[dict[type, Any]] = []
-
-    def process(self, **parameters: Any) -> Process:
-        return node_process(
-            BUNDLED_PARAMETERS, parameters={'image_transport': 'raw', **parameters},
-            remap={'__ns': f'/{self.name}', **{topic: f'/{self.name}{target}'
-                                               for topic, target in BAG_TOPICS.items()}})
-
-    def connect(self) -> None:
-        """Make the drivers' publishers, of both qualities of service."""
-        self.publishers = [
-            faults.drivers(self.graph, namespace=f'/{self.name}', best_effort=kinds)
-            for kinds in ((), faults.TOPIC_OF)]
-
-    def endpoints(self) -> list[set[tuple[int, ...]]]:
-        """Ids of its subscriptions and publishers; those of a killed node remain for 20 s."""
-        node = self.graph.node
-        known = [node.get_subscriptions_info_by_topic(f'/{self.name}{topic}')
-                 for topic in BAG_TOPICS.values()]
-        known += [node.get_publishers_info_by_topic(f'{self.own}/{topic}')
-                  for topic in ('relative_pose', 'reference')]
-        return [{tuple(info.endpoint_gid) for info in of_topic} for of_topic in known]
-
-    def publish(self, phase: int, message: Any) -> None:
-        """From phase to phase with the other quality of service."""
-        self.publishers[phase % 2][type(message)].publish(message)
-
-
 def resident(pid: int) -> float:
     """Memory [MB] of a process."""
     return int(Path(f'/proc/{pid}/statm').read_text().split()[1]) * 4096 / 2**20
-
-
-def values_of(name: str, diagnostics: list[DiagnosticArray]) -> list[dict[str, str]]:
-    return [diagnostic_values(item) for item in diagnostics
-            if item.status[0].name.startswith(f'/{name}/')]
-
-
-@pytest.fixture(scope='module')
-def bag_messages(bundled_bag: Path) -> list[tuple[int, Any]]:
-    return faults.read_messages(bundled_bag, faults.PHASE + 0.1, every=2)
 
 
 @pytest.fixture(scope='module')
@@ -180,39 +132,43 @@ def truth(bundled_bag: Path) -> TrueTrajectory:
 
 
 @pytest.fixture(scope='module')
-def session(module_ros_domain_id: int,
-            bag_messages: list[tuple[int, Any]]) -> Iterator[SimpleNamespace]:
-    """What the node published and wrote while all phases were played; it is still running."""
-    stream = Stream(bag_messages, FAULTS, FIRST_STAMP_NS)
+def session(module_ros_domain_id: int, bundled_bag: Path) -> Iterator[SimpleNamespace]:
+    """What the node published and wrote while all phases were played."""
+    stream = Stream(faults.read_messages(bundled_bag, faults.PHASE + 0.1, every=2), FAULTS,
+                    FIRST_STAMP_NS)
     last = len(FAULTS) - 1
-    with Graph() as graph:
-        node = Node(graph, 'a')
-        # The second one is started with the first, for the last test.
-        with node.process() as process, Node(graph, 'b').process(use_sim_time=True) as looping:
-            diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
-            process.wait_for('ready')
-            node.connect()
-            stream.play(node.publish, node.poses, range(3))
-            memory = resident(process.pid)
-            stream.play(node.publish, node.poses, range(3, last))
-            growth = resident(process.pid) - memory
-            restarted = graph.call(Trigger, f'{node.own}/reset', Trigger.Request())
-            debug_images = graph.listen(Image, f'{node.own}/debug_image')
-            wait_until(lambda: graph.node.count_publishers(f'{node.own}/debug_image'),
-                       'discovery')
-            stream.play(node.publish, node.poses, range(last, last + 1), enough=4)
-            count = len(values_of('a', diagnostics))
-            wait_until(lambda: len(values_of('a', diagnostics)) >= count + 2, 'diagnostics')
-            # On a busy machine debug images hold up what comes with them; it is sent again.
-            wait_until(lambda: min(len(node.poses), len(node.references)) >= int(
-                values_of('a', diagnostics)[-1]['poses']), 'all poses', timeout=30.0)
-            print(process.output)
-            yield SimpleNamespace(
-                graph=graph, node=node, process=process, looping=looping, stream=stream,
-                poses=list(node.poses), references={
-                    faults.stamp_of(item): time_ns(item.time_ref) for item in node.references},
-                values=values_of('a', diagnostics)[-1], output=process.output,
-                memory_growth=growth, restarted=restarted, debug_images=list(debug_images))
+    with Graph() as graph, node_process(BUNDLED_PARAMETERS, remap=BAG_TOPICS, parameters={
+            'image_transport': 'raw'}) as process:
+        poses = graph.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
+        references = graph.listen(TimeReference, '/relpose_node/reference')
+        diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
+        process.wait_for('ready')
+        # From phase to phase with the other quality of service.
+        publishers = [faults.drivers(graph, best_effort=kinds) for kinds in ((), faults.TOPIC_OF)]
+
+        def play(phases: range, enough: int = 2) -> None:
+            stream.play(lambda phase, message: publishers[phase % 2][type(message)].publish(
+                message), poses, phases, enough)
+
+        play(range(3))
+        memory = resident(process.pid)
+        play(range(3, last))
+        growth = resident(process.pid) - memory
+        restarted = graph.call(Trigger, '/relpose_node/reset', Trigger.Request())
+        debug_images = graph.listen(Image, '/relpose_node/debug_image')
+        graph.wait_for_publisher('/relpose_node/debug_image')
+        play(range(last, last + 1), enough=4)
+        count = len(diagnostics)
+        wait_until(lambda: len(diagnostics) >= count + 2, 'diagnostics')
+        # On a busy machine debug images hold up what comes with them; it is sent again.
+        wait_until(lambda: min(len(poses), len(references)) >= int(
+            diagnostic_values(diagnostics[-1])['poses']), 'all poses', timeout=30.0)
+        print(process.output)
+        yield SimpleNamespace(
+            stream=stream, poses=list(poses), references={
+                faults.stamp_of(item): time_ns(item.time_ref) for item in references},
+            values=diagnostic_values(diagnostics[-1]), output=process.output,
+            memory_growth=growth, restarted=restarted, debug_images=list(debug_images))
 
 
 def wrong(message: PoseWithCovarianceStamped, begin_ns: int, end_ns: int,
@@ -345,83 +301,3 @@ def test_debug_images_show_pairs(session):
         assert 1000 < colored < 30_000
         assert image[480:].max() == 255
 
-
-# -- two nodes -------------------------------------------------------------------------------
-
-def poses_with_references(node: Node, known: tuple[int, int]) -> list[tuple[Any, set[int]]]:
-    """Poses since `known`, each with the references of its stamp.
-
-    Stamps repeat themselves, as the bag is played again: a pose may have several references. It
-    has none where the node was killed, or not discovered yet, between the two messages.
-    """
-    begins: dict[int, set[int]] = {}
-    for reference in node.references[known[1]:]:
-        begins.setdefault(faults.stamp_of(reference), set()).add(time_ns(reference.time_ref))
-    return [(message, begins[faults.stamp_of(message)]) for message in node.poses[known[0]:]
-            if faults.stamp_of(message) in begins]
-
-
-def received(node: Node) -> tuple[int, int]:
-    return len(node.poses), len(node.references)
-
-
-def play_until_poses(stream: Stream, nodes: list[Node], clock: Any) -> None:
-    """The same stamps again and again, with the clock of the bag."""
-    def publish(phase: int, message: Any) -> None:
-        for node in nodes:
-            node.publish(phase, message)
-        clock.publish(Clock(clock=message.header.stamp))
-
-    known = [received(node) for node in nodes]
-    for _ in range(8):   # a busy machine omits most frames
-        stream.rewind()
-        stream.play(publish, nodes[-1].poses)
-        if all(poses_with_references(node, before)
-               for node, before in zip(nodes, known, strict=True)):
-            return
-    pytest.fail(f'no poses with references of {[node.name for node in nodes]}')
-
-
-def wrong_poses(node: Node, known: tuple[int, int], stream: Stream,
-                truth: TrueTrajectory) -> list[str]:
-    """Errors of the poses since `known`, each with the one of its references that fits best."""
-    found = []
-    for message, references in poses_with_references(node, known):
-        end_ns = stream.taken_at[faults.stamp_of(message)]
-        found.append(min((wrong(message, stream.taken_at[begin_ns], end_ns, truth)
-                          for begin_ns in references), key=len))
-    return [how for how in found if how]
-
-
-def test_two_nodes_one_is_killed_and_the_other_continues_in_a_looping_bag(
-        session, bag_messages, truth):
-    """Two namespaces; one on the clock of a bag that starts again, one killed and restarted."""
-    graph, killed, looping = session.graph, session.node, Node(session.graph, 'b')
-    diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
-    clock = graph.node.create_publisher(Clock, '/clock', 10)
-    stream = Stream(bag_messages, [Fault('', faults.nothing)], FIRST_STAMP_NS)
-    session.looping.wait_for('ready')
-    looping.connect()
-    wait_until(lambda: all(looping.endpoints()), 'the second node', session.looping)
-    known = received(killed)
-    play_until_poses(stream, [killed, looping], clock)
-    assert session.process.signal(signal.SIGKILL)[0] == -signal.SIGKILL
-    before = killed.endpoints()
-    with killed.process() as restarted:
-        play_until_poses(stream, [looping], clock)
-        restarted.wait_for('ready')
-        wait_until(lambda: all(now - old for now, old in zip(
-            killed.endpoints(), before, strict=True)), 'the restarted node', restarted)
-        play_until_poses(stream, [killed, looping], clock)
-        wait_until(lambda: int(values_of('b', diagnostics)[-1]['clock_jumps']) >= 2,
-                   'jumps of the clock', session.looping, timeout=30.0)
-        wait_until(lambda: values_of('a', diagnostics), 'diagnostics', restarted, timeout=30.0)
-        for process in (restarted, session.looping):
-            assert process.signal(signal.SIGINT)[0] == 0
-            assert 'Traceback' not in process.output
-    for node, before in ((killed, known), (looping, (0, 0))):
-        assert wrong_poses(node, before, stream, truth) == []
-    stamps = {name: [faults.stamp_of(item) for item in diagnostics
-                     if item.status[0].name.startswith(f'/{name}/')][-1] for name in 'ab'}
-    # Stamped by the clock of the graph.
-    assert stamps['b'] < FIRST_STAMP_NS + 10 * SECOND < stamps['a']

@@ -10,6 +10,7 @@ import signal
 import time
 from typing import Any
 
+from builtin_interfaces.msg import Time
 from conftest import BUNDLED_PARAMETERS
 from diagnostic_msgs.msg import DiagnosticArray
 import fault_stream as faults
@@ -19,7 +20,8 @@ import numpy as np
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 from std_srvs.srv import Trigger
@@ -27,6 +29,7 @@ from std_srvs.srv import Trigger
 from rs_relpose_lab.live.graph import diagnostic_values, Graph
 from rs_relpose_lab.live.processes import node_process, Process, wait_until
 from rs_relpose_ros.nodes import relpose_node as node_module
+from rs_relpose_ros.nodes.inputs import LATCHED
 
 # The first node may have to compile the kernels.
 pytestmark = [pytest.mark.live, pytest.mark.timeout(600)]
@@ -266,21 +269,24 @@ def test_a_late_node_gets_a_latched_camera_info_and_says_why_no_image_comes(
         ros_domain_id, bundled_bag):
     messages = faults.read_messages(bundled_bag, 1.5)
     info = next(message for _, message in messages if isinstance(message, CameraInfo))
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     with Graph() as graph:
-        driver = graph.node.create_publisher(CameraInfo, BAG_TOPICS['camera_info'], latched)
+        driver = graph.node.create_publisher(CameraInfo, BAG_TOPICS['camera_info'], LATCHED)
         driver.publish(info)
         graph.node.create_publisher(CompressedImage, BAG_TOPICS['image'] + '/compressed', 1)
         poses = graph.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
-        with node_process(BUNDLED_PARAMETERS, remap=BAG_TOPICS,
-                          parameters={'image_transport': 'raw'}) as node:
+        diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
+        with node_process(BUNDLED_PARAMETERS, remap=BAG_TOPICS, parameters={
+                'image_transport': 'raw', 'use_sim_time': True}) as node:
             node.wait_for('set image_transport:=compressed')
+            graph.publisher(Clock, '/clock').publish(Clock(clock=Time(sec=100)))   # it stands
             faults.play(faults.drivers(graph, Image, Imu), messages)
             wait_until(lambda: len(poses) >= 3, 'three poses', node)
             assert 'no CameraInfo' not in node.output
             # Logged once; nothing is said of the driver's other durability.
             assert node.output.count(f'no image on {BAG_TOPICS["image"]} for 5 s; ') == 1
             assert 'incompatible' not in node.output
+            # Stamped by the clock of the graph, at steady times.
+            assert stamp_of(diagnostics[-1]) == 100 * faults.SECOND
 
 
 def test_a_wrong_parameter_is_detected_and_poses_are_withheld(ros_domain_id, bundled_bag):
