@@ -28,7 +28,7 @@ from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.camera import DISTORTION_MODELS, RollingShutterCamera
-from rs_relpose_ros.geometry.timing import FrameIntervals, NANOSECONDS
+from rs_relpose_ros.geometry.timing import NANOSECONDS
 
 # Coefficients of each camera model that bend a picture visibly.
 MODELS = {'plumb_bob': (-0.2, 0.05, 0.001, -0.001, 0.0),
@@ -159,24 +159,13 @@ def test_noise_does_not_make_the_readout_time_longer():
     assert result.readout_time.value == pytest.approx(0.02, abs=1.5e-3)
 
 
-def test_global_shutter_through_a_fisheye(tmp_path):
-    """All rows of a global shutter have one time: its pixels may be distorted afterwards."""
-    recorded = simulated(13, readout_time=0.0, fps=30.0)
-    pinhole = camera_of(recorded.truth)
-    fisheye = dataclasses.replace(pinhole, distortion_model='equidistant',
-                                  distortion=MODELS['equidistant'])
-    bent = dataclasses.replace(recorded.tracks, points=fisheye.project(
-        pinhole.unproject(recorded.tracks.points)))
-    result = calibrate(bent, recorded.gyro, fisheye)
-    assert_right(result, recorded.truth)
-    assert result.shutter == 'global'
-    assert written(result, fisheye, tmp_path)[1].sensor.readout_time == 0.0
-
-
 @pytest.mark.parametrize(('model', 'coefficients'), [
     ('plumb_bob', (-0.15, 0.0, 0.0, 0.0, 0.0)), ('equidistant', (0.03, 0.0, 0.0, 0.0))])
 def test_lens_is_estimated(model, coefficients, tmp_path):
-    """Of pixels distorted afterwards, as in the test before; all of the lens 10 px off."""
+    """All rows of a global shutter have one time: its pixels may be distorted afterwards.
+
+    All of the lens is 10 px off.
+    """
     recorded = simulated(21, readout_time=0.0, fps=30.0)
     pinhole = camera_of(recorded.truth)
     lens = dataclasses.replace(pinhole, distortion_model=model, distortion=coefficients,
@@ -187,7 +176,9 @@ def test_lens_is_estimated(model, coefficients, tmp_path):
                                 distortion_model=model, distortion=(0.0,) * len(coefficients))
     result = calibrate(bent, recorded.gyro, guess, focal_known=False)
     assert_right(result, recorded.truth)
+    assert result.shutter == 'global'
     _, configured = written(result, guess, tmp_path)
+    assert configured.sensor.readout_time == 0.0
     sigmas = configured.intrinsics
     found = sigmas.of_image(guess.width, guess.height)
     assert found.distortion_model == model
@@ -300,14 +291,6 @@ def test_search_finds_offset_and_rotation(rotation, axes):
     np.testing.assert_allclose(found.R_cam_imu, R, atol=0.03)
 
 
-def test_gyro_path_is_the_rotation_of_an_even_turn():
-    times = np.linspace(0.0, 2.0, 41)
-    path = start.GyroPath.integrated(times, np.tile([0.3, -0.4, 0.5], (41, 1)), [0.1, 0.0, 0.0])
-    at = np.array([0.0, 0.333, 1.7])
-    expected = Rotation.from_rotvec(at[:, None] * [0.2, -0.4, 0.5]).as_matrix()
-    np.testing.assert_allclose(path.at(at), expected, atol=1e-9)
-
-
 @lru_cache(maxsize=1)
 def few_pairs() -> tuple[coplanarity.Problem, coplanarity.Unknowns, Truth]:
     """Pairs, and a calibration a little off the truth."""
@@ -347,21 +330,6 @@ def test_gradient_is_that_of_finite_differences():
                                atol=1e-4 * np.abs(numeric).max())
     # The rotation that an exposure makes is of first order in the turn within it.
     assert analytic[EXPOSURE] == pytest.approx(numeric[EXPOSURE], rel=0.03)
-
-
-def test_steps_of_calibration_and_pairs_together_converge():
-    """Gauss-Newton with the pairs eliminated: each step [sigma] is far shorter than the last."""
-    problem, unknowns, _ = few_pairs()
-    free, lengths = np.arange(GLOBAL) != EXPOSURE, []
-    for _ in range(4):
-        found = evaluate(problem, unknowns)
-        H = (found.reduced.sum(axis=0) + np.diag(problem.prior))[np.ix_(free, free)]
-        gradient = (found.score.sum(axis=0) + problem.prior * unknowns.parameters)[free]
-        step = np.zeros(GLOBAL)
-        step[free] = -np.linalg.solve(H, gradient)
-        lengths.append(math.sqrt(-gradient @ step[free]))
-        unknowns = stepped(unknowns, step, found.local_step(step))
-    assert (np.diff(np.log(lengths)) < math.log(0.3)).all()
 
 
 def test_residual_is_the_distance_in_pixels_to_the_nearest_pair_that_fits():
@@ -509,13 +477,3 @@ def test_jitter_of_stamps_is_not_taken_for_exposure(tmp_path):
     assert abs(result.readout_time.value - truth.readout_time) < 1e-3
     assert 'per_interval' not in written(result, camera_of(truth), tmp_path)[0]
     assert any('not automatic exposure' in line for line in report(result, camera_of(truth)))
-
-
-def test_interval_is_kept_where_frames_are_missing():
-    tracker = FrameIntervals()
-    found = [tracker.add(int(stamp)) for stamp in stamps_of(
-        [30, 30, 90, 30, 45, 60, 100, 100, 30, 120, 30])]
-    assert found[0] is None
-    # 90, 100 and 120 are frames lost; twice 100 is another rate.
-    assert [value / MS for value in found[1:]] == [30, 30, 30, 30, 45, 60, 60, 100, 30, 30, 30]
-    assert tracker.add(START) == 30 * MS        # a stamp that goes back has none

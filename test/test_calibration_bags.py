@@ -22,9 +22,9 @@ from rs_relpose_ros.calibrate.observations import Tracks
 from rs_relpose_ros.calibrate.start import GyroSeries
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.config.files import read_parameters
-from rs_relpose_ros.errors import MissingInputError
+from rs_relpose_ros.config.settings import TrackingConfig
+from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
-from rs_relpose_ros.tracking.features import make_tracker
 
 SMALL = SimulationConfig(
     duration=3.0, width=320, height=240, fx=225.0, edge_samples=1, plan='walk:3',
@@ -57,15 +57,11 @@ def test_bag_gives_a_parameter_file_that_the_node_takes(bag, tmp_path, capsys):
     assert picture is not None and picture.std() > 5.0
 
 
-def test_chosen_tracker_follows_the_points(bag, tmp_path, monkeypatch):
-    made = []
-    monkeypatch.setattr(procedure, 'make_tracker',
-                        lambda config: made.append(config) or make_tracker(config))
-    _, values = calibrated(bag, tmp_path, '--detector', 'sift')
-    assert [config.detector for config in made] == ['sift']
-    assert values['readout_time_s']['value'] == pytest.approx(0.02, abs=4e-3)
-    assert values['time_offset_s']['value'] == pytest.approx(0.03, abs=4e-3)
-    assert values['shutter'] == 'rolling'
+def test_the_chosen_tracker_is_used(bag, tmp_path, monkeypatch, refused):
+    def refuse(config: TrackingConfig) -> None:
+        raise InputError(f'a tracker of {config.detector}')
+    monkeypatch.setattr(procedure, 'make_tracker', refuse)
+    refused('a tracker of sift', 'calibrate', bag, '--out', tmp_path, '--detector', 'sift')
 
 
 def nominal(message: Any) -> None:

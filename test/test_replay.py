@@ -244,34 +244,6 @@ def test_two_runs_are_equal_and_stamps_restrict(replayed, bundled_bag, tmp_path,
     assert frames['not_among_stamps'] == len(stamps) - 30
 
 
-@pytest.mark.parametrize('kind', ['uncalibrated', 'absent'])
-def test_intrinsics_by_parameters_are_as_good(replayed, bundled_bag, tmp_path, capsys, kind):
-    """The first second of the bundled bag, its calibration in the parameters: equal bit by bit."""
-    with open_bag(bundled_bag) as bag, BagWriter(tmp_path / 'bag') as out:
-        topics = bag.find_topics()
-        [info, *_] = [item.message for item in bag.messages([topics.camera_info])]
-        for topic, bag_time_ns, message in bag.messages(
-                [topics.image, topics.imu, topics.camera_info]):
-            if bag_time_ns > START_NS + 10**9:
-                break
-            if topic == topics.camera_info.name:
-                if kind == 'absent':
-                    continue
-                message = build.camera_info(build.rosbags_types, k=(0.0,) * 9,
-                                            stamp_ns=stamp_ns(message.header))
-            out.write(topic, message.__msgtype__, message, bag_time_ns)
-    assert replay(capsys, tmp_path / 'bag', *PARAMETERS, '--no-pictures',
-                  '--set', f'camera_matrix={info.k.tolist()}',
-                  '--set', f'distortion_coefficients={info.d.tolist()}',
-                  '--set', f'distortion_model={info.distortion_model}',
-                  '--out', tmp_path / 'out')[0] == 0
-    first = (tmp_path / 'out' / 'relative_poses.csv').read_text().splitlines()
-    assert len(first) > 3
-    full = (replayed / 'relative_poses.csv').read_text().splitlines()
-    # The last ones end with the bag.
-    assert first[:-1] == full[:len(first) - 1]
-
-
 def test_a_wrong_parameter_is_reported_and_is_exit_code_1(bundled_bag, tmp_path, capsys):
     """The first 1.2 s with a time offset that is 15 ms off, to earlier rows: no row's."""
     stamps, out = tmp_path / 'stamps.txt', tmp_path / 'out'
