@@ -211,12 +211,11 @@ def test_derivatives_are_those_of_the_cost(fitted):
     state, sigma = arguments[2], 0.4
     state = state._replace(bias=np.zeros(3), rotations=np.zeros_like(state.rotations))
     _, normal = cost_of(state, arguments, sigma)
-    tracks = normal.tracks.copy()
-    tracks[..., -1] = 0.0
+    normal.tracks[:, -1] = 0.0
     for k in range(len(normal.gradient)):
         step = np.zeros(len(normal.gradient))
         step[k] = 1e-3 / math.sqrt(normal.hessian[k, k])
-        up, down = (cost_of(adjustment.moved_state(state, sign * step, tracks), arguments,
+        up, down = (cost_of(adjustment.moved_state(state, normal, sign * step), arguments,
                             sigma)[0] for sign in (1.0, -1.0))
         half = 0.25 * (up - down) / step[k]
         # In sigmas of the unknown: far below the noise.
@@ -225,7 +224,8 @@ def test_derivatives_are_those_of_the_cost(fitted):
 
 def independent_residuals(x, tracks, priors, sigma, f0):
     """Residuals of the equations in the docstring of `adjustment`, without its code."""
-    V, N = tracks.used.shape
+    V, N = len(tracks.used), tracks.number
+    observations = np.moveaxis(tracks.observations, 2, -1).reshape(V, -1, adjustment.VALUES)[:, :N]
     t, log_k, b, e = x[:3] / np.linalg.norm(x[:3]), x[3], x[4:7], x[7:10]
     phi = np.vstack([np.zeros(3), x[10:10 + 3 * V - 3].reshape(-1, 3)])
     own = x[10 + 3 * V - 3:].reshape(N, 3)
@@ -233,15 +233,15 @@ def independent_residuals(x, tracks, priors, sigma, f0):
     f = f0 + own[:, 0:1] * np.array([1.0, 0, 0]) + own[:, 1:2] * np.array([0, 1.0, 0])
     f /= np.linalg.norm(f, axis=1)[:, None]
     for v in range(V):
-        s = tracks.times[v][:, None]
-        p = s / T * t + np.exp(log_k) * (tracks.moved[v] + 0.5 * e * (s * s - T * s))
+        measured, to_pixels, s, moved = np.split(observations[v], [3, 9, 10], axis=1)
+        p = s / T * t + np.exp(log_k) * (moved + 0.5 * e * (s * s - T * s))
         R = np.einsum('nij,jk->nik', Rotation.from_rotvec(phi[v] + s * b).as_matrix(),
                       tracks.rotations[v])
         ray = np.einsum('nji,nj->ni', R, f - own[:, 2:] * p)
         ray /= np.linalg.norm(ray, axis=1)[:, None]
-        r = np.einsum('nij,nj->ni', tracks.to_pixels[v], ray - tracks.rays[v]) / sigma
+        r = np.einsum('nij,nj->ni', to_pixels.reshape(-1, 2, 3), ray - measured) / sigma
         q = 0.25 * np.sum(r * r, axis=1, keepdims=True) + 1e-12
-        out.append((r * np.sqrt(np.log1p(q) / q))[tracks.used[v]].ravel())
+        out.append((r * np.sqrt(np.log1p(q) / q))[tracks.used[v].ravel()[:N]].ravel())
     information = np.linalg.cholesky(priors.rotation_information).T
     return np.concatenate([
         *out, information @ phi[1:].ravel(), own[:, 2] / adjustment._INVERSE_DISTANCE_SIGMA,
@@ -263,12 +263,12 @@ def test_optimum_is_that_of_an_independent_fit():
     for _ in range(6):   # far beyond the steps of an estimate
         adjusted = adjust(tracks, priors, adjusted.state, adjusted.sigma, 1e9)
     sigma = math.hypot(adjusted.sigma, adjustment._COMMON_SIGMA)
+    directions, rho = start.tracks[0, :3, :25].T, start.tracks[0, adjustment.INVERSE_DISTANCE, :25]
     begin = np.concatenate([start.t, [start.log_scale], start.bias, start.accelerations[0],
                             start.rotations[1:].ravel(),
-                            np.column_stack([np.zeros((25, 2)),
-                                             start.inverse_distances]).ravel()])
+                            np.column_stack([np.zeros((25, 2)), rho]).ravel()])
     found = least_squares(
-        independent_residuals, begin, args=(tracks, priors, sigma, start.directions),
+        independent_residuals, begin, args=(tracks, priors, sigma, directions),
         x_scale='jac', xtol=1e-12, ftol=1e-12, gtol=1e-12)
     n = len(adjusted.covariance)
     away = np.r_[found.x[:3] / np.linalg.norm(found.x[:3]) - adjusted.state.t,

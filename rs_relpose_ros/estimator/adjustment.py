@@ -15,6 +15,8 @@ rotation R_v between the reference rows (phi_0 = 0), E_v the gyro within the fra
 Each track has a direction f_i (its observation in frame 1 has noise, too) and an inverse distance
 rho_i, which are eliminated (Schur complement). An observation has the robust cost
 ``4 log(1 + r^2 / 4)``, r being its distance from the prediction in units of the noise.
+
+Tracks are evaluated in blocks as in `sampson`; products are by BLAS, blocks too small for threads.
 """
 
 import math
@@ -44,14 +46,27 @@ Flags = NDArray[np.bool_]
 # First unknown: two steps of t in its tangent plane, log k, b, e_0, e_1, ...; then phi of the
 # frames 1, 2, ...
 TANGENT, LOG_SCALE, BIAS, ACCELERATION, MOST_ACCELERATIONS = 0, 2, 3, 6, 3
-# Of a track: two steps of its direction, and its inverse distance.
+# Tracks of a block. First row of an observation in it: unit ray in the axes of its frame's
+# reference row, derivatives of the pixel's two coordinates by the ray [px], s [s], S(s) [m].
+BLOCK = 64
+RAY, TO_PIXELS, TIME, MOVED, VALUES = 0, 3, 9, 10, 13
+# First row of the unknowns of a track: f, two columns across the ray of frame 1, along which it
+# moves, and rho times the length of f.
+DIRECTION, COLUMNS, INVERSE_DISTANCE, TRACK_VALUES = 0, 3, 9, 10
+# Unknowns of a track: two steps of its direction, and its inverse distance.
 _TRACK = 3
+# First row of an observation's derivatives: by its track, residual, by phi of its frame, by the
+# path.
+_RESIDUAL, _PHI, _PATH = 3, 4, 7
+_ROWS = _PATH + ACCELERATION + 3 * MOST_ACCELERATIONS
 # Weak priors keep a track without parallax regular: its inverse distance [1/baselines] is zero
 # within this sigma, and a floor of its normal equations.
 _INVERSE_DISTANCE_SIGMA, _FLOOR = 10.0, 1e-9
 # Largest number of steps, decrease of the cost at which they end, largest step of log k.
 _STEPS, _CONVERGED, _LARGEST_STEP = 5, 0.5, 1.0
 _FIRST_DAMPING = 1e-4
+# Sine squared of the parallax below which the distance of a track starts at a small value.
+_PARALLEL, _FAR = 1e-8, 1e-2
 # Error of a track that its residuals do not show, since it is similar in all frames [px].
 _COMMON_SIGMA = 0.06
 # Mean of ``r^2 / (1 + r^2 / 4)`` for Gaussian noise in two coordinates.
@@ -59,15 +74,58 @@ _GAUSSIAN = 1.109
 
 
 class Tracks(NamedTuple):
-    """Observations of N tracks in V frames; `used` where there is one."""
+    """Observations of N tracks in V frames, in blocks; those not used are zero."""
 
-    rays: Array   # (V, N, 3) unit, in the axes of each frame's reference row
-    to_pixels: Array   # (V, N, 2, 3) derivatives of the pixel by the ray [px]
-    times: Array   # (V, N) s [s]
-    moved: Array   # (V, N, 3) S(s) [m]
-    used: Flags   # (V, N)
+    observations: Array   # (V, blocks, VALUES, BLOCK)
+    used: Flags   # (V, blocks, BLOCK)
     rotations: Array   # (V, 3, 3) R_v by the gyro
     duration: float   # T [s]
+    number: int   # N
+
+
+def no_observations(rotations: Array, duration: float, count: int) -> Tracks:
+    """Room for `count` tracks in V frames of the `rotations` (V, 3, 3)."""
+    shape = len(rotations), -(-count // BLOCK)
+    return Tracks(np.zeros((*shape, VALUES, BLOCK)), np.zeros((*shape, BLOCK), dtype=np.bool_),
+                  rotations, duration, count)
+
+
+@kernel
+def fill_view(tracks: Tracks, v: int, used: Flags, rays: Array, jacobian: Array, times: Array,
+              rotations: Array, row_rotation: Array, interval: float, alpha: Array, beta: Array,
+              acceleration: Array, arm: Array, chord: Array) -> None:
+    """Fill the observations of view v: derotated rays, and the displacement by the IMU.
+
+    `rotations` (N, 3, 3) of the rows, `row_rotation` (3,) from one row to the next [rad].
+    """
+    R, J = tracks.rotations[v], np.empty((3, 2))
+    for i in range(len(rays)):
+        if not used[i]:
+            continue
+        b, k = i // BLOCK, i % BLOCK
+        tracks.used[v, b, k] = True
+        E, tau, o = rotations[i], times[i], tracks.observations[v, b]
+        ray, turned = rotated(E, rays[i]), rotated(R, rotated(E, arm))
+        for m in range(2):
+            column = rotated(E, jacobian[i, :, m])
+            J[0, m], J[1, m], J[2, m] = column
+        # One row further down, the camera has rotated on.
+        further = cross(row_rotation, ray)
+        # Pseudo-inverse of the (3, 2) derivative: (J^T J)^-1 J^T.
+        uu = uv = vv = 0.0
+        for x in range(3):
+            J[x, 1] += further[x]
+            uu += J[x, 0] * J[x, 0]
+            uv += J[x, 0] * J[x, 1]
+            vv += J[x, 1] * J[x, 1]
+        determinant, time = uu * vv - uv * uv, interval + tau
+        o[TIME, k] = time
+        for x in range(3):
+            o[RAY + x, k] = ray[x]
+            o[TO_PIXELS + x, k] = (vv * J[x, 0] - uv * J[x, 1]) / determinant
+            o[TO_PIXELS + 3 + x, k] = (uu * J[x, 1] - uv * J[x, 0]) / determinant
+            o[MOVED + x, k] = (alpha[x] + tau * beta[x] + 0.5 * tau * tau * acceleration[x]
+                               - turned[x] + arm[x] - time / tracks.duration * chord[x])
 
 
 class PathPriors(NamedTuple):
@@ -88,23 +146,55 @@ class PathState(NamedTuple):
     bias: Array   # (3,) b
     accelerations: Array   # (K, 3) e
     rotations: Array   # (V, 3) phi
-    directions: Array   # (N, 3) f, unit
-    inverse_distances: Array   # (N,) rho
+    tracks: Array   # (blocks, TRACK_VALUES, BLOCK)
+
+
+@kernel
+def start_of_tracks(tracks: Tracks, R: Array, t: Array) -> Array:
+    """Tracks of a state (blocks, TRACK_VALUES, BLOCK) by their first and last rays.
+
+    Columns across a ray: Duff et al., "Building an Orthonormal Basis, Revisited" (JCGT 6, 2017).
+    """
+    first, last = tracks.observations[0], tracks.observations[-1]
+    out = np.zeros((len(first), TRACK_VALUES, BLOCK))
+    for b in range(len(first)):
+        for i in range(BLOCK):
+            x, y, z = first[b, RAY, i], first[b, RAY + 1, i], first[b, RAY + 2, i]
+            if not tracks.used[0, b, i]:   # no observation of it counts
+                z = 1.0
+            sign = math.copysign(1.0, z)
+            a = -1.0 / (sign + z)
+            track, f = out[b], (x, y, z)
+            for k in range(3):
+                track[DIRECTION + k, i] = f[k]
+            columns = (1.0 + sign * x * x * a, sign * x * y * a, -sign * x, x * y * a,
+                       sign + y * y * a, -y)
+            for k in range(6):
+                track[COLUMNS + k, i] = columns[k]
+            h = rotated(R, (last[b, RAY, i], last[b, RAY + 1, i], last[b, RAY + 2, i]))
+            normal = cross(f, h)
+            squared, by_h, by_f = (dot(normal, normal), dot(cross(t, h), normal),
+                                   dot(cross(t, f), normal))
+            usable = squared > _PARALLEL and by_h > 0.0 and by_f > 0.0
+            track[INVERSE_DISTANCE, i] = squared / by_h if usable else _FAR
+    return out
 
 
 class Normal(NamedTuple):
     """Normal equations of the path (n,), the tracks eliminated.
 
-    `of_priors`: their cost. `hessian` (n, n): its lower triangle. `tracks` (N, 3, n + 1): the
-    solution of each track's equations for a step of the path and for its own gradient. `scores`
-    (N, n): each track's part of the gradient. `squares` (V, N): of the residuals [px^2].
+    `of_priors`: their cost. `hessian` (n, n); `tracks` (blocks, n + 1, 3, BLOCK): products of a
+    track's unknowns with the path and with its residuals, solved by the Cholesky `factors`
+    (blocks, 6, BLOCK) of its own equations. `scatter` (n, n): of the tracks' parts of the
+    gradient. `squares` (V, blocks, BLOCK): of the residuals [px^2].
     """
 
     of_priors: float
     hessian: Array
     gradient: Array
     tracks: Array
-    scores: Array
+    factors: Array
+    scatter: Array
     squares: Array
 
 
@@ -125,111 +215,117 @@ def _bends(s: float, T: float) -> tuple[float, float, float]:
 
 
 @small_kernel
-def _observe(tracks: Tracks, state: PathState, k: float, R: Array, basis: Array, v: int, i: int,
-             columns: Array, jac: Array) -> tuple[float, float]:
-    """Residual [px] of an observation; `jac` (2, 12 + 3 K) by its track, the path and phi_v.
+def _observe(o: Array, track: Array, R: Array, basis: Array, motion: Array, k: float, T: float,
+             variance: float, moves: float, rows: Array, squares: Array) -> None:
+    """Derivatives (_ROWS, 2, BLOCK) of a block's observations, times the roots of their weights.
 
-    `R` (3, 3) of its frame; `columns` (3, 2): tangent basis of the track's direction.
+    `o`, `track`: blocks of `Tracks` and of `PathState`; R of the frame; `motion` (5, 3): t, bias
+    and accelerations; `variance`: of the noise; `moves`: 0 for the first frame, whose phi is zero.
     """
-    s, T, rho = tracks.times[v, i], tracks.duration, state.inverse_distances[i]
-    share, t, e, extra = s / T, state.t, state.accelerations, len(state.accelerations)
-    own, f = tracks.moved[v, i], state.directions[i]
-    bends = _bends(s, T)
-    moved = (own[0] + bends[0] * e[0, 0], own[1] + bends[0] * e[0, 1],
-             own[2] + bends[0] * e[0, 2])
-    for j in range(1, extra):
-        moved = (moved[0] + bends[j] * e[j, 0], moved[1] + bends[j] * e[j, 1],
-                 moved[2] + bends[j] * e[j, 2])
-    path = (share * t[0] + k * moved[0], share * t[1] + k * moved[1], share * t[2] + k * moved[2])
-    before = (f[0] - rho * path[0], f[1] - rho * path[1], f[2] - rho * path[2])
-    # Exp(s b) to first order: b is that of a calibrated gyro.
-    turn = cross(state.bias, before)
-    away = (before[0] - s * turn[0], before[1] - s * turn[1], before[2] - s * turn[2])
-    ahead = rotated_back(R, away)
-    scale = 1.0 / norm(ahead)
-    ray = (scale * ahead[0], scale * ahead[1], scale * ahead[2])
-    first = 0.0
-    second = 0.0
-    for m in range(2):
-        P, row = tracks.to_pixels[v, i, m], jac[m]
-        along = dot(P, ray)
-        if m == 0:
-            first = along - dot(P, tracks.rays[v, i])
-        else:
-            second = along - dot(P, tracks.rays[v, i])
-        # Derivative by `away`, in the axes of camera 1.
-        u = rotated(R, (scale * (P[0] - along * ray[0]), scale * (P[1] - along * ray[1]),
-                        scale * (P[2] - along * ray[2])))
-        by_path = (-rho * u[0], -rho * u[1], -rho * u[2])
-        turned = cross(u, away)
-        for x in range(2):
-            row[x] = u[0] * columns[0, x] + u[1] * columns[1, x] + u[2] * columns[2, x]
-            row[3 + x] = share * (by_path[0] * basis[0, x] + by_path[1] * basis[1, x]
-                                  + by_path[2] * basis[2, x])
-        row[2], row[5] = -dot(u, path), k * dot(by_path, moved)
-        row[6], row[7], row[8] = s * turned[0], s * turned[1], s * turned[2]
-        for j in range(extra):
+    for i in range(BLOCK):
+        s, rho = o[TIME, i], track[INVERSE_DISTANCE, i]
+        share, bends = s / T, _bends(s, T)
+        moved = (o[MOVED, i], o[MOVED + 1, i], o[MOVED + 2, i])
+        for j in range(MOST_ACCELERATIONS):
+            e = 2 + j
+            moved = (moved[0] + bends[j] * motion[e, 0], moved[1] + bends[j] * motion[e, 1],
+                     moved[2] + bends[j] * motion[e, 2])
+        path = (share * motion[0, 0] + k * moved[0], share * motion[0, 1] + k * moved[1],
+                share * motion[0, 2] + k * moved[2])
+        before = (track[0, i] - rho * path[0], track[1, i] - rho * path[1],
+                  track[2, i] - rho * path[2])
+        # Exp(s b) to first order: b is that of a calibrated gyro.
+        turn = cross(motion[1], before)
+        away = (before[0] - s * turn[0], before[1] - s * turn[1], before[2] - s * turn[2])
+        ahead = rotated_back(R, away)
+        scale = 1.0 / norm(ahead)
+        ray = (scale * ahead[0], scale * ahead[1], scale * ahead[2])
+        off = (ray[0] - o[RAY, i], ray[1] - o[RAY + 1, i], ray[2] - o[RAY + 2, i])
+        squares[i] = 0.0
+        for m in range(2):
+            a, b, c = TO_PIXELS + 3 * m, TO_PIXELS + 3 * m + 1, TO_PIXELS + 3 * m + 2
+            rows[_RESIDUAL, m, i] = o[a, i] * off[0] + o[b, i] * off[1] + o[c, i] * off[2]
+            squares[i] += rows[_RESIDUAL, m, i] * rows[_RESIDUAL, m, i]
+        root = 1.0 / math.sqrt(variance + 0.25 * squares[i])
+        for m in range(2):
+            rows[_RESIDUAL, m, i] *= root
+            a, b, c = TO_PIXELS + 3 * m, TO_PIXELS + 3 * m + 1, TO_PIXELS + 3 * m + 2
+            along, size = o[a, i] * ray[0] + o[b, i] * ray[1] + o[c, i] * ray[2], root * scale
+            # Derivative by `away`, in the axes of camera 1.
+            u = rotated(R, (size * (o[a, i] - along * ray[0]), size * (o[b, i] - along * ray[1]),
+                            size * (o[c, i] - along * ray[2])))
+            by_path, turned = (-rho * u[0], -rho * u[1], -rho * u[2]), cross(u, away)
+            rows[2, m, i] = -dot(u, path)
+            rows[_PATH + LOG_SCALE, m, i] = k * dot(by_path, moved)
+            for x in range(2):
+                a, b, c = COLUMNS + 3 * x, COLUMNS + 3 * x + 1, COLUMNS + 3 * x + 2
+                rows[x, m, i] = u[0] * track[a, i] + u[1] * track[b, i] + u[2] * track[c, i]
+                rows[_PATH + x, m, i] = share * (
+                    by_path[0] * basis[0, x] + by_path[1] * basis[1, x] + by_path[2] * basis[2, x])
             for x in range(3):
-                row[9 + 3 * j + x] = k * bends[j] * by_path[x]
-        for x in range(3):
-            row[9 + 3 * extra + x] = turned[x]
-    return first, second
+                rows[_PHI + x, m, i] = moves * turned[x]
+                rows[_PATH + BIAS + x, m, i] = s * turned[x]
+                for j in range(MOST_ACCELERATIONS):
+                    rows[_PATH + ACCELERATION + 3 * j + x, m, i] = k * bends[j] * by_path[x]
 
 
-@kernel
-def _add(jac: Array, r: tuple[float, float], weight: float, v: int, own: Array,
-         own_gradient: Array, mixed: Array, hessian: Array, gradient: Array) -> None:
-    """Add an observation to the equations of its track and to those of the path.
+@small_kernel
+def _accumulate(rows: Array, places: NDArray[np.int64], gram: Array, own: Array, mixed: Array,
+                whole: Array) -> None:
+    """Add a block of one frame to the equations.
 
-    Of `hessian` the rows of a phi have the columns up to it.
+    Of its tracks: `own` (6, BLOCK) lower triangles; `mixed` (n + 1, 4, BLOCK) products of the
+    unknowns `places` (M,) of `rows`, from the residual on, with those of the track and with the
+    residual. `whole` (n + 1, n + 1): of the path, with `gram` (M, M) as room.
     """
-    path = jac.shape[1] - _TRACK - 3
-    first = path + 3 * (v - 1)   # of phi_v
-    u, w = jac[0], jac[1]
+    used = rows.reshape(_ROWS, 2 * BLOCK)[_RESIDUAL:_RESIDUAL + len(places)]
+    np.dot(used, used.T, gram)
+    for y in range(len(places)):
+        for x in range(len(places)):
+            whole[places[y], places[x]] += gram[y, x]
+    count = 0
     for y in range(_TRACK):
-        by_u, by_w = weight * u[y], weight * w[y]
-        own_gradient[y] += by_u * r[0] + by_w * r[1]
-        for x in range(_TRACK):
-            own[y, x] += by_u * u[x] + by_w * w[x]
-        for x in range(path):
-            mixed[y, x] += by_u * u[_TRACK + x] + by_w * w[_TRACK + x]
-        if v > 0:
-            for x in range(3):
-                mixed[y, first + x] += (by_u * u[_TRACK + path + x]
-                                        + by_w * w[_TRACK + path + x])
-    for y in range(path if v == 0 else path + 3):
-        by_u, by_w = weight * u[_TRACK + y], weight * w[_TRACK + y]
-        row = y if y < path else first + y - path
-        gradient[row] += by_u * r[0] + by_w * r[1]
-        for x in range(path):
-            hessian[row, x] += by_u * u[_TRACK + x] + by_w * w[_TRACK + x]
-        for x in range(path, y + 1):
-            hessian[row, first + x - path] += by_u * u[_TRACK + x] + by_w * w[_TRACK + x]
-
-
-@kernel
-def _eliminate(own: Array, own_gradient: Array, mixed: Array, hessian: Array, gradient: Array,
-               solved: Array) -> None:
-    """Subtract a track from the path's equations; `solved` (3, n + 1) its own solutions."""
-    n = len(gradient)
-    c0, c1, c2 = cross(own[1], own[2]), cross(own[2], own[0]), cross(own[0], own[1])
-    determinant = dot(own[0], c0)
-    for y in range(3):
-        # A row of the inverse of a symmetric matrix.
-        a0, a1, a2 = c0[y] / determinant, c1[y] / determinant, c2[y] / determinant
-        for x in range(n):
-            solved[y, x] = a0 * mixed[0, x] + a1 * mixed[1, x] + a2 * mixed[2, x]
-        solved[y, n] = a0 * own_gradient[0] + a1 * own_gradient[1] + a2 * own_gradient[2]
-    for y in range(n):
-        h0, h1, h2 = mixed[0, y], mixed[1, y], mixed[2, y]
-        gradient[y] -= h0 * solved[0, n] + h1 * solved[1, n] + h2 * solved[2, n]
         for x in range(y + 1):
-            hessian[y, x] -= h0 * solved[0, x] + h1 * solved[1, x] + h2 * solved[2, x]
+            for i in range(BLOCK):
+                own[count, i] += rows[y, 0, i] * rows[x, 0, i] + rows[y, 1, i] * rows[x, 1, i]
+            count += 1
+    for x in range(len(places)):
+        for y in range(_TRACK + 1):
+            row, other, to = rows[_RESIDUAL + x], rows[y], mixed[places[x], y]
+            for i in range(BLOCK):
+                to[i] += row[0, i] * other[0, i] + row[1, i] * other[1, i]
+
+
+@small_kernel
+def _eliminate(own: Array, rho: Array, mixed: Array, factors: Array, solved: Array) -> None:
+    """Cholesky `factors` L (6, BLOCK) of the tracks' equations, ``solved = L^-1 mixed``.
+
+    What is left of the products with the residual is the track's part of the gradient.
+    """
+    n, weight = len(mixed) - 1, _INVERSE_DISTANCE_SIGMA**-2
+    for i in range(BLOCK):
+        mixed[n, 2, i] += weight * rho[i]
+        a = 1.0 / math.sqrt(own[0, i] + _FLOOR)
+        b, d = own[1, i] * a, own[3, i] * a
+        c = 1.0 / math.sqrt(own[2, i] + _FLOOR - b * b)
+        e = (own[4, i] - d * b) * c
+        f = 1.0 / math.sqrt(own[5, i] + weight + _FLOOR - d * d - e * e)
+        factors[0, i], factors[1, i], factors[2, i] = a, b, c
+        factors[3, i], factors[4, i], factors[5, i] = d, e, f
+    for x in range(n, -1, -1):
+        of, out = mixed[x], solved[x]
+        for i in range(BLOCK):
+            first = of[0, i] * factors[0, i]
+            second = (of[1, i] - factors[1, i] * first) * factors[2, i]
+            third = (of[2, i] - factors[3, i] * first - factors[4, i] * second) * factors[5, i]
+            out[0, i], out[1, i], out[2, i] = first, second, third
+            of[3, i] -= (first * solved[n, 0, i] + second * solved[n, 1, i]
+                         + third * solved[n, 2, i])
 
 
 @kernel
 def _add_priors(state: PathState, priors: PathPriors, hessian: Array, gradient: Array) -> float:
-    """Add the priors to the lower triangle of the path's equations; their part of the cost."""
+    """Add the priors to the path's equations; their part of the cost, with that of the tracks."""
     away = state.log_scale - priors.log_scale
     hessian[LOG_SCALE, LOG_SCALE] += priors.log_scale_weight
     gradient[LOG_SCALE] += priors.log_scale_weight * away
@@ -251,97 +347,106 @@ def _add_priors(state: PathState, priors: PathPriors, hessian: Array, gradient: 
         product = 0.0
         for x in range(len(phi)):
             product += priors.rotation_information[y, x] * phi[x]
-        for x in range(y + 1):
             hessian[first + y, first + x] += priors.rotation_information[y, x]
         gradient[first + y] += product
         cost += product * phi[y]
+    for b in range(len(state.tracks)):
+        for i in range(BLOCK):
+            cost += (state.tracks[b, INVERSE_DISTANCE, i] / _INVERSE_DISTANCE_SIGMA)**2
     return cost
 
 
 @kernel
 def linearised(tracks: Tracks, priors: PathPriors, state: PathState, sigma: float) -> Normal:
     """Normal equations about a state, with the noise `sigma` [px]."""
-    V, N = tracks.used.shape
+    V, blocks, _ = tracks.used.shape
     path = ACCELERATION + 3 * len(state.accelerations)
     n = path + 3 * (V - 1)
-    hessian, gradient, before = np.zeros((n, n)), np.zeros(n), np.zeros(n)
-    solved, scores, squares = np.empty((N, _TRACK, n + 1)), np.empty((N, n)), np.zeros((V, N))
-    own, own_gradient, mixed = np.empty((3, 3)), np.empty(3), np.empty((3, n))
-    jac, basis = np.empty((2, _TRACK + path + 3)), tangent_basis(state.t)
-    rotations, k = np.empty((V, 3, 3)), math.exp(state.log_scale)
+    basis, k, motion = tangent_basis(state.t), math.exp(state.log_scale), np.zeros((5, 3))
+    copy_vector(state.t, motion[0])
+    copy_vector(state.bias, motion[1])
+    copy_matrix(state.accelerations, motion[2:])
+    rotations = np.empty((V, 3, 3))
     for v in range(V):
         copy_matrix(exp_so3(state.rotations[v]) @ tracks.rotations[v], rotations[v])
-    for i in range(N):
-        own[:], own_gradient[:], mixed[:] = 0.0, 0.0, 0.0
-        columns = tangent_basis(state.directions[i])
+    # Unknowns of the rows from the residual on; n is the residual: its products are the gradient.
+    places = np.arange(_PATH - _RESIDUAL + path) - (_PATH - _RESIDUAL)
+    places[0] = n
+    rows, gram = np.empty((_ROWS, 2, BLOCK)), np.empty((len(places), len(places)))
+    squares, factors = np.empty((V, blocks, BLOCK)), np.empty((blocks, 6, BLOCK))
+    solved, scores = np.empty((blocks, n + 1, _TRACK, BLOCK)), np.empty((n, BLOCK))
+    whole, scatter, sums = np.zeros((n + 1, n + 1)), np.zeros((n, n)), np.empty((n + 1, n + 1))
+    product = np.empty((n, n))
+    for b in range(blocks):
+        own, mixed = np.zeros((6, BLOCK)), np.zeros((n + 1, 4, BLOCK))
         for v in range(V):
-            if tracks.used[v, i]:
-                r = _observe(tracks, state, k, rotations[v], basis, v, i, columns, jac)
-                squares[v, i] = r[0] * r[0] + r[1] * r[1]
-                weight = 1.0 / (sigma * sigma + 0.25 * squares[v, i])
-                _add(jac, r, weight, v, own, own_gradient, mixed, hessian, gradient)
-        own[2, 2] += _INVERSE_DISTANCE_SIGMA**-2
-        own_gradient[2] += state.inverse_distances[i] * _INVERSE_DISTANCE_SIGMA**-2
-        for y in range(_TRACK):
-            own[y, y] += _FLOOR
-        _eliminate(own, own_gradient, mixed, hessian, gradient, solved[i])
-        for y in range(n):
-            scores[i, y] = gradient[y] - before[y]
-        copy_vector(gradient, before)
+            _observe(tracks.observations[v, b], state.tracks[b], rotations[v], basis, motion, k,
+                     tracks.duration, sigma * sigma, min(v, 1), rows, squares[v, b])
+            for x in range(3):
+                places[_PHI - _RESIDUAL + x] = path + 3 * max(v - 1, 0) + x
+            _accumulate(rows, places, gram, own, mixed, whole)
+        _eliminate(own, state.tracks[b, INVERSE_DISTANCE], mixed, factors[b], solved[b])
+        flat = solved[b].reshape(n + 1, _TRACK * BLOCK)
+        np.dot(flat, flat.T, sums)
+        copy_matrix(mixed[:n, _TRACK], scores)
+        np.dot(scores, scores.T, product)
+        for y in range(n + 1):
+            for x in range(n + 1):
+                whole[y, x] -= sums[y, x]
+                if y < n and x < n:
+                    scatter[y, x] += product[y, x]
+    hessian, gradient = whole[:n, :n].copy(), whole[n, :n].copy()
     of_priors = _add_priors(state, priors, hessian, gradient)
-    for rho in state.inverse_distances:
-        of_priors += (rho / _INVERSE_DISTANCE_SIGMA)**2
-    return Normal(of_priors, hessian, gradient, solved, scores, squares)
+    return Normal(of_priors, hessian, gradient, solved, factors, scatter, squares)
 
 
 @kernel
 def _cost(normal: Normal, tracks: Tracks, sigma: float) -> tuple[float, float]:
     """Cost with the noise `sigma` [px], and the noise by these residuals, once iterated."""
-    V, N = tracks.used.shape
     cost, weighted, count = normal.of_priors, 0.0, 0
-    for v in range(V):
-        for i in range(N):
-            if tracks.used[v, i]:
-                square = 0.25 * normal.squares[v, i] / (sigma * sigma)
-                cost += 4.0 * math.log(1.0 + square)
-                weighted += 4.0 * square / (1.0 + square)
-                count += 1
+    used, squares = tracks.used.ravel(), normal.squares.ravel()
+    for i in range(len(used)):
+        if used[i]:
+            square = 0.25 * squares[i] / (sigma * sigma)
+            cost += 4.0 * math.log(1.0 + square)
+            weighted += 4.0 * square / (1.0 + square)
+            count += 1
     return cost, weighted / count
 
 
-@small_kernel
-def moved_state(state: PathState, step: Array, tracks: Array) -> PathState:
-    """The state after a step (n,) of the path, each track moved with it (`Normal.tracks`)."""
-    n, count = len(step), len(tracks)
-    basis, t = tangent_basis(state.t), np.empty(3)
+@kernel
+def moved_state(state: PathState, normal: Normal, step: Array) -> PathState:
+    """The state after a step (n,) of the path, each track moved with it."""
+    n, basis, t = len(step), tangent_basis(state.t), np.empty(3)
     for x in range(3):
         t[x] = state.t[x] + basis[x, 0] * step[TANGENT] + basis[x, 1] * step[TANGENT + 1]
-    t /= norm(t)
-    rotations = state.rotations.copy()
-    for v in range(1, len(rotations)):
-        for x in range(3):
+    length, bias = norm(t), state.bias.copy()
+    accelerations, rotations = state.accelerations.copy(), state.rotations.copy()
+    for x in range(3):
+        t[x] /= length
+        bias[x] += step[BIAS + x]
+        for j in range(len(accelerations)):
+            accelerations[j, x] += step[ACCELERATION + 3 * j + x]
+        for v in range(1, len(rotations)):
             # Exp is additive to first order: phi is as small as the gyro's error.
             rotations[v, x] += step[n - 3 * (len(rotations) - v) + x]
-    directions, inverse_distances = np.empty((count, 3)), np.empty(count)
-    own = np.empty(_TRACK)
-    for i in range(count):
+    tracks, own = state.tracks.copy(), np.empty((_TRACK, BLOCK))
+    for b in range(len(tracks)):
+        track, L, solved = tracks[b], normal.factors[b], normal.tracks[b]
         for y in range(_TRACK):
-            own[y] = -tracks[i, y, n]
+            for i in range(BLOCK):
+                own[y, i] = solved[n, y, i]
             for x in range(n):
-                own[y] -= tracks[i, y, x] * step[x]
-        columns, f = tangent_basis(state.directions[i]), directions[i]
-        for x in range(3):
-            f[x] = state.directions[i, x] + columns[x, 0] * own[0] + columns[x, 1] * own[1]
-        length = norm(f)
-        for x in range(3):
-            f[x] /= length
-        inverse_distances[i] = state.inverse_distances[i] + own[2]
-    accelerations = state.accelerations.copy()
-    for j in range(len(accelerations)):
-        for x in range(3):
-            accelerations[j, x] += step[ACCELERATION + 3 * j + x]
-    return PathState(t, state.log_scale + step[LOG_SCALE], state.bias + step[BIAS:BIAS + 3],
-                     accelerations, rotations, directions, inverse_distances)
+                for i in range(BLOCK):
+                    own[y, i] += solved[x, y, i] * step[x]
+        for i in range(BLOCK):
+            third = own[2, i] * L[5, i]
+            second = (own[1, i] - L[4, i] * third) * L[2, i]
+            first = (own[0, i] - L[1, i] * second - L[3, i] * third) * L[0, i]
+            for x in range(3):
+                track[x, i] -= first * track[COLUMNS + x, i] + second * track[COLUMNS + 3 + x, i]
+            track[INVERSE_DISTANCE, i] -= third
+    return PathState(t, state.log_scale + step[LOG_SCALE], bias, accelerations, rotations, tracks)
 
 
 @kernel
@@ -365,18 +470,17 @@ def adjust(tracks: Tracks, priors: PathPriors, start: PathState, expected: float
 
     `expected` [px]: noise, which counts as much as `weight` degrees of freedom.
     """
-    N = tracks.used.shape[1]
     observations = 2.0 * tracks.used.sum()
     state, sigma, noise, damping = start, expected, expected, _FIRST_DAMPING
     normal = linearised(tracks, priors, state, sigma)
-    freedom = max(observations - _TRACK * N - len(normal.gradient), 1.0)
+    freedom = max(observations - _TRACK * tracks.number - len(normal.gradient), 1.0)
     for _ in range(_STEPS):
         # Residuals of fewer degrees of freedom than observations, weighted as in the cost.
         variance = sigma * sigma * _cost(normal, tracks, sigma)[1] / _GAUSSIAN
         noise = math.sqrt((weight * expected * expected + observations * variance)
                           / (weight + freedom))
         sigma = math.hypot(noise, _COMMON_SIGMA)
-        after = moved_state(state, _step(normal, damping), normal.tracks)
+        after = moved_state(state, normal, _step(normal, damping))
         new = linearised(tracks, priors, after, sigma)
         gain = _cost(normal, tracks, sigma)[0] - _cost(new, tracks, sigma)[0]
         if gain > 0.0:   # False for NaN
@@ -385,26 +489,19 @@ def adjust(tracks: Tracks, priors: PathPriors, start: PathState, expected: float
                 break
         else:
             damping = max(100.0 * damping, 1e-2)
-    return Adjusted(state, noise, _covariance(normal, state, priors, (sigma / noise)**2))
+    return Adjusted(state, noise, _covariance(normal, state, priors, (sigma / noise)**2,
+                                              tracks.number))
 
 
 @kernel
-def _covariance(normal: Normal, state: PathState, priors: PathPriors, common: float) -> Array:
+def _covariance(normal: Normal, state: PathState, priors: PathPriors, common: float,
+                count: int) -> Array:
     """Of the path (n, n), with the scatter of the tracks' gradients (sandwich), times `common`.
 
-    The errors of one track in consecutive frames are similar, those of two tracks are not.
+    The errors of one track in consecutive frames are similar, those of the `count` tracks are not.
     """
-    N, n = normal.scores.shape
-    hessian, scatter = normal.hessian.copy(), np.zeros((n, n))
+    n = len(normal.gradient)
+    scatter = common * count / max(count - n / _TRACK, 1.0) * normal.scatter
     _add_priors(state, priors, scatter, np.zeros(n))
-    scale = common * N / max(N - n / _TRACK, 1.0)
-    for i in range(N):
-        for y in range(n):
-            value = scale * normal.scores[i, y]
-            for x in range(y + 1):
-                scatter[y, x] += value * normal.scores[i, x]
-    for y in range(n):
-        for x in range(y):
-            scatter[x, y], hessian[x, y] = scatter[y, x], hessian[y, x]
-    covariance = inverse(hessian)
+    covariance = inverse(normal.hessian)
     return covariance @ scatter @ covariance

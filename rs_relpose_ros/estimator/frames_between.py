@@ -27,13 +27,12 @@ from rs_relpose_ros.estimator.adjustment import (
     TANGENT,
     Tracks,
 )
-from rs_relpose_ros.estimator.result import depths_of_rays, RelativePose
+from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.estimator.velocity import CORRELATION_TIME, span_of_scales
 from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3, skew, tangent_basis
-from rs_relpose_ros.jit import kernel
 
 # Error of gravity and accelerometer together, 1 sigma per axis [m/s^2]: a camera in motion does
 # not measure its tilt better.
@@ -49,8 +48,6 @@ _LEAST_TRACKS, _MOST_TRACKS = 10, 200
 # other: 4 sigmas are then twice that, the largest limit of an inlier. All tracks have the errors
 # of the frames, so that the covariance would be too small.
 _LARGEST_NOISE = 0.5
-# Sine squared of the parallax below which the distance of a track starts at a small value.
-_PARALLEL, _FAR = 1e-8, 1e-2
 _LARGEST_PIXEL = 1e6
 
 
@@ -180,8 +177,8 @@ def refined(pose: RelativePose, points1: Array, motion1: FrameMotion, second: tu
         tracks, priors, _start(pose, views, tracks, priors),
         min(max(pose.residual_rms, 0.1 * config.pixel_sigma), config.pixel_sigma),
         _SIGMA_FREEDOM)
-    if not (np.isfinite(adjusted.covariance).all()
-            and np.median(adjusted.state.inverse_distances) > 0.0):
+    distances = adjusted.state.tracks[:, adjustment.INVERSE_DISTANCE][tracks.used[0]]
+    if not (np.isfinite(adjusted.covariance).all() and np.median(distances) > 0.0):
         return replace(pose, frames_reason='the adjustment of all frames does not converge')
     if adjusted.sigma > max(_LARGEST_NOISE * config.threshold, config.pixel_sigma):
         return replace(pose, frames_reason='tracks and gyro of the frames between contradict each '
@@ -227,57 +224,17 @@ def _tracks(views: Sequence[_View], path: _Path, camera: RollingShutterCamera) -
     # The gyro covers the rows of the image only.
     used = (np.isfinite(rays).all(axis=2) & (points[..., 1] >= 0.0)
             & (points[..., 1] <= camera.height - 1.0))
+    used &= used[0]
     rows = np.where(used, points[..., 1], camera.reference_row_index)
-    rotations = np.array([view.rotation for view in views])
-    tracks = Tracks(np.zeros((*shape, 3)), np.zeros((*shape, 2, 3)), camera.row_times(rows),
-                    np.zeros((*shape, 3)), used, rotations, views[-1].interval)
+    tracks = adjustment.no_observations(
+        np.array([view.rotation for view in views]), views[-1].interval, shape[1])
+    times = camera.row_times(rows)
     for v, view in enumerate(views):
-        _fill(tracks, v, rays[v], jacobian[v], view.motion.rotations(tracks.times[v]),
-              camera.line_delay * view.motion.angular_velocity, view.interval, path.alphas[v],
-              path.betas[v], path.accelerations[v], path.lever_arm, path.chord)
+        adjustment.fill_view(
+            tracks, v, used[v], rays[v], jacobian[v], times[v], view.motion.rotations(times[v]),
+            camera.line_delay * view.motion.angular_velocity, view.interval, path.alphas[v],
+            path.betas[v], path.accelerations[v], path.lever_arm, path.chord)
     return tracks
-
-
-@kernel
-def _fill(tracks: Tracks, v: int, rays: Array, jacobian: Array, rotations: Array,
-          row_rotation: Array, interval: float, alpha: Array, beta: Array, acceleration: Array,
-          arm: Array, chord: Array) -> None:
-    """Fill the observations of view v: derotated rays, and the displacement by the IMU.
-
-    `rotations` (N, 3, 3) of the rows, `row_rotation` (3,) from one row to the next [rad].
-    """
-    R, J, turned = tracks.rotations[v], np.empty((3, 2)), np.empty(3)
-    for i in range(len(rays)):
-        if not tracks.used[v, i]:
-            continue
-        E, tau = rotations[i], tracks.times[v, i]
-        for x in range(3):
-            tracks.rays[v, i, x] = (E[x, 0] * rays[i, 0] + E[x, 1] * rays[i, 1]
-                                    + E[x, 2] * rays[i, 2])
-            turned[x] = E[x, 0] * arm[0] + E[x, 1] * arm[1] + E[x, 2] * arm[2]
-            for m in range(2):
-                J[x, m] = (E[x, 0] * jacobian[i, 0, m] + E[x, 1] * jacobian[i, 1, m]
-                           + E[x, 2] * jacobian[i, 2, m])
-        ray = tracks.rays[v, i]
-        for x in range(3):   # one row further down, the camera has rotated on
-            a, b = (x + 1) % 3, (x + 2) % 3
-            J[x, 1] += row_rotation[a] * ray[b] - row_rotation[b] * ray[a]
-        # Pseudo-inverse of the (3, 2) derivative: (J^T J)^-1 J^T.
-        uu = uv = vv = 0.0
-        for x in range(3):
-            uu += J[x, 0] * J[x, 0]
-            uv += J[x, 0] * J[x, 1]
-            vv += J[x, 1] * J[x, 1]
-        determinant = uu * vv - uv * uv
-        time = interval + tau
-        for x in range(3):
-            tracks.to_pixels[v, i, 0, x] = (vv * J[x, 0] - uv * J[x, 1]) / determinant
-            tracks.to_pixels[v, i, 1, x] = (uu * J[x, 1] - uv * J[x, 0]) / determinant
-            lever = R[x, 0] * turned[0] + R[x, 1] * turned[1] + R[x, 2] * turned[2] - arm[x]
-            tracks.moved[v, i, x] = (
-                alpha[x] + tau * beta[x] + 0.5 * tau * tau * acceleration[x] - lever
-                - time / tracks.duration * chord[x])
-        tracks.times[v, i] = time
 
 
 def _priors(views: Sequence[_View], path: _Path,
@@ -321,15 +278,10 @@ def _start(pose: RelativePose, views: Sequence[_View], tracks: Tracks,
     off = log_so3(np.ascontiguousarray(pose.R @ tracks.rotations[-1].T))
     # Half of the rotation's error to the bias, half to the noise.
     rotations = np.outer([view.interval / T for view in views], 0.5 * off)
-    depths, _, near = depths_of_rays(
-        tracks.rays[0], tracks.rays[-1] @ pose.R.T, np.tile(pose.t, (tracks.used.shape[1], 1)),
-        _PARALLEL)
     log_scale = -math.log(pose.baseline) if math.isfinite(pose.baseline) else priors.log_scale
-    accelerations = len(priors.acceleration_weights)
-    return PathState(pose.t.copy(), log_scale, 0.5 * off / T, np.zeros((accelerations, 3)),
-                     rotations,
-                     tracks.rays[0].copy(),
-                     np.where(near, 1.0 / depths, _FAR))
+    return PathState(
+        pose.t.copy(), log_scale, 0.5 * off / T, np.zeros((len(priors.acceleration_weights), 3)),
+        rotations, adjustment.start_of_tracks(tracks, np.ascontiguousarray(pose.R), pose.t))
 
 
 def _result(pose: RelativePose, adjusted: Adjusted, tracks: Tracks, priors: PathPriors,
