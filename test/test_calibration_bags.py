@@ -1,6 +1,5 @@
 """``rs_relpose calibrate`` from bag to parameter file, and bags that it refuses."""
 
-from dataclasses import replace
 import json
 from pathlib import Path
 import tarfile
@@ -14,7 +13,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 import yaml
 
-from rs_relpose_lab.experiments.calibration_tracks import about_one_axis
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.bag import write_bag
 from rs_relpose_ros.calibrate import procedure
@@ -23,7 +21,7 @@ from rs_relpose_ros.calibrate.start import GyroSeries
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import TrackingConfig
-from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 
 SMALL = SimulationConfig(
@@ -105,26 +103,6 @@ def test_lens_that_is_not_estimated(bag, change, reason, tmp_path, capsys):
     path = copied(bag, tmp_path / 'bag', change)
     assert main(['calibrate', str(path), '--lens', '--out', str(tmp_path / 'out')]) == 2
     assert reason in capsys.readouterr().err
-
-
-@pytest.mark.long
-def test_bag_of_a_global_shutter_and_of_one_axis(tmp_path, capsys):
-    """The rotation about the only axis is not observable, readout time and offset are.
-
-    Errors of lens and gyro move the readout time of one axis by more than a millisecond: whether
-    the shutter is global is then unsure.
-    """
-    write_bag(simulate(replace(SMALL, readout_time=0.0), trajectory=about_one_axis(0, 3.0)),
-              tmp_path / 'bag')
-    code, values = calibrated(tmp_path / 'bag', tmp_path / 'out')
-    assert code == 1
-    assert values['shutter'] == 'unsure'
-    assert abs(values['readout_time_s']['value']) < 1e-3 < values['readout_time_s']['sigma']
-    assert not values['rotation_from_axis_map_rad']['observable']
-    assert 'NOT OBSERVABLE' in capsys.readouterr().out
-    # The file leaves it out, and the node requires it.
-    with pytest.raises(MissingInputError, match='quat_cam_imu_xyzw is not set'):
-        _ = read_parameters(tmp_path / 'out/calibration.yaml').sensor.R_cam_imu
 
 
 def blank(message: Any) -> None:

@@ -73,8 +73,8 @@ def test_profile_loses_no_big_image(ros_domain_id, monkeypatch):
 
 @pytest.mark.parametrize(('name', 'texts'), [
     # What the node subscribes to is remapped; the shipped profile, unless the user has one.
-    ('relpose', ["'relpose_node'", *(f"('{topic}', " for topic in (
-        'image', 'camera_info', 'imu', 'calibration', 'accel')), "'config', 'fastdds.xml'"]),
+    ('relpose', ["'relpose_node'", "('image', Path", "('camera_info', Path", "('imu', argument",
+                 "('calibration', 'relpose", "('accel', argument", "'config', 'fastdds.xml'"]),
     *((name, ["'relpose.launch.py'", f"'{nodes}'"]) for name, nodes in (
         ('global_shutter', 'global_shutter_node'),
         ('relpose_and_global_shutter', 'relpose_node,global_shutter_node'),

@@ -3,7 +3,6 @@
 from dataclasses import replace
 import re
 
-import message_builders as build
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -27,8 +26,6 @@ from rs_relpose_ros.estimator.result import landmarks, Status
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.so3 import tangent_basis
 from rs_relpose_ros.imu.integration import preintegrate
-from rs_relpose_ros.messages.outgoing import inlier_records, pair_messages
-from rs_relpose_ros.messages.published_pair import match_records
 
 CONFIG = EstimatorConfig(gravity_sigma=np.radians(0.2), gyro_sigma=np.radians(0.1),
                          pixel_sigma=0.5)
@@ -227,16 +224,6 @@ def test_equal_state_gives_equal_bits_another_seed_or_solver_nearly_the_same():
     for solver in ('uniform_9pt', 'uniform_11pt', 'angular_3pt', 'angular_5pt'):
         other = estimate(scene, replace(CONFIG, solver=solver))
         assert rotation_error(a.R, other.R) < 0.02, solver
-
-
-def test_gyro_prediction_is_a_prior_and_the_interval_centres_the_velocity():
-    scene = make_scene(8, constant_velocity=True, speed=3.0)
-    interval = 1.0 / np.linalg.norm(scene.v1)
-    pose = estimate(scene, relative_rotation=scene.R,
-                    relative_rotation_covariance=1e-8 * np.eye(3), interval=interval)
-    assert rotation_error(pose.R, scene.R) < 0.02
-    assert np.linalg.norm(pose.linear_velocity1 - scene.v1) < 0.2 * np.linalg.norm(scene.v1)
-    assert np.linalg.norm(pose.linear_velocity2 - scene.v2) < 0.2 * np.linalg.norm(scene.v2)
 
 
 def test_pure_rotation_has_a_rotation_and_no_translation():
@@ -448,16 +435,6 @@ def test_interval_duration_inverse_and_lever_arm_of_a_baseline(pairs):
     assert estimate_relative_pose(*pair.points, SMALL_CAMERA, *pair.motions, inertial=free)
 
 
-@pytest.mark.parametrize('motion', ['vehicle', 'drone'])
-def test_other_carriers(pairs, motion):
-    """A prior that is too wide costs some of the precision only."""
-    poses = [pair.estimate(replace(WALK_CONFIG, motion=motion), inertial=pair.inertial)
-             for pair in pairs[:8]]
-    errors = [np.log(pose.baseline / pair.baseline)
-              for pose, pair in zip(poses, pairs, strict=False)]
-    assert np.nanmedian(np.abs(errors)) < 0.3
-
-
 def evidence(pair, pose, inertial):
     nothing = np.empty((0, 2))
     problem = build_problem(nothing, nothing, SMALL_CAMERA, *pair.motions, pair.R,
@@ -485,12 +462,6 @@ def test_images_distinguish_the_acceleration_from_another_one(pairs, with_accele
     configured, opposite = np.sum(right, axis=0)
     assert configured > 10.0 and opposite < -10.0
     assert np.sum(permuted, axis=0)[0] < -10.0
-
-
-def test_a_global_shutter_has_no_evidence_of_the_acceleration(pairs):
-    """All its rows have one time: no velocity is observable."""
-    pose = pairs[0].estimate(camera=replace(SMALL_CAMERA, readout_time=0.0), interval=INTERVAL)
-    assert np.abs(evidence(pairs[0], pose, pairs[0].inertial)).max() < 0.5
 
 
 def test_evidence_by_the_density_of_the_acceleration():
@@ -543,23 +514,6 @@ def test_parallel_rays_have_no_point_and_outliers_have_nothing():
     inliers = np.arange(len(pair.matches)) % 3 > 0
     for values in found(replace(pair.pose, inliers=inliers), pair.rays2):
         np.testing.assert_array_equal(np.isfinite(values).all(axis=1), inliers)
-
-
-def test_published_records_mark_points_that_are_not_known():
-    pair = simulated_flight(0).pairs[0]
-    points = pair.landmarks.points.copy()
-    points[3] = np.nan
-    pair = replace(pair, landmarks=pair.landmarks._replace(points=points))
-    cloud = pair_messages(pair, build.rosbags_types)['matches']
-    assert not cloud.is_dense
-    records = match_records(cloud)
-    assert np.isnan(records['x']).nonzero()[0].tolist() == [3]
-    assert records.tobytes() == inlier_records(pair).tobytes()
-    broken = inlier_records(pair)
-    broken['u1_gs'][5] = np.nan
-    cloud.data = np.frombuffer(broken.tobytes(), dtype=np.uint8)
-    with pytest.raises(InputError, match='must be finite'):
-        match_records(cloud)
 
 
 # -- Refinement: Sampson error, its Jacobian and depths, priors of the joint fit -------------

@@ -6,7 +6,6 @@ No traceback, no crash, no hang, no unbounded memory. A short share here, the fu
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
 import faulthandler
 from pathlib import Path
 import shutil
@@ -21,18 +20,15 @@ from message_builders import damaged, WHOLE, with_other_fields
 import numpy as np
 import pytest
 from recorded_files import make_posecam, make_realsense, make_tables
-from simulated_pairs import simulated_flight
 
 from rs_relpose_lab.datasets import read_realsense
 from rs_relpose_ros.bags.convert import write_bag
 from rs_relpose_ros.bags.phones import read_posecam, read_tables
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.config.settings import Parameters
-from rs_relpose_ros.errors import InputError, RsRelposeError
+from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.messages.incoming import Intake, Role
-from rs_relpose_ros.messages.outgoing import pair_messages
-from rs_relpose_ros.messages.published_pair import PairSynchronizer, PoseChain
 from rs_relpose_ros.offline.replay import read_truth, Replay
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.sequencer import FrameRefused, Sequencer, WAITING_FRAMES
@@ -175,41 +171,6 @@ def test_damaged_messages(count):
     assert outcomes['used'] > 0.5 * total
     assert outcomes['refused'] > 0.03 * total
     assert outcomes['frame ready'] > 0.01 * total
-
-
-# --- pairs
-
-def chain(plan: list[tuple[int, list[Any]]]) -> Counter[str]:
-    """Outcomes of published pairs, of which one message each, or none, has other bytes."""
-    flight, outcomes = simulated_flight(4, points=30).pairs, Counter[str]()
-    synchronizer, path = PairSynchronizer(), PoseChain()
-    for number, (chosen, changes) in enumerate(plan):
-        result = flight[number % len(flight)]
-        result = replace(result, stamp_ns=result.stamp_ns + number * 10**9)
-        messages = pair_messages(result, build.rosbags_types)
-        for k, (topic, message) in enumerate(messages.items()):
-            try:
-                sent = with_damage(message, (damaged, changes) if k == chosen else None)
-                pair = None if sent is None else synchronizer.add(topic, sent)
-            except InputError as error:
-                check_text(error)
-                outcomes['refused'] += 1
-                continue
-            if pair is not None:
-                step = path.add(pair)
-                outcomes['chained'] += 1
-                assert np.isfinite(step.scale) or not pair
-                assert np.isfinite([pose.position for pose in step.poses]).all()
-    return outcomes + Counter({'lost': synchronizer.given_up})
-
-
-@share_and_all(60, 1250, 1300)
-def test_damaged_pairs(count):
-    outcomes = outcomes_of(chain, count, st.lists(
-        st.tuples(st.integers(0, 11), edits), min_size=25, max_size=25))
-    assert outcomes['chained'] > 5 * count
-    assert outcomes['refused'] > 0.3 * count
-    assert outcomes['lost'] > 0.8 * count
 
 
 # --- bags

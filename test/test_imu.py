@@ -9,7 +9,6 @@ from message_builders import imu as imu_message
 from message_builders import rosbags_types
 import numpy as np
 import pytest
-from scipy.integrate import trapezoid
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 from two_view_scene import direction_error
@@ -216,17 +215,6 @@ def test_a_frame_turns_with_the_mean_rate_of_its_exposure(exposure):
     assert angles[0] / angles[1] == pytest.approx(smaller, abs=3e-3)
 
 
-def test_mean_rates_against_a_dense_mean():
-    generator = np.random.default_rng(3)
-    stamps = np.cumsum(generator.integers(2_000_000, 8_000_000, 40))
-    rates, at, width = generator.normal(size=(40, 3)), stamps[[8, 20]] + 1_234_567, 0.017
-    dense = at[:, None] + np.linspace(-0.5, 0.5, 200_001) * width * 1e9
-    expected = [trapezoid(np.interp(times, stamps, axis), dx=1.0 / 200_000)
-                for times in dense for axis in rates.T]
-    found = integration.mean_rates(stamps, rates, at, width)
-    np.testing.assert_allclose(found.ravel(), expected, atol=1e-8)
-
-
 def test_frame_imu_is_in_the_camera_frame_at_the_stamped_row():
     rate = np.array([0.0, 0.0, 0.8])
     buffer, reference = filled(samples(at_200_hz(400), rate)), START + 1_500_000_123
@@ -306,19 +294,6 @@ def test_what_may_be_a_motion_is_no_rest(case):
     keep = (np.arange(len(stamps)) % 100 < 80) | (case != 'gaps')
     found = tracked(config, stamps[keep], rates[keep], forces[keep])
     assert tuple(found.value) == config.gyro_bias and found.sigma == config.gyro_bias_sigma
-
-
-def test_the_begin_of_a_motion_is_left_out():
-    """A camera that starts to rotate slowly: the window with the start is not used."""
-    rng = np.random.default_rng(2)
-    # From 2.4 s on, the last tenth of a window, at the tenth of a radian per second.
-    rates, forces = rest(3.0, rng)
-    moving = rates.copy()
-    moving[480:] += np.linspace(0.0, 0.1, len(rates) - 480)[:, None]
-    found = tracked(ImuConfig(), *joined((moving, forces)))
-    still = tracked(ImuConfig(), *joined((rates[:501], forces[:501])))
-    np.testing.assert_array_equal(found.value, still.value)
-    assert still.sigma < 1e-3
 
 
 def test_sigma_grows_after_rest_and_a_second_rest_follows_a_drift():
@@ -508,24 +483,6 @@ def test_gravity_is_causal_and_independent_of_pruning(gravity_filter):
     for other, at_ns in ((early, 1299 * PERIOD + 2_000_000), (pruned, 1499 * PERIOD)):
         one, same = other.gravity(at_ns), kept.gravity(at_ns)
         assert np.array_equal(one.direction, same.direction) and one.sigma == same.sigma
-
-
-def test_gravity_between_samples_and_before_the_last_query_is_propagated_by_the_gyro():
-    buffer, end = run(swinging, seconds=4.0, seed=7)
-    for at_ns in (end, end - 3_000_000, end - 500_000_000):
-        assert direction_error(buffer.gravity(at_ns).direction, down(at_ns)) < 0.3
-    assert buffer.gravity(end + 1) is None
-
-
-def test_fast_gyro_and_slow_accelerometer_in_separate_messages():
-    fast, slow = 2_500_000 * np.arange(2400), 15_873_016 * np.arange(370) + 1_111_111
-    rates = (Rotation.from_matrix(swinging(fast * 1e-9)).inv()
-             * Rotation.from_matrix(swinging(fast * 1e-9 + 1e-4))).as_rotvec() / 1e-4
-    items = [replace(item, linear_acceleration=None) for item in samples(fast, rates)]
-    items += [replace(item, angular_velocity=None)
-              for item in samples(slow, np.zeros(3), UP @ swinging(slow * 1e-9))]
-    buffer, at_ns = filled(sorted(items, key=lambda item: item.stamp_ns)), 2300 * 2_500_000
-    assert direction_error(buffer.gravity(at_ns).direction, down(at_ns)) < 1.0
 
 
 # -- Orientation computed by the IMU itself -------------------------------------------------------

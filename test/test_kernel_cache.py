@@ -142,26 +142,6 @@ def test_without_private_parts_of_numba(package):
     assert run(package, 'other Numba') == [16.0, 15.0, 0, 2]
 
 
-# With kernels that are called by address.
-CAMERA = """
-from rs_relpose_ros.geometry.camera import RollingShutterCamera
-camera = RollingShutterCamera(width=640, height=480, fx=450.0, fy=450.0, cx=319.5, cy=239.5,
-                              distortion_model='plumb_bob', distortion=(-0.1, 0.01, 1e-3, 0.0),
-                              readout_time=0.03)
-pixels = [[40.0 * k, 30.0 * k] for k in range(16)]
-rays = camera.unproject(pixels)
-print(rays.tobytes().hex(), camera.project(rays).tobytes().hex())
-"""
-
-
-def test_results_are_bit_equal_without_private_parts_of_numba(tmp_path):
-    public = output(CAMERA, cwd=ROOT, env={
-        **os.environ, 'RS_RELPOSE_PUBLIC_NUMBA': '1', 'NUMBA_CACHE_DIR': str(tmp_path)})
-    assert list(tmp_path.rglob('*.nbc'))
-    assert len(public) > 16 * 5 * 16
-    assert public == output(CAMERA, cwd=ROOT)
-
-
 def test_this_numba_was_tried():
     """If not: run the tests with it, then add it to the versions in jit.py."""
     assert re.match(r'\d+\.\d+', numba.__version__)[0] in TRIED

@@ -1,10 +1,7 @@
 """The node and a player as processes over DDS, on the bundled bag; signals that end the node."""
 
-from collections.abc import Iterator
-import itertools
 from pathlib import Path
 import signal
-import threading
 import time
 from types import SimpleNamespace
 
@@ -12,7 +9,6 @@ from conftest import BUNDLED_PARAMETERS
 from diagnostic_msgs.msg import DiagnosticArray
 import fault_stream as faults
 from fault_stream import BAG_TOPICS
-from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -140,7 +136,6 @@ def test_the_player_says_what_is_wrong(ros_domain_id, bundled_bag, arguments, ex
 
 # -- a signal ends the node at once and quietly, at any time ----------------------------
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
 LONG = pytest.mark.long
 
 
@@ -190,41 +185,3 @@ def test_a_signal_ends_a_node_that_compiles(ros_domain_id, tmp_path, monkeypatch
         node.wait_for('compiling kernels')
         # The compiler lets go of the interpreter only now and then.
         assert end(node, signal.SIGTERM) <= 5.0
-
-
-@pytest.fixture
-def drivers(ros_domain_id: int, bundled_bag: Path) -> Iterator[Graph]:
-    """A camera and an IMU that publish all the time."""
-    messages = faults.read_messages(bundled_bag, 2.6)
-    ended = threading.Event()
-    with Graph() as graph:
-        publishers = {kind: graph.node.create_publisher(kind, topic, 100)
-                      for kind, topic in faults.TOPIC_OF.items()}
-
-        def publish() -> None:
-            for later in itertools.count(step=3):
-                if ended.is_set():
-                    return
-                faults.play(publishers, messages, later)
-
-        thread = threading.Thread(target=publish)
-        thread.start()
-        yield graph
-        ended.set()
-        thread.join(10.0)
-
-
-@pytest.mark.long
-@pytest.mark.timeout(3600)
-@pytest.mark.parametrize('number', SIGNALS)
-def test_a_working_node_ends_within_a_second(drivers, number):
-    poses = drivers.listen(PoseWithCovarianceStamped, '/relpose_node/relative_pose')
-    times = []
-    for _ in range(50):
-        with node_process(BUNDLED_PARAMETERS, remap=faults.BAG_TOPICS,
-                          parameters={'image_transport': 'raw'}) as node:
-            poses.clear()
-            wait_until(lambda: poses, 'a pose', node)
-            times.append(end(node, number))
-    print(f'of {len(times)}: at most {max(times):.2f} s')
-    assert max(times) <= 1.0

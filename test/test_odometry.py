@@ -6,7 +6,6 @@ import gc
 import importlib.util
 from itertools import pairwise
 import math
-import pickle
 from types import FunctionType, ModuleType
 
 import gtsam
@@ -26,7 +25,7 @@ from rs_relpose_ros.odometry import need_gtsam
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.graph import KeyframeGraph, KeyframeState
 from rs_relpose_ros.odometry.offline import draw_paths, path_of, write_tum
-from rs_relpose_ros.odometry.pair import BodyState, deviations, KeyframePair, Mounting, square_root
+from rs_relpose_ros.odometry.pair import BodyState, deviations, KeyframePair, Mounting
 from rs_relpose_ros.odometry.states import Base, ContinuousPath, OdometryState
 from rs_relpose_ros.offline.truth import TrueTrajectory
 
@@ -185,16 +184,6 @@ def test_derivatives_of_deviations_are_those_of_finite_differences():
         np.testing.assert_allclose(by[:, k], (plus - minus) / 2e-6, atol=1e-6)
 
 
-def test_square_root_leaves_out_what_is_not_observed():
-    rng = np.random.default_rng(2)
-    root = rng.normal(size=(5, 11))
-    H, g = root.T @ root, root.T @ rng.normal(size=5)
-    A, a = square_root(H, g)
-    assert A.shape == (5, 11)
-    np.testing.assert_allclose(A.T @ A, H, atol=1e-9)
-    np.testing.assert_allclose(A.T @ a, g, atol=1e-9)
-
-
 # --- paths
 
 def test_path_is_metric(walked, tracked):
@@ -268,16 +257,6 @@ def test_slow_motion_is_no_known_scale():
                               variances)
         graph = KeyframeGraph(state, np.eye(3), PARAMETERS.imu, PARAMETERS.odometry)
         assert graph.scale_sigma() == pytest.approx(expected, rel=1e-6)
-
-
-def test_far_velocities_have_no_information(walked):
-    """Linearised at 25 baselines per interval beside the mean velocity; one baseline is near."""
-    pair = walked.pairs[5]
-    assert pair.without_far_velocities() is pair
-    for way, rows in ((1.0, 11), (25.0, 5)):
-        moved = pair.images.velocities + np.eye(6)[4] * way / INTERVAL
-        far = replace(pair, images=replace(pair.images, velocities=moved))
-        assert len(far.without_far_velocities().images.gradient) == rows
 
 
 def test_a_gross_pair_before_the_start_is_a_wrong_start(walked):
@@ -644,14 +623,6 @@ def test_a_path_continues_after_a_jump_of_the_clock(walked, seconds):
         assert np.linalg.norm(error) < 3.0 * math.sqrt(np.trace(after.pose_covariance[:3, :3]))
 
 
-def test_samples_that_come_far_too_late_are_left_out(walked, tracked):
-    samples = [*walked.samples]
-    late = samples.pop(1000)
-    samples.insert(1100, replace(late, angular_velocity=(9.0, 9.0, 9.0)))
-    _, out = run(walked, samples=samples)
-    np.testing.assert_allclose(positions(out), positions(tracked[1]), atol=0.01)
-
-
 def test_pairs_of_another_camera_are_refused(walked):
     other = [replace(pair, frame_id='rear_camera') for pair in walked.pairs]
     estimator, _ = run(walked, pairs=walked.pairs[:20], samples=samples_of(walked, -1.0, 3.1),
@@ -678,18 +649,6 @@ def test_an_imu_of_another_frame_gives_no_path_and_the_reason(walked, turn):
         assert not (out and begin == 0.0)
         assert estimator.reason.startswith('pairs and IMU contradict each other')
         assert [text for text in estimator.warnings() if 'quat_cam_imu_xyzw' in text]
-
-
-def test_nothing_is_published_while_a_parameter_is_wrong(walked):
-    finding = 'time_offset wrong: off'
-    wrong = [replace(pair, contradiction=finding)
-             if 6.0 < seconds_of(pair.current_ns) < 7.0 else pair for pair in walked.pairs]
-    estimator, out = run(walked, pairs=wrong)
-    assert estimator.counts['calibration contradicted'] > 3
-    assert estimator.warnings().count(f'lost: {finding}') == 1
-    assert not [k for k in out if 6.1 < seconds_of(k.imu_ns) < 6.9]
-    assert out[-1].path == 1
-    assert estimator.state is not OdometryState.LOST
 
 
 def test_pairs_that_are_wrong_together_do_not_disprove_axes(walked):
@@ -757,22 +716,6 @@ def test_earlier_losses_stay_in_the_covariance(walked):
     assert turns[2] > 0.9 * turns[1] > 0.9 * 0.4**2 > 100.0 * turns[0]
 
 
-def test_reset_begins_at_the_origin(walked):
-    reset = seconds_of(walked.pairs[40].current_ns)
-    estimator, out = run(walked, pairs=walked.pairs[:40],
-                         samples=samples_of(walked, -1.0, reset))
-    assert np.linalg.norm(out[-1].position) > 0.5
-    estimator.reset()
-    assert estimator.propagated(out[-1].imu_ns) is None
-    _, after = run(walked, pairs=walked.pairs[41:], samples=samples_of(walked, reset, 13.0),
-                   estimator=estimator)
-    start_ns = after[0].imu_ns - round(estimator.starts[1].seconds * SECOND)
-    way = np.linalg.norm(walked.truth.position(after[0].imu_ns) - walked.truth.position(start_ns))
-    assert np.linalg.norm(after[0].position) == pytest.approx(
-        way, rel=3.0 * estimator.starts[1].scale_sigma)
-    assert after[0].pose_covariance[0, 0] < 0.01
-
-
 def test_pairs_without_imu_do_not_accumulate(walked):
     estimator = OdometryEstimator(PARAMETERS)
     for k in range(300):
@@ -802,16 +745,6 @@ def objects_behind(root) -> int:
             observed[id(one)] = one
             ahead += gc.get_referents(one)
     return len(observed)
-
-
-def test_memory_is_constant_without_pairs():
-    estimator, rng, sizes = OdometryEstimator(PARAMETERS), np.random.default_rng(0), []
-    for k in range(12_000):   # two minutes
-        if k % 4000 == 0:
-            sizes.append(len(pickle.dumps(estimator)))
-        estimator.add_imu(ImuSample(START_NS + k * SECOND // 100, tuple(rng.normal(size=3)),
-                                    tuple(rng.normal(size=3))))
-    assert sizes[0] < sizes[1] == sizes[2]
 
 
 def test_without_gtsam_the_error_has_the_command_to_install_it(monkeypatch):

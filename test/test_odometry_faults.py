@@ -25,7 +25,6 @@ from nav_msgs.msg import Path as PathMessage
 import numpy as np
 import pytest
 import rclpy
-from rclpy.clock import Clock, ClockType
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
@@ -245,9 +244,11 @@ def test_nothing_is_published_without_a_pose(session, fault):
 
 
 def test_faults_are_reported(session):
+    lines = session.output.splitlines()
     for expected in ('uncertain: no usable pair for 0.', 'lost: no usable pair for 2 s',
                      'lost: time_offset wrong: off'):
-        assert session.output.count(expected) == 1, expected
+        [line] = [line for line in lines if expected in line]
+        assert line.startswith('[ERROR]') == expected.startswith('lost')
     assert 'Traceback' not in session.output
     [status] = session.diagnostics[-1].status
     assert re.fullmatch(r'no message on /relpose_node/pairs for \d+ s and '
@@ -432,17 +433,6 @@ def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag, tmp_p
     assert ekf['odom0'] == '/odometry_node/odometry' and all(ekf['odom0_config'][6:12])
     assert ekf['publish_tf'] and not parameters.odometry.publish_odometry_tf
     assert (ekf['odom_frame'], ekf['base_link_frame']) == ('odom', 'base_link')
-
-
-def test_a_lost_path_is_an_error_in_the_log():
-    node = MagicMock(_sensors=[], _steady=Clock(clock_type=ClockType.STEADY_TIME))
-    node._sample_at = node._steady.now()
-    node._estimator.take.return_value = []
-    node._estimator.warnings.return_value = ['imu_position is zero', 'lost: no pair', 'tracking']
-    OdometryNode._read_sensors(node)
-    assert [call.args[0] for call in node._info.call_args_list] == ['imu_position is zero',
-                                                                    'tracking']
-    node._error.assert_called_once_with('lost: no pair')
 
 
 def test_the_position_of_the_imu_is_that_of_tf_before_the_path_begins():

@@ -12,7 +12,6 @@ from test_odometry import PARAMETERS, ROW, run, SECOND, START_NS, walk, without
 
 from rs_relpose_lab.experiments import odometry_disturbances as disturbances
 from rs_relpose_lab.experiments import odometry_loops, odometry_recordings
-from rs_relpose_lab.experiments.odometry_disturbances import Disturbance
 from rs_relpose_lab.experiments.trust_runs import (
     Arrival,
     simulated,
@@ -22,7 +21,6 @@ from rs_relpose_lab.experiments.trust_runs import (
 )
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_ros.cli.main import main
-from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.covariance import ImageInformation
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.so3 import exp_so3, tangent_basis
@@ -148,34 +146,6 @@ def test_metrics_of_a_closed_walk(monkeypatch):
 
 # -- Disturbances of `benchmark odometry`: their tracks, and the states that follow ----------
 
-def test_tracks_of_a_disturbance(monkeypatch):
-    monkeypatch.setattr(disturbances, '_MARGIN', 0.2)
-    simulation = simulate(SimulationConfig(seed=3, duration=0.6, plan='walk:0.6'))
-    rng = np.random.default_rng(0)
-    recording = simulated(Source('', TRACKS), simulation, TrackNoise(), rng)
-    before = recording.sightings
-
-    def other(**values):
-        return disturbances.disturbed(recording, simulation, Disturbance(0.2, **values), rng)
-
-    assert [a.number for a in other(images=False).arrivals] == [*range(6), *range(12, 18)]
-    assert other().sightings is before
-    dark = other(corners=0.1, white=5.0).sightings
-    object_ = other(object_speed=60.0).sightings
-    for k, ids in enumerate(before.ids):
-        if not 6 <= k < 12:   # the same corners, and none of them after the disturbance
-            np.testing.assert_array_equal(object_.pixels[k], before.pixels[k])
-            assert np.isin(object_.ids[k], before.ids[0]).any() == (k < 6)
-            continue
-        assert len(dark.ids[k]) < 0.2 * len(ids)
-        assert dark.noise[k].std() > 3.0
-        moved = object_.pixels[k] - before.pixels[k]
-        # By 2 px from frame to frame since a corner appeared, on the left.
-        assert np.isclose(moved[:, 0] / 2.0, np.rint(moved[:, 0] / 2.0), atol=1e-6).all()
-        assert 0.3 < (moved[:, 0] > 1.0).mean() < 0.7 or k == 6
-        assert (moved[before.pixels[k][:, 0] > 400.0, 0] < 1.0).all()
-
-
 def test_states_through_a_disturbance():
     given = walk('walk:14', 14.0, imu_rate=100.0)
     # Gyro and accelerometer in messages of their own.
@@ -199,12 +169,6 @@ def test_states_through_a_disturbance():
     other = disturbances.on_feed('no images, 2 s', 1, feed, replace(
         truth, position=elsewhere))
     assert other.beyond_position > 100
-
-
-def test_one_disturbance_is_chosen():
-    assert disturbances.tasks(2, 7, 'blur, 2 s') == [('blur, 2 s', 7), ('blur, 2 s', 8)]
-    with pytest.raises(InputError, match='blur, 3 s'):
-        disturbances.tasks(2, 7, 'blur, 3 s')
 
 
 def test_a_recording_in_parts(monkeypatch, tmp_path):

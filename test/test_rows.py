@@ -113,21 +113,6 @@ def test_errors_of_keyframes_and_biases_are_spread(path):
     assert np.abs(biased.pose(at)[0] - exact.pose(at)[0]).max() < 2e-4
 
 
-def test_times_may_be_scalars_and_arrays(rows):
-    R, p = rows.pose(TIMES.reshape(20, 20))
-    v, w = rows.velocity(TIMES.reshape(20, 20))
-    assert (R.shape, p.shape, v.shape, w.shape) == (
-        (20, 20, 3, 3), (20, 20, 3), (20, 20, 3), (20, 20, 3))
-    one = rows.pose(int(TIMES[23]))
-    np.testing.assert_array_equal(one[0], R[1, 3])
-    np.testing.assert_array_equal(one[1], p[1, 3])
-    assert rows.covariance(TIMES.reshape(20, 20)).shape == (20, 20, 6, 6)
-    nothing = TIMES[:0]
-    assert [part.shape for part in rows.pose(nothing)] == [(0, 3, 3), (0, 3)]
-    assert rows.velocity(nothing)[0].shape == (0, 3)
-    assert rows.covariance(nothing).shape == (0, 6, 6)
-
-
 def test_velocity_is_the_derivative_of_the_pose(rows):
     at, step = TIMES[50:150], 100_000
     for frame in ('camera', 'imu', 'base'):
@@ -504,12 +489,6 @@ def test_a_lens_is_fitted_with_the_coefficients_of_the_format(lens, radial, most
     errors = np.abs(fitted.project(camera.unproject(pixels)) - pixels)
     assert errors.max() < most
     assert errors.mean() < 0.1 * most
-
-
-def test_a_lens_that_the_format_knows_is_not_changed(trajectory):
-    for lens, radial in (('brown', 2), ('brown, k3', 3), ('rational', 6), ('fisheye', 2)):
-        camera = made(trajectory, lens).camera
-        assert formats.fitted(camera, radial) is camera
 
 
 @pytest.mark.parametrize('lens', ['pinhole', 'brown', 'brown, k3', 'rational', 'fisheye'])
