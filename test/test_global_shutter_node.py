@@ -1,4 +1,4 @@
-"""global_shutter_node over DDS: images of an undisturbed bag, and after faults."""
+"""global_shutter_node over DDS: images of a bag; other images; a wrong calibration."""
 
 from collections.abc import Iterator
 import itertools
@@ -11,11 +11,11 @@ from conftest import BUNDLED_PARAMETERS, ROOT
 import cv2
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import fault_stream as faults
-from fault_stream import BAG_TOPICS, Fault, SECOND, stamp_of, Stream
+from fault_stream import BAG_TOPICS, SECOND, stamp_of
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from rs_relpose_lab.experiments.global_shutter import frames_of_bag
 from rs_relpose_lab.live.graph import diagnostic_values, Graph
@@ -29,27 +29,8 @@ pytestmark = [pytest.mark.live, pytest.mark.timeout(600)]
 OWN = '/global_shutter_node'
 # Bundled bag: 239.5 of 480 rows that take 30 ms.
 DELAY_NS = round(239.5 / 480 * 0.03 * SECOND)
-# Images of the bag that are played without a fault.
-UNDISTURBED = 60
-
-GAP = 'the gyro does not cover the readout of the frame'
-FAULTS = [
-    Fault('IMU gap', faults.without(Imu, 0.3, 0.5), GAP),
-    Fault('camera stops', faults.nothing),
-    Fault('camera still stands', faults.nothing),
-    Fault('camera comes back', faults.nothing),
-    Fault('clocks back', faults.nothing, jump=-20.0),
-    Fault('clocks ahead', faults.nothing, GAP, jump=20.0),
-    Fault('late IMU', faults.delayed(Imu, lambda: 0.3)),
-    Fault('uncalibrated', faults.changed(CameraInfo, lambda m: setattr(m, 'k', np.zeros(9))),
-          'the camera is uncalibrated'),
-    Fault('the end', faults.nothing),
-]
-# Phases of which no image is sent: 3.4 s.
-WITHOUT_CAMERA = ('camera stops', 'camera still stands')
-# Images that end a phase, a third of a second.
-ENOUGH = 11
-
+# Images of the bag that are played.
+PLAYED = 60
 
 def stamps_of(messages: list[Any]) -> list[int]:
     return [stamp_of(message) for message in messages]
@@ -59,14 +40,13 @@ def stamps_of(messages: list[Any]) -> list[int]:
 def expected(bundled_bag: Path) -> dict[int, GlobalShutterFrame]:
     """Derotated offline, by the stamps of the images in the bag."""
     frames = frames_of_bag(bundled_bag, read_parameters(BUNDLED_PARAMETERS))
-    return {frame.original_stamp_ns: frame for frame in itertools.islice(frames, UNDISTURBED)}
+    return {frame.original_stamp_ns: frame for frame in itertools.islice(frames, PLAYED)}
 
 
 @pytest.fixture(scope='module')
 def session(module_ros_domain_id: int, bundled_bag: Path) -> Iterator[SimpleNamespace]:
-    """Messages of the undisturbed images, those during the faults, and the rest."""
-    messages = faults.read_messages(bundled_bag, UNDISTURBED / 30.0)
-    stream = Stream(messages, FAULTS, 10_000 * SECOND)
+    """Messages of the first images of the bag."""
+    messages = faults.read_messages(bundled_bag, PLAYED / 30.0)
     with Graph() as graph, node_process(
             BUNDLED_PARAMETERS, remap=BAG_TOPICS, node='global_shutter_node', parameters={
                 'image_transport': 'raw', **faults.reliable(*BAG_TOPICS.values())}) as node:
@@ -74,44 +54,31 @@ def session(module_ros_domain_id: int, bundled_bag: Path) -> Iterator[SimpleName
         infos = graph.listen(CameraInfo, f'{OWN}/camera_info')
         diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
         node.wait_for('ready')
-        publishers, sent = faults.drivers(graph), 0
-
-        def publish(phase: int, message: Any) -> None:
-            nonlocal sent
-            if isinstance(message, Image):
-                if FAULTS[phase].name in WITHOUT_CAMERA:
-                    return
-                sent += 1
-            publishers[type(message)].publish(message)
-
+        publishers = faults.drivers(graph)
         with Graph() as other:
             compressed = other.listen(CompressedImage, f'{OWN}/image/compressed')
             for topic in ('image', 'image/compressed', 'mask', 'camera_info'):
                 other.wait_for_publisher(f'{OWN}/{topic}')
             faults.play(publishers, messages)
         wait_until_quiet(lambda: len(images), 1.0, node)   # a busy machine is behind
-        undisturbed = list(images)
-        stream.play(publish, images, enough=ENOUGH)
         count = len(diagnostics)
         wait_until(lambda: len(diagnostics) >= count + 2, 'diagnostics', node)
         code, seconds = node.signal(signal.SIGINT)
+        assert code == 0 and seconds <= 1.0
         yield SimpleNamespace(
-            undisturbed=undisturbed, compressed=compressed, masks=masks, stream=stream,
-            images=images[len(undisturbed):], infos=infos,
+            images=images, compressed=compressed, masks=masks, infos=infos,
             info=next(message for _, message in messages if isinstance(message, CameraInfo)),
-            sent=sent + sum(isinstance(message, Image) for _, message in messages),
+            sent=sum(isinstance(message, Image) for _, message in messages),
             diagnostics=diagnostics, values=diagnostic_values(diagnostics[-1]),
-            output=node.output, exit_code=code, seconds_to_end=seconds)
+            output=node.output)
 
-
-# -- undisturbed images ----------------------------------------------------------------------
 
 def test_images_are_those_of_the_replay_bit_by_bit(session, expected):
     by_stamp = {frame.stamp_ns: frame for frame in expected.values()}
-    stamps = stamps_of(session.undisturbed)
-    assert len(stamps) > 0.83 * UNDISTURBED
+    stamps = stamps_of(session.images)
+    assert len(stamps) > 0.83 * PLAYED
     assert stamps == sorted(set(stamps))
-    for message in session.undisturbed:
+    for message in session.images:
         frame = by_stamp[stamp_of(message)]
         assert (message.encoding, message.width, message.height, message.step) == (
             'mono8', 640, 480, 640)
@@ -126,10 +93,10 @@ def test_images_are_those_of_the_replay_bit_by_bit(session, expected):
 
 
 def test_compressed_images_are_the_same(session):
-    raw = {stamp_of(message): message for message in session.undisturbed}
+    raw = {stamp_of(message): message for message in session.images}
     pairs = [(message, raw[stamp_of(message)]) for message in session.compressed
              if stamp_of(message) in raw]
-    assert len(pairs) > 0.55 * UNDISTURBED
+    assert len(pairs) > 0.55 * PLAYED
     for compressed, image in pairs[::20]:
         assert compressed.format.startswith('mono8; jpeg compressed')
         pixels = cv2.imdecode(np.frombuffer(compressed.data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -138,7 +105,7 @@ def test_compressed_images_are_the_same(session):
 
 
 def test_camera_info_is_as_published(session):
-    assert set(stamps_of(session.undisturbed + session.images)) <= set(stamps_of(session.infos))
+    assert set(stamps_of(session.images)) <= set(stamps_of(session.infos))
     for info in session.infos[::20]:
         for name in ('width', 'height', 'distortion_model', 'binning_x', 'roi'):
             assert getattr(info, name) == getattr(session.info, name)
@@ -162,66 +129,8 @@ def test_diagnostics_count_all_frames(session):
     assert 1.0 < float(values['largest_shift_px']) < 30.0
     assert values['applied_time_offset_ms'] == '0.00'
     assert 0.0 < float(values['latency_p50_ms']) <= float(values['latency_p99_ms'])
-
-
-# -- faults ----------------------------------------------------------------------------------
-
-def source(stream: Stream, image: Image) -> int | None:
-    """Stamp of the received image that was derotated."""
-    stamp = stamp_of(image) - DELAY_NS
-    return next((near for near in (stamp, stamp - 1, stamp + 1) if near in stream.taken_at), None)
-
-
-@pytest.mark.parametrize('name', [
-    fault.name for fault in FAULTS if fault.name not in WITHOUT_CAMERA])
-def test_images_come_within_a_second_of_good_data(session, name):
-    number = [fault.name for fault in FAULTS].index(name)
-    begin_ns, end_ns = session.stream.good[number]
-    found = [stamp for stamp in stamps_of(session.images)
-             if begin_ns <= stamp <= end_ns + DELAY_NS]
-    assert found[0] - begin_ns < SECOND
-    assert len(found) > 10
-
-
-def test_no_wrong_image_is_published(session, expected):
-    """Each is that of the undisturbed bag: never derotated by a gyro of another time.
-
-    Where the gyro was interpolated or the bias found later it differs by little.
-    """
-    checked = 0
-    for image in session.images:
-        stamp = source(session.stream, image)
-        assert stamp is not None, 'an image of no time'
-        taken = session.stream.taken_at[stamp]
-        if taken is None:
-            continue
-        checked += 1
-        difference = np.abs(expected[taken].image().values.astype(int) - faults.pixels_of(image))
-        assert difference.mean() < 1.0
-    assert checked > 100
-
-
-def test_images_without_gyro_are_not_published(session):
-    assert int(session.values['frames_refused_imu_gap']) >= 5
-    number = [fault.name for fault in FAULTS].index('IMU gap')
-    begin_ns = session.stream.good[number][0] - round(faults.FAULT_UNTIL * SECOND)
-    # Frames whose rows lie within the gap.
-    gap = range(begin_ns + round(0.31 * SECOND), begin_ns + round(0.46 * SECOND))
-    assert not [stamp for stamp in stamps_of(session.images) if stamp in gap]
-
-
-def test_faults_are_reported_and_nothing_else(session):
-    lines = [line for line in session.output.splitlines()
-             if line.startswith(('[WARN]', '[ERROR]', '[FATAL]'))]
-    said = [fault.said for fault in FAULTS if fault.said]
-    assert [text for text in said if not any(text in line for line in lines)] == []
-    allowed = (*said, 'newer frames wait for the gyro', 'no gyro sample that covers',
-               '(overload)', 'stamps jumped', 'frame is ', 'no image on')
-    assert [line for line in lines if not any(text in line for text in allowed)] == []
-    assert session.output.count('ready') == 1
-    assert 'Traceback' not in session.output
-    assert session.exit_code == 0
-    assert session.seconds_to_end <= 1.0
+    # At most that the machine was busy, and that the player came late.
+    assert session.output.count('[WARN]') <= 2 and '[ERROR]' not in session.output
 
 
 def test_other_images_of_the_same_driver_are_reported(ros_domain_id):

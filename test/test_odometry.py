@@ -259,6 +259,16 @@ def test_slow_motion_is_no_known_scale():
         assert graph.scale_sigma() == pytest.approx(expected, rel=1e-6)
 
 
+def test_far_velocities_have_no_information(walked):
+    """Linearised at 25 baselines per interval beside the mean velocity; one baseline is near."""
+    pair = walked.pairs[5]
+    assert pair.without_far_velocities() is pair
+    for way, rows in ((1.0, 11), (25.0, 5)):
+        moved = pair.images.velocities + np.eye(6)[4] * way / INTERVAL
+        far = replace(pair, images=replace(pair.images, velocities=moved))
+        assert len(far.without_far_velocities().images.gradient) == rows
+
+
 def test_a_gross_pair_before_the_start_is_a_wrong_start(walked):
     turn = exp_so3(np.array([0.0, 0.3, 0.0]))
     pairs = [replace(pair, images=replace(pair.images, R=turn @ pair.images.R)) if k == 2 else pair

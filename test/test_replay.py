@@ -8,15 +8,14 @@ from typing import Any
 
 from conftest import BUNDLED_PARAMETERS, rows_of
 import cv2
-import message_builders as build
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation, Slerp
+from test_check import broken, Small, uncalibrated
 from two_view_scene import direction_error
 
 from rs_relpose_ros.bags.reader import open_bag
-from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.errors import InputError
@@ -380,54 +379,29 @@ def test_bad_parameter_files(tmp_path, text, words):
 
 # -- bad input, from end to end --------------------------------------------------------------
 
-def write_bag(path: Path, spoil: Callable[[str, Any, int], object] = lambda *_: None,
-              topics: tuple[str, ...] = ('image', 'camera_info', 'imu')) -> Path:
-    """A short bag of a camera that stands, with noise as sensors have it.
-
-    `spoil(topic, message, index)` may damage messages.
-    """
-    rng, types = np.random.default_rng(0), build.rosbags_types
-    picture = cv2.GaussianBlur(rng.integers(0, 256, (120, 160), dtype=np.uint8), (5, 5), 1.5)
-    entries = []
-    for k in range(4):
-        stamp = START_NS + k * 33_000_000
-        pixels = picture ^ rng.integers(0, 2, picture.shape, dtype=np.uint8)
-        info = build.camera_info(types, width=160, height=120, stamp_ns=stamp,
-                                 k=(120.0, 0.0, 79.5, 0.0, 120.0, 59.5, 0.0, 0.0, 1.0))
-        entries += [(stamp + 30_000_000, 'camera_info', info, k),
-                    (stamp + 30_000_001, 'image', build.gray_image(types, pixels, stamp), k)]
-    for k in range(-20, 38):
-        stamp = START_NS + k * 5_000_000
-        entries.append((stamp + 2_000_000, 'imu', build.imu(
-            types, stamp, tuple(rng.normal(0.0, 1e-3, 3)), (0.0, -9.81, 0.0)), k))
-    with BagWriter(path) as bag:
-        for bag_time_ns, topic, message, index in sorted(entries, key=lambda entry: entry[0]):
-            if topic in topics:
-                spoil(topic, message, index)
-                bag.write(f'/{topic}', message.__msgtype__, message, bag_time_ns)
-    return path
+def changed(part: str, change: Callable[[Any], object]) -> dict[str, Any]:
+    """Changes every message of a part of a small bag."""
+    def made(self: Small, stamp: int) -> Any:
+        message = getattr(Small, part)(self, stamp)
+        change(message)
+        return message
+    return {part: made}
 
 
-def all_of(topic: str, change: Callable[[Any], object]) -> dict[str, Any]:
-    """Changes every message of a topic."""
-    return {'spoil': lambda name, message, _: name == topic and change(message)}
-
-
-@pytest.mark.parametrize('options, words', [
-    ({'topics': ('image', 'imu')}, 'give camera_matrix'),
-    (all_of('camera_info', lambda m: m.k.put(0, 0.0)), 'uncalibrated'),
-    (all_of('camera_info', lambda m: setattr(m, 'distortion_model', 'bananas')), 'bananas'),
-    (all_of('image', lambda m: setattr(m, 'encoding', '32FC1')), '32FC1'),
-    (all_of('imu', lambda m: setattr(m.angular_velocity, 'x', float('nan'))), 'finite'),
-    (all_of('camera_info', lambda m: setattr(m, 'width', 320)), '320x120')])
-def test_bags_that_cannot_be_used(tmp_path, refused, options, words):
-    bag = write_bag(tmp_path / 'bag', **options)
+@pytest.mark.parametrize('changes, words', [
+    ({'info_topic': ''}, 'give camera_matrix'), ({'info': uncalibrated}, 'uncalibrated'),
+    (changed('info', lambda m: setattr(m, 'distortion_model', 'bananas')), 'bananas'),
+    (changed('image', lambda m: setattr(m, 'encoding', '32FC1')), '32FC1'),
+    (changed('imu', lambda m: setattr(m.angular_velocity, 'x', float('nan'))), 'finite'),
+    (changed('info', lambda m: setattr(m, 'width', 320)), '320x120')])
+def test_bags_that_cannot_be_used(tmp_path, refused, changes, words):
+    bag = broken(seconds=0.4, **changes).write(tmp_path / 'bag')
     refused(words, 'replay', bag, *SENSOR, '--no-pictures', '--out', tmp_path / 'out')
 
 
 @pytest.fixture(scope='module')
 def good_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_bag(tmp_path_factory.mktemp('good') / 'bag')
+    return broken(seconds=0.4).write(tmp_path_factory.mktemp('good') / 'bag')
 
 
 # Path (empty: a good bag), options, words; kinds of damage are the reader's tests.
@@ -491,13 +465,14 @@ def test_no_pose_is_exit_code_1(tmp_path, capsys, good_bag, monkeypatch):
 
 
 def test_one_bad_message_among_good_ones_is_counted(tmp_path, capsys):
-    def spoil(topic, message, index):
-        if topic == 'imu' and index == 9:
-            message.angular_velocity.y = float('nan')
-        if topic == 'image' and index == 2:
-            message.data = message.data[:50]
-
-    bag = write_bag(tmp_path / 'bag', spoil)
+    small = broken(seconds=0.4)
+    messages = small.messages()
+    samples, images = ([message for topic, _, message, _ in messages if topic == name]
+                       for name in (small.imu_topic, small.image_topic))
+    samples[29].angular_velocity.y = float('nan')
+    images[2].data = images[2].data[:50]
+    small.messages = lambda: messages
+    bag = small.write(tmp_path / 'bag')
     assert replay(capsys, bag, *SENSOR, '--out', tmp_path / 'out')[0] == 1
     summary = summary_of(tmp_path / 'out')
     assert summary['invalid_messages'] == 1
