@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 import sys
+import threading
 from typing import Any
 from unittest.mock import MagicMock
 
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_lab.live.processes import wait_until
 import rs_relpose_ros
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.config.files import read_parameters
@@ -28,10 +30,16 @@ from rs_relpose_ros.messages.incoming import Intake, Role, sensor_messages
 from rs_relpose_ros.nodes.diagnostics import Statistics
 from rs_relpose_ros.nodes.inputs import SensorInputs
 from rs_relpose_ros.nodes.relpose_node import PairPublishers, RelposeNode
+from rs_relpose_ros.nodes.sensor_node import Worker
 from rs_relpose_ros.pipeline import pair as pairs
 from rs_relpose_ros.pipeline.pair import DerotatedRays, Frame, median_parallax, PairResult
 from rs_relpose_ros.pipeline.pipeline import FrameFailed, FrontEnd, Outcome
-from rs_relpose_ros.pipeline.sequencer import FrameRefused, QueuedFrame
+from rs_relpose_ros.pipeline.sequencer import (
+    FrameRefused,
+    MAILBOX_FRAMES,
+    QueuedFrame,
+    Refusal,
+)
 from rs_relpose_ros.tracking.images import CompressedImage, RawImage
 
 MS = 1_000_000
@@ -130,6 +138,37 @@ def test_a_refusal_is_an_outcome():
     assert front_end.step() is None
     front_end.sequencer.close()
     assert isinstance(front_end.step(), FrameRefused)
+
+
+def test_a_busy_worker_costs_no_imu(monkeypatch):
+    """Messages are taken in meanwhile; the oldest frames are dropped, and the latest wait."""
+    held: list[Frame] = []
+    started, released = threading.Event(), threading.Event()
+
+    def process(frame: Frame, *_: Any) -> None:
+        held.append(frame)
+        started.set()
+        assert released.wait(100.0)
+
+    front_end, rng = FrontEnd(PARAMETERS), np.random.default_rng(0)
+    monkeypatch.setattr(front_end._processor, 'process', process)
+    sequencer, worker = front_end.sequencer, Worker(front_end, lambda: None, lambda _: None)
+    worker.start()
+    for k in range(40):
+        for ms in range(30 * k - 5, 30 * k + 25, 5):
+            sequencer.add_imu(ImuSample(ms * MS, (0.0, 0.1, 0.0), (0.0, -9.81, 0.0)))
+        sequencer.add_frame(noise(30 * k, rng), INTRINSICS)
+        assert started.wait(50.0)   # of the first frame
+    counts = sequencer.counts()
+    assert (counts.imu_gaps, counts.imu_samples, counts.frames_taken, counts.refused) == (
+        0, 240, 1, {Refusal.OVERLOAD: 39 - MAILBOX_FRAMES})
+    released.set()
+    wait_until(lambda: len(held) == 1 + MAILBOX_FRAMES, 'the frames that waited')
+    assert worker.stop(10.0)
+    # The gyro from the frame before to the first after all those that went has no hole.
+    stamps = held[1].imu.since_previous.stamps_ns
+    assert (stamps[0], stamps[-1]) == (0, held[1].stamp_ns)
+    assert np.diff(stamps).max() <= 5 * MS
 
 
 # -- pairs -----------------------------------------------------------------------------------

@@ -17,14 +17,11 @@ from rs_relpose_ros.estimator.problem import PairState, to_reference_row
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.geometry import so3
 from rs_relpose_ros.geometry.camera import (
-    DISTORTION_MODELS,
-    DistortionModel,
     Intrinsics,
     RollingShutterCamera,
 )
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 from rs_relpose_ros.geometry.timing import ImageClock, seconds_between, to_nanoseconds
-from rs_relpose_ros.jit import kernel
 
 vectors = hnp.arrays(np.float64, 3, elements=st.floats(-3.0, 3.0))
 
@@ -112,29 +109,6 @@ def test_opencv_projects_the_ray_back_to_its_pixel(model, distortion):
     for k, step in enumerate(1e-4 * np.eye(2)):
         numeric = (camera.unproject(PIXELS + step) - camera.unproject(PIXELS - step)) / 2e-4
         np.testing.assert_allclose(jacobian[:, :, k], numeric, atol=1e-9)
-
-
-@kernel
-def distort_by_division(x, y, k, out):
-    """A model that the package does not have: x' = x / (1 + k r^2)."""
-    scale = 1.0 / (1.0 + k[0] * (x * x + y * y))
-    slope = -2.0 * k[0] * scale * scale
-    out[0], out[1] = scale * x, scale * y
-    out[2], out[3] = scale + slope * x * x, slope * x * y
-    out[4], out[5] = slope * x * y, scale + slope * y * y
-
-
-def test_a_model_of_the_registry_is_a_model_of_the_camera(monkeypatch):
-    monkeypatch.setitem(DISTORTION_MODELS, 'division', DistortionModel(
-        'division', (1,), 1, distort_by_division))
-    camera = make_camera('division', (0.1,))
-    rays = camera.unproject(PIXELS)
-    undistorted = rays[:, :2] / rays[:, 2:]
-    distorted = undistorted / (1.0 + 0.1 * (undistorted**2).sum(axis=1, keepdims=True))
-    np.testing.assert_allclose(
-        distorted * (camera.fx, camera.fy) + (camera.cx, camera.cy), PIXELS, atol=1e-8)
-    np.testing.assert_allclose(camera.project(3.0 * rays), PIXELS, atol=1e-8)
-    assert make_camera('division', (0.0,)).is_undistorted
 
 
 def test_no_mirror_images():

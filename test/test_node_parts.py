@@ -6,21 +6,16 @@ from dataclasses import replace
 import itertools
 from pathlib import Path
 import re
-import threading
 from typing import Any
 
 from conftest import Clock, ROOT
-import message_builders as build
 import numpy as np
 import pytest
 import rclpy
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from sensor_msgs.msg import CameraInfo, Image, Imu
 
-from rs_relpose_lab.live.processes import wait_until
 from rs_relpose_ros.config.declare import Declared
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.estimator.result import RelativePose, Status
@@ -36,12 +31,10 @@ from rs_relpose_ros.nodes.diagnostics import (
     WARN,
 )
 from rs_relpose_ros.nodes.parameters import NodeParameters
-from rs_relpose_ros.nodes.relpose_node import RelposeNode
 from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState
 from rs_relpose_ros.pipeline.monitor import Applied, Tracked
-from rs_relpose_ros.pipeline.pair import Frame, PairResult
-from rs_relpose_ros.pipeline.sequencer import MAILBOX_FRAMES, Refusal, SequencerCounts
-from rs_relpose_ros.pipeline.warm_up import warm_up
+from rs_relpose_ros.pipeline.pair import PairResult
+from rs_relpose_ros.pipeline.sequencer import Refusal, SequencerCounts
 from rs_relpose_ros.tracking.features import Matches
 
 SECOND = 10**9
@@ -454,86 +447,6 @@ def test_a_live_parameter_is_passed_on(node, parameters, name):
     [result] = node.set_parameters([Parameter(name, value=DEFAULTS[name])])
     assert result.successful
     assert parameters.current == Parameters()
-
-
-FRAME_NS, READOUT_NS = SECOND // 30, SECOND // 50
-IMU_NS = FRAME_NS // 12
-START_NS = 1_700_000_000 * SECOND
-WIDTH, HEIGHT = 64, 48
-FRAMES = 40
-IMAGE = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH), dtype=np.uint8)
-
-
-@pytest.mark.timeout(600)   # the kernels may not be compiled yet
-def test_a_busy_worker_costs_the_node_no_imu(module_ros_domain_id, monkeypatch):
-    """The node goes on receiving; the oldest frames are dropped, and the latest wait."""
-    warm_up()
-    held: list[Frame] = []
-    started, released = threading.Event(), threading.Event()
-
-    def process(frame: Frame, parameters: Parameters) -> None:
-        held.append(frame)
-        started.set()
-        assert released.wait(300.0)
-
-    context = Context()
-    rclpy.init(context=context)
-    rclpy.init(args=['--ros-args', '-p', f'readout_time:={READOUT_NS / SECOND}', '-p',
-                     'quat_cam_imu_xyzw:=[0.0, 0.0, 0.0, 1.0]'])
-    node = RelposeNode()
-    monkeypatch.setattr(node._loop._processor, 'process', process)
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    driver = rclpy.create_node('driver', context=context)
-    publishers = {msgtype: driver.create_publisher(msgtype, topic, 1000) for msgtype, topic in (
-        (Image, 'image'), (CameraInfo, 'camera_info'), (Imu, 'imu'))}
-
-    def spin_until(condition: Any, what: str) -> None:
-        def spun() -> Any:
-            executor.spin_once(timeout_sec=0.02)
-            return condition()
-        wait_until(spun, what)
-
-    try:
-        spin_until(lambda: all(p.get_subscription_count() for p in publishers.values()),
-                   'discovery')
-        sequencer = node._loop.sequencer
-        publishers[CameraInfo].publish(build.camera_info(
-            build.rclpy_types, width=WIDTH, height=HEIGHT,
-            k=(60.0, 0.0, 32.0, 0.0, 60.0, 24.0, 0.0, 0.0, 1.0)))
-        spin_until(lambda: node._intake.intrinsics is not None, 'the calibration')
-        for k in range(FRAMES):
-            # From before the first row of the first frame to behind the last row of each.
-            for sample in range(12 * k - 3, 12 * k + 9):
-                # A gyro with an axis that repeats itself bit by bit would be refused.
-                rates = 1e-4 * np.sin(sample) + np.array([0.1, 0.2, 0.3])
-                publishers[Imu].publish(build.imu(
-                    build.rclpy_types, START_NS + sample * IMU_NS, rates.tolist()))
-            # No image is that before: a frozen camera's are refused.
-            publishers[Image].publish(build.gray_image(
-                build.rclpy_types, IMAGE + np.uint8(k), START_NS + k * FRAME_NS))
-            # Best effort: of the images only the latest five are kept for the callback.
-            spin_until(lambda k=k: sequencer.counts().frames == k + 1, f'image {k}')
-            if k == 0:
-                spin_until(started.is_set, 'the first frame')
-        spin_until(lambda: sequencer.counts().imu_samples == 12 * FRAMES, 'all IMU samples')
-        counts = sequencer.counts()
-        assert (counts.imu_gaps, counts.frames_taken, counts.refused) == (
-            0, 1, {Refusal.OVERLOAD: FRAMES - 1 - MAILBOX_FRAMES})
-        released.set()
-        wait_until(lambda: len(held) == 1 + MAILBOX_FRAMES, 'the frames that waited')
-        # The gyro from the frame before to the first after all those that went has no hole.
-        stamps = held[1].imu.since_previous.stamps_ns
-        assert (stamps[0], stamps[-1]) == (START_NS, held[1].stamp_ns)
-        assert np.diff(stamps).max() <= IMU_NS
-    finally:
-        released.set()
-        node._worker.stop(10.0)
-        executor.shutdown()
-        node.destroy_node()
-        driver.destroy_node()
-        rclpy.try_shutdown()
-        context.try_shutdown()
 
 
 @pytest.mark.skipif(not Path('/dev/full').exists(), reason='Linux has a device that is full')

@@ -6,6 +6,7 @@ import gc
 import importlib.util
 from itertools import pairwise
 import math
+import pickle
 from types import FunctionType, ModuleType
 
 import gtsam
@@ -633,6 +634,14 @@ def test_a_path_continues_after_a_jump_of_the_clock(walked, seconds):
         assert np.linalg.norm(error) < 3.0 * math.sqrt(np.trace(after.pose_covariance[:3, :3]))
 
 
+def test_samples_that_come_far_too_late_are_left_out(walked, tracked):
+    samples = [*walked.samples]
+    late = samples.pop(1000)
+    samples.insert(1100, replace(late, angular_velocity=(9.0, 9.0, 9.0)))
+    _, out = run(walked, samples=samples)
+    np.testing.assert_allclose(positions(out), positions(tracked[1]), atol=0.01)
+
+
 def test_pairs_of_another_camera_are_refused(walked):
     other = [replace(pair, frame_id='rear_camera') for pair in walked.pairs]
     estimator, _ = run(walked, pairs=walked.pairs[:20], samples=samples_of(walked, -1.0, 3.1),
@@ -755,6 +764,16 @@ def objects_behind(root) -> int:
             observed[id(one)] = one
             ahead += gc.get_referents(one)
     return len(observed)
+
+
+def test_memory_is_constant_without_pairs():
+    estimator, rng, sizes = OdometryEstimator(PARAMETERS), np.random.default_rng(0), []
+    for k in range(12_000):   # two minutes
+        if k % 4000 == 0:
+            sizes.append(len(pickle.dumps(estimator)))
+        estimator.add_imu(ImuSample(START_NS + k * SECOND // 100, tuple(rng.normal(size=3)),
+                                    tuple(rng.normal(size=3))))
+    assert sizes[0] < sizes[1] == sizes[2]
 
 
 def test_without_gtsam_the_error_has_the_command_to_install_it(monkeypatch):

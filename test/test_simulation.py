@@ -192,20 +192,6 @@ def bundled():
     return args, simulate(command.configuration(args))
 
 
-def test_hidden_and_departed_points_have_no_match(bundled):
-    hall = bundled[1]
-    grid = np.stack(np.meshgrid(np.arange(5.0, 640, 15), np.arange(5.0, 480, 15)),
-                    axis=-1).reshape(-1, 2)
-    matches = hall.true_matches(100, 130, grid)
-    gone = np.isnan(matches[:, 0])
-    assert 0.02 < gone.mean() < 0.9
-    there, back = matches[~gone], hall.true_matches(130, 100, matches[~gone])
-    assert there.min() > -0.5
-    # Points in both images match both ways.
-    np.testing.assert_allclose(back, grid[~gone], atol=1e-6)
-    assert np.isnan(hall.renderer.project(0.5, [[-50.0, 0.0, 1.6]])).all()
-
-
 # -- bags ------------------------------------------------------------------------------------
 
 SMALL = ['--duration', '0.2', '--width', '160', '--height', '120', '--fx', '110',
