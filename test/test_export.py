@@ -105,7 +105,7 @@ def test_poses_of_rows_are_as_good_as_those_of_keyframes(bundled_bag, rows, mess
 
 def test_a_benchmark_measures_rows_of_a_walk(monkeypatch):
     monkeypatch.setattr(reconstruction, '_RENDERED', 1)
-    found = reconstruction.on_walk(walks(1, 9001, 3.0)[0])
+    found = reconstruction.on_walk(walks(1, 9001, 2.0)[0])
     assert max(found.first, found.middle, found.last) < 1.2
     assert found.turned < 0.03
     # Frames from linear poses, by those from one pose.

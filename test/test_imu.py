@@ -296,6 +296,19 @@ def test_what_may_be_a_motion_is_no_rest(case):
     assert tuple(found.value) == config.gyro_bias and found.sigma == config.gyro_bias_sigma
 
 
+def test_the_begin_of_a_motion_is_left_out():
+    """A camera that starts to rotate slowly: the window with the start is not used."""
+    rng = np.random.default_rng(2)
+    # From 2.4 s on, the last tenth of a window, at the tenth of a radian per second.
+    rates, forces = rest(3.0, rng)
+    moving = rates.copy()
+    moving[480:] += np.linspace(0.0, 0.1, len(rates) - 480)[:, None]
+    found = tracked(ImuConfig(), *joined((moving, forces)))
+    still = tracked(ImuConfig(), *joined((rates[:501], forces[:501])))
+    np.testing.assert_array_equal(found.value, still.value)
+    assert still.sigma < 1e-3
+
+
 def test_sigma_grows_after_rest_and_a_second_rest_follows_a_drift():
     rng, config = np.random.default_rng(3), ImuConfig()
     tracker = BiasTracker(config)

@@ -1,6 +1,5 @@
 """Compiled kernels: found after a move, never used for another source; none after the warm-up."""
 
-from concurrent.futures import ThreadPoolExecutor
 import functools
 import json
 import os
@@ -145,14 +144,6 @@ def test_without_private_parts_of_numba(package):
 def test_this_numba_was_tried():
     """If not: run the tests with it, then add it to the versions in jit.py."""
     assert re.match(r'\d+\.\d+', numba.__version__)[0] in TRIED
-
-
-def test_two_processes_start_together(package):
-    shutil.rmtree(package / NAME / '__pycache__' / 'kernels')
-    with ThreadPoolExecutor() as pool:
-        both = list(pool.map(run, [package] * 2))
-    assert [results[:2] for results in both] == [[7.0, 6.0]] * 2
-    assert run(package) == HITS
 
 
 def test_every_import_of_a_kernels_module_counts(monkeypatch):

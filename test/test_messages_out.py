@@ -130,9 +130,11 @@ def test_published_covariances_have_no_negative_eigenvalue():
 @build.both_types
 def test_matches_are_the_inliers(types):
     result = pair()
+    assert outgoing.pair_messages(result, types)['matches'].is_dense
+    result.landmarks.points[result.pose.inliers.argmax()] = np.nan   # its rays are parallel
     cloud = outgoing.pair_messages(result, types)['matches']
     assert cloud.header.frame_id == 'camera_reference'
-    assert cloud.is_dense
+    assert not cloud.is_dense
     names = ['u1', 'v1', 'u2', 'v2', 'tau1', 'tau2', 'x1', 'y1', 'z1', 'x2', 'y2', 'z2',
              'x', 'y', 'z', 'u1_gs', 'v1_gs', 'u2_gs', 'v2_gs', 'id']
     assert [field.name for field in cloud.fields] == names

@@ -34,7 +34,7 @@ from rs_relpose_ros.pipeline.monitor import Agreement, Applied, ConsistencyMonit
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrameFailed, FrontEnd
 from rs_relpose_ros.pipeline.recursion import pair_information, PairData, Recursion
-from rs_relpose_ros.pipeline.rotations import AccelerationSums, RotationSums
+from rs_relpose_ros.pipeline.rotations import AccelerationSums, rotation_of_rays, RotationSums
 
 AXES, OFFSET, READOUT, BIAS = findings.AXES, findings.OFFSET, findings.READOUT, findings.BIAS
 SCALE, FOCAL, DISTORTION = findings.SCALE, findings.FOCAL, findings.DISTORTION
@@ -410,6 +410,18 @@ def test_too_little_rotation_is_not_compared():
 
 # -- assessment ----------------------------------------------------------------------------------
 
+def test_rotation_of_rays_withstands_near_points():
+    rng = np.random.default_rng(0)
+    rays = rng.normal(size=(60, 3)) * [0.3, 0.3, 0.0] + [0.0, 0.0, 1.0]
+    turn = Rotation.from_rotvec([0.03, -0.02, 0.05])
+    later = turn.inv().apply(rays)
+    later[:8] += [0.1, 0.0, 0.0]
+    unit = [a / np.linalg.norm(a, axis=1)[:, None] for a in (rays, later)]
+    np.testing.assert_allclose(rotation_of_rays(*unit), turn.as_rotvec(), atol=3e-3)
+    unit[0][:50] = np.nan
+    assert rotation_of_rays(*unit) is None
+
+
 def calibration(c, sigma, coupled=0.0):
     """Of the deviations c; OFFSET and READOUT are alike by `coupled`."""
     correlation = np.eye(DEVIATIONS)
@@ -698,7 +710,8 @@ def imu_with(axes=UNCHANGED, gyro=1.0, late=0.0, force=UNCHANGED):
 CYCLED = np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]])
 ROTATED = Rotation.from_rotvec(np.radians([2.0, -1.7, 1.5]))
 WRONG_ONES = [
-    Wrong('offset', 'time_offset', ('time_offset=0.01',), None, 0.0, 2e-4, stamps_late=0.01),
+    Wrong('offset', 'time_offset', ('time_offset=0.01',), None, 0.0, 1e-3, stamps_late=0.01,
+          pairs=20),
     # Far from the configuration a pair is not linear: more are needed.
     Wrong('late', 'time_offset', (), imu_with(late=0.03), 0.03, 1e-3, pairs=26),
     Wrong('no readout', 'readout_time', ('readout_time=0.0',), None, 0.03, 1e-3, pairs=14),
@@ -777,7 +790,7 @@ def test_a_pair_is_published_before_its_assessment(bundled_bag, monkeypatch):
     published = []
     with open_bag(bundled_bag) as bag:
         run = Replay(bag, bag.find_topics(), parameters)
-        for pair in run.pairs():
+        for pair in itertools.islice(run.pairs(), 14):
             assert pair.health is assessed[-1]
             published.append(pair)
         assert run.health is assessed[-1] is not published[-1].health
