@@ -17,7 +17,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 from lz4.frame import LZ4FrameDecompressor
 from rosbags.convert.converter import LATCH
-from rosbags.interfaces import Connection, ConnectionExtRosbag2, Qos, QosReliability
+from rosbags.interfaces import Connection, ConnectionExtRosbag2, QosReliability
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag1 import reader as rosbag1
 from rosbags.rosbag2 import Reader as Reader2
@@ -75,29 +75,6 @@ _MAX_METADATA_BYTES = 1 << 24
 _zstd: Any = vars(mcap)['zstd']
 
 
-def _bound_decompression() -> None:
-    """Replace the decompressors of rosbags, for all bags that this process reads.
-
-    rosbags has no setting for it. A version without such an entry in its tables raises
-    ImportError, since nothing would be bounded.
-    """
-    def of_chunk(decompressor: Callable[[], Any]) -> Callable[..., bytes]:
-        # MCAP gives the size of a chunk, ROS 1 does not.
-        return lambda data, *size: _decompressed(decompressor, data, min([*size, MAX_CHUNK_BYTES]))
-
-    whole_file = SimpleNamespace(open=_bounded_file, decompress=lambda data: _decompressed(
-        _zstd.ZstdDecompressor, data, MAX_MESSAGE_BYTES))
-    tables: Any = ((mcap.DECOMPRESSORS, 'zstd', of_chunk(_zstd.ZstdDecompressor)),
-                   (mcap.DECOMPRESSORS, 'lz4', of_chunk(LZ4FrameDecompressor)),
-                   (rosbag1.decompressors, 'lz4', of_chunk(LZ4FrameDecompressor)),
-                   (rosbag1.decompressors, 'bz2', of_chunk(bz2.BZ2Decompressor)),
-                   (vars(rosbag2), 'zstd', whole_file))
-    for table, name, bounded in tables:
-        if name not in table:
-            raise ImportError(f'rosbags decompresses {name} in another way than 0.11 does')
-        table[name] = bounded
-
-
 @contextmanager
 def _bounded_file(file: BinaryIO, mode: str) -> Iterator[SimpleNamespace]:
     """Open a zstd file that can be read up to a bounded size; called by rosbags."""
@@ -128,7 +105,24 @@ def _decompressed(decompressor: Callable[[], Any], data: bytes, limit: int) -> b
     return out
 
 
-_bound_decompression()
+def _chunk(decompressor: Callable[[], Any]) -> Callable[..., bytes]:
+    # MCAP gives the size of a chunk, ROS 1 does not.
+    return lambda data, *size: _decompressed(decompressor, data, min([*size, MAX_CHUNK_BYTES]))
+
+
+# Replaced for all bags that this process reads: rosbags has no setting. Without such an entry in
+# the tables of its version nothing would be bounded.
+_TABLES: Any = (
+    (mcap.DECOMPRESSORS, 'zstd', _chunk(_zstd.ZstdDecompressor)),
+    (mcap.DECOMPRESSORS, 'lz4', _chunk(LZ4FrameDecompressor)),
+    (rosbag1.decompressors, 'lz4', _chunk(LZ4FrameDecompressor)),
+    (rosbag1.decompressors, 'bz2', _chunk(bz2.BZ2Decompressor)),
+    (vars(rosbag2), 'zstd', SimpleNamespace(open=_bounded_file, decompress=lambda data: (
+        _decompressed(_zstd.ZstdDecompressor, data, MAX_MESSAGE_BYTES)))))
+for _table, _name, _bounded in _TABLES:
+    if _name not in _table:
+        raise ImportError(f'rosbags decompresses {_name} in another way than 0.11 does')
+    _table[_name] = _bounded
 
 
 # -- Checks before a parser reads the files -------------------------------------------------------
@@ -163,6 +157,10 @@ def _check_path(path: Path) -> None:
             raise InputError(f'{file} is empty')
         if file.suffix == '.mcap':
             _check_mcap(file)
+        elif file.suffix == '.bag':
+            with file.open('rb') as opened:
+                if opened.read(9) != b'#ROSBAG V':
+                    raise InputError(f'{path} is no ROS 1 bag')
 
 
 def _check_metadata(path: Path) -> None:
@@ -171,9 +169,7 @@ def _check_metadata(path: Path) -> None:
         raise InputError(f'{path} is no metadata of a bag: it has more than '
                          f'{_MAX_METADATA_BYTES} bytes')
     content = path.read_bytes()
-    # Recorders write no aliases, so mostly the bytes alone decide and nothing is parsed. A file
-    # that is no YAML is refused by the reader.
-    with suppress(yaml.YAMLError, RecursionError):
+    with suppress(yaml.YAMLError, RecursionError):   # no YAML: refused by the reader
         if b'*' in content and any(
                 isinstance(event, yaml.AliasEvent) for event in yaml.parse(content)):
             raise InputError(f'{path} has YAML aliases, which no recorder writes: it is damaged')
@@ -253,11 +249,6 @@ class Chosen(NamedTuple):
     camera_info: Topic | None
     imu: Topic | None
     accel: Topic | None
-
-    @property
-    def all(self) -> list[Topic]:
-        """All that exist."""
-        return [topic for topic in self if topic]
 
 
 @dataclass(frozen=True, slots=True)
@@ -378,15 +369,6 @@ class RawMessage(NamedTuple):
     data: bytes
 
 
-class TopicOrigin(NamedTuple):
-    """Metadata of a topic that a copy of it needs; empty if the bag does not have them."""
-
-    definition: str   # of the message type
-    type_hash: str
-    serialization: str
-    qos: tuple[Qos, ...]   # as its publishers offered
-
-
 @functools.cache
 def _types(of_ros2: bool) -> Typestore:
     """Message types of one ROS, by their names alone.
@@ -440,14 +422,14 @@ class Bag:
             return 'best effort'
         return 'reliable' if QosReliability.RELIABLE in offered else ''
 
-    def origin(self, topic: Topic) -> TopicOrigin:
-        """Metadata for a copy of a topic, in ROS 2."""
+    def origin(self, topic: Topic) -> dict[str, Any]:
+        """Metadata for a copy of a topic, in ROS 2, as rosbags' `add_connection` takes them."""
         connection = self._connections([topic])[0]
         if not isinstance(connection.ext, ConnectionExtRosbag2):
-            return TopicOrigin('', '', 'cdr', tuple(LATCH) if connection.ext.latching else ())
-        return TopicOrigin(connection.msgdef.data, connection.digest,
-                           connection.ext.serialization_format,
-                           tuple(connection.ext.offered_qos_profiles))
+            return {'msgdef': '', 'offered_qos_profiles': LATCH if connection.ext.latching else ()}
+        return {'msgdef': connection.msgdef.data, 'rihs01': connection.digest,
+                'serialization_format': connection.ext.serialization_format,
+                'offered_qos_profiles': connection.ext.offered_qos_profiles}
 
     def can_be_copied(self, topic: Topic) -> bool:
         """Whether `raw_messages` can read it: of ROS 1 only types that ROS 2 has, too."""
@@ -548,9 +530,9 @@ def open_bag(path: Path | str) -> Iterator[Bag]:
     no bag, truncated or damaged.
     """
     path = Path(path)
-    _check_path(path)
     with ExitStack() as stack:
         try:
+            _check_path(path)
             reader = Reader1(path) if path.suffix == '.bag' and path.is_file() else Reader2(path)
             reader.open()
             stack.callback(reader.close)
@@ -561,19 +543,10 @@ def open_bag(path: Path | str) -> Iterator[Bag]:
             raise InputError(f'{path} cannot be read: {error.strerror}') from error
         # A damaged file can raise anything in the parsers.
         except Exception as error:
-            raise InputError(_reason_not_opened(path, error)) from error
+            fix = f'; try "rosbag reindex {path.name}"' if path.suffix == '.bag' else ''
+            kind = 'is truncated or damaged, or no bag' if path.is_file() else 'is damaged'
+            raise InputError(f'{path} {kind}: {_message(error)}{fix}') from error
         yield bag
-
-
-def _reason_not_opened(path: Path, error: Exception) -> str:
-    if path.suffix == '.bag':
-        with path.open('rb') as file:
-            if file.read(9) != b'#ROSBAG V':
-                return f'{path} is no ROS 1 bag'
-        return (f'{path} is truncated or damaged ({_message(error)}): copy it again, or repair it '
-                f'with "rosbag reindex {path.name}"')
-    kind = 'is truncated or damaged, or no bag' if path.is_file() else 'is damaged'
-    return f'{path} {kind}: {_message(error)}'
 
 
 def _message(error: Exception) -> str:

@@ -6,10 +6,10 @@ import shutil
 from typing import Any, Self
 
 from rosbags.interfaces import Connection
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 from rosbags.typesys import get_typestore, Stores
 
-from rs_relpose_ros.bags.reader import RawMessage, Topic, TopicOrigin
+from rs_relpose_ros.bags.reader import RawMessage, Topic
 from rs_relpose_ros.errors import InputError
 
 # Of an unknown type in a bag without hashes: players use its name.
@@ -32,14 +32,10 @@ class BagWriter:
         self._copied: dict[tuple[str, str], Connection] = {}
 
     def __enter__(self) -> Self:
-        # Again: the path may have been created since.
-        refuse_existing(self.path)
         try:
             self._writer.open()
-        except OSError as error:
-            raise InputError(
-                f'cannot create the bag {self.path}: {error.strerror}; choose a writable path'
-            ) from error
+        except (OSError, WriterError) as error:
+            raise InputError(f'cannot create the bag {self.path}: {error}') from error
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
@@ -59,12 +55,9 @@ class BagWriter:
 
     def type(self, msgtype: str) -> Any:
         """Message class of a type name such as ``'sensor_msgs/msg/Imu'``."""
-        try:
-            return self._typestore.types[msgtype]
-        except KeyError:
-            raise InputError(
-                f'ROS 2 Jazzy has no message type {msgtype!r}; names look like '
-                "'sensor_msgs/msg/Imu'") from None
+        if msgtype not in self._typestore.types:
+            raise InputError(f'ROS 2 Jazzy has no message type {msgtype!r}')
+        return self._typestore.types[msgtype]
 
     def write(self, topic: str, msgtype: str, message: Any, bag_time_ns: int) -> None:
         """Append a message; a topic is announced at its first message and has one type.
@@ -83,15 +76,13 @@ class BagWriter:
         self._writer.write(
             connection, bag_time_ns, self._typestore.serialize_cdr(message, msgtype))
 
-    def announce(self, topic: Topic, origin: TopicOrigin) -> None:
-        """Announce a topic whose messages are copied or replaced, with the same QoS."""
-        known = topic.msgtype in self._typestore.fielddefs
-        definition = {} if known and not origin.definition else {
-            'msgdef': origin.definition, 'rihs01': origin.type_hash or _UNKNOWN_HASH}
+    def announce(self, topic: Topic, origin: dict[str, Any]) -> None:
+        """Announce a topic whose messages are copied or replaced; `origin` is that of `Bag`."""
+        origin = {'msgdef': '', **origin, 'rihs01': origin.get('rihs01') or _UNKNOWN_HASH}
+        if topic.msgtype in self._typestore.fielddefs and not origin['msgdef']:
+            del origin['msgdef'], origin['rihs01']
         connection = self._writer.add_connection(
-            topic.name, topic.msgtype, typestore=self._typestore,
-            serialization_format=origin.serialization, offered_qos_profiles=origin.qos,
-            **definition)
+            topic.name, topic.msgtype, typestore=self._typestore, **origin)
         self._copied[topic.name, topic.msgtype] = connection
         self._connections.setdefault(topic.name, connection)
 

@@ -148,7 +148,7 @@ def inspect_bag(args: argparse.Namespace) -> CheckReport:
     parameters = read_parameters(args.params, args.set)
     with open_bag(args.bag) as bag:
         chosen = bag.choose_topics(options.topic_options(args))
-        messages = sum(topic.count for topic in chosen.all)
+        messages = sum(topic.count for topic in filter(None, chosen))
         if parameters.sensor.missing() and chosen.image is not None:
             messages *= 2   # the bag is read twice
         with options.progress_bar(messages, 'message', options.bag_name(args.bag)) as bar:

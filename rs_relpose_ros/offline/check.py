@@ -17,16 +17,9 @@ from rs_relpose_ros.imu.buffer import length_fault
 from rs_relpose_ros.messages.incoming import Role, sensor_messages
 from rs_relpose_ros.messages.transforms import with_extrinsics
 from rs_relpose_ros.offline import check_recording
-from rs_relpose_ros.offline.check_recording import Completion, Inertial, SampleRun, Scan, Stamps
+from rs_relpose_ros.offline.check_recording import Completion, SampleRun, Scan, Stamps
 from rs_relpose_ros.pipeline.assessment import not_evaluated
-from rs_relpose_ros.pipeline.findings import (
-    Assessment,
-    BY_NAME,
-    Finding,
-    FindingState,
-    NOT_EVALUATED,
-    QUANTITIES,
-)
+from rs_relpose_ros.pipeline.findings import Assessment, BY_NAME, Finding, FindingState
 
 OK, UNKNOWN, SUSPECT, WRONG = FindingState
 
@@ -101,11 +94,11 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
             scan.add(role, message)
             yield role, message
 
-    if sample is None:
-        for _ in scanned():
-            pass
-    else:
-        sample.run(scanned())
+    source = scanned()
+    if sample is not None:
+        sample.run(source)
+    for _ in source:   # all of it without a sample
+        pass
     findings = [_topics(bag, chosen, parameters), _parameters(parameters)]
     if contradiction:
         findings.append(Finding('transforms', SUSPECT, contradiction, 'correct the description of '
@@ -122,13 +115,12 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
 
 
 def _topics(bag: Bag, chosen: Chosen, parameters: Parameters) -> Finding:
-    roles = chosen._asdict()
-    measured = {role: topic.name if topic else None for role, topic in roles.items()}
+    measured = {role: topic and topic.name for role, topic in chosen._asdict().items()}
     needed = ['image', 'imu'] if parameters.intrinsics.given else ['image', 'camera_info', 'imu']
-    absent = [role for role in needed if roles[role] is None]
+    absent = [role for role in needed if measured[role] is None]
     if not absent:
         return by_case('topics', ', '.join(f'{topic.name} ({topic.count})'
-                                           for topic in chosen.all), measured)
+                                           for topic in filter(None, chosen)), measured)
     there = ', '.join(map(str, bag.topics)) or 'no topics at all'
     return Finding('topics', WRONG, f'no {" and no ".join(absent)} topic; the bag has {there}',
                    'record images (raw or compressed), their CameraInfo and a sensor_msgs/Imu '
@@ -231,7 +223,7 @@ def _rate(stamps: Stamps) -> Finding:
         return Finding(name, WRONG, f'{stamps.count} image(s) of different stamps or fewer',
                        'record at least some seconds', measured={'count': stamps.count})
     # Each longer step hides frames; 1.5 of a step occurs even with automatic exposure.
-    gaps, longest = stamps.longer_than(1.7 * interval)
+    gaps, longest = int((stamps.forwards > 1.7 * interval).sum()), stamps.longest
     missed = max(round(duration / interval) - stamps.count + 1, 0) if gaps else 0
     text = f'{1.0 / interval:.1f} Hz, {stamps.count} in {duration:.1f} s'
     if gaps:
@@ -296,13 +288,13 @@ _FASTEST_MEDIAN = 8.0
 
 def imu_findings(scan: Scan, reliability: str, parameters: Parameters) -> list[Finding]:
     """Findings on the IMU by itself."""
-    if not len(scan.inertial.rates):
+    if not len(scan.rates):
         problem = scan.problems.get(Role.IMU, 'all messages mark the gyro as absent')
         return [Finding('gyro', WRONG, f'no gyro: {problem}', 'choose a topic that has '
                         'angular_velocity with --imu-topic', measured={})]
     return [_imu_rate(scan, reliability, parameters),
-            stamp_finding('imu stamps', scan.imu_stamps, 'the IMU'), _gyro(scan.inertial),
-            _bias(scan.inertial, parameters), _accelerometer(scan.inertial)]
+            stamp_finding('imu stamps', scan.imu_stamps, 'the IMU'), _gyro(scan),
+            _bias(scan, parameters), _accelerometer(scan)]
 
 
 def _imu_rate(scan: Scan, reliability: str, parameters: Parameters) -> Finding:
@@ -311,11 +303,9 @@ def _imu_rate(scan: Scan, reliability: str, parameters: Parameters) -> Finding:
     if not interval > 0.0:
         return Finding(name, WRONG, f'{stamps.count} message(s), no two of increasing stamps',
                        _NO_STEP, measured={})
-    gaps, longest = stamps.longer_than(gap)
+    gaps, longest = int((stamps.forwards > gap).sum()), stamps.longest
     text = (f'{1.0 / interval:.0f} Hz, {stamps.count} in {stamps.duration:.1f} s, longest '
-            f'step {1e3 * longest:.1f} ms')
-    if reliability:
-        text += f', recorded as {reliability}'
+            f'step {1e3 * longest:.1f} ms' + f', recorded as {reliability}' * bool(reliability))
     return by_case(
         name, text, {'rate_hz': 1.0 / interval, 'count': stamps.count, 'gaps': gaps,
                      'longest_step_s': longest, 'unusable': scan.bad_imu,
@@ -331,21 +321,21 @@ def _imu_rate(scan: Scan, reliability: str, parameters: Parameters) -> Finding:
              'publish 200 Hz or more, which resolves the rotation of a hand within one readout'))
 
 
-def _gyro(inertial: Inertial) -> Finding:
-    rates = np.linalg.norm(inertial.rates, axis=1)
+def _gyro(scan: Scan) -> Finding:
+    rates = np.linalg.norm(scan.rates, axis=1)
     median, high = float(np.median(rates)), float(np.percentile(rates, 95))
     return by_case(
         'gyro', f'median {math.degrees(median):.1f} deg/s, 95 % {math.degrees(high):.1f} deg/s',
         {'median_rad_s': median, 'p95_rad_s': high},
-        Case(float(np.ptp(inertial.rates, axis=0).max()) == 0.0, WRONG,
+        Case(float(np.ptp(scan.rates, axis=0).max()) == 0.0, WRONG,
              'the sensor is stuck or not read: correct its driver', '; all samples are equal'),
         Case(median > _FASTEST_MEDIAN, WRONG, 'these are degrees per second: sensor_msgs/Imu '
              'requires rad/s, so correct the driver', f' if {median:.0f} were rad/s'))
 
 
-def _bias(inertial: Inertial, parameters: Parameters) -> Finding:
+def _bias(scan: Scan, parameters: Parameters) -> Finding:
     configured, sigma = parameters.imu.gyro_bias, parameters.imu.gyro_bias_sigma
-    name, rest = 'gyro at rest', inertial.rest()
+    name, rest = 'gyro at rest', scan.rest
     if rest is None:
         return Finding(name, UNKNOWN, 'not measured: the IMU is never at rest here',
                        'to measure it, keep the camera at rest for some seconds',
@@ -360,23 +350,23 @@ def _bias(inertial: Inertial, parameters: Parameters) -> Finding:
              f', gyro_bias is {list(np.array(configured))} +- {sigma:g}'))
 
 
-def _accelerometer(inertial: Inertial) -> Finding:
-    name, forces = 'gravity', inertial.forces
+def _accelerometer(scan: Scan) -> Finding:
+    name, forces = 'gravity', scan.forces
     if not len(forces):
         return by_case(
             name, 'no accelerometer', {'mean_length_m_s2': None,
-                                       'orientations': inertial.orientations},
-            Case(inertial.orientations > 0, OK, '', ', but an orientation'),
+                                       'orientations': scan.orientations},
+            Case(scan.orientations > 0, OK, '', ', but an orientation'),
             Case(True, SUSPECT, "poses are less accurate without: choose the accelerometer's "
                  'topic with --accel-topic (node: remap accel)'))
     length = float(np.linalg.norm(forces, axis=1).mean())
     fault = length_fault(length)
     text = fault.partition(': ')[0] or f'|acc| {length:.2f} m/s^2 in the mean'
-    if inertial.orientations:
-        text += f', and {inertial.orientations} orientations with covariance'
+    if scan.orientations:
+        text += f', and {scan.orientations} orientations with covariance'
     return by_case(
         name, text, {'mean_length_m_s2': length, 'mean_m_s2': forces.mean(axis=0).tolist(),
-                     'orientations': inertial.orientations},
+                     'orientations': scan.orientations},
         Case(bool(fault), WRONG, f'{fault.partition(": ")[2]}; or set use_gravity: false'),
         Case(not _PLAUSIBLE_FORCE[0] <= length <= _PLAUSIBLE_FORCE[1], SUSPECT, 'calibrate the '
              'accelerometer (bias, scale), or set use_gravity: false', ', not near 9.81'))
@@ -407,7 +397,7 @@ def joint_findings(scan: Scan, sample: SampleRun | None, completion: Completion,
 
     `sample` is None if `completion` could not find missing `parameters`.
     """
-    health = NOT_EVALUATED if sample is None else _with_calibration(sample, scan, completion)
+    health = Assessment(()) if sample is None else _with_calibration(sample, scan, completion)
     found = [_overlap(scan, parameters)]
     if sample is not None:
         found += [_pairs(sample, health), _texture(sample, health)]
@@ -512,7 +502,7 @@ def quantity_findings(health: Assessment, reason: str) -> Iterator[Finding]:
             finding.fix, _MEASURE if state is not finding.state is OK else
             'check again afterwards: a large deviation hides others' if state is WRONG else ''))))
     if not health.findings:
-        for quantity in QUANTITIES:
+        for quantity in BY_NAME.values():
             yield Finding(quantity.name, UNKNOWN, f'not measured: {reason}', unit=quantity.unit)
 
 
@@ -546,8 +536,8 @@ def _not_configured(name: str, completion: Completion, scan: Scan) -> Finding:
             estimated=size, sigma=estimate.sigma, observable=True)
     text = (f'quat_cam_imu_xyzw not configured; nearest map {axes_text(found.axis_map)}, '
             f'{math.degrees(found.rotation.value):.1f} deg from it')
-    if len(scan.inertial.forces):
-        down = -found.R_cam_imu @ scan.inertial.forces.mean(axis=0)
+    if len(scan.forces):
+        down = -found.R_cam_imu @ scan.forces.mean(axis=0)
         axis = int(np.argmax(np.abs(down)))
         sides = (('left', 'right'), ('top', 'bottom'), ('back', 'front'))[axis]
         text += f'; gravity points to the {sides[int(down[axis] > 0.0)]} of the image'
@@ -558,8 +548,8 @@ def _not_configured(name: str, completion: Completion, scan: Scan) -> Finding:
 
 def _effect(scan: Scan, health: Assessment, parameters: Parameters) -> Finding | None:
     """Displacement of the last row relative to the first by rotation alone [px]."""
-    name, intrinsics, inertial = 'rolling shutter', scan.intrinsics, scan.inertial
-    if intrinsics is None or not len(inertial.rates):
+    name, intrinsics, rest = 'rolling shutter', scan.intrinsics, scan.rest
+    if intrinsics is None or not len(scan.rates):
         return None
     configured = parameters.sensor.readout_time
     found = {finding.quantity: finding for finding in health.findings}.get('readout_time')
@@ -574,9 +564,8 @@ def _effect(scan: Scan, health: Assessment, parameters: Parameters) -> Finding |
                             ': no method needs to model rows'),
                        Case(True, UNKNOWN, '', ', which this recording does not confirm'))
     assert readout is not None
-    rest = inertial.rest()
     bias = np.array(parameters.imu.gyro_bias) if rest is None else rest.value
-    rates = np.linalg.norm(inertial.rates - bias, axis=1)
+    rates = np.linalg.norm(scan.rates - bias, axis=1)
     median, high = (readout * intrinsics.fx * float(np.percentile(rates, p)) for p in (50, 95))
     method = ('is sufficient' if high < _NO_EFFECT else
               'is not sufficient' if median > _STRONG_EFFECT else 'loses accuracy')

@@ -7,13 +7,13 @@ parameters that are missing, and replaces those that are too far off for the fro
 
 from array import array
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics
@@ -25,7 +25,7 @@ from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.timing import NANOSECONDS, Sensor, to_nanoseconds
-from rs_relpose_ros.imu.buffer import ImuBuffer, ImuSample
+from rs_relpose_ros.imu.buffer import ImuBuffer
 from rs_relpose_ros.imu.filters import GyroBias
 from rs_relpose_ros.messages.incoming import Intake, PARTS, ReasonCounts, Role, stamp_ns
 from rs_relpose_ros.offline.replay import MessageRefused, outcomes
@@ -47,105 +47,38 @@ _MOST_ENCODINGS = 20
 
 
 class Stamps:
-    """Stamps of a topic, in the order of recording."""
+    """Stamps (N,) of a topic [ns], in the order of recording, and how much later [s] that was."""
 
-    def __init__(self) -> None:
-        self._stamps_ns, self._delays = array('q'), array('d')
-
-    def add(self, stamp_ns: int, recorded_ns: int) -> None:
-        """Add the next message."""
-        self._stamps_ns.append(stamp_ns)
-        self._delays.append((recorded_ns - stamp_ns) * 1e-9)
-
-    @property
-    def ns(self) -> NDArray[np.int64]:
-        """The stamps (N,)."""
-        return np.array(self._stamps_ns, dtype=np.int64)
-
-    @property
-    def count(self) -> int:
-        """Number of messages."""
-        return len(self._stamps_ns)
-
-    @property
-    def steps(self) -> Array:
-        """Steps (N - 1,) between successive messages [s]; some may be zero or negative."""
-        return np.diff(self.ns) * 1e-9
-
-    @property
-    def _forwards(self) -> Array:
-        return self.steps[self.steps > 0.0]
-
-    @property
-    def interval(self) -> float:
-        """Median of the steps forwards [s]; NaN where there is none."""
-        steps = self._forwards
-        return float(np.median(steps)) if len(steps) else float('nan')
-
-    @property
-    def jitter(self) -> float:
-        """Spread of these steps, 1.48 times the median deviation [s]."""
-        steps = self._forwards
-        return 1.4826 * float(np.median(np.abs(steps - np.median(steps)))) if len(steps) else 0.0
-
-    @property
-    def delay(self) -> float:
-        """Median of recording time minus stamp [s]; NaN without a message."""
-        return float(np.median(self._delays)) if self.count else float('nan')
-
-    @property
-    def duration(self) -> float:
-        """From the smallest to the largest stamp [s]."""
-        return int(np.ptp(self.ns)) * 1e-9 if self.count else 0.0
-
-    def longer_than(self, seconds: float) -> tuple[int, float]:
-        """Number of steps forwards that are longer, and the longest [s]."""
-        steps = self._forwards
-        return int((steps > seconds).sum()), float(steps.max(initial=0.0))
-
-
-class Inertial:
-    """Readings of the IMU, in the order of recording."""
-
-    def __init__(self) -> None:
-        self.orientations = 0    # orientations with a covariance
-        self._forces, self._rates = array('d'), array('d')
-        self._buffer = ImuBuffer(ImuConfig(gyro_bias_sigma=_BIAS_SIGMA))
-
-    def add(self, sample: ImuSample) -> None:
-        """Add a sample."""
-        self.orientations += sample.orientation is not None
-        self._forces.extend(sample.linear_acceleration or ())
-        self._rates.extend(sample.angular_velocity or ())
-        self._buffer.add(sample)
-
-    @property
-    def rates(self) -> Array:
-        """Rates (K, 3) of the gyro [rad/s]."""
-        return np.array(self._rates).reshape(-1, 3)
-
-    @property
-    def forces(self) -> Array:
-        """Specific forces (K, 3) [m/s^2], IMU frame."""
-        return np.array(self._forces).reshape(-1, 3)
-
-    def rest(self) -> GyroBias | None:
-        """Mean rate at rest; None if the IMU never was."""
-        rest = self._buffer.bias(self._buffer.newest_ns or 0)
-        return rest if rest.sigma < _BIAS_SIGMA else None
+    def __init__(self, stamps_ns: Sequence[int], delays: Sequence[float]) -> None:
+        self.ns = np.array(stamps_ns, dtype=np.int64)
+        self.count = len(self.ns)
+        self.delay = float(np.median(delays)) if self.count else math.nan
+        self.duration = int(np.ptp(self.ns)) * 1e-9 if self.count else 0.0   # [s]
+        self.steps = np.diff(self.ns) * 1e-9   # (N - 1,) [s]; some may be zero or negative
+        self.forwards = self.steps[self.steps > 0.0]
+        self.longest = float(self.forwards.max(initial=0.0))
+        # Median of the steps forwards [s], and 1.48 times their median deviation from it.
+        self.interval, self.jitter = math.nan, 0.0
+        if len(self.forwards):
+            self.interval = float(np.median(self.forwards))
+            self.jitter = 1.4826 * float(np.median(np.abs(self.forwards - self.interval)))
 
 
 class Scan:
     """Statistics of all streams; `images` is the number of images to come.
 
-    `configured`: intrinsics in place of the CameraInfo's, if there are any.
+    `configured`: intrinsics in place of the CameraInfo's, if there are any. Derived values are
+    those of all messages: read them after the last one.
     """
 
     def __init__(self, images: int, configured: IntrinsicsConfig) -> None:
         self._configured = configured
         self.by_parameters = configured.given
         self._every = max(images // _DECODED, 1)
-        self.image_stamps, self.imu_stamps, self.inertial = Stamps(), Stamps(), Inertial()
+        self._stamps = {role: (array('q'), array('d')) for role in (Role.IMAGE, Role.IMU)}
+        self._rates, self._forces = array('d'), array('d')
+        self._buffer = ImuBuffer(ImuConfig(gyro_bias_sigma=_BIAS_SIGMA))
+        self.orientations = 0                                # of the IMU, with a covariance
         self.encodings: Counter[str] = Counter()             # images by encoding or format
         self.sizes: Counter[tuple[int, int]] = Counter()     # decoded images by (width, height)
         self.largest_image = 0                         # message of an image [bytes]
@@ -157,36 +90,63 @@ class Scan:
     def add(self, role: Role, message: BagMessage) -> None:
         """Add the next message."""
         try:
-            self._take(role, PARTS[role].read(message.message), message.bag_time_ns)
+            data = PARTS[role].read(message.message)
+            if role in self._stamps:
+                stamps_ns, delays = self._stamps[role]
+                stamps_ns.append(data.stamp_ns)
+                delays.append((message.bag_time_ns - data.stamp_ns) * 1e-9)
+            if role is Role.IMAGE:
+                self._add_image(data)
+            elif role is not Role.CAMERA_INFO:
+                self.orientations += data.orientation is not None
+                self._forces.extend(data.linear_acceleration or ())
+                self._rates.extend(data.angular_velocity or ())
+                self._buffer.add(data)
+            elif not self.by_parameters:
+                self.calibrations += data != self.intrinsics
+                self.intrinsics = data
         except RsRelposeError as error:
             self.bad_images += role is Role.IMAGE
             self.bad_imu += role in (Role.IMU, Role.ACCEL)
             self.problems.setdefault(Role.IMU if role is Role.ACCEL else role, str(error))
 
-    def _take(self, role: Role, data: Any, recorded_ns: int) -> None:
-        if role is Role.IMAGE:
-            self._add_image(data, recorded_ns)
-        elif role is Role.CAMERA_INFO:
-            if not self.by_parameters:
-                self.calibrations += data != self.intrinsics
-                self.intrinsics = data
-        else:
-            if role is Role.IMU:
-                self.imu_stamps.add(data.stamp_ns, recorded_ns)
-            self.inertial.add(data)
-
-    def _add_image(self, image: EncodedImage, recorded_ns: int) -> None:
+    def _add_image(self, image: EncodedImage) -> None:
         encoding = image.encoding[:60]
         if encoding in self.encodings or len(self.encodings) < _MOST_ENCODINGS:
             self.encodings[encoding] += 1
         self.largest_image = max(self.largest_image, len(image.data))
-        self.image_stamps.add(image.stamp_ns, recorded_ns)
-        if (self.image_stamps.count - 1) % self._every:
+        if (len(self._stamps[Role.IMAGE][0]) - 1) % self._every:
             return
         height, width = image.decoded().shape
         self.sizes[width, height] += 1
         if self.by_parameters:
             self.intrinsics = self._configured.of_image(width, height)
+
+    @cached_property
+    def image_stamps(self) -> Stamps:
+        """Stamps of the images."""
+        return Stamps(*self._stamps[Role.IMAGE])
+
+    @cached_property
+    def imu_stamps(self) -> Stamps:
+        """Stamps of the IMU, without those of a separate accelerometer."""
+        return Stamps(*self._stamps[Role.IMU])
+
+    @cached_property
+    def rates(self) -> Array:
+        """Rates (K, 3) of the gyro [rad/s]."""
+        return np.array(self._rates).reshape(-1, 3)
+
+    @cached_property
+    def forces(self) -> Array:
+        """Specific forces (K, 3) [m/s^2], IMU frame."""
+        return np.array(self._forces).reshape(-1, 3)
+
+    @cached_property
+    def rest(self) -> GyroBias | None:
+        """Mean rate at rest; None if the IMU never was."""
+        rest = self._buffer.bias(self._buffer.newest_ns or 0)
+        return rest if rest.sigma < _BIAS_SIGMA else None
 
 
 # -- Samples ---------------------------------------------------------------------------------
@@ -246,17 +206,16 @@ def completed(bag: Bag, topics: SensorTopics, parameters: Parameters) -> Complet
         found = _calibrated(bag, topics, parameters)
     except InputError as error:
         return Completion(parameters, None, str(error))
-    readout, problem = found.readout_time, ''
+    readout, axes, problem = found.readout_time, found.rotation, ''
     values: dict[str, Any] = {}
-    for name, estimate, found_values in (
-            ('quat_cam_imu_xyzw', found.rotation, {'quat_cam_imu_xyzw': found.quat_cam_imu_xyzw}),
-            ('readout_time', readout, {
-                'readout_time': abs(readout.value),
-                'readout_direction': 'up' if readout.value < 0.0 else 'down'})):
-        if name in missing and estimate.observable:
-            values.update(found_values)
-        elif name in missing:
-            problem = problem or estimate.remark
+    if 'quat_cam_imu_xyzw' in missing:
+        problem = '' if axes.observable else axes.remark
+        values |= {'quat_cam_imu_xyzw': found.quat_cam_imu_xyzw} if axes.observable else {}
+    if 'readout_time' in missing and readout.observable:
+        values |= {'readout_time': abs(readout.value),
+                   'readout_direction': 'up' if readout.value < 0.0 else 'down'}
+    elif 'readout_time' in missing:
+        problem = problem or readout.remark
     return Completion(parameters.updated(values), found, problem)
 
 
@@ -310,14 +269,6 @@ def _contradiction(name: str, configured: float, estimated: float, sigma: float,
                    configured, estimated, sigma, quantity.unit, True)
 
 
-def _part_of(images: int, part: int) -> range:
-    """Indices of the images of a part of a recording of so many `images`, 0 to 2."""
-    if images <= _PARTS * _PART_IMAGES:
-        return range(part * images // _PARTS, (part + 1) * images // _PARTS)
-    first = part * (images - _PART_IMAGES) // (_PARTS - 1)
-    return range(first, first + _PART_IMAGES)
-
-
 class SampleRun:
     """Parts of a recording of so many `images` through the front end.
 
@@ -331,7 +282,9 @@ class SampleRun:
             'track_readout_time': False})
         self._front_end = FrontEnd(configured, offline=True)
         self._intake = Intake(self._front_end.sequencer, configured)
-        self._parts = tuple(_part_of(images, part) for part in range(_PARTS))
+        # Indices of the first images of the parts, which overlap in a short recording.
+        self._firsts = [part * max(images - _PART_IMAGES, 0) // (_PARTS - 1)
+                        for part in range(_PARTS)]
         self._before = findings.NOT_EVALUATED   # of the settled parts
         self._last: PairResult | None = None
         self._part_since_ns = 0
@@ -340,6 +293,9 @@ class SampleRun:
         self.matches: list[int] = []   # of each pair
         self.poses = 0
         self.poseless = ReasonCounts()   # reasons of pairs without a pose
+        # Whether hardly any image could be used; many pairs have no pose; a deviation may be too
+        # large to be estimated from pairs.
+        self.is_refused = self.few_poses = self.is_lost = False
 
     def run(self, source: Iterable[tuple[Role, BagMessage]]) -> None:
         """Process the messages of the bag; those that cannot be used are counted."""
@@ -354,29 +310,15 @@ class SampleRun:
             self.frames += 1
             if outcome.result is not None:
                 self._add_pair(outcome.result)
+        self.is_refused = self.frames < _FEW_USED * self._handed
+        self.few_poses = self.poses < _MOST_POSED * len(self.matches)
+        self.is_lost = bool(self.matches) and (self.few_poses or not _FAR_OFF.isdisjoint(
+            fault.quantity for fault in self.health.faults))
 
     @property
     def health(self) -> Assessment:
         """Of each quantity the worst finding of all parts."""
         return findings.worst_of(self._before, self._front_end.health)
-
-    @property
-    def is_refused(self) -> bool:
-        """Whether hardly any image could be used."""
-        return self.frames < _FEW_USED * self._handed
-
-    @property
-    def few_poses(self) -> bool:
-        """Whether many pairs have no pose."""
-        return self.poses < _MOST_POSED * len(self.matches)
-
-    @property
-    def is_lost(self) -> bool:
-        """Whether a deviation may be too large to be estimated from pairs."""
-        if not self.matches:
-            return False
-        off = {fault.quantity for fault in self.health.faults}
-        return bool(off & _FAR_OFF) or self.few_poses
 
     def _chosen(self, source: Iterable[tuple[Role, BagMessage]],
                 ) -> Iterator[tuple[Role, BagMessage]]:
@@ -385,7 +327,7 @@ class SampleRun:
         for role, message in source:
             if role is Role.IMAGE:
                 index += 1
-                if not any(index in part for part in self._parts) or (
+                if not any(0 <= index - first < _PART_IMAGES for first in self._firsts) or (
                         self._handed - self._done >= _MOST_WAITING):
                     try:
                         self._front_end.sequencer.pass_over(stamp_ns(message.message.header))
