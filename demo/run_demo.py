@@ -78,8 +78,8 @@ def metric_path() -> str:
 
 def remarks(replayed: LiveComparison, opencv: list[Score]) -> list[str]:
     """Lines below the table."""
-    without = [record for record in replayed.records if record.status is not Status.OK]
-    statuses = ', '.join(sorted({record.status.value for record in without}))
+    without = [record for record in replayed.records if record.pose.status is not Status.OK]
+    statuses = ', '.join(sorted({record.pose.status.value for record in without}))
     equal = f'{replayed.unequal} of them not equal' if replayed.unequal else 'bit-equal'
     lines = [(f'no pose: {len(without)} pairs ({statuses}); in {sum(map(is_still, without))} the '
               'camera hardly moves'),

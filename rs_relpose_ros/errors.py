@@ -1,4 +1,8 @@
-"""Exceptions of the package, with one root class."""
+"""Exceptions of the package, with one root class; packages that may be absent."""
+
+import importlib
+import importlib.util
+from types import ModuleType
 
 
 class RsRelposeError(Exception):
@@ -11,3 +15,10 @@ class InputError(RsRelposeError, ValueError):
 
 class MissingInputError(RsRelposeError):
     """A required input is absent (a topic, a calibration, the readout time)."""
+
+
+def library(module: str, absent: str) -> ModuleType:
+    """Import a module; MissingInputError with the message `absent` if there is no such package."""
+    if importlib.util.find_spec(module.partition('.')[0]) is None:
+        raise MissingInputError(absent)
+    return importlib.import_module(module)

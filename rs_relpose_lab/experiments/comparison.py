@@ -50,7 +50,7 @@ def score(name: str, errors: Sequence[PairErrors | None], pairs: int | None = No
 
 def score_of_records(name: str, records: Sequence[PairRecord]) -> Score:
     """Score of a replay."""
-    return score(name, [r.errors if r.status is Status.OK else None for r in records])
+    return score(name, [r.errors if r.pose.status is Status.OK else None for r in records])
 
 
 def is_still(record: PairRecord) -> bool:

@@ -4,10 +4,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-import importlib
 import math
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import cv2
@@ -17,7 +15,7 @@ from numpy.typing import ArrayLike
 from rs_relpose_ros.bags import convert
 from rs_relpose_ros.bags.convert import Recording
 from rs_relpose_ros.config.files import SourcedValue
-from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.errors import InputError, library, MissingInputError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuSample, Vector
@@ -26,8 +24,8 @@ from rs_relpose_ros.imu.buffer import ImuSample, Vector
 START_NS = 1000 * NANOSECONDS
 
 _JPEG_QUALITY = 90
-# Module -> its package on PyPI; all of the extra `video`.
-_PACKAGES = {'av': 'av', 'telemetry_parser': 'telemetry-parser'}
+_ABSENT = ('videos need the Python package {}, which is not installed: pip install av '
+           'telemetry-parser')
 
 
 def read_video(path: Path, lens_profile: Path | None) -> Recording:
@@ -67,15 +65,6 @@ def read_video(path: Path, lens_profile: Path | None) -> Recording:
         accel=telemetry.accel)
 
 
-def _library(module: str) -> ModuleType:
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise MissingInputError(
-            f'videos need the Python package {_PACKAGES[module]}, which is not installed: '
-            f'pip install {" ".join(_PACKAGES.values())}') from error
-
-
 # -- Frames (PyAV) --------------------------------------------------------------------------------
 
 class Video:
@@ -86,7 +75,7 @@ class Video:
 
     def __init__(self, path: Path) -> None:
         self.path = convert.check_file(path)
-        self._av = _library('av')
+        self._av = library('av', _ABSENT.format('av'))
         with self._decoding(), self._av.open(str(path)) as container:
             if not container.streams.video:
                 raise InputError(f'{path} has no video stream')
@@ -260,9 +249,9 @@ def _spread(forces: Sequence[Vector | None], times: Sequence[int]) -> tuple[ImuS
 
 def _parsed(path: Path) -> tuple[Any, list[Mapping[str, Any]], list[Mapping[str, Any]]]:
     """The parser, tags by group of each payload, and IMU samples [ms, deg/s, m/s^2]."""
-    library = _library('telemetry_parser')
+    telemetry = library('telemetry_parser', _ABSENT.format('telemetry-parser'))
     try:
-        parser = library.Parser(str(convert.check_file(path)))
+        parser = telemetry.Parser(str(convert.check_file(path)))
         return parser, parser.telemetry(), parser.normalized_imu()
     except (OSError, ValueError) as error:
         raise MissingInputError(

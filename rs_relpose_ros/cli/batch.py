@@ -18,7 +18,7 @@ import cv2
 from rs_relpose_ros.calibrate.result import as_mapping
 from rs_relpose_ros.cli.main import FAILED, make_parser
 from rs_relpose_ros.cli.options import add_parameter_arguments, package_version, progress_bar
-from rs_relpose_ros.cli.poses import has_good_poses, replay_bag
+from rs_relpose_ros.cli.poses import replay_bag
 from rs_relpose_ros.cli.recordings import calibrate_bag, inspect_bag
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.errors import InputError, RsRelposeError
@@ -76,24 +76,11 @@ def run(args: argparse.Namespace) -> int:
     return 0 if set(result.states) == {State.DONE} else FAILED
 
 
-def _check(args: argparse.Namespace) -> tuple[bool, Mapping[str, Any]]:
-    report = inspect_bag(args)
-    return not report.failed, report.to_mapping()
-
-
-def _calibrate(args: argparse.Namespace) -> tuple[bool, Mapping[str, Any]]:
-    result, camera = calibrate_bag(args)
-    return result.complete, as_mapping(result, camera)
-
-
-def _replay(args: argparse.Namespace) -> tuple[bool, Mapping[str, Any]]:
-    _, outcome = replay_bag(args)
-    return has_good_poses(outcome), outcome.metrics
-
-
-# Command -> whether its exit code would be 0, and its results as in `RESULT_FILES`.
-_WORK: Mapping[str, Callable[[argparse.Namespace], tuple[bool, Mapping[str, Any]]]] = {
-    'check': _check, 'calibrate': _calibrate, 'replay': _replay}
+# Command -> its results as in `RESULT_FILES`.
+_WORK: Mapping[str, Callable[[argparse.Namespace], Mapping[str, Any]]] = {
+    'check': lambda args: inspect_bag(args).to_mapping(),
+    'calibrate': lambda args: as_mapping(*calibrate_bag(args)),
+    'replay': lambda args: replay_bag(args)[1].metrics}
 
 
 def run_job(job: Job) -> Outcome:
@@ -108,10 +95,10 @@ def run_job(job: Job) -> Outcome:
         arguments, sys.argv = sys.argv, ['rs_relpose', *words]   # for summary.json
         try:
             with redirect_stderr(io.StringIO()):
-                good, results = _WORK[job.command](make_parser(job.command).parse_args(words))
-            state, metrics = State.DONE, batch_results.metrics_of(job.command, results)
-            if not good:
-                state, message = State.FINDINGS, batch_results.message_of(job.command, results)
+                results = _WORK[job.command](make_parser(job.command).parse_args(words))
+            metrics = batch_results.metrics_of(job.command, results)
+            message = batch_results.message_of(job.command, results)
+            state = State.FINDINGS if message else State.DONE
             if job.command == 'check':
                 text = json.dumps(results, indent=2, allow_nan=False) + '\n'
                 files[RESULT_FILES['check']] = text.encode()

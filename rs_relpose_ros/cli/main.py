@@ -2,16 +2,13 @@
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
-import importlib
-import importlib.util
 import logging
 import os
 import sys
-from types import ModuleType
 from typing import Any, NamedTuple
 
 from rs_relpose_ros.blas_threads import use_one_blas_thread
-from rs_relpose_ros.errors import MissingInputError, RsRelposeError
+from rs_relpose_ros.errors import library, MissingInputError, RsRelposeError
 
 PROGRAM = 'rs_relpose'
 
@@ -45,6 +42,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
                  'render rolling-shutter images and IMU of a known motion into a bag'),
 }
 
+LABORATORY = 'the package rs_relpose_lab, which is not installed'
 DONE, FAILED, BAD_INPUT = 0, 1, 2
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 PIPE_CLOSED = 141  # 128 + SIGPIPE
@@ -76,18 +74,10 @@ class _Version(argparse.Action):
 def load_command(name: str) -> Command:
     """Import the command `name`; MissingInputError if its package is not installed."""
     module, _, attribute = COMMANDS[name][0].partition(':')
-    command: Any = import_of(module, f'the command {name} needs')
+    command: Any = library(module, f'the command {name} needs {LABORATORY}')
     if attribute:
         command = getattr(command, attribute)
     return Command(command.HELP, command.add_arguments, command.run)
-
-
-def import_of(module: str, needs: str) -> ModuleType:
-    """Import a module of a package that may be absent; `needs` begins the error's message."""
-    package = module.partition('.')[0]
-    if importlib.util.find_spec(package) is None:
-        raise MissingInputError(f'{needs} the package {package}, which is not installed')
-    return importlib.import_module(module)
 
 
 def make_parser(selected: str | None) -> argparse.ArgumentParser:

@@ -69,19 +69,14 @@ def _calibration(args: argparse.Namespace) -> dict[str, Any]:
     return file_values(folder / CALIBRATION_FILE)
 
 
-def has_good_poses(outcome: replay.ReplayOutcome) -> bool:
-    """Whether a pair has a pose, and no parameter is wrong."""
-    metrics = outcome.metrics
-    return bool(metrics['pairs']['answered']) and metrics['health']['state'] != 'wrong'
-
-
 def _replay(args: argparse.Namespace) -> int:
     folder, outcome = replay_bag(args)
     metrics = outcome.metrics
     options.warn_unused(metrics['not_used'])
     _print_replay(outcome)
     print(f'in {folder}: {", ".join([*(path.name for path in outcome.files), SUMMARY_FILE])}')
-    return 0 if has_good_poses(outcome) else FAILED
+    good = metrics['pairs']['answered'] and metrics['health']['state'] != 'wrong'
+    return 0 if good else FAILED
 
 
 def _print_replay(outcome: replay.ReplayOutcome) -> None:
@@ -100,7 +95,7 @@ def _print_replay(outcome: replay.ReplayOutcome) -> None:
     elif not pairs['answered']:
         # The reason of suppressed poses follows with the findings.
         reasons = sorted({record.pose.reason for record in outcome.records
-                          if record.status.value != 'WITHHELD'})
+                          if record.pose.status.value != 'WITHHELD'})
         for reason in reasons[:_MOST_REASONS]:
             print(f'no pose: {reason}')
     _print_errors(metrics['errors_against_truth'])

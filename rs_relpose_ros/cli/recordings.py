@@ -17,10 +17,10 @@ from rs_relpose_ros.bags.writer import refuse_existing
 from rs_relpose_ros.calibrate import result as calibration
 from rs_relpose_ros.calibrate.procedure import calibrate, read_recording
 from rs_relpose_ros.cli import options
-from rs_relpose_ros.cli.main import Command, FAILED, import_of
+from rs_relpose_ros.cli.main import Command, FAILED, LABORATORY
 from rs_relpose_ros.config import settings
 from rs_relpose_ros.config.files import read_parameters, write_parameters
-from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.errors import InputError, library, MissingInputError
 from rs_relpose_ros.geometry.camera import DISTORTION_MODELS, RollingShutterCamera
 from rs_relpose_ros.messages.transforms import bag_frames, extrinsics
 from rs_relpose_ros.offline.check import check_bag, CheckReport
@@ -188,11 +188,8 @@ class Source(NamedTuple):
 
 def _of_laboratory(reader: str) -> Callable[[Path, Path | None], Recording]:
     """A reader of another package, found by name: the product does not depend on it."""
-    def read(folder: Path, _: Path | None) -> Recording:
-        module = import_of('rs_relpose_lab.datasets', 'public recordings need')
-        recording: Recording = getattr(module, reader)(folder)
-        return recording
-    return read
+    return lambda folder, _: getattr(library(
+        'rs_relpose_lab.datasets', f'public recordings need {LABORATORY}'), reader)(folder)
 
 
 SOURCES: Mapping[str, Source] = {

@@ -68,7 +68,7 @@ def odometry_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Para
             observed.append(Tracks.of_pair(pair))
             given = KeyframePair.of_result(pair)
             views[given.current_ns + given.row_ns] = View(pair.stamp_ns, pair.parallax)
-            yield replay.counts.last_ns, given
+            yield replay.last_ns, given
 
     samples = _samples(bag, topics)
     live = follow(estimator, pairs(), samples)

@@ -4,21 +4,20 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass
-import importlib
 import json
 import logging
 import os
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.errors import InputError, library, MissingInputError
 from rs_relpose_ros.offline import batch_results
 from rs_relpose_ros.offline.batch_results import Bag, Job, Outcome, State, Store
 from rs_relpose_ros.output_files import SUMMARY_FILE, written
 
 # How many workers may die over one bag before it is given up, less one.
 _ALLOWED_DEATHS = 1
+_ABSENT = "many bags need Dask, which is not installed: pip install 'dask[distributed]'"
 _TIMEOUT = 20.0   # to find a scheduler and its workers [s]
 
 
@@ -66,7 +65,7 @@ def run_batch(client: Any, request: Request, folder: Path, work: Callable[[Job],
     store = Store(folder)
     outcomes = {job: earlier for job in jobs if (earlier := store.done(job)) is not None}
     reused = len(outcomes)
-    for _ in range(reused):
+    for _ in outcomes:
         on_bag()
     for outcome in _run_jobs(client, [job for job in jobs if job not in outcomes], work):
         store.add(outcome)
@@ -76,10 +75,8 @@ def run_batch(client: Any, request: Request, folder: Path, work: Callable[[Job],
         on_bag()
     rows = tuple(outcomes[job] for job in jobs)
     store.write_table(rows)
-    combined = batch_results.CombinedCalibration()
-    if request.command == 'calibrate':
-        combined = batch_results.combine(
-            {row.job.name: row.metrics for row in rows if row.metrics})
+    combined = batch_results.combine({row.job.name: row.metrics for row in rows if (
+        row.metrics and request.command == 'calibrate')})
     result = BatchOutcome(rows, combined, reused)
     summary = {
         'command': request.command, 'options': list(request.options),
@@ -100,7 +97,7 @@ def open_cluster(scheduler: str | None, workers: int | None) -> Iterator[Any]:
     By default as many as this process may use processors. MissingInputError without Dask, or
     without workers; InputError if no scheduler answers.
     """
-    dask, distributed = _library('dask'), _library('distributed')
+    dask, distributed = library('dask', _ABSENT), library('distributed', _ABSENT)
     # It logs starts and ends of processes; errors of the work are in the outcomes.
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
     with ExitStack() as stack:
@@ -137,7 +134,7 @@ def _run_jobs(client: Any, jobs: Sequence[Job],
 
     A worker that dies is replaced, and its job repeated, by another worker if possible.
     """
-    distributed = _library('distributed')
+    distributed = library('distributed', _ABSENT)
     waiting = list(reversed(jobs))
     running: dict[Any, Job] = {}
     finished = distributed.as_completed()
@@ -152,24 +149,13 @@ def _run_jobs(client: Any, jobs: Sequence[Job],
 
     fill()
     for future in finished:
-        yield _outcome(future, running.pop(future), distributed)
+        job = running.pop(future)
+        try:
+            outcome = future.result()
+        except distributed.scheduler.KilledWorker:
+            outcome = Outcome(job, State.LOST, f'each of {_ALLOWED_DEATHS + 1} workers died over '
+                              'this bag: out of memory, or a fault of a library')
+        except Exception as error:  # noqa: BLE001 any error of a worker is the outcome of its bag
+            outcome = Outcome(job, State.FAILED, f'{type(error).__name__}: {error}')
+        yield outcome
         fill()
-
-
-def _outcome(future: Any, job: Job, distributed: ModuleType) -> Outcome:
-    try:
-        outcome: Outcome = future.result()
-    except distributed.scheduler.KilledWorker:
-        return Outcome(job, State.LOST, f'each of {_ALLOWED_DEATHS + 1} workers died over this '
-                       'bag: out of memory, or a fault of a library')
-    except Exception as error:  # noqa: BLE001 any error of a worker is the outcome of its bag
-        return Outcome(job, State.FAILED, f'{type(error).__name__}: {error}')
-    return outcome
-
-
-def _library(name: str) -> ModuleType:
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise MissingInputError('many bags need Dask, which is not installed: pip install '
-                                "'dask[distributed]'") from error

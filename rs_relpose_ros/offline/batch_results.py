@@ -181,11 +181,7 @@ class Store:
             for row in outcomes:
                 writer.writerow([row.job.bag.path, row.job.name, row.state.value,
                                  ' '.join(row.message.split()), f'{row.seconds:.3f}',
-                                 *(_text(row.metrics.get(name)) for name in columns)])
-
-
-def _text(value: object) -> str:
-    return '' if value is None else repr(float(value)) if isinstance(value, float) else str(value)
+                                 *map(row.metrics.get, columns)])
 
 
 # -- Columns of the table, and messages, from the results of one bag ------------------------------
@@ -224,14 +220,11 @@ def metrics_of(command: str, results: Results) -> dict[str, Any]:
         verdicts = [finding['verdict'] for finding in results['findings']]
         return {verdict: verdicts.count(verdict) for verdict in _VERDICTS}
     columns = _CALIBRATE_COLUMNS if command == 'calibrate' else _REPLAY_COLUMNS
-    metrics = {column: _at(results, place) for column, place in columns.items()}
-    if command == 'replay':
-        metrics['pairs_with_truth'] = metrics['pairs_with_truth'] or 0
-    return metrics
+    return {column: _at(results, place) for column, place in columns.items()}
 
 
 def message_of(command: str, results: Results) -> str:
-    """The problems that a completed command found."""
+    """The problems that a completed command found; empty if its exit code is 0."""
     if command == 'check':
         problems = [f'{finding["name"]}: {finding["text"]}' for finding in results['findings']
                     if finding['verdict'] == 'failure']
@@ -239,7 +232,7 @@ def message_of(command: str, results: Results) -> str:
         parts = {**{name: _at(results, name) for name in _CALIBRATED},
                  'rotation': results[_ROTATION]}
         problems = [f'{name} is not observable: {part["remark"]}' for name, part in parts.items()
-                    if part is not None and not part['observable']]
+                    if part is not None and not part['determined']]
     else:
         problems = [finding['sentence'] for finding in results['health']['findings']
                     if finding['state'] == 'wrong']

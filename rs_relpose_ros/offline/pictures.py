@@ -168,10 +168,10 @@ def _shade_no_pose(axis: Axes, records: Sequence[PairRecord], start_ns: int,
     for record in records:
         if record.pose:
             continue
-        text = label or f'no pose: {record.status.value}'
+        text = label or f'no pose: {record.pose.status.value}'
         (begin,), (end,) = _spans([record], start_ns)
         axis.axvspan(begin, end, facecolor='0.6', alpha=0.35, edgecolor='0.3', linewidth=0.0,
-                     hatch=hatches.get(record.status, '//'),
+                     hatch=hatches.get(record.pose.status, '//'),
                      label=None if text in labelled else text)
         labelled.add(text)
 

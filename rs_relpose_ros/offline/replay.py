@@ -91,21 +91,8 @@ def unused_reason(outcome: FrameRefused | FrameFailed | MessageRefused) -> str:
     return kind + outcome.reason
 
 
-@dataclass(slots=True)
-class ReplayCounts:
-    """Counts that the sequencer does not have, and wall times [s]."""
-
-    invalid_messages: int = 0
-    failed_frames: int = 0
-    pairs: int = 0
-    seconds: float = 0.0   # of the whole, without compilation
-    processing_seconds: float = 0.0   # of it, in tracking and estimation
-    first_ns: int = 0   # bag time of the first message
-    last_ns: int = 0   # and of the last one so far
-
-
 class Replay:
-    """One run over an open bag; iterate over `pairs`, then read `counts` and `reasons`.
+    """One run over an open bag; iterate over `pairs`, then read the counts and `reasons`.
 
     With `stamps` only these frames are handed over, as those that a live node processed.
     `keep_images`: whether pairs have their current image.
@@ -118,12 +105,15 @@ class Replay:
         self._front_end = FrontEnd(parameters, offline=True, keep_images=keep_images)
         self.sequencer = self._front_end.sequencer
         self.intake = Intake(self.sequencer, parameters, stamps)
-        self.counts = ReplayCounts()
+        self.invalid_messages = self.failed_frames = self.pair_count = 0
+        # Wall times [s]: of the whole without compilation, and of tracking and estimation.
+        self.seconds = self.processing_seconds = 0.0
+        self.first_ns = self.last_ns = 0   # bag times of the first and of the last message so far
         # Unused frames and messages, by the first message of each reason.
         self.reasons = ReasonCounts()
 
     def pairs(self) -> Iterator[PairResult]:
-        """Run over the bag, and yield every pair; `counts.last_ns` is then its bag time.
+        """Run over the bag, and yield every pair; `last_ns` is then its bag time.
 
         Raises if the bag is damaged, its camera is not calibrated, or no frame could be used.
         """
@@ -131,20 +121,20 @@ class Replay:
         started = time.perf_counter()
         for outcome in outcomes(self._front_end, self.intake, self._messages()):
             if isinstance(outcome, Frame):
-                self.counts.processing_seconds += outcome.seconds
+                self.processing_seconds += outcome.seconds
                 if outcome.result is not None:
-                    self.counts.pairs += 1
+                    self.pair_count += 1
                     yield outcome.result
                 continue
             if isinstance(outcome, MessageRefused):
                 if not self.sequencer.counts().frames_taken:
                     outcome.raise_without_intrinsics()
-                self.counts.invalid_messages += 1
-            self.counts.failed_frames += isinstance(outcome, FrameFailed)
+                self.invalid_messages += 1
+            self.failed_frames += isinstance(outcome, FrameFailed)
             reason = unused_reason(outcome)
             if self.reasons.add(reason):
                 _logger.info('not used: %s', reason)
-        self.counts.seconds = time.perf_counter() - started
+        self.seconds = time.perf_counter() - started
         self._check_outcome()
 
     @property
@@ -154,8 +144,8 @@ class Replay:
 
     def _messages(self) -> Iterator[tuple[Role, BagMessage]]:
         for role, message in sensor_messages(self._bag, self._topics):
-            self.counts.first_ns = self.counts.first_ns or message.bag_time_ns
-            self.counts.last_ns = message.bag_time_ns
+            self.first_ns = self.first_ns or message.bag_time_ns
+            self.last_ns = message.bag_time_ns
             yield role, message
 
     def _check_outcome(self) -> None:
@@ -169,7 +159,7 @@ class Replay:
                                 len(self._stamps))
         reason = next(iter(self.reasons.most_common()), None)
         if reason is not None and (not self.sequencer.counts().frames_taken
-                                   or (self.counts.failed_frames and not self.counts.pairs)):
+                                   or (self.failed_frames and not self.pair_count)):
             raise InputError(f'no frame of {self._bag.path} could be used: {reason}')
 
 
@@ -220,7 +210,7 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
                 messages = pair_messages(pair, writer.type, parameters.pair.reference_frame)
                 for topic, message in messages.items():
                     writer.write(f'/relpose_node/{topic}', PAIR_TOPICS[topic], message,
-                                 run.counts.last_ns)
+                                 run.last_ns)
             on_pair(pair)
             if pictures and (shown is None or _picture_rank(pair) > _picture_rank(shown)):
                 shown = pair
@@ -243,8 +233,8 @@ def _summary(records: list[PairRecord], run: Replay, last: PairResult | None,
              health: Assessment) -> dict[str, Any]:
     """Content of summary.json; medians are over the pairs with a pose, null without any."""
     answered = [record for record in records if record.pose]
-    counts, sequencer = run.counts, run.sequencer.counts()
-    seconds, taken = counts.processing_seconds, sequencer.frames_taken
+    sequencer, seconds = run.sequencer.counts(), run.processing_seconds
+    taken = sequencer.frames_taken
     return {
         'pairs': pair_counts(records),
         'frames': {
@@ -252,7 +242,7 @@ def _summary(records: list[PairRecord], run: Replay, last: PairResult | None,
             'not_among_stamps': run.intake.images_skipped,
             'processed': taken,
             'refused': {refusal.value: n for refusal, n in sequencer.refused.items()},
-            'failed': counts.failed_frames,
+            'failed': run.failed_frames,
         },
         'imu': {
             'samples': sequencer.imu_samples,
@@ -263,15 +253,15 @@ def _summary(records: list[PairRecord], run: Replay, last: PairResult | None,
         },
         'tracked': _tracked(last),
         'health': health.as_json(),
-        'invalid_messages': counts.invalid_messages,
+        'invalid_messages': run.invalid_messages,
         'not_used': run.reasons.most_common(),
         'medians': {metric.name: median([record.metrics[metric.name] for record in answered])
                     for metric in PAIR_METRICS},
         'baselines': tables.baselines(answered),
         'errors_against_truth': tables.errors_against_truth(answered),
         'timing': {
-            'bag_s': (counts.last_ns - counts.first_ns) * 1e-9,
-            'wall_s': counts.seconds,
+            'bag_s': (run.last_ns - run.first_ns) * 1e-9,
+            'wall_s': run.seconds,
             'frame_rate_hz': taken / seconds if seconds > 0.0 else None,
             'processing_per_frame_ms': 1e3 * seconds / taken if taken else None,
             'estimate_median_ms': median([1e3 * record.pose.duration for record in records]),
@@ -281,7 +271,7 @@ def _summary(records: list[PairRecord], run: Replay, last: PairResult | None,
 
 def pair_counts(records: list[PairRecord]) -> dict[str, Any]:
     """Numbers of pairs for summary.json."""
-    by_status = Counter(record.status for record in records)
+    by_status = Counter(record.pose.status for record in records)
     return {'total': len(records), 'answered': sum(bool(record.pose) for record in records),
             'by_status': {status.value: by_status[status] for status in Status}}
 

@@ -17,7 +17,7 @@ import scipy
 
 from rs_relpose_ros.bags.reader import SensorTopics
 from rs_relpose_ros.config.settings import Parameters
-from rs_relpose_ros.estimator.result import RelativePose, Status
+from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.messages.incoming import ReasonCounts
 from rs_relpose_ros.messages.outgoing import number, published_covariance, quat_xyzw
@@ -48,11 +48,6 @@ class PairRecord:
                    result.gyro_rotation,
                    {metric.name: metric.of(result) for metric in PAIR_METRICS},
                    None if truth is None else truth.errors(pose.R, pose.t, ns1, ns2))
-
-    @property
-    def status(self) -> Status:
-        """Status of the pose."""
-        return self.pose.status
 
 
 # -- tables ----------------------------------------------------------------------------------
@@ -99,7 +94,7 @@ def _error_row(record: PairRecord) -> list[str] | None:
     values = [''] * 4 if errors is None else [number(value) for value in (
         errors.baseline, errors.rotation, errors.rotation_error, errors.translation_error)]
     return [str(record.reference_stamp_ns), str(record.stamp_ns),
-            number(record.metrics['interval_s']), *values, record.status.value]
+            number(record.metrics['interval_s']), *values, record.pose.status.value]
 
 
 ERRORS = Table('errors.csv', (
