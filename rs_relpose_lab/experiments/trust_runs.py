@@ -21,7 +21,6 @@ from rs_relpose_lab.simulation.render import view_of
 from rs_relpose_lab.simulation.rows import observe
 from rs_relpose_lab.simulation.simulation import Simulation
 from rs_relpose_lab.simulation.trajectory import FinePath
-from rs_relpose_ros.bags.convert import by_stamp
 from rs_relpose_ros.bags.reader import CAMERA_FRAME, IMAGE_DELAY, IMU_DELAY, open_bag
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import Parameters, sensor_model
@@ -494,7 +493,8 @@ def recording_at(path: Path) -> Recording:
         for role, message in sensor_messages(bag, topics, found):
             found[role].append(PARTS[role].read(message.message))
         truth = read_truth(bag, topics)
-    images, samples = found[Role.IMAGE], by_stamp(found[Role.IMU] + found[Role.ACCEL])
+    images = found[Role.IMAGE]
+    samples = sorted(found[Role.IMU] + found[Role.ACCEL], key=lambda sample: sample.stamp_ns)
     first = images[0].decoded()
     intrinsics = (found[Role.CAMERA_INFO] or [
         parameters.intrinsics.of_image(first.shape[1], first.shape[0])])[0]

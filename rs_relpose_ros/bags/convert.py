@@ -4,7 +4,7 @@ A format has a reader that gives a `Recording`: `phones`, `video`, and those of 
 the laboratory. `read_rows`, `read_lines` and `read_object` read text files of such formats.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 import csv
 from dataclasses import dataclass
@@ -66,19 +66,23 @@ def image_file(stamp_ns: int, path: Path) -> RecordedImage:
 class Recording:
     """One camera and one IMU, at least one image and one sample, and the node's parameters.
 
-    Images, samples and poses in the order of their stamps, each by its sensor's clock.
+    Images and poses in the order of their stamps, each by its sensor's clock. Samples are sorted;
+    the node drops repeated ones.
     """
 
     camera: RollingShutterCamera | None   # None: not calibrated, and the bag has no CameraInfo
     images: Sequence[RecordedImage]
-    imu: tuple[ImuSample, ...]   # in its own axes; without `accel` gyro and accelerometer together
+    imu: Sequence[ImuSample]   # in its own axes; without `accel` gyro and accelerometer together
     title: str   # head of the parameter file
     parameters: tuple[SourcedValue, ...]
-    accel: tuple[ImuSample, ...] = ()   # samples of an accelerometer with stamps of its own
+    accel: Sequence[ImuSample] = ()   # samples of an accelerometer with stamps of its own
     truth: tuple[TruePose, ...] = ()   # of the camera's optical frame, on the IMU's clock
     image_format: str = COLOUR_JPEG   # as in sensor_msgs/CompressedImage
 
     def __post_init__(self) -> None:
+        for name in ('imu', 'accel'):
+            ordered = tuple(sorted(getattr(self, name), key=attrgetter('stamp_ns')))
+            object.__setattr__(self, name, ordered)
         if not self.images or not self.imu:
             raise MissingInputError('a recording needs at least one image and one IMU sample')
         for earlier, later in pairwise(self.images):
@@ -95,15 +99,10 @@ class Recording:
                 f'and the images, from {first} to {last} ns, have no time in common: they are '
                 'not of the same recording, or their stamps are not on one clock')
 
-    def cropped(self, samples: tuple[ImuSample, ...]) -> tuple[ImuSample, ...]:
+    def cropped(self, samples: Sequence[ImuSample]) -> list[ImuSample]:
         """Those of `imu` or `accel` up to shortly after the last image, as the bag has them."""
         end_ns = self.images[-1].stamp_ns + _IMU_AFTER_NS
-        return tuple(sample for sample in samples if sample.stamp_ns <= end_ns)
-
-
-def by_stamp(samples: Iterable[ImuSample]) -> tuple[ImuSample, ...]:
-    """All samples in the order of their stamps; the node drops repeated ones."""
-    return tuple(sorted(samples, key=attrgetter('stamp_ns')))
+        return [sample for sample in samples if sample.stamp_ns <= end_ns]
 
 
 # -- Bags -----------------------------------------------------------------------------------------
@@ -121,7 +120,7 @@ def write_bag(recording: Recording, path: Path | str,
     """
     imu_delay_ns = to_nanoseconds(reader.IMU_DELAY)
 
-    def imu(samples: tuple[ImuSample, ...], topic: str) -> Iterator[_Entry]:
+    def imu(samples: Sequence[ImuSample], topic: str) -> Iterator[_Entry]:
         for sample in recording.cropped(samples):
             yield (sample.stamp_ns + imu_delay_ns, topic, reader.IMU, outgoing.imu_message(
                 sample.stamp_ns, reader.IMU_FRAME, sample.angular_velocity,
@@ -290,8 +289,7 @@ def read_lines(path: Path) -> Iterator[Row]:
 
 
 def _opened(path: Path, most_bytes: float) -> TextIO:
-    check_file(path, most_bytes)
-    return path.open(encoding='utf-8', errors='replace')
+    return check_file(path, most_bytes).open(encoding='utf-8', errors='replace')
 
 
 def check_file(path: Path, most_bytes: float = math.inf) -> Path:

@@ -5,13 +5,13 @@ from dataclasses import replace
 import logging
 import math
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.bags import convert
-from rs_relpose_ros.bags.convert import by_stamp, read_object, read_table, Recording, Row
+from rs_relpose_ros.bags.convert import read_object, read_table, Recording, Row
 from rs_relpose_ros.bags.video import readout_of_milliseconds, readout_values, Video
 from rs_relpose_ros.config.files import SourcedValue
 from rs_relpose_ros.errors import InputError, MissingInputError
@@ -33,11 +33,10 @@ _logger = logging.getLogger(__name__)
 
 def read_android(folder: Path) -> Recording:
     """A recording of any of `LOGGERS`; MissingInputError if it is of none of them."""
-    for logger in LOGGERS:
-        if all((folder / name).exists() for name in logger.files):
-            return logger.read(folder)
-    known = '; '.join(f'{", ".join(logger.files)} ({logger.name})' for logger in LOGGERS)
-    raise MissingInputError(f'{folder} is of no known logger, by its files: {known}')
+    for files, read in LOGGERS.values():
+        if all((folder / name).exists() for name in files):
+            return read(folder)
+    raise MissingInputError(f'{folder} is of no known logger, by its files: {known_loggers()}')
 
 
 # -- Parameters that loggers have in common -------------------------------------------------------
@@ -90,8 +89,7 @@ def _camera_matrix(fx: float, fy: float, cx: float, cy: float, source: str) -> S
 
 
 def _refuse_portrait(path: Path, width: int, height: int) -> None:
-    """Refuse images higher than wide: they were rotated, as no phone's sensor is."""
-    if height > width:
+    if height > width:   # as no phone's sensor is
         raise InputError(
             f'{path} has images of {width}x{height}: they were rotated, and their rows are the '
             "sensor's columns; record in the sensor's own orientation (landscape)")
@@ -132,10 +130,10 @@ def read_tables(folder: Path) -> Recording:
 
     All stamps on one clock, the IMU in the phone's sensor axes; other columns are ignored.
     """
-    gyro = by_stamp(ImuSample(_stamp(row), row.vector(*'xyz'), None)
-                    for row in read_table(folder / 'gyro.csv'))
-    accel = by_stamp(ImuSample(_stamp(row), None, row.vector(*'xyz'))
-                     for row in _optional_table(folder / 'accel.csv'))
+    gyro = [ImuSample(_stamp(row), row.vector(*'xyz'), None)
+            for row in read_table(folder / 'gyro.csv')]
+    accel = [ImuSample(_stamp(row), None, row.vector(*'xyz'))
+             for row in _optional_table(folder / 'accel.csv')]
     return Recording(
         None, _table_images(folder, read_table(folder / 'frames.csv')), gyro,
         _title(folder, '. `rs_relpose calibrate` estimates readout time and focal length'),
@@ -192,7 +190,7 @@ def read_jsonl(folder: Path) -> Recording:
         (convert.COMPRESSED, _STAMP_ROW, _TIME_OFFSET, rotation), accel=accel)
 
 
-def _events(path: Path) -> tuple[list[int], tuple[ImuSample, ...], tuple[ImuSample, ...]]:
+def _events(path: Path) -> tuple[list[int], list[ImuSample], list[ImuSample]]:
     """Stamps of the frames [ns] by their numbers, samples of gyro and accelerometer."""
     frames: list[tuple[int, int]] = []
     gyro: list[ImuSample] = []
@@ -213,7 +211,7 @@ def _events(path: Path) -> tuple[list[int], tuple[ImuSample, ...], tuple[ImuSamp
                 gyro.append(ImuSample(stamp_ns, vector, None))
             else:
                 accel.append(ImuSample(stamp_ns, None, vector))
-    return [stamp_ns for _, stamp_ns in sorted(frames)], by_stamp(gyro), by_stamp(accel)
+    return [stamp_ns for _, stamp_ns in sorted(frames)], gyro, accel
 
 
 def _calibration(path: Path, video: Video) -> tuple[RollingShutterCamera | None, SourcedValue]:
@@ -276,10 +274,10 @@ def read_mars(folder: Path) -> Recording:
     shift_ns, clock = _clock(folder / 'edge_epochs.txt')
     stamps_ns = [row.nanoseconds('Frame timestamp[nanosec]') + shift_ns
                  for row in read_table(stamps)]
-    imu = by_stamp(ImuSample(row.nanoseconds('Timestamp[nanosec]'),
-                             row.vector(*(f'g{axis}[rad/s]' for axis in 'xyz')),
-                             row.vector(*(f'a{axis}[m/s^2]' for axis in 'xyz')))
-                   for row in read_table(folder / 'gyro_accel.csv'))
+    imu = [ImuSample(row.nanoseconds('Timestamp[nanosec]'),
+                     row.vector(*(f'g{axis}[rad/s]' for axis in 'xyz')),
+                     row.vector(*(f'a{axis}[m/s^2]' for axis in 'xyz')))
+           for row in read_table(folder / 'gyro_accel.csv')]
     metadata = _optional_table(folder / 'movie_metadata.csv')
     readout = 'Frame readout time[nanosec]'
     return Recording(
@@ -367,8 +365,7 @@ def read_posecam(folder: Path) -> Recording:
         accel=accel, truth=_truth(poses, _jumps(folder / 'manifest.json')))
 
 
-def _posecam_imu(path: Path) -> tuple[tuple[ImuSample, ...], tuple[ImuSample, ...],
-                                      list[SourcedValue]]:
+def _posecam_imu(path: Path) -> tuple[list[ImuSample], list[ImuSample], list[SourcedValue]]:
     """Gyro, accelerometer, and the bias that the phone reports of an uncorrected gyro."""
     gyro: list[ImuSample] = []
     accel: list[ImuSample] = []
@@ -389,7 +386,7 @@ def _posecam_imu(path: Path) -> tuple[tuple[ImuSample, ...], tuple[ImuSample, ..
     bias = [] if not biases else [
         SourcedValue('gyro_bias', tuple(np.median(biases, axis=0).tolist()),
                      'Median of the bias that the phone reports; the bag has raw rates.')]
-    return by_stamp(gyro), by_stamp(accel), bias
+    return gyro, accel, bias
 
 
 def _truth(poses: list[Row], jumps: list[int]) -> tuple[TruePose, ...]:
@@ -437,17 +434,15 @@ def _intrinsics(path: Path) -> list[SourcedValue]:
     return [_camera_matrix(fx, fy, cx, cy, "ARCore's intrinsics, without distortion.")]
 
 
-class Logger(NamedTuple):
-    """A logger, the files by which its folders are recognised, and its reader."""
+# Logger -> the files by which its folders are recognised, and its reader.
+LOGGERS: Mapping[str, tuple[tuple[str, ...], Callable[[Path], Recording]]] = {
+    'PoseCam': (('poses.csv', 'imu.csv', 'frames'), read_posecam),
+    'MARS Logger': (('movie.mp4', 'frame_timestamps.txt', 'gyro_accel.csv'), read_mars),
+    'data.jsonl': (('data.jsonl',), read_jsonl),
+    'tables': (('frames.csv', 'gyro.csv'), read_tables),
+}
 
-    name: str
-    files: tuple[str, ...]
-    read: Callable[[Path], Recording]
 
-
-LOGGERS = (
-    Logger('PoseCam', ('poses.csv', 'imu.csv', 'frames'), read_posecam),
-    Logger('MARS Logger', ('movie.mp4', 'frame_timestamps.txt', 'gyro_accel.csv'), read_mars),
-    Logger('data.jsonl', ('data.jsonl',), read_jsonl),
-    Logger('tables', ('frames.csv', 'gyro.csv'), read_tables),
-)
+def known_loggers() -> str:
+    """All loggers and their files, in words."""
+    return '; '.join(f'{name} ({", ".join(files)})' for name, (files, _) in LOGGERS.items())

@@ -205,8 +205,8 @@ class Telemetry:
 
     brand: str
     model: str
-    gyro: tuple[ImuSample, ...]   # with the accelerometer if it has the same rate
-    accel: tuple[ImuSample, ...]   # else separately
+    gyro: list[ImuSample]   # with the accelerometer if it has the same rate
+    accel: list[ImuSample]   # else separately
     readout: ReportedReadout | None
 
 
@@ -217,7 +217,13 @@ def read_telemetry(path: Path, start_ns: int) -> Telemetry:
     then a row has no single time.
     """
     parser, tags, samples = _parsed(path)
-    _refuse_stabilised(path, tags)
+    for group, tag, off, name, switch in _STABILISATION:
+        for value in _values(tags, group, tag):
+            if str(value).strip() not in off:
+                raise InputError(
+                    f'{path} is stabilised in the camera ({name} is {value}): each image was '
+                    f'warped, so its rows have no single time; switch {switch} off before '
+                    'recording')
     with_gyro = [sample for sample in samples if sample['gyro'] is not None]
     brand, model = parser.camera or 'unknown camera', parser.model or 'of unknown model'
     if not with_gyro:
@@ -228,23 +234,16 @@ def read_telemetry(path: Path, start_ns: int) -> Telemetry:
     rates = _in_camera(np.radians([sample['gyro'] for sample in with_gyro]))
     found = [sample['accl'] for sample in with_gyro if sample['accl'] is not None]
     forces: Sequence[Vector | None] = _in_camera(found) if found else []
-    accel: tuple[ImuSample, ...] = ()
+    accel: list[ImuSample] = []
     if len(forces) < len(times):
-        accel = _spread(forces, times)
+        # With its own rate, uniformly over the time of the gyro: telemetry-parser lists the
+        # sensors of a payload in parallel, independently of their rates.
+        step = (times[-1] - times[0]) / max(len(times) - 1, 1) * len(times) / max(len(forces), 1)
+        accel = [ImuSample(times[0] + round(number * step), None, force)
+                 for number, force in enumerate(forces)]
         forces = [None] * len(times)
-    gyro = tuple(map(ImuSample, times, rates, forces))
+    gyro = list(map(ImuSample, times, rates, forces))
     return Telemetry(brand, model, gyro, accel, _readout(tags))
-
-
-def _spread(forces: Sequence[Vector | None], times: Sequence[int]) -> tuple[ImuSample, ...]:
-    """Samples of an accelerometer with its own rate, uniformly over the time of the gyro.
-
-    telemetry-parser lists the sensors of a payload in parallel, independently of their rates.
-    """
-    span = times[-1] - times[0]
-    step = span / max(len(times) - 1, 1) * len(times) / max(len(forces), 1)
-    return tuple(ImuSample(times[0] + round(number * step), None, force)
-                 for number, force in enumerate(forces))
 
 
 def _parsed(path: Path) -> tuple[Any, list[Mapping[str, Any]], list[Mapping[str, Any]]]:
@@ -262,16 +261,6 @@ def _parsed(path: Path) -> tuple[Any, list[Mapping[str, Any]], list[Mapping[str,
         if type(error).__name__ != 'PanicException':
             raise
         raise InputError(f'{path}: telemetry-parser cannot read it: {error}') from error
-
-
-def _refuse_stabilised(path: Path, tags: Sequence[Mapping[str, Any]]) -> None:
-    for group, tag, off, name, switch in _STABILISATION:
-        for value in _values(tags, group, tag):
-            if str(value).strip() not in off:
-                raise InputError(
-                    f'{path} is stabilised in the camera ({name} is {value}): each image was '
-                    f'warped, so its rows have no single time; switch {switch} off before '
-                    'recording')
 
 
 def _readout(tags: Sequence[Mapping[str, Any]]) -> ReportedReadout | None:

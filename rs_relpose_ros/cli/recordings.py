@@ -198,9 +198,8 @@ SOURCES: Mapping[str, Source] = {
         '(pip install telemetry-parser av). Recordings that the camera stabilised are refused.',
         'FILE', video.read_video, has_lens_profile=True),
     'android': Source(
-        "folder of a phone's logger, recognised by its files: " + '; '.join(
-            f'{logger.name} ({", ".join(logger.files)})' for logger in phones.LOGGERS),
-        'FOLDER', lambda folder, _: phones.read_android(folder)),
+        f"folder of a phone's logger, recognised by its files: {phones.known_loggers()}", 'FOLDER',
+        lambda folder, _: phones.read_android(folder)),
     'realsense_rgb_rs': Source(
         'colour camera, gyro and accelerometer of a RealSense, from '
         'github.com/Zoltan3057/DM-VIO-dataset (imu.txt, frames.csv, camera.txt, images/)',

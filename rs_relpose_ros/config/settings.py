@@ -278,21 +278,18 @@ class GlobalShutterConfig(Settings):
         'or black', choices=('replicate', 'black'))
 
 
-class Pinhole(NamedTuple):
-    """Focal lengths and principal point [px]."""
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-
-
-def pinhole_of_matrix(name: str, k: Sequence[float]) -> Pinhole:
-    """Intrinsics of a camera matrix, row by row; `name` is its name in an InputError."""
+def pinhole_of_matrix(name: str, k: Sequence[float]) -> dict[str, Any]:
+    """``fx, fy, cx, cy`` of a camera matrix, row by row; `name` is its name in an InputError."""
     validate.array(name, k, (9,))
     if any(k[i] != 0.0 for i in (1, 3, 6, 7)) or k[8] != 1.0:
         raise InputError(f'{name} must be [fx 0 cx 0 fy cy 0 0 1], got {list(k)}')
-    return Pinhole(k[0], k[4], k[2], k[5])
+    return {'fx': k[0], 'fy': k[4], 'cx': k[2], 'cy': k[5]}
+
+
+def _sigma(of: str, unit: str, high: float, per: str = '') -> Any:
+    """Sigma of a calibrated parameter."""
+    return setting(0.0, f'{of}, 1 sigma{per}; 0 if it is not known', unit, low=0.0, high=high,
+                   restarts=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,15 +306,11 @@ class IntrinsicsConfig(Settings):
     distortion_coefficients: tuple[float, ...] | None = setting(
         None, 'coefficients of distortion_model in the order of OpenCV; no distortion if not '
         'given', kind=tuple, restarts=True)
-    focal_length_sigma: float = setting(
-        0.0, 'relative uncertainty of the focal length, 1 sigma; 0 if it is not known', low=0.0,
-        high=1.0, restarts=True)
-    distortion_sigma: float = setting(
-        0.0, 'uncertainty of the first of distortion_coefficients, 1 sigma; 0 if it is not known',
-        low=0.0, high=10.0, restarts=True)
-    principal_point_sigma: float = setting(
-        0.0, 'uncertainty of the principal point, 1 sigma per axis; 0 if it is not known', 'px',
-        low=0.0, high=1e4, restarts=True)
+    focal_length_sigma: float = _sigma('relative uncertainty of the focal length', '', 1.0)
+    distortion_sigma: float = _sigma(
+        'uncertainty of the first of distortion_coefficients', '', 10.0)
+    principal_point_sigma: float = _sigma(
+        'uncertainty of the principal point', 'px', 1e4, ' per axis')
 
     def __post_init__(self) -> None:
         Settings.__post_init__(self)
@@ -338,11 +331,10 @@ class IntrinsicsConfig(Settings):
         """The intrinsics for images of this size, which cover the whole sensor."""
         if self.camera_matrix is None:
             raise MissingInputError('parameter camera_matrix is not set')
-        fx, fy, cx, cy = pinhole_of_matrix('camera_matrix', self.camera_matrix)
         return Intrinsics(
-            width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, image_width=width,
-            image_height=height, distortion_model=self.distortion_model,
-            distortion=self.distortion_coefficients or ())
+            width=width, height=height, image_width=width, image_height=height,
+            distortion_model=self.distortion_model, distortion=self.distortion_coefficients or (),
+            **pinhole_of_matrix('camera_matrix', self.camera_matrix))
 
 
 @dataclass(frozen=True, slots=True)
@@ -352,9 +344,7 @@ class SensorConfig(Settings):
     readout_time: float | None = setting(
         None, 'image height times line delay; 0 for a global shutter', 's', low=0.0, high=0.5,
         kind=float, restarts=True)
-    readout_time_sigma: float = setting(
-        0.0, 'uncertainty of readout_time, 1 sigma; 0 if it is not known', 's', low=0.0,
-        high=1.0, restarts=True)
+    readout_time_sigma: float = _sigma('uncertainty of readout_time', 's', 1.0)
     readout_direction: str = setting(
         'down', 'whether row 0 is read first (down) or last (up)',
         choices=READOUT_DIRECTIONS, restarts=True)
@@ -375,16 +365,13 @@ class SensorConfig(Settings):
     time_offset: float = setting(
         0.0, 'IMU clock minus camera clock: t_imu = stamp + time_offset', 's', low=-10.0,
         high=10.0, restarts=True)
-    time_offset_sigma: float = setting(
-        0.0, 'uncertainty of time_offset, 1 sigma; 0 if it is not known', 's', low=0.0,
-        high=10.0, restarts=True)
+    time_offset_sigma: float = _sigma('uncertainty of time_offset', 's', 10.0)
     time_offset_per_interval: float = setting(
         0.0, 'change of time_offset with the interval T between frames (automatic exposure): '
         't_imu = stamp + time_offset + time_offset_per_interval (T - '
         'time_offset_reference_interval)', 's/s', low=-5.0, high=5.0, restarts=True)
-    time_offset_per_interval_sigma: float = setting(
-        0.0, 'uncertainty of time_offset_per_interval, 1 sigma; 0 if it is not known', 's/s',
-        low=0.0, high=5.0, restarts=True)
+    time_offset_per_interval_sigma: float = _sigma(
+        'uncertainty of time_offset_per_interval', 's/s', 5.0)
     time_offset_reference_interval: float = setting(
         0.0, 'interval between frames at which time_offset holds; used with '
         'time_offset_per_interval', 's', low=0.0, high=10.0, restarts=True)
@@ -397,9 +384,7 @@ class SensorConfig(Settings):
     quat_cam_imu_xyzw: tuple[float, ...] | None = setting(
         None, 'rotation IMU to camera, v_cam = R(q) v_imu; x y z w', low=-1.0, high=1.0, length=4,
         kind=tuple, restarts=True)
-    axes_sigma: float = setting(
-        0.0, 'uncertainty of quat_cam_imu_xyzw, 1 sigma per axis; 0 if it is not known', 'rad',
-        low=0.0, high=1.0, restarts=True)
+    axes_sigma: float = _sigma('uncertainty of quat_cam_imu_xyzw', 'rad', 1.0, ' per axis')
 
     def __post_init__(self) -> None:
         Settings.__post_init__(self)

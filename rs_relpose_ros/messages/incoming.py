@@ -91,7 +91,7 @@ def intrinsics_from_info(msg: Any) -> Intrinsics:
     roi = msg.roi
     roi_width, roi_height = int(roi.width) or width, int(roi.height) or height
     return Intrinsics(
-        width=width, height=height, **pinhole._asdict(),
+        width=width, height=height, **pinhole,
         distortion_model=str(msg.distortion_model)[:40],
         distortion=tuple(float(value) for value in coefficients),
         x_offset=int(roi.x_offset), y_offset=int(roi.y_offset),

@@ -30,7 +30,7 @@ class UnrollReport:
     copied: int = 0   # messages of other topics
     topics_copied: int = 0
     reasons: Mapping[str, int] = field(default_factory=dict)   # of omitted images
-    warnings: tuple[str, ...] = ()
+    warnings: list[str] = field(default_factory=list)
 
 
 @dataclass(slots=True, eq=False)
@@ -81,7 +81,12 @@ class _Unrolling:
 
     def run(self) -> UnrollReport:
         """Write the new bag."""
-        for outcome in outcomes(self._loop, self._intake, self._messages(self._announce())):
+        copied = [topic for topic in self._bag.topics if self._bag.can_be_copied(topic)]
+        for topic in copied:
+            self._writer.announce(topic, self._bag.origin(topic))
+        self._report.topics_copied = len({*copied} - {self._topics.image,
+                                                      self._topics.camera_info})
+        for outcome in outcomes(self._loop, self._intake, self._messages(copied)):
             if isinstance(outcome, MessageRefused) and not self._report.images:
                 outcome.raise_without_intrinsics()
             result = outcome.result if isinstance(outcome, Frame) else None
@@ -93,20 +98,15 @@ class _Unrolling:
             place.writes = place.writes or ()
         self._flush()
         self._report.reasons = self._reasons.most_common()
-        self._warn_of_shared_stamps()
+        self._report.warnings += [f'{topic} is omitted: ROS 2 has no such message type'
+                                  for topic in self._bag.topics if topic not in copied]
+        shared = [topic for topic, found in self._shared.items() if 2 * sum(found) > len(found)]
+        if shared and self._stamp_clock == 'imu':
+            self._report.warnings.append(
+                f'{", ".join(shared)} had the stamps of the derotated images and keep them, on '
+                "the camera's clock: set stamp_clock=camera if they are used together (depth, "
+                'stereo)')
         return self._report
-
-    def _announce(self) -> list[Topic]:
-        """Announce all topics that can be written, and return them."""
-        copied = [topic for topic in self._bag.topics if self._bag.can_be_copied(topic)]
-        for topic in copied:
-            self._writer.announce(topic, self._bag.origin(topic))
-        self._report.warnings = tuple(
-            f'{topic} is omitted: ROS 2 has no such message type'
-            for topic in self._bag.topics if topic not in copied)
-        own = {self._topics.image, self._topics.camera_info}
-        self._report.topics_copied = sum(topic not in own for topic in copied)
-        return copied
 
     # -- messages of the bag -----------------------------------------------------------------
 
@@ -160,13 +160,8 @@ class _Unrolling:
         if not places:
             del self._images[stamp]
         place.writes = ()
-        if result is not None:
-            place.writes = self._new_messages(result, place.bag_time_ns)
-            self._report.images += 1
-            self._report.largest_shift = max(self._report.largest_shift, result.map.shift)
-
-    def _new_messages(self, result: GlobalShutterFrame,
-                      bag_time_ns: int) -> tuple[Callable[[], None], Callable[[], None]]:
+        if result is None:
+            return
         topic, info, types = self._topics.image, self._topics.camera_info, self._writer.type
         header, pixels = (result.stamp_ns, result.frame_id), result.image()
         image = (outgoing.compressed_image_message(*header, pixels, png=result.is_png, types=types)
@@ -174,20 +169,14 @@ class _Unrolling:
                  else outgoing.image_message(*header, pixels, types))
         camera_info = outgoing.camera_info_message(
             *header, result.intrinsics, self._intake.camera_info_of(result.intrinsics), types)
-        write, name = self._writer.write, topic.camera_info if info is None else info.name
-        return (partial(write, name, reader.CAMERA_INFO, camera_info, bag_time_ns),
-                partial(write, topic.name, topic.msgtype, image, bag_time_ns))
+        name = topic.camera_info if info is None else info.name
+        place.writes = tuple(partial(self._writer.write, *message, place.bag_time_ns)
+                             for message in ((name, reader.CAMERA_INFO, camera_info),
+                                             (topic.name, topic.msgtype, image)))
+        self._report.images += 1
+        self._report.largest_shift = max(self._report.largest_shift, result.map.shift)
 
     def _flush(self) -> None:
         while self._places and self._places[0].writes is not None:
             for write in self._places.popleft().writes or ():
                 write()
-
-    def _warn_of_shared_stamps(self) -> None:
-        """Warn of other image topics with the camera's stamps."""
-        shared = [topic for topic, found in self._shared.items() if 2 * sum(found) > len(found)]
-        if shared and self._stamp_clock == 'imu':
-            text = (f'{", ".join(shared)} had the stamps of the derotated images and keep them, '
-                    "on the camera's clock: set stamp_clock=camera if they are used together "
-                    '(depth, stereo)')
-            self._report.warnings += (text,)
