@@ -1,6 +1,5 @@
 """Exceptions of the package, with one root class; packages that may be absent."""
 
-import importlib
 import importlib.util
 from types import ModuleType
 

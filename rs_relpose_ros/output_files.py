@@ -16,11 +16,9 @@ if TYPE_CHECKING:
 
 
 def save_picture(picture: Figure, path: Path) -> None:
-    """Write a plot as PNG on white; the file is the same for every backend."""
-    # A node stores its calibration, and draws nothing: Matplotlib takes a second.
-    import matplotlib as mpl
+    """Write a plot as PNG on white; the same file for every backend, version and user."""
+    import matplotlib as mpl  # takes a second, and a node draws nothing
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    # Independent of the version of matplotlib and of the user's settings.
     with mpl.rc_context({'savefig.facecolor': 'white'}):
         FigureCanvasAgg(picture)
         with written(path, 'wb') as file:
@@ -35,10 +33,10 @@ BLUE, ORANGE, GREEN, RED = '#0072B2', '#E69F00', '#009E73', '#D55E00'
 def refuse_unwritable(folder: Path) -> None:
     """Raise an InputError if a folder cannot be created or written; it is not created."""
     nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-    if not nearest.is_dir():
-        raise InputError(f'{nearest} is a file: choose another directory for the results')
-    if not os.access(nearest, os.W_OK | os.X_OK):
-        raise InputError(f'{nearest} cannot be written: choose another directory for the results')
+    problem = ('is a file' if not nearest.is_dir() else
+               '' if os.access(nearest, os.W_OK | os.X_OK) else 'cannot be written')
+    if problem:
+        raise InputError(f'{nearest} {problem}: choose another directory for the results')
 
 
 @contextmanager
@@ -47,23 +45,18 @@ def written(path: Path, mode: str = 'w') -> Iterator[IO[Any]]:
 
     An OSError names it; that of a full disk does not by itself.
     """
-    part = path.with_name(f'{path.name}.part')
-    text: dict[str, Any] = {} if 'b' in mode else {
-        'encoding': 'utf-8', 'newline': '', 'buffering': 1}
+    part, text = path.with_name(f'{path.name}.part'), 'b' not in mode
     try:
-        with part.open(mode, **text) as file:
+        with part.open(mode, encoding='utf-8' if text else None, newline='' if text else None,
+                       buffering=1 if text else -1) as file:
             yield file
         part.replace(path)
     except Exception as error:
         with suppress(OSError):
             part.unlink()
         if isinstance(error, OSError):
-            raise _named(error, path) from error
+            raise type(error)(error.errno, error.strerror, str(path)) from error
         raise
-
-
-def _named(error: OSError, path: Path) -> OSError:
-    return type(error)(error.errno, error.strerror, str(path))
 
 
 def prepare_folder(folder: Path, replaced: Sequence[str]) -> None:
@@ -95,5 +88,5 @@ def beside(out: Path) -> Iterator[Path]:
             yield Path(folder) / out.name
         except OSError as error:
             if folder in str(error.filename or folder):   # not of an input
-                raise _named(error, out) from error
+                raise type(error)(error.errno, error.strerror, str(out)) from error
             raise
