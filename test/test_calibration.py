@@ -142,23 +142,6 @@ def test_camera_read_upwards_with_unknown_focal_length(tmp_path):
     assert 'camera_matrix (too slow)' in text and 'camera_matrix:' not in text
 
 
-@pytest.mark.long
-def test_slow_camera_is_not_confidently_wrong():
-    recorded = simulated(17, speed=0.2, rotation_rate=math.radians(6.0), pixel_noise=0.4,
-                         gyro_bias=(0.004, -0.003, 0.002))
-    readout = calibrated(recorded).readout_time
-    assert abs(readout.value - 0.02) < 4.0 * readout.sigma
-    # A fifth of the rotation determines it a fifth as well.
-    assert readout.sigma > 3.0 * usual()[1].readout_time.sigma
-
-
-@pytest.mark.long
-def test_noise_does_not_make_the_readout_time_longer():
-    """Freedom that grows with the readout time would."""
-    result = calibrated(simulated(18, pixel_noise=1.0, outliers=0.25))
-    assert result.readout_time.value == pytest.approx(0.02, abs=1.5e-3)
-
-
 @pytest.mark.parametrize(('model', 'coefficients'), [
     ('plumb_bob', (-0.15, 0.0, 0.0, 0.0, 0.0)), ('equidistant', (0.03, 0.0, 0.0, 0.0))])
 def test_lens_is_estimated(model, coefficients, tmp_path):

@@ -22,8 +22,7 @@ from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.messages.incoming import stamp_ns
 from rs_relpose_ros.messages.outgoing import pair_messages, PAIR_TOPICS
 from rs_relpose_ros.nodes.inputs import message_class
-from rs_relpose_ros.offline.replay import read_truth, Replay
-from rs_relpose_ros.offline.truth import TrueTrajectory
+from rs_relpose_ros.offline.replay import Replay
 
 # The replay may have to compile the kernels.
 pytestmark = [pytest.mark.live, pytest.mark.timeout(600)]
@@ -35,42 +34,31 @@ PX4 = ROOT / 'docs' / 'examples' / 'px4_odometry.py'
 
 
 @pytest.fixture(scope='module')
-def recorded(bundled_bag: Path) -> tuple[list[dict[str, Any]], TrueTrajectory]:
+def recorded(bundled_bag: Path) -> list[dict[str, Any]]:
     """What the node publishes of the bundled bag, one pair lost on the way."""
     with open_bag(bundled_bag) as bag:
-        topics = bag.find_topics()
-        truth = read_truth(bag, topics)
-        assert truth is not None
-        replay = Replay(bag, topics, read_parameters(BUNDLED_PARAMETERS))
+        replay = Replay(bag, bag.find_topics(), read_parameters(BUNDLED_PARAMETERS))
         pairs = [pair_messages(pair, message_class) for pair in replay.pairs()]
-        return [*pairs[:LOST], *pairs[LOST + 1:]], truth
+        return [*pairs[:LOST], *pairs[LOST + 1:]]
 
 
 @pytest.fixture(scope='module')
 def run(module_ros_domain_id: int,
-        recorded: tuple[list[dict[str, Any]], TrueTrajectory]) -> Iterator[SimpleNamespace]:
+        recorded: list[dict[str, Any]]) -> Iterator[SimpleNamespace]:
     """Paths that the example published, each with its last stamp, and its output."""
-    pairs, truth = recorded
     with Graph() as graph, Process(
             str(EXAMPLE), '--ros-args', '-r', '__ns:=/relpose_node') as example:
         paths = graph.listen(PathMessage, '/relpose_node/pose_chain/path')
         publishers = {name: graph.publisher(message_class(kind), f'/relpose_node/{name}')
                       for name, kind in PAIR_TOPICS.items()}
         graph.wait_for_publisher('/relpose_node/pose_chain/path')
-        for count, pair in enumerate(pairs):
+        for count, pair in enumerate(recorded):
             # In any order: what belongs together has one stamp.
             for name, message in sorted(pair.items(), key=itemgetter(0), reverse=count % 2 == 1):
                 publishers[name].publish(message)
             wait_until(lambda n=count: len(paths) > n, 'a path', example)
         code, _ = example.signal(signal.SIGINT)
-        yield SimpleNamespace(pairs=pairs, paths=paths, truth=truth, output=example.output,
-                              exit_code=code)
-
-
-def whole_paths(run: SimpleNamespace) -> list[PathMessage]:
-    """The longest of each that was begun."""
-    return [path for path, later in zip(run.paths, [*run.paths[1:], None], strict=True)
-            if later is None or len(later.poses) <= len(path.poses)]
+        yield SimpleNamespace(pairs=recorded, paths=paths, output=example.output, exit_code=code)
 
 
 def test_each_pair_extends_a_path(run):
@@ -83,37 +71,12 @@ def test_each_pair_extends_a_path(run):
 
 def test_a_restart_of_the_path_is_reported(run):
     """Where a pair is missing; but not at the bag's standstill and pure rotation."""
-    paths = whole_paths(run)
+    paths = [path for path, later in zip(run.paths, [*run.paths[1:], None], strict=True)
+             if later is None or len(later.poses) <= len(path.poses)]
     assert [len(path.poses) for path in paths] == [LOST + 1, len(run.pairs) - LOST + 1]
     assert run.output.count('a pair is missing: the path restarts, at another scale') == 1
     assert stamp_ns(paths[1].poses[0].header) > stamp_ns(paths[0].poses[-1].header)
     assert sum('relative_pose' not in pair for pair in run.pairs) >= 2
-
-
-def test_shape_of_the_paths(run):
-    """After one similarity each: scale is carried from pair to pair."""
-    for path in whole_paths(run):
-        stamps = [stamp_ns(pose.header) for pose in path.poses]
-        found = np.array([[p.x, p.y, p.z] for p in (pose.pose.position for pose in path.poses)])
-        true = np.array([run.truth.position(stamp) for stamp in stamps])
-        aligned = after_similarity(found, true)
-        true_steps = np.linalg.norm(np.diff(true, axis=0), axis=1)
-        length, moves = true_steps.sum(), true_steps > 0.01   # [m]
-        error = np.sqrt(np.mean(np.sum((aligned - true)**2, axis=1)))
-        steps = np.linalg.norm(np.diff(aligned, axis=0), axis=1)
-        assert (steps[~moves] < 1e-9).all()
-        steps = steps[moves] / true_steps[moves]
-        assert error <= 0.02 * length
-        assert 0.8 < steps.min()
-        # A pair of 4 px of parallax, after the standstill, has uncertain depths.
-        assert steps.max() < 1.25
-
-
-def after_similarity(points: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """`points` (N, 3) moved, rotated and scaled onto `target` in the sense of least squares."""
-    centred, aim = points - points.mean(axis=0), target - target.mean(axis=0)
-    rotated = Rotation.align_vectors(aim, centred)[0].apply(centred)
-    return np.sum(rotated * aim) / np.sum(rotated**2) * rotated + target.mean(axis=0)
 
 
 def test_odometry_in_the_axes_of_px4():

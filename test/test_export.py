@@ -193,15 +193,6 @@ def test_unrolled_images_have_one_pose(run, bundled_bag, tmp_path, messages):
     assert raw['formula_px']['median'] > 1.2 * report['formula_px']['median']
 
 
-def test_without_rolling_shutter_all_poses_are_that_of_the_middle_row(run):
-    code, out = run('--format', 'instant-ngp', '--images', 'unrolled')
-    assert code == 0
-    value = json.loads((out / 'transforms.json').read_text())
-    assert value['rolling_shutter'] == [0.0] * 4
-    assert all(frame['transform_matrix_start'] == frame['transform_matrix_end']
-               == frame['transform_matrix'] for frame in value['frames'])
-
-
 def test_images_at_a_rate(run):
     code, out = run('--format', 'nerfstudio', '--rate', '6', '--images', 'none')
     assert code == 0

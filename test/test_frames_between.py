@@ -347,12 +347,9 @@ def test_uncertain_direction_is_decided_by_all_frames(scene):
 @pytest.mark.parametrize(('change', 'message'), [
     (lambda f: [replace(f[0], points=f[0].points[1:]), *f[1:]], 'points of a frame between'),
     (lambda f: f[::-1], 'must increase'),
-    (lambda f: [f[0], f[0]], 'must increase'),
     (lambda f: [replace(f[0], interval=TIMES[-1], inertial=None)], 'less than interval'),
     (lambda f: [replace(f[0], points=np.zeros((150, 3)))], 'shape'),
-    (lambda f: [replace(f[0], points=np.full((150, 2), np.inf))], 'finite'),
     (lambda f: [replace(f[0], interval=-0.1, inertial=None)], 'interval of a frame between'),
-    (lambda f: [replace(f[0], interval=math.nan, inertial=None)], 'interval of a frame between'),
     (lambda f: [replace(f[0], interval=0.05)], 'duration'),
     (lambda f: [replace(f[0], relative_rotation=None)], 'go together'),
     (lambda f: [replace(f[0], relative_rotation=2.0 * np.eye(3))], 'rotation matrix'),

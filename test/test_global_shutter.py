@@ -243,12 +243,6 @@ def test_a_swinging_camera_against_the_truth():
     assert errors.left_p90 <= 0.15
 
 
-def test_on_a_walk_the_translation_is_left_and_nothing_else():
-    errors = lab.map_errors('walk', SimulationConfig(seed=9302, duration=0.3, plan='walk:0.3'))
-    assert errors.left > 0.1
-    assert errors.map_p90 <= 0.1
-
-
 def test_a_tracked_time_offset_is_applied():
     """The pairs show it, as to relpose_node, and the stamps move by it."""
     simulation = simulate(SimulationConfig(

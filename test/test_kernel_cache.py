@@ -175,11 +175,9 @@ import sys
 from numba.core.ccallback import CFunc
 from numba.core.dispatcher import Dispatcher
 from rs_relpose_ros.bags.reader import open_bag
-from rs_relpose_ros.pipeline.pair import Frame
-from rs_relpose_ros.pipeline.pipeline import FrontEnd
-from rs_relpose_ros.messages.incoming import Intake, sensor_messages
-from rs_relpose_ros.pipeline.warm_up import warm_up_pipeline
 from rs_relpose_ros.config.files import read_parameters
+from rs_relpose_ros.offline.replay import Replay
+from rs_relpose_ros.pipeline.warm_up import warm_up_pipeline
 
 def kernels():
     # A CFunc is a kernel that is called by address.
@@ -192,19 +190,12 @@ def kernels():
     return kernels
 
 
-parameters = read_parameters(sys.argv[2], sys.argv[3:])
+parameters = read_parameters(sys.argv[2])
 warm_up_pipeline(parameters)
 before = kernels()
-front_end = FrontEnd(parameters, offline=True)
-intake = Intake(front_end.sequencer)
-statuses = set()
 with open_bag(sys.argv[1]) as bag:
-    topics = bag.find_topics()
-    for role, item in sensor_messages(bag, topics):
-        intake.receive(role, item.message)
-        while isinstance(outcome := front_end.step(), Frame):
-            if outcome.result is not None:
-                statuses.add(outcome.result.pose.status.value)
+    statuses = {pair.pose.status.value
+                for pair in Replay(bag, bag.find_topics(), parameters).pairs()}
 after = kernels()
 print(json.dumps([sorted(statuses), [k for k in after if after[k] != before[k]],
                   sum(before.values())]))

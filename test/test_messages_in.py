@@ -154,17 +154,13 @@ def test_bayer_patterns_have_their_colors(types, pattern, bits):
 
 @pytest.mark.parametrize(('change', 'expected'), [
     ({'encoding': '32FC1'}, "'32FC1' is not known; publish one of mono8"),
-    ({'encoding': 'bayer_rggb12'}, "'bayer_rggb12' is not known"),
     ({'width': 0}, 'size 0x7'),
-    ({'height': 0}, 'size 10x0'),
     ({'width': 2**32 - 1, 'height': 2**32 - 1, 'step': 2**32 - 1}, 'size .* is not usable'),
     ({'width': 16384, 'height': 16384, 'step': 16384}, 'size .* is not usable'),
     ({'width': 8192, 'height': 8192, 'step': 8192}, '70 bytes of data, but 8192x8192'),
     ({'step': 9}, 'step is 9 bytes, but a row .* has 10'),
-    ({'step': 2**32 - 1}, '70 bytes of data'),
     ({'height': 8}, '70 bytes of data, but 10x8 .* needs 80'),
     ({'encoding': 'bgr8'}, 'step is 10 bytes, but a row .* has 30'),
-    ({'encoding': 'mono16'}, 'step is 10 bytes, but a row .* has 20'),
 ])
 def test_unusable_image_is_refused(change, expected):
     fields = {'width': 10, 'height': 7, 'encoding': 'mono8', 'step': 10, **change}
@@ -199,7 +195,6 @@ JPEG = build.jpeg(np.random.default_rng(1).integers(0, 256, (48, 64), dtype=np.u
     (b'', '0 bytes is neither JPEG nor PNG'),
     (b'GIF89a' + bytes(100), '106 bytes is neither JPEG nor PNG'),
     (JPEG[:len(JPEG) // 2], 'is truncated'),
-    (JPEG[:3], 'is truncated'),
     (b'\xff\xd8\xff\xd9', 'has no frame header'),
     (b'\xff\xd8\xff\xe0\x00\x00' + bytes(20) + b'\xff\xd9', 'has no frame header'),
     (JPEG[:24] + b'\xff\xd9', 'has no frame header'),
@@ -250,14 +245,12 @@ UNCALIBRATED = {'k': (0.0,) * 9}
     (UNCALIBRATED, 'uncalibrated'),
     ({'model': 'double_sphere', 'd': (0.1, 0.2)}, "'double_sphere'"),
     ({'d': (0.1,) * 6}, 'got 6'),
-    ({'d': (0.1,) * 1000}, '1000 coefficients'),
     ({'d': (float('nan'),) * 5}, 'distortion must be finite'),
     ({'k': (-450.0, 0, 320, 0, 450, 240, 0, 0, 1)}, 'fx must be'),
     ({'k': (float('inf'), 0, 320, 0, 450, 240, 0, 0, 1)}, 'must be finite'),
     ({'k': (450.0, 3.0, 320, 0, 450, 240, 0, 0, 1)}, r'must be \[fx 0 cx'),
     ({'width': 0}, 'size 0x480'),
     ({'roi': (400, 0, 400, 300)}, 'leaves the sensor in x'),
-    ({'roi': (0, 400, 400, 300)}, 'leaves the sensor in y'),
     ({'binning': (1000, 1)}, 'image_width must be >= 1'),
 ])
 def test_unusable_calibration_is_refused(change, expected):

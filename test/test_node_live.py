@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_lab.live import player
 from rs_relpose_lab.live.graph import diagnostic_values, Graph
 from rs_relpose_lab.live.processes import node_process, player_process, Process, wait_until
 from rs_relpose_ros.bags.reader import COMPRESSED_TOPIC, IMU_TOPIC, open_bag
@@ -121,17 +120,6 @@ def test_a_good_run_ends_well_and_says_little(run):
     assert run.output.count('(overload)') <= 1
     assert run.output.count('[WARN]') == (run.output.count('(overload)')
                                           + run.output.count('no image on'))
-
-
-@pytest.mark.parametrize(('arguments', 'expected'), [
-    (['--topics', '/nothing'], 'has no topic /nothing; it has /camera/camera_info'),
-    (['--wait-for-subscribers', '0.2'], 'nobody subscribed to'),
-])
-def test_the_player_says_what_is_wrong(ros_domain_id, bundled_bag, arguments, expected, capfd):
-    assert player.main([str(bundled_bag), *arguments]) == 2
-    said = capfd.readouterr().err
-    assert expected in said
-    assert 'Traceback' not in said
 
 
 # -- a signal ends the node at once and quietly, at any time ----------------------------

@@ -294,7 +294,7 @@ def test_a_wrong_parameter_is_detected_and_poses_are_withheld(ros_domain_id, bun
         node.wait_for('ready')
         for topic in ('relative_pose', 'pairs'):
             graph.wait_for_publisher(f'/relpose_node/{topic}')
-        faults.play(faults.drivers(graph), faults.read_messages(bundled_bag, 1.4))
+        faults.play(faults.drivers(graph), faults.read_messages(bundled_bag, 2.5))
         report = wait_until(lambda: next((item for item in diagnostics if diagnostic_values(
             item)['health'] == 'wrong'), None), 'health: wrong', node)
         wait_until(lambda: sum(diagnostic_values(message)['health'] == 'wrong'

@@ -190,16 +190,6 @@ def test_loop_is_closed(returned, tmp_path):
         assert across < 0.01
 
 
-def test_gyro_is_propagated_over_the_frames_between(returned, tmp_path):
-    """With a frame between, the gyro reaches from the first to the last, and gives a rotation."""
-    bag, parameters, _ = returned
-    first, between, last = (stamp_of(k, FPS) for k in (0, 10, 20))
-    _, alone = run_pairs(bag, parameters, [(first, last)], tmp_path / 'a')
-    _, with_it = run_pairs(bag, parameters, [(first, between), (between, last), (first, last)],
-                           tmp_path / 'b')
-    assert float(with_it[2]['sigma_rz']) < 0.95 * float(alone[0]['sigma_rz'])
-
-
 @pytest.fixture(scope='module')
 def library(returned):
     """Parameters, a buffer of the whole walk, and its first and last frame."""

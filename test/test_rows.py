@@ -491,6 +491,12 @@ def test_a_lens_is_fitted_with_the_coefficients_of_the_format(lens, radial, most
     assert errors.mean() < 0.1 * most
 
 
+def test_a_lens_that_the_format_knows_is_not_changed(trajectory):
+    for lens, radial in (('brown', 2), ('brown, k3', 3), ('rational', 6), ('fisheye', 2)):
+        camera = made(trajectory, lens).camera
+        assert formats.fitted(camera, radial) is camera
+
+
 @pytest.mark.parametrize('lens', ['pinhole', 'brown', 'brown, k3', 'rational', 'fisheye'])
 def test_pycolmap_reads_the_model(lens, trajectory, tmp_path):
     """COLMAP's own reader and projection, which has packages for x86-64 only."""

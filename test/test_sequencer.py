@@ -1,6 +1,5 @@
 """The sequencer: which frames are released when, and that each one is released or counted."""
 
-import threading
 import time
 
 from conftest import Clock
@@ -297,25 +296,6 @@ def test_interleaving_does_not_change_the_result(early, takes):
         if a.imu.since_previous is not None:
             np.testing.assert_array_equal(a.imu.since_previous.angular_velocities,
                                           b.imu.since_previous.angular_velocities)
-
-
-def test_threads():
-    """One thread feeds, another takes: every frame is released once, in order, or counted."""
-    sequencer, items = Sequencer(parameters()), []
-    worker = threading.Thread(target=lambda: items.extend(
-        iter(lambda: sequencer.take(timeout=5.0), None)))
-    worker.start()
-    for ms in range(0, 4000, 5):
-        sequencer.add_imu(sample(ms))
-        if ms % 20 == 0:
-            add_frames(sequencer, ms)
-    sequencer.close()
-    worker.join(timeout=20.0)
-    assert not worker.is_alive()
-    assert len(items) == 200
-    assert stamps(items) == sorted(set(stamps(items))) != []
-    counts = sequencer.counts()
-    assert counts.frames == 200 == counts.frames_taken + sum(counts.refused.values())
 
 
 BY_INTERVAL = {'time_offset_per_interval': -0.5, 'time_offset_reference_interval': 0.04}

@@ -91,19 +91,6 @@ def residual(solution, f1, f2, tau1, tau2):
     return np.abs((np.cross(f1, f2 @ solution.R.T) * b).sum(axis=1)).max() / np.abs(b).max()
 
 
-def test_generated_matches_obey_the_rolling_shutter_essential_matrix():
-    """With the measured rays, as in docs/conventions.md, 'Conversion from the paper'."""
-    P = make_minimal_problems(0, 20, 9, turned=True)
-    for k in range(20):
-        for m1, m2, tau1, tau2 in zip(P.rays1[k], P.rays2[k], P.tau1[k], P.tau2[k], strict=True):
-            b = P.t[k] - tau1 * P.v1[k] + tau2 * P.R[k] @ P.v2[k]
-            turn1 = Rotation.from_rotvec(tau1 * P.w1[k]).as_matrix()
-            turn2 = Rotation.from_rotvec(tau2 * P.w2[k]).as_matrix()
-            assert abs(m2 @ turn2.T @ P.R[k].T @ np.cross(b, turn1 @ m1)) < 1e-13
-            assert abs(m2 @ turn2.T @ P.R[k].T @ np.cross(P.t[k], turn1 @ m1)) > 1e-6
-        assert 0.0 < P.tau1[k].min() and P.tau1[k].max() < 1080 * 60e-6
-
-
 # --- exact data
 
 @each_exact_case
