@@ -15,6 +15,7 @@ LABORATORY = 'rs_relpose_lab'
 # Module -> call in it that compiles the kernels of a node with its default parameters.
 WARM_UPS = {
     'pipeline.warm_up': 'fill_cache()',
+    'calibrate.procedure': 'warm_up_fit()',
     'pipeline.global_shutter': 'warm_up_unroller(module.Parameters())',
     'odometry.pair': 'warm_up_odometry()',
 }

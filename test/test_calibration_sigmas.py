@@ -27,7 +27,7 @@ from rs_relpose_ros.calibrate.coplanarity import (
     SLOPE,
 )
 from rs_relpose_ros.calibrate.fit import Fit, ModelErrors, widened
-from rs_relpose_ros.calibrate.procedure import calibrate, CalibrationInput
+from rs_relpose_ros.calibrate.procedure import calibrate, CalibrationInput, evaluated
 from rs_relpose_ros.calibrate.result import CalibrationResult, CostCurve, parameter_file
 from rs_relpose_ros.calibrate.start import GyroSeries, noise_density
 from rs_relpose_ros.config.files import read_parameters
@@ -194,7 +194,7 @@ def evaluated_at(readout: float, sigma: float) -> tuple[CalibrationResult, Fit]:
     final = dataclasses.replace(final, unknowns=final.unknowns._replace(parameters=parameters),
                                 covariance=covariance, converged=True)
     curve = CostCurve(np.linspace(-0.03, 0.03, 3), np.zeros(3))
-    return fitting.evaluated(data, final, curve, CalibrationConfig()), final
+    return evaluated(data, final, curve, CalibrationConfig()), final
 
 
 def test_a_readout_that_the_images_do_not_determine_is_that_of_the_interval():
@@ -219,7 +219,7 @@ def test_sigmas_of_the_lens_do_not_exceed_those_of_its_priors():
     covariance[CENTER, CENTER] += (10.0 * sigma)**2
     wide = dataclasses.replace(final, covariance=covariance)
     curve = CostCurve(np.linspace(-0.03, 0.03, 3), np.zeros(3))
-    result = fitting.evaluated(data, wide, curve, CalibrationConfig())
+    result = evaluated(data, wide, curve, CalibrationConfig())
     *_, column, row = result.lens
     assert 0.9 * sigma < column.sigma < sigma
     assert row.sigma == pytest.approx(math.sqrt(covariance[CENTER + 1, CENTER + 1]), rel=0.1)

@@ -1,6 +1,7 @@
 """A node without parameters: it calibrates itself, stores the result, and uses the file."""
 
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 import os
 from pathlib import Path
@@ -145,6 +146,12 @@ def outcomes(bag: Path, calibration: LiveCalibration, *, moving: bool = True,
                 yield calibration.step(0.02)
 
 
+@pytest.fixture
+def calibration() -> Iterator[LiveCalibration]:
+    with closing(LiveCalibration(Parameters(), use_stored=False)) as calibrating:
+        yield calibrating
+
+
 def is_near_the_truth(parameters: str) -> bool:
     values = text_values(parameters, 'text')
     turn = Rotation.from_quat(values['quat_cam_imu_xyzw']).as_matrix() @ TRUTH.R_cam_imu.T
@@ -153,10 +160,9 @@ def is_near_the_truth(parameters: str) -> bool:
             and Rotation.from_matrix(turn).magnitude() < 0.03)
 
 
-def test_a_recording_that_is_too_short_counts_when_it_is_looped(bag, monkeypatch):
+def test_a_recording_that_is_too_short_counts_when_it_is_looped(bag, calibration, monkeypatch):
     """The stamps begin again, and so does a clock that is set back."""
     monkeypatch.setattr(live, '_SILENCE', 0.0)
-    calibration = LiveCalibration(Parameters(), use_stored=False)
     assert not any(isinstance(outcome, Calibrated)
                    for outcome in outcomes(bag, calibration, images=120))
     short = calibration.step()
@@ -167,8 +173,7 @@ def test_a_recording_that_is_too_short_counts_when_it_is_looped(bag, monkeypatch
         outcome.parameters for outcome in found if isinstance(outcome, Calibrated)))
 
 
-def test_images_that_come_too_fast_are_counted(bag):
-    calibration = LiveCalibration(Parameters(), use_stored=False)
+def test_images_that_come_too_fast_are_counted(bag, calibration):
     with open_bag(bag) as opened:
         for role, message in sensor_messages(opened, opened.find_topics({}), (Role.IMAGE,)):
             calibration.receive(role, message.message)
@@ -179,8 +184,7 @@ def test_images_that_come_too_fast_are_counted(bag):
     assert counts.refused == {Refusal.OVERLOAD: 202}
 
 
-def test_a_camera_at_rest_is_never_calibrated_and_the_motion_is_named(bag):
-    calibration = LiveCalibration(Parameters(), use_stored=False)
+def test_a_camera_at_rest_is_never_calibrated_and_the_motion_is_named(bag, calibration):
     found = [outcome for outcome in outcomes(bag, calibration, moving=False)
              if outcome is not None]
     assert {type(outcome) for outcome in found} == {Progress}

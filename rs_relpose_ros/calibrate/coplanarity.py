@@ -46,6 +46,7 @@ _OF_LENS = EXPOSURE - FOCAL
 # Unknowns of a pair: step of the direction in its tangent plane (2), bend (3), turn (3) [rad].
 DIRECTION, BEND, TURN = 14, 16, 19
 ALL = 22
+LOCAL = ALL - GLOBAL
 # Residual [sigma] beyond which the Geman-McClure loss is nearly constant.
 ROBUST = 3.0
 
@@ -377,6 +378,48 @@ def accumulate(problem: Problem, path: GyroPath, unknowns: Unknowns, tangent: Ar
                 J[BEND + i] = rows * by_b[i]
             _add_match(J, found.r, level * level * per_noise2, sums.gradient[p], sums.hessian[p])
         sums.losses[p] = loss
+
+
+@kernel
+def eliminate(sums: Sums, prior: Array, damping: Array, score: Array, reduced: Array,
+              back: Array) -> None:
+    """Fill the normal equations of the parameters, and how the pairs' own unknowns follow them.
+
+    With ``H_ll + prior = L L^T`` (diagonal times ``1 + damping``) and ``Y = L^-1 [H_lg, g_l]``:
+    ``score = g_g - Y_g^T y_l``, ``reduced = H_gg - Y_g^T Y_g``, ``back = L^-T Y``.
+    """
+    L = np.empty((LOCAL, LOCAL))
+    for p in range(len(prior)):
+        gradient, H, Y = sums.gradient[p], sums.hessian[p], back[p]
+        for i in range(LOCAL):
+            for j in range(i):
+                value = H[GLOBAL + i, GLOBAL + j]
+                for k in range(j):
+                    value -= L[i, k] * L[j, k]
+                L[i, j] = value / L[j, j]
+            value = (H[GLOBAL + i, GLOBAL + i] + prior[p, i]) * (1.0 + damping[p])
+            for k in range(i):
+                value -= L[i, k] ** 2
+            L[i, i] = math.sqrt(value)
+            for c in range(GLOBAL + 1):
+                value = H[GLOBAL + i, c] if c < GLOBAL else gradient[GLOBAL + i]
+                for k in range(i):
+                    value -= L[i, k] * Y[k, c]
+                Y[i, c] = value / L[i, i]
+        for i in range(GLOBAL):
+            score[p, i] = gradient[i]
+            for k in range(LOCAL):
+                score[p, i] -= Y[k, i] * Y[k, GLOBAL]
+            for j in range(i + 1):
+                value = H[i, j]
+                for k in range(LOCAL):
+                    value -= Y[k, i] * Y[k, j]
+                reduced[p, i, j] = reduced[p, j, i] = value
+        for i in range(LOCAL - 1, -1, -1):
+            for c in range(GLOBAL + 1):
+                for k in range(i + 1, LOCAL):
+                    Y[i, c] -= L[k, i] * Y[k, c]
+                Y[i, c] /= L[i, i]
 
 
 @kernel

@@ -14,7 +14,6 @@ Three kinds of errors exceed the noise of the matches:
   (`ModelErrors`). How far each moves the calibration follows from one evaluation.
 """
 
-from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 import itertools
@@ -27,20 +26,18 @@ from scipy import special  # scipy.stats takes seconds to import, at the start o
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.calibrate import coplanarity as model
-from rs_relpose_ros.calibrate.coplanarity import GLOBAL, Problem, READOUT, ROTATION, Unknowns
-from rs_relpose_ros.calibrate.observations import Observations, Varying, with_lens
-from rs_relpose_ros.calibrate.result import (
-    CalibrationResult,
-    CostCurve,
-    Estimate,
-    LensEstimates,
+from rs_relpose_ros.calibrate.coplanarity import (
+    GLOBAL,
+    LOCAL,
+    Problem,
+    READOUT,
+    ROTATION,
+    Unknowns,
 )
-from rs_relpose_ros.calibrate.start import GyroPath, nearest_axis_map
-from rs_relpose_ros.config.settings import CalibrationConfig
-from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.calibrate.result import CostCurve
+from rs_relpose_ros.calibrate.start import GyroPath
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import log_so3
-from rs_relpose_ros.pipeline.findings import BY_NAME
 
 # Stretches of a second, within which errors may be correlated, and limits of their number.
 _STRETCH = 1.0
@@ -95,7 +92,6 @@ _HYPOTHESES = 60
 _NEAR, _MOST_GAIN = 2.0, 8.0
 # Levenberg-Marquardt's damping of the pairs' own unknowns stays in this range.
 _DAMPING = (1e-6, 1e3)
-LOCAL = model.ALL - GLOBAL
 # Range of the noise of a pair, relative to the median over all pairs.
 _NOISE_RANGE = (0.6, 4.0)
 
@@ -124,7 +120,10 @@ def restarted(problem: Problem, unknowns: Unknowns, caution: float = 1.0) -> Unk
                    p[model.BIAS:model.BIAS + 3], caution * float(np.median(unknowns.noise)))
 
 
-def stepped(unknowns: Unknowns, step: Array, local: Array) -> Unknowns:
+_STAY = np.zeros((1, LOCAL))
+
+
+def stepped(unknowns: Unknowns, step: Array, local: Array = _STAY) -> Unknowns:
     """Unknowns after a step of the parameters (GLOBAL,) and of each pair (P, LOCAL)."""
     parameters = unknowns.parameters + step
     parameters[ROTATION:ROTATION + 3] = 0.0
@@ -182,29 +181,40 @@ def redirected(problem: Problem, unknowns: Unknowns) -> Unknowns:
 
 def evaluate(problem: Problem, unknowns: Unknowns, derivatives: bool = True) -> Evaluation:
     """Residuals and, with `derivatives`, the normal equations at `unknowns`."""
+    return _evaluation(problem, unknowns, _sums(problem, unknowns, derivatives))
+
+
+def _sums(problem: Problem, unknowns: Unknowns, derivatives: bool) -> model.Sums:
     pairs = problem.pairs
     size = pairs if derivatives else 0
     sums = model.Sums(np.empty(pairs), np.empty(len(problem.view1.points)),
                       np.zeros((size, model.ALL)), np.zeros((size, model.ALL, model.ALL)))
     model.accumulate(problem, _path(problem, unknowns), unknowns, _tangents(unknowns.direction),
                      derivatives, sums)
-    # Priors of the pairs' own unknowns; the 1 keeps a direction that no match determines.
+    return sums
+
+
+def _evaluation(problem: Problem, unknowns: Unknowns, sums: model.Sums) -> Evaluation:
+    """Add the priors of the pairs' own unknowns, and eliminate these."""
+    pairs, size = problem.pairs, len(sums.gradient)
     own = np.hstack([np.zeros((pairs, 2)), unknowns.bend, unknowns.turn])
-    weights = np.repeat([np.ones(pairs), problem.bend_sigma**-2, problem.turn_sigma**-2],
-                        [2, 3, 3], axis=0).T
-    losses = sums.losses + 0.5 * (weights * own**2).sum(axis=1)
-    if not derivatives:
-        return Evaluation(losses, sums.residuals, *3 * (np.empty(0),))
-    H = sums.hessian + np.tril(sums.hessian, -1).swapaxes(1, 2)
-    g_g, H_gg = sums.gradient[:, :GLOBAL], H[:, :GLOBAL, :GLOBAL]
-    g_l, H_lg = sums.gradient[:, GLOBAL:] + weights * own, H[:, GLOBAL:, :GLOBAL]
-    H_ll = H[:, GLOBAL:, GLOBAL:] + weights[:, :, None] * np.eye(LOCAL)
-    H_ll *= 1.0 + unknowns.damping[:, None, None] * np.eye(LOCAL)
-    # Schur complement: score = g_g - H_gl H_ll^-1 g_l, reduced = H_gg - H_gl H_ll^-1 H_lg.
-    back = np.linalg.solve(H_ll, np.concatenate([H_lg, g_l[:, :, None]], axis=2))
-    eliminated = H_lg.swapaxes(1, 2) @ back
-    return Evaluation(losses, sums.residuals, g_g - eliminated[:, :, GLOBAL],
-                      H_gg - eliminated[:, :, :GLOBAL], back)
+    weights = _local_priors(problem)
+    result = Evaluation(
+        sums.losses + 0.5 * (weights * own**2).sum(axis=1), sums.residuals,
+        np.empty((size, GLOBAL)), np.empty((size, GLOBAL, GLOBAL)),
+        np.empty((size, LOCAL, GLOBAL + 1)))
+    if size:
+        gradient = sums.gradient + np.hstack([np.zeros((pairs, GLOBAL)), weights * own])
+        model.eliminate(sums._replace(gradient=gradient), weights, unknowns.damping,
+                        result.score, result.reduced, result.back)
+    return result
+
+
+def _local_priors(problem: Problem) -> Array:
+    """Inverse variances (P, LOCAL); the 1 keeps a direction that no match determines."""
+    return np.ascontiguousarray(np.repeat(
+        [np.ones(problem.pairs), problem.bend_sigma**-2, problem.turn_sigma**-2],
+        [2, 3, 3], axis=0).T)
 
 
 def with_bends(problem: Problem, unknowns: Unknowns) -> Problem:
@@ -445,8 +455,13 @@ def widened(final: Fit, errors: ModelErrors | None) -> Fit:
     wider = np.sqrt(_between_regions(final) * _disagreement(final))
     scatter = final.covariance * np.outer(wider, wider)
     if errors is not None:
-        moves = np.array([_move(final, *there) for there in _perturbed(final, errors)])
-        scatter = scatter + moves.T @ moves
+        # One Newton step from the optimum with each error.
+        here = evaluate(final.problem, final.unknowns)
+        H, _ = _normal_equations(final.problem, here, final.unknowns, final.free)
+        gradients = [(evaluate(*there).score - here.score).sum(axis=0)[final.free]
+                     for there in _perturbed(final, errors)]
+        moves = np.linalg.solve(H, np.transpose(gradients))
+        scatter[np.ix_(final.free, final.free)] += moves @ moves.T
     return replace(final, covariance=scatter)
 
 
@@ -459,12 +474,16 @@ def _between_regions(final: Fit) -> Array:
     problem, free, curve = final.problem, final.free, bent(final.weights)
     index = np.ix_(free, free)
     region, stretch = _regions(problem.view1.points), stretches(problem.middles)
-    whole = evaluate(problem, final.unknowns)
+    sums = _sums(problem, final.unknowns, derivatives=True)
+    whole = _evaluation(problem, final.unknowns, sums)
     prior = np.diag(problem.prior)
     inverse = np.linalg.inv((curve * whole.reduced.sum(axis=0) + prior)[index])
     moves, cells = [], np.zeros_like(inverse)
     for name in np.unique(region):
-        rest = evaluate(problem.matches(region != name), final.unknowns)
+        of_region = _sums(problem.matches(region == name), final.unknowns, derivatives=True)
+        rest = _evaluation(problem, final.unknowns, sums._replace(
+            gradient=sums.gradient - of_region.gradient,
+            hessian=sums.hessian - of_region.hessian))
         own = (whole.score - rest.score)[:, free]
         rest_curvature = (curve * rest.reduced.sum(axis=0) + prior)[index]
         moves.append(np.linalg.pinv(rest_curvature, hermitian=True) @ own.sum(axis=0))
@@ -507,16 +526,6 @@ def _disagreement(final: Fit) -> Array:
     return factors
 
 
-def _move(final: Fit, problem: Problem, unknowns: Unknowns) -> Array:
-    """Move (G,) of the optimum, by one Newton step, with other data or other fixed parameters."""
-    there, here = evaluate(problem, unknowns), evaluate(final.problem, final.unknowns)
-    H, _ = _normal_equations(problem, here, final.unknowns, final.free)
-    move = np.zeros(GLOBAL)
-    gradient = (there.score - here.score).sum(axis=0)[final.free]
-    move[final.free] = -np.linalg.solve(H, gradient)
-    return move
-
-
 def _perturbed(final: Fit, errors: ModelErrors) -> Iterator[tuple[Problem, Unknowns]]:
     """Data and unknowns with one sigma of each error of the model."""
     problem, unknowns = final.problem, final.unknowns
@@ -543,151 +552,20 @@ def _perturbed(final: Fit, errors: ModelErrors) -> Iterator[tuple[Problem, Unkno
                 gyro_rates=problem.gyro_rates @ (np.eye(3) + mixing)), unknowns
 
 
-# -- Result of a fit, and observability --------------------------------------------------------
-
-_RECORD_MORE = ('too little rotation, too short, or too few points: record 10 s or more of a '
-                'textured scene while rotating 20 to 60 deg/s about all three axes')
-# Error of every focal length, relative: the residual is not linear in the noise of the points.
-_LEAST_FOCAL_SIGMA = 2e-4
-# A note if the intervals between frames vary for an unknown reason.
-_UNCLEAR = defaultdict(str, {Varying.UNCLEAR: (
-    'the intervals between frames vary neither as automatic exposure does nor as jitter: the '
-    'offset is assumed to be the same in all frames')})
-# Sigma, in those of an observable value, beyond which a rotation or focal length is of no use.
-_USELESS = 10.0
-# Largest sigmas of observable values: readout time and offset [s], its slope [s/s], bias [rad/s],
-# focal length (relative).
-_MOST_READOUT, _MOST_OFFSET, _MOST_SLOPE, _MOST_BIAS, _MOST_FOCAL = 1.5e-3, 3e-3, 0.5, 0.01, 0.03
-# Errors (2, GLOBAL) that are common to a recording and not part of its scatter, without and with a
-# tracker: its own, measured on rendered bags with KLT [s, rad, rad/s]; of the slope [s/s], as the
-# exposure also changes within one step of the interval.
-_COMMON = np.zeros((2, GLOBAL))
-_COMMON[:, model.FOCAL] = _LEAST_FOCAL_SIGMA
-_COMMON[1, [READOUT, model.OFFSET]], _COMMON[1, model.SLOPE] = 5e-5, 0.08
-_COMMON[1, ROTATION:ROTATION + 3], _COMMON[1, model.BIAS:model.BIAS + 3] = 1e-3, 2.5e-4
+# Sigma of the direction of motion of a pair [rad], beyond which it is hardly known.
+_KNOWN_DIRECTION = 0.1
 
 
-def evaluated(data: Observations, final: Fit, curve: CostCurve,
-              config: CalibrationConfig, *, axes_known: bool = False) -> CalibrationResult:
-    """Result of a fit; `axes_known`: also of a transform. InputError for a readout too long."""
-    common = np.where(final.free, _COMMON[int(config.exposed)], 0.0)
-    covariance = final.covariance + np.diag(common**2)
-    unknowns = final.unknowns
-    if final.free[model.FOCAL]:
-        # Widened, the sigmas of the lens may exceed those of its priors.
-        known = slice(model.RADIAL, model.EXPOSURE)
-        unknowns, covariance = joined(unknowns, covariance, known, final.problem.center[known],
-                                       1.0 / final.problem.prior[known])
-    bounded, covariance, beyond = _bounded(unknowns, covariance, data.interval)
-    parameters, R_cam_imu = bounded.parameters, bounded.R_imu_cam.T
-    rates, one_axis, _ = data.excitation(parameters[model.BIAS:model.BIAS + 3], R_cam_imu)
-    sigmas, wide = np.sqrt(np.diag(covariance)), config.tolerance
-    # Row 0 is read this share of the readout before the middle row.
-    to_first = np.zeros(GLOBAL)
-    height = data.camera.height
-    to_first[[model.OFFSET, READOUT]] = 1.0, -0.5 * (height - 1) / height
-    # Rotations about the axes of the camera.
-    part = slice(ROTATION, ROTATION + 3)
-    rotation_sigma = np.sqrt(np.diag(R_cam_imu @ covariance[part, part] @ R_cam_imu.T))
-    axis_map = nearest_axis_map(R_cam_imu)
-    cosine = (np.trace(R_cam_imu @ axis_map.T) - 1.0) / 2.0
-    bias_x, bias_y, bias_z = (_estimate(parameters[i], sigmas[i], wide * _MOST_BIAS)
-                              for i in range(model.BIAS, model.BIAS + 3))
-    slope = lens = None
-    if final.free[model.FOCAL]:
-        camera = with_lens(data.camera, parameters[model.LENS])
-        factor = math.exp(data.lens[0] + parameters[model.FOCAL])
-        lens = LensEstimates(
-            _estimate(factor, factor * sigmas[model.FOCAL], factor * wide * _MOST_FOCAL, one_axis),
-            *(Estimate(value, float(sigma), True) for value, sigma in zip(
-                (camera.distortion[0], camera.cx, camera.cy), sigmas[model.LENS][1:],
-                strict=True)))
-    if final.free[model.SLOPE]:
-        slope = _estimate(parameters[model.SLOPE], sigmas[model.SLOPE], _MOST_SLOPE)
-    jitters = data.stamps.varying is Varying.JITTER
-    unsettled = '' if final.converged else 'the fit has not converged'
-    return CalibrationResult(
-        readout_time=replace(_estimate(parameters[READOUT], sigmas[READOUT],
-                                       wide * _MOST_READOUT), determined=True),
-        fitted_readout=float(unknowns.parameters[READOUT]),
-        time_offset=_estimate(float(to_first @ parameters), math.sqrt(
-            to_first @ covariance @ to_first), wide * _MOST_OFFSET),
-        R_cam_imu=R_cam_imu, rotation_sigma=rotation_sigma,
-        rotation=_estimate(math.acos(np.clip(cosine, -1.0, 1.0)), rotation_sigma.max(),
-                           wide * config.max_rotation_sigma, '' if axes_known else one_axis),
-        axis_map=axis_map, gyro_bias=(bias_x, bias_y, bias_z), lens=lens,
-        exposure=_exposure(data, final, sigmas[model.EXPOSURE]),
-        exposure_margin=data.exposure.margin,
-        offset_by_interval=None if jitters else slope,
-        offset_by_jitter=slope if jitters else None, stamp_jitter=data.stamps.jitter,
-        rotation_rates=rates, curve=curve,
-        pixel_sigma=float(np.median(final.unknowns.noise)),
-        inlier_ratio=float((final.weights > 0.25).mean()),
-        frames=len(data.tracks), pairs=final.problem.pairs, matches=int(final.problem.begin[-1]),
-        frame_interval=data.interval,
-        warnings=tuple(filter(None, (unsettled, one_axis, beyond, _UNCLEAR[data.stamps.varying]))))
+def move_of_poses(final: Fit, covariance: Array) -> float:
+    """Move of the direction of the median pair by the doubt of the parameters, over its sigma.
 
-
-def _exposure(data: Observations, final: Fit, square_sigma: float) -> Estimate:
-    """Exposure at the median interval [s]."""
-    assumed = float(np.median(data.exposure.assumed))
-    square = assumed**2 + float(final.unknowns.parameters[model.EXPOSURE])
-    value = min(math.sqrt(max(square, 0.0)), data.interval)
-    # Also of a square near zero, where the root has no derivative.
-    sigma = math.sqrt(value**2 + square_sigma) - value
-    return Estimate(value, sigma, sigma <= 0.5 * value, 'the images do not show any')
-
-
-def joined(unknowns: Unknowns, covariance: Array, known: slice, values: Array | float,
-           variances: Array | float) -> tuple[Unknowns, Array]:
-    """The calibration with independent values of some parameters, and its covariance."""
-    own = covariance[known, known]
-    gain = covariance[:, known] @ np.linalg.inv(own + variances * np.eye(len(own)))
-    step = gain @ (values - unknowns.parameters[known])
-    return (stepped(unknowns, step, np.zeros((len(unknowns.direction), LOCAL))),
-            covariance - gain @ covariance[known])
-
-
-def _bounded(unknowns: Unknowns, covariance: Array,
-             interval: float) -> tuple[Unknowns, Array, str]:
-    """The calibration with its readout within an interval T between frames, and a note.
-
-    No camera reads longer than that. The readout time is the mean of its normal distribution
-    between these bounds, and the others follow by their covariance with it. Sigmas are kept: an
-    estimate beyond the bound has errors that the bound does not limit. An estimate less certain
-    than the bound itself, T / 2 +- T / sqrt(12) if read downwards, is joined with that.
+    The latter is by the noise of its matches, `_KNOWN_DIRECTION` at the most.
     """
-    known = interval / math.sqrt(12.0)
-    if covariance[READOUT, READOUT] > known**2:
-        return (*joined(unknowns, covariance, slice(READOUT, READOUT + 1), 0.5 * interval,
-                         known**2),
-                ('the images hardly determine the readout time: it is mostly that of any camera '
-                f'that is read downwards within the {1e3 * interval:.1f} ms between frames'))
-    readout, sigma = float(unknowns.parameters[READOUT]), math.sqrt(covariance[READOUT, READOUT])
-    found = 'the readout time is estimated as ' + BY_NAME['readout_time'].with_sigma(
-        abs(readout), sigma)
-    if abs(readout) - 3.0 * sigma > interval:
-        raise InputError(
-            f'{found}, longer than the interval of {1e3 * interval:.1f} ms between frames, which '
-            'no camera can do: check for frames that were dropped and stamped again, and for '
-            'images that were cropped, scaled or rotated')
-    # Of a truncated normal distribution; at least 0.1 % of it lies within.
-    ends = (np.array([-interval, interval]) - readout) / sigma
-    density, below = np.exp(-0.5 * ends**2) / math.sqrt(2.0 * math.pi), special.ndtr(ends)
-    mean = readout - sigma * float(np.diff(density)[0] / np.diff(below)[0])
-    step = covariance[:, READOUT] * ((mean - readout) / sigma**2)
-    note = '' if abs(readout) <= interval else (
-        f'{found}, but is at most the {1e3 * interval:.1f} ms between frames: all parameters are '
-        f'for {1e3 * abs(mean):.1f} ms, the mean below that')
-    return stepped(unknowns, step, np.zeros((len(unknowns.direction), LOCAL))), covariance, note
-
-
-def _estimate(value: float, sigma: float, limit: float, blocking_reason: str = '') -> Estimate:
-    """Estimate, observable if its sigma is within `limit` and nothing blocks it.
-
-    Beyond `_USELESS` limits a value is of no use.
-    """
-    good = bool(sigma <= limit and not blocking_reason)
-    return Estimate(float(value), float(sigma), good,
-                    '' if good else blocking_reason or _RECORD_MORE,
-                    determined=sigma <= _USELESS * limit and not blocking_reason)
+    problem, sums = final.problem, _sums(final.problem, final.unknowns, derivatives=True)
+    H = sums.hessian[:, GLOBAL:, GLOBAL:]
+    H = H + np.tril(H, -1).swapaxes(1, 2) + _local_priors(problem)[:, :, None] * np.eye(LOCAL)
+    back = _evaluation(problem, final.unknowns, sums).back[:, :2, :GLOBAL]
+    move, own = (float(np.sqrt(np.median(np.trace(of_pairs, axis1=1, axis2=2))))
+                 for of_pairs in (back @ covariance @ back.swapaxes(1, 2),
+                                  np.linalg.inv(H)[:, :2, :2]))
+    return move / min(own, _KNOWN_DIRECTION)

@@ -1,33 +1,41 @@
 """Calibration of a running camera: its tracks and gyro in memory, the fit in its own process."""
 
 from collections import Counter
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 import os
 import pickle
 from queue import Empty, Queue
 import subprocess
 import sys
-from tempfile import TemporaryFile
 import time
 from typing import Any
 
 from rs_relpose_ros.calibrate import stored
-from rs_relpose_ros.calibrate.procedure import calibrate, CalibrationInput, Recorder
+from rs_relpose_ros.calibrate.procedure import (
+    calibrate,
+    CalibrationInput,
+    Recorder,
+    warm_up_fit,
+)
 from rs_relpose_ros.calibrate.result import CalibrationResult, parameter_file, quantities
 from rs_relpose_ros.calibrate.stored import Calibrated, CameraId, Progress
-from rs_relpose_ros.config.settings import CalibrationConfig, Parameters, TRACKED_IN_IMAGES
+from rs_relpose_ros.config.settings import Parameters, TRACKED_IN_IMAGES
 from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.messages.incoming import Role, stamp_ns
 from rs_relpose_ros.messages.transforms import AXES_SIGMA
 from rs_relpose_ros.pipeline.sequencer import Refusal, SequencerCounts
 
-# Length of the recording [s]: of the first fit, and of a lens that is not known, whose fit takes
-# longer than the two seconds; kept at most; added before the next fit.
-_FIRST, _FIRST_OF_LENS, _LONGEST, _STEP = 6.0, 8.0, 60.0, 2.0
+# Length of the recording [s]: of the first fit, and of a lens that is not known; kept at most;
+# added before the next fit.
+_FIRST, _FIRST_OF_LENS, _LONGEST, _STEP = 6.0, 7.0, 60.0, 1.0
 # From this length on [s] values with wider sigmas suffice, as their doubt is in the covariances:
 # factor of the limits.
-_LONG, _WIDER = 8.0, 2.0
+_LONG, _WIDER = 7.0, 2.0
+# The same from the start, where the doubt moves poses by less than their own sigma.
+_UNNOTICED = 3.0
 # From this length on [s] a rotation as exact as that of a transform suffices: a robot on wheels
 # rotates about one axis only.
 _WHEELS = 20.0
@@ -40,8 +48,9 @@ _WITHOUT_INFO = 15
 # Consecutive images that cannot be used after which the recording starts again, of another size,
 # or goes on with a clock that was set back.
 _MOST_REFUSED = 15
-# Niceness of the process of the fit: the node's own work goes first.
-_NICE = 15
+# Niceness of the process of the fits: the node's own work goes first, but a loaded machine still
+# ends a fit.
+_NICE = 5
 
 
 class LiveCalibration:
@@ -64,10 +73,11 @@ class LiveCalibration:
         self._short = 0.0   # length of a recording that was reported as too short [s]
         self._done = False
         self._camera: CameraId | None = None
-        self._fit: _Fit | None = None
+        self._fits: _Fits | None = None
         self._restart()
 
     def _restart(self) -> None:
+        self.close()
         self._recorder = Recorder(self._parameters.tracking, _LONGEST)
         self._images = self._refused = 0
         self._fitted_ns = 0   # stamp of the last image at the begin of the last fit
@@ -88,8 +98,8 @@ class LiveCalibration:
 
     @property
     def fitting(self) -> bool:
-        """Whether the process of a fit runs."""
-        return self._fit is not None
+        """Whether a fit runs."""
+        return self._fits is not None and self._fits.recording is not None
 
     def waits_for_imu(self) -> bool:
         """Samples may come in batches."""
@@ -123,6 +133,8 @@ class LiveCalibration:
             return None
         outcome = self._next(timeout)
         self._done = isinstance(outcome, Calibrated)
+        if self._done:
+            self.close()
         return outcome
 
     def _next(self, timeout: float) -> Progress | Calibrated | RsRelposeError | None:
@@ -169,9 +181,10 @@ class LiveCalibration:
                         f'at least {self._first:.0f} s are needed, 10 s or more are good')
 
     def close(self) -> None:
-        """End the process of the fit."""
-        if self._fit is not None:
-            self._fit.stop()
+        """End the process of the fits."""
+        if self._fits is not None:
+            self._fits.stop()
+            self._fits = None
 
     def _first_image(self, frame_id: str) -> Progress | Calibrated | RsRelposeError:
         """The stored calibration of the camera, if there is one, or the error of its file."""
@@ -183,6 +196,7 @@ class LiveCalibration:
         except InputError as error:
             return error
         if not (self._use_stored and path.is_file()):
+            self._fits = None if self.waits_for else _Fits()
             return Progress('calibrating: rotate the camera about all three axes, 20 to 60 deg/s, '
                             'for some 20 s' if not self.waits_for else
                             f'waiting for {self.waits_for}')
@@ -194,11 +208,12 @@ class LiveCalibration:
             return error
 
     def _after_fit(self) -> Progress | Calibrated | None:
-        if self._fit is not None:
-            result = self._fit.result()
+        fits = self._fits
+        if fits is not None and fits.recording is not None:
+            result = fits.result()
             if result is None:
                 return None
-            recording, self._fit = self._fit.recording, None
+            recording, fits.recording = fits.recording, None
             return self._evaluated(result, recording)
         recorder = self._recorder
         grown = 1e-9 * (recorder.last_ns - self._fitted_ns) if self._fitted_ns else _STEP
@@ -207,13 +222,17 @@ class LiveCalibration:
         self._fitted_ns = recorder.last_ns
         sensor = self._parameters.sensor
         config = replace(TRACKED_IN_IMAGES, exposure_time=sensor.exposure_time,
-                         exposure_margin=sensor.exposure_margin)
+                         exposure_margin=sensor.exposure_margin,
+                         unnoticed_tolerance=_UNNOTICED)
         if recorder.seconds >= _LONG:
             config = replace(config, tolerance=_WIDER)
         if recorder.seconds >= _WHEELS and self.quat_prior is not None:
             config = replace(config, max_rotation_sigma=1.1 * AXES_SIGMA / _WIDER)
+        if fits is None or fits.ended:
+            self.close()
+            self._fits = fits = _Fits()
         try:
-            self._fit = _Fit(recorder.recording(), config, self.quat_prior)
+            fits.begin(recorder.recording(), config, self.quat_prior)
         except RsRelposeError as error:
             return Progress(f'calibrating: {error}')
         return None
@@ -238,54 +257,77 @@ class LiveCalibration:
             {name: text if of.observable else f'{text}; {of.remark}' for name, text, of in rows})
 
 
-class _Fit:
-    """A fit in a process of its own, so that it takes no time of the interpreter's lock.
+class _Fits:
+    """Process that fits one recording after the other, with no share of the interpreter's lock.
 
-    Not by multiprocessing, which unblocks the signals of the calling thread.
+    Not by multiprocessing, which unblocks the signals of the calling thread. It imports and loads
+    its kernels while the first images are recorded.
     """
 
-    def __init__(self, recording: CalibrationInput, config: CalibrationConfig,
-                 quat_prior: tuple[float, ...] | None) -> None:
+    def __init__(self) -> None:
+        self.recording: CalibrationInput | None = None   # while its fit runs
+        self._process = subprocess.Popen([sys.executable, '-m', __name__], stdin=subprocess.PIPE,
+                                         stdout=subprocess.PIPE)
+        self._thread = ThreadPoolExecutor(1)
+        self._result: Future[CalibrationResult | RsRelposeError] | None = None
+
+    def begin(self, recording: CalibrationInput, *others: Any) -> None:
+        """Fit a recording; `others`: configuration, and rotation of a transform."""
         self.recording = recording
-        self._result = TemporaryFile()   # noqa: SIM115 closed by result or stop
-        with TemporaryFile() as arguments:
-            pickle.dump((recording, config, quat_prior), arguments)
-            arguments.seek(0)
-            self._process = subprocess.Popen([sys.executable, '-m', __name__], stdin=arguments,
-                                             stdout=self._result)
+        self._result = self._thread.submit(self._answer, (recording, *others))
+
+    def _answer(self, arguments: tuple[Any, ...]) -> CalibrationResult | RsRelposeError:
+        requests, answers = self._process.stdin, self._process.stdout
+        assert requests is not None
+        assert answers is not None
+        try:
+            pickle.dump(arguments, requests, protocol=5)   # without copies of the arrays
+            requests.flush()
+            found: CalibrationResult | RsRelposeError = pickle.load(answers)   # noqa: S301
+        except (OSError, EOFError, pickle.UnpicklingError):
+            self._process.kill()
+            found = RsRelposeError('the process of the fit ended early: out of memory?')
+        return found
+
+    @property
+    def ended(self) -> bool:
+        """Whether the process has ended."""
+        return self._process.poll() is not None
 
     def result(self) -> CalibrationResult | RsRelposeError | None:
         """None while it runs."""
-        if self._process.poll() is None:
+        if self._result is None or not self._result.done():
             return None
-        with self._result:
-            self._result.seek(0)
-            try:
-                # Written by the own process.
-                found: CalibrationResult | RsRelposeError = pickle.load(self._result)  # noqa: S301
-            except (EOFError, pickle.UnpicklingError):
-                found = RsRelposeError('the process of the fit ended early: out of memory?')
-        return found
+        return self._result.result()
 
     def stop(self) -> None:
         """End the process; signals of the terminal are blocked in it."""
         self._process.kill()
         self._process.wait()
-        self._result.close()
+        self._thread.shutdown()
+        for pipe in (self._process.stdin, self._process.stdout):
+            with suppress(OSError):   # the rest of a request
+                pipe.close()   # type: ignore[union-attr]
 
 
-def _fit() -> None:
-    """Fit the pickled recording of stdin, and write the result, or its error, to stdout."""
+def _serve() -> None:
+    """Fit the pickled recordings of stdin, and write the results, or their errors, to stdout."""
     os.nice(_NICE)
-    recording, config, quat_prior = pickle.load(sys.stdin.buffer)   # noqa: S301 of the parent
-    try:
-        result: CalibrationResult | RsRelposeError = calibrate(
-            recording.tracks, recording.gyro, recording.camera,
-            focal_known=recording.focal_known, config=config, quat_prior=quat_prior)
-    except RsRelposeError as error:
-        result = error
-    pickle.dump(result, sys.stdout.buffer)
+    warm_up_fit()
+    while True:
+        try:
+            recording, config, quat_prior = pickle.load(sys.stdin.buffer)  # noqa: S301 of the node
+        except EOFError:   # the node has ended
+            return
+        try:
+            result: CalibrationResult | RsRelposeError = calibrate(
+                recording.tracks, recording.gyro, recording.camera,
+                focal_known=recording.focal_known, config=config, quat_prior=quat_prior)
+        except RsRelposeError as error:
+            result = error
+        pickle.dump(result, sys.stdout.buffer)
+        sys.stdout.buffer.flush()
 
 
 if __name__ == '__main__':
-    _fit()
+    _serve()

@@ -234,6 +234,8 @@ def with_lens(camera: RollingShutterCamera, lens: Array) -> RollingShutterCamera
 # Frames further apart than so many intervals have lost some in between.
 _LOST = 1.5
 _LEAST_PAIRS = 10
+# Pairs of a second that a fit uses at most: with all of them its sigmas are no smaller.
+_PAIRS_PER_SECOND = 80.0
 # Longest step between samples of the gyro that is interpolated [s], and rms rate below which the
 # camera is at rest about an axis [rad/s].
 MAX_GYRO_GAP, LEAST_ROTATION = 0.03, math.radians(2.0)
@@ -338,9 +340,9 @@ class Observations:
                 f'only {len(pairs)} pairs of images have {selection.min_matches} points in common '
                 'and a gyro without gaps: record a textured scene with a short exposure, and all '
                 'of the gyro')
-        if len(pairs) > selection.most_pairs:
-            pairs = pairs.chosen(
-                np.linspace(0, len(pairs) - 1, selection.most_pairs).astype(np.int64))
+        most = min(selection.most_pairs, round(_PAIRS_PER_SECOND * self.times[-1]))
+        if len(pairs) > most:
+            pairs = pairs.chosen(np.linspace(0, len(pairs) - 1, most).astype(np.int64))
         return self.problem(pairs, offset)
 
     def image_rates(self, pairs: Pairs) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 import logging
@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special  # scipy.stats takes seconds to import, at the start of a node
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.bags.reader import Bag, SensorTopics
@@ -22,6 +23,8 @@ from rs_relpose_ros.calibrate.coplanarity import (
     GLOBAL,
     LENS,
     OFFSET,
+    RADIAL,
+    READOUT,
     ROTATION,
     SLOPE,
     Unknowns,
@@ -32,9 +35,16 @@ from rs_relpose_ros.calibrate.observations import (
     Observations,
     PairSelection,
     Tracks,
+    Varying,
+    with_lens,
 )
-from rs_relpose_ros.calibrate.result import CalibrationResult
-from rs_relpose_ros.calibrate.start import find_starts, GyroSeries, Start
+from rs_relpose_ros.calibrate.result import (
+    CalibrationResult,
+    CostCurve,
+    Estimate,
+    LensEstimates,
+)
+from rs_relpose_ros.calibrate.start import find_starts, GyroSeries, nearest_axis_map, Start
 from rs_relpose_ros.config.settings import CalibrationConfig, TrackingConfig
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry import Array
@@ -43,6 +53,7 @@ from rs_relpose_ros.geometry.so3 import log_so3
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.messages.incoming import PARTS, ReasonCounts, Role, sensor_messages
 from rs_relpose_ros.messages.transforms import AXES_SIGMA
+from rs_relpose_ros.pipeline.findings import BY_NAME
 from rs_relpose_ros.pipeline.rotations import LEAST_RAYS
 from rs_relpose_ros.tracking.features import make_tracker
 from rs_relpose_ros.tracking.images import EncodedImage, GrayLevels
@@ -116,7 +127,23 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
     curve = fit.cost_curve(fit.with_bends(some, final.unknowns), final, data.interval,
                            lambda share: progress(0.8 + 0.2 * share))
     final, axes_known = _with_axes(data, final, R_prior)
-    return fit.evaluated(data, final, curve, config, axes_known=axes_known)
+    return evaluated(data, final, curve, config, axes_known=axes_known)
+
+
+def warm_up_fit() -> None:
+    """Compile (or load from the cache) the kernels of a calibration, on made-up points."""
+    frames, points, rng = 60, 30, np.random.default_rng(0)
+    stamps_ns = np.arange(frames) * to_nanoseconds(1.0 / 30.0)
+    tracks = Tracks(stamps_ns, np.repeat(np.arange(frames), points),
+                    np.tile(np.arange(points), frames), rng.uniform(0, 200, (frames * points, 2)))
+    gyro_ns = np.arange(-100, 500) * to_nanoseconds(5e-3)
+    camera = RollingShutterCamera(width=200, height=200, fx=150.0, fy=150.0, cx=100.0, cy=100.0,
+                                  readout_time=0.0)
+    data = Observations.of(tracks, GyroSeries(gyro_ns, rng.normal(size=(600, 3))), camera)
+    data.image_rates(data.pairs(_NEIGHBOURS, rng))
+    problem = data.selected_problem(_SOME_PAIRS, 0.0, rng)
+    begin = fit.initial(problem, np.eye(3), 0.0)
+    fit.fit(fit.with_bends(problem, begin), begin, np.ones(GLOBAL, dtype=bool), rounds=1)
 
 
 def _with_axes(data: Observations, final: fit.Fit,
@@ -137,7 +164,7 @@ def _with_axes(data: Observations, final: fit.Fit,
     if turn @ np.linalg.solve(AXES_SIGMA**2 * np.eye(3) + 9.0 * covariance[part, part],
                               turn) > 1.0:
         return final, False
-    unknowns, covariance = fit.joined(final.unknowns, covariance, part, turn, AXES_SIGMA**2)
+    unknowns, covariance = joined(final.unknowns, covariance, part, turn, AXES_SIGMA**2)
     return replace(final, unknowns=unknowns, covariance=covariance), True
 
 
@@ -210,15 +237,174 @@ def _fit_with_lens(about: Callable[[Array], Observations], data: Observations, c
                    free: NDArray[np.bool_], selection: PairSelection,
                    rng: np.random.Generator) -> tuple[Observations, fit.Fit]:
     """Fit from `coarse`, linear in the lens, repeated about its own lens until that stays."""
+    seed, offset, found = int(rng.integers(2**32)), coarse.parameters[OFFSET], None
     for _ in range(_LENS_ROUNDS):
         data = about(data.lens + coarse.parameters[LENS])
-        problem = data.selected_problem(selection, coarse.parameters[OFFSET], rng)
-        begin = fit.restarted(problem, coarse, 2.0)
+        problem = data.selected_problem(selection, offset, np.random.default_rng(seed))
+        if found is not None and np.array_equal(problem.view1.rows, found.problem.view1.rows):
+            # The same matches: only the lens is linearised again.
+            parameters = coarse.parameters.copy()
+            parameters[LENS] = 0.0
+            begin = coarse._replace(parameters=parameters)
+        else:
+            begin = fit.restarted(problem, coarse, 2.0)
         found = fit.fit(fit.with_bends(problem, begin), begin, free)
         coarse = found.unknowns
         if (np.abs(coarse.parameters[LENS]) <= _LENS_STAYS).all():
             break
+    assert found is not None
     return data, found
+
+
+# -- Result of a fit, and observability --------------------------------------------------------
+
+_RECORD_MORE = ('too little rotation, too short, or too few points: record 10 s or more of a '
+                'textured scene while rotating 20 to 60 deg/s about all three axes')
+# Error of every focal length, relative: the residual is not linear in the noise of the points.
+_LEAST_FOCAL_SIGMA = 2e-4
+# A note if the intervals between frames vary for an unknown reason.
+_UNCLEAR = defaultdict(str, {Varying.UNCLEAR: (
+    'the intervals between frames vary neither as automatic exposure does nor as jitter: the '
+    'offset is assumed to be the same in all frames')})
+# Sigma, in those of an observable value, beyond which a rotation or focal length is of no use.
+_USELESS = 10.0
+# Largest sigmas of observable values: readout time and offset [s], its slope [s/s], bias [rad/s],
+# focal length (relative).
+_MOST_READOUT, _MOST_OFFSET, _MOST_SLOPE, _MOST_BIAS, _MOST_FOCAL = 1.5e-3, 3e-3, 0.5, 0.01, 0.03
+# Errors (2, GLOBAL) that are common to a recording and not part of its scatter, without and with a
+# tracker: its own, measured on rendered bags with KLT [s, rad, rad/s]; of the slope [s/s], as the
+# exposure also changes within one step of the interval.
+_COMMON = np.zeros((2, GLOBAL))
+_COMMON[:, FOCAL] = _LEAST_FOCAL_SIGMA
+_COMMON[1, [READOUT, OFFSET]], _COMMON[1, SLOPE] = 5e-5, 0.08
+_COMMON[1, ROTATION:ROTATION + 3], _COMMON[1, BIAS:BIAS + 3] = 1e-3, 2.5e-4
+
+
+def evaluated(data: Observations, final: fit.Fit, curve: CostCurve,
+              config: CalibrationConfig, *, axes_known: bool = False) -> CalibrationResult:
+    """Result of a fit; `axes_known`: also of a transform. InputError for a readout too long."""
+    common = np.where(final.free, _COMMON[int(config.exposed)], 0.0)
+    covariance = final.covariance + np.diag(common**2)
+    unknowns = final.unknowns
+    if final.free[FOCAL]:
+        # Widened, the sigmas of the lens may exceed those of its priors.
+        known = slice(RADIAL, EXPOSURE)
+        unknowns, covariance = joined(unknowns, covariance, known, final.problem.center[known],
+                                       1.0 / final.problem.prior[known])
+    bounded, covariance, beyond = _bounded(unknowns, covariance, data.interval)
+    parameters, R_cam_imu = bounded.parameters, bounded.R_imu_cam.T
+    rates, one_axis, _ = data.excitation(parameters[BIAS:BIAS + 3], R_cam_imu)
+    sigmas, wide = np.sqrt(np.diag(covariance)), config.tolerance
+    if fit.move_of_poses(final, covariance) <= 1.0:
+        wide = max(wide, config.unnoticed_tolerance)
+    # Row 0 is read this share of the readout before the middle row.
+    to_first = np.zeros(GLOBAL)
+    height = data.camera.height
+    to_first[[OFFSET, READOUT]] = 1.0, -0.5 * (height - 1) / height
+    # Rotations about the axes of the camera.
+    part = slice(ROTATION, ROTATION + 3)
+    rotation_sigma = np.sqrt(np.diag(R_cam_imu @ covariance[part, part] @ R_cam_imu.T))
+    axis_map = nearest_axis_map(R_cam_imu)
+    cosine = (np.trace(R_cam_imu @ axis_map.T) - 1.0) / 2.0
+    bias_x, bias_y, bias_z = (_estimate(parameters[i], sigmas[i], wide * _MOST_BIAS)
+                              for i in range(BIAS, BIAS + 3))
+    slope = lens = None
+    if final.free[FOCAL]:
+        camera = with_lens(data.camera, parameters[LENS])
+        factor = math.exp(data.lens[0] + parameters[FOCAL])
+        lens = LensEstimates(
+            _estimate(factor, factor * sigmas[FOCAL], factor * wide * _MOST_FOCAL, one_axis),
+            *(Estimate(value, float(sigma), True) for value, sigma in zip(
+                (camera.distortion[0], camera.cx, camera.cy), sigmas[LENS][1:], strict=True)))
+    if final.free[SLOPE]:
+        slope = _estimate(parameters[SLOPE], sigmas[SLOPE], _MOST_SLOPE)
+    jitters = data.stamps.varying is Varying.JITTER
+    unsettled = '' if final.converged else 'the fit has not converged'
+    return CalibrationResult(
+        readout_time=replace(_estimate(parameters[READOUT], sigmas[READOUT],
+                                       wide * _MOST_READOUT), determined=True),
+        fitted_readout=float(unknowns.parameters[READOUT]),
+        time_offset=_estimate(float(to_first @ parameters), math.sqrt(
+            to_first @ covariance @ to_first), wide * _MOST_OFFSET),
+        R_cam_imu=R_cam_imu, rotation_sigma=rotation_sigma,
+        rotation=_estimate(math.acos(np.clip(cosine, -1.0, 1.0)), rotation_sigma.max(),
+                           wide * config.max_rotation_sigma, '' if axes_known else one_axis),
+        axis_map=axis_map, gyro_bias=(bias_x, bias_y, bias_z), lens=lens,
+        exposure=_exposure(data, final, sigmas[EXPOSURE]),
+        exposure_margin=data.exposure.margin,
+        offset_by_interval=None if jitters else slope,
+        offset_by_jitter=slope if jitters else None, stamp_jitter=data.stamps.jitter,
+        rotation_rates=rates, curve=curve,
+        pixel_sigma=float(np.median(final.unknowns.noise)),
+        inlier_ratio=float((final.weights > 0.25).mean()),
+        frames=len(data.tracks), pairs=final.problem.pairs, matches=int(final.problem.begin[-1]),
+        frame_interval=data.interval,
+        warnings=tuple(filter(None, (unsettled, one_axis, beyond, _UNCLEAR[data.stamps.varying]))))
+
+
+def _exposure(data: Observations, final: fit.Fit, square_sigma: float) -> Estimate:
+    """Exposure at the median interval [s]."""
+    assumed = float(np.median(data.exposure.assumed))
+    square = assumed**2 + float(final.unknowns.parameters[EXPOSURE])
+    value = min(math.sqrt(max(square, 0.0)), data.interval)
+    # Also of a square near zero, where the root has no derivative.
+    sigma = math.sqrt(value**2 + square_sigma) - value
+    return Estimate(value, sigma, sigma <= 0.5 * value, 'the images do not show any')
+
+
+def joined(unknowns: Unknowns, covariance: Array, known: slice, values: Array | float,
+           variances: Array | float) -> tuple[Unknowns, Array]:
+    """The calibration with independent values of some parameters, and its covariance."""
+    own = covariance[known, known]
+    gain = covariance[:, known] @ np.linalg.inv(own + variances * np.eye(len(own)))
+    step = gain @ (values - unknowns.parameters[known])
+    return (fit.stepped(unknowns, step),
+            covariance - gain @ covariance[known])
+
+
+def _bounded(unknowns: Unknowns, covariance: Array,
+             interval: float) -> tuple[Unknowns, Array, str]:
+    """The calibration with its readout within an interval T between frames, and a note.
+
+    No camera reads longer than that. The readout time is the mean of its normal distribution
+    between these bounds, and the others follow by their covariance with it. Sigmas are kept: an
+    estimate beyond the bound has errors that the bound does not limit. An estimate less certain
+    than the bound itself, T / 2 +- T / sqrt(12) if read downwards, is joined with that.
+    """
+    known = interval / math.sqrt(12.0)
+    if covariance[READOUT, READOUT] > known**2:
+        return (*joined(unknowns, covariance, slice(READOUT, READOUT + 1), 0.5 * interval,
+                         known**2),
+                ('the images hardly determine the readout time: it is mostly that of any camera '
+                f'that is read downwards within the {1e3 * interval:.1f} ms between frames'))
+    readout, sigma = float(unknowns.parameters[READOUT]), math.sqrt(covariance[READOUT, READOUT])
+    found = 'the readout time is estimated as ' + BY_NAME['readout_time'].with_sigma(
+        abs(readout), sigma)
+    if abs(readout) - 3.0 * sigma > interval:
+        raise InputError(
+            f'{found}, longer than the interval of {1e3 * interval:.1f} ms between frames, which '
+            'no camera can do: check for frames that were dropped and stamped again, and for '
+            'images that were cropped, scaled or rotated')
+    # Of a truncated normal distribution; at least 0.1 % of it lies within.
+    ends = (np.array([-interval, interval]) - readout) / sigma
+    density, below = np.exp(-0.5 * ends**2) / math.sqrt(2.0 * math.pi), special.ndtr(ends)
+    mean = readout - sigma * float(np.diff(density)[0] / np.diff(below)[0])
+    step = covariance[:, READOUT] * ((mean - readout) / sigma**2)
+    note = '' if abs(readout) <= interval else (
+        f'{found}, but is at most the {1e3 * interval:.1f} ms between frames: all parameters are '
+        f'for {1e3 * abs(mean):.1f} ms, the mean below that')
+    return fit.stepped(unknowns, step), covariance, note
+
+
+def _estimate(value: float, sigma: float, limit: float, blocking_reason: str = '') -> Estimate:
+    """Estimate, observable if its sigma is within `limit` and nothing blocks it.
+
+    Beyond `_USELESS` limits a value is of no use.
+    """
+    good = bool(sigma <= limit and not blocking_reason)
+    return Estimate(float(value), float(sigma), good,
+                    '' if good else blocking_reason or _RECORD_MORE,
+                    determined=sigma <= _USELESS * limit and not blocking_reason)
 
 
 # -- Tracks and gyro of a bag -------------------------------------------------------------------
@@ -292,7 +478,7 @@ class Recorder:
         self._tracker, self._levels = make_tracker(tracking), GrayLevels()
         self._since_renewed = 0     # images
         # Stamps of the images, ids and pixels (N, 2) of their points.
-        self._frames: deque[tuple[int, NDArray[np.uint32], Array]] = deque()
+        self._frames: deque[tuple[int, NDArray[np.uint32], NDArray[np.float32]]] = deque()
         self.size = (0, 0)   # of the images [px]
         self._gyro: dict[int, tuple[float, float, float]] = {}
 
@@ -341,7 +527,8 @@ class Recorder:
         if tracker.tracked_fraction < _KEPT or self._since_renewed >= _RENEWED_AFTER:
             tracker.promote()
             self._since_renewed = 0
-        self._frames.append((encoded.stamp_ns, matches.track_ids, matches.points2))
+        self._frames.append((encoded.stamp_ns, matches.track_ids,
+                             matches.points2.astype(np.float32)))   # to 1e-4 px
         self.size = image.shape[1], image.shape[0]
         while self.seconds > self._longest:
             self._frames.popleft()
@@ -376,7 +563,7 @@ class Recorder:
         if intrinsics is None and not self.uncalibrated:
             raise MissingInputError(f'no CameraInfo can be used{why}')
         of_frames, ids, pixels = zip(*self._frames, strict=True)
-        points, stamps = np.concatenate(pixels), sorted(self._gyro)
+        points, stamps = np.concatenate(pixels, dtype=np.float64), sorted(self._gyro)
         if intrinsics is not None:
             points = intrinsics.to_sensor(points)
         frames = np.repeat(np.arange(len(ids)), list(map(len, ids)))

@@ -67,25 +67,30 @@ def find_starts(rates: Array, begins: Array, ends: Array, gyro_times: Array, gyr
     rotation about one axis is not determined, it is that of `R_prior`, or of an axis map.
     """
     turned = cumulative_trapezoid(gyro_rates, gyro_times, axis=0, initial=0.0)
-    starts: list[Start] = []
-    for offset in np.arange(-max_offset, max_offset + 0.5 * step, step):
+
+    def aligned(offset: float, factors: ArrayLike) -> Start | None:
         inside = ((begins + offset >= gyro_times[0]) & (ends + offset <= gyro_times[-1]))
         # An offset at which the gyro misses most frames cannot be evaluated.
         if inside.sum() < max(10, 0.5 * len(rates)):
-            continue
+            return None
         begin, end = begins[inside] + offset, ends[inside] + offset
         measured = np.stack([
             (np.interp(end, gyro_times, of_axis) - np.interp(begin, gyro_times, of_axis))
             / (end - begin) for of_axis in turned.T], axis=1)
-        starts.append(min((_aligned(rates[inside] * [1.0 / factor, 1.0 / factor, 1.0], measured,
-                                    float(offset), float(factor), R_prior)
-                           for factor in focal_factors),
-                          key=lambda start: start.misfit))
+        return min((_aligned(rates[inside] * [1.0 / factor, 1.0 / factor, 1.0], measured,
+                             offset, float(factor), R_prior) for factor in np.atleast_1d(factors)),
+                   key=lambda start: start.misfit)
+
+    # The best offsets hardly depend on the focal length.
+    offsets = np.arange(-max_offset, max_offset + 0.5 * step, step)
+    starts = [start for offset in offsets
+              if (start := aligned(float(offset), np.median(focal_factors)))]
     chosen: list[Start] = []
     for start in sorted(starts, key=lambda start: start.misfit):
         if all(abs(start.offset - other.offset) >= 4.0 * step for other in chosen):
             chosen.append(start)
-    return chosen[:count]
+    return sorted(filter(None, (aligned(start.offset, focal_factors) for start in chosen[:count])),
+                  key=lambda start: start.misfit)
 
 
 def _aligned(estimated: Array, measured: Array, offset: float, focal_factor: float,
@@ -188,7 +193,12 @@ def _path_rotation(rotation: Array, rate1: Array, rate2: Array, dt: float, out: 
     """Write ``R Exp(phi)`` with ``phi = (w_1 + w_2) dt / 2``: Rodrigues' formula for each row."""
     phi = (0.5 * dt * (rate1[0] + rate2[0]), 0.5 * dt * (rate1[1] + rate2[1]),
            0.5 * dt * (rate1[2] + rate2[2]))
-    a, b = so3.rodrigues(so3.dot(phi, phi))
+    square = so3.dot(phi, phi)
+    if square < 0.01:   # to 1e-14; without sine and cosine twice as fast
+        a = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
+        b = 0.5 - square / 24.0 * (1.0 - square / 30.0 * (1.0 - square / 56.0))
+    else:
+        a, b = so3.rodrigues(square)
     for i in range(3):
         side = so3.cross(rotation[i], phi)
         back = so3.cross(side, phi)

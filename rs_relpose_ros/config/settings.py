@@ -250,6 +250,9 @@ class CalibrationConfig(Settings):
         0.25, 'largest clock offset that is searched for', 's', low=0.01, high=5.0)
     tolerance: float = setting(
         1.0, 'factor of the largest sigmas of observable parameters', low=0.1, high=10.0)
+    unnoticed_tolerance: float = setting(
+        1.0, 'the same where the doubt moves the direction of the median pair by less than its '
+        'own sigma', low=0.1, high=10.0)
     max_rotation_sigma: float = setting(
         math.radians(0.7), 'largest sigma of an observable rotation, each axis, at a tolerance of '
         '1', 'rad', low=1e-5, high=1.0)
