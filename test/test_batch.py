@@ -144,21 +144,6 @@ def test_calibrations_of_one_camera():
                                [0.0, 0.0, np.sin(0.0055), np.cos(0.0055)], atol=1e-9)
 
 
-@pytest.mark.parametrize('command, results, message', [
-    ('check', {'findings': [{'name': 'stamps', 'verdict': 'failure', 'text': 'go back'},
-                            {'name': 'imu rate', 'verdict': 'ok', 'text': 'fine'}]},
-     'stamps: go back'),
-    ('calibrate', {'focal_px': None, 'time_offset_s': {'determined': True},
-                   'rotation_from_axis_map_rad': {'determined': False, 'remark': 'turn more'}},
-     'rotation is not observable: turn more'),
-    ('replay', {'health': {'findings': [{'state': 'wrong', 'sentence': 'axes are mirrored'},
-                                        {'state': 'ok', 'sentence': 'bias'}]},
-                'pairs': {'answered': 0, 'by_status': {'OK': 0, 'NO_CONSENSUS': 3}}},
-     'axes are mirrored; no pair has a pose: 3 NO_CONSENSUS')])
-def test_message_names_the_problems(command, results, message):
-    assert batch_results.message_of(command, results) == message
-
-
 def results_of(folder: Path) -> dict[str, dict[str, str]]:
     return {row['name']: row for row in rows_of(folder / 'results.csv')}
 

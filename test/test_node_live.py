@@ -1,14 +1,20 @@
-"""The node and a player as processes over DDS, on the bundled bag; signals that end the node."""
+"""The node and a player as processes over DDS; signals; examples of the documentation."""
 
+from collections.abc import Iterator
+import importlib.util
+from operator import itemgetter
 from pathlib import Path
 import signal
 import time
 from types import SimpleNamespace
+from typing import Any
 
-from conftest import BUNDLED_PARAMETERS
+from conftest import BUNDLED_PARAMETERS, ROOT
 from diagnostic_msgs.msg import DiagnosticArray
 import fault_stream as faults
 from fault_stream import BAG_TOPICS
+from nav_msgs.msg import Odometry
+from nav_msgs.msg import Path as PathMessage
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -163,3 +169,91 @@ def test_a_signal_ends_a_node_that_compiles(ros_domain_id, tmp_path, monkeypatch
         node.wait_for('compiling kernels')
         # The compiler lets go of the interpreter only now and then.
         assert end(node, signal.SIGTERM) <= 5.0
+
+
+# -- examples of the documentation --------------------------------------------------------------
+
+# A pair before the bag's standstill.
+LOST = 4
+EXAMPLE = ROOT / 'docs' / 'examples' / 'chain_poses.py'
+PX4 = ROOT / 'docs' / 'examples' / 'px4_odometry.py'
+
+
+@pytest.fixture(scope='module')
+def recorded(bundled_bag: Path) -> list[dict[str, Any]]:
+    """What the node publishes of the bundled bag, one pair lost on the way."""
+    with open_bag(bundled_bag) as bag:
+        replay = Replay(bag, bag.find_topics(), read_parameters(BUNDLED_PARAMETERS))
+        pairs = [pair_messages(pair, message_class) for pair in replay.pairs()]
+        return [*pairs[:LOST], *pairs[LOST + 1:]]
+
+
+@pytest.fixture(scope='module')
+def chain(module_ros_domain_id: int,
+          recorded: list[dict[str, Any]]) -> Iterator[SimpleNamespace]:
+    """Paths that the example published, each with its last stamp, and its output."""
+    with Graph() as graph, Process(
+            str(EXAMPLE), '--ros-args', '-r', '__ns:=/relpose_node') as example:
+        paths = graph.listen(PathMessage, '/relpose_node/pose_chain/path')
+        publishers = {name: graph.publisher(message_class(kind), f'/relpose_node/{name}')
+                      for name, kind in PAIR_TOPICS.items()}
+        graph.wait_for_publisher('/relpose_node/pose_chain/path')
+        for count, pair in enumerate(recorded):
+            # In any order: what belongs together has one stamp.
+            for name, message in sorted(pair.items(), key=itemgetter(0), reverse=count % 2 == 1):
+                publishers[name].publish(message)
+            wait_until(lambda n=count: len(paths) > n, 'a path', example)
+        code, _ = example.signal(signal.SIGINT)
+        yield SimpleNamespace(pairs=recorded, paths=paths, output=example.output, exit_code=code)
+
+
+def test_each_pair_extends_a_path(chain):
+    assert len(chain.paths) == len(chain.pairs) > 20
+    for path, pair in zip(chain.paths, chain.pairs, strict=True):
+        assert path.header.stamp == pair['pairs'].header.stamp
+    assert chain.exit_code == 0
+    assert 'Traceback' not in chain.output
+
+
+def test_a_restart_of_the_path_is_reported(chain):
+    """Where a pair is missing; but not at the bag's standstill and pure rotation."""
+    paths = [path for path, later in zip(chain.paths, [*chain.paths[1:], None], strict=True)
+             if later is None or len(later.poses) <= len(path.poses)]
+    assert [len(path.poses) for path in paths] == [LOST + 1, len(chain.pairs) - LOST + 1]
+    assert chain.output.count('a pair is missing: the path restarts, at another scale') == 1
+    assert stamp_ns(paths[1].poses[0].header) > stamp_ns(paths[0].poses[-1].header)
+    assert sum('relative_pose' not in pair for pair in chain.pairs) >= 2
+
+
+def test_odometry_in_the_axes_of_px4():
+    """What is ahead, left and above is ahead, right and below."""
+    spec = importlib.util.spec_from_file_location('px4_odometry', PX4)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    rng, message = np.random.default_rng(0), Odometry()
+    root = rng.normal(size=(6, 6))
+    message.header.stamp.sec, message.header.stamp.nanosec = 12, 345_678_901
+    pose, twist = message.pose.pose, message.twist.twist
+    message.pose.covariance = (root @ root.T).ravel()
+    R, (p, v, w) = Rotation.random(random_state=1), rng.normal(size=(3, 3))
+    for vector, values in ((pose.position, p), (pose.orientation, R.as_quat()), (twist.linear, v),
+                           (twist.angular, w)):
+        for axis, value in zip('xyzw', values, strict=False):
+            setattr(vector, axis, float(value))
+    found = module.px4_fields(message)
+    assert found['timestamp_sample'] == 12_345_678
+    right_down = np.diag([1.0, -1.0, -1.0])
+    q = found['q']
+    px4_R = Rotation.from_quat([q[1], q[2], q[3], q[0]])
+    # A point of the body, in the world of PX4, by PX4's pose and by that of the message.
+    point = rng.normal(size=3)
+    np.testing.assert_allclose(px4_R.apply(right_down @ point) + found['position'],
+                               right_down @ (R.apply(point) + p), atol=1e-6)
+    np.testing.assert_allclose(found['velocity'], right_down @ v, atol=1e-6)
+    np.testing.assert_allclose(found['angular_velocity'], right_down @ w, atol=1e-6)
+    # Variances of errors that are drawn from the covariance, in the body's axes of PX4.
+    errors = rng.multivariate_normal(np.zeros(6), root @ root.T, 20_000)
+    np.testing.assert_allclose(found['position_variance'],
+                               (errors[:, :3] @ right_down).var(axis=0), rtol=0.05)
+    np.testing.assert_allclose(found['orientation_variance'], px4_R.apply(
+        errors[:, 3:] @ right_down, inverse=True).var(axis=0), rtol=0.05)
