@@ -144,7 +144,7 @@ def fitted(scene, monkeypatch):
         return calls[-1][1]
     monkeypatch.setattr(frames_between.adjustment, 'adjust', record)
     pose = scene.pose()
-    (arguments, adjusted), = calls
+    arguments, adjusted = calls[-1]
     return pose, arguments, adjusted
 
 
@@ -258,7 +258,7 @@ def test_optimum_is_that_of_an_independent_fit():
         patch.setattr(frames_between.adjustment, 'adjust',
                       lambda *a: (calls.append(a), adjust(*a))[1])
         scene.pose()
-    (tracks, priors, start, expected, weight), = calls
+    tracks, priors, start, expected, weight = calls[0]
     adjusted = adjust(tracks, priors, start, expected, weight)
     for _ in range(6):   # far beyond the steps of an estimate
         adjusted = adjust(tracks, priors, adjusted.state, adjusted.sigma, 1e9)

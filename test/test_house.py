@@ -21,7 +21,7 @@ BUDGETS = {
     'rs_relpose_ros/calibrate': (3106, 9),
     'rs_relpose_ros/cli': (1190, 6),
     'rs_relpose_ros/config': (860, 4),
-    'rs_relpose_ros/estimator': (3890, 12),
+    'rs_relpose_ros/estimator': (3899, 12),
     'rs_relpose_ros/geometry': (1270, 6),
     'rs_relpose_ros/imu': (1310, 4),
     'rs_relpose_ros/messages': (1550, 5),

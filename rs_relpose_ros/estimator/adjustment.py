@@ -63,8 +63,10 @@ _ROWS = _PATH + ACCELERATION + 3 * MOST_ACCELERATIONS
 # within this sigma, and a floor of its normal equations.
 _INVERSE_DISTANCE_SIGMA, _FLOOR = 10.0, 1e-9
 # Largest number of steps, decrease of the cost at which they end, largest step of log k.
-_STEPS, _CONVERGED, _LARGEST_STEP = 5, 0.5, 1.0
-_FIRST_DAMPING = 1e-4
+_STEPS, _CONVERGED, _LARGEST_STEP = 6, 0.5, 1.0
+_FIRST_DAMPING = 1e-7
+# Distance [sigma] beyond which an observation is far from its prediction.
+_FARTHEST = 4.0
 # Sine squared of the parallax below which the distance of a track starts at a small value.
 _PARALLEL, _FAR = 1e-8, 1e-2
 # Error of a track that its residuals do not show, since it is similar in all frames [px].
@@ -204,6 +206,7 @@ class Adjusted(NamedTuple):
     state: PathState
     sigma: float
     covariance: Array
+    far: Flags   # (V, blocks, BLOCK) observations far from their predictions
 
 
 @small_kernel
@@ -488,9 +491,10 @@ def adjust(tracks: Tracks, priors: PathPriors, start: PathState, expected: float
             if gain < _CONVERGED:
                 break
         else:
-            damping = max(100.0 * damping, 1e-2)
-    return Adjusted(state, noise, _covariance(normal, state, priors, (sigma / noise)**2,
-                                              tracks.number))
+            damping = max(100.0 * damping, 1e-4)
+    return Adjusted(
+        state, noise, _covariance(normal, state, priors, (sigma / noise)**2, tracks.number),
+        normal.squares > (_FARTHEST * sigma)**2)
 
 
 @kernel

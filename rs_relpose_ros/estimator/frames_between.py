@@ -25,6 +25,8 @@ from rs_relpose_ros.estimator.adjustment import (
     PathPriors,
     PathState,
     TANGENT,
+    TIME,
+    TO_PIXELS,
     Tracks,
 )
 from rs_relpose_ros.estimator.result import RelativePose
@@ -173,11 +175,14 @@ def refined(pose: RelativePose, points1: Array, motion1: FrameMotion, second: tu
     path = _Path.of(views)
     tracks = _tracks(views, path, camera)
     priors = _priors(views, path, config)
-    adjusted = adjustment.adjust(
-        tracks, priors, _start(pose, views, tracks, priors),
-        min(max(pose.residual_rms, 0.1 * config.pixel_sigma), config.pixel_sigma),
-        _SIGMA_FREEDOM)
-    distances = adjusted.state.tracks[:, adjustment.INVERSE_DISTANCE][tracks.used[0]]
+    state = _start(pose, views, tracks, priors)
+    expected = min(max(pose.residual_rms, 0.1 * config.pixel_sigma), config.pixel_sigma)
+    for _ in range(2):   # once more without the observations far from the first result
+        adjusted = adjustment.adjust(tracks, priors, state, expected, _SIGMA_FREEDOM)
+        state = adjusted.state
+        tracks.used[adjusted.far] = False
+        tracks.observations.swapaxes(2, 3)[adjusted.far, TO_PIXELS:TIME] = 0.0
+    distances = state.tracks[:, adjustment.INVERSE_DISTANCE][tracks.used[0]]
     if not (np.isfinite(adjusted.covariance).all() and np.median(distances) > 0.0):
         return replace(pose, frames_reason='the adjustment of all frames does not converge')
     if adjusted.sigma > max(_LARGEST_NOISE * config.threshold, config.pixel_sigma):

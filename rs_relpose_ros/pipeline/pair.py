@@ -383,7 +383,7 @@ def _with_gravity(imu1: FrameImu, imu2: FrameImu,
 # of that in proportion to time, which is the mean of a random walk with known ends.
 
 # Frames between that are used, evenly in the pair: more of them add hardly any accuracy.
-MOST_FRAMES = 3
+MOST_FRAMES = 5
 
 
 def used_frames(between: Sequence[Frames]) -> list[Frames]:
