@@ -16,7 +16,6 @@ import pytest
 import recorded_files as made
 from recorded_files import removed, replaced, written
 from scipy.spatial.transform import Rotation
-import yaml
 
 from rs_relpose_lab import datasets
 from rs_relpose_ros.bags.convert import read_rows, Row
@@ -554,16 +553,6 @@ def test_parameter_file_is_that_of_the_command(tmp_path, dataset, title, values,
 
 
 # --- recordings
-
-@pytest.mark.recordings
-def test_axes_of_the_realsense_and_of_its_calibration(recordings):
-    """Its README: camchain.yaml is 1.2 deg off about x and 0.7 about z."""
-    chain = (recordings / 'realsense_rgb_rs' / 'camchain.yaml').read_text().expandtabs()
-    given = Rotation.from_matrix(np.array(yaml.safe_load(chain)['cam0']['T_cam_imu'])[:3, :3])
-    axes = read_parameters(ROOT / 'config' / 'realsense_rgb_rs.yaml').sensor.R_cam_imu
-    assert np.degrees((Rotation.from_matrix(axes) * given.inv()).as_rotvec()) == pytest.approx(
-        [1.2, 0.0, 0.7], abs=0.15)
-
 
 @pytest.mark.recordings
 def test_xiaomi_recording(recordings, tmp_path):

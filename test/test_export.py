@@ -103,6 +103,7 @@ def test_poses_of_rows_are_as_good_as_those_of_keyframes(bundled_bag, rows, mess
         assert rotation < 0.03
 
 
+@pytest.mark.long
 def test_a_benchmark_measures_rows_of_a_walk(monkeypatch):
     monkeypatch.setattr(reconstruction, '_RENDERED', 1)
     found = reconstruction.on_walk(walks(1, 9001, 2.0)[0])

@@ -306,12 +306,6 @@ def test_no_frames_between_change_nothing(scene):
     assert paper.frames == 2 and 'two views' in paper.frames_reason
 
 
-def test_equal_input_gives_an_equal_result(scene):
-    first, second = scene.pose(), scene.pose()
-    for name in ('R', 't', 'covariance', 'baseline', 'pixel_sigma'):
-        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
-
-
 def test_tracks_may_be_missing_and_wrong(scene):
     """A third of the tracks lost in each frame, a tenth of the others wrong."""
     rng = np.random.default_rng(0)

@@ -1,6 +1,7 @@
-"""The node and a player as processes over DDS; signals; examples of the documentation."""
+"""The node and a player as processes over DDS; signals; examples; the live benchmark."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 import importlib.util
 from operator import itemgetter
 from pathlib import Path
@@ -19,12 +20,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from rs_relpose_lab.experiments import live, live_clip
 from rs_relpose_lab.live.graph import diagnostic_values, Graph
 from rs_relpose_lab.live.processes import node_process, player_process, Process, wait_until
 from rs_relpose_ros.bags.reader import COMPRESSED_TOPIC, IMU_TOPIC, open_bag
 from rs_relpose_ros.config.files import read_parameters
+from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.messages.incoming import stamp_ns, time_ns
 from rs_relpose_ros.messages.outgoing import pair_messages, PAIR_TOPICS
+from rs_relpose_ros.nodes.diagnostics import FrameTimings
 from rs_relpose_ros.nodes.inputs import message_class
 from rs_relpose_ros.offline.replay import read_truth, Replay
 
@@ -81,8 +85,8 @@ def test_replay_of_the_same_frames_is_bit_equal(run, bundled_bag):
         replay = Replay(bag, bag.find_topics(), read_parameters(BUNDLED_PARAMETERS),
                         stamps=frozenset(run.stamps))
         replayed = [pair_messages(pair, message_class) for pair in replay.pairs()]
-    for topic, live in run.messages.items():
-        assert live == [messages[topic] for messages in replayed if topic in messages]
+    for topic, published in run.messages.items():
+        assert published == [messages[topic] for messages in replayed if topic in messages]
     stamps = [stamp_ns(message.header) for message in run.messages['pairs']]
     assert stamps == sorted(set(stamps))
     assert set(stamps) <= set(run.stamps)
@@ -257,3 +261,44 @@ def test_odometry_in_the_axes_of_px4():
                                (errors[:, :3] @ right_down).var(axis=0), rtol=0.05)
     np.testing.assert_allclose(found['orientation_variance'], px4_R.apply(
         errors[:, 3:] @ right_down, inverse=True).var(axis=0), rtol=0.05)
+
+
+# -- the live benchmark -------------------------------------------------------------------------
+
+def test_frame_timings_name_what_cannot_be_written(tmp_path):
+    with pytest.raises(InputError, match=r'timings_file .* cannot be written'):
+        FrameTimings(str(tmp_path / 'nowhere' / 'frames.csv'))
+
+
+def test_a_run_and_its_report(tmp_path, ros_domain_id, monkeypatch):
+    """Three seconds of small images, as any cell is run."""
+    monkeypatch.setattr(live_clip, 'PERIOD', 2.0)
+    cell, seconds = live.LiveCell(320, 240, 'bgr8', 200), []
+    clip = live_clip.prepare_clip(tmp_path, cell.width, cell.height)
+    found, over_time = live.run_cell(cell, clip, 3.0, tmp_path / cell.name,
+                                     ROOT / 'config' / 'fastdds.xml', lambda: seconds.append(1))
+    # The last two images would have no IMU.
+    assert (found.frames_sent, found.imu_sent) == (90 - 2, 600)
+    assert found.frames_received <= found.frames_sent
+    refused = found.dropped_overload + found.dropped_other
+    assert found.frames_used + refused == found.frames_received
+    assert 5 < found.poses <= found.pairs < found.frames_used
+    assert found.wrong == 0 and found.rotation_error.p50 < 0.2
+    assert len(seconds) >= 2
+    for times in (found.latency, found.end_to_end, found.frame_time, found.frame_cpu):
+        assert 0.0 < times.p50 <= times.p99 <= times.largest
+    # From outside it cannot be faster than from inside, except for the rest of the distribution.
+    assert found.end_to_end.largest > found.latency.p50
+    assert 0.0 < found.cpu_callbacks < found.cpu
+    assert len(over_time.latencies) == found.poses
+    assert 0.0 < found.private_end < found.memory_end
+    # The clip is not rendered again.
+    assert live_clip.prepare_clip(tmp_path, cell.width, cell.height, pytest.fail) == clip
+    other = replace(found, cell='another', latency=live.Percentiles(np.nan, np.nan, np.nan))
+    report = live.write_report(tmp_path, [found, other])
+    assert report.count(f'| {cell.name}') == report.count('| another ') == 3
+    assert f'{found.poses} of {found.pairs}' in report
+    header, first, _ = (tmp_path / 'live.csv').read_text().splitlines()
+    assert header.startswith('cell,duration,frames_sent') and 'latency_p99' in header
+    assert first.startswith(f'{cell.name},3.0,88')
+    assert 'MB/h' in live.write_soak_report(tmp_path / 'soak', found, over_time)

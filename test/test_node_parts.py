@@ -424,14 +424,6 @@ def test_the_parameters_of_the_construction_are_read_only(node, parameters, name
     assert_refused(node, 'read-only', Parameter(name, value=value))
 
 
-def test_parameters_are_described(node, parameters):
-    threshold, levels = (node.describe_parameter(name) for name in ('threshold', 'klt_levels'))
-    assert (threshold.read_only, levels.read_only) == (False, True)
-    assert threshold.description.endswith('[px]')
-    [bounds] = threshold.floating_point_range
-    assert (bounds.from_value, bounds.to_value) == (0.05, 50.0)
-
-
 @pytest.mark.parametrize('name', LIVE)
 def test_a_live_parameter_is_passed_on(node, parameters, name):
     value, before = other_value(name, DECLARATIONS[name]), len(CHANGES)

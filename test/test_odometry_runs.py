@@ -131,6 +131,7 @@ def test_odometry_of_a_bag_with_loops(bundled_bag, tmp_path, monkeypatch, capsys
     assert (np.diff(rows.loops_ns) > 1.9e9).all()
 
 
+@pytest.mark.long
 def test_metrics_of_a_closed_walk(monkeypatch):
     monkeypatch.setattr(loops, '_APART', 2.5)
     config = SimulationConfig(seed=9101, duration=4.0, plan='walk:4', fps=20.0, readout_time=0.02)
@@ -171,6 +172,7 @@ def test_states_through_a_disturbance():
     assert other.beyond_position > 100
 
 
+@pytest.mark.long
 def test_a_recording_in_parts(monkeypatch, tmp_path):
     """A path and its halves, of which the first one has no pairs in its last second."""
     given = walk('walk:9', 9.0, imu_rate=100.0)
