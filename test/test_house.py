@@ -26,7 +26,7 @@ BUDGETS = {
     'rs_relpose_ros/imu': (1310, 4),
     'rs_relpose_ros/messages': (1550, 5),
     'rs_relpose_ros/nodes': (2180, 9),
-    'rs_relpose_ros/odometry': (3140, 11),
+    'rs_relpose_ros/odometry': (3139, 11),
     'rs_relpose_ros/offline': (2680, 10),
     'rs_relpose_ros/pipeline': (3740, 12),
     'rs_relpose_ros/solvers': (1720, 6),

@@ -135,11 +135,11 @@ _ALIGNED = 5.0
 class PathMetrics:
     """Odometry of a recording.
 
-    `start`: seconds from the first pair to the first published keyframe. `step_nees`: mean of
-    the smoothed steps between keyframes in units of their covariances, by degrees of freedom;
-    `nees_*`: of the states that odometry_node publishes, against the start; NaN where the truth
-    has errors of its own. `drift`: error of the end after the first 5 s are aligned, by the length
-    of the path [%]. `processor`: of one core, by the graph alone, without messages [%].
+    `start`: seconds from the first pair to the first published keyframe. `nees_*`: squared errors
+    of the states that odometry_node publishes, against the start, in units of their covariances,
+    by degrees of freedom, mean; NaN where the truth has errors of its own. `drift`: error of the
+    end after the first 5 s are aligned, by the length of the path [%]. `processor`: of one core,
+    by the graph alone, without messages [%].
     """
 
     name: str
@@ -152,7 +152,6 @@ class PathMetrics:
     start: float
     live: TrajectoryErrors
     smoothed: TrajectoryErrors
-    step_nees: float
     nees_position: float
     nees_rotation: float
     nees_velocity: float
@@ -197,14 +196,12 @@ def on_recording(recording: Recording, truth: TrueStates | TrueTrajectory, *,
     started = time.thread_time()
     live = offline.follow(estimator, feed.pairs, feed.samples)
     processor = time.thread_time() - started
-    smoothed, nees = estimator.smoothed(), (math.nan,) * 4
+    smoothed, nees = estimator.smoothed(), (math.nan,) * 3
     if isinstance(truth, TrueStates):
         states = list(published(OdometryEstimator(parameters), feed))
-        position, rotation, velocity = (
-            errors_squared(states, smoothed[0], truth).mean(axis=0) / 3.0).tolist()
+        nees = (errors_squared(states, smoothed[0], truth).mean(axis=0) / 3.0).tolist()
         truth = TrueTrajectory(truth.stamps_ns, truth.position,
                                Rotation.from_matrix(truth.R).as_quat())
-        nees = step_nees(estimator, truth), position, rotation, velocity
     paths = {'live': offline.path_of(live, truth), 'smoothed': offline.path_of(smoothed, truth)}
     errors = [path.errors for path in paths.values() if path.errors is not None]
     if len(errors) < 2:
@@ -217,17 +214,6 @@ def on_recording(recording: Recording, truth: TrueStates | TrueTrajectory, *,
         len(feed.pairs), estimator.counts['contradicting'], estimator.counts['lost'],
         first.at_rest, first.seconds, errors[0], errors[1], *nees, drift(live, truth),
         100.0 * processor / recording.seconds)
-
-
-def step_nees(estimator: OdometryEstimator, truth: TrueTrajectory) -> float:
-    """Squared errors of the smoothed steps in units of their covariance; mean, by 3."""
-    found = []
-    for start_ns, end_ns, step in estimator.smoothed_steps():
-        known = truth.relative_pose(start_ns, end_ns)
-        if known is not None:
-            error = step.translation - known[1]
-            found.append(error @ np.linalg.solve(step.covariance, error) / 3.0)
-    return float(np.mean(found))
 
 
 def drift(live: Sequence[Odometry], truth: TrueTrajectory) -> float:
@@ -245,12 +231,12 @@ def write_report(folder: Path, paths: Sequence[PathMetrics]) -> str:
     """Write the metrics (CSV) and the report (Markdown), and return the latter."""
     return write_table(folder, 'odometry', paths, markdown_table(
         ('recording', 'readout [ms]', 'length [m]', 'started [s]', 'live: ATE [m]', 'scale [%]',
-         'over 1 m [%]', 'smoothed: ATE', 'scale', 'over 1 m', 'NEES of steps',
-         'position', 'rotation', 'velocity', 'drift [%]', 'core [%]', 'left out'),
+         'over 1 m [%]', 'smoothed: ATE', 'scale', 'over 1 m', 'NEES: position',
+         'rotation', 'velocity', 'drift [%]', 'core [%]', 'left out'),
         [(f'{p.name}, {p.seconds:.0f} s', f'{p.readout_ms:.1f}', f'{p.live.length_m:.1f}',
           f'{p.start:.1f}' + (' at rest' if p.at_rest else ''), *_errors(p.live),
           *_errors(p.smoothed), *(_known(value) for value in (
-              p.step_nees, p.nees_position, p.nees_rotation, p.nees_velocity)), f'{p.drift:.3f}',
+              p.nees_position, p.nees_rotation, p.nees_velocity)), f'{p.drift:.3f}',
           f'{p.processor:.1f}',
           f'{p.contradicting} of {p.pairs}' + (f', lost {p.lost} times' if p.lost else ''))
          for p in paths]))

@@ -7,7 +7,6 @@ arrival within `_LATE_NS`.
 from collections import Counter, deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 import math
 from typing import NamedTuple
 
@@ -28,7 +27,6 @@ from rs_relpose_ros.odometry.graph import (
     KeyframeState,
     Loop,
     POSE,
-    Step,
     VELOCITY,
 )
 from rs_relpose_ros.odometry.pair import AXES, KeyframePair
@@ -344,12 +342,6 @@ class OdometryEstimator:
                 self._warnings.append(f'loops of {len(run.stamps)} keyframes not added: {error}')
         return taken
 
-    def smoothed_steps(self) -> list[tuple[int, int, Step]]:
-        """Steps between consecutive keyframes, with both times on the IMU clock."""
-        return [(start, end, step) for run in self._runs
-                for ((_, start), (_, end)), step in zip(
-                    pairwise(run.stamps), run.graph.smoothed_steps(), strict=True)]
-
     # -- pairs -------------------------------------------------------------------------------
 
     def _ready(self, pair: KeyframePair) -> bool:
@@ -391,26 +383,21 @@ class OdometryEstimator:
         recent = [innovation for at_ns, innovation, _ in run.recent
                   if at_ns > pair.current_ns - _RECENT_NS]
         inflation = max(1.0, float(np.mean(recent or [1.0])))
-        gate = inflation * _CONTRADICTING if run.published else math.inf
+        # The gyro predicts a rotation before the scale is known.
+        gate = (inflation * _CONTRADICTING if run.published or pair.is_pure_rotation
+                else math.inf)
         innovation = run.graph.add(interval, pair, at_rest, inflation=_SHARED * inflation,
                                    gate=gate)
-        run.largest = max(run.largest, innovation)
         run.stamps.append((pair.stamp_ns, pair.current_ns))
         run.recent.append((pair.current_ns, min(innovation, _CONTRADICTING), interval.duration))
         if innovation > gate:
-            self.counts['contradicting'] += 1
             self.corrections += 1
-            self._unusable_ns = pair.current_ns
-            run.contradicting += 1
-            if not run.confirmed and run.contradicting == _WRONG_STARTS:
-                self._wrong_starts = _WRONG_STARTS
-                self._end(_CONTRADICTION, pair.current_ns)
-                return None
-            if seconds_between(run.observed_ns, pair.current_ns) > self._config.max_coast:
-                self._end(f'no usable pair for {self._config.max_coast:g} s', pair.current_ns)
+            self._reject(run, pair)
+            if self._run is None:
                 return None
         else:
             run.observed_ns, run.pairs = pair.current_ns, run.pairs + 1
+            run.largest = max(run.largest, innovation)
             run.confirmed += run.published and pair.has_direction
             run.variances = _variances(run.graph.newest)
             if run.published:
@@ -420,6 +407,19 @@ class OdometryEstimator:
         self.corrections += 1
         return self._odometry(run, run.graph.newest, interval.rates[-1], pair.stamp_ns,
                               pair.current_ns)
+
+    def _reject(self, run: _Run, pair: KeyframePair) -> None:
+        """Count a pair that contradicts the path, which ends if too many do."""
+        self.counts['contradicting'] += 1
+        self._unusable_ns = pair.current_ns
+        run.contradicting += 1
+        if not run.published:
+            self._count_wrong_start()
+        elif not run.confirmed and run.contradicting == _WRONG_STARTS:
+            self._wrong_starts = _WRONG_STARTS
+            self._end(_CONTRADICTION, pair.current_ns)
+        elif seconds_between(run.observed_ns, pair.current_ns) > self._config.max_coast:
+            self._end(f'no usable pair for {self._config.max_coast:g} s', pair.current_ns)
 
     def _continued(self, pair: KeyframePair) -> _Run | None:
         """The run with a keyframe at the pair's reference; None if it has ended."""
@@ -563,12 +563,8 @@ class OdometryEstimator:
                            'changes its speed, or standstill')
         if run.at_rest or run.pairs >= _LEAST_PAIRS:
             if max(run.graph.misfit(), run.largest / _GROSS) > _WRONG_START:
-                self.counts['wrong starts'] += 1
-                self._wrong_starts += 1
                 self._run = None
-                if self._wrong_starts == _WRONG_STARTS:
-                    self.reason = _CONTRADICTION
-                    self._warnings.append(_CONTRADICTION)
+                self._count_wrong_start()
                 return False
             if sigma < self._config.max_scale_sigma:
                 run.published = True
@@ -586,6 +582,13 @@ class OdometryEstimator:
         if seconds > _LONGEST_START:
             self._run = None
         return False
+
+    def _count_wrong_start(self) -> None:
+        self.counts['wrong starts'] += 1
+        self._wrong_starts += 1
+        if self._wrong_starts == _WRONG_STARTS:
+            self.reason = _CONTRADICTION
+            self._warnings.append(_CONTRADICTION)
 
     def _end(self, reason: str, imu_ns: int) -> None:
         """End the run; the next one continues from its end."""

@@ -313,13 +313,7 @@ def _published(sensor: Sensor) -> RollingShutterCamera:
 
 def _shown(model: Model, rows: RowTrajectory, k: Ints, pixels: Array) -> Array:
     """Pixels (N, 2) of derotated images of pixels of the frames k (N,)."""
-    down = model.camera.readout_direction == 'down'
-    seconds = model.camera.line_delay * (
-        pixels[:, 1] - (0.0 if down else model.camera.height - 1.0))
-    times = np.clip(model.times_ns[k, formats.START] + np.rint(
-        NANOSECONDS * np.nan_to_num(seconds)).astype(np.int64),
-        model.times_ns[k, formats.START], model.times_ns[k, formats.END])
-    R, _ = rows.pose(times)
+    R, _ = rows.pose(model.times_of(k, pixels[:, 1]))
     rays = np.einsum('nij,nj->ni', R, model.camera.unproject(pixels))
     return model.camera.project(np.einsum('nji,nj->ni', model.R[k, formats.MIDDLE], rays))
 

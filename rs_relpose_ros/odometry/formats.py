@@ -60,6 +60,13 @@ class Model:
         out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = self.R, self.positions, 1.0
         return out
 
+    def times_of(self, k: Ints, rows: Array) -> Ints:
+        """Times (N,) [ns] of rows of the frames k (N,), limited to those of the image."""
+        first = 0.0 if self.camera.readout_direction == 'down' else self.camera.height - 1.0
+        times = self.times_ns[k, START] + np.rint(NANOSECONDS * self.camera.line_delay * (
+            np.nan_to_num(rows) - first)).astype(np.int64)
+        return np.clip(times, self.times_ns[k, START], self.times_ns[k, END])
+
     @property
     def rolls(self) -> bool:
         """Whether the images have a rolling shutter."""
@@ -125,11 +132,7 @@ def velocity_of_pixel(model: Model, k: Ints, points: Array, rows: Array) -> Arra
 def path(rows: RowTrajectory) -> Placement:
     """The poses of the trajectory itself."""
     def place(model: Model, k: Ints, points: Array, at: Array) -> Array:
-        seconds = (at - (0.0 if model.camera.readout_direction == 'down'
-                         else model.camera.height - 1.0)) * model.camera.line_delay
-        times = model.times_ns[k, START] + np.rint(NANOSECONDS * seconds).astype(np.int64)
-        # Points outside of the image may belong to rows before or after it.
-        R, p = rows.pose(np.clip(times, model.times_ns[k, START], model.times_ns[k, END]))
+        R, p = rows.pose(model.times_of(k, at))
         return np.einsum('nji,nj->ni', R, points - p)
     return place
 

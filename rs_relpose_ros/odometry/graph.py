@@ -32,9 +32,16 @@ _LEAST_SPEED = 0.1
 _LONGEST_STEP = 0.25
 # Steps of the optimisation with a keyframe until the start; then one changes no path by 0.2 mm.
 _START_STEPS = 10
-# Errors of an accelerometer that its noise density has not: scale, axes, vibration, clock
-# [m/s^2/sqrt(Hz)] (docs/lab/odometry.md, "Starts").
-_ACCEL_ERRORS = 8e-3
+# Errors of an accelerometer that its noise density has not (scale, axes, vibration, clock), as
+# another density [m/s^2/sqrt(Hz)], and variances of pairs by those of their images: values that
+# innovations choose from, with 1 sigma of the former and of the logarithm of the latter before
+# them; time in which they are forgotten [s] (docs/lab/odometry.md, "Noise by innovations").
+_ACCEL_ERRORS = np.array([0.0, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3])[:, None]
+_PAIR_VARIANCES = np.array([0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0])
+_LIKELY = -0.5 * ((_ACCEL_ERRORS / 8e-3)**2 + (np.log(_PAIR_VARIANCES) / 0.7)**2)
+_FORGOTTEN = 20.0
+# Largest share of one pair in that choice, as a difference of log likelihoods.
+_ONE_PAIR = 6.0
 # Integration error of the samples, as a noise density of the position [m/sqrt(s)].
 _INTEGRATION = 1e-4
 # Share of right loops within the bound of chi squared.
@@ -75,19 +82,11 @@ class Loop(NamedTuple):
     pair: KeyframePair
 
 
-class Step(NamedTuple):
-    """From one keyframe's camera to the next one's, in the axes of the former."""
-
-    translation: Array   # (3,) [m]
-    covariance: Array   # (3, 3)
-
-
 def _preintegration(imu: ImuConfig, config: OdometryConfig) -> Any:
     """Noise densities of the samples for gtsam."""
     params = gtsam.PreintegrationCombinedParams.MakeSharedU(STANDARD_GRAVITY)
     eye = np.eye(3)
     params.setGyroscopeCovariance(imu.gyro_noise_density**2 * eye)
-    params.setAccelerometerCovariance((imu.accel_noise_density**2 + _ACCEL_ERRORS**2) * eye)
     params.setIntegrationCovariance(_INTEGRATION**2 * eye)
     params.setBiasOmegaCovariance(config.gyro_bias_walk**2 * eye)
     params.setBiasAccCovariance(config.accel_bias_walk**2 * eye)
@@ -104,6 +103,47 @@ def _optimizer(iterations: int = 10) -> Any:
     return params
 
 
+class _Innovation(NamedTuple):
+    """A pair against all before it and the samples."""
+
+    errors: Array   # (n,) in units of the pair's sigmas
+    covariance: Array   # (n, n) without the pair's own
+    by_accelerometer: Array   # (n, n) change of that by the variance of the accelerometer's noise
+
+    @property
+    def chi_squared(self) -> float:
+        """Per degree of freedom."""
+        n = len(self.errors)
+        return float(self.errors @ np.linalg.solve(np.eye(n) + self.covariance, self.errors)) / n
+
+
+class _Noise:
+    """Noise of accelerometer and pairs as innovations show it, by a posterior over a grid."""
+
+    def __init__(self) -> None:
+        self._log = _LIKELY
+        self._read()
+
+    def observe(self, innovation: _Innovation, seconds: float) -> None:
+        """Use an innovation; `seconds`: since the one before."""
+        known, vectors = np.linalg.eigh(
+            innovation.covariance + (_ACCEL_ERRORS**2 - self.accel_errors**2)[..., None]
+            * innovation.by_accelerometer)
+        squared = (innovation.errors @ vectors)[:, None]**2
+        variances = np.maximum(known, 0.0)[:, None] + _PAIR_VARIANCES[:, None]
+        log = -0.5 * (squared / variances + np.log(variances)).sum(axis=2)
+        kept = math.exp(-seconds / _FORGOTTEN)
+        self._log = (kept * self._log + (1.0 - kept) * _LIKELY
+                     + np.maximum(log - log.max(), -_ONE_PAIR))
+        self._read()
+
+    def _read(self) -> None:
+        weights = np.exp(self._log - self._log.max())
+        weights /= weights.sum()
+        self.accel_errors = math.sqrt((weights * _ACCEL_ERRORS**2).sum())
+        self.pair_variance = math.exp((weights * np.log(_PAIR_VARIANCES)).sum())
+
+
 class KeyframeGraph:
     """Keyframes since a start; each new one optimises the newest window.
 
@@ -113,7 +153,8 @@ class KeyframeGraph:
     def __init__(self, start: KeyframeState, R_cam_body: Array, imu: ImuConfig,
                  config: OdometryConfig, *, keep: bool = False) -> None:
         self._R_cam_body, self._config = R_cam_body, config
-        self._preintegration = _preintegration(imu, config)
+        self._preintegration, self._imu = _preintegration(imu, config), imu
+        self._noise = _Noise()
         # Each update is one step of the optimisation, which the next keyframe continues.
         self._smoother = gtsam.BatchFixedLagSmoother(config.smoothing_lag, _optimizer(1))
         # All factors and states since the start, for the final smoothing.
@@ -165,11 +206,14 @@ class KeyframeGraph:
         factors.add(_imu_factor(i, j, pim))
         innovation = 0.0
         if pair is not None and pair.images is not None:
-            innovation = self._innovation(pim, self._pair_factor(i, j, pair, rates))
+            found = self._innovation(pim, self._pair_factor(i, j, pair, rates))
+            innovation = found.chi_squared
             if innovation <= gate:
                 # Without a gate, at a start, the misfit shows what is wrong.
                 own = max(innovation, 1.0) if gate < math.inf else 1.0
-                factors.add(self._pair_factor(i, j, pair, rates, math.sqrt(inflation * own)))
+                factors.add(self._pair_factor(i, j, pair, rates, math.sqrt(
+                    inflation * own * self._noise.pair_variance)))
+                self._noise.observe(found, interval.duration)
                 if pair.is_pure_rotation:
                     factors.add(self._still_factor(i, j))
         if at_rest and innovation <= gate:
@@ -197,25 +241,6 @@ class KeyframeGraph:
         with _solving():
             values, marginals = self._smoothed()
             return [_state(values, marginals, k) for k in range(self._count)]
-
-    def smoothed_steps(self) -> list[Step]:
-        """Steps between consecutive keyframes, for evaluations."""
-        C, steps = self._R_cam_body, []
-        with _solving():
-            values, marginals = self._smoothed()
-        c = values.atVector(L(0))
-        arm = skew(c)
-        for i in range(self._count - 1):
-            first, second = (values.atPose3(X(k)) for k in (i, i + 1))
-            R1, R2 = first.rotation().matrix(), second.rotation().matrix()
-            way = R1.T @ (second.translation() - first.translation() + R2 @ c) - c
-            back = R1.T @ R2
-            # By rotations and translations of both bodies, each in its own axes, and the camera.
-            by = np.hstack([skew(way) + arm, -np.eye(3), -back @ arm, back, back - np.eye(3)])
-            with _solving():
-                covariance = _joint(marginals, [X(i), X(i + 1), L(0)])
-            steps.append(Step(C @ way, C @ by @ covariance @ by.T @ C.T))
-        return steps
 
     def add_loops(self, loops: Sequence[Loop]) -> list[Loop]:
         """Add pairs of keyframes far apart to what is smoothed, and return those that count.
@@ -284,6 +309,8 @@ class KeyframeGraph:
 
     def _preintegrated(self, interval: ImuInterval) -> Any:
         """``gtsam.PreintegratedCombinedMeasurements``, by the mean of two samples each."""
+        self._preintegration.setAccelerometerCovariance((
+            self._imu.accel_noise_density**2 + self._noise.accel_errors**2) * np.eye(3))
         out = gtsam.PreintegratedCombinedMeasurements(self._preintegration, self._bias)
         rates = 0.5 * (interval.rates[1:] + interval.rates[:-1])
         forces = 0.5 * (interval.forces[1:] + interval.forces[:-1])
@@ -316,8 +343,7 @@ class KeyframeGraph:
         noise[:15, :15] = back @ back.T
         return by, noise, values
 
-    def _innovation(self, pim: Any, of_pair: Any) -> float:
-        """Chi squared of a pair per degree of freedom, given all before it and the samples."""
+    def _innovation(self, pim: Any, of_pair: Any) -> _Innovation:
         by, noise, values = self._linearised(pim)
         H, e = of_pair.linearize(values).jacobian()
         second = np.zeros((len(e), 18))
@@ -325,9 +351,14 @@ class KeyframeGraph:
         whole = second @ by
         whole[:, :9] += H[:, :9]
         whole[:, ARM] += H[:, 18:]
-        S = (np.eye(len(e)) + whole @ self._newest.covariance @ whole.T
-             + second @ noise @ second.T)
-        return float(e @ np.linalg.solve(S, e)) / len(e)
+        # White noise of the acceleration in position and velocity of the second body.
+        seconds, R = pim.deltaTij(), values.atPose3(X(self._count)).rotation().matrix()
+        of_velocity = second[:, VELOCITY] @ R
+        of_both = second[:, 3:6] + (1.5 / seconds) * of_velocity
+        by_accelerometer = (seconds**3 / 3.0 * of_both @ of_both.T
+                            + seconds / 4.0 * of_velocity @ of_velocity.T)
+        return _Innovation(e, whole @ self._newest.covariance @ whole.T
+                           + second @ noise @ second.T, by_accelerometer)
 
     def _pair_factor(self, i: int, j: int, pair: KeyframePair, rates: Array | None = None,
                      sigma: float = 1.0, *, robust: bool = False) -> Any:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.timing import NANOSECONDS, Sensor
-from rs_relpose_ros.odometry.rows import read_arrays, RowTrajectory
-from rs_relpose_ros.output_files import written
+from rs_relpose_ros.odometry.rows import ArrayFile, RowTrajectory
 from rs_relpose_ros.pipeline.pair import PairResult
 
 TRACKS_FILE = 'tracks.npz'
@@ -28,7 +26,7 @@ _DEPTH_SIGMA = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Tracks:
+class Tracks(ArrayFile):
     """Inliers of keyframe pairs (N,), in the order of tracks and time."""
 
     ids: Ints
@@ -62,17 +60,6 @@ class Tracks:
     def kept(self, which: NDArray[np.bool_] | Ints) -> Tracks:
         """Some of the observations."""
         return Tracks(*(getattr(self, one.name)[which] for one in fields(self)))
-
-    def save(self, path: Path) -> None:
-        """Write an npz file."""
-        with written(path, 'wb') as file:
-            np.savez_compressed(file, **{
-                one.name: getattr(self, one.name) for one in fields(self)})
-
-    @classmethod
-    def load(cls, path: Path) -> Tracks:
-        """Read a file of `save`; InputError if it is none."""
-        return cls(**read_arrays(path, [one.name for one in fields(cls)]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,9 +110,6 @@ def triangulated(tracks: Tracks, rows: RowTrajectory, sensor: Sensor, most: int)
         distances = np.maximum(np.linalg.norm(local, axis=1), 1e-3)
         weights = 1.0 / (distances * (1.0 + (errors / _SCALE)**2))**2
     good &= enough & (errors < _GATE)
-    if not good.any():
-        nothing = np.zeros(0)
-        return Landmarks(np.zeros((0, 3)), nothing, nothing.astype(np.int64), tracks.kept(good))
     spread = np.linalg.eigvalsh(summed(np.where(good[:, None, None], normals, 0.0)))[:, 0]
     sigmas = 1.0 / (camera.fx * np.sqrt(np.maximum(spread, 1e-12)))
     views = summed(good.astype(np.float64))

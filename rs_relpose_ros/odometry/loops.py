@@ -52,22 +52,10 @@ def scene_depth(path: Sequence[Odometry], views: Mapping[int, View], focal_lengt
 
 def proposed_loops(path: Sequence[Odometry], depth: float,
                    camera: RollingShutterCamera) -> list[tuple[int, int]]:
-    """Keyframes far apart in time with a common view, by a path.
+    """Keyframes far apart in time with a common view, by a path of the camera.
 
-    Parameters
-    ----------
-    path : sequence of Odometry
-        Poses of the camera, in the order of time.
-    depth : float
-        Distance of the scene [m].
-    camera : RollingShutterCamera
-        For the field of view.
-
-    Returns
-    -------
-    list of tuple
-        Positions of both keyframes in the path, the earlier one first; the most similar views
-        first, and none within a second of another one at both ends.
+    `depth`: of the scene [m]. Returns their positions in the path, the earlier one first; the most
+    similar views first, and none within a second of another one at both ends.
     """
     seconds = np.array([pose.imu_ns - path[0].imu_ns for pose in path]) / NANOSECONDS
     found = [(share, i, j) for j, pose in enumerate(path) for share, i in _common_views(

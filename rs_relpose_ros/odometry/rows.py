@@ -10,10 +10,10 @@ interval cancels thereby.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 import zipfile
 
 import numpy as np
@@ -51,8 +51,33 @@ class Knot(NamedTuple):
     covariance: Array   # (6, 6) of the base's position and rotation, in the axes of the world
 
 
+class ArrayFile:
+    """A dataclass of arrays that is written and read as an npz file."""
+
+    __slots__ = ()
+    __match_args__: tuple[str, ...]
+
+    def save(self, path: Path | str) -> None:
+        """Write an npz file of the attributes, exactly."""
+        with written(Path(path), 'wb') as file:
+            np.savez_compressed(file, **{
+                name: getattr(self, name) for name in self.__match_args__})
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """Read a file of `save`; InputError if it is none."""
+        try:
+            with Path(path).open('rb') as stream, np.load(stream, allow_pickle=False) as file:
+                return cls(**{name: file[name] for name in cls.__match_args__})
+        except FileNotFoundError:
+            raise InputError(f'{path} does not exist: `rs_relpose odometry` writes it') from None
+        except (ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise InputError(f'{path} is damaged or no file of `rs_relpose odometry`: '
+                             f'{error}') from error
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class RowTrajectory:
+class RowTrajectory(ArrayFile):
     """Metric poses in a world with z up, at any time within `spans`.
 
     Times are integers [ns] on the **clock of the IMU**, scalars or arrays (N,). That of row v of
@@ -201,31 +226,6 @@ class RowTrajectory:
         p = self.positions[k] + _cubic(s, step, self.positions[k + 1] - self.positions[k], v1, v2)
         return (mount, times, R @ mount[:, :3], p + R @ mount[:, 3], v1 + s * (v2 - v1),
                 rate1 + s * (rate2 - rate1))
-
-    # -- files -----------------------------------------------------------------------------------
-
-    def save(self, path: Path | str) -> None:
-        """Write an npz file of the attributes, exactly."""
-        with written(Path(path), 'wb') as file:
-            np.savez_compressed(file, **{
-                one.name: getattr(self, one.name) for one in fields(self)})
-
-    @classmethod
-    def load(cls, path: Path | str) -> RowTrajectory:
-        """Read a file of `save`; InputError if it is none."""
-        return cls(**read_arrays(path, [one.name for one in fields(cls)]))
-
-
-def read_arrays(path: Path | str, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Arrays of an npz file by name; InputError if it has others."""
-    try:
-        with Path(path).open('rb') as stream, np.load(stream, allow_pickle=False) as file:
-            return {name: file[name] for name in names}
-    except FileNotFoundError:
-        raise InputError(f'{path} does not exist: `rs_relpose odometry` writes it') from None
-    except (ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f'{path} is damaged or no file of `rs_relpose odometry`: '
-                         f'{error}') from error
 
 
 def _cubic(s: Array, step: Array, way: Array, slope1: Array, slope2: Array) -> Array:
