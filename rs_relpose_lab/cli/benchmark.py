@@ -175,32 +175,22 @@ def _speed_arguments(parser: argparse.ArgumentParser) -> None:
                         metavar='N', help='numbers of matches over which time is shown (default: '
                         '300 1000 3000 10000)')
     _number(parser, '--repeats', 3, 'the shortest of so many repeats counts')
-    _number(parser, '--processes', 3, 'new processes whose first estimate is timed')
-    _number(parser, '--soak', 0, 'measure the growth of memory over N estimates')
 
 
 def _run_speed(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments import speed
     from rs_relpose_lab.experiments.problems import Cell, CELLS
     _check_at_least(1, args, 'trials', 'repeats')
-    _check_at_least(0, args, 'processes', 'soak')
     _check_at_least(50, args, 'matches')
     cells = matching_cells(args.cells, CELLS)
     # Large problems need fewer: their times scatter less.
     few = max(args.trials // 5, 1)
-    # First, so that nothing else of this process occupies the processor's caches.
-    first = speed.first_estimates(args.processes)
     with progress_bar(len(cells) * args.trials + len(args.matches) * few, 'problem') as bar:
         comparison = [timing for cell in cells for timing in speed.compare(
             cell, Cell().matches, args.trials, args.repeats, args.seed, bar.update)]
         scaling = [timing for count in sorted(set(args.matches)) for timing in speed.compare(
             cells[0], count, few, args.repeats, args.seed, bar.update)]
-    soaked = None
-    if args.soak:
-        with progress_bar(args.soak + args.soak // 10, 'estimate') as bar:
-            soaked = speed.soak(args.soak, bar.update)
-    return _print_report(speed.write_report(args.output, comparison, scaling, first, soaked),
-                         args.output)
+    return _print_report(speed.write_report(args.output, comparison, scaling), args.output)
 
 
 def _live_arguments(parser: argparse.ArgumentParser) -> None:
@@ -256,6 +246,17 @@ def _run_live(args: argparse.Namespace) -> int:
     return int(failed)
 
 
+def _cases_arguments(parser: argparse.ArgumentParser) -> None:
+    _cells(parser, ['*'], 'all by default')
+
+
+def _run_cases(args: argparse.Namespace) -> int:
+    from rs_relpose_lab.experiments import live_cases as cases
+    chosen = [cases.CASES[name] for name in matching_cells(args.cells, cases.CASES)]
+    return _report_of(chosen, lambda case: cases.run_case(case, args.output / 'walk'),
+                      cases.write_report, args, 'case')
+
+
 def _compare_live(args: argparse.Namespace, cells: Sequence[str]) -> int:
     from rs_relpose_lab.experiments import live
 
@@ -300,13 +301,6 @@ def _run_consistency(args: argparse.Namespace) -> int:
         for config in consistency.configurations(args.bags, args.seed, 1e-3 * args.exposure)]
     return _report_of(chosen, lambda measure: list(measure()), consistency.write_report, args,
                       'bag')
-
-
-def _run_calibration(args: argparse.Namespace) -> int:
-    from rs_relpose_lab.experiments import calibration
-    _check_at_least(1, args, 'runs')
-    return _report_of(range(args.seed, args.seed + args.runs), calibration.run_calibration,
-                      calibration.write_tracks_report, args, 'recording')
 
 
 def _lenses_arguments(parser: argparse.ArgumentParser) -> None:
@@ -484,21 +478,6 @@ def _run_reconstruction(args: argparse.Namespace) -> int:
                       reconstruction.write_report, args, 'walk')
 
 
-def _all_arguments(parser: argparse.ArgumentParser) -> None:
-    _number(parser, '--trials', 200, 'problems a cell of the accuracy benchmark')
-    _number(parser, '--soak', 100_000, 'measure the growth of memory over N estimates')
-
-
-def _run_all(args: argparse.Namespace) -> int:
-    """Each benchmark as its own command line would run it."""
-    parser = argparse.ArgumentParser()
-    add_arguments(parser)
-    accuracy = ['accuracy', '--trials', str(args.trials), '--jobs', str(args.jobs),
-                '--sigma-factor', '1', '0.5', '2', '--output', str(args.output / 'accuracy')]
-    speed = ['speed', '--soak', str(args.soak), '--output', str(args.output / 'speed')]
-    return max([run(parser.parse_args(words)) for words in (accuracy, speed)])
-
-
 BENCHMARKS = {
     'accuracy': Benchmark(
         'errors, normalised errors and lost poses against an oracle, over many random problems',
@@ -506,12 +485,15 @@ BENCHMARKS = {
         jobs='processes; times are comparable only where each has its own core'),
     'speed': Benchmark(
         'time and errors of this library, OpenCV (USAC_MAGSAC) and PoseLib on the same problems, '
-        'growth of time with matches, and the first estimate of a new process',
+        'and growth of time with matches',
         _speed_arguments, _run_speed, 'speed', seed_of='problem'),
     'live': Benchmark(
         'the node at camera rate: latency, drops, processor time, memory. Needs ROS. A cell is an '
         'image size, a format (mono8, bgr8, jpeg) and a rate of the IMU; its clip is rendered '
         'once into OUTPUT/clips', _live_arguments, _run_live, 'live'),
+    'live-cases': Benchmark(
+        'faults of drivers and configurations, each with a node of its own: named, or harmless. '
+        'Needs ROS', _cases_arguments, _run_cases, 'live_cases'),
     'consistency': Benchmark(
         'whether covariances hold: squared errors in their units (NEES by degrees of freedom), '
         'over the pairs of rendered walks, and over the true pairs of recordings',
@@ -530,11 +512,6 @@ BENCHMARKS = {
         'poses of rows, as exported by `rs_relpose export`, against the truth, and frames '
         'rendered with them. Needs gtsam', _reconstruction_arguments, _run_reconstruction,
         'reconstruction', first_seed=9101, seed_of='walk', jobs='processes'),
-    'calibration': Benchmark(
-        '`rs_relpose calibrate` on simulated tracks of 300 frames, against the truth; the focal '
-        'length is unknown in every other round of the 24 axis maps',
-        lambda parser: _number(parser, '--runs', 240, 'recordings'), _run_calibration,
-        'calibration', seed_of='recording', jobs='processes'),
     'calibration-lenses': Benchmark(
         '`rs_relpose calibrate` on rendered bags, of unknown lenses if not --known, and the '
         'poses with its file against those with the true calibration',
@@ -551,8 +528,4 @@ BENCHMARKS = {
         'one wrong parameter at a time on recordings: which the consistency monitor names, and '
         'errors of its suggested values; docs/lab/trust.md',
         _suggestions_arguments, _run_suggestions, 'suggestions'),
-    'all': Benchmark(
-        'accuracy (sigmas also half and twice the true ones) and speed (memory over 100,000 '
-        'estimates), as the project reports them: some hours on one core',
-        _all_arguments, _run_all, 'benchmark', jobs='processes of the accuracy benchmark'),
 }

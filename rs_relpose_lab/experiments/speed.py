@@ -1,14 +1,11 @@
 """Time and accuracy of this library, OpenCV and PoseLib on the same problems."""
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 import gc
 from importlib.metadata import PackageNotFoundError, version
 import math
-from multiprocessing import get_context
 from operator import attrgetter
-import os
 from pathlib import Path
 import platform
 import time
@@ -18,9 +15,8 @@ import numpy as np
 
 from rs_relpose_lab.experiments.harness import grouped, markdown_table, write_csv
 from rs_relpose_lab.experiments.methods import as_pair, Estimate, METHODS, prepared
-from rs_relpose_lab.experiments.problems import Cell, CELLS, make_problem
+from rs_relpose_lab.experiments.problems import CELLS, make_problem
 from rs_relpose_lab.experiments.scoring import Quantiles
-from rs_relpose_lab.live.processes import process_metrics
 from rs_relpose_ros import warm_up
 
 THRESHOLD = 1.5  # [px], of OpenCV and PoseLib
@@ -45,15 +41,6 @@ class Timing:
     duration: float
     rotation: float
     translation: float
-
-
-@dataclass(frozen=True, slots=True)
-class Soak:
-    """Resident memory [MB] before and after so many estimates of twenty problems."""
-
-    estimates: int
-    before: float
-    after: float
 
 
 def compare(cell_name: str, matches: int, trials: int, repeats: int, first_seed: int = 0,
@@ -92,47 +79,6 @@ def _shortest(call: Estimate, repeats: int) -> float:
     finally:
         gc.enable()
     return min(durations)
-
-
-def _base_problem(seed: int) -> Estimate:
-    cell = Cell()
-    return prepared(METHODS['auto'], as_pair(make_problem(cell, seed), cell), seed)
-
-
-def first_estimates(processes: int) -> list[tuple[float, float]]:
-    """First and second estimate [ms] of new processes, one after the other; without imports.
-
-    The kernels' cache on disk is filled before, by an estimate in this process.
-    """
-    warm_up()
-    results = []
-    for _ in range(processes):
-        with ProcessPoolExecutor(1, get_context('spawn')) as pool:
-            results.append(pool.submit(_first_estimates).result())
-    return results
-
-
-def _first_estimates() -> tuple[float, float]:
-    call = _base_problem(0)
-    return 1e3 * _shortest(call, 1), 1e3 * _shortest(call, 1)
-
-
-def soak(estimates: int, on_estimate: Callable[[], object] = lambda: None) -> Soak:
-    """Measure the growth of memory over many estimates.
-
-    A tenth as many estimates come first, so that buffers have their size.
-    """
-    calls = [_base_problem(seed) for seed in range(20)]
-
-    def work(count: int) -> None:
-        for k in range(count):
-            calls[k % len(calls)]()
-            on_estimate()
-
-    work(estimates // 10)
-    before = process_metrics(os.getpid())
-    work(estimates)
-    return Soak(estimates, before.resident, process_metrics(os.getpid()).resident)
 
 
 def medians(timings: Sequence[Timing], method: str) -> dict[int, float]:
@@ -188,20 +134,19 @@ def method_statistics(timings: Sequence[Timing]) -> list[MethodStatistics]:
     return result
 
 
-def write_report(folder: Path, comparison: Sequence[Timing], scaling: Sequence[Timing],
-                 first: Sequence[tuple[float, float]], soak: Soak | None) -> str:
+def write_report(folder: Path, comparison: Sequence[Timing],
+                 scaling: Sequence[Timing]) -> str:
     """Write runs, tables, plot and report into a folder; the report."""
     compared, scaled = method_statistics(comparison), method_statistics(scaling)
     write_csv(folder / 'runs.csv', [*comparison, *scaling])
     write_csv(folder / 'methods.csv', compared)
     write_csv(folder / 'scaling.csv', scaled)
-    report = _report(compared, scaling, first, soak)
+    report = _report(compared, scaling)
     (folder / 'speed.md').write_text(report)
     return report
 
 
-def _report(compared: Sequence[MethodStatistics], scaling: Sequence[Timing],
-            first: Sequence[tuple[float, float]], soak: Soak | None) -> str:
+def _report(compared: Sequence[MethodStatistics], scaling: Sequence[Timing]) -> str:
     parts = [
         '# Speed\n',
         (f'One thread of {_processor()}; {_versions()}. OpenCV and PoseLib with a threshold of '
@@ -216,16 +161,6 @@ def _report(compared: Sequence[MethodStatistics], scaling: Sequence[Timing],
               entry.translation.text(3), f'{entry.lost}') for entry in rows]))
     if scaling:
         parts.append(_scaling_table(scaling))
-    if first:
-        firsts, seconds = zip(*first, strict=True)
-        parts.append('## A new process, kernels cached\n')
-        parts.append(f'First estimate {np.median(firsts):.0f} ms (largest of {len(first)} '
-                     f'processes: {max(firsts):.0f} ms), second {np.median(seconds):.1f} ms; '
-                     'imports not counted.\n')
-    if soak is not None:
-        parts.append('## Memory\n')
-        parts.append(f'Resident {soak.before:.1f} MB before and {soak.after:.1f} MB after '
-                     f'{soak.estimates} estimates.\n')
     return '\n'.join(parts)
 
 

@@ -93,7 +93,7 @@ class Recorder:
                 cloud = matches.get(stamp)
                 values = diagnostic_values(pairs[stamp]) if stamp in pairs else {}
                 covariance = np.array(pose.pose.covariance).reshape(6, 6)
-                t, quat_xyzw = _pose_of(pose)
+                t, quat_xyzw = pose_of(pose)
                 writer.writerow([
                     '' if reference is None else str(time_ns(reference.time_ref)), str(stamp),
                     *map(number, (*t, *quat_xyzw, *translation_sigmas(covariance),
@@ -103,7 +103,7 @@ class Recorder:
         return len(poses)
 
 
-def _pose_of(msg: Any) -> tuple[list[float], list[float]]:
+def pose_of(msg: Any) -> tuple[list[float], list[float]]:
     """Position and quaternion x y z w of a pose message."""
     t, q = msg.pose.pose.position, msg.pose.pose.orientation
     return [t.x, t.y, t.z], [q.x, q.y, q.z, q.w]
@@ -182,7 +182,7 @@ class _Listener:
         for stamp in sorted(self.poses.keys() & references.keys()):
             received_ns, msg = self.poses[stamp]
             received.append(ReceivedPose(references[stamp], stamp, received_ns,
-                                         *map(np.array, _pose_of(msg))))
+                                         *map(np.array, pose_of(msg))))
         return received
 
 
