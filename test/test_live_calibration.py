@@ -307,16 +307,19 @@ def test_two_nodes_of_one_name_and_messages_without_frame_id_are_reported(
 
 
 @pytest.mark.live
-@pytest.mark.parametrize('node', ['odometry_node', 'global_shutter_node'])
-def test_other_nodes_take_the_published_calibration(ros_domain_id, node):
+def test_other_nodes_take_the_published_calibration(ros_domain_id):
     text = (TEXT + '    quat_cam_imu_xyzw: [0.0, 0.0, 0.0, 1.0]\n    axes_sigma: 0.01\n')
-    with Graph() as graph, node_process(node=node, remap={
-            'calibration': '/relpose_node/calibration'}) as process:
-        process.wait_for('waiting for')
-        graph.node.create_publisher(String, '/relpose_node/calibration', LATCHED).publish(
-            String(data=text))
-        process.wait_for('ready')
-        process.stop()
+    topic = '/relpose_node/calibration'
+    with Graph() as graph, node_process(
+            node='odometry_node', remap={'calibration': topic}) as odometry, node_process(
+            node='global_shutter_node', remap={'calibration': topic}) as global_shutter:
+        nodes = odometry, global_shutter
+        for node in nodes:
+            node.wait_for('waiting for')
+        graph.node.create_publisher(String, topic, LATCHED).publish(String(data=text))
+        for node in nodes:
+            node.wait_for('ready')
+            node.stop()
 
 
 @pytest.mark.live
