@@ -28,7 +28,7 @@ BUDGETS = {
     'rs_relpose_ros/nodes': (2180, 9),
     'rs_relpose_ros/odometry': (3139, 11),
     'rs_relpose_ros/offline': (2680, 10),
-    'rs_relpose_ros/pipeline': (3740, 12),
+    'rs_relpose_ros/pipeline': (3744, 12),
     'rs_relpose_ros/solvers': (1720, 6),
     'rs_relpose_ros/tracking': (1230, 5),
     'rs_relpose_lab': (10535, 49),

@@ -384,6 +384,13 @@ def jittering(rng, frames):
     return EVEN[:frames] + np.round(2e6 * rng.normal(size=frames)).astype(np.int64)
 
 
+def test_an_exposure_longer_than_the_interval_is_refused():
+    sequencer = replaying(exposure_time=0.06)
+    add_imu(sequencer, 0, 400)
+    add_frames(sequencer, 100, 150, 190)   # an interval of 50 ms may be jitter
+    assert refusals(drain(sequencer)) == [Refusal.BAD_IMAGE]
+
+
 @pytest.mark.parametrize(('frames', 'lost'), [(5, 0), (32, 0), (60, 12)])
 def test_the_scatter_is_that_of_the_stamps_whether_or_not_frames_are_lost(frames, lost):
     rng, found = np.random.default_rng(0), []

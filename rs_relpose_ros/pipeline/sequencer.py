@@ -220,6 +220,11 @@ class Sequencer:
             self._last_stamp_ns = stamp_ns
             # Of all frames that come, also of those refused later: live as in replay.
             interval_ns = self._intervals.add(stamp_ns)
+            # A quarter: of stamps that jitter.
+            if interval_ns and clock.exposure_time * NANOSECONDS > 1.25 * interval_ns:
+                self._refuse(stamp_ns, Refusal.BAD_IMAGE, 'exposure_time is longer than the '
+                             f'interval between frames, {interval_ns / NANOSECONDS:.4f} s')
+                return
             self._queue.append(QueuedFrame(
                 image, intrinsics, clock.exposed_span_ns(stamp_ns, interval_ns),
                 clock.reference_ns(stamp_ns, interval_ns), clock.exposure(interval_ns),
