@@ -24,7 +24,7 @@ BUDGETS = {
     'rs_relpose_ros/estimator': (3899, 12),
     'rs_relpose_ros/geometry': (1270, 6),
     'rs_relpose_ros/imu': (1310, 4),
-    'rs_relpose_ros/messages': (1550, 5),
+    'rs_relpose_ros/messages': (1590, 5),
     'rs_relpose_ros/nodes': (2180, 9),
     'rs_relpose_ros/odometry': (3139, 11),
     'rs_relpose_ros/offline': (2680, 10),

@@ -449,6 +449,8 @@ class ImuBuffer(ImuSamples):
 
     def _run_filters(self, until_ns: int) -> None:
         """Filter the samples up to a time that were not filtered yet."""
+        if until_ns <= self._filtered_ns:
+            return
         stamps = self.gyro.stamps
         first = int(np.searchsorted(stamps, self._filtered_ns, side='right'))
         last = int(np.searchsorted(stamps, until_ns, side='right'))

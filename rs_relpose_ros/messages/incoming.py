@@ -5,12 +5,13 @@ field is trusted: sizes are checked before memory is allocated, and an unusable 
 `InputError`.
 """
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from functools import partial
 import math
 import re
+import struct
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,7 +45,10 @@ def stamp_ns(header: Any) -> int:
 
 def time_ns(stamp: Any) -> int:
     """Integer [ns] of a builtin_interfaces/Time."""
-    seconds, nanoseconds = int(stamp.sec), int(stamp.nanosec)
+    return _nanoseconds(int(stamp.sec), int(stamp.nanosec))
+
+
+def _nanoseconds(seconds: int, nanoseconds: int) -> int:
     if seconds < 0 or not 0 <= nanoseconds < NANOSECONDS:
         raise InputError(f'stamp is out of range: {seconds} s and {nanoseconds} ns')
     return seconds * NANOSECONDS + nanoseconds
@@ -107,36 +111,71 @@ def info_field(msg: Any, name: str) -> Any:
 def imu_sample_from_message(msg: Any, *, with_gyro: bool = True) -> ImuSample:
     """Gyro and accelerometer of a sensor_msgs/Imu, each None if the message has no such sensor.
 
-    By REP-145 a covariance whose first element is -1 means that the sensor does not exist. Drivers
-    with one topic per sensor leave the other vector zero, so an accelerometer that reads exactly
-    zero in all axes counts as absent. Not `with_gyro`: the topic is that of the accelerometer.
+    `msg`: deserialised, or its bytes of CDR. By REP-145 a covariance whose first element is -1
+    means that the sensor does not exist. Drivers with one topic per sensor leave the other vector
+    zero, so an accelerometer that reads exactly zero in all axes counts as absent. Not
+    `with_gyro`: the topic is that of the accelerometer.
     """
+    if isinstance(msg, bytes):
+        stamp, numbers = _imu_of_cdr(msg)
+        quat_xyzw, variances = numbers[:4], (numbers[4], numbers[8])
+        rate, rate_variance, force, force_variance = (
+            numbers[13:16], numbers[16], numbers[25:28], numbers[28])
+    else:
+        q, w, f = msg.orientation, msg.angular_velocity, msg.linear_acceleration
+        variances = msg.orientation_covariance[0], msg.orientation_covariance[4]
+        stamp, quat_xyzw = stamp_ns(msg.header), (q.x, q.y, q.z, q.w)
+        rate, force = (w.x, w.y, w.z), (f.x, f.y, f.z)
+        rate_variance = msg.angular_velocity_covariance[0]
+        force_variance = msg.linear_acceleration_covariance[0]
     angular_velocity = linear_acceleration = None
-    if with_gyro and msg.angular_velocity_covariance[0] != -1.0:
-        angular_velocity = _vector('angular_velocity', msg.angular_velocity, MAX_ANGULAR_VELOCITY)
-    if msg.linear_acceleration_covariance[0] != -1.0:
-        linear_acceleration = _vector('linear_acceleration', msg.linear_acceleration,
-                                      MAX_LINEAR_ACCELERATION)
+    if with_gyro and rate_variance != -1.0:
+        angular_velocity = _vector('angular_velocity', rate, MAX_ANGULAR_VELOCITY)
+    if force_variance != -1.0:
+        linear_acceleration = _vector('linear_acceleration', force, MAX_LINEAR_ACCELERATION)
         if linear_acceleration == (0.0, 0.0, 0.0):
             linear_acceleration = None
     if angular_velocity is None and linear_acceleration is None:
         raise InputError('an IMU message has neither gyro nor accelerometer: both are marked as '
                          'absent (covariance -1) or zero')
-    return ImuSample(stamp_ns(msg.header), angular_velocity, linear_acceleration,
-                     None if angular_velocity is None else _orientation(msg))
+    return ImuSample(stamp, angular_velocity, linear_acceleration,
+                     None if angular_velocity is None else _orientation(quat_xyzw, *variances))
 
 
-def _orientation(msg: Any) -> Orientation | None:
-    """Down in the IMU frame; None without a usable orientation covariance.
+# CDR of a header: kind and options of the encoding, stamp, size of frame_id with its end.
+_HEADER = struct.Struct('<2s2xiII')
+_LITTLE_ENDIAN = bytes((0, 1))
+# Orientation, angular velocity, linear acceleration, each followed by its covariance (3, 3).
+_IMU_NUMBERS = struct.Struct('<37d')
+
+
+def frame_id_of_cdr(data: bytes) -> str:
+    """frame_id of the CDR of a message with a header."""
+    size = _HEADER.unpack_from(data)[-1]
+    return data[_HEADER.size:_HEADER.size + size - 1].decode(errors='replace')
+
+
+def _imu_of_cdr(data: bytes) -> tuple[int, tuple[float, ...]]:
+    """Stamp [ns] and numbers of a sensor_msgs/Imu, sooner than by its deserialisation."""
+    try:
+        encoding, seconds, nanoseconds, size = _HEADER.unpack_from(data)
+        # Aligned to 8 bytes from the end of kind and options (4).
+        numbers = _IMU_NUMBERS.unpack_from(data, 4 - -(_HEADER.size - 4 + size) // 8 * 8)
+    except struct.error as error:
+        raise InputError(f'the CDR of an IMU message is too short: {error}') from None
+    if encoding != _LITTLE_ENDIAN:
+        raise InputError('the CDR of an IMU message is not little-endian')
+    return _nanoseconds(seconds, nanoseconds), numbers
+
+
+def _orientation(quat_xyzw: Sequence[float], first: float, second: float) -> Orientation | None:
+    """Down in the IMU frame; None without usable variances, `first` and `second` of the diagonal.
 
     Drivers without an orientation leave all zeros, "unknown" by REP-145.
     """
-    variance = max(float(msg.orientation_covariance[0]), float(msg.orientation_covariance[4]))
-    q = msg.orientation
-    x, y, z, w = float(q.x), float(q.y), float(q.z), float(q.w)
-    norm2 = x * x + y * y + z * z + w * w
-    if not (float(msg.orientation_covariance[0]) > 0.0 and 0.0 < variance < math.pi**2
-            and abs(norm2 - 1.0) < 0.02):
+    x, y, z, w = map(float, quat_xyzw)
+    variance, norm2 = max(float(first), float(second)), x * x + y * y + z * z + w * w
+    if not (first > 0.0 and 0.0 < variance < math.pi**2 and abs(norm2 - 1.0) < 0.02):
         return None
     # Minus the third row of R(q), world from IMU.
     down = (-2.0 * (x * z - w * y) / norm2, -2.0 * (y * z + w * x) / norm2,
@@ -144,8 +183,8 @@ def _orientation(msg: Any) -> Orientation | None:
     return Orientation(down, math.sqrt(variance))
 
 
-def _vector(name: str, vector: Any, largest: float) -> tuple[float, float, float]:
-    values = (float(vector.x), float(vector.y), float(vector.z))
+def _vector(name: str, vector: Sequence[float], largest: float) -> tuple[float, float, float]:
+    values = float(vector[0]), float(vector[1]), float(vector[2])
     if not all(map(math.isfinite, values)):
         raise InputError(f'{name} of an IMU message must be finite, got {list(values)}')
     if max(map(abs, values)) > largest:

@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.covariance import ImageInformation
-from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.timing import NANOSECONDS
@@ -180,50 +179,55 @@ def pair_messages(result: PairResult, types: MessageTypes,
     message stands for a missing value. `reference_frame`: frame_id of relative pose and rotation;
     empty for ``<camera frame>_reference``.
     """
+    return {topic: make() for topic, make in pair_parts(result, types, reference_frame).items()}
+
+
+def pair_parts(result: PairResult, types: MessageTypes,
+               reference_frame: str = '') -> dict[str, Callable[[], Any]]:
+    """Functions that make the messages of `pair_messages`."""
     pose, stamp_ns = result.pose, result.stamp_ns
-    reference_frame = reference_frame or f'{result.frame_id}_reference'
-    messages = {} if not pose else _pose_messages(
-        pose, header(stamp_ns, reference_frame, types), header(stamp_ns, result.frame_id, types),
-        result.reference_stamp_ns, inlier_records(result), types)
+    in_camera = header(stamp_ns, result.frame_id, types)
+    in_reference = header(stamp_ns, reference_frame or f'{result.frame_id}_reference', types)
+    # The covariance needs no conversion: (dt, dtheta) with R_true = Exp(dtheta) R in camera 1
+    # is ROS's order x, y, z and rotations about the fixed axes of the header's frame.
+    parts = {} if not pose else {
+        'relative_pose': lambda: types('geometry_msgs/msg/PoseWithCovarianceStamped')(
+            header=in_reference, pose=types('geometry_msgs/msg/PoseWithCovariance')(
+                pose=_pose(pose.R, pose.t, types),
+                covariance=published_covariance(pose.covariance))),
+        'reference': lambda: types('sensor_msgs/msg/TimeReference')(
+            header=in_camera, time_ref=_time(result.reference_stamp_ns, types),
+            source='reference_keyframe'),
+        # Of the current camera: angular in rad/s, linear in baselines per second.
+        'velocity': lambda: types('geometry_msgs/msg/TwistWithCovarianceStamped')(
+            header=in_camera, twist=twist_message(pose.linear_velocity2, pose.angular_velocity2,
+                                                  pose.velocity_covariance, types)),
+        'matches': lambda: _matches_message(inlier_records(result), in_reference, types)}
     if pose.rotation_known:
         # Errors of the rotation are about the axes of the reference camera, as in
         # ``~/relative_pose``; the angular velocity is in the current camera's, as in
         # ``~/velocity``.
-        messages['relative_rotation'] = imu_message(
-            stamp_ns, reference_frame, pose.angular_velocity2, None, types,
+        parts['relative_rotation'] = lambda: imu_message(
+            stamp_ns, in_reference.frame_id, pose.angular_velocity2, None, types,
             angular_velocity_covariance=published_covariance(pose.velocity_covariance[3:, 3:]),
             orientation=quat_xyzw(pose.R),
             orientation_covariance=published_covariance(pose.covariance[3:, 3:]))
+    topics = ' '.join(parts)
+    parts['pairs'] = lambda: _status_of_pair(result, topics, types)
+    return parts
+
+
+def _status_of_pair(result: PairResult, topics: str, types: MessageTypes) -> Any:
+    pose = result.pose
     values = [(value.key, value.text(value.of(result))) for value in PAIR_VALUES.values()]
-    values.append((TOPICS_KEY, ' '.join(messages)))
+    values.append((TOPICS_KEY, topics))
     text = f'{pose.status.value}: {pose.reason}' if pose.reason else pose.status.value
     if result.health.state is FindingState.WRONG:
         level = 2
     else:
         level = 0 if pose and result.health.state is not FindingState.SUSPECT else 1
-    messages['pairs'] = diagnostics_message(stamp_ns, status_message(
+    return diagnostics_message(result.stamp_ns, status_message(
         level, 'keyframe pair', text, result.frame_id, values, types), types)
-    return messages
-
-
-def _pose_messages(pose: RelativePose, in_reference: Any, in_camera: Any, reference_ns: int,
-                   inliers: NDArray[np.void], types: MessageTypes) -> dict[str, Any]:
-    """Messages of `POSE_TOPICS`; `in_reference`, `in_camera`: headers."""
-    return {
-        # The covariance needs no conversion: (dt, dtheta) with R_true = Exp(dtheta) R in camera 1
-        # is ROS's order x, y, z and rotations about the fixed axes of the header's frame.
-        'relative_pose': types('geometry_msgs/msg/PoseWithCovarianceStamped')(
-            header=in_reference, pose=types('geometry_msgs/msg/PoseWithCovariance')(
-                pose=_pose(pose.R, pose.t, types),
-                covariance=published_covariance(pose.covariance))),
-        'reference': types('sensor_msgs/msg/TimeReference')(
-            header=in_camera, time_ref=_time(reference_ns, types),
-            source='reference_keyframe'),
-        # Of the current camera: angular in rad/s, linear in baselines per second.
-        'velocity': types('geometry_msgs/msg/TwistWithCovarianceStamped')(
-            header=in_camera, twist=twist_message(pose.linear_velocity2, pose.angular_velocity2,
-                                                  pose.velocity_covariance, types)),
-        'matches': _matches_message(inliers, in_reference, types)}
 
 
 def _matches_message(points: NDArray[np.void], in_reference: Any, types: MessageTypes) -> Any:

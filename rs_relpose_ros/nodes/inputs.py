@@ -23,7 +23,7 @@ from rclpy.time import Time
 
 from rs_relpose_ros.errors import MissingInputError
 from rs_relpose_ros.geometry.timing import NANOSECONDS
-from rs_relpose_ros.messages.incoming import Intake, PARTS, Role, stamp_ns
+from rs_relpose_ros.messages.incoming import frame_id_of_cdr, Intake, PARTS, Role, stamp_ns
 from rs_relpose_ros.nodes.diagnostics import INVALID, SILENCE, TOPICS
 
 if TYPE_CHECKING:
@@ -222,14 +222,14 @@ class SensorInputs:
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
         self._imu = [PolledSubscription(
             node, types[role], role.value, best_effort(_IMU_DEPTH),
-            partial(self._on_sample, role), lambda: self._intake.waits_for_imu(),
+            partial(self._on_sample, role), lambda: self._intake.waits_for_imu(), raw=True,
             qos_overriding_options=overridable())
             for role in (Role.IMU, Role.ACCEL)]
         node.create_subscription(
             types[Role.IMAGE], self.topics[Role.IMAGE], self._on_image,
             best_effort(_IMAGE_DEPTH), qos_overriding_options=overridable())
-        node.create_timer(_DRAIN_PERIOD, self._drain,
-                          clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._timer = node.create_timer(_DRAIN_PERIOD, self._drain,
+                                        clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def hand_to(self, intake: Intake | LiveCalibration) -> None:
         """Messages go to another receiver from here on, the last CameraInfo first."""
@@ -252,6 +252,7 @@ class SensorInputs:
         # An unusable image is refused by the sequencer, which counts it.
         self._intake.receive(Role.IMAGE, image)
         self._drain_imu()
+        self._timer.reset()   # no wake-up of its own while images come
 
     def _on_info(self, data: bytes, *, latched: bool) -> None:
         """Receive a serialised CameraInfo that differs by more than its stamp: few do."""
@@ -262,10 +263,10 @@ class SensorInputs:
             self._info = deserialize_message(data, self._info_type)
             self._receive(Role.CAMERA_INFO, self._info)
 
-    def _on_sample(self, role: Role, message: Any) -> None:
+    def _on_sample(self, role: Role, data: bytes) -> None:
         self._count(role)
-        self.frame_ids[role] = message.header.frame_id
-        self._receive(role, message)
+        self.frame_ids[role] = frame_id_of_cdr(data)
+        self._receive(role, data)
 
     def _receive(self, role: Role, message: Any) -> None:
         error = self._intake.receive(role, message)

@@ -14,7 +14,7 @@ from rs_relpose_ros.config.files import text_values
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.messages import outgoing
-from rs_relpose_ros.messages.incoming import PARTS, Role, stamp_ns
+from rs_relpose_ros.messages.incoming import frame_id_of_cdr, PARTS, Role, stamp_ns
 from rs_relpose_ros.messages.transforms import extrinsics
 from rs_relpose_ros.nodes import inputs
 from rs_relpose_ros.nodes.inputs import message_class
@@ -120,7 +120,7 @@ class OdometryNode(StoppableNode):
         self._sensors = [inputs.PolledSubscription(
             self, message_class(PARTS[role].msgtypes[0]), role.value,
             inputs.best_effort(_IMU_DEPTH), partial(self._on_sample, role), lambda: False,
-            qos_overriding_options=overridable()) for role in (Role.IMU, Role.ACCEL)]
+            raw=True, qos_overriding_options=overridable()) for role in (Role.IMU, Role.ACCEL)]
         # Of each image: whether the camera still delivers where no pair comes.
         self._sensors.append(inputs.PolledSubscription(
             self, message_class('sensor_msgs/msg/CameraInfo'), Role.CAMERA_INFO.value,
@@ -167,8 +167,8 @@ class OdometryNode(StoppableNode):
         if values:
             self._settings.adopt(values)
 
-    def _on_sample(self, role: Role, message: Any) -> None:
-        frame = message.header.frame_id
+    def _on_sample(self, role: Role, data: bytes) -> None:
+        frame = frame_id_of_cdr(data)
         first = self._frames.setdefault(role, frame)
         if frame != first:
             self._warn(f'a message of {frame} on {self.resolve_topic_name(role.value)} is not '
@@ -178,7 +178,7 @@ class OdometryNode(StoppableNode):
         if role is Role.IMU:
             self._silent[self._imu] = 0
         try:
-            self._estimator.add_imu(PARTS[role].read(message))
+            self._estimator.add_imu(PARTS[role].read(data))
         except InputError as error:
             self._warn(str(error))
             return

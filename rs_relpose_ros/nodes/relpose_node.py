@@ -1,6 +1,8 @@
 """relpose_node: publishes the keyframe pairs of a rolling-shutter camera with an IMU."""
 
+from collections.abc import Callable, Mapping
 from functools import partial
+from typing import Any
 
 from rclpy.node import Node
 from scipy.spatial.transform import Rotation
@@ -13,7 +15,7 @@ from rs_relpose_ros.nodes.inputs import message_class, transform_broadcaster
 from rs_relpose_ros.nodes.sensor_node import run_node, SensorNode
 from rs_relpose_ros.pipeline.pair import Frame, PairResult
 from rs_relpose_ros.pipeline.pipeline import FrontEnd
-from rs_relpose_ros.pipeline.warm_up import warm_up_pipeline
+from rs_relpose_ros.pipeline.warm_up import fill_cache_if_empty, warm_up_pipeline
 from rs_relpose_ros.tracking.images import Pixels
 
 NAME = 'relpose_node'
@@ -51,6 +53,7 @@ class RelposeNode(SensorNode):
         return FrontEnd(parameters, keep_images=True)
 
     def _warm_up(self) -> None:
+        fill_cache_if_empty()
         warm_up_pipeline(self._settings.current)
         if self._timings is not None:
             self._timings.start()
@@ -66,8 +69,12 @@ class RelposeNode(SensorNode):
     def _on_processed(self, frame: Frame[PairResult]) -> None:
         if frame.result is not None:
             config = self._settings.current.pair
-            self._outputs.publish(frame.result, config)
+            messages = outgoing.pair_parts(frame.result, message_class, config.reference_frame)
+            self._outputs.publish({'relative_pose': messages.pop('relative_pose')}
+                                  if frame.result.pose else {})
             self._statistics.add_pair(frame.result, frame.ready_ns)
+            self._outputs.publish(messages)
+            self._outputs.publish_transform(frame.result, config)
             self._outputs.publish_picture(frame.result, config)
             self._log_health(frame.result.health, withhold=config.withhold_when_wrong)
         if self._timings is not None:
@@ -88,18 +95,22 @@ class PairPublishers:
         self._transforms = (transform_broadcaster(node, 'publish_tf') if config.publish_tf
                             else None)
 
-    def publish(self, result: PairResult, config: PairConfig) -> None:
-        """Publish all that is known of a pair."""
-        messages = outgoing.pair_messages(result, message_class, config.reference_frame)
-        for topic, message in messages.items():
-            self._pair[topic].publish(message)
+    def publish(self, messages: Mapping[str, Callable[[], Any]]) -> None:
+        """Make and publish the messages of topics that are subscribed."""
+        for topic, make in messages.items():
+            if self._pair[topic].get_subscription_count():
+                self._pair[topic].publish(make())
+
+    def publish_transform(self, result: PairResult, config: PairConfig) -> None:
+        """Publish the pose of a pair as a transform, if that is wanted."""
         if self._transforms is not None and result.pose:
             # The camera has its parent in the robot's tree already, and a frame has only one: so
             # the reference is the child, by the pose's inverse. Its origin is one baseline away,
             # whose length in metres is unknown.
             quaternion = outgoing.quat_xyzw(result.pose.R)
             self._transforms.sendTransform(outgoing.transform_message(
-                result.stamp_ns, result.frame_id, messages['relative_pose'].header.frame_id,
+                result.stamp_ns, result.frame_id,
+                config.reference_frame or f'{result.frame_id}_reference',
                 quaternion * [-1.0, -1.0, -1.0, 1.0],
                 -Rotation.from_quat(quaternion).inv().apply(result.pose.t), message_class))
 

@@ -17,7 +17,6 @@ import traceback
 from typing import Any, ClassVar, NoReturn, TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticArray
-from numba.core.event import RecordingListener, register
 import rclpy
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -50,6 +49,7 @@ from rs_relpose_ros.nodes.inputs import (
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrameFailed, FrameLoop, Outcome
 from rs_relpose_ros.pipeline.sequencer import FrameRefused, Refusal
+from rs_relpose_ros.pipeline.warm_up import cache_is_filled, release_compiler
 
 if TYPE_CHECKING:
     from rs_relpose_ros.calibrate.live import LiveCalibration
@@ -186,6 +186,7 @@ class Worker(threading.Thread):
         """Work until `stop`."""
         try:
             self._warm_up()
+            release_compiler()
         except Exception as error:  # noqa: BLE001 - the node shows it; a silent thread is worse
             self._consume(FrameFailed(None, error))
             return
@@ -203,11 +204,8 @@ class Worker(threading.Thread):
 
 # Time [s] for the worker to end: a frame takes less, compiling takes longer.
 _JOIN_TIMEOUT = 0.4
-# Time [s] of a start above which kernels are being compiled, not loaded from the cache.
+# Time [s] of a start after which it is said that kernels are compiled, if they are.
 _REPORT_COMPILING = 4.0
-# Kernels that are compiled, not loaded: begin and end of each; a few may be at any start.
-_COMPILED, _SOME_KERNELS = RecordingListener(), 10
-register('numba:compile', _COMPILED)
 
 
 def _camera(parameters: Parameters) -> list[Any]:
@@ -339,7 +337,7 @@ class SensorNode(StoppableNode):
         assert self._worker is not None
         if not self._worker.warm.is_set():
             if (time.monotonic_ns() - self._started_ns > _REPORT_COMPILING * NANOSECONDS
-                    and len(_COMPILED.buffer) > _SOME_KERNELS):
+                    and not cache_is_filled()):
                 self._info('compiling kernels, as the build has none for this machine: this start '
                            'takes a minute or two, later ones some seconds')
             return

@@ -207,7 +207,8 @@ class Sequencer:
                 # Of two topics one is always behind; late is a gyro sample behind another one.
                 counts.imu_late += added is AddResult.LATE and stamp_ns < before_ns
                 counts.imu_gaps += stamp_ns - before_ns > self._max_gap_ns
-            self._update_queue()
+            if self._queue:
+                self._update_queue()
 
     def add_frame(self, image: EncodedImage, intrinsics: Intrinsics) -> None:
         """Add an image to the queue, or refuse it for its stamp."""

@@ -2,15 +2,23 @@
 
     python -m rs_relpose_ros.pipeline.warm_up
 
-fills the cache on two cores, in one to two minutes: the first run then starts at once.
+fills the cache on two cores in a minute: the first run then starts at once.
 """
 
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+import ctypes
 import gc
+import mmap
 import multiprocessing
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
 
 import cv2
+from llvmlite.binding import get_host_cpu_name
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,14 +32,17 @@ from rs_relpose_ros.estimator.sampling import MODES
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
+from rs_relpose_ros.geometry.so3 import exp_so3
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.imu.buffer import ImuSample
+from rs_relpose_ros.jit import source_digest
 from rs_relpose_ros.pipeline.pair import Frame, Result
 from rs_relpose_ros.pipeline.pipeline import FrameLoop, FrontEnd
 from rs_relpose_ros.solvers.common import Solutions
 from rs_relpose_ros.tracking.images import RawImage
 
 _WIDTH, _HEIGHT = 320, 240
+_PR_SET_PDEATHSIG = 1
 # With distortion, so that its kernels are compiled, too.
 _INTRINSICS = Intrinsics(width=_WIDTH, height=_HEIGHT, fx=250.0, fy=250.0, cx=159.5, cy=119.5,
                          image_width=_WIDTH, image_height=_HEIGHT,
@@ -112,30 +123,67 @@ def fill_cache() -> None:
 
     Other solvers are compiled when they are chosen.
     """
-    rarely = 100_000   # collections of garbage, which syntax trees do not become: a tenth faster
-    with ProcessPoolExecutor(1, multiprocessing.get_context('spawn'), gc.set_threshold,
-                             (rarely,)) as pool:
-        other_half = pool.submit(_warm_up_estimate)
-        gc.set_threshold(rarely)
-        for solver in MODES[EstimatorConfig().solver].solvers:
-            assert solver.address
-        # No pair has that many matches: everything but the estimate.
-        warm_up_pipeline(Parameters.from_mapping({'min_inliers': 10_000}))
-        points1, points2, camera, motion = _sideways()
-        pose = RelativePose(status=Status.OK, inliers=np.ones(len(points1), dtype=bool),
-                            R=np.eye(3), t=np.eye(3)[0], residual_rms=1.0)
-        frames_between.refined(pose, points1, motion, (points2, motion, 0.2, *_ROTATION),
-                               [_halfway()], camera, EstimatorConfig())
-        other_half.result()
+    gc.set_threshold(100_000)   # syntax trees do not become garbage: a tenth faster
+    other_half = multiprocessing.get_context('fork').Process(
+        target=_fill_half, args=(os.getpid(),))
+    other_half.start()
+    for solver in MODES[EstimatorConfig().solver].solvers:
+        assert solver.address
+    # No pair has that many matches: everything but the estimate.
+    warm_up_pipeline(Parameters.from_mapping({'min_inliers': 10_000}))
+    points1, points2, camera, motion = _sideways()
+    pose = RelativePose(status=Status.OK, inliers=np.ones(len(points1), dtype=bool),
+                        R=np.eye(3), t=np.eye(3)[0], residual_rms=1.0)
+    frames_between.refined(pose, points1, motion, (points2, motion, 0.2, *_ROTATION),
+                           [_halfway()], camera, EstimatorConfig())
+    _estimation().sample()   # with what the other process has compiled by then
+    other_half.join()
     warm_up_pipeline(Parameters())
+    _mark().touch()
 
 
-def _warm_up_estimate() -> None:
-    """Compile a two-view estimate: all steps but the first, then sampling."""
+def _fill_half(parent: int) -> None:
+    """Compile a two-view estimate without sampling."""
+    _end_with(parent)
     _estimation().refine(Solutions(np.eye(3)[None], np.eye(1, 9)))
-    # By then the other process has compiled the solvers, which are most of it.
-    _estimation().sample()
+
+
+def _end_with(parent: int) -> None:
+    """Let the kernel of Linux end this process with its parent, or with the thread of it."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:   # it has ended already
+        os._exit(1)
+
+
+def _mark() -> Path:
+    """File of a filled cache: by sources, version and machine."""
+    name = f'{source_digest(__name__)[:16]}-{get_host_cpu_name()}-{numba.__version__}'
+    return Path(exp_so3.stats.cache_path, name)
+
+
+def cache_is_filled() -> bool:
+    """Whether `fill_cache` has been here, with these sources on this machine."""
+    return _mark().exists()
+
+
+def fill_cache_if_empty() -> None:
+    """Compile in processes of their own, whose memory, some 700 MB, is freed afterwards."""
+    if not cache_is_filled():
+        subprocess.run([sys.executable, '-m', 'rs_relpose_ros.pipeline.warm_up',
+                        str(os.getpid())], check=False)
+
+
+def release_compiler() -> None:
+    """Free the 60 MB of LLVM's code (Linux), which a kernel that is compiled later loads again."""
+    advise = ctypes.CDLL(None).madvise
+    for line in Path('/proc/self/maps').read_text().splitlines():
+        addresses, access, *_, path = line.split(maxsplit=5)
+        if access == 'r-xp' and 'llvmlite' in path:   # unchanged pages of the file
+            start, end = (int(address, 16) for address in addresses.split('-'))
+            advise(ctypes.c_void_p(start), ctypes.c_size_t(end - start), mmap.MADV_DONTNEED)
 
 
 if __name__ == '__main__':
+    if len(sys.argv) > 1:
+        _end_with(int(sys.argv[1]))
     fill_cache()
