@@ -216,13 +216,22 @@ def rate_in_hertz(text: str) -> float:
     return rate
 
 
-def _odometry(args: argparse.Namespace) -> int:
+def _odometry_of(args: argparse.Namespace, **how: Any) -> tuple[Path, Any]:
+    """Folder and outcome of the odometry; prints its warnings, and why it did not start."""
     need_gtsam()
-    from rs_relpose_ros.odometry import offline, rows
-    folder, outcome = options.run_on_bag(args, 'odometry', partial(
-        offline.odometry_into, rate=args.rate, loops=args.loops))
+    from rs_relpose_ros.odometry.offline import odometry_into
+    folder, outcome = options.run_on_bag(args, 'odometry', partial(odometry_into, **how))
     for text in outcome.warnings:
         print(text)
+    if not outcome.live:
+        print('odometry did not start:', outcome.blocking_reason or 'it needs some seconds of '
+              'motion, or standstill, and informative pairs')
+    return folder, outcome
+
+
+def _odometry(args: argparse.Namespace) -> int:
+    folder, outcome = _odometry_of(args, rate=args.rate, loops=args.loops)
+    from rs_relpose_ros.odometry import offline, rows
     metrics = outcome.metrics
     pairs = metrics['pairs']
     print(f'{metrics["keyframes"]} keyframes of {pairs["pairs"]} pairs over '
@@ -242,17 +251,10 @@ def _odometry(args: argparse.Namespace) -> int:
             print(f'{trajectory}, against the ground truth: ATE {errors["ate_m"]:.3f} m over '
                   f'{errors["length_m"]:.1f} m, scale {100.0 * errors["scale_error"]:+.2f} %')
     if not outcome.live:
-        print(start_failure(outcome.blocking_reason))
         return FAILED
     print(f'in {folder}: {offline.LIVE_FILE}, {offline.SMOOTHED_FILE}, {rows.ROWS_FILE}, '
           f'{offline.PICTURE}, {SUMMARY_FILE}')
     return 0
-
-
-def start_failure(blocking_reason: str) -> str:
-    """Message on an odometry that did not start."""
-    return 'odometry did not start: ' + (
-        blocking_reason or 'it needs some seconds of motion, or standstill, and informative pairs')
 
 
 ODOMETRY = Command(
@@ -310,14 +312,8 @@ def _export(args: argparse.Namespace) -> int:
     with beside(args.out) as part:
         trajectory = args.trajectory or part.with_name('odometry')
         if args.trajectory is None:
-            need_gtsam()
-            from rs_relpose_ros.odometry.offline import odometry_into
-            _, outcome = options.run_on_bag(argparse.Namespace(
-                **{**vars(args), 'out': trajectory}), 'odometry', odometry_into)
-            for text in outcome.warnings:
-                print(text)
+            _, outcome = _odometry_of(argparse.Namespace(**vars(args) | {'out': trajectory}))
             if not outcome.live:
-                print(start_failure(outcome.blocking_reason))
                 return FAILED
         if args.format == TUM:
             poses = camera_poses(RowTrajectory.load(trajectory / ROWS_FILE), args.rate)
@@ -325,20 +321,17 @@ def _export(args: argparse.Namespace) -> int:
             text = f'{len(poses)} poses of the camera'
         else:
             part.mkdir()
-            _print_report(args, _with_images(args, part, trajectory))
+            with options.opened(args, read_parameters(args.params, args.set)) as opened:
+                report = export.export_into(part, *opened, trajectory, export.Options(
+                    args.format, args.images, args.rate, args.points,
+                    trajectory / IMAGES if args.link else None))
+            _print_report(args, report)
             if args.trajectory is None:
                 trajectory.rename(part / 'odometry')
             text = ', '.join(sorted(path.name for path in part.iterdir()))
         part.rename(args.out)
     print(f'in {args.out}: {text}')
     return 0
-
-
-def _with_images(args: argparse.Namespace, part: Path, trajectory: Path) -> export.ExportReport:
-    with options.opened(args, read_parameters(args.params, args.set)) as opened:
-        return export.export_into(part, *opened, trajectory, export.Options(
-            args.format, args.images, args.rate, args.points,
-            trajectory / IMAGES if args.link else None))
 
 
 def _print_report(args: argparse.Namespace, report: export.ExportReport) -> None:

@@ -22,17 +22,7 @@ from rs_relpose_ros.geometry.camera import REFERENCE_ROWS, RollingShutterCamera
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
 from rs_relpose_ros.geometry.timing import clocks_apart
 from rs_relpose_ros.pipeline import findings
-from rs_relpose_ros.pipeline.findings import (
-    AXES,
-    BIAS,
-    DISTORTION,
-    Finding,
-    FindingState,
-    FOCAL,
-    OFFSET,
-    Quantity,
-    READOUT,
-)
+from rs_relpose_ros.pipeline.findings import Finding, FindingState, Quantity
 from rs_relpose_ros.pipeline.recursion import Calibration, PRIOR_SIGMA
 from rs_relpose_ros.pipeline.rotations import RotationComparison
 
@@ -60,7 +50,7 @@ _AS_CONFIGURED = 3.0
 # Error that linearisation leaves, 1 sigma as a share of the last step: on recordings with times
 # that are far off steps are 0.4 to 0.8 of the error, with other parameters 0.9.
 _REMAINS = np.full(findings.DEVIATIONS, 0.25)
-_REMAINS[[OFFSET, READOUT]] = 1.0
+_REMAINS[[findings.OFFSET, findings.READOUT]] = 1.0
 # Error of a suggested value, 1 sigma as a share of the deviation: matches and inliers were
 # selected with the wrong value. About 0.08 on recordings.
 _SELECTED = 0.1
@@ -100,11 +90,12 @@ def configured_sigmas(parameters: Parameters, from_reference: float) -> Array:
     `from_reference` [s]: interval between frames less that to which the time offset refers.
     """
     sensor, lens, sigmas = parameters.sensor, parameters.intrinsics, np.zeros(findings.DEVIATIONS)
-    sigmas[AXES], sigmas[BIAS] = sensor.axes_sigma, parameters.imu.gyro_bias_sigma
-    sigmas[OFFSET] = math.hypot(sensor.time_offset_sigma, (
+    sigmas[findings.AXES] = sensor.axes_sigma
+    sigmas[findings.BIAS] = parameters.imu.gyro_bias_sigma
+    sigmas[findings.OFFSET] = math.hypot(sensor.time_offset_sigma, (
         from_reference * sensor.time_offset_per_interval_sigma))
-    sigmas[READOUT] = sensor.readout_time_sigma
-    sigmas[FOCAL], sigmas[DISTORTION] = lens.focal_length_sigma, lens.distortion_sigma
+    sigmas[findings.READOUT] = sensor.readout_time_sigma
+    sigmas[[findings.FOCAL, findings.DISTORTION]] = lens.focal_length_sigma, lens.distortion_sigma
     return sigmas
 
 
@@ -197,7 +188,7 @@ def undetermined(estimated: Calibration, configured: Configured) -> Array:
         odds_k = (|Sigma_k| / |P_k|)^1/2 exp(b_k^T Sigma_k b_k / 2),  Sigma_k = (S_kk + P_k^-1)^-1
     """
     odds, known = 0.0, configured.sigmas > 0.0
-    known[BIAS] = False
+    known[findings.BIAS] = False
     estimated = replace(estimated, shared=1.0)
     for quantity, of_prior in _PRIORS:
         part = quantity.part
@@ -209,7 +200,7 @@ def undetermined(estimated: Calibration, configured: Configured) -> Array:
             odds += math.exp(0.5 * (log_determinant(covariance) + of_prior + gain)) / len(_PRIORS)
     share = odds / (1.0 + odds)
     within = _solved(np.zeros_like(known), estimated, configured).moment
-    within[BIAS] = within[:, BIAS] = 0.0
+    within[findings.BIAS] = within[:, findings.BIAS] = 0.0
     return share * _solved(~known, estimated, configured).moment + (1.0 - share) * within
 
 
@@ -275,7 +266,7 @@ def _solved(free: NDArray[np.bool_], estimated: Calibration, configured: Configu
     All others are within their configured sigmas, and zero where there is none.
     """
     sigmas, active = np.where(free, PRIOR_SIGMA, configured.sigmas), configured.active
-    if free[DISTORTION]:
+    if free[findings.DISTORTION]:
         factors = estimated.if_distorted
         estimated = replace(estimated, S=factors[:, None, None] * estimated.S,
                             b=factors[:, None] * estimated.b)
@@ -375,11 +366,12 @@ def _fault_findings(one: Inconsistency, configured: Configured,
 
 def _another_row(one: Inconsistency, configured: Configured) -> str:
     """Remark on another stamped row that is equivalent to the same offset; empty for none."""
-    camera, deviation = configured.camera, one.deviation[OFFSET]
+    camera, sigma = configured.camera, one.sigma[findings.OFFSET]
     for name in REFERENCE_ROWS:
         row = replace(camera, reference_row=name).reference_row_index
         makes = (camera.reference_row_index - row) * camera.line_delay
-        if name != camera.reference_row and abs(deviation - makes) < 2.0 * one.sigma[OFFSET]:
+        if name != camera.reference_row and (
+                abs(one.deviation[findings.OFFSET] - makes) < 2.0 * sigma):
             return f' (stamp_row: {name} is equivalent)'
     return ''
 
@@ -402,9 +394,9 @@ def _values(quantity: Quantity, left: Array, sigmas: Array,
     worst = int(np.argmax(np.abs(left) / sigmas))
     sigma, setting = float(sigmas[worst]), None
     values: dict[str, ArrayLike] = {   # active ones, in the unit of the quantity
-        'axes': 0.0, 'time_offset': sensor.time_offset + float(configured.active[OFFSET]),
+        'axes': 0.0, 'time_offset': sensor.time_offset + float(configured.active[findings.OFFSET]),
         'readout_time': camera.readout_time,
-        'gyro_bias': configured.gyro_bias + configured.active[BIAS], 'gyro_scale': 1.0,
+        'gyro_bias': configured.gyro_bias + configured.active[findings.BIAS], 'gyro_scale': 1.0,
         'focal_length': camera.fx, 'distortion': (*camera.distortion, 0.0)[0]}
     active = np.atleast_1d(np.asarray(values[quantity.name], dtype=np.float64))
     estimated = active + left

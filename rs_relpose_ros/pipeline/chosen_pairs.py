@@ -16,13 +16,7 @@ from rs_relpose_ros.geometry.timing import to_nanoseconds
 from rs_relpose_ros.imu.buffer import frame_imu, ImuBuffer
 from rs_relpose_ros.imu.integration import FrameImu
 from rs_relpose_ros.pipeline import pair
-from rs_relpose_ros.pipeline.pair import (
-    Frame,
-    GyroRotation,
-    PairResult,
-    TrackHistory,
-    used_frames,
-)
+from rs_relpose_ros.pipeline.pair import Frame, GyroRotation, PairResult, TrackHistory, used_frames
 from rs_relpose_ros.pipeline.pipeline import Processor
 from rs_relpose_ros.tracking.features import DescriptorTracker
 

@@ -16,14 +16,7 @@ from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import tangent_basis
 from rs_relpose_ros.pipeline import assessment, findings, recursion
 from rs_relpose_ros.pipeline.assessment import Configured, Effect, Inconsistency
-from rs_relpose_ros.pipeline.findings import (
-    Assessment,
-    BIAS,
-    DEVIATIONS,
-    Finding,
-    OFFSET,
-    READOUT,
-)
+from rs_relpose_ros.pipeline.findings import Assessment, BIAS, DEVIATIONS, Finding, OFFSET, READOUT
 from rs_relpose_ros.pipeline.recursion import Calibration, Recursion
 from rs_relpose_ros.pipeline.rotations import AccelerationSums, RotationSums
 
@@ -95,8 +88,10 @@ class ConsistencyMonitor:
                 self._find_inconsistencies(information, pose, configured)
             except np.linalg.LinAlgError:
                 self._inconsistent = []
+        # The least lead of the IMU's clock, forwards or backwards; 0 if its sign changes.
+        ahead = max(min(self.ahead, default=0.0), 0.0) + min(max(self.ahead, default=0.0), 0.0)
         self._gross = assessment.gross_errors(
-            self.rotations.compared(), self._ahead(), configured, self._gross)
+            self.rotations.compared(), ahead, configured, self._gross)
         self.health = assessment.assess(self.calibration, self._inconsistent, self._gross,
                                         configured)
         self._wrong_configuration = bool(self.health.faults)
@@ -136,11 +131,6 @@ class ConsistencyMonitor:
         # The effect of an inconsistent parameter on the baseline is not known.
         return pose.without_baseline('baseline not known: a configured parameter is inconsistent '
                                      '(see health)') if shift.any() and pose else pose
-
-    def _ahead(self) -> float:
-        """The least lead of the IMU's clock, forwards or backwards; 0 if its sign changes."""
-        least, largest = min(self.ahead, default=0.0), max(self.ahead, default=0.0)
-        return max(least, 0.0) + min(largest, 0.0)
 
     def _deviation(self) -> Array:
         """(11,) from the active values, of all inconsistent quantities."""

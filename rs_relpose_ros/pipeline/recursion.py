@@ -20,7 +20,7 @@ from collections import deque
 from dataclasses import dataclass, replace
 import functools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,16 +38,8 @@ from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
 from rs_relpose_ros.imu.integration import GyroSegment, RotationSensitivity
 from rs_relpose_ros.jit import kernel
-from rs_relpose_ros.pipeline.findings import (
-    AXES,
-    BIAS,
-    DEVIATIONS,
-    DISTORTION,
-    FOCAL,
-    OFFSET,
-    READOUT,
-    SCALE,
-)
+from rs_relpose_ros.pipeline import findings
+from rs_relpose_ros.pipeline.findings import AXES, BIAS, DEVIATIONS, FOCAL, OFFSET, READOUT
 
 # Sigma of the velocities about the mean one [baselines per second].
 _VELOCITY_SIGMA = 1.0
@@ -172,19 +164,25 @@ def _shifts(pair: PairData, problem: TwoViewProblem, state: TwoViewState, H: Arr
             D: Array) -> tuple[Array, Array]:
     """Shift of the estimated pose by deviations and center, (6, 13), and whitened, (5, 13).
 
-    With the prior of the estimate for the gyro's rotation; H and C are changed.
+    With the prior of the estimate for the gyro's rotation; H and C are changed. The state is that
+    at the middle row, which a longer readout time delays, by D = share c, but not the stamped one:
+    ``t = Exp(w_1 D) t_middle, R = Exp(w_1 D) R_middle Exp(w_2 D)^T``; w in middle-row axes.
     """
     assert problem.rotation_information is not None
     prior_information = np.linalg.inv(pair.gyro_covariance)
     H[THETA:THETA + 3, THETA:THETA + 3] += prior_information - problem.rotation_information
     C[THETA:THETA + 3] += (problem.rotation_information - prior_information) @ D
-    covariance = inverse(H)
-    moved = _at_stamped_row(pair, problem, state, -covariance @ C)
+    covariance, tangent = inverse(H), so3.tangent_basis(state.t)
+    moved = -covariance @ C
+    to_middle = problem.motion1.rotations([problem.reference_row_time])[0]
+    share, rate1 = middle_share(pair.camera), to_middle @ pair.rates[0]
+    rate2 = to_middle @ (pair.gyro_rotation @ pair.rates[1])
+    moved[TANGENT:TANGENT + 2, READOUT] += share * (tangent.T @ so3.skew(rate1) @ state.t)
+    moved[THETA:THETA + 3, READOUT] += share * (rate1 - rate2)
     spread = np.linalg.cholesky(covariance[_POSE[:, None], _POSE])
     # In the axes of the stamped row.
-    to_stamped = problem.motion1.rotations([problem.reference_row_time])[0].T
-    by_deviation = np.vstack([to_stamped @ so3.tangent_basis(state.t) @ moved[TANGENT:TANGENT + 2],
-                              to_stamped @ moved[THETA:THETA + 3]])
+    by_deviation = np.vstack([to_middle.T @ tangent @ moved[TANGENT:TANGENT + 2],
+                              to_middle.T @ moved[THETA:THETA + 3]])
     return by_deviation, solve_triangular(spread, moved[_POSE], lower=True)
 
 
@@ -198,10 +196,10 @@ def _common_noise(matches: FitMatches, J: Array, r: Array, S: Array) -> tuple[fl
     scale = np.outer(PRIOR_SIGMA, PRIOR_SIGMA)
     covariance = inverse(S * scale + np.eye(DEVIATIONS)) * scale
     in_region = image_regions(matches) == np.arange(REGIONS[0] * REGIONS[1])[:, None]
-    along = J[:, DISTORTION]
+    along = J[:, findings.DISTORTION]
     information = J.T * matches.weights @ J
     without = r - along * ((along * matches.weights) @ r / (
-        information[DISTORTION, DISTORTION] + PRIOR_SIGMA[DISTORTION]**-2.0))
+        np.diag(information)[findings.DISTORTION] + PRIOR_SIGMA[findings.DISTORTION]**-2.0))
     independent = float((covariance * information).sum())
 
     def ratio(left: Array) -> float:
@@ -238,23 +236,6 @@ def _state(pair: PairData, problem: TwoViewProblem, observations: Array, prior: 
     return gauss_newton(matches, state, prior, _NEW_STEPS)
 
 
-def _at_stamped_row(pair: PairData, problem: TwoViewProblem, state: TwoViewState,
-                    moved: Array) -> Array:
-    """Moved states (17, 13) at the middle row, with its movement relative to the stamped row.
-
-    A longer readout time delays the middle row, by D = share c, but not the stamped one:
-    ``t = Exp(w_1 D) t_middle, R = Exp(w_1 D) R_middle Exp(w_2 D)^T``; w in middle-row axes.
-    """
-    to_middle = problem.motion1.rotations([problem.reference_row_time])[0]
-    share, rate1 = middle_share(pair.camera), to_middle @ pair.rates[0]
-    rate2 = to_middle @ (pair.gyro_rotation @ pair.rates[1])
-    moved = moved.copy()
-    moved[TANGENT:TANGENT + 2, READOUT] += share * (so3.tangent_basis(state.t).T @ so3.skew(rate1)
-                                                    @ state.t)
-    moved[THETA:THETA + 3, READOUT] += share * (rate1 - rate2)
-    return moved
-
-
 @functools.lru_cache(maxsize=16)
 def _lens(camera: RollingShutterCamera, focal: float, distortion: float, right: float = 0.0,
           down: float = 0.0) -> RollingShutterCamera:
@@ -275,7 +256,7 @@ def _gyro(pair: PairData) -> Array:
     D[:, OFFSET] = pair.gyro_rotation @ pair.rates[1] - pair.rates[0]
     D[:, READOUT] = middle_share(pair.camera) * D[:, OFFSET]
     D[:, BIAS] = -pair.gyro_sensitivity.by_rate @ pair.R_cam_imu
-    D[:, SCALE] = pair.gyro_sensitivity.by_scale
+    D[:, findings.SCALE] = pair.gyro_sensitivity.by_scale
     return D
 
 
@@ -317,7 +298,7 @@ class _Rows(NamedTuple):
             turn[:, :, OFFSET] = later
             turn[:, :, READOUT] = shares[k][:, None] * rate + middle_share(camera) * later
             turn[:, :, BIAS] = -along * pair.R_cam_imu
-            turn[:, :, SCALE] = tau[:, None] * rate
+            turn[:, :, findings.SCALE] = tau[:, None] * rate
         return cls(turns, shares)
 
     def displaced(self, observations: Array, at: Array) -> Array:
@@ -455,6 +436,22 @@ NOTHING_ESTIMATED = Calibration(
     np.zeros((0, DEVIATIONS)), np.zeros(0), np.zeros(DEVIATIONS), 1.0, 1.0, 1.0)
 
 
+class LastSeconds(deque[Any]):
+    """Tuples of the last seconds, at most `most`, each with its stamp [ns] first."""
+
+    def __init__(self, most: int, window_ns: int) -> None:
+        super().__init__(maxlen=most)
+        self._window_ns = window_ns
+
+    def keep(self, item: tuple[Any, ...]) -> None:
+        """Add a tuple, in the order of time; an earlier stamp restarts."""
+        if self and item[0] < self[-1][0]:
+            self.clear()
+        self.append(item)
+        while self[0][0] < item[0] - self._window_ns:
+            self.popleft()
+
+
 class _Entry(NamedTuple):
     """A pair and its linearisation."""
 
@@ -469,11 +466,7 @@ class Recursion:
     """The pairs of the last seconds."""
 
     def __init__(self) -> None:
-        self._pairs: deque[_Entry] = deque(maxlen=MOST_PAIRS)
-
-    def clear(self) -> None:
-        """Forget all pairs."""
-        self._pairs.clear()
+        self._pairs = LastSeconds(MOST_PAIRS, WINDOW_NS)
 
     def add(self, stamp_ns: int, data: PairData, active: Array,
             about: Array) -> PairInformation | None:
@@ -482,14 +475,9 @@ class Recursion:
         It is linearised about the deviations `about` (11,), which differ from those `active`
         once a quantity is inconsistent. Returns the information of the pair, None if it has none.
         """
-        if self._pairs and stamp_ns < self._pairs[-1].stamp_ns:
-            self.clear()
         information = pair_information(data, active, about)
-        if information is None:
-            return None
-        self._pairs.append(_Entry(stamp_ns, data, active, about, information))
-        while self._pairs[0].stamp_ns < stamp_ns - WINDOW_NS:
-            self._pairs.popleft()
+        if information is not None:
+            self._pairs.keep(_Entry(stamp_ns, data, active, about, information))
         return information
 
     def relinearise(self) -> bool:

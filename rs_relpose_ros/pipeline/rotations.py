@@ -7,7 +7,6 @@ maximises ``trace(Q^T M)`` aligns them (Kabsch 1976). A constant rate is removed
 a bias of the gyro, and a steady translation, which is similar to a rotation of the images.
 """
 
-from collections import deque
 from dataclasses import dataclass
 import math
 
@@ -21,7 +20,7 @@ from rs_relpose_ros.geometry.timing import to_nanoseconds
 from rs_relpose_ros.imu.buffer import ForceFault
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.pipeline.findings import Finding, FindingState
-from rs_relpose_ros.pipeline.recursion import MOST_PAIRS, WINDOW_NS
+from rs_relpose_ros.pipeline.recursion import LastSeconds, MOST_PAIRS, WINDOW_NS
 
 # Fewer rays give no rotation.
 LEAST_RAYS = 12
@@ -118,31 +117,22 @@ class RotationComparison:
         return float(np.linalg.norm(log_so3(self.rotation)))
 
 
-class RotationSums:
+class RotationSums(LastSeconds):
     """The rotations of the last seconds."""
 
     def __init__(self) -> None:
-        # Arguments of `add`.
-        self._rotations: deque[tuple[int, float, Array, Array]] = deque(maxlen=_MOST_ROTATIONS)
-
-    def clear(self) -> None:
-        """Forget all rotations."""
-        self._rotations.clear()
+        super().__init__(_MOST_ROTATIONS, _WINDOW_NS)
 
     def add(self, stamp_ns: int, interval: float, by_images: Array, by_gyro: Array) -> None:
-        """Add rotation vectors (3,) over the same `interval` [s], in the order of time."""
-        if self._rotations and stamp_ns < self._rotations[-1][0]:
-            self.clear()
-        self._rotations.append((stamp_ns, interval, by_images, by_gyro))
-        while self._rotations[0][0] < stamp_ns - _WINDOW_NS:
-            self._rotations.popleft()
+        """Add rotation vectors (3,) over the same `interval` [s]."""
+        self.keep((stamp_ns, interval, by_images, by_gyro))
 
     def compared(self) -> RotationComparison | None:
         """The comparison; None if there are too few or too small rotations."""
-        if len(self._rotations) < _FEWEST:
+        if len(self) < _FEWEST:
             return None
         _, intervals, theta, phi = (
-            np.array(column) for column in zip(*self._rotations, strict=True))
+            np.array(column) for column in zip(*self, strict=True))
         by_images = float(np.linalg.norm(theta, axis=1).sum())
         by_gyro = float(np.linalg.norm(phi, axis=1).sum())
         if max(by_images, by_gyro) < _LEAST_ANGLE or by_gyro < 1e-3 * _LEAST_ANGLE:
@@ -160,7 +150,7 @@ class RotationSums:
             _left(mirrored, theta, phi), rotation,
             np.ascontiguousarray((U * (1.0, 1.0, -handed)) @ Vt),
             trace / max(float((phi**2).sum()), _NO_ROTATION), by_gyro,
-            len(self._rotations))
+            len(self))
 
 
 def _left(trace: float, theta: Array, phi: Array) -> float:
@@ -188,11 +178,11 @@ _CERTAIN = 10.0
 _FAULTY_NS = to_nanoseconds(1.0)
 
 
-class AccelerationSums:
-    """Sums of the log Bayes factors of the measured acceleration and of its opposite."""
+class AccelerationSums(LastSeconds):
+    """Log Bayes factors of the measured acceleration and of its opposite, with their stamps."""
 
     def __init__(self) -> None:
-        self._pairs: deque[tuple[int, float, float]] = deque(maxlen=MOST_PAIRS)
+        super().__init__(MOST_PAIRS, WINDOW_NS)
         self._fault, self._fault_ns, self._faulty = '', 0, False   # of the samples
 
     def report(self, stamp_ns: int, inertial: InertialMotion | str) -> None:
@@ -202,18 +192,9 @@ class AccelerationSums:
         self._fault = inertial if isinstance(inertial, ForceFault) else ''
         self._faulty = bool(self._fault) and stamp_ns - self._fault_ns >= _FAULTY_NS
 
-    def clear(self) -> None:
-        """Forget all pairs."""
-        self._pairs.clear()
-
     def add(self, stamp_ns: int, evidence: InertialEvidence) -> None:
-        """Add a pair, in the order of time; an earlier stamp restarts."""
-        if self._pairs and stamp_ns < self._pairs[-1][0]:
-            self.clear()
-        configured, opposite = (max(-_LARGEST, min(value, _LARGEST)) for value in evidence)
-        self._pairs.append((stamp_ns, configured, opposite))
-        while self._pairs[0][0] < stamp_ns - WINDOW_NS:
-            self._pairs.popleft()
+        """Add a pair."""
+        self.keep((stamp_ns, *(max(-_LARGEST, min(value, _LARGEST)) for value in evidence)))
 
     def uses(self, evidence: InertialEvidence | None) -> bool:
         """Whether a pair of such evidence uses the accelerometer; None: not known yet."""
@@ -244,5 +225,5 @@ class AccelerationSums:
         return None
 
     def _sums(self) -> tuple[float, float]:
-        return (sum(configured for _, configured, _ in self._pairs),
-                sum(opposite for _, _, opposite in self._pairs))
+        return (sum(configured for _, configured, _ in self),
+                sum(opposite for _, _, opposite in self))
