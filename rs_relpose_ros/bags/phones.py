@@ -134,25 +134,26 @@ def read_tables(folder: Path) -> Recording:
             for row in read_table(folder / 'gyro.csv')]
     accel = [ImuSample(_stamp(row), None, row.vector(*'xyz'))
              for row in _optional_table(folder / 'accel.csv')]
+    frames = read_table(folder / 'frames.csv')
+    stamps_ns = [_stamp(row) for row in frames]
+    if 'file' in frames[0].words:
+        images = tuple(convert.image_file(stamp_ns, convert.file_inside(folder, row, 'file'))
+                       for stamp_ns, row in zip(stamps_ns, frames, strict=True))
+    else:
+        videos = [path for path in sorted(folder.iterdir())
+                  if path.suffix.lower() in ('.mp4', '.mov')]
+        if len(videos) != 1:
+            raise InputError(f'{frames[0].path} has no column file, and {folder} has '
+                             f'{len(videos)} videos (.mp4, .mov): there must be one')
+        images = _landscape_video(videos[0]).frames(stamps_ns, frames[0].path)
     return Recording(
-        None, _table_images(folder, read_table(folder / 'frames.csv')), gyro,
-        _title(folder, '. `rs_relpose calibrate` estimates readout time and focal length'),
+        None, images, gyro, _title(
+            folder, '. `rs_relpose calibrate` estimates readout time and focal length'),
         (convert.COMPRESSED, _STAMP_ROW, _TIME_OFFSET, _axes()), accel=accel)
 
 
 def _stamp(row: Row) -> int:
     return row.nanoseconds(next((name for name in _STAMPS if name in row.words), _STAMPS[0]))
-
-
-def _table_images(folder: Path, frames: list[Row]) -> tuple[convert.RecordedImage, ...]:
-    if 'file' in frames[0].words:
-        return tuple(convert.image_file(_stamp(row), convert.file_inside(folder, row, 'file'))
-                     for row in frames)
-    videos = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in ('.mp4', '.mov')]
-    if len(videos) != 1:
-        raise InputError(f'{frames[0].path} has no column file, and {folder} has {len(videos)} '
-                         'videos (.mp4, .mov): there must be one')
-    return _landscape_video(videos[0]).frames([_stamp(row) for row in frames], frames[0].path)
 
 
 # -- Recordings with a line of JSON for each event ------------------------------------------------
@@ -280,24 +281,18 @@ def read_mars(folder: Path) -> Recording:
            for row in read_table(folder / 'gyro_accel.csv')]
     metadata = _optional_table(folder / 'movie_metadata.csv')
     readout = 'Frame readout time[nanosec]'
+    fx, fy = (float(np.median(_reals(metadata, name) or [0.0])) for name in ('fx[px]', 'fy[px]'))
+    lens = [] if min(fx, fy) <= 0.0 else [_camera_matrix(
+        fx, fy, (video.width - 1) / 2.0, (video.height - 1) / 2.0, "A GUESS: the lens's nominal "
+        'focal length as logged, principal point in the middle, no distortion.')]
     return Recording(
         None, video.frames(stamps_ns, stamps), imu,
         _title(folder, ': recorded with the MARS Logger'),
         (convert.COMPRESSED, *_readout(_reals(metadata, readout), readout),
          *_exposure(_reals(metadata, 'Exposure time[nanosec]')),
-         *_nominal_focal_length(metadata, video), _STAMP_ROW,
+         *lens, _STAMP_ROW,
          SourcedValue('time_offset', 0.0, f'NOT KNOWN: {clock}. `rs_relpose calibrate` measures '
                       'it.'), _axes()))
-
-
-def _nominal_focal_length(metadata: list[Row], video: Video) -> list[SourcedValue]:
-    fx, fy = (float(np.median(_reals(metadata, name) or [0.0])) for name in ('fx[px]', 'fy[px]'))
-    if min(fx, fy) <= 0.0:
-        return []
-    return [_camera_matrix(
-        fx, fy, (video.width - 1) / 2.0, (video.height - 1) / 2.0,
-        "A GUESS: the lens's nominal focal length as logged, principal point in the middle, no "
-        'distortion.')]
 
 
 def _clock(path: Path) -> tuple[int, str]:
@@ -362,7 +357,7 @@ def read_posecam(folder: Path) -> Recording:
          *_exposure(_reals(metadata, 'exposure_time_ns')), _STAMP_ROW, _TIME_OFFSET,
          _axes(camera.get('sensor_orientation_deg') if isinstance(camera, Mapping) else None),
          *_intrinsics(folder / 'intrinsics.json'), *bias),
-        accel=accel, truth=_truth(poses, _jumps(folder / 'manifest.json')))
+        accel=accel, truth=_truth(poses, folder / 'manifest.json'))
 
 
 def _posecam_imu(path: Path) -> tuple[list[ImuSample], list[ImuSample], list[SourcedValue]]:
@@ -389,8 +384,14 @@ def _posecam_imu(path: Path) -> tuple[list[ImuSample], list[ImuSample], list[Sou
     return gyro, accel, bias
 
 
-def _truth(poses: list[Row], jumps: list[int]) -> tuple[TruePose, ...]:
+def _truth(poses: list[Row], manifest: Path) -> tuple[TruePose, ...]:
     """The longest sequence of tracked poses without a jump, after which the world is another."""
+    found = _optional_object(manifest).get('pose_jumps')
+    # Next to the list, whose name is not documented, are counts and thresholds.
+    stamps = [jump.get('timestamp_ns')
+              for values in (found.values() if isinstance(found, Mapping) else [found])
+              if isinstance(values, list) for jump in values if isinstance(jump, Mapping)]
+    jumps = [stamp for stamp in stamps if isinstance(stamp, int) and abs(stamp) < 2**63]
     tracked = [row for row in poses if row.word('tracking_state') == 'TRACKING']
     ends = np.searchsorted([row.nanoseconds('timestamp_ns') for row in tracked], sorted(jumps))
     longest = max(np.split(np.arange(len(tracked)), ends), key=len)
@@ -408,16 +409,6 @@ def _pose(row: Row) -> TruePose:
         raise row.error(f'the quaternion must have length 1, got {length:.3g}')
     x, y, z, w = (Rotation.from_quat(quaternion) * _GL_FROM_OPTICAL).as_quat().tolist()
     return TruePose(row.nanoseconds('timestamp_ns'), row.vector('tx', 'ty', 'tz'), (x, y, z, w))
-
-
-def _jumps(path: Path) -> list[int]:
-    """Stamps [ns] of the first frames after a jump of the poses."""
-    found = _optional_object(path).get('pose_jumps')
-    # Next to the list, whose name is not documented, are counts and thresholds.
-    jumps = [jump for values in (found.values() if isinstance(found, Mapping) else [found])
-             if isinstance(values, list) for jump in values if isinstance(jump, Mapping)]
-    stamps = [jump.get('timestamp_ns') for jump in jumps]
-    return [stamp for stamp in stamps if isinstance(stamp, int) and abs(stamp) < 2**63]
 
 
 def _intrinsics(path: Path) -> list[SourcedValue]:

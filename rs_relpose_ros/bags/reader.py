@@ -146,7 +146,17 @@ def _check_path(path: Path) -> None:
                     f'{path} has no metadata.yaml, so its recorder was not stopped properly: give '
                     f'{files[0].name} itself, or make one with "ros2 bag reindex {path}"')
             raise InputError(f'{path} is no bag: it has no metadata.yaml')
-        _check_metadata(path / 'metadata.yaml')
+        metadata = path / 'metadata.yaml'
+        if metadata.stat().st_size > _MAX_METADATA_BYTES:
+            raise InputError(f'{metadata} is no metadata of a bag: it has more than '
+                             f'{_MAX_METADATA_BYTES} bytes')
+        content = metadata.read_bytes()
+        with suppress(yaml.YAMLError, RecursionError):   # no YAML: refused by the reader
+            # Printed, aliases can be endless.
+            if b'*' in content and any(
+                    isinstance(event, yaml.AliasEvent) for event in yaml.parse(content)):
+                raise InputError(f'{metadata} has YAML aliases, which no recorder writes: it is '
+                                 'damaged')
     elif path.suffix in (*_STORAGE_SUFFIXES, '.bag'):
         files = [path]
     else:
@@ -161,18 +171,6 @@ def _check_path(path: Path) -> None:
             with file.open('rb') as opened:
                 if opened.read(9) != b'#ROSBAG V':
                     raise InputError(f'{path} is no ROS 1 bag')
-
-
-def _check_metadata(path: Path) -> None:
-    """Refuse a metadata.yaml that is too large, or has aliases: printed, these can be endless."""
-    if path.stat().st_size > _MAX_METADATA_BYTES:
-        raise InputError(f'{path} is no metadata of a bag: it has more than '
-                         f'{_MAX_METADATA_BYTES} bytes')
-    content = path.read_bytes()
-    with suppress(yaml.YAMLError, RecursionError):   # no YAML: refused by the reader
-        if b'*' in content and any(
-                isinstance(event, yaml.AliasEvent) for event in yaml.parse(content)):
-            raise InputError(f'{path} has YAML aliases, which no recorder writes: it is damaged')
 
 
 def _check_mcap(path: Path) -> None:

@@ -90,8 +90,12 @@ def run_job(job: Job) -> Outcome:
     state, message, metrics = State.REFUSED, '', {}
     with TemporaryDirectory() as scratch:
         out = Path(scratch, 'out')
-        words = _words(job, Path(scratch), out)
-        files = {}
+        words, files = [job.command, job.bag.path], {}
+        if job.parameters:
+            parameters = Path(scratch, 'parameters.yaml')
+            parameters.write_text(job.parameters, encoding='utf-8')
+            words += ['--params', str(parameters)]
+        words += [*(['--out', str(out)] if job.command != 'check' else []), *job.options]
         arguments, sys.argv = sys.argv, ['rs_relpose', *words]   # for summary.json
         try:
             with redirect_stderr(io.StringIO()):
@@ -125,21 +129,20 @@ def report(result: runs.BatchOutcome, folder: Path) -> list[str]:
     if len(unfinished) > _MOST_LINES:
         lines.append(f'... and {len(unfinished) - _MOST_LINES} more in '
                      f'{batch_results.RESULTS_FILE}')
-    lines += [_combined_line(one) for one in result.combined.metrics if len(one.bags) > 1]
+    for one in result.combined.metrics:
+        if degrees := len(one.bags) > 1 and one.degrees_of_freedom:
+            scale = math.sqrt(max(one.chi2 / degrees, 1.0))
+            lines.append(
+                f'{one.metric}: {one.mean:.6g} +- {one.sigma:.2g}, of {degrees + 1} bags, chi2 '
+                f'{one.chi2:.3g} of {degrees} degrees of freedom'
+                + (f' (sigma times {scale:.2g})' if scale > 1.0 else '')
+                + (f'; outliers: {", ".join(one.outliers)}' if one.outliers else ''))
     if result.combined.quat_cam_imu_xyzw is not None:
         numbers = ', '.join(f'{value:.6f}' for value in result.combined.quat_cam_imu_xyzw)
         lines.append(f'quat_cam_imu_xyzw: [{numbers}]')
     lines.append(f'in {folder}: {batch_results.RESULTS_FILE}, {SUMMARY_FILE}, '
                  f'{batch_results.PICTURE_FILE}, and a folder for each bag')
     return lines
-
-
-def _combined_line(one: batch_results.Combined) -> str:
-    reduced = one.chi2 / max(one.degrees_of_freedom, 1)
-    return (f'{one.metric}: {one.mean:.6g} +- {one.sigma:.2g}, of {one.degrees_of_freedom + 1} '
-            f'bags, chi2 {one.chi2:.3g} of {one.degrees_of_freedom} degrees of freedom'
-            + (f' (sigma times {math.sqrt(reduced):.2g})' if reduced > 1.0 else '')
-            + (f'; outliers: {", ".join(one.outliers)}' if one.outliers else ''))
 
 
 def _request(args: argparse.Namespace) -> Request:
@@ -164,14 +167,3 @@ def _request(args: argparse.Namespace) -> Request:
     except SystemExit as end:   # argparse has printed the reason
         raise InputError(f'--options: {shlex.join(options)} are no options of {command}') from end
     return Request(command, tuple(args.bags), text, tuple(options), package_version())
-
-
-def _words(job: Job, scratch: Path, out: Path) -> list[str]:
-    words = [job.command, job.bag.path]
-    if job.parameters:
-        parameters = scratch / 'parameters.yaml'
-        parameters.write_text(job.parameters, encoding='utf-8')
-        words += ['--params', str(parameters)]
-    if job.command != 'check':
-        words += ['--out', str(out)]
-    return [*words, *job.options]

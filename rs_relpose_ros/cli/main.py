@@ -126,7 +126,11 @@ def _run(arguments: list[str]) -> int:
         return _report_error(f'error: {error}', BAD_INPUT)
     except SystemExit as end:  # argparse has printed the error or the help
         return end.code if isinstance(end.code, int) else BAD_INPUT
-    _set_up_logging(args.verbose)
+    logging.basicConfig(level=logging.WARNING, format='%(levelname)s %(name)s: %(message)s')
+    # Numba and Matplotlib would fill pages at level DEBUG.
+    for package in ('rs_relpose_ros', 'rs_relpose_lab'):
+        logging.getLogger(package).setLevel(
+            {0: logging.WARNING, 1: logging.INFO}.get(args.verbose, logging.DEBUG))
     try:
         return int(load_command(args.command).run(args))
     except BrokenPipeError:
@@ -143,14 +147,6 @@ def _run(arguments: list[str]) -> int:
 def _add_verbose(parser: argparse.ArgumentParser, default: Any) -> None:
     parser.add_argument('-v', '--verbose', action='count', default=default,
                         help='log the progress; twice for details')
-
-
-def _set_up_logging(verbosity: int) -> None:
-    level = {0: logging.WARNING, 1: logging.INFO}.get(verbosity, logging.DEBUG)
-    logging.basicConfig(level=logging.WARNING, format='%(levelname)s %(name)s: %(message)s')
-    # Numba and Matplotlib would fill pages at level DEBUG.
-    for package in ('rs_relpose_ros', 'rs_relpose_lab'):
-        logging.getLogger(package).setLevel(level)
 
 
 def _report_error(message: str, code: int) -> int:

@@ -57,7 +57,12 @@ def read_parameters(path: Path | str | None, assignments: Sequence[str] = (),
     if path is not None:
         values = file_values(Path(path), node)
         try:
-            _check_sigmas(values)
+            if any(values.get(sigma) for sigma in _SIGMAS.values()):
+                for name, sigma in _SIGMAS.items():
+                    if name in values and sigma not in values:
+                        raise InputError(f'{name} is given without {sigma}: a calibration file '
+                                         'has each parameter with its sigma, 0 if that is not '
+                                         'known')
             parameters = parameters.updated(values)
         except InputError as error:
             raise InputError(f'{path}: {error}') from error
@@ -151,15 +156,6 @@ def text_values(text: str, path: str, wanted: str = _NODE) -> dict[str, Any]:
         raise InputError(f'{path} has no parameters of {wanted}: they must be below "/**:" or '
                          f'"{wanted}:" and "ros__parameters:"')
     return _converted(values)
-
-
-def _check_sigmas(values: Mapping[str, Any]) -> None:
-    """InputError if a calibration file has a parameter without its sigma."""
-    if any(values.get(sigma) for sigma in _SIGMAS.values()):
-        for name, sigma in _SIGMAS.items():
-            if name in values and sigma not in values:
-                raise InputError(f'{name} is given without {sigma}: a calibration file has each '
-                                 'parameter with its sigma, 0 if that is not known')
 
 
 def _converted(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -308,8 +308,20 @@ class SampleRun:
                 self.reasons.add(outcome.reason)
                 continue
             self.frames += 1
-            if outcome.result is not None:
-                self._add_pair(outcome.result)
+            pair = outcome.result
+            if pair is None:
+                continue
+            self.matches.append(len(pair.matches))
+            if pair.pose:
+                self.poses += 1
+            else:
+                self.poseless.add(pair.pose.reason)
+            last, self._last = self._last, pair
+            if last is None or not 0 <= pair.stamp_ns - last.stamp_ns < _APART_NS:
+                self._before = findings.worst_of(self._before, pair.health)
+                self._part_since_ns = pair.stamp_ns
+            if pair.stamp_ns - self._part_since_ns >= _SETTLED_NS:
+                self._before = self.health
         self.is_refused = self.frames < _FEW_USED * self._handed
         self.few_poses = self.poses < _MOST_POSED * len(self.matches)
         self.is_lost = bool(self.matches) and (self.few_poses or not _FAR_OFF.isdisjoint(
@@ -336,17 +348,3 @@ class SampleRun:
                     continue
                 self._handed += 1
             yield role, message
-
-    def _add_pair(self, pair: PairResult) -> None:
-        self.matches.append(len(pair.matches))
-        if pair.pose:
-            self.poses += 1
-        else:
-            self.poseless.add(pair.pose.reason)
-        last = self._last
-        if last is None or not 0 <= pair.stamp_ns - last.stamp_ns < _APART_NS:
-            self._before = findings.worst_of(self._before, pair.health)
-            self._part_since_ns = pair.stamp_ns
-        self._last = pair
-        if pair.stamp_ns - self._part_since_ns >= _SETTLED_NS:
-            self._before = self.health

@@ -135,7 +135,18 @@ class Replay:
             if self.reasons.add(reason):
                 _logger.info('not used: %s', reason)
         self.seconds = time.perf_counter() - started
-        self._check_outcome()
+        if self._stamps is not None:
+            absent = len(self._stamps - self.intake.stamps_found)
+            if absent == len(self._stamps):
+                raise InputError(f'none of the {absent} chosen stamps is the stamp of an image on '
+                                 f'{self._topics.image.name}')
+            if absent:
+                _logger.warning('%d of the %d chosen stamps are not in the bag', absent,
+                                len(self._stamps))
+        most = next(iter(self.reasons.most_common()), None)
+        if most is not None and (not self.sequencer.counts().frames_taken
+                                 or (self.failed_frames and not self.pair_count)):
+            raise InputError(f'no frame of {self._bag.path} could be used: {most}')
 
     @property
     def health(self) -> Assessment:
@@ -147,20 +158,6 @@ class Replay:
             self.first_ns = self.first_ns or message.bag_time_ns
             self.last_ns = message.bag_time_ns
             yield role, message
-
-    def _check_outcome(self) -> None:
-        if self._stamps is not None:
-            absent = len(self._stamps - self.intake.stamps_found)
-            if absent == len(self._stamps):
-                raise InputError(f'none of the {absent} chosen stamps is the stamp of an image on '
-                                 f'{self._topics.image.name}')
-            if absent:
-                _logger.warning('%d of the %d chosen stamps are not in the bag', absent,
-                                len(self._stamps))
-        reason = next(iter(self.reasons.most_common()), None)
-        if reason is not None and (not self.sequencer.counts().frames_taken
-                                   or (self.failed_frames and not self.pair_count)):
-            raise InputError(f'no frame of {self._bag.path} could be used: {reason}')
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -90,7 +90,9 @@ class TrueTrajectory:
         return PairErrors(
             baseline=float(np.linalg.norm(t_true)), rotation=rotation_angle(R_true),
             rotation_error=rotation_angle(R.T @ R_true),
-            translation_error=direction_angle(t, t_true))
+            # The arc cosine loses digits at small angles.
+            translation_error=float(np.degrees(np.arctan2(
+                np.linalg.norm(np.cross(t, t_true)), t @ t_true))) if t_true.any() else np.nan)
 
 
 def rotation_angle(R: Array) -> float:
@@ -98,14 +100,6 @@ def rotation_angle(R: Array) -> float:
     if not np.isfinite(R).all():
         return float('nan')
     return float(np.degrees(Rotation.from_matrix(R).magnitude()))
-
-
-def direction_angle(a: Array, b: Array) -> float:
-    """Angle between two vectors [deg]; NaN if one is NaN or zero."""
-    if not (np.linalg.norm(a) > 0.0 and np.linalg.norm(b) > 0.0):
-        return float('nan')
-    # The arc cosine loses digits at small angles.
-    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), np.dot(a, b))))
 
 
 def median_and_p90(values: Sequence[float]) -> tuple[float, float]:

@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from rs_relpose_ros.bags import reader
 from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics, Topic
@@ -122,8 +121,15 @@ class _Unrolling:
                 message = self._bag.read(raw)
             elif role is Role.IMAGE:
                 message = self._bag.read(raw)
-                if not self._reserve(message, raw.bag_time_ns):
+                self._report.images_in_bag += 1
+                try:
+                    stamp: int = PARTS[role].read(message).stamp_ns
+                except RsRelposeError as error:
+                    self._reasons.add(str(error))
                     continue
+                self._places.append(_Place(raw.bag_time_ns))
+                self._stamps.add(stamp)
+                self._images.setdefault(stamp, deque()).append(self._places[-1])
             else:
                 self._report.copied += 1
                 self._places.append(_Place(raw.bag_time_ns, (partial(self._writer.copy, raw),)))
@@ -135,19 +141,6 @@ class _Unrolling:
                     continue
                 message = self._bag.read(raw)
             yield role, BagMessage(raw.topic, raw.bag_time_ns, message)
-
-    def _reserve(self, message: Any, bag_time_ns: int) -> bool:
-        """Reserve the place of an image; whether it is readable."""
-        self._report.images_in_bag += 1
-        try:
-            stamp: int = PARTS[Role.IMAGE].read(message).stamp_ns
-        except RsRelposeError as error:
-            self._reasons.add(str(error))
-            return False
-        self._places.append(_Place(bag_time_ns))
-        self._stamps.add(stamp)
-        self._images.setdefault(stamp, deque()).append(self._places[-1])
-        return True
 
     # -- images ------------------------------------------------------------------------------
 

@@ -85,7 +85,14 @@ class ConsistencyMonitor:
         (information, pose, configured), self._due = self._due, None
         if information is not None:
             try:
-                self._find_inconsistencies(information, pose, configured)
+                if self._recursion.relinearise():
+                    self.calibration = self._recursion.solved()
+                (self._on_poses if pose else self._on_rotations).append(_effect(information, pose))
+                # A deviation may be so large that no pair has a pose.
+                self._inconsistent = assessment.find_inconsistencies(
+                    self.calibration, self._on_poses or self._on_rotations, configured)
+                self._likely = self._deviation() if self._inconsistent else assessment.likely(
+                    self.calibration, configured)
             except np.linalg.LinAlgError:
                 self._inconsistent = []
         # The least lead of the IMU's clock, forwards or backwards; 0 if its sign changes.
@@ -99,17 +106,6 @@ class ConsistencyMonitor:
             self.acceleration.clear()
         if (finding := self.acceleration.finding()) is not None:
             self.health = Assessment((*self.health.findings, finding))
-
-    def _find_inconsistencies(self, information: recursion.PairInformation, pose: RelativePose,
-                              configured: Configured) -> None:
-        if self._recursion.relinearise():
-            self.calibration = self._recursion.solved()
-        (self._on_poses if pose else self._on_rotations).append(_effect(information, pose))
-        # A deviation may be so large that no pair has a pose.
-        self._inconsistent = assessment.find_inconsistencies(
-            self.calibration, self._on_poses or self._on_rotations, configured)
-        self._likely = self._deviation() if self._inconsistent else assessment.likely(
-            self.calibration, configured)
 
     def _add(self, stamp_ns: int, data: recursion.PairData, pose: RelativePose,
              configured: Configured) -> RelativePose:

@@ -94,21 +94,6 @@ def _cubic_constraints(basis: Array, M: Array) -> None:
                 _add_product(EET[3 * i + k], E[3 * k + j], 1.0, _TO_CUBIC, M[1 + 3 * i + j])
 
 
-@small_kernel
-def _rotate_basis(basis: Array) -> None:
-    """Another orthonormal basis (4, 9) of the same space, in place: a rotation by 60 degrees.
-
-    The quaternion ``(1 + i + j + k) / 2`` times (x, y, z, 1) combines every vector with all
-    others.
-    """
-    for m in range(9):
-        a, b, c, d = basis[0, m], basis[1, m], basis[2, m], basis[3, m]
-        basis[0, m] = 0.5 * (a - b - c - d)
-        basis[1, m] = 0.5 * (a + b - c + d)
-        basis[2, m] = 0.5 * (a + b + c - d)
-        basis[3, m] = 0.5 * (a - b + c + d)
-
-
 @kernel
 def _eliminate(M: Array) -> float:
     """Gauss-Jordan with row pivoting: identity in rows and columns 4 to 9.
@@ -154,7 +139,13 @@ def _reduced_constraints(basis: Array, M: Array) -> bool:
     coefficient = math.inf
     for attempt in range(3):
         if attempt > 0:
-            _rotate_basis(basis)
+            # A rotation by 60 degrees: the quaternion (1 + i + j + k) / 2 times (x, y, z, 1).
+            for m in range(9):
+                a, b, c, d = basis[0, m], basis[1, m], basis[2, m], basis[3, m]
+                basis[0, m] = 0.5 * (a - b - c - d)
+                basis[1, m] = 0.5 * (a + b - c + d)
+                basis[2, m] = 0.5 * (a + b + c - d)
+                basis[3, m] = 0.5 * (a - b + c + d)
         _cubic_constraints(basis, M)
         coefficient = _eliminate(M)
         if coefficient < 1e4:

@@ -164,29 +164,23 @@ def _decomposed(sample: Sample, factors: RowTimeFactors, R: Array) -> _Decompose
 
 
 @kernel
-def _by_rotation(sample: Sample, factors: RowTimeFactors, R: Array, y: Array) -> Array:
-    """``d(A(R) y) / dtheta`` (11, 3), R moving as ``Exp(theta) R``."""
-    out = np.empty((len(sample.f1), 3))
-    for k in range(len(out)):
-        # b = y_1 + p y_2 + q y_3, and d((f_1 x h) . b) / dtheta = h x (b x f_1) with h = R f_2
-        p, q = factors.p[k], factors.q[k]
-        b = (y[0] + p * y[3] + q * y[6], y[1] + p * y[4] + q * y[7], y[2] + p * y[5] + q * y[8])
-        out[k, 0], out[k, 1], out[k, 2] = so3.cross(
-            so3.rotated(R, sample.f2[k]), so3.cross(b, sample.f1[k]))
-    return out
-
-
-@kernel
 def _reach_rank_8(sample: Sample, factors: RowTimeFactors, R: Array, y: Array) -> bool:
     """Move `R` (3, 3) in place to a rotation with rank 8 of A(R) and null vector `y` (9,).
 
     Levenberg-Marquardt; the damping is relative to the squared norm of the Jacobian.
     """
     now, damping, J = _decomposed(sample, factors, R), 1e-8, np.empty((3, 3))
-    accepted = True
+    accepted, by_rotation, p, q = True, np.empty((len(sample.f1), 3)), factors.p, factors.q
     for _ in range(30):
         if accepted:
-            J = now.across @ _by_rotation(sample, factors, R, now.y)
+            for k in range(len(by_rotation)):
+                # b = y_1 + p y_2 + q y_3, and d((f_1 x h) . b) / dtheta = h x (b x f_1), h = R f_2
+                b = (now.y[0] + p[k] * now.y[3] + q[k] * now.y[6],
+                     now.y[1] + p[k] * now.y[4] + q[k] * now.y[7],
+                     now.y[2] + p[k] * now.y[5] + q[k] * now.y[8])
+                by_rotation[k, 0], by_rotation[k, 1], by_rotation[k, 2] = so3.cross(
+                    so3.rotated(R, sample.f2[k]), so3.cross(b, sample.f1[k]))
+            J = now.across @ by_rotation   # R moving as Exp(theta) R
         # The conditions are (sigma, 0, 0); least squares with the damping.
         U, s, Vt = np.linalg.svd(J)
         step = -now.sigma * Vt.T @ (s / (s**2 + damping * (s**2).sum()) * U[0])
