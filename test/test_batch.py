@@ -20,9 +20,8 @@ import numpy as np
 import pytest
 
 from rs_relpose_ros.cli import batch, main
-from rs_relpose_ros.offline import batch_results
-from rs_relpose_ros.offline.batch import Request, run_batch
-from rs_relpose_ros.offline.batch_results import Bag, Job, Outcome, State, Store
+from rs_relpose_ros.offline import batch as runs
+from rs_relpose_ros.offline.batch import Bag, Job, Outcome, Request, run_batch, State, Store
 
 pytest.importorskip('distributed', reason='needs the extra batch')
 # Clusters start, and a first run compiles kernels.
@@ -45,13 +44,13 @@ def test_bags_of_paths_and_globs(tmp_path, monkeypatch):
         (tmp_path / f'{name}.yaml').write_text(f'# {name}\n')
     (tmp_path / 'other').mkdir()
     (tmp_path / 'old.bag').write_bytes(b'12345')
-    found = batch_results.find_bags([str(tmp_path / name) for name in ('b', '*', 'absent')])
+    found = runs.find_bags([str(tmp_path / name) for name in ('b', '*', 'absent')])
     assert [Path(bag.path).name for bag in found] == ['b', 'a', 'old.bag', 'absent']
     assert [bag.size for bag in found] == [11, 11, 5, -1]
     assert [bag.parameters for bag in found] == ['# b\n', '# a\n', '', '']
     os.utime(tmp_path / 'a' / 'data.mcap', ns=(1, 4_000_000_000_000_000_000))
     monkeypatch.chdir(tmp_path.parent)
-    [relative] = batch_results.find_bags([f'{tmp_path.name}/a*'])
+    [relative] = runs.find_bags([f'{tmp_path.name}/a*'])
     assert relative.path == f'{tmp_path.name}/a'
     assert relative.changed_ns == 4_000_000_000_000_000_000
 
@@ -62,7 +61,7 @@ def test_bags_of_paths_and_globs(tmp_path, monkeypatch):
     (['/c/a/x', '/d/a/x'], ['c__a__x', 'd__a__x']),
     (['./x', 'x'], ['x_0', 'x_1'])])
 def test_names_of_results_differ(paths, names):
-    assert batch_results.unique_names(paths) == names
+    assert runs.unique_names(paths) == names
 
 
 @pytest.mark.parametrize('state', State)
@@ -109,7 +108,7 @@ def test_a_full_disk_is_reported_with_the_file(tmp_path, file):
     # Of two that disagree, neither is known to be wrong: the sigma grows.
     ([1.0, 2.0], [0.1, 0.1], 1.5, 0.5, 50.0, ())])
 def test_weighted_mean(values, sigmas, mean, sigma, chi2, outliers):
-    combined = batch_results.weighted_mean('x', 'abcdef'[:len(values)], values, sigmas)
+    combined = runs.weighted_mean('x', 'abcdef'[:len(values)], values, sigmas)
     assert (combined.mean, combined.sigma, combined.chi2) == pytest.approx((mean, sigma, chi2))
     assert combined.outliers == outliers
     assert combined.degrees_of_freedom == len(values) - len(outliers) - 1
@@ -119,7 +118,7 @@ def calibration(readout: float, observable: bool = True, yaw: float = 0.0) -> di
     """Columns of what `calibrate` writes."""
     def estimate(value: float, observed: bool = True) -> dict:
         return {'value': value, 'sigma': 0.0002, 'observable': observed, 'remark': 'turn more'}
-    return batch_results.metrics_of('calibrate', {
+    return runs.metrics_of('calibrate', {
         'shutter': 'rolling', 'readout_time_s': estimate(readout, observable),
         'time_offset_s': estimate(-0.01), 'focal_px': None,
         'gyro_bias_rad_per_s': [estimate(0.001 * k) for k in range(3)],
@@ -129,7 +128,7 @@ def calibration(readout: float, observable: bool = True, yaw: float = 0.0) -> di
 
 
 def test_calibrations_of_one_camera():
-    one_camera = batch_results.combine(
+    one_camera = runs.combine(
         {'a': calibration(0.0300, yaw=0.01), 'b': calibration(0.0302, yaw=0.012),
          'c': calibration(0.0301, yaw=0.011), 'd': calibration(0.9, observable=False, yaw=0.011)})
     combined = {one.metric: one for one in one_camera.metrics}

@@ -23,9 +23,7 @@ from rs_relpose_ros.cli.recordings import calibrate_bag, inspect_bag
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.offline import batch as runs
-from rs_relpose_ros.offline import batch_results
-from rs_relpose_ros.offline.batch import open_cluster, Request, run_on_worker
-from rs_relpose_ros.offline.batch_results import Job, Outcome, RESULT_FILES, State
+from rs_relpose_ros.offline.batch import Job, open_cluster, Outcome, Request, run_on_worker, State
 from rs_relpose_ros.output_files import refuse_unwritable, SUMMARY_FILE
 
 HELP = ('Run check, calibrate or replay over many bags: on processes of this machine, one thread '
@@ -41,7 +39,7 @@ _MOST_LINES = 20
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument('batch_command', metavar='COMMAND', choices=tuple(RESULT_FILES),
+    parser.add_argument('batch_command', metavar='COMMAND', choices=tuple(runs.RESULT_FILES),
                         help='check, calibrate or replay')
     parser.add_argument('bags', metavar='BAGS', nargs='+',
                         help='bags, or globs in quotes, as the workers see them')
@@ -100,12 +98,12 @@ def run_job(job: Job) -> Outcome:
         try:
             with redirect_stderr(io.StringIO()):
                 results = _WORK[job.command](make_parser(job.command).parse_args(words))
-            metrics = batch_results.metrics_of(job.command, results)
-            message = batch_results.message_of(job.command, results)
+            metrics = runs.metrics_of(job.command, results)
+            message = runs.message_of(job.command, results)
             state = State.FINDINGS if message else State.DONE
             if job.command == 'check':
                 text = json.dumps(results, indent=2, allow_nan=False) + '\n'
-                files[RESULT_FILES['check']] = text.encode()
+                files[runs.RESULT_FILES['check']] = text.encode()
         except RsRelposeError as error:
             message = str(error)
         except OSError as error:
@@ -128,7 +126,7 @@ def report(result: runs.BatchOutcome, folder: Path) -> list[str]:
               for row in unfinished[:_MOST_LINES]]
     if len(unfinished) > _MOST_LINES:
         lines.append(f'... and {len(unfinished) - _MOST_LINES} more in '
-                     f'{batch_results.RESULTS_FILE}')
+                     f'{runs.RESULTS_FILE}')
     for one in result.combined.metrics:
         if degrees := len(one.bags) > 1 and one.degrees_of_freedom:
             scale = math.sqrt(max(one.chi2 / degrees, 1.0))
@@ -140,8 +138,8 @@ def report(result: runs.BatchOutcome, folder: Path) -> list[str]:
     if result.combined.quat_cam_imu_xyzw is not None:
         numbers = ', '.join(f'{value:.6f}' for value in result.combined.quat_cam_imu_xyzw)
         lines.append(f'quat_cam_imu_xyzw: [{numbers}]')
-    lines.append(f'in {folder}: {batch_results.RESULTS_FILE}, {SUMMARY_FILE}, '
-                 f'{batch_results.PICTURE_FILE}, and a folder for each bag')
+    lines.append(f'in {folder}: {runs.RESULTS_FILE}, {SUMMARY_FILE}, '
+                 f'{runs.PICTURE_FILE}, and a folder for each bag')
     return lines
 
 

@@ -15,10 +15,9 @@ import numpy as np
 from rs_relpose_ros.estimator.velocity import InertialEvidence
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.motion import InertialMotion
-from rs_relpose_ros.geometry.so3 import aligning_rotation, log_so3, median
+from rs_relpose_ros.geometry.so3 import aligning_rotation, log_so3
 from rs_relpose_ros.geometry.timing import to_nanoseconds
 from rs_relpose_ros.imu.buffer import ForceFault
-from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.pipeline.findings import Finding, FindingState
 from rs_relpose_ros.pipeline.recursion import LastSeconds, MOST_PAIRS, WINDOW_NS
 
@@ -48,27 +47,9 @@ def rotation_of_rays(rays1: Array, rays2: Array) -> Array | None:
         return None
     first, second = rays1[finite], rays2[finite]
     rotation = aligning_rotation(first.T @ second)
-    return log_so3(aligning_rotation(_correlation(first, second, rotation)))
-
-
-@kernel
-def _correlation(rays1: Array, rays2: Array, rotation: Array) -> Array:
-    """``sum w a b^T`` (3, 3) of rays (N, 3); weights w by residuals of `rotation`."""
-    n = len(rays1)
-    squares, out = np.zeros(n), np.zeros((3, 3))
-    for i in range(n):
-        for j in range(3):
-            off = rays1[i, j]
-            for k in range(3):
-                off -= rotation[j, k] * rays2[i, k]
-            squares[i] += off * off
-    limit = max(median(squares.copy()), 1e-12)
-    for i in range(n):
-        weight = 1.0 / (1.0 + squares[i] / limit)
-        for j in range(3):
-            for k in range(3):
-                out[j, k] += weight * rays1[i, j] * rays2[i, k]
-    return out
+    squares = ((first - second @ rotation.T)**2).sum(axis=1)
+    weights = 1.0 / (1.0 + squares / max(float(np.median(squares)), 1e-12))
+    return log_so3(aligning_rotation((first.T * weights) @ second))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
