@@ -105,8 +105,6 @@ class Recording:
         return [sample for sample in samples if sample.stamp_ns <= end_ns]
 
 
-# -- Bags -----------------------------------------------------------------------------------------
-
 # Bag time [ns], topic, type, message.
 _Entry = tuple[int, str, str, Any]
 

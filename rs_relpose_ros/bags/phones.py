@@ -114,8 +114,6 @@ def _reals(rows: list[Row], column: str) -> list[float]:
     return [row.real(column) for row in rows if row.words.get(column, '') not in ('', 'null')]
 
 
-# -- Recordings of any logger as tables -----------------------------------------------------------
-
 _STAMPS = ('stamp_ns', 'timestamp_ns')
 
 
@@ -155,8 +153,6 @@ def read_tables(folder: Path) -> Recording:
 def _stamp(row: Row) -> int:
     return row.nanoseconds(next((name for name in _STAMPS if name in row.words), _STAMPS[0]))
 
-
-# -- Recordings with a line of JSON for each event ------------------------------------------------
 
 _VIDEOS = ('data.mp4', 'data.mov', 'data.mkv')
 # Times can begin at any value, also below 0, where stamps cannot be.
@@ -252,8 +248,6 @@ def _calibrated_camera(found: dict[str, Any], width: int, height: int) -> Rollin
         distortion=tuple(coefficients), readout_time=0.0)
 
 
-# -- MARS Logger ----------------------------------------------------------------------------------
-
 # How far the two clocks may drift apart during a recording [ns]; beyond it the phone slept.
 _MAX_DRIFT_NS = 1_000_000
 
@@ -314,8 +308,6 @@ def _clock(path: Path) -> tuple[int, str]:
     return differences[0], ("the camera's clock is not the IMU's; its stamps were shifted by the "
                             f'logged difference, {differences[0] * 1e-6:.3f} ms')
 
-
-# -- PoseCam --------------------------------------------------------------------------------------
 
 # From ARCore's camera (x right, y up, z backwards) to the optical frame (x right, y down).
 _GL_FROM_OPTICAL = Rotation.from_quat([1.0, 0.0, 0.0, 0.0])

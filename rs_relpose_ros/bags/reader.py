@@ -207,8 +207,6 @@ def _truncated(path: Path, at: int) -> InputError:
         f'"mcap recover {path.name} -o recovered.mcap"')
 
 
-# -- Topics of the sensors ------------------------------------------------------------------------
-
 @dataclass(frozen=True, slots=True)
 class Topic:
     """A topic of a bag with the number of its messages."""
@@ -347,8 +345,6 @@ class _TopicFinder:
 def _option(role: str) -> str:
     return f'--{role.replace("_", "-")}-topic'
 
-
-# -- Bags -----------------------------------------------------------------------------------------
 
 class BagMessage(NamedTuple):
     """A message with its topic and the time at which it was recorded [ns]."""

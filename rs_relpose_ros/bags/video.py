@@ -65,8 +65,6 @@ def read_video(path: Path, lens_profile: Path | None) -> Recording:
         accel=telemetry.accel)
 
 
-# -- Frames (PyAV) --------------------------------------------------------------------------------
-
 class Video:
     """The first video stream of a file, as it was encoded: a rotation for display is not applied.
 
@@ -133,8 +131,6 @@ class Video:
             raise InputError(
                 f'{self.path} is no video that can be read: {error.strerror}') from error
 
-
-# -- Readout time ---------------------------------------------------------------------------------
 
 # telemetry-parser and lens profiles add this to the milliseconds of columns.
 _BY_COLUMNS_MS = 10_000.0

@@ -29,8 +29,6 @@ _MOST_REASONS = 5
 _logger = logging.getLogger(__name__)
 
 
-# -- replay ----------------------------------------------------------------------------------
-
 def _add_replay_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_run_arguments(parser, 'relpose')
     parser.add_argument('--stamps', metavar='FILE', type=Path,
@@ -155,8 +153,6 @@ REPLAY = Command(
     'one of these parameters is wrong.', _add_replay_arguments, _replay)
 
 
-# -- pairs -----------------------------------------------------------------------------------
-
 def _add_pairs_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_run_arguments(parser, 'pairs')
     parser.add_argument('--list', metavar='FILE', type=Path, required=True,
@@ -196,8 +192,6 @@ PAIRS = Command(
     'The configured parameters are used as they are: run check or replay first. Exit code 1: no '
     'pair has a pose.', _add_pairs_arguments, _pairs)
 
-
-# -- odometry --------------------------------------------------------------------------------
 
 def _add_odometry_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_run_arguments(parser, 'odometry')
@@ -267,8 +261,6 @@ ODOMETRY = Command(
     'configured. Exit code 1: odometry did not start.',
     _add_odometry_arguments, _odometry)
 
-
-# -- export ----------------------------------------------------------------------------------
 
 def _add_export_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_bag_argument(parser)

@@ -33,8 +33,6 @@ _CALIBRATION_FILES = (CALIBRATION_FILE, 'calibration.json', 'cost_over_readout.p
 _logger = logging.getLogger(__name__)
 
 
-# -- calibrate -------------------------------------------------------------------------------
-
 def _add_calibrate_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_bag_argument(parser)
     options.add_out_argument(parser, 'calibration')
@@ -134,8 +132,6 @@ CALIBRATE = Command(
     _calibrate)
 
 
-# -- check -----------------------------------------------------------------------------------
-
 def _add_check_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_bag_argument(parser)
     options.add_parameter_arguments(parser)
@@ -174,8 +170,6 @@ CHECK = Command(
     'verdict (ok, unknown, warning, failure) and the suggested fix. Exit code 1: a defect makes '
     'the estimation fail or its poses wrong.', _add_check_arguments, _check)
 
-
-# -- convert ---------------------------------------------------------------------------------
 
 class Source(NamedTuple):
     """A format of recordings."""
@@ -255,8 +249,6 @@ CONVERT = Command(
     'its source. Stamps and JPEG images are copied unchanged. "rs_relpose convert SOURCE --help" '
     'describes a source.', _add_convert_arguments, _convert)
 
-
-# -- unroll ----------------------------------------------------------------------------------
 
 def _add_unroll_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_bag_argument(parser)

@@ -182,8 +182,6 @@ def undistort_points(points: Array, first_guesses: Array, distort: int,
     return out, inverse
 
 
-# -- The camera ---------------------------------------------------------------------------------
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RollingShutterCamera:
     """A calibrated camera whose rows are read one after the other.

@@ -37,8 +37,6 @@ Results = Mapping[str, Any]
 Metrics = Mapping[str, Any]
 
 
-# -- Bags, jobs and outcomes: sent to the workers and back ----------------------------------------
-
 class State(Enum):
     """How the work on a bag ended."""
 
@@ -138,8 +136,6 @@ def unique_names(paths: list[str]) -> list[str]:
         names = [f'{name}_{number}' for number, name in enumerate(names)]
     return names
 
-
-# -- Folder of results ----------------------------------------------------------------------------
 
 class Store:
     """The folder of the results; those of an earlier run are used again."""
@@ -356,8 +352,6 @@ def combine(calibrations: Mapping[str, Metrics]) -> CombinedCalibration:
         tuple(float(value) for value in mean.as_quat(canonical=True)))
 
 
-# -- Picture --------------------------------------------------------------------------------------
-
 # The two columns of each command that are drawn, their factors and labels.
 _DRAWN = {
     'check': (('failure', 1.0, 'failures'), ('warning', 1.0, 'warnings')),
@@ -397,8 +391,6 @@ def draw(command: str, rows: Sequence[Outcome], combined: Sequence[Combined], pa
     both[0].set_ylim(len(rows) - 0.4, -0.6)
     save_picture(picture, path)
 
-
-# -- Run on a cluster -----------------------------------------------------------------------------
 
 # How many workers may die over one bag before it is given up, less one.
 _ALLOWED_DEATHS = 1

@@ -471,8 +471,6 @@ def _texture(sample: SampleRun, health: Assessment) -> Finding:
              f', fewer than {_FEW_MATCHES} in {100 * poor:.0f} %'))
 
 
-# -- Configured parameters --------------------------------------------------------------------
-
 def _with_calibration(sample: SampleRun, scan: Scan, completion: Completion) -> Assessment:
     """Findings of the sample; if it is lost, the parameters that a calibration contradicts."""
     found, health = completion.found, sample.health
@@ -543,8 +541,6 @@ def _not_configured(name: str, completion: Completion, scan: Scan) -> Finding:
         text += f'; gravity points to the {sides[int(down[axis] > 0.0)]} of the image'
     return replace(unknown, message=text)
 
-
-# -- Rolling shutter --------------------------------------------------------------------------
 
 def _effect(scan: Scan, health: Assessment, parameters: Parameters) -> Finding | None:
     """Displacement of the last row relative to the first by rotation alone [px]."""

@@ -36,8 +36,6 @@ from rs_relpose_ros.pipeline.pipeline import FrontEnd
 from rs_relpose_ros.pipeline.warm_up import warm_up
 from rs_relpose_ros.tracking.images import EncodedImage
 
-# -- One pass over the bag -------------------------------------------------------------------
-
 # Uncertainty of the bias before it is measured at rest, 1 sigma [rad/s]; the gate is four times
 # that.
 _BIAS_SIGMA = 0.03
@@ -148,8 +146,6 @@ class Scan:
         rest = self._buffer.bias(self._buffer.newest_ns or 0)
         return rest if rest.sigma < _BIAS_SIGMA else None
 
-
-# -- Samples ---------------------------------------------------------------------------------
 
 # Parts of consecutive images, evenly over the recording: three times 10 s at 30 Hz; and images of
 # a calibration.

@@ -314,8 +314,6 @@ def read_stamps(path: Path | str) -> frozenset[int]:
     return stamps
 
 
-# -- Pairs of a list --------------------------------------------------------------------------
-
 # Columns of the list, those of the tables of `replay`: these are valid lists.
 LIST_COLUMNS = POSES.columns[:2]
 # The table of `replay`, and the reason of a pair without a pose.

@@ -50,8 +50,6 @@ class PairRecord:
                    None if truth is None else truth.errors(pose.R, pose.t, ns1, ns2))
 
 
-# -- tables ----------------------------------------------------------------------------------
-
 class Table(NamedTuple):
     """A CSV file, its columns, and the row of a record; no row for None."""
 
@@ -142,8 +140,6 @@ def rotation_sigmas(covariance: Array) -> tuple[float, float, float]:
     x, y, z = np.sqrt(np.maximum(np.diag(covariance)[3:], 0.0))
     return float(x), float(y), float(z)
 
-
-# -- summary.json ----------------------------------------------------------------------------
 
 def write_summary(path: Path, metrics: dict[str, Any], *, bag: Path, topics: SensorTopics,
                   parameters: Parameters, command: Sequence[str], package_version: str) -> None:

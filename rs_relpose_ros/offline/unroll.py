@@ -107,8 +107,6 @@ class _Unrolling:
                 'stereo)')
         return self._report
 
-    # -- messages of the bag -----------------------------------------------------------------
-
     def _messages(self, topics: list[Topic]) -> Iterator[tuple[Role, BagMessage]]:
         """Messages of camera and IMU; all messages get their places."""
         roles = {(topic.name, topic.msgtype): role for role in (
@@ -141,8 +139,6 @@ class _Unrolling:
                     continue
                 message = self._bag.read(raw)
             yield role, BagMessage(raw.topic, raw.bag_time_ns, message)
-
-    # -- images ------------------------------------------------------------------------------
 
     def _settle(self, stamp: int, result: GlobalShutterFrame | None) -> None:
         """Fill the place of an image, with its CameraInfo."""

@@ -382,8 +382,6 @@ def _fault(quantity: str, message: str, fix: str, state: FindingState = FindingS
     return Finding(quantity, state, message, fix, configured, estimated, None, unit, True)
 
 
-# -- Values of a quantity from its deviation -------------------------------------------------
-
 def _values(quantity: Quantity, left: Array, sigmas: Array,
             configured: Configured) -> tuple[Finding, object]:
     """A consistent finding with the values of a quantity, and the value to set.
@@ -418,8 +416,6 @@ def _values(quantity: Quantity, left: Array, sigmas: Array,
                    float(active[component]), value, sigma, quantity.unit,
                    True), value if setting is None else setting
 
-
-# -- Gross errors ----------------------------------------------------------------------------
 
 def gross_errors(rotations: RotationComparison | None, ahead: float, configured: Configured,
                  before: tuple[Finding, ...] = ()) -> tuple[Finding, ...]:

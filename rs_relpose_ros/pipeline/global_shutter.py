@@ -109,8 +109,6 @@ class MiddleRow:
                       intrinsics.image_height, float(shift))
 
 
-# -- Derotated frames ---------------------------------------------------------------------------
-
 _BORDERS = {'replicate': cv2.BORDER_REPLICATE, 'black': cv2.BORDER_CONSTANT}
 
 

@@ -155,8 +155,6 @@ def _effect(information: recursion.PairInformation, pose: RelativePose) -> Effec
         np.linalg.cholesky(claimed), information.pose_by_deviation[rows], lower=True))
 
 
-# -- Errors that all tracks of a pair share ------------------------------------------------------
-
 class Agreement:
     """How far consecutive pairs agree about the direction of motion at the keyframe they share.
 
@@ -213,8 +211,6 @@ def _disagreement(before: RelativePose, after: RelativePose) -> float:
               + after.linear_velocity1_covariance / lengths[1]**2)
     return float(apart @ np.linalg.solve(across.T @ spread @ across, apart))
 
-
-# -- Tracked parameters, applied in small steps ---------------------------------------------
 
 # 1 sigma [s] below which an estimate is applied.
 _APPLIED_SIGMA = 2e-3
