@@ -16,8 +16,7 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from rs_relpose_ros.config.declare import Declared
-from rs_relpose_ros.config.settings import Parameters
+from rs_relpose_ros.config.settings import Declared, Parameters
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.nodes import diagnostics
 from rs_relpose_ros.nodes.diagnostics import (

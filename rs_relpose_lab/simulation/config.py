@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.simulation.motions import Plan
 from rs_relpose_lab.simulation.scene import SCENES
-from rs_relpose_ros.config.declare import setting, Settings
+from rs_relpose_ros.config.settings import setting, Settings
 from rs_relpose_ros.geometry import validate
 from rs_relpose_ros.geometry.camera import READOUT_DIRECTIONS, REFERENCE_ROWS, RollingShutterCamera
 

@@ -17,8 +17,7 @@ from typing import Any
 
 import yaml
 
-from rs_relpose_ros.config.declare import ANY_VALUE
-from rs_relpose_ros.config.settings import Parameters
+from rs_relpose_ros.config.settings import ANY_VALUE, Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
 
 _NODE = 'relpose_node'

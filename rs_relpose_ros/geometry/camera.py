@@ -51,17 +51,10 @@ def distort_equidistant(x: float, y: float, k: Array, out: Array) -> None:
     out[4], out[5] = slope * x * y, scale + slope * y * y
 
 
-@kernel
 def ideal_fisheye(points: Array) -> Array:
     """Undistorted points of the ideal fisheye: from the distorted ones, Newton overshoots."""
-    out = points.copy()
-    for i in range(len(points)):
-        u, v = points[i, 0], points[i, 1]
-        angle = math.sqrt(u * u + v * v)
-        if angle > 1e-8:
-            scale = math.tan(min(angle, 1.5)) / angle
-            out[i, 0], out[i, 1] = u * scale, v * scale
-    return out
+    angles = np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-8)
+    return np.asarray(points * np.tan(np.minimum(angles, 1.5)) / angles)
 
 
 @kernel

@@ -11,8 +11,7 @@ from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from rs_relpose_ros.config.declare import Declared
-from rs_relpose_ros.config.settings import Parameters
+from rs_relpose_ros.config.settings import Declared, Parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.nodes.inputs import SHUT_DOWN
 

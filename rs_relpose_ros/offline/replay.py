@@ -194,7 +194,7 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
     prepare_folder(folder, (POSES.file, ERRORS.file, SUMMARY_FILE, *PICTURES))
     records: list[PairRecord] = []
     shown: PairResult | None = None
-    last, health = None, NOT_EVALUATED
+    last, health, best = None, NOT_EVALUATED, (False, 0.0)
     written = (POSES,) if truth is None else (POSES, ERRORS)
     with ExitStack() as stack:
         write_record = stack.enter_context(tables.table_writer(folder, written))
@@ -209,8 +209,10 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
                     writer.write(f'/relpose_node/{topic}', PAIR_TOPICS[topic], message,
                                  run.last_ns)
             on_pair(pair)
-            if pictures and (shown is None or _picture_rank(pair) > _picture_rank(shown)):
-                shown = pair
+            # The better picture: with a pose, many inliers and much parallax.
+            rank = bool(pair.pose), float(pair.pose.inliers.sum() * pair.parallax)
+            if pictures and (shown is None or rank > best):
+                shown, best = pair, rank
     health = worst_of(health, run.health)
     files = [folder / table.file for table in written] + [out_bag] * with_bag
     if shown is not None:
@@ -219,11 +221,6 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
         files += draw_replay([folder / name for name in PICTURES], records, shown, truth)
     return ReplayOutcome(records, _summary(records, run, last, health), health, files,
                          run.intake.intrinsics)
-
-
-def _picture_rank(pair: PairResult) -> tuple[bool, float]:
-    """Larger for the better picture: with a pose, many inliers and much parallax."""
-    return bool(pair.pose), float(pair.pose.inliers.sum() * pair.parallax)
 
 
 def _summary(records: list[PairRecord], run: Replay, last: PairResult | None,

@@ -161,12 +161,12 @@ def write_summary(path: Path, metrics: dict[str, Any], *, bag: Path, topics: Sen
 
 def baselines(answered: Sequence[PairRecord]) -> dict[str, Any]:
     """Number of poses with a metric baseline, its median sigma, and the reasons of the others."""
-    known = [record.pose.baseline_log_sigma for record in answered
-             if not record.pose.baseline_reason]
-    reasons = ReasonCounts()
+    known, reasons = [], ReasonCounts()
     for record in answered:
         if record.pose.baseline_reason:
             reasons.add(record.pose.baseline_reason)
+        else:
+            known.append(record.pose.baseline_log_sigma)
     return {'known': len(known), 'log_sigma_median': median(known),
             'not_known': reasons.most_common()}
 

@@ -55,11 +55,6 @@ class RowMap(NamedTuple):
     height: int
     shift: float   # [px] largest difference of a coordinate of a node and its source
 
-    @property
-    def complete(self) -> bool:
-        """Whether every node has a source."""
-        return not np.isnan(self.nodes).any()
-
     def bands(self) -> Iterator[tuple[slice, NDArray[np.float32]]]:
         """Bands of rows of the image and their sources (N, W, 2), for `cv2.remap`.
 
@@ -130,12 +125,12 @@ class GlobalShutterFrame:
     def image(self) -> Pixels:
         """The derotated image, in the encoding of the original."""
         values, border = self.original.values, _BORDERS[self.border]
-        complete, derotated = self.map.complete, np.empty_like(values)
+        has_holes, derotated = np.isnan(self.map.nodes).any(), np.empty_like(values)
         for rows, sources in self.map.bands():
             # None, as the types forbid: OpenCV 5 takes an empty second map for one.
             derotated[rows] = cv2.remap(values, sources, None,  # type: ignore[call-overload]
                                         cv2.INTER_LINEAR, borderMode=border)
-            if not complete:
+            if has_holes:
                 derotated[rows][np.isnan(sources[..., 0])] = 0
         return Pixels(derotated, self.original.encoding)
 
