@@ -10,9 +10,8 @@ C.-R. Lee and K.-J. Yoon, *Inertial-aided Rolling Shutter Relative Pose Estimati
 'Minimal Algorithms' and 'Solver'.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -70,51 +69,44 @@ class MinimalSolution:
     v2: Array
 
 
-class MinimalSolver(Protocol):
-    """Signature of the solvers."""
+# Behind the description of each solver.
+_ARGUMENTS = """
 
-    __name__: str
+    Parameters
+    ----------
+    rays1, rays2 : ({n}, 3) array_like
+        Rays, each in its own camera's frame, of any length but zero; {rays}.
+    tau1, tau2 : ({n},) array_like
+        Row times [s] relative to the reference row.
+    gravity1, gravity2 : (3,) array_like
+        Direction of free fall in each camera's frame at the reference row, of any length; used by
+        `uniform_9pt`, `linear_9pt` and `angular_3pt`.
+    start_rotations : (K, 3, 3) array_like
+        Rotations from which `uniform_11pt` starts: the gyro's prediction, or those of
+        `angular_5pt`.
 
-    def __call__(self, rays1: ArrayLike, rays2: ArrayLike, tau1: ArrayLike, tau2: ArrayLike, *,
-                 gravity1: ArrayLike | None = None, gravity2: ArrayLike | None = None,
-                 start_rotations: ArrayLike | None = None) -> list[MinimalSolution]:
-        """Solve one minimal sample of n matches.
+    Returns
+    -------
+    list of MinimalSolution
+        All real solutions; of `uniform_11pt` the distinct solutions that it reaches. Of
+        (t, v1, v2) and its negative, which solve the same equations, the one with more of the
+        points in front of both cameras, at the positions of the cameras at their rows.
 
-        Parameters
-        ----------
-        rays1, rays2 : (n, 3) array_like
-            Rays, each in its own camera's frame, of any length but zero; as measured for
-            `linear_9pt` and `global_5pt`, derotated by the gyro for all others.
-        tau1, tau2 : (n,) array_like
-            Row times [s] relative to the reference row.
-        gravity1, gravity2 : (3,) array_like
-            Direction of free fall in each camera's frame at the reference row, of any length; used
-            by `uniform_9pt`, `linear_9pt` and `angular_3pt`.
-        start_rotations : (K, 3, 3) array_like
-            Rotations from which `uniform_11pt` starts: the gyro's prediction, or those of
-            `angular_5pt`.
-
-        Returns
-        -------
-        list of MinimalSolution
-            All real solutions; of `uniform_11pt` the distinct solutions that it reaches. Of
-            (t, v1, v2) and its negative, which solve the same equations, the one with more of the
-            points in front of both cameras, at the positions of the cameras at their rows.
-
-        Raises
-        ------
-        InputError
-            A wrong shape, a value that is not finite, a zero vector, a start that is not a
-            rotation, or a missing argument that the solver uses.
-        """
+    Raises
+    ------
+    InputError
+        A wrong shape, a value that is not finite, a zero vector, a start that is not a rotation,
+        or a missing argument that the solver uses.
+    """
 
 
-def as_function(row: Solver) -> MinimalSolver:
+def as_function(row: Solver) -> Callable[..., list[MinimalSolution]]:
     """The solver of a row as a pure function."""
+    n = row.sample_size
+
     def solve(rays1: ArrayLike, rays2: ArrayLike, tau1: ArrayLike, tau2: ArrayLike, *,
               gravity1: ArrayLike | None = None, gravity2: ArrayLike | None = None,
               start_rotations: ArrayLike | None = None) -> list[MinimalSolution]:
-        n = row.sample_size
         sample = Sample(validate.unit_vectors('rays1', rays1, (n, 3)),
                         validate.unit_vectors('rays2', rays2, (n, 3)),
                         validate.array('tau1', tau1, (n,)), validate.array('tau2', tau2, (n,)))
@@ -133,8 +125,9 @@ def as_function(row: Solver) -> MinimalSolver:
         return found
 
     solve.__name__ = solve.__qualname__ = row.name
-    solve.__doc__ = (f'{row.summary}\n\n    Of {row.sample_size} matches; arguments and result as '
-                     f'in `MinimalSolver`.\n\n    {row.solve.__doc__}')
+    rays = 'derotated by the gyro' if row.model.derotated else 'as measured'
+    solve.__doc__ = f'{row.summary}\n\n    {str(row.solve.__doc__).rstrip()}' + _ARGUMENTS.format(
+        n=n, rays=rays)
     return solve
 
 
