@@ -414,13 +414,9 @@ class BatchOutcome:
     """All bags, in their order, and their combined calibration."""
 
     rows: tuple[Outcome, ...]
+    states: Counter[State]   # number of bags of each state
     combined: CombinedCalibration
     reused: int   # bags with results of an earlier run
-
-    @property
-    def states(self) -> Counter[State]:
-        """Number of bags of each state."""
-        return Counter(row.state for row in self.rows)
 
 
 def run_batch(client: Any, request: Request, folder: Path, work: Callable[[Job], Outcome],
@@ -454,7 +450,7 @@ def run_batch(client: Any, request: Request, folder: Path, work: Callable[[Job],
     store.write_table(rows)
     combined = combine({row.job.name: row.metrics for row in rows if (
         row.metrics and request.command == 'calibrate')})
-    result = BatchOutcome(rows, combined, reused)
+    result = BatchOutcome(rows, Counter(row.state for row in rows), combined, reused)
     summary = {
         'command': request.command, 'options': list(request.options),
         'version': request.version, 'bags': len(rows),
