@@ -226,11 +226,12 @@ class Sequencer:
                 self._refuse(stamp_ns, Refusal.BAD_IMAGE, 'exposure_time is longer than the '
                              f'interval between frames, {interval_ns / NANOSECONDS:.4f} s')
                 return
+            reference_ns = clock.reference_ns(stamp_ns, interval_ns)
+            newest_ns = self._buffer.gyro.newest_ns
             self._queue.append(QueuedFrame(
-                image, intrinsics, clock.exposed_span_ns(stamp_ns, interval_ns),
-                clock.reference_ns(stamp_ns, interval_ns), clock.exposure(interval_ns),
-                received_ns=self._now(), generation=self._generation, ahead=self._ahead(
-                    clock.reference_ns(stamp_ns, interval_ns))))
+                image, intrinsics, clock.exposed_span_ns(stamp_ns, interval_ns), reference_ns,
+                clock.exposure(interval_ns), received_ns=self._now(), generation=self._generation,
+                ahead=0.0 if newest_ns is None else seconds_between(reference_ns, newest_ns)))
             self._update_queue()
 
     def pass_over(self, stamp_ns: int) -> None:
@@ -354,10 +355,6 @@ class Sequencer:
             return None
         self._queue.popleft()
         return self._counted(head.image.stamp_ns, refusal, reason)
-
-    def _ahead(self, reference_ns: int) -> float:
-        newest_ns = self._buffer.gyro.newest_ns
-        return 0.0 if newest_ns is None else seconds_between(reference_ns, newest_ns)
 
     def _update_queue(self) -> None:
         """Mark the frames that the IMU covers by now, and keep the queue within its bounds."""
