@@ -251,7 +251,7 @@ class SensorInputs:
         self.stamps_ns.append(stamp_ns(image.header))
         # An unusable image is refused by the sequencer, which counts it.
         self._intake.receive(Role.IMAGE, image)
-        self._drain_imu()
+        self._drain()
         self._timer.reset()   # no wake-up of its own while images come
 
     def _on_info(self, data: bytes, *, latched: bool) -> None:
@@ -279,10 +279,5 @@ class SensorInputs:
         self._last_ns[role] = time.monotonic_ns()
 
     def _drain(self) -> None:
-        self._camera_info.drain()
-        self._latched.drain()
-        self._drain_imu()
-
-    def _drain_imu(self) -> None:
-        for subscription in self._imu:
+        for subscription in (self._camera_info, self._latched, *self._imu):
             subscription.drain()

@@ -1,8 +1,7 @@
 """relpose_node: publishes the keyframe pairs of a rolling-shutter camera with an IMU."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 from rclpy.node import Node
 from scipy.spatial.transform import Rotation
@@ -69,13 +68,8 @@ class RelposeNode(SensorNode):
     def _on_processed(self, frame: Frame[PairResult]) -> None:
         if frame.result is not None:
             config = self._settings.current.pair
-            messages = outgoing.pair_parts(frame.result, message_class, config.reference_frame)
-            self._outputs.publish({'relative_pose': messages.pop('relative_pose')}
-                                  if frame.result.pose else {})
-            self._statistics.add_pair(frame.result, frame.ready_ns)
-            self._outputs.publish(messages)
-            self._outputs.publish_transform(frame.result, config)
-            self._outputs.publish_picture(frame.result, config)
+            self._outputs.publish(frame.result, config, partial(
+                self._statistics.add_pair, frame.result, frame.ready_ns))
             self._log_health(frame.result.health, withhold=config.withhold_when_wrong)
         if self._timings is not None:
             self._timings.add(frame)
@@ -95,14 +89,16 @@ class PairPublishers:
         self._transforms = (transform_broadcaster(node, 'publish_tf') if config.publish_tf
                             else None)
 
-    def publish(self, messages: Mapping[str, Callable[[], Any]]) -> None:
-        """Make and publish the messages of topics that are subscribed."""
-        for topic, make in messages.items():
+    def publish(self, result: PairResult, config: PairConfig, published: Callable[[], object],
+                ) -> None:
+        """Publish what is known of a pair and subscribed; `published` follows the first topic."""
+        parts = outgoing.pair_parts(result, message_class, config.reference_frame)
+        first = next(iter(parts))
+        for topic, make in parts.items():
             if self._pair[topic].get_subscription_count():
                 self._pair[topic].publish(make())
-
-    def publish_transform(self, result: PairResult, config: PairConfig) -> None:
-        """Publish the pose of a pair as a transform, if that is wanted."""
+            if topic == first:
+                published()
         if self._transforms is not None and result.pose:
             # The camera has its parent in the robot's tree already, and a frame has only one: so
             # the reference is the child, by the pose's inverse. Its origin is one baseline away,
@@ -113,9 +109,6 @@ class PairPublishers:
                 config.reference_frame or f'{result.frame_id}_reference',
                 quaternion * [-1.0, -1.0, -1.0, 1.0],
                 -Rotation.from_quat(quaternion).inv().apply(result.pose.t), message_class))
-
-    def publish_picture(self, result: PairResult, config: PairConfig) -> None:
-        """Publish ~/debug_image of any pair, if it is subscribed."""
         if config.publish_debug_image and self._debug_image.get_subscription_count():
             self._debug_image.publish(outgoing.image_message(
                 result.stamp_ns, result.frame_id, Pixels(outgoing.draw_pair(result), 'bgr8'),
