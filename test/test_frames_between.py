@@ -281,7 +281,10 @@ def test_optimum_is_that_of_an_independent_fit():
 
 
 def test_no_frames_between_change_nothing(scene):
-    """And frames that cannot be used leave the two-view estimate, with a reason."""
+    """And frames that cannot be used leave the two-view estimate, with a reason.
+
+    That starts at the gyro's rotation instead of samples: at the same optimum, but for rounding.
+    """
     two = scene.pose(between=())
     nothing = np.full((len(scene.arguments['points1']), 2), np.nan)
     lost = [replace(frame, points=nothing) for frame in scene.between]
@@ -298,7 +301,8 @@ def test_no_frames_between_change_nothing(scene):
         assert bool(reason) == bool(other.frames_reason)
         for name in ('R', 't', 'covariance', 'linear_velocity1', 'linear_velocity2', 'inliers',
                      'baseline', 'baseline_log_sigma', 'velocity_covariance', 'pixel_sigma'):
-            np.testing.assert_array_equal(getattr(other, name), getattr(two, name))
+            np.testing.assert_allclose(getattr(other, name), getattr(two, name),
+                                       rtol=1e-7 if reason else 0.0, atol=1e-12 if reason else 0.0)
     without_gyro = scene.pose(relative_rotation=None, relative_rotation_covariance=None,
                               inertial=None)
     assert without_gyro.frames == 2 and 'gyro' in without_gyro.frames_reason

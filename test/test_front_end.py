@@ -207,6 +207,9 @@ CHANGED: dict[str, Any] = {
 BESIDE: dict[str, dict[str, Any]] = {
     # Many samples are needed: the hypotheses of a solver without priors, few of which fit.
     'confidence': {'solver': 'uniform_9pt', 'threshold': 0.2},
+    # By default the gyro's rotation needs no samples.
+    'max_iterations': {'solver': 'uniform_9pt'},
+    'time_limit': {'solver': 'uniform_9pt'},
     # So far off that the consistency monitor reports it as wrong.
     'withhold_when_wrong': {'time_offset': 0.03}}
 # Has an effect on what the node publishes.

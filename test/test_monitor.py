@@ -258,8 +258,7 @@ def test_pairs_leave_the_window_and_an_earlier_stamp_restarts():
     for stamp_ns, left in ((22_500 * MS, 3), (10_000 * MS, 1)):
         sums.add(stamp_ns, pair, NONE, NONE)
         assert sums.solved().pairs == left
-    sums.clear()
-    assert sums.solved() is recursion.NOTHING_ESTIMATED
+    assert Recursion().solved() is recursion.NOTHING_ESTIMATED
     np.testing.assert_array_equal(recursion.NOTHING_ESTIMATED.sigma, recursion.PRIOR_SIGMA)
 
 

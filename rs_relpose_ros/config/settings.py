@@ -426,6 +426,9 @@ class IntrinsicsConfig(Settings):
             **pinhole_of_matrix('camera_matrix', self.camera_matrix))
 
 
+_matrix = lru_cache(maxsize=16)(lambda quat_xyzw: Rotation.from_quat(quat_xyzw).as_matrix())
+
+
 @dataclass(frozen=True, slots=True)
 class SensorConfig(Settings):
     """Readout, clock and axes of camera and IMU, which no message provides."""
@@ -488,7 +491,7 @@ class SensorConfig(Settings):
         if self.quat_cam_imu_xyzw is None:
             raise MissingInputError('parameter quat_cam_imu_xyzw is not set: give the rotation '
                                     'from IMU to camera, v_cam = R(q) v_imu, as [x, y, z, w]')
-        return Rotation.from_quat(self.quat_cam_imu_xyzw).as_matrix()
+        return _matrix(self.quat_cam_imu_xyzw).copy()
 
     def missing(self) -> list[str]:
         """Names of the required settings that are not given."""

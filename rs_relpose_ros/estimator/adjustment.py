@@ -85,13 +85,6 @@ class Tracks(NamedTuple):
     number: int   # N
 
 
-def no_observations(rotations: Array, duration: float, count: int) -> Tracks:
-    """Room for `count` tracks in V frames of the `rotations` (V, 3, 3)."""
-    shape = len(rotations), -(-count // BLOCK)
-    return Tracks(np.zeros((*shape, VALUES, BLOCK)), np.zeros((*shape, BLOCK), dtype=np.bool_),
-                  rotations, duration, count)
-
-
 @kernel
 def fill_view(tracks: Tracks, v: int, used: Flags, rays: Array, jacobian: Array, times: Array,
               rotations: Array, row_rotation: Array, interval: float, alpha: Array, beta: Array,

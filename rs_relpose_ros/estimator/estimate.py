@@ -19,7 +19,7 @@ from rs_relpose_ros.estimator import (
     sampson,
     velocity,
 )
-from rs_relpose_ros.estimator.frames_between import IntermediateFrame
+from rs_relpose_ros.estimator.frames_between import checked_rotation, IntermediateFrame
 from rs_relpose_ros.estimator.priors import Priors, TwoViewState, VelocityPrior
 from rs_relpose_ros.estimator.problem import build_problem, to_reference_row, TwoViewProblem
 from rs_relpose_ros.estimator.result import landmarks, RelativePose, Status
@@ -33,11 +33,6 @@ from rs_relpose_ros.solvers.common import Solutions
 
 # -- Arguments of `estimate_relative_pose`: each error names the argument -------------------------
 
-# Pixels beyond this are no pixels. Of a predicted rotation [rad^2]: far above that of an unknown
-# rotation, which is 10.
-_LARGEST_PIXEL, _LARGEST_COVARIANCE = 1e6, 1e12
-
-
 def _checked_matches(points1: ArrayLike, points2: ArrayLike, quality: ArrayLike | None,
                      ) -> tuple[Array, Array, NDArray[np.int64]]:
     """Pixels (N, 2) of both frames, and the sampling order of the matches."""
@@ -46,25 +41,12 @@ def _checked_matches(points1: ArrayLike, points2: ArrayLike, quality: ArrayLike 
     for name, value in (('points1', points1), ('points2', points2)):
         empty = value.size == 0 if isinstance(value, np.ndarray) else value in ([], ())
         checked.append(validate.array(name, np.empty((0, 2)) if empty else value, (count, 2),
-                                      largest=_LARGEST_PIXEL, unit='px'))
+                                      largest=frames_between.LARGEST_PIXEL, unit='px'))
         count = len(checked[0])
     if quality is None:
         return checked[0], checked[1], np.arange(count)
     order = np.argsort(-validate.array('quality', quality, (count,)), kind='stable')
     return checked[0], checked[1], order
-
-
-def _checked_rotation(rotation: ArrayLike | None, covariance: ArrayLike | None,
-                      ) -> tuple[Array | None, Array | None]:
-    """A predicted rotation with its covariance, or None twice."""
-    if rotation is None and covariance is None:
-        return None, None
-    if rotation is None or covariance is None:
-        raise InputError('relative_rotation and relative_rotation_covariance go together: give '
-                         'both or neither')
-    return (validate.rotations('relative_rotation', rotation),
-            validate.covariance('relative_rotation_covariance', covariance, 3,
-                                largest=_LARGEST_COVARIANCE, unit='rad^2', rounding=1e-12))
 
 
 def _checked_interval(interval: float | None, inertial: InertialMotion | None) -> float | None:
@@ -95,6 +77,8 @@ SAMPLING_VELOCITY_SIGMA = 3.0
 ENOUGH = 0.5
 # First columns of the rays f_1 and f_2 in an observation.
 RAYS = (0, 9)
+# And at which the gyro's rotation with one direction of translation needs no other hypothesis.
+CERTAIN = 0.75
 # Noise of |f_1 - R f_2| is 1.67 sigma in the median (Rayleigh, two images).
 ROTATION_ONLY_SIGMAS = 2.5
 # Least chi-square of the acceleration (6 degrees of freedom; 99 % of pure noise lie below) and
@@ -160,13 +144,13 @@ def estimate_relative_pose(
     started = time.perf_counter()
     config = EstimatorConfig() if config is None else config
     points1, points2, order = _checked_matches(points1, points2, quality)
-    rotation, spread = _checked_rotation(relative_rotation, relative_rotation_covariance)
+    rotation, spread = checked_rotation(relative_rotation, relative_rotation_covariance)
     interval = frames_between.check(between, points1, _checked_interval(interval, inertial))
     mode = _checked_mode(config, motion1, motion2)
     problem = build_problem(points1, points2, camera, motion1, motion2, rotation, spread,
                             mode.model.derotated)
     seed = np.array([np.random.default_rng(rng).integers(2**63)], dtype=np.uint64)
-    pose = Estimation(problem, mode, config, order, seed, interval, inertial).run()
+    pose = Estimation(problem, mode, config, order, seed, interval, inertial).run(bool(between))
     pose = _certain(frames_between.refined(pose, points1, motion1, (
         points2, motion2, interval, rotation, spread, inertial), between, camera, config), config)
     if global_shutter_pixels and pose:
@@ -227,12 +211,14 @@ class Estimation:
         # Whether solvers were skipped, since one before them had enough inliers.
         self.solvers_skipped = False
 
-    def run(self) -> RelativePose:
-        """The pose, or the reason why there is none."""
+    def run(self, warm: bool = False) -> RelativePose:
+        """The pose, or the reason why there is none; `warm`: samples only if `_by_gyro` fails."""
         if len(self.order) < self.config.min_inliers:
             return self._failure(Status.TOO_FEW_MATCHES,
                                  f'{len(self.order)} usable matches, fewer than min_inliers = '
                                  f'{self.config.min_inliers}')
+        if warm and (state := self._by_gyro()) is not None:
+            return self._completed(state)
         # 1. Hypotheses from minimal samples, ranked by multi-scale MSAC.
         return self.refine(self.sample())
 
@@ -240,13 +226,32 @@ class Estimation:
         """All steps after the first."""
         # 2. Local optimisation of each; the best in the cost of the full model.
         state = self._best(hypotheses)
-        if self.solvers_skipped and (state is None or ENOUGH >= float(sampson.select_inliers(
-                self.matches, state, self.config.threshold).sum()) / len(self.order)):
+        if self.solvers_skipped and (state is None or self._share(state) <= ENOUGH):
             # Inliers of an angular hypothesis by chance are outliers of the uniform model.
             state = self._best(self.sample(enough=1.0))
         if state is None:
             return self._failure(Status.NO_CONSENSUS, 'no hypothesis is consistent with the '
                                  'matches')
+        return self._completed(state)
+
+    def _share(self, state: TwoViewState) -> float:
+        """Share of the matches that are inliers of a state."""
+        return float(sampson.select_inliers(self.matches, state, self.config.threshold).sum()
+                     ) / len(self.order)
+
+    def _by_gyro(self) -> TwoViewState | None:
+        """The state from the gyro's rotation, if it explains the matches."""
+        R = self.problem.rotation
+        if R is None or self.config.solver != 'auto' or self.config.refinement != 'map':
+            return None
+        t = sampling.translation_direction(self.problem.observations[self.problem.valid], R)
+        velocity = self.priors.velocity.rate * t
+        state = self._best(Solutions(np.ascontiguousarray(R)[None],
+                                     np.concatenate([t, velocity, velocity])[None]))
+        return state if state is not None and self._share(state) > CERTAIN else None
+
+    def _completed(self, state: TwoViewState) -> RelativePose:
+        """Steps 3 to 5, from the best state."""
         # 3. Refinement on its inliers.
         refined = self._refined(state)
         if reason := self._no_consensus(refined.inliers):

@@ -11,24 +11,12 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
 from rs_relpose_ros.config.settings import EstimatorConfig, MOTIONS
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator import adjustment
-from rs_relpose_ros.estimator.adjustment import (
-    ACCELERATION,
-    Adjusted,
-    BIAS,
-    LOG_SCALE,
-    MOST_ACCELERATIONS,
-    PathPriors,
-    PathState,
-    TANGENT,
-    TIME,
-    TO_PIXELS,
-    Tracks,
-)
+from rs_relpose_ros.estimator.adjustment import BIAS, PathPriors, PathState, TANGENT, Tracks
 from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.estimator.velocity import CORRELATION_TIME, span_of_scales
 from rs_relpose_ros.geometry import Array, validate
@@ -50,7 +38,22 @@ _LEAST_TRACKS, _MOST_TRACKS = 10, 200
 # other: 4 sigmas are then twice that, the largest limit of an inlier. All tracks have the errors
 # of the frames, so that the covariance would be too small.
 _LARGEST_NOISE = 0.5
-_LARGEST_PIXEL = 1e6
+# Pixels beyond this are no pixels. Of a predicted rotation [rad^2]: far above that of an unknown
+# rotation, which is 10.
+LARGEST_PIXEL, _LARGEST_COVARIANCE = 1e6, 1e12
+
+
+def checked_rotation(rotation: ArrayLike | None, covariance: ArrayLike | None,
+                     of: str = '') -> tuple[Array | None, Array | None]:
+    """A predicted rotation with its covariance, or None twice."""
+    if rotation is None and covariance is None:
+        return None, None
+    if rotation is None or covariance is None:
+        raise InputError(f'relative_rotation and relative_rotation_covariance{of} go together: '
+                         'give both or neither')
+    return (validate.rotations(f'relative_rotation{of}', rotation),
+            validate.covariance(f'relative_rotation_covariance{of}', covariance, 3,
+                                largest=_LARGEST_COVARIANCE, unit='rad^2', rounding=1e-12))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,19 +89,13 @@ class IntermediateFrame:
     def __post_init__(self) -> None:
         points = np.asarray(self.points, dtype=np.float64)
         validate.array('points of a frame between', np.nan_to_num(points, nan=0.0, posinf=np.inf),
-                       ('N', 2), largest=_LARGEST_PIXEL, unit='px')
+                       ('N', 2), largest=LARGEST_PIXEL, unit='px')
         object.__setattr__(self, 'points', np.ascontiguousarray(points))
         validate.number('interval of a frame between', self.interval, 1e-6, 1e6, 's')
-        if (self.relative_rotation is None) != (self.relative_rotation_covariance is None):
-            raise InputError('relative_rotation and relative_rotation_covariance of a frame '
-                             'between go together: give both or neither')
-        if self.relative_rotation is not None:
-            assert self.relative_rotation_covariance is not None
-            object.__setattr__(self, 'relative_rotation', validate.rotations(
-                'relative_rotation of a frame between', self.relative_rotation))
-            object.__setattr__(self, 'relative_rotation_covariance', validate.covariance(
-                'relative_rotation_covariance of a frame between',
-                self.relative_rotation_covariance, 3, rounding=1e-12))
+        R, of_R = checked_rotation(self.relative_rotation, self.relative_rotation_covariance,
+                                   ' of a frame between')
+        object.__setattr__(self, 'relative_rotation', R)
+        object.__setattr__(self, 'relative_rotation_covariance', of_R)
         if self.inertial is not None and not math.isclose(
                 self.inertial.duration, self.interval, abs_tol=1e-6):
             raise InputError('the interval of a frame between must equal the duration of its '
@@ -136,14 +133,6 @@ class _View(NamedTuple):
     covariance: Array
     inertial: InertialMotion | None
 
-    @classmethod
-    def of(cls, frame: IntermediateFrame, inliers: NDArray[np.intp]) -> _View | None:
-        """With the tracks `inliers` (N,); None without the gyro's rotation."""
-        if frame.relative_rotation is None or frame.relative_rotation_covariance is None:
-            return None
-        return cls(frame.points[inliers], frame.motion, frame.interval, frame.relative_rotation,
-                   frame.relative_rotation_covariance, frame.inertial)
-
 
 def refined(pose: RelativePose, points1: Array, motion1: FrameMotion, second: tuple[Any, ...],
             between: Sequence[IntermediateFrame], camera: RollingShutterCamera,
@@ -160,14 +149,16 @@ def refined(pose: RelativePose, points1: Array, motion1: FrameMotion, second: tu
     inliers = np.flatnonzero(pose.inliers)   # new corners are spread in this order
     if len(inliers) > _MOST_TRACKS:
         inliers = inliers[np.linspace(0, len(inliers) - 1, _MOST_TRACKS).astype(int)]
-    last = _View.of(IntermediateFrame(*second), inliers)
-    if last is None:
+    if second[3] is None:
         return replace(pose, frames_reason='there is no rotation by the gyro')
+    last = _View(second[0][inliers], *second[1:])
     views = [_View(points1[inliers], motion1, 0.0, np.eye(3), np.zeros((3, 3)), None)]
     for frame in between:
-        view = _View.of(frame, inliers)
-        if view is not None and np.isfinite(view.points[:, 0]).sum() >= _LEAST_TRACKS:
-            views.append(view)
+        points, R, of_R = (frame.points[inliers], frame.relative_rotation,
+                           frame.relative_rotation_covariance)
+        if not (R is None or of_R is None) and (
+                np.isfinite(points[:, 0]).sum() >= _LEAST_TRACKS):
+            views.append(_View(points, frame.motion, frame.interval, R, of_R, frame.inertial))
     if len(views) == 1:
         return replace(pose, frames_reason='no frame between has a rotation by the gyro and '
                        f'{_LEAST_TRACKS} inliers of the pair')
@@ -181,7 +172,8 @@ def refined(pose: RelativePose, points1: Array, motion1: FrameMotion, second: tu
         adjusted = adjustment.adjust(tracks, priors, state, expected, _SIGMA_FREEDOM)
         state = adjusted.state
         tracks.used[adjusted.far] = False
-        tracks.observations.swapaxes(2, 3)[adjusted.far, TO_PIXELS:TIME] = 0.0
+        tracks.observations.swapaxes(2, 3)[
+            adjusted.far, adjustment.TO_PIXELS:adjustment.TIME] = 0.0
     distances = state.tracks[:, adjustment.INVERSE_DISTANCE][tracks.used[0]]
     if not (np.isfinite(adjusted.covariance).all() and np.median(distances) > 0.0):
         return replace(pose, frames_reason='the adjustment of all frames does not converge')
@@ -231,8 +223,10 @@ def _tracks(views: Sequence[_View], path: _Path, camera: RollingShutterCamera) -
             & (points[..., 1] <= camera.height - 1.0))
     used &= used[0]
     rows = np.where(used, points[..., 1], camera.reference_row_index)
-    tracks = adjustment.no_observations(
-        np.array([view.rotation for view in views]), views[-1].interval, shape[1])
+    blocks = shape[0], -(-shape[1] // adjustment.BLOCK)
+    tracks = Tracks(np.zeros((*blocks, adjustment.VALUES, adjustment.BLOCK)),
+                    np.zeros((*blocks, adjustment.BLOCK), dtype=bool),
+                    np.array([view.rotation for view in views]), views[-1].interval, shape[1])
     times = camera.row_times(rows)
     for v, view in enumerate(views):
         adjustment.fill_view(
@@ -253,9 +247,9 @@ def _priors(views: Sequence[_View], path: _Path,
     walk = max(first - of_bias * times[0], 0.0) + _LEAST_WALK**2
     # Errors of the stamps, of the first frame for all others.
     rates = np.array([view.rotation @ view.motion.angular_velocity for view in views])
-    covariance = np.kron(walk * np.minimum.outer(times, times), np.eye(3))
-    covariance += np.kron(np.ones((len(times), len(times))),
-                          config.stamp_sigma**2 * np.outer(rates[0], rates[0]))
+    covariance: Array = np.kron(walk * np.minimum.outer(times, times), np.eye(3))
+    covariance += np.tile(config.stamp_sigma**2 * np.outer(rates[0], rates[0]),
+                          (len(times), len(times)))
     for k, rate in enumerate(rates[1:]):
         block = slice(3 * k, 3 * k + 3)
         covariance[block, block] += config.stamp_sigma**2 * np.outer(rate, rate)
@@ -263,15 +257,15 @@ def _priors(views: Sequence[_View], path: _Path,
     variances = (np.array([_GRAVITY_SIGMA**2]) if path.known else
                  _of_carrier(MOTIONS[config.motion].acceleration, views[-1].interval))
     return PathPriors(-0.5 * (lowest + highest), 12.0 / (highest - lowest)**2, 1.0 / of_bias,
-                      1.0 / variances, np.linalg.inv(covariance))
+                      1.0 / variances, np.asarray(np.linalg.inv(covariance), dtype=np.float64))
 
 
 def _of_carrier(sigma: float, interval: float) -> Array:
     """Variances (K,) of the Legendre coefficients of an exponentially correlated acceleration."""
     x, weights = np.polynomial.legendre.leggauss(16)
-    order = np.arange(MOST_ACCELERATIONS)
+    order = np.arange(adjustment.MOST_ACCELERATIONS)
     to_coefficients = (order[:, None] + 0.5) * weights * np.polynomial.legendre.legvander(
-        x, MOST_ACCELERATIONS - 1).T
+        x, adjustment.MOST_ACCELERATIONS - 1).T
     correlation = np.exp(-0.5 * interval * np.abs(x[:, None] - x) / CORRELATION_TIME)
     return np.asarray(sigma**2 * np.diag(to_coefficients @ correlation @ to_coefficients.T))
 
@@ -289,7 +283,7 @@ def _start(pose: RelativePose, views: Sequence[_View], tracks: Tracks,
         rotations, adjustment.start_of_tracks(tracks, np.ascontiguousarray(pose.R), pose.t))
 
 
-def _result(pose: RelativePose, adjusted: Adjusted, tracks: Tracks, priors: PathPriors,
+def _result(pose: RelativePose, adjusted: adjustment.Adjusted, tracks: Tracks, priors: PathPriors,
             path: _Path, views: int) -> RelativePose:
     """The two-view result with the pose, its covariance and the velocities of all frames."""
     state, C, T = adjusted.state, adjusted.covariance, tracks.duration
@@ -297,7 +291,7 @@ def _result(pose: RelativePose, adjusted: Adjusted, tracks: Tracks, priors: Path
     off = T * state.bias + state.rotations[-1]   # from the gyro's rotation
     R = exp_so3(off) @ tracks.rotations[-1]
     by_state = np.zeros((6, n))
-    by_state[:3, TANGENT:LOG_SCALE] = tangent_basis(state.t)
+    by_state[:3, TANGENT:adjustment.LOG_SCALE] = tangent_basis(state.t)
     by_state[3:, BIAS:BIAS + 3], by_state[3:, -3:] = T * np.eye(3), np.eye(3)
     # B_j' at both ends.
     bends = T * np.array([[-0.5, 1.0 / 6.0, 0.0], [0.5, 1.0 / 6.0, 0.0]])[
@@ -305,10 +299,10 @@ def _result(pose: RelativePose, adjusted: Adjusted, tracks: Tracks, priors: Path
     # p' at both ends (2, 3), in the axes of camera 1, and its derivatives.
     of_scale = k * (np.array(path.ends) - path.chord / T + bends @ state.accelerations)
     velocities, derivatives = state.t / T + of_scale, np.zeros((2, 3, n))
-    derivatives[..., TANGENT:LOG_SCALE] = by_state[:3, TANGENT:LOG_SCALE] / T
-    derivatives[..., LOG_SCALE] = of_scale
-    derivatives[..., ACCELERATION:ACCELERATION + bends.shape[1] * 3] = k * np.kron(
-        bends[:, None], np.eye(3))
+    derivatives[..., TANGENT:adjustment.LOG_SCALE] = by_state[:3, TANGENT:adjustment.LOG_SCALE] / T
+    derivatives[..., adjustment.LOG_SCALE] = of_scale
+    of_accelerations = derivatives[..., adjustment.ACCELERATION:]
+    of_accelerations[..., :bends.shape[1] * 3] = k * np.kron(bends[:, None], np.eye(3))
     by_first, by_second = derivatives
     # R^T p' rotates with the error of R.
     by_second = R.T @ (by_second + skew(velocities[1]) @ by_state[3:])
@@ -323,7 +317,7 @@ def _result(pose: RelativePose, adjusted: Adjusted, tracks: Tracks, priors: Path
         linear_velocity1=velocities[0], linear_velocity1_covariance=by_first @ C @ by_first.T,
         linear_velocity2=R.T @ velocities[1], velocity_covariance=velocity_covariance,
         baseline=1.0 / k if known else pose.baseline,
-        baseline_log_sigma=(math.sqrt(C[LOG_SCALE, LOG_SCALE]) if known
+        baseline_log_sigma=(math.sqrt(C[adjustment.LOG_SCALE, adjustment.LOG_SCALE]) if known
                             else pose.baseline_log_sigma),
         frames=views, gyro_square=float(off @ np.linalg.solve(of_gyro, off)),
         pixel_sigma=adjusted.sigma)

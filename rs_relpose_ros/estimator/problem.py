@@ -65,15 +65,19 @@ def build_problem(points1: Array, points2: Array, camera: RollingShutterCamera,
 
 
 def observed(points1: Array, points2: Array, camera: RollingShutterCamera, motion1: FrameMotion,
-             motion2: FrameMotion, derotate: bool = True) -> Array:
-    """Observations (N, 20) of matched pixels (N, 2); motions at the middle row."""
+             motion2: FrameMotion, derotate: bool = True,
+             rotations: tuple[Array, Array] | None = None) -> Array:
+    """Observations (N, 20) of matched pixels (N, 2); motions at the middle row.
+
+    `rotations`: (N, 3, 3) of their rows in both frames, if they are known.
+    """
     delay, observations = middle_row_delay(camera), np.empty((len(points1), 20))
     for k, (points, motion) in enumerate(((points1, motion1), (points2, motion2))):
         rays, jacobian = camera.unproject_with_jacobian(points)
         tau = camera.row_times(points[:, 1]) - delay
         observations[:, 18 + k], block = tau, observations[:, 9 * k:9 * k + 9]
         if derotate:
-            _derotate(rays, jacobian, motion.rotations(tau),
+            _derotate(rays, jacobian, motion.rotations(tau) if rotations is None else rotations[k],
                       camera.line_delay * motion.angular_velocity, block)
         else:
             _derotate(rays, jacobian, np.tile(np.eye(3), (len(points), 1, 1)), np.zeros(3), block)

@@ -426,10 +426,7 @@ def gain_without_gyro(matches: RayMatches, state: TwoViewState, prior: Priors, f
     start = so3.aligning_rotation(correlation(observations, use, 0, 9))
     spread = so3.median(transfer_errors(observations, use, start, focal))
     R, _ = fit_rotation(observations, use, start, free, focal, 0.5 * spread)
-    # The direction nearest to all epipolar planes.
-    normals = np.cross(observations[:, :3], observations[:, 9:12] @ R.T)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-3)[:, None]
-    t = np.ascontiguousarray(np.linalg.eigh(normals.T @ normals)[1][:, 0])
+    t = translation_direction(observations, R)
     velocity = prior.velocity.rate * t
     state = TwoViewState(R, t, velocity, velocity.copy(), np.zeros(3), np.zeros(3))
     state = priors.signed(state, sampson.cheirality_sign(observations, use, state))
@@ -442,6 +439,13 @@ def gain_without_gyro(matches: RayMatches, state: TwoViewState, prior: Priors, f
         weights = 1.0 / (1.0 + (r / (_FREE_SIGMAS * sigma))**2)
         state = gauss_newton(FitMatches(observations, weights, sigma), state, free, _FREE_STEPS)
     return gain, state.R
+
+
+def translation_direction(observations: Array, R: Array) -> Array:
+    """Unit vector (3,) nearest to the epipolar planes of observations (N, 20) for a rotation."""
+    normals = np.cross(observations[:, :3], observations[:, 9:12] @ R.T)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-3)[:, None]
+    return np.ascontiguousarray(np.linalg.eigh(normals.T @ normals)[1][:, 0])
 
 
 # -- Distribution of the inliers' rays: do they determine a pose? ---------------------------------

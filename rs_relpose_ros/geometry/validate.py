@@ -72,9 +72,9 @@ def array(name: str, value: ArrayLike | None, shape: tuple[int | str, ...], *,
         checked = np.array(value, dtype=np.float64, order='C')
     except (TypeError, ValueError):
         raise InputError(f'{name} must be an array of numbers, got {value!r}') from None
-    if checked.ndim != len(shape) or any(
+    if checked.shape != shape and (checked.ndim != len(shape) or any(
             isinstance(size, int) and size != found
-            for size, found in zip(shape, checked.shape, strict=True)):
+            for size, found in zip(shape, checked.shape, strict=True))):
         comma = ',' if len(shape) == 1 else ''
         raise InputError(f'{name} must have shape ({", ".join(map(str, shape))}{comma}), '
                          f'got {checked.shape}')
@@ -122,9 +122,9 @@ def covariance(name: str, value: ArrayLike, size: int, *, largest: float = _FLOA
                unit: str = '', rounding: float = 1e-9) -> Array:
     """A symmetric matrix (size, size) without eigenvalues below ``-rounding``."""
     matrix = array(name, value, (size, size), largest=largest, unit=unit)
-    asymmetry = np.abs(matrix - matrix.T).max()
-    if asymmetry > _ROUNDING_SYMMETRY * max(1.0, np.abs(matrix).max()) \
-            or np.linalg.eigvalsh(matrix)[0] < -rounding:
+    most = np.abs(matrix).max()
+    if most > 0.0 and (np.abs(matrix - matrix.T).max() > _ROUNDING_SYMMETRY * max(1.0, most)
+                       or np.linalg.eigvalsh(matrix)[0] < -rounding):
         raise InputError(f'{name} must be a covariance matrix (symmetric, no negative '
                          f'eigenvalue), got {matrix.tolist()}')
     return matrix

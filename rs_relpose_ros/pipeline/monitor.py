@@ -48,6 +48,7 @@ class ConsistencyMonitor:
         self.latest: recursion.PairInformation | None = None   # of the last pair
         self._inconsistent: list[Inconsistency] = []
         self._likely = np.zeros(DEVIATIONS)   # about which pairs are linearised
+        self._undetermined: Array | None = None   # by the pairs before
         self._gross: tuple[Finding, ...] = ()
         # Seconds by which stamps of the IMU are ahead as images arrive, of the last frames.
         self.ahead: deque[float] = deque(maxlen=_ARRIVALS)
@@ -95,6 +96,7 @@ class ConsistencyMonitor:
                     self.calibration, configured)
             except np.linalg.LinAlgError:
                 self._inconsistent = []
+            self._undetermined = assessment.undetermined(self.calibration, configured)
         # The least lead of the IMU's clock, forwards or backwards; 0 if its sign changes.
         ahead = max(min(self.ahead, default=0.0), 0.0) + min(max(self.ahead, default=0.0), 0.0)
         self._gross = assessment.gross_errors(
@@ -121,8 +123,10 @@ class ConsistencyMonitor:
         shift = by_deviation @ self._deviation()
         # The inconsistency, deviations that the pairs so far have not excluded, and the center.
         by_center = configured.center_sigma * information.pose_by_center
+        if self._undetermined is None:
+            self._undetermined = assessment.undetermined(self.calibration, configured)
         doubt = np.outer(shift, shift) + by_center @ by_center.T + (
-            by_deviation @ assessment.undetermined(self.calibration, configured) @ by_deviation.T)
+            by_deviation @ self._undetermined @ by_deviation.T)
         pose = replace(pose, covariance=pose.covariance + doubt)
         # The effect of an inconsistent parameter on the baseline is not known.
         return pose.without_baseline('baseline not known: a configured parameter is inconsistent '

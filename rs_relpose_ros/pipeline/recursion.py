@@ -31,6 +31,7 @@ from rs_relpose_ros.estimator.covariance import image_regions, REGIONS
 from rs_relpose_ros.estimator.fit import FitMatches, gauss_newton
 from rs_relpose_ros.estimator.priors import inverse, PARAMETERS, TANGENT, THETA, TwoViewState
 from rs_relpose_ros.estimator.problem import build_problem, observed, TwoViewProblem
+from rs_relpose_ros.estimator.sampling import translation_direction
 from rs_relpose_ros.estimator.sampson import jacobian, residuals
 from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
@@ -223,10 +224,7 @@ def _state(pair: PairData, problem: TwoViewProblem, observations: Array, prior: 
                              @ problem.motion2.rotations([delay])[0].T)
     t = pair.t
     if not np.isfinite(t).all():
-        # The direction nearest to all epipolar planes.
-        normals = np.cross(observations[:, :3], observations[:, 9:12] @ R.T)
-        t = np.ascontiguousarray(np.linalg.eigh(normals.T @ normals)[1][:, 0])
-        fit = True
+        t, fit = translation_direction(observations, R), True
     velocity = t / pair.interval
     state = TwoViewState(R, t, velocity, velocity.copy(), np.zeros(3), np.zeros(3))
     if not fit:
@@ -268,9 +266,11 @@ def _by_lens(pair: PairData, problem: TwoViewProblem, rows: _Rows, keep: NDArray
     pixels would shrink with a longer focal length.
     """
     columns, points1, points2 = [], pair.points1[keep], pair.points2[keep]
+    rotations = (problem.motion1.rotations(problem.observations[keep, 18]),
+                 problem.motion2.rotations(problem.observations[keep, 19]))
     for step in _STEP * np.eye(4):
         observations = observed(points1, points2, _lens(pair.camera, *step), problem.motion1,
-                                problem.motion2)
+                                problem.motion2, rotations=rotations)
         if at.any():
             observations = rows.displaced(observations, at)
         columns.append((residuals(observations, state) - r) / _STEP)
