@@ -134,7 +134,7 @@ def fill_cache() -> None:
     points1, points2, camera, motion = _sideways()
     pose = RelativePose(status=Status.OK, inliers=np.ones(len(points1), dtype=bool),
                         R=np.eye(3), t=np.eye(3)[0], residual_rms=1.0)
-    frames_between.refined(pose, points1, motion, (points2, motion, 0.2, *_ROTATION),
+    frames_between.refined(pose, points1, motion, (points2, motion, 0.2, *_ROTATION, None),
                            [_halfway()], camera, EstimatorConfig())
     _estimation().sample()   # with what the other process has compiled by then
     other_half.join()
