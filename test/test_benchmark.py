@@ -329,18 +329,15 @@ def test_information_of_a_rotation(quantity, axis, rates, low, high):
 
 @pytest.mark.recordings
 def test_a_phone_that_rotates_on_the_spot_has_no_finding(converted):
-    """At 3.4 s a pair of 27 deg has no translation; an invented one contradicted the axes.
-
-    With a focal length of 500 px, 18 more than the right one, images and gyro contradict each
-    other in that pair; with the right one it has a translation.
-    """
+    """At 3.4 s a pair of 27 deg has no translation with 18 px too much of the focal length."""
     name = 'android_phone_rs'
     bag = converted(name, 'android')
     right = (ROOT / 'rs_relpose_lab' / 'recordings' / f'{name}.yaml').read_text()
     bag.with_suffix('.yaml').write_text(right.replace('482.0', '500.0'))
     recording = trust_runs.recording_at(bag)
     pairs = [pair for pair, _ in trust_runs.run(recording, recording.configured, 4.5)]
-    assert [pair.stamp_ns // 10**8 % 10**4 for pair in pairs if not pair.pose] == [4381]
+    assert [pair.stamp_ns // 10**8 % 10**4 for pair in pairs if not pair.pose] == [
+        4353, 4381]   # the first one has too little parallax
     assert not [pair.health.faults for pair in pairs if pair.health.faults]
 
 

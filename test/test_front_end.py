@@ -293,7 +293,7 @@ def test_publishing_of_debug_images_can_be_switched_while_running(recorded, para
     outputs = PairPublishers(node, parameters.pair)
     for wanted, pictures in ((True, 1), (False, 1), (True, 2)):
         config = parameters.updated({'publish_debug_image': wanted}).pair
-        outputs.publish_picture(pair, config)
+        outputs.publish(pair, config, lambda: None)
         assert publishers['~/debug_image'].publish.call_count == pictures
 
 # -- the walk of one image -------------------------------------------------------------------
@@ -306,8 +306,6 @@ def walk_of_a_pair(recorded: list[Any], parameters: Parameters) -> dict[tuple[st
     """Functions that are given, or return, an image or a pair: whether from another module.
 
     From the callback of the image to the publication of its pair, in order, without properties.
-    Functions below those (camera model, IMU filters, tracker, monitor, and the estimator) get only
-    parts of it.
     """
     folder = str(Path(rs_relpose_ros.__file__).parent)
     entered: list[Any] = []
@@ -339,7 +337,7 @@ def walk_of_a_pair(recorded: list[Any], parameters: Parameters) -> dict[tuple[st
     relpose._on_processed = partial(RelposeNode._on_processed, relpose)
     for role, message in recorded:
         if role is not Role.IMAGE:
-            inputs._on_sample(role, message)
+            inputs._receive(role, message)
             continue
         entered.clear()
         sys.setprofile(profile)
@@ -370,7 +368,7 @@ def test_the_walk_of_one_image_is_short(recorded, parameters):
           sep='\n')
     assert next(iter(walk)) == ('nodes/inputs.py', 'SensorInputs._on_image')
     assert walk['pipeline/sequencer.py', 'Sequencer.take']
-    assert walk['messages/outgoing.py', 'pair_messages']
+    assert walk['messages/outgoing.py', 'pair_parts']
     assert sum(walk.values()) <= 12
     assert len(walk) <= 20
 

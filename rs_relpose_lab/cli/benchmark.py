@@ -251,10 +251,12 @@ def _cases_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_cases(args: argparse.Namespace) -> int:
-    from rs_relpose_lab.experiments import live_cases as cases
-    chosen = [cases.CASES[name] for name in matching_cells(args.cells, cases.CASES)]
-    return _report_of(chosen, lambda case: cases.run_case(case, args.output / 'walk'),
-                      cases.write_report, args, 'case')
+    from rs_relpose_lab.experiments import live_cases
+    from rs_relpose_lab.live.live_cases import CASES
+
+    chosen = [CASES[name] for name in matching_cells(args.cells, CASES)]
+    return _report_of(chosen, lambda case: live_cases.run_case(case, args.output / 'walk'),
+                      live_cases.write_report, args, 'case')
 
 
 def _compare_live(args: argparse.Namespace, cells: Sequence[str]) -> int:

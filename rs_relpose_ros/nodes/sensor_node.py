@@ -12,7 +12,6 @@ import os
 from pathlib import Path
 import sys
 import threading
-import time
 import traceback
 from typing import Any, ClassVar, NoReturn, TYPE_CHECKING
 
@@ -32,7 +31,6 @@ from rs_relpose_ros.calibrate.stored import Calibrated, Progress
 from rs_relpose_ros.config.files import text_values
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, RsRelposeError
-from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.messages import outgoing
 from rs_relpose_ros.messages.incoming import Intake, PARTS, Role
 from rs_relpose_ros.messages.transforms import extrinsics
@@ -204,8 +202,6 @@ class Worker(threading.Thread):
 
 # Time [s] for the worker to end: a frame takes less, compiling takes longer.
 _JOIN_TIMEOUT = 0.4
-# Time [s] of a start after which it is said that kernels are compiled, if they are.
-_REPORT_COMPILING = 4.0
 
 
 def _camera(parameters: Parameters) -> list[Any]:
@@ -328,18 +324,16 @@ class SensorNode(StoppableNode):
             self._loop = self._make_loop(parameters)
             self._intake = Intake(self._loop.sequencer, parameters)
             self._worker = Worker(self._loop, self._warm_up, self._consume)
+        if not cache_is_filled():
+            self._info('compiling kernels, as the build has none for this machine: this start '
+                       'takes a minute or two, later ones some seconds')
         self._worker.start()
-        self._started_ns = time.monotonic_ns()
         # No subscription before the kernels are loaded: the first frames would be dropped.
         self._warm_timer = self.create_timer(0.02, self._subscribe_when_warm, clock=self._steady)
 
     def _subscribe_when_warm(self) -> None:
         assert self._worker is not None
         if not self._worker.warm.is_set():
-            if (time.monotonic_ns() - self._started_ns > _REPORT_COMPILING * NANOSECONDS
-                    and not cache_is_filled()):
-                self._info('compiling kernels, as the build has none for this machine: this start '
-                           'takes a minute or two, later ones some seconds')
             return
         self.destroy_timer(self._warm_timer)
         if self._inputs is not None:

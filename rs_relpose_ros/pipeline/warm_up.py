@@ -119,10 +119,7 @@ def _sideways() -> tuple[Array, Array, RollingShutterCamera, FrameMotion]:
 
 
 def fill_cache() -> None:
-    """Compile the kernels of the default parameters, on two cores, one process each.
-
-    Other solvers are compiled when they are chosen.
-    """
+    """Compile the kernels of the default parameters, on two cores, one process each."""
     gc.set_threshold(100_000)   # syntax trees do not become garbage: a tenth faster
     other_half = multiprocessing.get_context('fork').Process(
         target=_fill_half, args=(os.getpid(),))
@@ -152,13 +149,13 @@ def _end_with(parent: int) -> None:
     """Let the kernel of Linux end this process with its parent, or with the thread of it."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:   # it has ended already
-        os._exit(1)
+        signal.raise_signal(signal.SIGKILL)
 
 
 def _mark() -> Path:
     """File of a filled cache: by sources, version and machine."""
-    name = f'{source_digest(__name__)[:16]}-{get_host_cpu_name()}-{numba.__version__}'
-    return Path(exp_so3.stats.cache_path, name)
+    return Path(exp_so3.stats.cache_path,
+                f'{source_digest(__name__)[:16]}-{get_host_cpu_name()}-{numba.__version__}')
 
 
 def cache_is_filled() -> bool:
@@ -167,7 +164,7 @@ def cache_is_filled() -> bool:
 
 
 def fill_cache_if_empty() -> None:
-    """Compile in processes of their own, whose memory, some 700 MB, is freed afterwards."""
+    """Compile in processes of their own: their memory, some 700 MB, is freed."""
     if not cache_is_filled():
         subprocess.run([sys.executable, '-m', 'rs_relpose_ros.pipeline.warm_up',
                         str(os.getpid())], check=False)
