@@ -150,9 +150,9 @@ _IMU_NUMBERS = struct.Struct('<37d')
 
 
 def frame_id_of_cdr(data: bytes) -> str:
-    """frame_id of the CDR of a message with a header."""
-    size = _HEADER.unpack_from(data)[-1]
-    return data[_HEADER.size:_HEADER.size + size - 1].decode(errors='replace')
+    """frame_id of the CDR of a message with a header; empty if it is too short."""
+    end = _HEADER.size + int.from_bytes(data[_HEADER.size - 4:_HEADER.size], 'little') - 1
+    return data[_HEADER.size:end].decode(errors='replace')
 
 
 def _imu_of_cdr(data: bytes) -> tuple[int, tuple[float, ...]]:
