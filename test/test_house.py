@@ -29,7 +29,7 @@ BUDGETS = {
     'rs_relpose_ros/odometry': (3139, 11),
     'rs_relpose_ros/offline': (2510, 9),
     'rs_relpose_ros/pipeline': (3700, 12),
-    'rs_relpose_ros/solvers': (1525, 6),
+    'rs_relpose_ros/solvers': (1700, 6),
     'rs_relpose_ros/tracking': (1230, 5),
     'rs_relpose_lab': (10560, 50),
     'test': (18503, 49),

@@ -4,6 +4,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import cross, dot, Vector
@@ -11,31 +12,74 @@ from rs_relpose_ros.jit import kernel, small_kernel
 
 
 @kernel
-def solve_linear(A: Array, b: Array) -> None:
-    """Solve ``A x = b`` in place of `b` (n,), which is not finite if `A` is singular.
+def lu_factor(A: Array, pivots: NDArray[np.int64]) -> float:
+    """LU factorisation of `A` (n, n) in place, with row pivoting; the determinant.
 
-    Gauss's elimination with row pivoting; `A` (n, n) is overwritten.
+    The diagonal receives the reciprocals of the pivots. For inverse iteration, a pivot of exactly
+    zero is replaced by a tiny one; the determinant is then zero.
     """
-    n = len(b)
+    n = A.shape[0]
+    determinant, largest = 1.0, 0.0
+    for i in range(n):
+        for j in range(n):
+            largest = max(largest, abs(A[i, j]))
+    tiny = max(1e-18 * largest, 1e-280)
     for k in range(n):
         pivot = k
         for i in range(k + 1, n):
             if abs(A[i, k]) > abs(A[pivot, k]):
                 pivot = i
-        for j in range(k, n):
-            A[k, j], A[pivot, j] = A[pivot, j], A[k, j]
-        b[k], b[pivot] = b[pivot], b[k]
+        pivots[k] = pivot
+        if pivot != k:
+            for j in range(n):
+                A[k, j], A[pivot, j] = A[pivot, j], A[k, j]
+            determinant = -determinant
+        determinant *= A[k, k]
+        if A[k, k] == 0.0:
+            A[k, k] = tiny
         inverse = 1.0 / A[k, k]
         A[k, k] = inverse
         for i in range(k + 1, n):
             factor = A[i, k] * inverse
+            A[i, k] = factor
             for j in range(k + 1, n):
                 A[i, j] -= factor * A[k, j]
-            b[i] -= factor * b[k]
+    return determinant
+
+
+@kernel
+def lu_solve(LU: Array, pivots: NDArray[np.int64], b: Array) -> None:
+    """Solve ``A x = b`` in place of `b` (n,), with the result of `lu_factor`."""
+    n = LU.shape[0]
+    for k in range(n):
+        b[k], b[pivots[k]] = b[pivots[k]], b[k]
+    for k in range(n):
+        total = b[k]
+        for j in range(k):
+            total -= LU[k, j] * b[j]
+        b[k] = total
     for k in range(n - 1, -1, -1):
+        total = b[k]
         for j in range(k + 1, n):
-            b[k] -= A[k, j] * b[j]
-        b[k] *= A[k, k]
+            total -= LU[k, j] * b[j]
+        b[k] = total * LU[k, k]
+
+
+@small_kernel
+def lu_solve_transposed(LU: Array, pivots: NDArray[np.int64], b: Array) -> None:
+    """Solve ``A^T x = b`` in place of `b` (n,), with the result of `lu_factor`."""
+    n = LU.shape[0]
+    for k in range(n):
+        solved = b[k] * LU[k, k]
+        b[k] = solved
+        for j in range(k + 1, n):
+            b[j] -= LU[k, j] * solved
+    for k in range(n - 1, -1, -1):
+        solved = b[k]
+        for j in range(k):
+            b[j] -= LU[k, j] * solved
+    for k in range(n - 1, -1, -1):
+        b[k], b[pivots[k]] = b[pivots[k]], b[k]
 
 
 @kernel

@@ -288,14 +288,15 @@ def _polish(sample: Sample, R: Array, t: Array) -> bool:
     # Of e, with unit rays and unit t: rounding, and the largest value of a solution.
     converged, accepted = 1e-15, 1e-10
     steps = 4
-    J, step = np.empty((5, 5)), np.empty(5)
+    J, step, pivots = np.empty((5, 5)), np.empty(5), np.empty(5, dtype=np.int64)
     for attempt in range(steps + 1):
         basis = so3.tangent_basis(t)
         u, v = basis[:, 0], basis[:, 1]
         worst = _linearise(sample, R, t, u, v, J, step)
         if worst < converged or attempt == steps:
             return worst < accepted
-        algebra.solve_linear(J, step)
+        algebra.lu_factor(J, pivots)
+        algebra.lu_solve(J, pivots, step)
         length2 = 0.0
         for k in range(5):
             length2 += step[k] * step[k]
