@@ -47,7 +47,6 @@ _INTEGRATION = 1e-4
 # Share of right loops within the bound of chi squared.
 _LOOP_QUANTILE = 0.99
 
-
 # Columns of a pair's derivatives: pose and velocity of the first body, of the second one, camera.
 _BLOCKS = (slice(0, 6), slice(6, 9), slice(9, 15), slice(15, 18), slice(18, 21))
 # Columns of the covariance of a keyframe.
@@ -209,10 +208,12 @@ class KeyframeGraph:
             found = self._innovation(pim, self._pair_factor(i, j, pair, rates))
             innovation = found.chi_squared
             if innovation <= gate:
-                # Without a gate, at a start, the misfit shows what is wrong.
-                own = max(innovation, 1.0) if gate < math.inf else 1.0
-                factors.add(self._pair_factor(i, j, pair, rates, math.sqrt(
-                    inflation * own * self._noise.pair_variance)))
+                variance = self._noise.pair_variance
+                # Without a gate, at a start, the misfit shows what is wrong. Later the variance
+                # is no smaller than that of the images: innovations hide errors that persist.
+                if gate < math.inf:
+                    variance = max(variance, 1.0) * max(innovation, 1.0)
+                factors.add(self._pair_factor(i, j, pair, rates, math.sqrt(inflation * variance)))
                 self._noise.observe(found, interval.duration)
                 if pair.is_pure_rotation:
                     factors.add(self._still_factor(i, j))
@@ -248,7 +249,6 @@ class KeyframeGraph:
         They agree with the path without any of them, given its covariance, and then with that by
         all of them; needs `keep`.
         """
-        assert self._record is not None
         with _solving():
             values, marginals = self._smoothed()
             misfits = [self._misfit(loop, values, marginals) for loop in loops]
