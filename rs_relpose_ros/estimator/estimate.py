@@ -75,10 +75,10 @@ def _checked_mode(config: EstimatorConfig, motion1: FrameMotion,
 SAMPLING_VELOCITY_SIGMA = 3.0
 # Share of inliers at which the remaining solvers, with less prior knowledge, are skipped.
 ENOUGH = 0.5
-# First columns of the rays f_1 and f_2 in an observation.
-RAYS = (0, 9)
 # And at which the gyro's rotation with one direction of translation needs no other hypothesis.
 CERTAIN = 0.75
+# First columns of the rays f_1 and f_2 in an observation.
+RAYS = (0, 9)
 # Noise of |f_1 - R f_2| is 1.67 sigma in the median (Rayleigh, two images).
 ROTATION_ONLY_SIGMAS = 2.5
 # Least chi-square of the acceleration (6 degrees of freedom; 99 % of pure noise lie below) and
@@ -115,7 +115,8 @@ def estimate_relative_pose(
     motion1, motion2 : FrameMotion
         Angular velocity and gravity of each frame at its reference row; gravity may be None.
     relative_rotation, relative_rotation_covariance : (3, 3) array_like, optional
-        ``R_1^T R_2`` by the gyro; covariance of its error [rad^2]: ``R_true = Exp(dtheta) R``.
+        ``R_1^T R_2`` between the reference rows as predicted from the gyro, and the covariance of
+        its error in camera 1 [rad^2]: ``R_true = Exp(dtheta) relative_rotation``.
     interval : float, optional
         Seconds between the two reference rows, for velocities of `EstimatorConfig.motion`.
     rng : int or numpy.random.Generator
@@ -123,7 +124,8 @@ def estimate_relative_pose(
     quality : (N,) array_like, optional
         Higher is better: the sampling order of the matches.
     inertial : InertialMotion, optional
-        Preintegrated acceleration during `interval` (or None): for velocities and baseline [m].
+        Preintegrated acceleration between the two reference rows: determines velocities and
+        baseline in metres. `interval` must be its duration, or None.
     between : sequence of IntermediateFrame
         Frames between the two, in the order of time; requires `interval` or `inertial`.
     global_shutter_pixels : bool
