@@ -124,8 +124,7 @@ def estimate_relative_pose(
     quality : (N,) array_like, optional
         Higher is better: the sampling order of the matches.
     inertial : InertialMotion, optional
-        Preintegrated acceleration between the two reference rows: determines velocities and
-        baseline in metres. `interval` must be its duration, or None.
+        Preintegrated acceleration during `interval` (or None): for velocities and baseline [m].
     between : sequence of IntermediateFrame
         Frames between the two, in the order of time; requires `interval` or `inertial`.
     global_shutter_pixels : bool
