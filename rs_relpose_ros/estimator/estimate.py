@@ -140,8 +140,7 @@ def estimate_relative_pose(
     InputError
         (a ValueError) An argument of the wrong shape, not finite, or contradictory.
     """
-    started = time.perf_counter()
-    config = EstimatorConfig() if config is None else config
+    started, config = time.perf_counter(), config or EstimatorConfig()
     points1, points2, order = _checked_matches(points1, points2, quality)
     rotation, spread = checked_rotation(relative_rotation, relative_rotation_covariance)
     interval = frames_between.check(between, points1, _checked_interval(interval, inertial))
