@@ -258,10 +258,10 @@ def test_optimum_is_that_of_an_independent_fit():
         patch.setattr(frames_between.adjustment, 'adjust',
                       lambda *a: (calls.append(a), adjust(*a))[1])
         scene.pose()
-    tracks, priors, start, expected, weight, _ = calls[0]
-    adjusted = adjust(tracks, priors, start, expected, weight, 0.5)
+    tracks, priors, start, expected, weight = calls[0]
+    adjusted = adjust(tracks, priors, start, expected, weight)
     for _ in range(6):   # far beyond the steps of an estimate
-        adjusted = adjust(tracks, priors, adjusted.state, adjusted.sigma, 1e9, 0.5)
+        adjusted = adjust(tracks, priors, adjusted.state, adjusted.sigma, 1e9)
     sigma = math.hypot(adjusted.sigma, adjustment._COMMON_SIGMA)
     directions, rho = start.tracks[0, :3, :25].T, start.tracks[0, adjustment.INVERSE_DISTANCE, :25]
     begin = np.concatenate([start.t, [start.log_scale], start.bias, start.accelerations[0],

@@ -62,7 +62,8 @@ _ROWS = _PATH + ACCELERATION + 3 * MOST_ACCELERATIONS
 # Weak priors keep a track without parallax regular: its inverse distance [1/baselines] is zero
 # within this sigma, and a floor of its normal equations.
 _INVERSE_DISTANCE_SIGMA, _FLOOR = 10.0, 1e-9
-_STEPS, _LARGEST_STEP = 6, 1.0   # number of steps, and the largest one of log k
+# Largest number of steps, decrease of the cost at which they end, largest step of log k.
+_STEPS, _CONVERGED, _LARGEST_STEP = 6, 0.5, 1.0
 _FIRST_DAMPING = 1e-7
 # Distance [sigma] beyond which an observation is far from its prediction.
 _FARTHEST = 4.0
@@ -460,11 +461,10 @@ def _step(normal: Normal, damping: float) -> Array:
 
 @kernel
 def adjust(tracks: Tracks, priors: PathPriors, start: PathState, expected: float,
-           weight: float, converged: float) -> Adjusted:
+           weight: float) -> Adjusted:
     """Levenberg-Marquardt over path and tracks, the noise estimated again after each step.
 
-    `expected` [px]: noise, which counts as `weight` degrees of freedom; `converged`: decrease of
-    the cost at which the steps end.
+    `expected` [px]: noise, which counts as much as `weight` degrees of freedom.
     """
     observations = 2.0 * tracks.used.sum()
     state, sigma, noise, damping = start, expected, expected, _FIRST_DAMPING
@@ -481,7 +481,7 @@ def adjust(tracks: Tracks, priors: PathPriors, start: PathState, expected: float
         gain = _cost(normal, tracks, sigma)[0] - _cost(new, tracks, sigma)[0]
         if gain > 0.0:   # False for NaN
             state, normal, damping = after, new, 0.1 * damping
-            if gain < converged:
+            if gain < _CONVERGED:
                 break
         else:
             damping = max(100.0 * damping, 1e-4)

@@ -124,7 +124,8 @@ def estimate_relative_pose(
     quality : (N,) array_like, optional
         Higher is better: the sampling order of the matches.
     inertial : InertialMotion, optional
-        Preintegrated acceleration during `interval` (or None): for velocities and baseline [m].
+        Preintegrated acceleration between the two reference rows: determines velocities and
+        baseline in metres. `interval` must be its duration, or None.
     between : sequence of IntermediateFrame
         Frames between the two, in the order of time; requires `interval` or `inertial`.
     global_shutter_pixels : bool
@@ -148,12 +149,10 @@ def estimate_relative_pose(
     problem = build_problem(points1, points2, camera, motion1, motion2, rotation, spread,
                             mode.model.derotated)
     seed = np.array([np.random.default_rng(rng).integers(2**63)], dtype=np.uint64)
-    estimation = Estimation(problem, mode, config, order, seed, interval, inertial)
-    pose = frames_between.refined(estimation.run(bool(between)), points1, motion1, (
-        points2, motion2, interval, rotation, spread, inertial), between, camera, config)
-    if pose.frames_reason and estimation.warm:
-        pose = replace(estimation.run(), frames_reason=pose.frames_reason)
-    if (pose := _certain(pose, config)) and global_shutter_pixels:
+    pose = Estimation(problem, mode, config, order, seed, interval, inertial).run(bool(between))
+    pose = _certain(frames_between.refined(pose, points1, motion1, (
+        points2, motion2, interval, rotation, spread, inertial), between, camera, config), config)
+    if global_shutter_pixels and pose:
         pose = _with_global_shutter_pixels(pose, points1, points2, camera, motion1, motion2)
     return replace(pose, duration=time.perf_counter() - started)
 
@@ -201,25 +200,26 @@ class Estimation:
                                   config.pixel_sigma / problem.focal)
         self.priors = _priors(problem, mode, config, interval)
         self.interval, self.inertial = interval, inertial
-        # By the acceleration: prior of the velocities; chi-square against 0, 6 degrees of freedom.
+        # Prior of the velocities by the measured acceleration, and the chi-square (6 degrees of
+        # freedom) of that acceleration against zero.
         self.measured: VelocityPrior | None = None
         self.inertial_chi2 = 0.0
         self.iterations = 0
         self.deadline = (time.perf_counter() + config.time_limit if config.time_limit > 0.0
                          else math.inf)
-        self.solvers_skipped = False   # since one before them had enough inliers
-        self.warm = False   # from the gyro's rotation, with one scale of the velocities
+        # Whether solvers were skipped, since one before them had enough inliers.
+        self.solvers_skipped = False
 
     def run(self, warm: bool = False) -> RelativePose:
-        """The pose, or why there is none; `warm`: as needed by `frames_between`, if possible."""
+        """The pose, or the reason why there is none; `warm`: samples only if `_by_gyro` fails."""
         if len(self.order) < self.config.min_inliers:
             return self._failure(Status.TOO_FEW_MATCHES,
                                  f'{len(self.order)} usable matches, fewer than min_inliers = '
                                  f'{self.config.min_inliers}')
-        state = self._by_gyro() if warm else None
-        self.warm = state is not None
+        if warm and (state := self._by_gyro()) is not None:
+            return self._completed(state)
         # 1. Hypotheses from minimal samples, ranked by multi-scale MSAC.
-        return self.refine(self.sample()) if state is None else self._completed(state)
+        return self.refine(self.sample())
 
     def refine(self, hypotheses: Solutions) -> RelativePose:
         """All steps after the first."""
@@ -307,8 +307,7 @@ class Estimation:
             prior, scales = self.priors, velocity.TIMELESS if free else velocity.AT_ZERO
             if free and self.interval is not None:
                 expected, scales = velocity.expected_velocities(
-                    self.problem, config.motion, self.interval, self.inertial,
-                    1 if self.warm else velocity.SCALE_COUNT)
+                    self.problem, config.motion, self.interval, self.inertial)
                 prior = priors.with_velocity(prior, expected)
                 self.measured = None if self.inertial is None else expected
                 self.inertial_chi2 = float(

@@ -168,9 +168,8 @@ def refined(pose: RelativePose, points1: Array, motion1: FrameMotion, second: tu
     priors = _priors(views, path, config)
     state = _start(pose, views, tracks, priors)
     expected = min(max(pose.residual_rms, 0.1 * config.pixel_sigma), config.pixel_sigma)
-    # Once more without the observations far from the first result, which is nearly converged.
-    for converged in (10.0, 0.5):
-        adjusted = adjustment.adjust(tracks, priors, state, expected, _SIGMA_FREEDOM, converged)
+    for _ in range(2):   # once more without the observations far from the first result
+        adjusted = adjustment.adjust(tracks, priors, state, expected, _SIGMA_FREEDOM)
         state = adjusted.state
         tracks.used[adjusted.far] = False
         tracks.observations.swapaxes(2, 3)[

@@ -221,11 +221,14 @@ def _average(matches: RayMatches, used: FitMatches, start: TwoViewState, steps: 
 # so that one unknown, b, replaces six. Without accelerometer alpha' and beta' are those of a
 # random acceleration of zero mean and some correlation time.
 
-CORRELATION_TIME = 0.2   # [s] of a carrier's acceleration: steps, gusts, gears
+# Correlation time of a carrier's acceleration [s]: steps, gusts, gears.
+CORRELATION_TIME = 0.2
 # Error of the assumption of a constant velocity during the readout [m/s].
 ROW_VELOCITY_SIGMA = 0.005
-SCALE_COUNT = 4   # scales of the baseline over the speeds of a carrier
-WIDTH = 0.7   # of the prior of each, as a share of the distance to the next one
+# Scales of the baseline over the speeds of a carrier.
+SCALE_COUNT = 4
+# Of the prior of each, as a share of the distance to the next one.
+WIDTH = 0.7
 
 # Without a time between the frames: prior sigmas [baselines per second], and the exponent of the
 # power law of their prior. If the velocities are not observable (sideways motion, cameras at
@@ -238,27 +241,27 @@ AT_ZERO = Scales(np.array([0.5 * math.log(priors.PINNED)]), np.zeros(1))
 
 
 def expected_velocities(problem: TwoViewProblem, motion: str, interval: float,
-                        inertial: InertialMotion | None, count: int = SCALE_COUNT,
-                        ) -> tuple[VelocityPrior, Scales]:
-    """Prior of the velocities at the middle rows, and the grid of `count` scales.
+                        inertial: InertialMotion | None) -> tuple[VelocityPrior, Scales]:
+    """Prior of the velocities at the middle rows, and the grid of their scales.
 
     `motion`: carrier of the camera, of `MOTIONS`; `interval`: between the frames [s]; `inertial`:
     between their reference rows.
     """
+    carrier = MOTIONS[motion]
     if inertial is None:
-        expected, covariance = np.zeros(6), _of_carrier(MOTIONS[motion], interval)
+        expected, covariance = np.zeros(6), _of_carrier(carrier, interval)
     else:
         expected, covariance = _of_imu(problem, inertial)
     # (alpha', beta') to u = b (d - c t) + a: a = (alpha' / T, alpha' / T - beta')
     to_velocities = np.kron(np.array([[1.0 / interval, 0.0], [1.0 / interval, -1.0]]), np.eye(3))
     covariance = to_velocities @ covariance @ to_velocities.T + ROW_VELOCITY_SIGMA**2 * np.eye(6)
     lowest, highest = span_of_scales(motion, interval)
-    step = (highest - lowest) / count
-    centres = np.array([lowest + step * (0.5 + k) for k in range(count)])
+    step = (highest - lowest) / SCALE_COUNT
+    centres = np.array([lowest + step * (0.5 + k) for k in range(SCALE_COUNT)])
     prior = VelocityPrior(
         1.0 / interval, to_velocities @ expected, priors.inverse(covariance),
-        float(centres[count // 2]), 0.0, (WIDTH * step) ** -2, 0.0)
-    return prior, Scales(centres, np.zeros(count))
+        float(centres[SCALE_COUNT // 2]), 0.0, (WIDTH * step) ** -2, 0.0)
+    return prior, Scales(centres, np.zeros(SCALE_COUNT))
 
 
 def span_of_scales(motion: str, interval: float) -> tuple[float, float]:

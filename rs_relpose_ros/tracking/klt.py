@@ -22,8 +22,8 @@ Criteria = tuple[int, int, float]
 _SCHARR = 2.0**20 / 32.0**2
 # Search radius [px] of a window without a pyramid; one level more doubles it.
 _REACH = 4
-# Pixels around the windows within reach for interpolation and rounding.
-_FRINGE = 2
+# Pixels around a window for derivatives, interpolation and rounding.
+_FRINGE = 3
 # Patches are cut out of images that are larger by this factor.
 _WORTH = 2.0
 # Termination criteria of OpenCV for tracking and for alignment.
