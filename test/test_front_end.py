@@ -296,16 +296,14 @@ def test_publishing_of_debug_images_can_be_switched_while_running(recorded, para
         outputs.publish(pair, config, lambda: None)
         assert publishers['~/debug_image'].publish.call_count == pictures
 
-# -- the walk of one image -------------------------------------------------------------------
-
 IMAGE_MESSAGE = type(build.compressed(build.rosbags_types, b''))
 CARRIERS = (IMAGE_MESSAGE, RawImage, CompressedImage, QueuedFrame, Frame, PairResult)
 
 
 def walk_of_a_pair(recorded: list[Any], parameters: Parameters) -> dict[tuple[str, str], bool]:
-    """Functions that are given, or return, an image or a pair: whether from another module.
+    """Functions from an image's callback to its pair's publication that are given or return one.
 
-    From the callback of the image to the publication of its pair, in order, without properties.
+    True: called from another module. In order, without properties.
     """
     folder = str(Path(rs_relpose_ros.__file__).parent)
     entered: list[Any] = []
