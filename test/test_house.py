@@ -32,7 +32,7 @@ BUDGETS = {
     'rs_relpose_ros/solvers': (1700, 6),
     'rs_relpose_ros/tracking': (1230, 5),
     'rs_relpose_lab': (10560, 50),
-    'test': (18500, 49),
+    'test': (18538, 49),
 }
 MOST_MODULES, MOST_FOLDERS = 110, 15
 LONGEST_MODULE, SHORTEST_MODULE, LONGEST_FUNCTION = 700, 80, 60

@@ -48,7 +48,7 @@ from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.result import Landmarks, RelativePose, Status
-from rs_relpose_ros.geometry.so3 import log_so3
+from rs_relpose_ros.geometry.so3 import exp_so3, log_so3, skew
 from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.messages.incoming import PARTS, Role
 from rs_relpose_ros.messages.outgoing import pair_messages
@@ -328,6 +328,39 @@ def test_samples_of_another_frame_are_refused_until_reset(own_node, monkeypatch)
     assert own_node._estimator.newest_ns == stamp_of(other)
 
 
+def fused(messages: list[Odometry], used: list[bool]) -> tuple[np.ndarray, float]:
+    """Positions by a Kalman filter of a constant twist, and its innovations squared.
+
+    As ekf_node of robot_localization, which is in no wheel: of position and rotation in odom, and
+    the twist in the base; `used` of these 12 are measured. The innovations are the mean per degree
+    of freedom.
+    """
+    def measured(message):
+        twist = message.twist.twist
+        return (vector_of(message.pose.pose.position), rotation_of(message.pose.pose),
+                np.concatenate([vector_of(twist.linear), vector_of(twist.angular)]))
+
+    (p, R, w), P, nis, path = measured(messages[0]), 1e-2 * np.eye(12), [], []
+    for before, message in pairwise(messages):
+        dt = (stamp_of(message) - stamp_of(before)) / SECOND
+        F, N, H = np.eye(12), np.zeros((12, 12)), np.eye(12)[used]
+        F[:3, 3:6], F[:3, 6:9], F[3:6, 9:] = -skew(R @ w[:3]) * dt, R * dt, R * dt
+        p, R = p + R @ w[:3] * dt, R @ exp_so3(w[3:] * dt)
+        # Accelerations of 3 m/s^2 and 3 rad/s^2.
+        P = F @ P @ F.T + np.diag([1e-8] * 6 + [9.0 * dt**2] * 6)
+        z = measured(message)
+        e = H @ np.concatenate([z[0] - p, log_so3(z[1] @ R.T), z[2] - w])
+        N[:6, :6], N[6:, 6:] = (np.reshape(part.covariance, (6, 6))
+                                for part in (message.pose, message.twist))
+        S = H @ (P + N) @ H.T
+        K = P @ H.T @ np.linalg.inv(S)
+        x, P = K @ e, P - K @ S @ K.T
+        p, R, w = p + x[:3], exp_so3(x[3:6]) @ R, w + x[6:]
+        nis.append(e @ np.linalg.solve(S, e) / len(e))
+        path.append(p)
+    return np.array(path), float(np.mean(nis))
+
+
 # -- next to relpose_node and a player, on the bundled bag ---------------------------------------
 
 def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag, tmp_path, monkeypatch):
@@ -410,21 +443,27 @@ def test_path_is_metric_and_that_of_the_replay(ros_domain_id, bundled_bag, tmp_p
             np.testing.assert_equal(vector_of(sent.transform.translation),
                                     vector_of(pose.position))
 
-    # The twist is that of the poses, as a filter with the shipped configuration expects.
-    off = []
-    for before, after in pairwise(propagated):
-        seconds = (stamp_of(after) - stamp_of(before)) / SECOND
-        R1, R2 = (rotation_of(one.pose.pose) for one in (before, after))
-        twist = np.mean([[R @ vector_of(one.twist.twist.linear), vector_of(
-            one.twist.twist.angular)] for R, one in ((R1, before), (R2, after))], axis=0)
-        way = np.diff(positions_of([before, after]), axis=0)[0]
-        off.append(np.linalg.norm(np.array([way, log_so3(R1.T @ R2)]) / seconds - twist, axis=1))
-    assert (np.median(off, axis=0) < 0.1).all()   # [m/s], [rad/s]
+    # A filter with the shipped configuration; pose and twist agree, and the twist alone leads
+    # along the poses. Found on a replay: 2.7, and 2400 with the twist in the axes of the camera;
+    # live on a busy machine, where corrections are late and larger, 5.1. A twist without the lever
+    # arm (7.2) shows in its path: 0.22 m.
     text = (ROOT / 'config' / 'robot_localization.yaml').read_text()
     ekf = yaml.safe_load(text)['ekf_filter_node']['ros__parameters']
-    assert ekf['odom0'] == '/odometry_node/odometry' and all(ekf['odom0_config'][6:12])
+    assert ekf['odom0'] == '/odometry_node/odometry'
     assert ekf['publish_tf'] and not parameters.odometry.publish_odometry_tf
     assert (ekf['odom_frame'], ekf['base_link_frame']) == ('odom', 'base_link')
+    # A busy machine leaves gaps, in which no twist is constant.
+    gaps = np.flatnonzero(np.diff([stamp_of(message) for message in propagated]) > SECOND // 10)
+    parts = [propagated[begin:end] for begin, end in pairwise([0, *(gaps + 1), len(propagated)])
+             if end - begin > 10]
+    assert sum(map(len, parts)) > 30
+    for part in parts:
+        poses = positions_of(part)[1:]
+        path, nis = fused(part, ekf['odom0_config'][:12])
+        assert np.linalg.norm(path - poses, axis=1).max() < 0.1
+        assert nis < 20.0
+        path, _ = fused(part, [False] * 6 + [True] * 6)
+        assert np.linalg.norm(path - poses, axis=1).max() < 0.15
 
 
 def test_the_position_of_the_imu_is_that_of_tf_before_the_path_begins():
