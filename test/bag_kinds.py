@@ -20,8 +20,7 @@ STAMP_NS = 1_700_000_000_123_456_789
 IMAGE, INFO, IMU, POSE = (
     'sensor_msgs/msg/Image', 'sensor_msgs/msg/CameraInfo', 'sensor_msgs/msg/Imu',
     'geometry_msgs/msg/PoseStamped')
-CAMERA = RollingShutterCamera(width=8, height=6, fx=5.0, fy=5.5, cx=3.5, cy=2.5,
-                              readout_time=0.03)
+CAMERA = RollingShutterCamera(width=8, height=6, fx=5.0, fy=5.5, cx=3.5, cy=2.5, readout_time=0.03)
 PIXELS = np.arange(48, dtype=np.uint8).reshape(6, 8)
 JAZZY = build.TYPESTORE
 NOETIC = get_typestore(Stores.ROS1_NOETIC)

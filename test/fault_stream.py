@@ -139,8 +139,7 @@ def read_messages(bag: Path, seconds: float, every: int = 1) -> list[tuple[int, 
         for connection, bag_time_ns, raw in reader.messages(connections):
             if messages and bag_time_ns - messages[0][0] > seconds * SECOND:
                 break
-            message = rclpy.serialization.deserialize_message(
-                bytes(raw), _TYPES[connection.topic])
+            message = rclpy.serialization.deserialize_message(bytes(raw), _TYPES[connection.topic])
             if isinstance(message, CompressedImage):
                 if next(images) % every:
                     continue
@@ -161,15 +160,13 @@ def publish_in_time(messages: Iterable[tuple[Any, int, Any]]) -> None:
         publisher.publish(message)
 
 
-def drivers(graph: Graph, *kinds: type,
-            best_effort: Collection[type] = ()) -> dict[type, Any]:
+def drivers(graph: Graph, *kinds: type, best_effort: Collection[type] = ()) -> dict[type, Any]:
     """Subscribed publishers of a camera and an IMU by type of message, all by default."""
     return {kind: graph.publisher(kind, topic, kind in best_effort)
             for kind, topic in TOPIC_OF.items() if kind in (kinds or TOPIC_OF)}
 
 
-def play(publishers: dict[type, Any], messages: list[tuple[int, Any]],
-         later: float = 0.0) -> None:
+def play(publishers: dict[type, Any], messages: list[tuple[int, Any]], later: float = 0.0) -> None:
     """Publish at bag time the messages that have a publisher, their stamps `later` [s]."""
     publish_in_time(
         (publishers[type(message)], bag_time_ns,

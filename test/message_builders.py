@@ -44,8 +44,7 @@ def byte_data(types: Types, data: bytes) -> Any:
 
 
 def header(types: Types, stamp_ns: int, frame_id: str = 'camera') -> Any:
-    stamp = types('builtin_interfaces/msg/Time')(
-        sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    stamp = types('builtin_interfaces/msg/Time')(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
     return types('std_msgs/msg/Header')(stamp=stamp, frame_id=frame_id)
 
 

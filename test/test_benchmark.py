@@ -349,8 +349,7 @@ def test_a_missing_lens_is_named_although_a_little_more_of_it_would_not_move_the
     assert {pair.verdict.named for pair in pairs if pair.at > 1.0} == {('distortion',)}
     # Poses are uncertain at first, then suppressed, from the pair after the first certain one on.
     believed = [pair for pair in pairs if pair.has_pose]
-    assert all(pair.at < 0.45 and pair.direction_error < pair.direction_sigma
-               for pair in believed)
+    assert all(pair.at < 0.45 and pair.direction_error < pair.direction_sigma for pair in believed)
 
 
 def test_command_distinguishes_wrong_from_right(tmp_path):

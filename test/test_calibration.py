@@ -401,8 +401,7 @@ def test_pairs_have_the_tracks_points_in_common():
     tracks = Tracks(*map(np.array, ([0, 10, 20, 30], [0, 0, 1, 1, 1, 3, 3],
                                     [5, 6, 6, 5, 7, 7, 6])),
                     np.arange(14.0).reshape(7, 2))
-    pairs = make_pairs(tracks, (1, 2), PairSelection((), 9, 1, 99), 1.0,
-                       np.random.default_rng(0))
+    pairs = make_pairs(tracks, (1, 2), PairSelection((), 9, 1, 99), 1.0, np.random.default_rng(0))
     assert list(zip(pairs.first, pairs.second, strict=True)) == [(0, 1), (1, 3)]
     np.testing.assert_array_equal(pairs.begin, [0, 2, 4])
     np.testing.assert_array_equal(pairs.points1, tracks.points[[0, 1, 2, 4]])

@@ -486,8 +486,7 @@ def test_bad_usage(arguments, message, tmp_path, refused):
         broken(seconds=0.3).write(tmp_path / name)
     damaged = tmp_path / 'DAMAGED' / 'DAMAGED.mcap'
     damaged.write_bytes(damaged.read_bytes()[:3000])
-    refused(message, 'check', *(
-        tmp_path / word if word.isupper() else word for word in arguments))
+    refused(message, 'check', *(tmp_path / word if word.isupper() else word for word in arguments))
 
 
 def test_steps_between_stamps():

@@ -108,8 +108,7 @@ def test_frames_keep_their_varying_times(tmp_path):
         assert abs(np.median(read.pixels(number)) - made.brightness(number)) < 6
     assert INFO not in read.messages
     samples = read.samples('/imu/data_raw')
-    assert [sample.stamp_ns - START_NS for sample in samples] == [
-        5_000_000 * k for k in range(60)]
+    assert [sample.stamp_ns - START_NS for sample in samples] == [5_000_000 * k for k in range(60)]
     # x right is minus left, y down minus up, z forwards minus backwards.
     np.testing.assert_allclose(samples[7].angular_velocity, (0.2, -0.1, -0.3), rtol=1e-6)
     np.testing.assert_allclose(samples[7].linear_acceleration,
@@ -337,8 +336,7 @@ def test_jsonl(tmp_path):
         (10 * k + 3) * made.MILLISECOND + 1 for k in range(len(made.STAMPS))]
     lens = read.intrinsics
     assert (lens.fx, lens.fy, lens.cx, lens.cy) == (55, 56, 31, 24)
-    assert (lens.distortion_model, lens.distortion) == (
-        'equidistant', (0.1, 0.02, -0.003, 0.0004))
+    assert (lens.distortion_model, lens.distortion) == ('equidistant', (0.1, 0.02, -0.003, 0.0004))
     assert read.samples('/imu/gyro')[1].angular_velocity == (0.1, -0.2, 0.3)
     assert read.samples('/imu/accel')[0].linear_acceleration == (0, 9.8, 0.1)
     assert (read.axes * PHONE_AXES.inv()).magnitude() < 1e-7

@@ -286,8 +286,7 @@ def by_images(pose):
     """Rotation of the least cost of the images, and its covariance."""
     images = pose.images.of_rotation()
     step = -np.linalg.solve(images.information, images.gradient)
-    return (Rotation.from_rotvec(step).as_matrix() @ images.R,
-            np.linalg.inv(images.information))
+    return (Rotation.from_rotvec(step).as_matrix() @ images.R, np.linalg.inv(images.information))
 
 
 def test_the_gyro_between_the_frames_has_no_part_in_it():

@@ -52,8 +52,7 @@ def rows(trajectory) -> RowTrajectory:
 @pytest.fixture
 def run(bundled_bag, trajectory, rows, tmp_path):
     """Export the bundled bag; exit code and folder. `changes`: of the rows."""
-    def export_it(*options: str, tracks: Tracks | None = None,
-                  **changes: Any) -> tuple[int, Path]:
+    def export_it(*options: str, tracks: Tracks | None = None, **changes: Any) -> tuple[int, Path]:
         out, given = tmp_path / 'model', trajectory
         if tracks or changes:
             given = shutil.copytree(trajectory, tmp_path / 'other')

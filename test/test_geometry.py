@@ -16,10 +16,7 @@ from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.estimator.problem import PairState, to_reference_row
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.geometry import so3
-from rs_relpose_ros.geometry.camera import (
-    Intrinsics,
-    RollingShutterCamera,
-)
+from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 from rs_relpose_ros.geometry.timing import ImageClock, seconds_between, to_nanoseconds
 

@@ -363,8 +363,7 @@ def test_unknown_types_are_copied_and_other_images_of_the_same_stamps_reported(
         own = writer.add_connection('/own', 'own_msgs/msg/Thing', msgdef='uint8[20] data',
                                     rihs01='RIHS01_' + 'ab' * 32)
         writer.write(own, end_ns + 1, payload)
-        other = writer.add_connection('/depth', 'sensor_msgs/msg/Image',
-                                      typestore=build.TYPESTORE)
+        other = writer.add_connection('/depth', 'sensor_msgs/msg/Image', typestore=build.TYPESTORE)
         for k, m in enumerate(sensor_messages_of(path)[0]):
             writer.write(other, end_ns + k, build.serialized(build.gray_image(
                 build.rosbags_types, np.zeros((4, 4), np.uint8), stamp_ns(m.header))))
@@ -472,6 +471,5 @@ def test_gross_errors_are_found_without_relpose_node(bundled_bag, turn, change, 
 
 
 def test_nothing_is_watched_where_relpose_node_does(bundled_bag):
-    found = watched(bundled_bag, read_parameters(BUNDLED_PARAMETERS), in_degrees,
-                    is_watched=False)
+    found = watched(bundled_bag, read_parameters(BUNDLED_PARAMETERS), in_degrees, is_watched=False)
     assert not any(health.faults for health in found)

@@ -453,8 +453,7 @@ def test_a_gap_ends_the_propagation_by_the_gyro():
 def test_the_filter_estimates_a_bias_that_is_not_configured():
     errors = {}
     for sigma in (0.0, 0.02):
-        buffer, end = run(swinging, seconds=30.0, bias=(0.03, -0.02, 0.025),
-                          gyro_bias_sigma=sigma)
+        buffer, end = run(swinging, seconds=30.0, bias=(0.03, -0.02, 0.025), gyro_bias_sigma=sigma)
         estimate = buffer.gravity(end)
         errors[sigma] = direction_error(estimate.direction, down(end))
     assert errors[0.02] < 0.6

@@ -795,8 +795,7 @@ def test_messages_of_sensors(tmp_path):
     assert imu.header.frame_id == 'imu_link'
     assert (imu.angular_velocity.x, imu.linear_acceleration.z) == (0.1, 9.8)
     assert imu.orientation_covariance[0] == -1.0
-    np.testing.assert_array_equal(
-        imu.angular_velocity_covariance.reshape(3, 3), 4e-6 * np.eye(3))
+    np.testing.assert_array_equal(imu.angular_velocity_covariance.reshape(3, 3), 4e-6 * np.eye(3))
     assert (info.width, info.height, info.distortion_model) == (64, 48, 'plumb_bob')
     assert info.k.tolist() == [50.0, 0.0, 31.0, 0.0, 51.0, 23.0, 0.0, 0.0, 1.0]
     np.testing.assert_array_equal(info.p.reshape(3, 4)[:, :3], info.k.reshape(3, 3))

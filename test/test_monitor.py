@@ -133,8 +133,7 @@ def solved(pairs, active, about):
 
 def test_pairs_are_exact_at_times_that_are_far_off():
     """Linearised about the truth, they are solved to it, once the gyro after them is known."""
-    c, linear, exact = deviation(offset=0.03), *(
-        recursion.Recursion() for _ in range(2))
+    c, linear, exact = deviation(offset=0.03), *(recursion.Recursion() for _ in range(2))
     for k in range(9):
         for found in linear, exact:
             found.add(k, pair_data(0.3 * k, 0.3 * (k + 1), c), NONE, c)

@@ -193,8 +193,7 @@ def recorded(bundled_bag: Path) -> list[dict[str, Any]]:
 
 
 @pytest.fixture(scope='module')
-def chain(module_ros_domain_id: int,
-          recorded: list[dict[str, Any]]) -> Iterator[SimpleNamespace]:
+def chain(module_ros_domain_id: int, recorded: list[dict[str, Any]]) -> Iterator[SimpleNamespace]:
     """Paths that the example published, each with its last stamp, and its output."""
     with Graph() as graph, Process(
             str(EXAMPLE), '--ros-args', '-r', '__ns:=/relpose_node') as example:

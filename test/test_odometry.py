@@ -241,8 +241,7 @@ def test_start_at_rest_is_at_once():
 def test_nothing_is_published_before_the_scale_is_known():
     """At constant velocity the IMU does not observe the scale."""
     given = walk('constant:4', 3.0)
-    pairs = [replace(pair, baseline=math.nan, baseline_log_sigma=math.nan)
-             for pair in given.pairs]
+    pairs = [replace(pair, baseline=math.nan, baseline_log_sigma=math.nan) for pair in given.pairs]
     estimator, out = run(given, pairs=pairs)
     assert out == []
     assert estimator.state is OdometryState.STARTING

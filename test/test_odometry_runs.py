@@ -167,8 +167,7 @@ def test_states_through_a_disturbance():
     assert found.lost == 0 and found.largest_step < 1.0
     # A truth that is elsewhere by 1 m after the disturbance.
     elsewhere = given.positions + (given.stamps > START_NS + 8e9)[:, None] * [1.0, 0.0, 0.0]
-    other = disturbances.on_feed('no images, 2 s', 1, feed, replace(
-        truth, position=elsewhere))
+    other = disturbances.on_feed('no images, 2 s', 1, feed, replace(truth, position=elsewhere))
     assert other.beyond_position > 100
 
 

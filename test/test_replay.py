@@ -302,8 +302,7 @@ def test_truth_of_a_known_motion():
     ns1, ns2 = START_NS + 123_456_789, START_NS + 623_456_789   # half a second: 0.25 rad
     R, t = truth.relative_pose(ns1, ns2)
     np.testing.assert_allclose(R, Rotation.from_rotvec([0.0, 0.25, 0.0]).as_matrix(), atol=1e-9)
-    np.testing.assert_allclose(t, [2.0 * np.sin(0.25), 0.0, 2.0 * (np.cos(0.25) - 1.0)],
-                               atol=1e-8)
+    np.testing.assert_allclose(t, [2.0 * np.sin(0.25), 0.0, 2.0 * (np.cos(0.25) - 1.0)], atol=1e-8)
     off = Rotation.from_rotvec([np.radians(3.0), 0.0, 0.0]).as_matrix()
     errors = truth.errors(R @ off, Rotation.from_rotvec([0.0, 0.0, 0.1]).apply([t[0], 0.0, 0.0]),
                           ns1, ns2)

@@ -59,8 +59,7 @@ def knots(path, times, *, bias_error=0.0, noise=0.0):
 
 def samples(path, first, last, rate=400.0):
     times = np.arange(first, last, 1.0 / rate)
-    gyro, accel = ImuModel(C, LEVER, *BIASES).measure(
-        path.states(times), np.random.default_rng(0))
+    gyro, accel = ImuModel(C, LEVER, *BIASES).measure(path.states(times), np.random.default_rng(0))
     buffer = ImuSamples(0.05)
     for seconds, w, f in zip(times, gyro, accel, strict=True):
         buffer.add(ImuSample(START_NS + round(seconds * 1e9), tuple(w), tuple(f)))
@@ -418,8 +417,7 @@ def read_ncore(folder, model, lens):
         times = one.frames_timestamps_us[f]
         first, last = (np.linalg.inv(trajectory[stamps.tolist().index(time)]) for time in times)
         assert one.get_frame_image(int(times[1])).size == (W, H)
-        out.append(in_whole_rows(first, last, shutter, model.points[point], K, lens,
-                                 coefficients))
+        out.append(in_whole_rows(first, last, shutter, model.points[point], K, lens, coefficients))
     return np.array(out)
 
 

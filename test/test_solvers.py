@@ -81,8 +81,7 @@ def rotation_errors(solver, P, count, **changes):
 
 def baselines(solution, tau1, tau2):
     """``t - tau_1 d_1 + tau_2 d_2`` (n, 3)."""
-    return (solution.t - tau1[:, None] * solution.v1
-            + tau2[:, None] * (solution.R @ solution.v2))
+    return (solution.t - tau1[:, None] * solution.v1 + tau2[:, None] * (solution.R @ solution.v2))
 
 
 def residual(solution, f1, f2, tau1, tau2):
@@ -140,8 +139,7 @@ def test_the_number_of_solutions_is_that_of_an_eigenvalue_problem(solver, motion
     f1, f2 = rays(solver, P)
     for k in range(300):
         yaws = real_yaws(f1[k], f2[k], P.tau1[k], P.tau2[k], P.gravity1[k], P.gravity2[k])
-        found = np.array([yaw_of(s.R, P.gravity1[k], P.gravity2[k])
-                          for s in solve(solver, P, k)])
+        found = np.array([yaw_of(s.R, P.gravity1[k], P.gravity2[k]) for s in solve(solver, P, k)])
         for yaw in yaws:
             assert np.abs(np.angle(np.exp(1j * (found - yaw)))).min(initial=np.pi) < 1e-5
         total += len(yaws)

@@ -239,8 +239,7 @@ def test_motion_continues_in_proportion_to_the_time_between_images(scene):
         # The prediction knows 80 % of the motion.
         tracker.track(scene.view(views[1]), tracker.points + 0.8 * flow, 1.0)
         tracker.track(scene.view(views[2]), tracker.points + 12.0 * 0.8 * flow, gap)
-        found.append(np.count_nonzero(
-            errors(tracker.refined_matches(), views[0], views[2]) < 0.5))
+        found.append(np.count_nonzero(errors(tracker.refined_matches(), views[0], views[2]) < 0.5))
     assert found[0] > 200
     assert found[1] < 0.7 * found[0]
 

@@ -409,8 +409,7 @@ def _run_global_shutter(args: argparse.Namespace) -> int:
             bags.append(global_shutter.five_point_on_bag(
                 config, args.output / f'seed_{config.seed}'))
             bar.update()
-    return _print_report(global_shutter.write_report(args.output, maps, bags, speeds),
-                         args.output)
+    return _print_report(global_shutter.write_report(args.output, maps, bags, speeds), args.output)
 
 
 def _odometry_arguments(parser: argparse.ArgumentParser) -> None:

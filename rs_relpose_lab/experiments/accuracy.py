@@ -155,8 +155,7 @@ class OracleCache:
 @functools.cache
 def _source() -> bytes:
     """Source of generator and oracle when first read."""
-    return b''.join(Path(str(module.__file__)).read_bytes()
-                    for module in (rows, problems, oracle))
+    return b''.join(Path(str(module.__file__)).read_bytes() for module in (rows, problems, oracle))
 
 
 # -- report: statistics of each cell, against the project's limits ----------------------------

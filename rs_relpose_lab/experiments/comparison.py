@@ -122,8 +122,7 @@ def score_of_replay(name: str, bag_path: Path, parameters: Parameters) -> Score:
 def score_of_table(name: str, path: Path, pairs: Sequence[PairRecord],
                    truth: TrueTrajectory) -> Score:
     """Score of a live node's table; `pairs`: of a replay of its frames."""
-    times = {(r.reference_stamp_ns, r.stamp_ns): (r.reference_ns1, r.reference_ns2)
-             for r in pairs}
+    times = {(r.reference_stamp_ns, r.stamp_ns): (r.reference_ns1, r.reference_ns2) for r in pairs}
     errors = []
     with path.open(newline='', encoding='ascii') as file:
         for row in csv.DictReader(file):

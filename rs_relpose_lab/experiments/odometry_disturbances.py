@@ -77,8 +77,7 @@ def disturbed(recording: Recording, simulation: Simulation, what: Disturbance,
               rng: np.random.Generator) -> Recording:
     """The recording with a disturbance."""
     first_ns = simulation.config.start_ns
-    begin_ns, end_ns = (first_ns + to_nanoseconds(at) for at in (
-        _MARGIN, _MARGIN + what.seconds))
+    begin_ns, end_ns = (first_ns + to_nanoseconds(at) for at in (_MARGIN, _MARGIN + what.seconds))
     assert recording.sightings is not None
     within = [begin_ns <= simulation.reference_ns(arrival.number) < end_ns
               for arrival in recording.arrivals]

@@ -175,8 +175,7 @@ def _sampson(points1: Array, points2: Array, R: Values, t: Values,
     return (e / np.sqrt(e_u1 * e_u1 + e_v1 * e_v1 + e_u2 * e_u2 + e_v2 * e_v2)).T
 
 
-def _derotated(points: Array, w: Values,
-               ) -> tuple[tuple[Values, Values, Values], Array]:
+def _derotated(points: Array, w: Values) -> tuple[tuple[Values, Values, Values], Array]:
     """Derotated rays (3, K, N), their derivatives by u and v, and row times (N,)."""
     tau = LINE_DELAY * points[:, 1]
     m = np.stack([(points[:, 0] - CENTRE_U) / FOCAL, (points[:, 1] - CENTRE_V) / FOCAL,
@@ -206,8 +205,7 @@ def _series(w: Values, tau: Array) -> tuple[Values, Values]:
     return sine, cosine
 
 
-def _rotate(w: Values, m: Array, series: tuple[Values, Values],
-          ) -> Values:
+def _rotate(w: Values, m: Array, series: tuple[Values, Values]) -> Values:
     """``Exp(w tau) m`` (3, K, N) for w (3, K), m (3, 1, 1 or N) and the `_series` of w and tau."""
     once = _cross(w[:, :, None], m)
     return m + series[0] * once + series[1] * _cross(w[:, :, None], once)

@@ -185,8 +185,7 @@ def _limits(errors: Sequence[Array]) -> tuple[float, float]:
     return low, max(min(10.0**np.ceil(most), 180.0), 10.0 * low)
 
 
-def _draw_levels(plot: Axes, levels: Levels, side: str,
-                 limits: tuple[float, float]) -> None:
+def _draw_levels(plot: Axes, levels: Levels, side: str, limits: tuple[float, float]) -> None:
     methods = list(next(iter(levels.values())))
     step = 0.86 / len(methods)
     low, high = limits

@@ -125,8 +125,7 @@ def _rendered(simulation: Simulation, rows: RowTrajectory, times: Sequence[Times
     truth = simulation.states(stamps.ravel())
     R_true = truth.R_world_cam.reshape(*stamps.shape, 3, 3)
     p_true = truth.position.reshape(*stamps.shape, 3)
-    turns = Rotation.from_matrix(np.einsum(
-        'nji,njk->nik', R_true[:, 0], R_true[:, 2])).magnitude()
+    turns = Rotation.from_matrix(np.einsum('nji,njk->nik', R_true[:, 0], R_true[:, 2])).magnitude()
     ways = np.linalg.norm(p_true[:, 2] - p_true[:, 0], axis=1)
     moving = np.flatnonzero(config.fx * (turns + ways / _DEPTH) > _LEAST_MOTION)
     for k in np.random.default_rng(config.seed).permutation(moving)[:_RENDERED]:

@@ -58,8 +58,7 @@ class ChiSquares(NamedTuple):
     rotation: float
 
 
-def chi_squares(R: Array, t: Array, true_R: Array, true_t: Array,
-                covariance: Array) -> ChiSquares:
+def chi_squares(R: Array, t: Array, true_R: Array, true_t: Array, covariance: Array) -> ChiSquares:
     """Each error of a pose by its own part of the covariance; arguments as in `pose_error`."""
     rotation_error, shift = _rotation_and_shift(R, t, true_R, true_t)
     tangent = _tangent(t)

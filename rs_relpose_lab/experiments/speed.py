@@ -134,8 +134,7 @@ def method_statistics(timings: Sequence[Timing]) -> list[MethodStatistics]:
     return result
 
 
-def write_report(folder: Path, comparison: Sequence[Timing],
-                 scaling: Sequence[Timing]) -> str:
+def write_report(folder: Path, comparison: Sequence[Timing], scaling: Sequence[Timing]) -> str:
     """Write runs, tables, plot and report into a folder; the report."""
     compared, scaled = method_statistics(comparison), method_statistics(scaling)
     write_csv(folder / 'runs.csv', [*comparison, *scaling])

@@ -103,8 +103,7 @@ def on_recording(path: Path, parameter_file: Path) -> list[Suggestion]:
         size = abs(wrong.error(right)) / reference.sigma if reference and reference.sigma else 0.0
         estimated, sigma = (math.nan, math.nan) if last is None else (
             last.estimated or 0.0, last.sigma or math.nan)
-        results.append(Suggestion(path.name, name, size, right, estimated, sigma,
-                                  ' '.join(named)))
+        results.append(Suggestion(path.name, name, size, right, estimated, sigma, ' '.join(named)))
     return results
 
 
@@ -114,8 +113,7 @@ def _with_lens(path: Path, parameters: Parameters) -> Parameters:
         return parameters
     with open_bag(path) as bag:
         topics = bag.find_topics()
-        message = next(message for _, message in sensor_messages(bag, topics, (
-            Role.CAMERA_INFO,)))
+        message = next(message for _, message in sensor_messages(bag, topics, (Role.CAMERA_INFO,)))
         lens = PARTS[Role.CAMERA_INFO].read(message.message)
     return parameters.updated({
         'camera_matrix': (lens.fx, 0.0, lens.cx, 0.0, lens.fy, lens.cy, 0.0, 0.0, 1.0),

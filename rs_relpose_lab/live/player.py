@@ -52,8 +52,7 @@ class Outgoing:
     data: bytes
 
 
-def repeated(messages: Sequence[Outgoing], period_ns: int,
-             duration_ns: int) -> Iterator[Outgoing]:
+def repeated(messages: Sequence[Outgoing], period_ns: int, duration_ns: int) -> Iterator[Outgoing]:
     """Messages of one period repeatedly, each round's stamps and dues a period later.
 
     `messages`: in the order of `due_ns`; all begin with a header, and their stamps span one

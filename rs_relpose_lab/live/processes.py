@@ -85,8 +85,7 @@ class Process:
             return text in self.output
         wait_until(written, f'{text!r} in the output of {self._name}')
 
-    def signal(self, number: signal.Signals, *,
-               every: float = _END_TIMEOUT) -> tuple[int, float]:
+    def signal(self, number: signal.Signals, *, every: float = _END_TIMEOUT) -> tuple[int, float]:
         """Send a signal, again every so many seconds; exit code and seconds until the end."""
         started = time.monotonic()
         while (seconds := time.monotonic() - started) < _END_TIMEOUT:

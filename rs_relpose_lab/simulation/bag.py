@@ -71,8 +71,7 @@ def render_once(config: SimulationConfig, folder: Path,
     return made_once(folder, 'bag', render)
 
 
-def made_once(folder: Path, name: str,
-              make: Callable[[Path, Path], object]) -> tuple[Path, Path]:
+def made_once(folder: Path, name: str, make: Callable[[Path, Path], object]) -> tuple[Path, Path]:
     """A bag and its parameter file; `make` writes the file last, unless both exist."""
     bag, parameters = folder / name, folder / f'{name}.yaml'
     if not (bag.exists() and parameters.exists()):

@@ -42,8 +42,7 @@ class SimulationConfig(Settings):
     time_offset: float = setting(
         0.0, 'IMU clock minus camera clock: t_imu = stamp + time_offset', 's', low=-10.0,
         high=10.0)
-    pixel_noise: float = setting(
-        1.0, 'image noise, 1 sigma', 'gray values', low=0.0, high=50.0)
+    pixel_noise: float = setting(1.0, 'image noise, 1 sigma', 'gray values', low=0.0, high=50.0)
     edge_samples: int = setting(
         2, 'pixels on outlines are the mean of this many samples squared', low=1, high=8)
     plan: str = setting(

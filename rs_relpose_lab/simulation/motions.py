@@ -109,8 +109,7 @@ def _segments(plan: Plan) -> tuple[Segment, ...]:
 def _levels(times: Array, segments: tuple[Segment, ...]) -> _Levels:
     # A step function that changes in the middle of the transitions, smoothed by a window as wide
     # as the ramp: inside a segment the levels are then constant, not nearly so.
-    borders = [(before.end + after.start) / 2
-               for before, after in itertools.pairwise(segments)]
+    borders = [(before.end + after.start) / 2 for before, after in itertools.pairwise(segments)]
     half = round(_RAMP / 2 / CONTROL_SPACING)
     padded = times[0] + CONTROL_SPACING * np.arange(-half, len(times) + half)
     index = np.searchsorted(borders, padded)

@@ -28,8 +28,7 @@ _EXPOSURE_STEP = 1.0
 _NOTHING = 128.0
 
 # Nothing here lets the compiler fuse operations: the same image on every processor.
-_jit = numba.njit(cache=True, nogil=True, error_model='numpy',
-                  fastmath={'arcp', 'nsz'})
+_jit = numba.njit(cache=True, nogil=True, error_model='numpy', fastmath={'arcp', 'nsz'})
 _inline = numba.njit(cache=True, nogil=True, error_model='numpy', forceinline=True,
                      fastmath={'arcp', 'nsz'})
 
@@ -104,8 +103,7 @@ class Renderer:
             _smooth_edges(exposure, self.scene, self.edge_samples, image, hits)
         return image
 
-    def locate(self, reference_time: float,
-               points: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
+    def locate(self, reference_time: float, points: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
         """World points (N, 3) [m] and indices of surfaces (N,) at pixels.
 
         `points` (N, 2) may lie between pixels. Without a hit: NaN and -1.

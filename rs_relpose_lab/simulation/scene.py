@@ -235,8 +235,7 @@ def _yard(builder: _Builder, rng: np.random.Generator) -> Iterator[Surface | Non
             (x + 1.5, border + width / 2, height / 2), (3.0, width, height), 0.0)
         border += width
     for side in (-1.0, 1.0):
-        yield from builder.box(
-            (2.0, side * rng.uniform(9.0, 10.5), 1.5), (18.0, 0.3, 3.0), 0.0)
+        yield from builder.box((2.0, side * rng.uniform(9.0, 10.5), 1.5), (18.0, 0.3, 3.0), 0.0)
     yield from _crates(builder, rng, count=12, reach=7.5)
     for _ in range(4):
         # Posts.

@@ -1,4 +1,7 @@
-"""Folders of Android loggers, each recognised by its files (`LOGGERS`)."""
+"""Folders of Android loggers, each recognised by its files (`LOGGERS`).
+
+Formats: docs/recordings.md, "Files of the loggers".
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -49,8 +52,7 @@ def _title(folder: Path, details: str) -> str:
 def _axes(sensor_orientation: object = None) -> SourcedValue:
     """Rotation from the phone's sensor axes to a back camera, from its SENSOR_ORIENTATION [deg].
 
-    The angle by which the image is rotated clockwise to be upright in the natural orientation of
-    the phone: x right, y up, z out of the screen. Most phones have 90.
+    The angle by which the image is rotated clockwise to be upright as the phone is held.
     """
     angle = 90
     source = 'ASSUMED: back camera with SENSOR_ORIENTATION {} deg, as most phones have it.'
@@ -118,16 +120,7 @@ _STAMPS = ('stamp_ns', 'timestamp_ns')
 
 
 def read_tables(folder: Path) -> Recording:
-    """Recordings of any logger as tables with a header line.
-
-    The files::
-
-        frames.csv   stamp_ns, file (a JPEG image; without it, the frames of the only video)
-        gyro.csv     stamp_ns,x,y,z   [rad/s]
-        accel.csv    stamp_ns,x,y,z   [m/s^2] specific force; may be absent
-
-    All stamps on one clock, the IMU in the phone's sensor axes; other columns are ignored.
-    """
+    """Recordings of any logger as tables with a header line."""
     gyro = [ImuSample(_stamp(row), row.vector(*'xyz'), None)
             for row in read_table(folder / 'gyro.csv')]
     accel = [ImuSample(_stamp(row), None, row.vector(*'xyz'))
@@ -163,17 +156,7 @@ _MODELS = {'pinhole': ('plumb_bob', (0, 3)), 'brown-conrady': ('plumb_bob', (0, 
 
 
 def read_jsonl(folder: Path) -> Recording:
-    """Frames of the first camera, and the IMU, of Spectacular AI's recorders.
-
-    The format (github.com/SpectacularAI/docs, other/DATA_FORMAT.md)::
-
-        data.mp4 (or .mov, .mkv)   the frames
-        data.jsonl                 {"time": s, "number": n, "frames": [{"cameraInd": 0, ...}]}
-                                   {"time": s, "sensor": {"type": "gyroscope",
-                                   "values": [x, y, z]}} and accelerometer; rad/s, m/s^2
-        calibration.json           cameras: focalLengthX, ..., model, distortionCoefficients,
-                                   imuToCamera (4x4), imageWidth, imageHeight
-    """
+    """Frames of the first camera, and the IMU, of Spectacular AI's recorders."""
     times_ns, gyro, accel = _events(folder / 'data.jsonl')
     path = next((folder / name for name in _VIDEOS if (folder / name).is_file()), None)
     if path is None:
@@ -253,17 +236,7 @@ _MAX_DRIFT_NS = 1_000_000
 
 
 def read_mars(folder: Path) -> Recording:
-    """Frames of the movie with the logged stamps, and the IMU, of the MARS Logger.
-
-    github.com/OSUPCVLab/mobile-ar-sensor-logger; as the app writes them::
-
-        movie.mp4              the frames
-        frame_timestamps.txt   Frame timestamp[nanosec], and more: a line for each frame
-        gyro_accel.csv         Timestamp[nanosec],gx[rad/s],gy[rad/s],gz[rad/s],ax[m/s^2],...
-        movie_metadata.csv     Timestamp[nanosec],fx[px],fy[px],...,Exposure time[nanosec],...,
-                               Frame readout time[nanosec],...
-        edge_epochs.txt        clock of the camera's stamps, and both clocks at start and end
-    """
+    """Frames of the movie with the logged stamps, and the IMU, of the MARS Logger."""
     video = _landscape_video(folder / 'movie.mp4')
     stamps = folder / 'frame_timestamps.txt'
     shift_ns, clock = _clock(folder / 'edge_epochs.txt')
@@ -314,22 +287,7 @@ _GL_FROM_OPTICAL = Rotation.from_quat([1.0, 0.0, 0.0, 0.0])
 
 
 def read_posecam(folder: Path) -> Recording:
-    """Frames, IMU and, as ground truth, ARCore's poses of PoseCam: its format posecam-4 and later.
-
-    An Android app with ARCore. As its IMPLEMENTATION_README describes it::
-
-        poses.csv            frame_index,timestamp_ns,tx,ty,tz,qx,qy,qz,qw,tracking_state,image
-        frames/              INDEX_STAMP.jpg, as the sensor reads them, if `image` is saved
-        frame_metadata.csv   exposure_time_ns, rolling_shutter_skew_ns, ois_mode, ... of each row
-        imu.csv              timestamp_ns,sensor,x,y,z,bias_x,bias_y,bias_z: accel, gyro_uncal or
-                             gyro
-        intrinsics.json      fx, fy, cx, cy [px] by ARCore
-        device.json          camera: sensor_orientation_deg, timestamp_source, ...
-        manifest.json        pose_jumps, ...
-
-    Poses are ARCore's Camera.getPose: x right, y up, z backwards, in the world, at a frame's
-    stamp.
-    """
+    """Frames, IMU and, as ground truth, ARCore's poses of PoseCam."""
     poses = read_table(folder / 'poses.csv')
     images = tuple(
         convert.image_file(row.nanoseconds('timestamp_ns'), folder / 'frames' / (

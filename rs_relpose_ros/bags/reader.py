@@ -11,7 +11,6 @@ import functools
 import logging
 import os
 from pathlib import Path
-import struct
 from types import SimpleNamespace
 from typing import Any, BinaryIO, NamedTuple
 
@@ -127,13 +126,6 @@ for _table, _name, _bounded in _TABLES:
 
 # -- Checks before a parser reads the files -------------------------------------------------------
 
-_MAGIC = b'\x89MCAP0\r\n'
-_FOOTER, _CHUNK = 0x02, 0x06
-_RECORD = struct.Struct('<BQ')
-# Start time, end time, uncompressed size, CRC: the head of a chunk.
-_CHUNK_HEAD = struct.Struct('<QQQI')
-
-
 def _check_path(path: Path) -> None:
     """Raise where there is no bag, or one whose files are incomplete."""
     if not path.exists():
@@ -165,46 +157,10 @@ def _check_path(path: Path) -> None:
     for file in files:
         if file.stat().st_size == 0:
             raise InputError(f'{file} is empty')
-        if file.suffix == '.mcap':
-            _check_mcap(file)
-        elif file.suffix == '.bag':
+        if file.suffix == '.bag':
             with file.open('rb') as opened:
                 if opened.read(9) != b'#ROSBAG V':
                     raise InputError(f'{path} is no ROS 1 bag')
-
-
-def _check_mcap(path: Path) -> None:
-    """Check that an MCAP file (https://mcap.dev/spec) is complete, from its record lengths."""
-    size = path.stat().st_size
-    with path.open('rb') as file:
-        if file.read(len(_MAGIC)) != _MAGIC:
-            raise InputError(f'{path} is no MCAP file')
-        at = len(_MAGIC)
-        opcode = None
-        while opcode != _FOOTER:
-            head = file.read(_RECORD.size)
-            if len(head) < _RECORD.size:
-                raise _truncated(path, at)
-            opcode, length = _RECORD.unpack(head)
-            at += _RECORD.size
-            if at + length > size:
-                raise _truncated(path, at)
-            if opcode == _CHUNK:
-                chunk = file.read(min(length, _CHUNK_HEAD.size))
-                if (len(chunk) < _CHUNK_HEAD.size
-                        or _CHUNK_HEAD.unpack(chunk)[2] > MAX_CHUNK_BYTES):
-                    raise InputError(f'{path} is corrupt: a chunk has an impossible size')
-            at += length
-            file.seek(at)
-        if file.read(len(_MAGIC)) != _MAGIC:
-            raise _truncated(path, at)
-
-
-def _truncated(path: Path, at: int) -> InputError:
-    return InputError(
-        f'{path} is truncated at byte {at}: the recorder was killed or the copy is incomplete; '
-        'copy it again, or save the complete part with '
-        f'"mcap recover {path.name} -o recovered.mcap"')
 
 
 @dataclass(frozen=True, slots=True)
@@ -537,7 +493,10 @@ def open_bag(path: Path | str) -> Iterator[Bag]:
             raise InputError(f'{path} cannot be read: {error.strerror}') from error
         # A damaged file can raise anything in the parsers.
         except Exception as error:
-            fix = f'; try "rosbag reindex {path.name}"' if path.suffix == '.bag' else ''
+            storage = next(path.glob('*.mcap'), path)
+            fix = {'.bag': f'; try "rosbag reindex {path.name}"',
+                   '.mcap': '; if it is truncated, copy it again, or "mcap recover '
+                            f'{storage.name} -o recovered.mcap"'}.get(storage.suffix, '')
             kind = 'is truncated or damaged, or no bag' if path.is_file() else 'is damaged'
             raise InputError(f'{path} {kind}: {_message(error)}{fix}') from error
         yield bag

@@ -293,15 +293,9 @@ def _in_camera(vectors: ArrayLike) -> list[Vector]:
 
 # -- Lens profiles of Gyroflow: readout time and calibration of a camera's mode -------------------
 #
-# github.com/gyroflow/lens_profiles (CC0-1.0) has about 2500, JSON files; used here::
-#
-#     camera_brand, camera_model              of the camera
-#     calib_dimension {w, h}                  size that the calibration belongs to [px]
-#     orig_dimension {w, h}                   size of the video [px]; calib_dimension if absent
-#     fps, frame_readout_time                 [Hz], [ms]: negative upwards, >= 10000 by columns
-#     fisheye_params {camera_matrix, distortion_coeffs}     OpenCV's fisheye model
-#     distortion_model                        another model; absent or opencv_fisheye here
-#     input_horizontal_stretch, input_vertical_stretch      1 for square pixels
+# github.com/gyroflow/lens_profiles (CC0-1.0) has about 2500, JSON files. `calib_dimension`: size
+# that the calibration belongs to [px]; `orig_dimension`: of the video, the same if absent;
+# `frame_readout_time` [ms]: negative upwards, >= 10000 by columns.
 
 _RATE_TOLERANCE = 0.01
 _ASPECT_TOLERANCE = 0.01

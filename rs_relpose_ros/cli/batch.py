@@ -125,8 +125,7 @@ def report(result: runs.BatchOutcome, folder: Path) -> list[str]:
     lines += [f'{row.state.value}: {row.job.bag.path}: {" ".join(row.message.split())}'
               for row in unfinished[:_MOST_LINES]]
     if len(unfinished) > _MOST_LINES:
-        lines.append(f'... and {len(unfinished) - _MOST_LINES} more in '
-                     f'{runs.RESULTS_FILE}')
+        lines.append(f'... and {len(unfinished) - _MOST_LINES} more in {runs.RESULTS_FILE}')
     for one in result.combined.metrics:
         if degrees := len(one.bags) > 1 and one.degrees_of_freedom:
             scale = math.sqrt(max(one.chi2 / degrees, 1.0))

@@ -1,15 +1,9 @@
-"""Time: integer nanoseconds everywhere, and the equation of the time of a row.
+"""Time: integer nanoseconds everywhere, and the time of a row on the IMU's clock.
 
-    t_imu(row v) = stamp + time_offset + k (T - T_ref) + exposure_shift
-                   + (v - v_stamp) * line_delay
+    t_imu(row v) = stamp + time_offset + k (T - T_ref) + exposure_shift + (v - v_stamp) line_delay
 
-``v_stamp`` is row 0, (height - 1) / 2 or height - 1 for a driver that stamps the first, middle or
-last row; ``exposure_shift`` is +exposure/2, 0 or -exposure/2 for a driver that stamps the start,
-middle or end of the exposure. A row shows the mean of its exposure: its time is the middle, and
-the gyro is averaged over the exposure. k is ``time_offset_per_interval``: what the difference of
-stamp and middle of the exposure depends otherwise on the interval T between frames
-(`FrameIntervals`). The exposure is ``exposure_time``, or ``T - exposure_margin`` if a margin is
-given (automatic exposure in little light).
+as in docs/time_and_frames.md, "Rows and the IMU's clock"; T is the interval between frames
+(`FrameIntervals`), k ``time_offset_per_interval``.
 """
 
 from dataclasses import dataclass

@@ -39,8 +39,7 @@ def number(name: str, value: Number, low: float = -math.inf, high: float = math.
     return value
 
 
-def whole_number(name: str, value: int, low: float, high: float = math.inf,
-                 unit: str = '') -> int:
+def whole_number(name: str, value: int, low: float, high: float = math.inf, unit: str = '') -> int:
     """A whole number in [low, high]."""
     if not (_is_within(value, low, high) and int(value) == value):
         raise InputError(
@@ -106,8 +105,7 @@ def unit_length(name: str, value: ArrayLike, tolerance: float) -> None:
         raise InputError(f'{name} must have length 1, got {value!r} of length {length:.4f}')
 
 
-def rotations(name: str, value: ArrayLike | None,
-              shape: tuple[int | str, ...] = (3, 3)) -> Array:
+def rotations(name: str, value: ArrayLike | None, shape: tuple[int | str, ...] = (3, 3)) -> Array:
     """A rotation matrix (3, 3), or several of them (K, 3, 3)."""
     # Bounded first, so that the product cannot overflow.
     R = array(name, value, shape, largest=2.0)

@@ -250,8 +250,7 @@ class GravityFilter:
                           - of_noise * _CORRELATION_TIME / _LASTING, 0.0)
         variance += unexplained * min(_LASTING / self._config.gravity_time_constant, 1.0)**2
         length, length_variance = self._state.length
-        return GravityEstimate(-up, math.sqrt(variance), float(length),
-                               math.sqrt(length_variance))
+        return GravityEstimate(-up, math.sqrt(variance), float(length), math.sqrt(length_variance))
 
     def _begin(self, k: int, stamps_ns: NDArray[np.int64], rates: Array, forces: Array) -> int:
         """Start from the first specific force at or after sample `k`; the index after it.

@@ -117,8 +117,7 @@ class PairValue(NamedTuple):
         if self.kind is Kind.VECTOR:
             values = values or [math.nan] * 3
             if len(values) != 3:
-                raise InputError(
-                    f'{self.key} of ~/pairs must be three numbers, got {text[:60]!r}')
+                raise InputError(f'{self.key} of ~/pairs must be three numbers, got {text[:60]!r}')
         return np.array(values)
 
 

@@ -458,8 +458,7 @@ def run_batch(client: Any, request: Request, folder: Path, work: Callable[[Job],
         'combined': combined.as_json()}
     with written(folder / SUMMARY_FILE) as file:
         file.write(json.dumps(summary, indent=1) + '\n')
-    draw(request.command, rows, combined.metrics,
-                       folder / PICTURE_FILE)
+    draw(request.command, rows, combined.metrics, folder / PICTURE_FILE)
     return result
 
 

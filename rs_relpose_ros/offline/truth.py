@@ -61,8 +61,7 @@ class TrueTrajectory:
             return False
         if self._stamps[after] == at_ns:
             return True
-        return after > 0 and bool(
-            self._stamps[after] - self._stamps[after - 1] <= _MAX_GAP_NS)
+        return after > 0 and bool(self._stamps[after] - self._stamps[after - 1] <= _MAX_GAP_NS)
 
     def position(self, at_ns: int) -> Array:
         """Position (3,) [m] at a time that the poses cover."""

@@ -1,11 +1,6 @@
 """Derotated images: every row rotated by the gyro to the time of the middle row.
 
-The ray m of a pixel in row v is rotated by
-
-    m_mid = R_mid^T R(tau) m,    tau = (v - v_ref) * line_delay,
-
-R(tau) being the orientation of the camera at row time tau. The map has the opposite direction,
-from the pixel of the derotated image to that of the original one: K^-1, undistort,
+The map is from the pixel of the derotated image to that of the original one: K^-1, undistort,
 R(tau)^T R_mid, distort, K, with tau of the row of the original pixel. The translation during the
 readout is not corrected: the gyro does not measure it, and its effect depends on depth.
 """

@@ -1,17 +1,7 @@
 """Recursive calibration from frame pairs, the unknowns of each pair eliminated.
 
-Residuals r of a pair (Sampson errors of the matches, the gyro's rotation, priors of velocities
-and rates) depend on its state x and on the deviations c of `findings`::
-
-    r + J_x dx + J_c dc,    H = J_x^T W J_x,    C = J_x^T W J_c
-    S = J_c^T W J_c - C^T H^-1 C,    b = C^T H^-1 J_x^T W r - J_c^T W r
-
-(Schur complement), so that ``sum S c = sum b`` over many pairs is the calibration that fits all.
-Deviations shift the pose by ``dx = -H^-1 C c``. Over the pairs of the last seconds
-``(sum S_p + P^-1) c = sum b_p`` with a wide prior P, so that deviations that are not observable
-stay zero, with their prior sigma. The inverse Hessian is widened by the misfit of the scores
-``g_p = b_p - S_p c`` of the pairs (sandwich; White, Econometrica 1982), axis by axis: about the
-solution, since about zero they contain the very deviation to be estimated.
+Names are those of the equations in docs/health.md, "Recursive calibration"; the deviations c are
+those of `findings`.
 """
 
 from __future__ import annotations
@@ -212,7 +202,6 @@ def _common_noise(matches: FitMatches, J: Array, r: Array, S: Array) -> tuple[fl
 
 
 def _noise(r: Array) -> float:
-    """Sigma of the matches [px] from their residuals."""
     return max(1.4826 * so3.median(np.abs(r)), _LEAST_SIGMA)
 
 
@@ -525,6 +514,7 @@ class Recursion:
         hessian = S.sum(axis=0) * np.outer(scale, scale) + np.eye(DEVIATIONS)
         covariance = inverse(hessian) * np.outer(scale, scale)
         c = covariance @ b.sum(axis=0)
+        # Sandwich (White, Econometrica 1982), about the solution: scores about zero contain it.
         scores = b - S @ c
         sandwich = covariance @ (scores.T @ scores) @ covariance
         widened, shared = ((n + _FEW_PAIRS) / n)**2, 1.0 + _SHARED**2 * n

@@ -1,10 +1,7 @@
 """Rotation by images alone against the gyro, and accelerometer against images.
 
-The comparison of rotations uses no prior and no pose, so that it holds for any error of axes,
-unit or sign of the gyro. Rotation vectors over some frames, ``theta`` by images and ``phi`` by
-gyro in the camera frame as configured, are summed in ``M = sum theta phi^T``; the rotation Q that
-maximises ``trace(Q^T M)`` aligns them (Kabsch 1976). A constant rate is removed from both first:
-a bias of the gyro, and a steady translation, which is similar to a rotation of the images.
+Method: docs/health.md, "Gross errors" and "Accelerometer". No prior and no pose is used, so that
+the comparison of rotations holds for any error of axes, unit or sign of the gyro.
 """
 
 from dataclasses import dataclass
@@ -112,8 +109,7 @@ class RotationSums(LastSeconds):
         """The comparison; None if there are too few or too small rotations."""
         if len(self) < _FEWEST:
             return None
-        _, intervals, theta, phi = (
-            np.array(column) for column in zip(*self, strict=True))
+        _, intervals, theta, phi = (np.array(column) for column in zip(*self, strict=True))
         by_images = float(np.linalg.norm(theta, axis=1).sum())
         by_gyro = float(np.linalg.norm(phi, axis=1).sum())
         if max(by_images, by_gyro) < _LEAST_ANGLE or by_gyro < 1e-3 * _LEAST_ANGLE:

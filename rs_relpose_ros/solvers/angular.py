@@ -154,8 +154,7 @@ def _reduced_constraints(basis: Array, M: Array) -> bool:
 
 
 @kernel
-def _multiply_add(p: Array, p_size: int, q: Array, q_size: int, factor: float,
-                  out: Array) -> None:
+def _multiply_add(p: Array, p_size: int, q: Array, q_size: int, factor: float, out: Array) -> None:
     """Add `factor` times the product of two polynomials in z to `out`."""
     for i in range(p_size):
         for j in range(q_size):
