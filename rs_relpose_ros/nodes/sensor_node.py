@@ -502,6 +502,9 @@ class SensorNode(StoppableNode):
     def _log_refused(self, refused: FrameRefused) -> None:
         if refused.refusal is Refusal.NO_CALIBRATION:
             return   # logged by `_missing_input`
+        if refused.refusal is Refusal.IMU_GAP and not (
+                self._loop and self._loop.sequencer.counts().frames_taken):
+            return   # the images began before the IMU; if it lasts, `_log_silence` gives it
         if refused.refusal is Refusal.NO_IMU:
             # A gap of 0.3 s between IMU messages: the sensor has stopped.
             if self._inputs is not None and self._inputs.silent(Role.IMU, 0.3):
