@@ -12,6 +12,9 @@ from pathlib import Path
 import sys
 import time
 
+import cv2
+import numpy as np
+
 from rs_relpose_lab.experiments.comparison import (
     compare_live,
     is_still,
@@ -22,17 +25,18 @@ from rs_relpose_lab.experiments.comparison import (
     score_of_replay,
     score_table,
 )
-from rs_relpose_lab.experiments.global_shutter import (
-    draw_before_and_after,
-    five_point_when_derotated,
-)
+from rs_relpose_lab.experiments.global_shutter import five_point_when_derotated
 from rs_relpose_lab.live.live_run import LiveRun, run_live
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.estimator.result import Status
+from rs_relpose_ros.messages.incoming import Intake, sensor_messages
 from rs_relpose_ros.offline.pictures import draw_errors
+from rs_relpose_ros.offline.replay import outcomes
 from rs_relpose_ros.offline.tables import POSES
+from rs_relpose_ros.pipeline.global_shutter import unrolling_loop
+from rs_relpose_ros.pipeline.pair import Frame
 
 ROOT = Path(__file__).resolve().parent.parent
 BAG = ROOT / 'bags' / 'hand_held'
@@ -53,7 +57,7 @@ def compare(live: LiveRun) -> list[str]:
         path = pool.submit(metric_path)
         replayed = compare_live(live.table, live.stamps, BAG, PARAMETERS, OUT, pictures=True)
         opencv = replayed.opencv_scores()
-        shift = draw_before_and_after(BAG, read_parameters(PARAMETERS), OUT / BEFORE_AND_AFTER)
+        shift = draw_before_and_after()
         scores = [replayed.node, score_of_records('the same, replayed', replayed.records),
                   *(future.result() for future in paper), *opencv, derotated.result()]
         draw_errors(replayed.records, OUT / 'errors.png', {s.name: s.errors for s in opencv})
@@ -64,6 +68,21 @@ def compare(live: LiveRun) -> list[str]:
 def score_of_paper(name: str) -> Score:
     """One of `PAPER_ALGORITHMS` over the whole bag."""
     return score_of_replay(name, BAG, read_parameters(PARAMETERS).updated(PAPER_ALGORITHMS[name]))
+
+
+def draw_before_and_after() -> float:
+    """Draw the frame of the bag with the largest shift, raw and derotated; the shift [px]."""
+    parameters = read_parameters(PARAMETERS)
+    loop = unrolling_loop(parameters, offline=True)
+    with open_bag(BAG) as bag:
+        messages = sensor_messages(bag, bag.find_topics())
+        frame = max((outcome.result for outcome in
+                     outcomes(loop, Intake(loop.sequencer, parameters), messages)
+                     if isinstance(outcome, Frame) and outcome.result is not None),
+                    key=lambda found: found.map.shift)
+    cv2.imwrite(str(OUT / BEFORE_AND_AFTER),
+                np.hstack([frame.original.values, frame.image().values]))
+    return frame.map.shift
 
 
 def metric_path() -> str:

@@ -236,14 +236,16 @@ def no_storage(folder: Path) -> Path:
     return bag
 
 
+SUFFIXES = 'mcap', 'db3', 'bag'
+
+
 @pytest.mark.parametrize('make, kind, words', [
     (lambda folder: folder / 'absent', MissingInputError, 'there is no bag'),
     (lambda folder: folder, InputError, 'is no bag: it has no metadata.yaml'),
     (recorder_killed, InputError, 'not stopped properly'),
     (file_of('notes.txt'), InputError, 'is no bag: give'),
-    *((file_of(f'a.{suffix}', b''), InputError, 'is empty') for suffix in ('mcap', 'db3', 'bag')),
-    *((file_of(f'a.{suffix}'), InputError, 'or no bag') for suffix in ('mcap', 'db3')),
-    (file_of('a.bag'), InputError, 'is no ROS 1 bag'),
+    *((file_of(f'a.{suffix}', b''), InputError, 'is truncated') for suffix in SUFFIXES),
+    *((file_of(f'a.{suffix}'), InputError, 'or no bag') for suffix in SUFFIXES),
     *((truncated(*cut), InputError, 'if it is truncated, copy it again, or "mcap recover ')
       for cut in (('mcap', 0.9), ('mcap', 0.5), ('mcap', 0.01), ('mcap_zstd_chunks', 0.5))),
     *((truncated(kind, 0.5), InputError, 'is damaged') for kind in (

@@ -17,14 +17,14 @@ OF_PACKAGE = {path: text for path, text in MODULES.items() if path.parts[0] == P
 # Folder -> most lines and modules. A larger number needs its reason in the commit that raises it.
 BUDGETS = {
     'rs_relpose_ros': (310, 5),
-    'rs_relpose_ros/bags': (1713, 6),
+    'rs_relpose_ros/bags': (1705, 6),
     'rs_relpose_ros/calibrate': (3106, 9),
     'rs_relpose_ros/cli': (1118, 6),
-    'rs_relpose_ros/config': (833, 3),
+    'rs_relpose_ros/config': (827, 3),
     'rs_relpose_ros/estimator': (3899, 12),
-    'rs_relpose_ros/geometry': (1252, 6),
+    'rs_relpose_ros/geometry': (1247, 6),
     'rs_relpose_ros/imu': (1303, 4),
-    'rs_relpose_ros/messages': (1586, 5),
+    'rs_relpose_ros/messages': (1558, 5),
     'rs_relpose_ros/nodes': (2178, 9),
     'rs_relpose_ros/odometry': (3139, 11),
     'rs_relpose_ros/offline': (2504, 9),

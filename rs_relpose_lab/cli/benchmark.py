@@ -100,13 +100,10 @@ def _report_of(items: Sequence[Any], work: Callable[[Any], Any],
 
 # -- options of several benchmarks ------------------------------------------------------------
 
-def _number(parser: argparse.ArgumentParser, option: str, default: int, text: str) -> None:
-    parser.add_argument(option, type=int, default=default, metavar='N',
-                        help=f'{text} (default: %(default)s)')
-
-
-def _seconds(parser: argparse.ArgumentParser, option: str, default: float, text: str) -> None:
-    parser.add_argument(option, type=float, default=default, metavar='S',
+def _number(parser: argparse.ArgumentParser, option: str, default: float, text: str) -> None:
+    """Declare an option that is a whole number (N) or seconds (S), as its default."""
+    parser.add_argument(option, type=type(default), default=default,
+                        metavar='N' if isinstance(default, int) else 'S',
                         help=f'{text} (default: %(default)s)')
 
 
@@ -195,7 +192,7 @@ def _run_speed(args: argparse.Namespace) -> int:
 
 def _live_arguments(parser: argparse.ArgumentParser) -> None:
     _cells(parser, ['all'], 'e.g. "640x480-*" or 1280x720-mono8-imu400 (default: all)')
-    _seconds(parser, '--duration', 60.0, 'length of each cell')
+    _number(parser, '--duration', 60.0, 'length of each cell')
     parser.add_argument('--soak', type=float, nargs='?', const=10.0, default=0.0,
                         metavar='MINUTES',
                         help='play the cells so long instead (default: 10), and show memory and '
@@ -246,14 +243,9 @@ def _run_live(args: argparse.Namespace) -> int:
     return int(failed)
 
 
-def _cases_arguments(parser: argparse.ArgumentParser) -> None:
-    _cells(parser, ['*'], 'all by default')
-
-
 def _run_cases(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments import live_cases
     from rs_relpose_lab.live.live_cases import CASES
-
     chosen = [CASES[name] for name in matching_cells(args.cells, CASES)]
     return _report_of(chosen, lambda case: live_cases.run_case(case, args.output / 'walk'),
                       live_cases.write_report, args, 'case')
@@ -261,7 +253,6 @@ def _run_cases(args: argparse.Namespace) -> int:
 
 def _compare_live(args: argparse.Namespace, cells: Sequence[str]) -> int:
     from rs_relpose_lab.experiments import live
-
     _check_at_least(1, args, 'turns')
     if not (args.against / 'rs_relpose_ros' / 'cli' / 'main.py').is_file():
         raise InputError(f'--against {args.against} is no checkout of this package: give the '
@@ -307,7 +298,7 @@ def _run_consistency(args: argparse.Namespace) -> int:
 
 def _lenses_arguments(parser: argparse.ArgumentParser) -> None:
     _number(parser, '--bags', 10, 'bags, each with a lens of its own')
-    _seconds(parser, '--seconds', 20.0, 'length of a bag')
+    _number(parser, '--seconds', 20.0, 'length of a bag')
     parser.add_argument('--model', choices=('plumb_bob', 'equidistant'), default='plumb_bob',
                         help='distortion model (default: %(default)s)')
     parser.add_argument('--live', action='store_true',
@@ -332,7 +323,7 @@ def _run_lenses(args: argparse.Namespace) -> int:
 def _stretches_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('bags', nargs='+', type=Path, metavar='BAG',
                         help='recordings of one camera with one IMU')
-    _seconds(parser, '--seconds', 4.0, 'length of a part')
+    _number(parser, '--seconds', 4.0, 'length of a part')
     parser.add_argument('--rows', metavar=('FIRST', 'LAST'), type=float, nargs=2,
                         default=(0.0, 0.0), help='use only these image rows')
 
@@ -354,7 +345,7 @@ def _trust_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--rows', nargs='+', default=['all'], metavar='NAME',
                         help='wrong configurations, with * as in file names, e.g. "readout-*" '
                              '(default: all)')
-    _seconds(parser, '--seconds', 30.0, 'length of a simulated bag')
+    _number(parser, '--seconds', 30.0, 'length of a simulated bag')
     _number(parser, '--right', 0, 'further bags with the right configuration, for false alarms: '
                                   'noise at the configured level, half of it and twice')
     _number(parser, '--rendered', 0, 'bags with images: the first ones of the others, rendered')
@@ -425,7 +416,7 @@ def _odometry_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--recordings', type=Path, nargs='+', metavar='BAG',
                         help='instead, bags with the right parameters next to them (BAG.yaml), '
                              'whole and in parts')
-    _seconds(parser, '--part', 4.5, 'length of a part of these')
+    _number(parser, '--part', 4.5, 'length of a part of these')
 
 
 def _run_odometry(args: argparse.Namespace) -> int:
@@ -474,7 +465,6 @@ def _run_reconstruction(args: argparse.Namespace) -> int:
     from rs_relpose_ros.odometry import need_gtsam
     need_gtsam()
     from rs_relpose_lab.experiments import odometry, reconstruction
-
     return _report_of(odometry.walks(args.walks, args.seed, args.seconds), reconstruction.on_walk,
                       reconstruction.write_report, args, 'walk')
 
@@ -494,7 +484,8 @@ BENCHMARKS = {
         'once into OUTPUT/clips', _live_arguments, _run_live, 'live'),
     'live-cases': Benchmark(
         'faults of drivers and configurations, each with a node of its own: named, or harmless. '
-        'Needs ROS', _cases_arguments, _run_cases, 'live_cases'),
+        'Needs ROS', partial(_cells, default=['*'], text='all by default'), _run_cases,
+        'live_cases'),
     'consistency': Benchmark(
         'whether covariances hold: squared errors in their units (NEES by degrees of freedom), '
         'over the pairs of rendered walks, and over the true pairs of recordings',

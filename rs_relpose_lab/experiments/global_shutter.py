@@ -30,8 +30,7 @@ from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
 from rs_relpose_ros.imu.buffer import ImuSample
-from rs_relpose_ros.messages.incoming import Intake, sensor_messages
-from rs_relpose_ros.offline.replay import MessageRefused, outcomes, read_truth, Replay
+from rs_relpose_ros.offline.replay import read_truth, Replay
 from rs_relpose_ros.offline.unroll import unroll
 from rs_relpose_ros.pipeline.global_shutter import GlobalShutterFrame, unrolling_loop
 from rs_relpose_ros.pipeline.pair import Frame
@@ -262,25 +261,6 @@ def five_point_when_derotated(path: Path, parameters: Parameters, folder: Path) 
     shutil.rmtree(folder / f'{path.name}_derotated', ignore_errors=True)
     return replace(five_point(_unrolled(path, parameters, folder), as_global_shutter(parameters)),
                    name='OpenCV 5-point, derotated')
-
-
-def frames_of_bag(path: Path, parameters: Parameters) -> Iterator[GlobalShutterFrame]:
-    """The derotated frames of a bag."""
-    loop = unrolling_loop(parameters, offline=True)
-    intake = Intake(loop.sequencer, parameters)
-    with open_bag(path) as bag:
-        for outcome in outcomes(loop, intake, sensor_messages(bag, bag.find_topics())):
-            if isinstance(outcome, MessageRefused):
-                raise outcome.error
-            if isinstance(outcome, Frame) and outcome.result is not None:
-                yield outcome.result
-
-
-def draw_before_and_after(path: Path, parameters: Parameters, picture: Path) -> float:
-    """Draw the frame of a bag with the largest shift, raw and derotated; the shift [px]."""
-    frame = max(frames_of_bag(path, parameters), key=lambda found: found.map.shift)
-    cv2.imwrite(str(picture), np.hstack([frame.original.values, frame.image().values]))
-    return frame.map.shift
 
 
 def bag_configurations(bags: int, first_seed: int) -> list[SimulationConfig]:

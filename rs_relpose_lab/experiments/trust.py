@@ -226,10 +226,7 @@ def bag_row(recording: trust_runs.Recording, name: str, informative: NDArray[np.
         informative=seconds, qualifies=seconds >= row.within, flagged=bool(in_time),
         flagged_after=flags[0][0] if flags else math.nan, named=' '.join(named),
         named_right=len(named) <= 2 and bool(set(named) & set(row.named)), pairs=len(pairs),
-        poses=len(later), direction_beyond=_directions_beyond(later),
-        rotation_beyond=_rotations_beyond(later), all_poses=len(every),
-        all_direction_beyond=_directions_beyond(every),
-        all_rotation_beyond=_rotations_beyond(every),
+        poses=len(later), all_poses=len(every), **_beyond(later), **_beyond(every, 'all_'),
         nees_direction=_mean([p.chi_direction / 2 for p in counted]),
         nees_rotation=_mean([p.chi_rotation / 3 for p in counted]),
         direction_error=_median([p.direction_error for p in counted]),
@@ -245,12 +242,9 @@ def _clock(informative: NDArray[np.bool_], at: float) -> float:
     return float(np.count_nonzero(informative[:full])) + running
 
 
-def _directions_beyond(pairs: Sequence[trust_runs.EvaluatedPair]) -> int:
-    return sum(pair.chi_direction > LIMIT_T for pair in pairs)
-
-
-def _rotations_beyond(pairs: Sequence[trust_runs.EvaluatedPair]) -> int:
-    return sum(pair.chi_rotation > LIMIT_R for pair in pairs)
+def _beyond(pairs: Sequence[trust_runs.EvaluatedPair], prefix: str = '') -> dict[str, int]:
+    return {f'{prefix}direction_beyond': sum(p.chi_direction > LIMIT_T for p in pairs),
+            f'{prefix}rotation_beyond': sum(p.chi_rotation > LIMIT_R for p in pairs)}
 
 
 def _mean(values: Sequence[float]) -> float:

@@ -127,40 +127,32 @@ for _table, _name, _bounded in _TABLES:
 # -- Checks before a parser reads the files -------------------------------------------------------
 
 def _check_path(path: Path) -> None:
-    """Raise where there is no bag, or one whose files are incomplete."""
+    """Raise where there is no bag, or one without usable metadata."""
     if not path.exists():
         raise MissingInputError(f'there is no bag at {path}')
-    if path.is_dir():
-        files = sorted(file for file in path.iterdir() if file.suffix in _STORAGE_SUFFIXES)
-        if not (path / 'metadata.yaml').exists():
-            if files:
+    if not path.is_dir():
+        if path.suffix not in (*_STORAGE_SUFFIXES, '.bag'):
+            raise InputError(f'{path} is no bag: give a rosbag2 directory (with metadata.yaml) or '
+                             'a .mcap, .db3 or .bag file')
+        return
+    metadata = path / 'metadata.yaml'
+    if not metadata.exists():
+        for file in sorted(path.iterdir()):
+            if file.suffix in _STORAGE_SUFFIXES:
                 raise InputError(
                     f'{path} has no metadata.yaml, so its recorder was not stopped properly: give '
-                    f'{files[0].name} itself, or make one with "ros2 bag reindex {path}"')
-            raise InputError(f'{path} is no bag: it has no metadata.yaml')
-        metadata = path / 'metadata.yaml'
-        if metadata.stat().st_size > _MAX_METADATA_BYTES:
-            raise InputError(f'{metadata} is no metadata of a bag: it has more than '
-                             f'{_MAX_METADATA_BYTES} bytes')
-        content = metadata.read_bytes()
-        with suppress(yaml.YAMLError, RecursionError):   # no YAML: refused by the reader
-            # Printed, aliases can be endless.
-            if b'*' in content and any(
-                    isinstance(event, yaml.AliasEvent) for event in yaml.parse(content)):
-                raise InputError(f'{metadata} has YAML aliases, which no recorder writes: it is '
-                                 'damaged')
-    elif path.suffix in (*_STORAGE_SUFFIXES, '.bag'):
-        files = [path]
-    else:
-        raise InputError(f'{path} is no bag: give a rosbag2 directory (with metadata.yaml) or a '
-                         '.mcap, .db3 or .bag file')
-    for file in files:
-        if file.stat().st_size == 0:
-            raise InputError(f'{file} is empty')
-        if file.suffix == '.bag':
-            with file.open('rb') as opened:
-                if opened.read(9) != b'#ROSBAG V':
-                    raise InputError(f'{path} is no ROS 1 bag')
+                    f'{file.name} itself, or make one with "ros2 bag reindex {path}"')
+        raise InputError(f'{path} is no bag: it has no metadata.yaml')
+    if metadata.stat().st_size > _MAX_METADATA_BYTES:
+        raise InputError(f'{metadata} is no metadata of a bag: it has more than '
+                         f'{_MAX_METADATA_BYTES} bytes')
+    content = metadata.read_bytes()
+    with suppress(yaml.YAMLError, RecursionError):   # no YAML: refused by the reader
+        # Printed, aliases can be endless.
+        if b'*' in content and any(
+                isinstance(event, yaml.AliasEvent) for event in yaml.parse(content)):
+            raise InputError(f'{metadata} has YAML aliases, which no recorder writes: it is '
+                             'damaged')
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ writes all parameters at their defaults, with descriptions.
 from collections.abc import Mapping, Sequence
 import contextlib
 from dataclasses import dataclass
+import math
 from pathlib import Path
 import sys
 import textwrap
@@ -104,16 +105,9 @@ def comment(text: str, indent: str = '') -> list[str]:
 
 
 def yaml_text(value: Any) -> str:
-    """YAML of a bool, a number, a text without quotes, or a tuple of those."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        return f"'{value}'"
-    if isinstance(value, tuple):
-        return f'[{", ".join(map(yaml_text, value))}]'
-    text = repr(value)
-    # 1e-05 is a text in YAML 1.1: a float needs a point.
-    return text.replace('e', '.0e') if 'e' in text and '.' not in text else text
+    """YAML of a bool, a number, a text, or a tuple of those, in one line."""
+    plain = list(value) if isinstance(value, tuple) else value
+    return yaml.safe_dump([plain], default_flow_style=True, width=math.inf)[1:-2]
 
 
 def file_values(path: Path, wanted: str = _NODE) -> dict[str, Any]:

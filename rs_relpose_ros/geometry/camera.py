@@ -277,13 +277,8 @@ class RollingShutterCamera:
     def project_rotating(self, rays: Array, rows: Array, rotations: Array) -> Array:
         """Raw pixels (N, 2) of rays (N, 3) while the camera rotates; NaN where there is none.
 
-        Parameters
-        ----------
-        rows : (N,) ndarray
-            First guesses of the rows.
-        rotations : (K, 3, 3) ndarray
-            From the frame of the rays to that of the camera, at K rows spread evenly from the
-            first to the last one.
+        `rows` (N,): first guesses. `rotations` (K, 3, 3): from the frame of the rays to that of
+        the camera, at K rows spread evenly from the first to the last one.
         """
         return project_rotating(rays, rows, rotations, self.height,
                                 (self.fx, self.fy, self.cx, self.cy),

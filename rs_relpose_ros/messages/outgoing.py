@@ -121,17 +121,12 @@ class PairValue(NamedTuple):
         return np.array(values)
 
 
-def _part(images: ImageInformation | None,
-          of: Callable[[ImageInformation], ArrayLike]) -> Array | None:
-    """Part of the images' estimate; None if it is not known."""
-    if images is None:
-        return None
-    numbers = np.atleast_1d(of(images))
-    return numbers if np.isfinite(numbers).all() else None
-
-
 def _image_value(key: str, of: Callable[[ImageInformation], ArrayLike]) -> PairValue:
-    return PairValue(key, Kind.REALS, lambda pair: _part(pair.pose.images, of))
+    """Part of the images' estimate; none if it is not known."""
+    def part(pair: PairResult) -> Array | None:
+        numbers = np.nan if pair.pose.images is None else of(pair.pose.images)
+        return np.atleast_1d(numbers) if np.isfinite(numbers).all() else None
+    return PairValue(key, Kind.REALS, part)
 
 
 # `TOPICS_KEY` follows: the other topics of the pair.
@@ -475,6 +470,9 @@ _BAR_WIDTH = 14
 _CAPTION_HEIGHT = 24
 _OUTLIER = (255, 255, 0)
 _WHITE = (255, 255, 255)
+# From the first row to the last one (216, 3).
+_COLORS = np.asarray(cv2.applyColorMap(
+    np.arange(40, 256, dtype=np.uint8)[:, None], cv2.COLORMAP_PLASMA)[:, 0], dtype=np.uint8)
 # Fractional bits of the coordinates that OpenCV draws at.
 _SHIFT = 4
 
@@ -483,8 +481,8 @@ def draw_pair(result: PairResult) -> Color:
     """The current image (H, W, 3) in blue, green, red, with the matches of its pair.
 
     Each match is a line from its pixel in the reference keyframe to a dot at its current pixel.
-    Inliers have the colour of their row time, explained by the bar on the left, outliers are cyan.
-    A caption has the status. Needs the pair's image.
+    Inliers have the colour of their row, explained with its time by the bar on the left; outliers
+    are cyan. A caption has the status. Needs the pair's image.
     """
     assert result.image2 is not None
     height, width = result.image2.shape
@@ -497,8 +495,7 @@ def draw_pair(result: PairResult) -> Color:
     inliers = result.pose.inliers
     if len(inliers) != len(points1):   # a pair without an estimate has none
         inliers = np.zeros(len(points1), dtype=bool)
-    first, last = _span(result)
-    colors = _colors(result.row_times2, first, last)
+    colors = _COLORS[(points2[:, 1] / height * len(_COLORS)).astype(int)].tolist()
     # Pixel centres lie at integer coordinates.
     ends = np.round(((np.stack([points1, points2], axis=1) + 0.5) * scale - 0.5)
                     * (1 << _SHIFT)).astype(int)
@@ -506,38 +503,13 @@ def draw_pair(result: PairResult) -> Color:
         color = color if inlier else _OUTLIER
         cv2.line(canvas, start, end, color, 1, cv2.LINE_AA, _SHIFT)
         cv2.circle(canvas, end, 2 << _SHIFT, color, -1, cv2.LINE_AA, _SHIFT)
-    if len(points2):
-        _draw_bar(canvas, result, first, last)
+    if len(points2) and np.ptp(points2[:, 1]) >= 1.0:
+        canvas[:, :_BAR_WIDTH] = cv2.resize(_COLORS[:, None], (_BAR_WIDTH, len(canvas)))
+        times = np.polyval(np.polyfit(points2[:, 1], result.row_times2, 1), (0, height - 1))
+        for time, y in zip(times, (14, len(canvas) - 6), strict=True):
+            cv2.putText(canvas, f'{1e3 * time:.1f} ms', (_BAR_WIDTH + 4, y),
+                        cv2.FONT_HERSHEY_SIMPLEX, 0.42, _WHITE, 1, cv2.LINE_AA)
     return np.concatenate([canvas, _caption(result, int(inliers.sum()), size[0])])
-
-
-def _span(result: PairResult) -> tuple[float, float]:
-    """Least and largest row time [s] of the matches; they differ."""
-    times = result.row_times2
-    if len(times) == 0 or np.ptp(times) < 1e-6:
-        return 0.0, 1.0
-    return float(times.min()), float(times.max())
-
-
-def _colors(times: NDArray[np.float64], first: float, last: float) -> list[tuple[int, ...]]:
-    levels = np.clip(40 + 215 * (times - first) / (last - first), 0, 255).astype(np.uint8)
-    if len(levels) == 0:
-        return []
-    return [tuple(color) for color in
-            cv2.applyColorMap(levels[:, None], cv2.COLORMAP_PLASMA)[:, 0].tolist()]
-
-
-def _draw_bar(canvas: Color, result: PairResult, first: float, last: float) -> None:
-    """Colours of the rows, with the times of the first and the last row."""
-    rows = result.matches.points2[:, 1]
-    if np.ptp(rows) < 1.0:
-        return
-    scale = canvas.shape[1] / result.image2.shape[1]  # type: ignore[union-attr]
-    of_rows = np.polyval(np.polyfit(rows, result.row_times2, 1), np.arange(len(canvas)) / scale)
-    canvas[:, :_BAR_WIDTH] = np.array(_colors(of_rows, first, last), dtype=np.uint8)[:, None]
-    for row, y in ((0, 14), (len(canvas) - 1, len(canvas) - 6)):
-        cv2.putText(canvas, f'{1e3 * of_rows[row]:.1f} ms', (_BAR_WIDTH + 4, y),
-                    cv2.FONT_HERSHEY_SIMPLEX, 0.42, _WHITE, 1, cv2.LINE_AA)
 
 
 def _caption(result: PairResult, inliers: int, width: int) -> Color:
