@@ -375,14 +375,14 @@ class Estimation:
         """
         problem, config = self.problem, self.config
         state, inliers, sigma = refined.state, refined.inliers, refined.sigma
-        parallax = float(np.median(fit.transfer_errors(
-            problem.observations, inliers, np.ascontiguousarray(state.R), problem.focal)))
+        parallax = so3.median(fit.transfer_errors(
+            problem.observations, inliers, np.ascontiguousarray(state.R), problem.focal))
         # Not from the rotation of the pose, which is arbitrary for points on a line.
         start = so3.aligning_rotation(sampling.correlation(problem.observations, inliers, *RAYS))
         R, information = fit.fit_rotation(
             problem.observations, inliers, start, self.priors, problem.focal, sigma)
         left = fit.transfer_errors(problem.observations, inliers, R, problem.focal)
-        median = float(np.median(left))
+        median = so3.median(left.copy())
         pure_rotation = median < ROTATION_ONLY_SIGMAS * sigma
         if not pure_rotation and parallax >= config.min_parallax:
             return None

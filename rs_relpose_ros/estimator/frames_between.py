@@ -22,7 +22,7 @@ from rs_relpose_ros.estimator.velocity import CORRELATION_TIME, span_of_scales
 from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
-from rs_relpose_ros.geometry.so3 import exp_so3, log_so3, skew, tangent_basis
+from rs_relpose_ros.geometry.so3 import by_axes, exp_so3, log_so3, median, skew, tangent_basis
 
 # Error of gravity and accelerometer together, 1 sigma per axis [m/s^2]: a camera in motion does
 # not measure its tilt better.
@@ -174,8 +174,8 @@ def refined(pose: RelativePose, points1: Array, motion1: FrameMotion, second: tu
         tracks.used[adjusted.far] = False
         tracks.observations.swapaxes(2, 3)[
             adjusted.far, adjustment.TO_PIXELS:adjustment.TIME] = 0.0
-    distances = state.tracks[:, adjustment.INVERSE_DISTANCE][tracks.used[0]]
-    if not (np.isfinite(adjusted.covariance).all() and np.median(distances) > 0.0):
+    distances = state.tracks[:, adjustment.INVERSE_DISTANCE][tracks.used[0]]   # a copy
+    if not (np.isfinite(adjusted.covariance).all() and median(distances) > 0.0):
         return replace(pose, frames_reason='the adjustment of all frames does not converge')
     if adjusted.sigma > max(_LARGEST_NOISE * config.threshold, config.pixel_sigma):
         return replace(pose, frames_reason='tracks and gyro of the frames between contradict each '
@@ -247,7 +247,7 @@ def _priors(views: Sequence[_View], path: _Path,
     walk = max(first - of_bias * times[0], 0.0) + _LEAST_WALK**2
     # Errors of the stamps, of the first frame for all others.
     rates = np.array([view.rotation @ view.motion.angular_velocity for view in views])
-    covariance: Array = np.kron(walk * np.minimum.outer(times, times), np.eye(3))
+    covariance = by_axes(walk * np.minimum.outer(times, times))
     covariance += np.tile(config.stamp_sigma**2 * np.outer(rates[0], rates[0]),
                           (len(times), len(times)))
     for k, rate in enumerate(rates[1:]):
@@ -302,7 +302,7 @@ def _result(pose: RelativePose, adjusted: adjustment.Adjusted, tracks: Tracks, p
     derivatives[..., TANGENT:adjustment.LOG_SCALE] = by_state[:3, TANGENT:adjustment.LOG_SCALE] / T
     derivatives[..., adjustment.LOG_SCALE] = of_scale
     of_accelerations = derivatives[..., adjustment.ACCELERATION:]
-    of_accelerations[..., :bends.shape[1] * 3] = k * np.kron(bends[:, None], np.eye(3))
+    of_accelerations[..., :bends.shape[1] * 3] = k * by_axes(bends).reshape(2, 3, -1)
     by_first, by_second = derivatives
     # R^T p' rotates with the error of R.
     by_second = R.T @ (by_second + skew(velocities[1]) @ by_state[3:])

@@ -41,10 +41,10 @@ def middle_row_delay(camera: RollingShutterCamera) -> float:
 def build_problem(points1: Array, points2: Array, camera: RollingShutterCamera,
                   motion1: FrameMotion, motion2: FrameMotion, relative_rotation: Array | None,
                   relative_rotation_covariance: Array | None,
-                  derotate: bool = True) -> TwoViewProblem:
+                  by_gyro: bool = True) -> TwoViewProblem:
     """Unproject, derotate and move to the middle row.
 
-    Without `derotate` (models without angular velocity: linear, global) rays are as measured.
+    Without `by_gyro` (models without angular velocity: linear, global) rays are as measured.
     """
     delay = middle_row_delay(camera)
     motion1, motion2 = motion1.shifted(delay), motion2.shifted(delay)
@@ -58,35 +58,23 @@ def build_problem(points1: Array, points2: Array, camera: RollingShutterCamera,
         # A floor far below any gyro keeps the information finite.
         information = np.linalg.inv(covariance + 1e-14 * np.eye(3))
         information = 0.5 * (information + information.T)
-    observations = observed(points1, points2, camera, motion1, motion2, derotate)
+    observations = np.empty((len(points1), 20))
+    for k, (pixels, motion) in enumerate(((points1, motion1), (points2, motion2))):
+        rays, jacobian = camera.unproject_with_jacobian(pixels)
+        tau = camera.row_times(pixels[:, 1]) - delay
+        rotations, rate = ((motion.rotations(tau), motion.angular_velocity) if by_gyro
+                           else (np.tile(np.eye(3), (len(tau), 1, 1)), np.zeros(3)))
+        derotate(rays, jacobian, rotations, camera.line_delay * rate,
+                 observations[:, 9 * k:9 * k + 9])
+        observations[:, 18 + k] = tau
     valid, points = _checked_columns(observations)
     return TwoViewProblem(observations, points, valid, 0.5 * (camera.fx + camera.fy), motion1,
                           motion2, -delay, rotation, information)
 
 
-def observed(points1: Array, points2: Array, camera: RollingShutterCamera, motion1: FrameMotion,
-             motion2: FrameMotion, derotate: bool = True,
-             rotations: tuple[Array, Array] | None = None) -> Array:
-    """Observations (N, 20) of matched pixels (N, 2); motions at the middle row.
-
-    `rotations`: (N, 3, 3) of their rows in both frames, if they are known.
-    """
-    delay, observations = middle_row_delay(camera), np.empty((len(points1), 20))
-    for k, (points, motion) in enumerate(((points1, motion1), (points2, motion2))):
-        rays, jacobian = camera.unproject_with_jacobian(points)
-        tau = camera.row_times(points[:, 1]) - delay
-        observations[:, 18 + k], block = tau, observations[:, 9 * k:9 * k + 9]
-        if derotate:
-            _derotate(rays, jacobian, motion.rotations(tau) if rotations is None else rotations[k],
-                      camera.line_delay * motion.angular_velocity, block)
-        else:
-            _derotate(rays, jacobian, np.tile(np.eye(3), (len(points), 1, 1)), np.zeros(3), block)
-    return observations
-
-
 @kernel
-def _derotate(rays: Array, jacobian: Array, rotations: Array, row_rotation: Array,
-              block: Array) -> None:
+def derotate(rays: Array, jacobian: Array, rotations: Array, row_rotation: Array,
+             block: Array) -> None:
     """Fill one camera's `block` (N, 9): derotated ray and its derivatives by u and v."""
     for i in range(len(rays)):
         for j in range(3):

@@ -443,9 +443,11 @@ def gain_without_gyro(matches: RayMatches, state: TwoViewState, prior: Priors, f
 
 def translation_direction(observations: Array, R: Array) -> Array:
     """Unit vector (3,) nearest to the epipolar planes of observations (N, 20) for a rotation."""
-    normals = np.cross(observations[:, :3], observations[:, 9:12] @ R.T)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-3)[:, None]
-    return np.ascontiguousarray(np.linalg.eigh(normals.T @ normals)[1][:, 0])
+    x, y, z = observations[:, :3].T
+    u, v, w = R @ observations[:, 9:12].T
+    normals = np.array([y * w - z * v, z * u - x * w, x * v - y * u])
+    normals /= np.maximum(np.sqrt((normals**2).sum(axis=0)), 1e-3)
+    return np.ascontiguousarray(np.linalg.eigh(normals @ normals.T)[1][:, 0])
 
 
 # -- Distribution of the inliers' rays: do they determine a pose? ---------------------------------
@@ -466,7 +468,7 @@ def distinct_directions(observations: Array, use: NDArray[np.bool_], first: int,
                         cell: float) -> int:
     """Number of distinct rays, to `cell` [rad]: copies of one add no information."""
     x, y = np.round(observations[use, first:first + 2].T / cell)
-    return len(np.unique(x + 1e6 * y))
+    return len(set((x + 1e6 * y).tolist()))
 
 
 def distance_from_a_plane(observations: Array, use: NDArray[np.bool_], first: int) -> float:

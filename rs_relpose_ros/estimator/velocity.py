@@ -253,7 +253,7 @@ def expected_velocities(problem: TwoViewProblem, motion: str, interval: float,
     else:
         expected, covariance = _of_imu(problem, inertial)
     # (alpha', beta') to u = b (d - c t) + a: a = (alpha' / T, alpha' / T - beta')
-    to_velocities = np.kron(np.array([[1.0 / interval, 0.0], [1.0 / interval, -1.0]]), np.eye(3))
+    to_velocities = so3.by_axes(np.array([[1.0 / interval, 0.0], [1.0 / interval, -1.0]]))
     covariance = to_velocities @ covariance @ to_velocities.T + ROW_VELOCITY_SIGMA**2 * np.eye(6)
     lowest, highest = span_of_scales(motion, interval)
     step = (highest - lowest) / SCALE_COUNT
@@ -281,8 +281,8 @@ def _of_imu(problem: TwoViewProblem, inertial: InertialMotion) -> tuple[Array, A
     if p.any():
         if problem.rotation is None:
             raise InputError('inertial with a lever_arm requires relative_rotation, too')
-        R, arm1 = problem.rotation, np.cross(problem.motion1.angular_velocity, p)
-        arm2 = np.cross(problem.motion2.angular_velocity, p)
+        R, arm1 = problem.rotation, so3.skew(problem.motion1.angular_velocity) @ p
+        arm2 = so3.skew(problem.motion2.angular_velocity) @ p
         alpha = alpha + inertial.duration * arm1 + p - R @ p
         beta = beta + arm1 - R @ arm2
     return np.concatenate([alpha, beta]), shifted.covariance
@@ -295,7 +295,7 @@ def _of_carrier(carrier: CarrierMotion, interval: float) -> Array:
     to_both = np.vstack([interval - times, np.ones(parts)]) * interval / parts
     correlation = np.exp(-np.abs(times[:, None] - times) / CORRELATION_TIME)
     covariance: Array = carrier.acceleration**2 * to_both @ correlation @ to_both.T
-    return np.asarray(np.kron(covariance, np.eye(3)))
+    return so3.by_axes(covariance)
 
 
 # -- Agreement of the measured acceleration with the velocities in the images ---------------------

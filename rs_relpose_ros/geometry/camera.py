@@ -161,8 +161,8 @@ def undistort_points(points: Array, first_guesses: Array, distort: int,
             if length > limit:
                 dx, dy = dx * limit / length, dy * limit / length
             x, y = x + dx, y + dy
-            # Relative to the point: 1e-9 px at any focal length.
-            if length < 1e-13 * (1.0 + limit):
+            # The error after a step is about its square: 1e-9 px at any focal length.
+            if length < 1e-8 * (1.0 + limit):
                 converged = True
                 break
         distort_at(distort, x, y, k, v)

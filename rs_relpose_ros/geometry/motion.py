@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array, validate
-from rs_relpose_ros.geometry.so3 import copy_matrix, copy_vector, exp_so3, log_so3, multiply
+from rs_relpose_ros.geometry.so3 import (
+    copy_matrix,
+    copy_vector,
+    exp_so3,
+    integrated_rotations,
+    log_so3,
+    multiply,
+)
 from rs_relpose_ros.jit import kernel
 
 # Far beyond any sensor: products of larger numbers may overflow.
@@ -81,20 +87,14 @@ class FrameMotion:
         if not times[0] <= 0.0 <= times[-1]:
             raise InputError('times must enclose 0, the time of the reference row, '
                              f'got [{times[0]:.6f}, {times[-1]:.6f}] s')
-        steps = np.diff(times)
-        # Rate linear between samples, to fourth order as in `imu.integration`.
-        angles = 0.5 * (rates[1:] + rates[:-1]) * steps[:, None]
-        step_rotations = Rotation.from_rotvec(
-            angles + np.cross(rates[:-1], rates[1:]) * (steps**2 / 12.0)[:, None]).as_matrix()
-        rotations = np.empty((len(times), 3, 3))
-        rotations[0] = np.eye(3)
-        for k, step in enumerate(step_rotations):
-            rotations[k + 1] = rotations[k] @ step
+        rotations = integrated_rotations(times, rates)
         # The mean over the rows: one sample has several times its noise.
-        mean_rate = angles.sum(axis=0) / (times[-1] - times[0])
-        unaligned = cls(mean_rate, None, times, rotations)
+        mean_rate = (0.5 * (times[1:] - times[:-1]) @ (rates[1:] + rates[:-1])
+                     / (times[-1] - times[0]))
+        at_reference, _ = rotations_between(times, rotations, np.zeros(1),
+                                            times.searchsorted(np.zeros(1), side='right'))
         return cls(mean_rate, None if gravity is None else np.asarray(gravity), times,
-                   unaligned.rotations([0.0])[0].T @ rotations)
+                   at_reference[0].T @ rotations)
 
     def rotations(self, row_times: ArrayLike) -> Array:
         """Orientation (N, 3, 3) at row times (N,) [s], in the frame of the reference row.
@@ -126,9 +126,9 @@ class FrameMotion:
         rotation = self.rotations([delay])[0]
         moved = self.gravity if self.gravity is None else rotation.T @ self.gravity
         if self.knot_times is None or self.knot_rotations is None:
-            return replace(self, gravity=moved)
-        return replace(self, gravity=moved, knot_times=self.knot_times - delay,
-                       knot_rotations=rotation.T @ self.knot_rotations)
+            return validate.replaced(self, gravity=moved)
+        return validate.replaced(self, gravity=moved, knot_times=self.knot_times - delay,
+                                 knot_rotations=rotation.T @ self.knot_rotations)
 
 
 @kernel
@@ -233,6 +233,7 @@ class InertialMotion:
         jacobian[:3, :3] = jacobian[3:, 3:] = turn.T
         jacobian[:3, 3:] = delay * turn.T
         covariance = jacobian @ self.covariance @ jacobian.T
-        return replace(self, alpha=turn.T @ alpha, beta=turn.T @ beta,
-                       covariance=0.5 * (covariance + covariance.T),
-                       acceleration1=turn.T @ a1, acceleration2=turn.T @ a2)
+        return validate.replaced(
+            self, alpha=turn.T @ alpha, beta=turn.T @ beta,
+            covariance=0.5 * (covariance + covariance.T), acceleration1=turn.T @ a1,
+            acceleration2=turn.T @ a2)

@@ -175,6 +175,15 @@ def skew(v: Array) -> Array:
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
+def by_axes(matrix: Array) -> Array:
+    """Kronecker product (3 n, 3 m) of a matrix (n, m) and the identity (3, 3)."""
+    n, m = matrix.shape
+    product = np.zeros((n, 3, m, 3))
+    for axis in range(3):
+        product[:, axis, :, axis] = matrix
+    return product.reshape(3 * n, 3 * m)
+
+
 def aligning_rotation(correlation: Array) -> Array:
     """Rotation R (3, 3) that minimises ``sum |a - R b|^2``, from ``sum a b^T`` (Wahba, Kabsch).
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import ImuConfig
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.so3 import integrated_rotations, STANDARD_GRAVITY
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
@@ -494,7 +494,7 @@ def frame_imu(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_
     estimate = buffer.gravity(end_ns)
     if estimate is not None:
         R = motion.rotations([(end_ns - reference_ns) * 1e-9])[0]
-        motion = replace(motion, gravity=R @ (R_cam_imu @ estimate.direction))
+        motion = validate.replaced(motion, gravity=R @ (R_cam_imu @ estimate.direction))
         gravity_sigma = estimate.sigma
     since_previous = None
     if (previous_reference_ns is not None and previous_reference_ns < reference_ns

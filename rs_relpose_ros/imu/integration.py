@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.config.settings import ImuConfig
-from rs_relpose_ros.geometry import Array, so3
+from rs_relpose_ros.geometry import Array, so3, validate
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 from rs_relpose_ros.geometry.so3 import integrated_rotations, skew
 from rs_relpose_ros.geometry.timing import seconds_between
@@ -197,8 +197,8 @@ def preintegrate(seconds: Array, rates: Array, forces: Array, gravity: Array,
     by_bias, by_rates = _error_derivatives(seconds, rates, rotations, once, twice)
     by_gyro = by_rates.sum(axis=0)
     # White noise of the accelerometer: the integrals of (T - s)^2, T - s and 1.
-    of_noise = np.kron(np.array([[duration**3 / 3.0, duration**2 / 2.0],
-                                 [duration**2 / 2.0, duration]]), np.eye(3))
+    of_noise = so3.by_axes(np.array([[duration**3 / 3.0, duration**2 / 2.0],
+                                     [duration**2 / 2.0, duration]]))
     # b t = (v_1 + w_1 x p) T + alpha + p - R p,   R (v_2 + w_2 x p) = v_1 + w_1 x p + beta
     R = rotations[-1]
     by_arm = np.vstack([duration * skew(rates[0]) + np.eye(3) - R,
@@ -274,8 +274,8 @@ def inertial_motion(gyro: GyroSegment, forces: ForceSegment, frame1: FrameImu, f
         + second.at_rest_sigma**2 * along
     motion = preintegrate(seconds, rates, specific, gravity, covariance,
                           np.array(config.imu_position), config, gyro.bias_sigma)
-    return replace(motion, acceleration1=first.within + gravity,
-                   acceleration2=R @ second.within + gravity)
+    return validate.replaced(motion, acceleration1=first.within + gravity,
+                             acceleration2=R @ second.within + gravity)
 
 
 def _resampled(gyro: GyroSegment, forces: ForceSegment) -> tuple[Array, Array, Array]:
@@ -308,8 +308,8 @@ def motions_on_the_way(whole: InertialMotion, first: FrameImu, since: FrameImu,
         duration = seconds_between(first.reference_ns, frame.reference_ns)
         # The stamped rows of all frames are samples of the segments.
         k = int(np.argmin(np.abs(seconds - seconds[0] - duration)))
-        motions.append(InertialMotion(
-            twice[k] + 0.5 * duration**2 * gravity, once[k] + duration * gravity, duration,
-            np.zeros((6, 6)), whole.lever_arm, whole.acceleration1,
-            rotations[k] @ frame.force.within + gravity))
+        motions.append(validate.replaced(
+            whole, alpha=twice[k] + 0.5 * duration**2 * gravity,
+            beta=once[k] + duration * gravity, duration=duration, covariance=np.zeros((6, 6)),
+            acceleration2=rotations[k] @ frame.force.within + gravity))
     return motions

@@ -21,7 +21,7 @@ from rs_relpose_ros.estimator.estimate import estimate_relative_pose
 from rs_relpose_ros.estimator.frames_between import IntermediateFrame
 from rs_relpose_ros.estimator.problem import build_problem
 from rs_relpose_ros.estimator.result import Landmarks, landmarks, RelativePose, Status
-from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry import Array, validate
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 from rs_relpose_ros.geometry.so3 import aligning_rotation, cross, median, norm, rotated
@@ -308,8 +308,9 @@ def estimate_pair(first: FrameImu, second: FrameImu, stamps_ns: tuple[int, int],
         relative_rotation=None if configured is None else configured.rotation,
         relative_rotation_covariance=None if configured is None else configured.covariance,
         interval=interval,
-        config=replace(parameters.estimator, gravity_sigma=gravity_sigma, stamp_sigma=max(
-            parameters.estimator.stamp_sigma, stamp_sigma)),
+        config=validate.replaced(
+            parameters.estimator, gravity_sigma=gravity_sigma,
+            stamp_sigma=max(parameters.estimator.stamp_sigma, stamp_sigma)),
         quality=matches.quality,
         inertial=None if isinstance(inertial, str) else inertial,
         between=() if configured is None or interval is None else between,
@@ -371,7 +372,8 @@ def _with_gravity(imu1: FrameImu, imu2: FrameImu,
     sigma1, sigma2 = imu1.gravity_sigma, imu2.gravity_sigma
     configured = parameters.estimator.gravity_sigma
     if not parameters.pair.use_gravity or sigma1 is None or sigma2 is None:
-        return replace(imu1.motion, gravity=None), replace(imu2.motion, gravity=None), configured
+        return (validate.replaced(imu1.motion, gravity=None),
+                validate.replaced(imu2.motion, gravity=None), configured)
     # One sigma for both frames: that of the filter where it is larger than the parameter.
     return imu1.motion, imu2.motion, min(max(configured, sigma1, sigma2), _LARGEST_GRAVITY_SIGMA)
 
@@ -425,11 +427,13 @@ class TrackHistory:
                                               [frame.imu for frame in chosen]))
         drift = matches.points2 - _points(last.matches, matches)
         interval = self._interval(last.imu)
-        return [IntermediateFrame(
-            sensor.intrinsics.to_sensor(_points(frame.matches, matches)
-                                        + self._interval(frame.imu) / interval * drift),
-            frame.imu.motion, self._interval(frame.imu), frame.gyro.rotation,
-            frame.gyro.covariance, motion)
+        return [validate.unchecked(
+            IntermediateFrame,
+            points=sensor.intrinsics.to_sensor(_points(frame.matches, matches)
+                                               + self._interval(frame.imu) / interval * drift),
+            motion=frame.imu.motion, interval=self._interval(frame.imu),
+            relative_rotation=frame.gyro.rotation,
+            relative_rotation_covariance=frame.gyro.covariance, inertial=motion)
             for frame, motion in zip(chosen, motions, strict=True)]
 
     def _interval(self, imu: FrameImu) -> float:

@@ -4,6 +4,7 @@ from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 import time
 from typing import Any, Generic
 
@@ -90,11 +91,12 @@ class Pipeline(Processor[PairResult]):
         self._sensor: Sensor | None = None
         self._readout = 0.0   # [s] of its camera, beyond the parameter
         self._stamps_ns: deque[int] = deque(maxlen=SCATTER_FRAMES)
+        self._compare: Callable[[], None] | None = None   # after a pair
         self.reset()
 
     def reset(self) -> None:
         """Forget the reference keyframe: tracking restarts with the next frame."""
-        self._monitor.assess()   # live it is done by now
+        self._assess()   # live it is done by now
         self._tracker.reset()
         self._stamps_ns.clear()
         self._reference: Frame[Any] | None = None
@@ -104,7 +106,6 @@ class Pipeline(Processor[PairResult]):
         self._reference_rays: DerotatedRays | None = None
         self._current_rays: DerotatedRays | None = None
         self._rotation: _RotationStart | None = None
-        self._promotion_due = False
         self._unmatched_ns: int | None = None   # of the last published pair with too few matches
 
     def process(self, frame: Frame[Any], parameters: Parameters) -> PairResult | None:
@@ -143,12 +144,13 @@ class Pipeline(Processor[PairResult]):
             parameters.keyframes, parallax=pair.parallax_of(rays1, rays2, gyro, sensor),
             interval=pair.interval_of(reference.imu, imu), frames=self._frames,
             tracked_fraction=self._tracker.tracked_fraction)
-        self._compare_rotations(frame.stamp_ns, matches, rotation, sensor, keyframe)
         if not keyframe:
+            self._compare_rotations(frame.stamp_ns, matches, rotation, sensor, keyframe)
             return None
+        self._compare = partial(self._compare_rotations, frame.stamp_ns, matches, rotation, sensor,
+                                keyframe)
         result = self._pair(reference, frame, gyro, sensor, parameters)
         self._restart_from(frame)
-        self._promotion_due = True
         if result.pose.status is Status.TOO_FEW_MATCHES:
             # Where nothing can be matched each frame creates a pair.
             if self._unmatched_ns is not None and seconds_between(
@@ -159,10 +161,15 @@ class Pipeline(Processor[PairResult]):
 
     def prepare(self) -> None:
         """Assess the configuration and search new corners, after a pair is published."""
-        if self._promotion_due:
-            self._promotion_due = False
-            self._monitor.assess()
+        if self._compare is not None:
+            self._assess()
             self._tracker.promote()
+
+    def _assess(self) -> None:
+        if self._compare is not None:
+            self._compare()
+            self._compare = None
+        self._monitor.assess()
 
     @property
     def health(self) -> findings.Assessment:

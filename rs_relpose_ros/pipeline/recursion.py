@@ -20,7 +20,7 @@ from rs_relpose_ros.estimator import priors
 from rs_relpose_ros.estimator.covariance import image_regions, REGIONS
 from rs_relpose_ros.estimator.fit import FitMatches, gauss_newton
 from rs_relpose_ros.estimator.priors import inverse, PARAMETERS, TANGENT, THETA, TwoViewState
-from rs_relpose_ros.estimator.problem import build_problem, observed, TwoViewProblem
+from rs_relpose_ros.estimator.problem import build_problem, derotate, TwoViewProblem
 from rs_relpose_ros.estimator.sampling import translation_direction
 from rs_relpose_ros.estimator.sampson import jacobian, residuals
 from rs_relpose_ros.geometry import Array, so3
@@ -224,15 +224,13 @@ def _state(pair: PairData, problem: TwoViewProblem, observations: Array, prior: 
 
 
 @functools.lru_cache(maxsize=16)
-def _lens(camera: RollingShutterCamera, focal: float, distortion: float, right: float = 0.0,
-          down: float = 0.0) -> RollingShutterCamera:
-    """The camera with deviations of FOCAL and DISTORTION, and of its principal point [px]."""
-    if not (focal or distortion or right or down):
+def _lens(camera: RollingShutterCamera, focal: float, distortion: float) -> RollingShutterCamera:
+    """The camera with deviations of FOCAL and DISTORTION."""
+    if not (focal or distortion):
         return camera
     coefficients = list(camera.distortion) or [0.0] * 4
     coefficients[0] += distortion
     return replace(camera, fx=camera.fx / (1.0 + focal), fy=camera.fy / (1.0 + focal),
-                   cx=camera.cx + right, cy=camera.cy + down,
                    distortion=tuple(coefficients) if any(coefficients) else camera.distortion)
 
 
@@ -254,16 +252,24 @@ def _by_lens(pair: PairData, problem: TwoViewProblem, rows: _Rows, keep: NDArray
     Rays and their derivatives by the pixel change together: with smaller rays alone, residuals in
     pixels would shrink with a longer focal length.
     """
-    columns, points1, points2 = [], pair.points1[keep], pair.points2[keep]
-    rotations = (problem.motion1.rotations(problem.observations[keep, 18]),
-                 problem.motion2.rotations(problem.observations[keep, 19]))
-    for step in _STEP * np.eye(4):
-        observations = observed(points1, points2, _lens(pair.camera, *step), problem.motion1,
-                                problem.motion2, rotations=rotations)
-        if at.any():
-            observations = rows.displaced(observations, at)
-        columns.append((residuals(observations, state) - r) / _STEP)
-    return np.stack(columns, axis=1)
+    camera, n = pair.camera, len(r)
+    centre, out = np.array([camera.cx, camera.cy]), np.empty((4 * n, 20))
+    for k, (points, motion) in enumerate(((pair.points1[keep], problem.motion1),
+                                          (pair.points2[keep], problem.motion2))):
+        # With another focal length or centre, a pixel has the ray that another one has now.
+        rays, jacobian = camera.unproject_with_jacobian(np.concatenate([
+            centre + (1.0 + _STEP) * (points - centre), points,
+            points - (_STEP, 0.0), points - (0.0, _STEP)]))
+        jacobian[:n] *= 1.0 + _STEP
+        rays[n:2 * n], jacobian[n:2 * n] = _lens(camera, 0.0, _STEP).unproject_with_jacobian(
+            points)
+        tau = problem.observations[keep, 18 + k]
+        derotate(rays, jacobian, np.tile(motion.rotations(tau), (4, 1, 1)),
+                 camera.line_delay * motion.angular_velocity, out[:, 9 * k:9 * k + 9])
+        out[:, 18 + k] = np.tile(tau, 4)
+    if at.any():
+        out = np.vstack([rows.displaced(block, at) for block in out.reshape(4, n, 20)])
+    return (residuals(out, state).reshape(4, n) - r).T / _STEP
 
 
 class _Rows(NamedTuple):

@@ -470,7 +470,7 @@ def stamp_sigma(stamps_ns: Sequence[int]) -> float:
     intervals = np.diff(np.array(stamps_ns)) / NANOSECONDS
     if len(intervals) < 2:
         return 0.0
-    period = float(np.quantile(intervals, _WHOLE, method='lower'))
+    period = float(np.sort(intervals)[int(_WHOLE * (len(intervals) - 1))])
     if not period > 0.0:
         return 0.0
     changes = np.diff(intervals - np.round(intervals / period) * period)
