@@ -27,20 +27,16 @@ from rs_relpose_ros.geometry import Array
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One problem, estimated.
-
-    `sigma_factor`: configured sigmas by the true ones; `error`, `oracle`: of estimator and oracle;
-    `duration`: of the whole estimate [s].
-    """
+    """One problem, estimated."""
 
     cell: str
     noise: Noise
-    sigma_factor: float
+    sigma_factor: float   # configured sigmas by the true ones
     seed: int
     status: str
     error: PoseError
     oracle: PoseError
-    duration: float
+    duration: float   # of the whole estimate [s]
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,40 +162,34 @@ GROSS_ERROR = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Consistency:
-    """Errors in units of the covariance.
+    """Errors in units of the covariance."""
 
-    `mean`: of the inner 98 % of NEES / 5: 1 is right, more is overconfident.
-    `above`: share above the 95 % quantile of chi-square: 0.05 is right.
-    """
-
-    mean: float
-    above: float
+    mean: float   # of the inner 98 % of NEES / 5: 1 is right, more is overconfident
+    above: float   # share above the 95 % quantile of chi-square: 0.05 is right
 
 
 @dataclass(frozen=True, slots=True)
 class CellStatistics:
     """Of one cell with one kind of noise and one factor of the configured sigmas.
 
-    `lost`, `gross`: trials without a pose, and with a rotation more than `GROSS_ERROR` wrong.
-    `rotation` ... `oracle_translation`: errors [deg]; a lost pose counts as infinite.
-    `rotation_ratio`, `translation_ratio`: estimator by oracle. `duration`: median [ms].
+    Errors are in degrees; a lost pose counts as infinite.
     """
 
     noise: str
     sigma_factor: float
     cell: str
     trials: int
-    lost: int
-    gross: int
+    lost: int   # trials without a pose
+    gross: int   # trials with a rotation more than `GROSS_ERROR` wrong
     rotation: Quantiles
     translation: Quantiles
     oracle_rotation: Quantiles
     oracle_translation: Quantiles
-    rotation_ratio: Quantiles
-    translation_ratio: Quantiles
+    rotation_ratio: Quantiles   # estimator by oracle
+    translation_ratio: Quantiles   # likewise
     nees: Consistency
     oracle_nees: Consistency
-    duration: float
+    duration: float   # median [ms]
 
 
 def cell_statistics(trials: Sequence[Trial]) -> CellStatistics:

@@ -60,21 +60,17 @@ def is_still(record: PairRecord) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiveComparison:
-    """Publications of a live node, and the replay of the frames that it processed.
-
-    `records`, `pairs`: of the replay; `frames`, `processed`: in the bag, and by the node.
-    `poses`, `unequal`: poses of both, and those that are not bit by bit the same in the two.
-    """
+    """Publications of a live node, and the replay of the frames that it processed."""
 
     node: Score
-    records: list[PairRecord]
-    pairs: list[PairResult]
+    records: list[PairRecord]   # of the replay
+    pairs: list[PairResult]   # of the replay
     truth: TrueTrajectory
     intrinsics: Intrinsics
-    frames: int
-    processed: int
-    poses: int
-    unequal: int
+    frames: int   # in the bag
+    processed: int   # by the node
+    poses: int   # of both
+    unequal: int   # those that are not bit by bit the same in the two
 
     def opencv_scores(self) -> list[Score]:
         """Scores of OpenCV's estimators on the matches of the replay's poses."""

@@ -52,18 +52,17 @@ _AHEAD = 0.02
 class MapErrors:
     """Distances [px] between sources of pixels by the map and by the truth, over a recording.
 
-    `left`: from the map to the true sources; `predicted`: from the true sources to those of
-    rotation alone; `map`: from the latter to the map, which models rotation alone. Median, 90 %.
+    Median and 90 %. The map models rotation alone.
     """
 
     name: str
     readout_ms: float
     rate: float   # [rad/s] largest
-    left: float
+    left: float   # from the map to the true sources
     left_p90: float
-    predicted: float
+    predicted: float   # from the true sources to those of rotation alone
     predicted_p90: float
-    map: float
+    map: float   # from the latter to the map
     map_p90: float
 
 

@@ -49,16 +49,12 @@ class Poses:
 
 @dataclass(frozen=True, slots=True)
 class LensRun:
-    """One bag: errors of the written values, and poses with them and with the true ones.
-
-    `seconds`: of the images that were used. `errors`: error and 1 sigma by name, of `LENS` where
-    the lens was not known.
-    """
+    """One bag: errors of the written values, and poses with them and with the true ones."""
 
     model: str
     seed: int
     exit_code: int
-    seconds: float
+    seconds: float   # of the images that were used
     truth: Poses
     calibrated: Poses = Poses()
     errors: dict[str, tuple[float, float]] = field(default_factory=dict)

@@ -80,68 +80,47 @@ class Percentiles:
 
 @dataclass(frozen=True, slots=True)
 class LiveStatistics:
-    """Statistics of one cell; times in ms, memory in MB, errors in degrees.
-
-    `frames_sent`, `frames_received`, `frames_used`: by the player, by the node's callback, and
-        through the whole pipeline.
-    `dropped_overload`: refused by the node because newer frames waited.
-    `latency`: of a published pair: from the later of image and first IMU sample that covers its
-        last row, as the node's callbacks got them, to publication.
-    `end_to_end`: the same from outside: from the later publication of the two by the player to the
-        receipt of the pose by a third process. No delay inside the node can hide from it.
-    `frame_time`, `frame_cpu`: of every frame, pair or not: wall time of its processing, and
-        processor time of the worker.
-    `cpu`, `cpu_callbacks`, `cpu_player`: percent of one core: the node, its first thread, player.
-    `memory_*`, `private_*`: of the node after the first pose and at the end: resident, and without
-        what is shared with other processes.
-    `seconds_to_ready`, `seconds_to_pose`: from the start of the node's process to its
-        subscriptions; from the first frame to the first pose.
-    `wrong`: poses that are off by more than 1 deg, or 15 deg in the direction of translation.
-    `player_late`: how late the player published, on this machine.
-    """
+    """Statistics of one cell; times in ms, memory in MB, errors in degrees."""
 
     cell: str
     duration: float
     frames_sent: int
-    frames_received: int
-    frames_used: int
-    dropped_overload: int
+    frames_received: int   # by the node's callback
+    frames_used: int   # through the whole pipeline
+    dropped_overload: int   # refused by the node because newer frames waited
     dropped_other: int
     imu_sent: int
     imu_received: int
     pairs: int
     poses: int
+    # From the callbacks of image and first IMU sample that covers its last row to publication.
     latency: Percentiles
-    end_to_end: Percentiles
-    frame_time: Percentiles
-    frame_cpu: Percentiles
-    cpu: float
-    cpu_callbacks: float
+    end_to_end: Percentiles   # the same by the player and a third process that receives the pose
+    frame_time: Percentiles   # wall time of every frame, pair or not
+    frame_cpu: Percentiles   # processor time of the worker
+    cpu: float   # of the node, percent of one core
+    cpu_callbacks: float   # of its first thread
     cpu_player: float
-    memory_start: float
+    memory_start: float   # resident, after the first pose
     memory_end: float
-    private_start: float
+    private_start: float   # without what is shared with other processes
     private_end: float
-    seconds_to_ready: float
-    seconds_to_pose: float
+    seconds_to_ready: float   # from the start of the node's process to its subscriptions
+    seconds_to_pose: float   # from the first frame to the first pose
     rotation_error: Percentiles
     translation_error: Percentiles
-    wrong: int
-    player_late: Percentiles
+    wrong: int   # poses that are off by more than 1 deg, or 15 deg in the direction of translation
+    player_late: Percentiles   # how late the player published
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Course:
-    """Latency and memory over time.
+    """Latency and memory over time."""
 
-    `latency_seconds`, `latencies` (N,): seconds since the first pair, and ms.
-    `memory_seconds`, `private` (M,): seconds likewise, and MB that are not shared.
-    """
-
-    latency_seconds: Array
-    latencies: Array
-    memory_seconds: Array
-    private: Array
+    latency_seconds: Array   # (N,) since the first pair
+    latencies: Array   # (N,) [ms]
+    memory_seconds: Array   # (M,) since the first pair
+    private: Array   # (M,) [MB] that are not shared
 
 
 def run_cell(cell: LiveCell, clip: live_clip.Clip, duration: float, folder: Path, profile: Path,

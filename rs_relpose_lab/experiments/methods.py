@@ -32,21 +32,15 @@ CAMERA = RollingShutterCamera(
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """How a pair is estimated.
-
-    `solver`, `refinement`: of this library, as in `EstimatorConfig`.
-    `library`, `threshold` [px]: of another one; `derotated`: its points are derotated by the
-        gyro to the time of the middle row.
-    `continuous_gyro`: the gyro over the rows and between the frames is used, too.
-    """
+    """How a pair is estimated."""
 
     label: str
-    solver: str = ''
-    refinement: str = 'alternating'
-    library: Literal['', 'opencv', 'poselib'] = ''
-    derotated: bool = False
-    continuous_gyro: bool = False
-    threshold: float = 1.0
+    solver: str = ''   # of this library, as in `EstimatorConfig`
+    refinement: str = 'alternating'   # likewise
+    library: Literal['', 'opencv', 'poselib'] = ''   # another one
+    derotated: bool = False   # points are derotated by the gyro to the middle row
+    continuous_gyro: bool = False   # the gyro over the rows and between the frames is used, too
+    threshold: float = 1.0   # of another library [px]
 
 
 # Of a pose [deg]: 0.5 rad, independent of the node's limit. For the other libraries, without
@@ -77,41 +71,30 @@ METHODS: Mapping[str, Method] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ContinuousGyro:
-    """Motion of a pair by a continuous gyro, in addition to one mean rate a frame.
-
-    `rotation`, `covariance` (3, 3): ``R_1^T R_2`` between the reference rows, and the covariance
-        of its error [rad^2]; `interval` [s] between them.
-    `rate_sigma` [rad/s], `gravity_sigma` [rad]: of the motions, per axis.
-    """
+    """Motion of a pair by a continuous gyro, in addition to one mean rate a frame."""
 
     motion1: FrameMotion
     motion2: FrameMotion
-    rotation: Array
-    covariance: Array
-    interval: float
-    rate_sigma: float
-    gravity_sigma: float | None = None
+    rotation: Array   # (3, 3) ``R_1^T R_2`` between the reference rows
+    covariance: Array   # (3, 3) of its error [rad^2]
+    interval: float   # [s] between the reference rows
+    rate_sigma: float   # [rad/s] of the motions, per axis
+    gravity_sigma: float | None = None   # [rad] likewise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairProblem:
-    """A pair of frames as every method gets it, and its truth.
+    """A pair of frames as every method gets it, and its truth."""
 
-    `points1`, `points2` (N, 2): matches [px], with their `quality` (N,).
-    `motion1`, `motion2`: one angular velocity and one direction of gravity each.
-    `R`, `t`: true pose between the reference rows, ``X1 = R X2 + t``; t of any length.
-    `configured`: settings of the estimator, noise levels among them.
-    """
-
-    points1: Array
+    points1: Array   # (N, 2) matches [px]
     points2: Array
     camera: RollingShutterCamera
-    motion1: FrameMotion
+    motion1: FrameMotion   # one angular velocity and one direction of gravity
     motion2: FrameMotion
-    R: Array
-    t: Array
-    configured: EstimatorConfig
-    quality: Array | None = None
+    R: Array   # true pose between the reference rows, ``X1 = R X2 + t``
+    t: Array   # of any length
+    configured: EstimatorConfig   # noise levels among them
+    quality: Array | None = None   # (N,) of the matches
     gyro: ContinuousGyro | None = None
 
     def error(self, pose: Pose | RelativePose | None) -> PoseError:

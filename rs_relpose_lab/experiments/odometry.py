@@ -133,14 +133,7 @@ _ALIGNED = 5.0
 
 @dataclass(frozen=True, slots=True)
 class PathMetrics:
-    """Odometry of a recording.
-
-    `start`: seconds from the first pair to the first published keyframe. `nees_*`: squared errors
-    of the states that odometry_node publishes, against the start, in units of their covariances,
-    by degrees of freedom, mean; NaN where the truth has errors of its own. `drift`: error of the
-    end after the first 5 s are aligned, by the length of the path [%]. `processor`: of one core,
-    by the graph alone, without messages [%].
-    """
+    """Odometry of a recording."""
 
     name: str
     readout_ms: float
@@ -149,14 +142,15 @@ class PathMetrics:
     contradicting: int
     lost: int
     at_rest: bool
-    start: float
+    start: float   # [s] from the first pair to the first published keyframe
     live: TrajectoryErrors
     smoothed: TrajectoryErrors
-    nees_position: float
-    nees_rotation: float
+    nees_position: float   # of published states by degrees of freedom, mean
+    nees_rotation: float   # NaN where the truth has errors of its own
     nees_velocity: float
+    # Error of the end after the first 5 s are aligned, by the length of the path [%].
     drift: float
-    processor: float
+    processor: float   # of one core, by the graph alone, without messages [%]
 
 
 def walks(count: int, first_seed: int, seconds: float = SHORT, *, readout: float | None = None,

@@ -42,21 +42,16 @@ _SILENT_NS = 250_000_000
 
 
 class Disturbance(NamedTuple):
-    """What happens from `_MARGIN` on for some seconds.
-
-    `images`, `samples`: whether they arrive. `corners`: share of the corners in sight, `white`:
-    factor of their noise, `lost`: share that is lost from frame to frame; `object_speed` [px/s]:
-    of the half of the image that an object covers, against the scene. `plan`: of the motion.
-    """
+    """What happens from `_MARGIN` on for some seconds."""
 
     seconds: float
-    images: bool = True
-    samples: bool = True
-    corners: float = 1.0
-    white: float = 1.0
-    lost: float = 0.0
-    object_speed: float = 0.0
-    plan: str = 'walk'
+    images: bool = True   # whether they arrive
+    samples: bool = True   # likewise
+    corners: float = 1.0   # share of the corners in sight
+    white: float = 1.0   # factor of their noise
+    lost: float = 0.0   # share of them that is lost from frame to frame
+    object_speed: float = 0.0   # [px/s] of an object that covers half of the image
+    plan: str = 'walk'   # of the motion
 
 
 DISTURBANCES = {
@@ -214,25 +209,19 @@ def _interpolated(truth: TrueStates, at_ns: int) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, slots=True)
 class DisturbedRun:
-    """A disturbance on one walk.
-
-    `beyond_*`: number of `states` from its begin on whose error is beyond the 99.7 % quantile.
-    `velocity_ratio`, `tilt_ratio`: of the sigmas 2 s after it and before it; NaN without a state.
-    `uncertain_after`: from the last usable pair before it [s]; NaN if it is not uncertain.
-    `largest_step`: between published states, in sigmas of the position.
-    """
+    """A disturbance on one walk."""
 
     name: str
     seed: int
-    states: int
-    beyond_position: int
+    states: int   # from its begin on
+    beyond_position: int   # states whose error is beyond the 99.7 % quantile
     beyond_rotation: int
     beyond_velocity: int
-    velocity_ratio: float
-    tilt_ratio: float
-    uncertain_after: float
+    velocity_ratio: float   # of the sigmas 2 s after it and before it; NaN without a state
+    tilt_ratio: float   # likewise
+    uncertain_after: float   # [s] from the last usable pair before it; NaN if never
     lost: int
-    largest_step: float
+    largest_step: float   # between published states, in sigmas of the position
 
 
 def tasks(seeds: int, first_seed: int, only: str | None = None) -> list[tuple[str, int]]:

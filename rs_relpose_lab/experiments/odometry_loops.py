@@ -40,11 +40,9 @@ SECONDS, _BEYOND = 60.0, 0.0027
 
 @dataclass(frozen=True, slots=True)
 class LoopMetrics:
-    """Odometry of a closed walk, smoothed.
+    """Odometry of a closed walk, smoothed, without loops and with them.
 
-    Errors of the last pose in the first one's frame ([m], [deg]), and ATE [m], without loops and
-    with them. `worst`: chi squared of the taken loops against the truth, by its 3 sigma bound, the
-    largest; NaN without loops.
+    Errors of the last pose in the first one's frame ([m], [deg]), and ATE [m].
     """
 
     name: str
@@ -52,7 +50,7 @@ class LoopMetrics:
     offered: int
     related: int
     taken: int
-    worst: float
+    worst: float   # largest chi squared of the taken loops, by its 3 sigma bound; NaN without
     end_without: float
     end: float
     rotation_without: float

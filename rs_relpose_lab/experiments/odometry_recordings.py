@@ -38,30 +38,22 @@ _BEYOND = float(chi2.ppf(0.9973, 3))
 
 @dataclass(frozen=True, slots=True)
 class RecordedPart:
-    """A recording, or a part of it, against the smoothed path of the whole.
-
-    `start`: seconds from the first pair with a direction to the first published state; NaN
-    without one. `claimed`: relative 1 sigma of the scale there; `speed`: error of the speed there
-    by its sigma; `scale`, `drift`: of the published path [%]. `beyond`: share of the states whose
-    position is beyond 3 sigma [%]; `step`: largest change of the position's error between
-    neighbouring states, in sigmas. `state`, `reason`: at the end; `uncertain`, `lost`: numbers of
-    intervals.
-    """
+    """A recording, or a part of it, against the smoothed path of the whole."""
 
     name: str
     begin: float
     seconds: float
-    start: float
-    claimed: float
-    speed: float
-    scale: float
-    drift: float
-    beyond: float
-    step: float
-    uncertain: int
-    lost: int
-    state: str
-    reason: str
+    start: float   # [s] from the first pair with a direction to the first state; NaN without
+    claimed: float   # relative 1 sigma of the scale there
+    speed: float   # error of the speed there by its sigma
+    scale: float   # of the published path [%]
+    drift: float   # likewise
+    beyond: float   # share of the states whose position is beyond 3 sigma [%]
+    step: float   # largest change of the position's error between states [sigma]
+    uncertain: int   # number of intervals
+    lost: int   # likewise
+    state: str   # at the end
+    reason: str   # at the end
 
 
 def on_recording(path: Path, seconds: float) -> Iterator[RecordedPart]:

@@ -71,14 +71,13 @@ def start_at(R: Array, t: Array, gravity: Array) -> Start:
 class Objective:
     """Residuals, of which the oracle minimises the sum of squares, over a step x from `start`.
 
-    `pixel_sigma` [px] per coordinate, `gravity_sigma` [rad] per axis of one frame's direction,
-    `gyro_sigma` [rad/s] per axis of one frame. Outliers are left out.
+    Outliers are left out.
     """
 
     problem: TwoViewProblem
-    pixel_sigma: float
-    gravity_sigma: float
-    gyro_sigma: float
+    pixel_sigma: float   # [px] per coordinate
+    gravity_sigma: float   # [rad] per axis of one frame's direction
+    gyro_sigma: float   # [rad/s] per axis of one frame
     start: Start
 
     @property

@@ -235,19 +235,15 @@ METHODS_OF_THE_PAPER = ('global_5pt', 'uniform_9pt', 'uniform_11pt', 'auto')
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """One experiment (figure) of the paper.
-
-    `axis`, `unit`: what is varied, with its unit; the unit.
-    `varied`, `levels`: the field of `Cell` and its values; `fixed`: others not at their defaults.
-    """
+    """One experiment (figure) of the paper."""
 
     name: str
     title: str
-    axis: str
+    axis: str   # what is varied, with its unit
     unit: str
-    varied: str
-    levels: tuple[float, ...]
-    fixed: tuple[tuple[str, float], ...] = ()
+    varied: str   # field of `Cell`
+    levels: tuple[float, ...]   # its values
+    fixed: tuple[tuple[str, float], ...] = ()   # other fields that are not at their defaults
     in_paper: bool = True
 
     def cell(self, level: float, base: Cell) -> Cell:
@@ -282,18 +278,14 @@ SWEEPS = {sweep.name: sweep for sweep in (
 
 @dataclass(frozen=True, slots=True)
 class PaperRun:
-    """Experiments, and their parameters.
+    """Experiments, and their parameters."""
 
-    `sweeps`, `directions`, `methods`: names of `SWEEPS`, `BASELINES` and `METHODS`.
-    `trials`: of each level of each direction; `base`: what an experiment does not vary.
-    """
-
-    sweeps: tuple[str, ...]
-    directions: tuple[str, ...]
-    methods: tuple[str, ...]
-    trials: int
+    sweeps: tuple[str, ...]   # of `SWEEPS`
+    directions: tuple[str, ...]   # of `BASELINES`
+    methods: tuple[str, ...]   # of `METHODS`
+    trials: int   # of each level of each direction
     seed: int
-    base: Cell = EXACT
+    base: Cell = EXACT   # what an experiment does not vary
 
     def __post_init__(self) -> None:
         for name, least in (('trials', 1), ('seed', 0)):

@@ -120,23 +120,17 @@ class Pair:
 
 @dataclass(frozen=True, slots=True)
 class PennCosyvioRun:
-    """Parameters of the experiment.
+    """Parameters of the experiment."""
 
-    `sequences`, `methods`: names of `STRETCHES`, `METHODS`.
-    `readout_time` [s]; `stamp_row`: that a frame's stamp marks.
-    `every`, `distance`: frames from one pair to the next, and between the two of a pair.
-    `pixel_noise`, `outliers`: of points, 1 sigma [px]; share of their matches that are random.
-    """
-
-    sequences: tuple[str, ...]
-    methods: tuple[str, ...]
-    readout_time: float = GOPRO_READOUT
-    stamp_row: str = 'first'
-    every: int = 5
-    distance: int = 30
+    sequences: tuple[str, ...]   # of `STRETCHES`
+    methods: tuple[str, ...]   # of `METHODS`
+    readout_time: float = GOPRO_READOUT   # [s]
+    stamp_row: str = 'first'   # that a frame's stamp marks
+    every: int = 5   # frames from one pair to the next
+    distance: int = 30   # frames between the two of a pair
     seed: int = 0
-    pixel_noise: float = 0.5
-    outliers: float = 0.3
+    pixel_noise: float = 0.5   # 1 sigma [px]
+    outliers: float = 0.3   # share of matches that are random
 
     def __post_init__(self) -> None:
         for name, least in (('every', 1), ('distance', 1), ('seed', 0)):

@@ -123,14 +123,11 @@ _INTRINSICS = ('tools/intrinsic_calibration/cc.mat', 'calibration/cc.mat')
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Poses:
-    """Poses of the rig in the world.
+    """Poses of the rig in the world."""
 
-    `stamps_ns` (K,): increasing; `positions` (K, 3) [m]; `rotations` (K,): to the world, z up.
-    """
-
-    stamps_ns: NDArray[np.int64]
-    positions: Array
-    rotations: Rotation
+    stamps_ns: NDArray[np.int64]   # (K,) increasing
+    positions: Array   # (K, 3) [m]
+    rotations: Rotation   # (K,) to the world, z up
 
 def read_poses(folder: Path, sequence: str) -> Poses:
     """Ground truth of a sequence."""

@@ -47,26 +47,18 @@ _DEPTHS = 6.0, 34.0  # [m]
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """One setting of an experiment; the defaults are the base cell of the benchmark.
+    """One setting of an experiment; the defaults are the base cell of the benchmark."""
 
-    `direction` of `BASELINES`; `speed` [m/s], `rate` [rad/s]: per axis, opposite in the frames.
-    `pixel_noise` [px], `gyro_noise` [deg/s]: 1 sigma per axis; `gravity_noise` [deg]: per axis of
-        one frame's direction.
-    `outliers`: share of matches whose second point is anywhere in the image.
-    `constant_velocity`: both frames move along the baseline at ``sqrt(3) speed``.
-    `placing` {'box', 'image'}: points are drawn evenly in a box of the world, or over the image
-        and depths of camera 1.
-    """
-
-    direction: str = 'forward'
-    speed: float = 1.0
-    rate: float = 1.0
-    pixel_noise: float = 0.5
-    gravity_noise: float = 0.2
-    gyro_noise: float = 0.1
-    outliers: float = 0.3
-    constant_velocity: bool = False
+    direction: str = 'forward'   # of `BASELINES`
+    speed: float = 1.0   # [m/s] per axis, opposite in the frames
+    rate: float = 1.0   # [rad/s] likewise
+    pixel_noise: float = 0.5   # [px] 1 sigma per axis
+    gravity_noise: float = 0.2   # [deg] 1 sigma per axis of one frame's direction
+    gyro_noise: float = 0.1   # [deg/s] 1 sigma per axis
+    outliers: float = 0.3   # share of matches whose second point is anywhere
+    constant_velocity: bool = False   # both frames move along the baseline at ``sqrt(3) speed``
     matches: int = 300
+    # Points drawn in a box of the world, or over the image 1.
     placing: Literal['box', 'image'] = 'box'
 
 
@@ -94,26 +86,21 @@ CELLS = {f'{direction}-{name}': Cell(direction=direction, **changes)  # type: ig
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TwoViewProblem:
-    """Matches, what the IMU measures, and the truth; pose and motion refer to row 0.
-
-    `measured_rate*` [rad/s], `measured_gravity*` (unit, down): each in its own camera's frame.
-    `R`, `t`: truth: ``X1 = R X2 + t``, ``|t| = 1``; `gravity1`: true direction in camera 1.
-    `v1`, `v2` [baselines per second], `w1`, `w2` [rad/s]: true velocities in the cameras' frames.
-    """
+    """Matches, what the IMU measures, and the truth; pose and motion refer to row 0."""
 
     points1: Array
     points2: Array
-    measured_rate1: Array
+    measured_rate1: Array   # [rad/s] in its own camera's frame, as all of these
     measured_rate2: Array
-    measured_gravity1: Array
+    measured_gravity1: Array   # unit, down
     measured_gravity2: Array
-    R: Array
+    R: Array   # truth: ``X1 = R X2 + t``, ``|t| = 1``
     t: Array
-    v1: Array
+    v1: Array   # true velocities in their own frames [baselines per second]
     v2: Array
-    w1: Array
+    w1: Array   # [rad/s]
     w2: Array
-    gravity1: Array
+    gravity1: Array   # true direction in camera 1
     is_outlier: NDArray[np.bool_]
 
 

@@ -35,24 +35,17 @@ _WITHIN, _RENDERED, _LEAST_MOTION, _DEPTH = 0.5, 4, 3.0, 4.0
 
 @dataclass(frozen=True, slots=True)
 class RowMetrics:
-    """Poses of a walk.
-
-    `keyframes`: root mean square error of the keyframes' positions after rigid alignment [m];
-    `first`, `middle`, `last`: that of the frames' rows by it; `turned`: largest of the three rows'
-    rms errors of rotations within 0.5 s [deg]. `rendered`: mean gray difference of frames rendered
-    with linear poses between first and last row, by that with the middle one, aligned at the
-    middle row; `rendered_on_path`: the same with the alignment of the whole path.
-    """
+    """Poses of a walk."""
 
     name: str
     readout_ms: float
-    keyframes: float
-    first: float
+    keyframes: float   # rms error of positions after rigid alignment [m]
+    first: float   # that of the rows by this alignment
     middle: float
     last: float
-    turned: float
-    rendered: float
-    rendered_on_path: float
+    turned: float   # largest rms error of the rows' rotations within 0.5 s [deg]
+    rendered: float   # gray difference with linear poses of the rows, by that with the middle one
+    rendered_on_path: float   # the same with the alignment of the whole path
 
 
 class _Linear(NamedTuple):

@@ -16,14 +16,11 @@ POSE_FREEDOM = 5
 
 @dataclass(frozen=True, slots=True)
 class PoseError:
-    """Of one estimate: angles [deg], infinite where there is no pose.
-
-    `nees`: normalised estimation error squared over rotation (3) and direction of translation (2);
-        NaN where there is no covariance.
-    """
+    """Of one estimate: angles [deg], infinite where there is no pose."""
 
     rotation: float
     translation: float
+    # Over rotation (3) and direction of translation (2); NaN without covariance.
     nees: float = math.nan
 
 

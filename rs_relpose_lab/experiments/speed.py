@@ -99,11 +99,7 @@ def exponent(times: dict[int, float]) -> float:
 
 @dataclass(frozen=True, slots=True)
 class MethodStatistics:
-    """Of one method in one cell: times [ms], errors [deg], a lost pose is infinite.
-
-    `time_ratio` is the median over problems of its time by that of PoseLib on derotated points;
-    NaN where PoseLib is not installed.
-    """
+    """Of one method in one cell: times [ms], errors [deg], a lost pose is infinite."""
 
     cell: str
     matches: int
@@ -111,7 +107,7 @@ class MethodStatistics:
     trials: int
     lost: int
     time: Quantiles
-    time_ratio: float
+    time_ratio: float   # median of its time by that of PoseLib on derotated points, if installed
     rotation: Quantiles
     translation: Quantiles
 

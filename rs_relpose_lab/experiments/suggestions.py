@@ -67,19 +67,15 @@ ROWS: Mapping[str, Wrong] = {
 
 @dataclass(frozen=True, slots=True)
 class Suggestion:
-    """A wrong value on a recording, in the unit of its quantity.
-
-    `size`: its error in sigmas of the correctly configured run, 0 where that does not observe it.
-    `estimated`, `sigma`: of the last finding, NaN without one; `others`: parameters named, too.
-    """
+    """A wrong value on a recording, in the unit of its quantity."""
 
     bag: str
     row: str
-    size: float
+    size: float   # its error in sigmas of the right run; 0 where that does not observe it
     right: float
-    estimated: float = math.nan
-    sigma: float = math.nan
-    others: str = ''
+    estimated: float = math.nan   # by the last finding; NaN without one
+    sigma: float = math.nan   # likewise
+    others: str = ''   # parameters named, too
 
     @property
     def off(self) -> float:

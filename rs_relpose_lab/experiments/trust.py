@@ -37,17 +37,14 @@ _DRAW, _SCENE, _MOTION, _TRACKS, _WRONG = range(10, 15)
 
 
 class BagPlan(NamedTuple):
-    """A bag of the matrix; `noise`: by the configured one, or 0 for a usual camera and IMU.
-
-    `images`: rendered, rather than tracks alone.
-    """
+    """A bag of the matrix."""
 
     number: int
     seed: int
     seconds: float
     readout_time: float
-    noise: float = 0.0
-    images: bool = False
+    noise: float = 0.0   # by the configured one; 0 for a usual camera and IMU
+    images: bool = False   # rendered, rather than tracks alone
 
     @property
     def motion(self) -> str:
@@ -115,16 +112,7 @@ def recording_of(plan: BagPlan) -> trust_runs.Recording:
 class BagRow:
     """One bag with one row.
 
-    `informative`: informative seconds of motion; `qualifies`: whether they are enough.
-    `flagged`: within them; `flagged_after`: after so many of them, NaN where never.
-    `named`: parameters named at the end of that time; `named_right`: at most two, with a right
-        one among them.
-    `poses`: published (at level ok or unknown) after the first of these seconds;
-        `direction_beyond`, `rotation_beyond`: those of them with errors beyond the limits; `all_`:
-        from the start.
-    `nees_`: mean of the chi squares by their degrees of freedom; errors and claimed sigma: medians
-        [deg]; of `poses`, and of all with the right configuration. `frame_ms`: median, frames
-        with a pair.
+    Errors, claimed sigma and chi squares are of `poses`; with the right configuration, of all.
     """
 
     bag: str
@@ -134,25 +122,25 @@ class BagRow:
     readout_ms: float
     noise: float
     row: str
-    informative: float
-    qualifies: bool
-    flagged: bool
-    flagged_after: float
-    named: str
-    named_right: bool
+    informative: float   # informative seconds of motion
+    qualifies: bool   # whether they are enough
+    flagged: bool   # within them
+    flagged_after: float   # after so many of them; NaN where never
+    named: str   # parameters named at the end of that time
+    named_right: bool   # at most two, with a right one among them
     pairs: int
-    poses: int
-    direction_beyond: int
+    poses: int   # published, at level ok or unknown, after the first of these seconds
+    direction_beyond: int   # those of them with an error beyond the limit
     rotation_beyond: int
-    all_poses: int
+    all_poses: int   # from the start, as the next two
     all_direction_beyond: int
     all_rotation_beyond: int
-    nees_direction: float
+    nees_direction: float   # mean of the chi squares by their degrees of freedom
     nees_rotation: float
-    direction_error: float
+    direction_error: float   # median [deg], as the next two
     direction_sigma: float
     rotation_error: float
-    frame_ms: float
+    frame_ms: float   # median, frames with a pair
 
 
 class Task(NamedTuple):

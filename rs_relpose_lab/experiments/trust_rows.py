@@ -40,15 +40,13 @@ AS_IT_IS = Geometry(lambda points, camera: points, lambda image, camera: image)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Configured:
-    """Configuration and messages of a run.
+    """Configuration and messages of a run."""
 
-    `values`: parameters by name; `sample`: an IMU sample as received; `geometry`: of the images.
-    """
-
-    values: Mapping[str, Any]
+    values: Mapping[str, Any]   # parameters by name
     intrinsics: Intrinsics
+    # An IMU sample as received.
     sample: Callable[[ImuSample], ImuSample] = field(default=lambda sample: sample)
-    geometry: Geometry = AS_IT_IS
+    geometry: Geometry = AS_IT_IS   # of the images
 
     @property
     def R_cam_imu(self) -> Rotation:
@@ -78,16 +76,12 @@ Error = Callable[[Configured, np.random.Generator], Injected | None]
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A row of the matrix.
+    """A row of the matrix."""
 
-    `named`: the right parameters, any of them. `within`: informative seconds of motion. `wrong`:
-    the wrong configuration in place of the right one; `injected`: its error, None where rotation
-    about two axes is the information.
-    """
-
-    named: tuple[str, ...]
-    within: int
-    wrong: Change
+    named: tuple[str, ...]   # the right parameters, any of them
+    within: int   # informative seconds of motion
+    wrong: Change   # the wrong configuration in place of the right one
+    # Its error; None where rotation about two axes is the information.
     injected: Error = lambda right, rng: None
 
 
@@ -278,23 +272,18 @@ _MOST_MATCHES = 150
 
 
 class TruePair(NamedTuple):
-    """A pair with its true pose: ``X1 = R X2 + t`` of the middle rows, |t| = 1.
+    """A pair with its true pose: ``X1 = R X2 + t`` of the middle rows, |t| = 1."""
 
-    `pixels1`, `pixels2` (N, 2): of the inliers, on the sensor; `sigma` [px]: of a match.
-    `rates1`, `rates2` (N, 3): mean true rate [rad/s] from the middle row to each match's row;
-    `rate1`, `rate2` (3,): at the middle rows. All rates are in the camera frame.
-    """
-
-    pixels1: Array
+    pixels1: Array   # (N, 2) of the inliers, on the sensor
     pixels2: Array
     R: Array
     t: Array
     interval: float
-    rates1: Array
+    rates1: Array   # (N, 3) mean true rate [rad/s] from the middle row to each match's row
     rates2: Array
-    rate1: Array
+    rate1: Array   # (3,) at the middle row; all rates are in the camera frame
     rate2: Array
-    sigma: float
+    sigma: float   # of a match [px]
     gyro_noise_density: float
 
 

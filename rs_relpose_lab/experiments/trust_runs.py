@@ -67,36 +67,28 @@ _SCATTER = 2654435761
 class TrackNoise:
     """Errors of a track, as those of `KltTracker` in a rendered bag (docs/lab/trust.md).
 
-    `white` [px]: 1 sigma per coordinate of each match. As the camera moves on, each corner slips
-    off its place, in a direction of its own: within `settled` metres by `slip` [px] times
-    Student's t of `freedom` degrees. A share `wrong` slides by a normal number times `slide`
-    [px/m].
+    As the camera moves on, each corner slips off its place, in a direction of its own.
     """
 
-    white: float = 0.04
-    slip: float = 0.08
-    freedom: float = 2.5
-    settled: float = 0.2
-    wrong: float = 0.003
-    slide: float = 10.0
+    white: float = 0.04   # 1 sigma per coordinate of each match [px]
+    slip: float = 0.08   # of the corner's place, times Student's t [px]
+    freedom: float = 2.5   # degrees of freedom of that
+    settled: float = 0.2   # [m] within which it slips
+    wrong: float = 0.003   # share of corners that slide on
+    slide: float = 10.0   # times a normal number [px/m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sightings:
-    """Where each frame of a recording shows the corners, errors apart.
+    """Where each frame of a recording shows the corners, errors apart."""
 
-    `ids`: of each frame's corners (N,), increasing; one that is lost does not come back.
-    `pixels`: their places (N, 2) on the sensor; `noise`: standard normal (N, 2).
-    `travelled` (F,): way of the camera up to each frame [m]. `slips` [px], `slides` [px/m]: (M, 2)
-    by id.
-    """
-
+    # Of each frame's corners (N,), increasing; one that is lost does not come back.
     ids: tuple[Ids, ...]
-    pixels: tuple[Array, ...]
-    noise: tuple[Array, ...]
-    travelled: Array
-    slips: Array
-    slides: Array
+    pixels: tuple[Array, ...]   # their places (N, 2) on the sensor
+    noise: tuple[Array, ...]   # standard normal (N, 2)
+    travelled: Array   # (F,) way of the camera up to each frame [m]
+    slips: Array   # (M, 2) by id [px]
+    slides: Array   # (M, 2) by id [px/m]
     errors: TrackNoise
 
 
@@ -286,24 +278,19 @@ class Source(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """Input of a run, and the truth.
-
-    `configured`: the right configuration. `image`: of a frame's number, from the sensor;
-    `sightings`: tracks in place of images. `true_pose`: R and t [m] of the stamped rows of two
-    stamps; None where it is unknown. `rate_stamps_ns` (K,), `rates` (K, 3): true angular rate
-    [rad/s], camera frame, on the IMU clock.
-    """
+    """Input of a run, and the truth."""
 
     source: Source
-    configured: trust_rows.Configured
+    configured: trust_rows.Configured   # right
     camera: RollingShutterCamera
     arrivals: Sequence[Arrival]
     samples: Sequence[ImuSample]
-    image: Callable[[int], Gray]
-    sightings: Sightings | None
+    image: Callable[[int], Gray]   # of a frame's number, from the sensor
+    sightings: Sightings | None   # tracks in place of images
+    # R and t [m] of the stamped rows of two stamps; None where it is unknown.
     true_pose: Callable[[int, int], tuple[Array, Array] | None]
-    rate_stamps_ns: NDArray[np.int64]
-    rates: Array
+    rate_stamps_ns: NDArray[np.int64]   # (K,) on the IMU's clock
+    rates: Array   # (K, 3) true angular rate [rad/s], camera frame
 
     @property
     def seconds(self) -> float:
@@ -343,22 +330,17 @@ class Verdict(NamedTuple):
     named: tuple[str, ...]
 @dataclass(frozen=True, slots=True)
 class EvaluatedPair:
-    """A pair of a run, against the truth.
+    """A pair of a run, against the truth; NaN without a pose."""
 
-    `at`: stamp since the recording's first [s]; `seconds`: wall time of its frame. Of a pose, NaN
-    without one: errors squared in sigmas, `chi_direction` (2 dof) and `chi_rotation` (3 dof);
-    errors and claimed 1 sigma [deg].
-    """
-
-    at: float
+    at: float   # stamp since the recording's first [s]
     status: str
     verdict: Verdict
-    seconds: float
-    chi_direction: float = math.nan
-    chi_rotation: float = math.nan
-    direction_error: float = math.nan
-    rotation_error: float = math.nan
-    direction_sigma: float = math.nan
+    seconds: float   # wall time of its frame
+    chi_direction: float = math.nan   # error squared in sigmas, 2 degrees of freedom
+    chi_rotation: float = math.nan   # likewise, 3
+    direction_error: float = math.nan   # [deg]
+    rotation_error: float = math.nan   # [deg]
+    direction_sigma: float = math.nan   # claimed, 1 sigma [deg]
 
     @property
     def has_pose(self) -> bool:

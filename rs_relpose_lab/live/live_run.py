@@ -117,19 +117,15 @@ _QUIET = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Play:
-    """A bag to be played to the node, and how.
-
-    `parameters`: file of the node; `transport`: its `image_transport`.
-    `remap`: the node's topics `image`, `camera_info` and `imu` by their names in the bag.
-    `player`: options of the player; `profile`: of Fast DDS, for all processes.
-    """
+    """A bag to be played to the node, and how."""
 
     bag: Path
-    parameters: Path
+    parameters: Path   # file of the node
+    # The node's topics `image`, `camera_info` and `imu` by their names in the bag.
     remap: dict[str, str]
-    transport: str
-    player: tuple[str, ...]
-    profile: Path | None
+    transport: str   # its `image_transport`
+    player: tuple[str, ...]   # options of the player
+    profile: Path | None   # of Fast DDS, for all processes
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,22 +141,17 @@ class ReceivedPose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuredRun:
-    """Results of `measure`.
-
-    `counters`: last values of the node's diagnostics.
-    `metrics`, `player_metrics`: of node and player, once a second while messages are played.
-    `started_ns`, `ready_ns`: times at which the node was started and had subscribed.
-    `timings`: table of the node's parameter `timings_file`; `log`: the player's.
-    """
+    """Results of `measure`."""
 
     poses: list[ReceivedPose]
-    counters: dict[str, str]
+    counters: dict[str, str]   # last values of the node's diagnostics
+    # Of the node, once a second while messages are played.
     metrics: list[processes.ProcessMetrics]
     player_metrics: list[processes.ProcessMetrics]
-    started_ns: int
-    ready_ns: int
-    timings: Path
-    log: Path
+    started_ns: int   # when the node was started
+    ready_ns: int   # when it had subscribed
+    timings: Path   # table of the node's parameter `timings_file`
+    log: Path   # table of the player
 
 
 class _Listener:

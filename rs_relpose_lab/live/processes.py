@@ -152,17 +152,13 @@ def wait_until_quiet(count: Callable[[], int], seconds: float, process: Process)
 
 @dataclass(frozen=True, slots=True)
 class ProcessMetrics:
-    """Processor time and memory of a process at a time, from /proc.
-
-    `cpu`, `cpu_main`: processor time since its start [s]: of all threads, and of the first one.
-    `resident`, `private` [MB]: without what is shared (the transport's segments) in the latter.
-    """
+    """Processor time and memory of a process at a time, from /proc."""
 
     time_ns: int
-    cpu: float
-    cpu_main: float
-    resident: float
-    private: float
+    cpu: float   # [s] since its start, of all threads
+    cpu_main: float   # [s] of the first thread
+    resident: float   # [MB]
+    private: float   # [MB] without what is shared (the transport's segments)
 
 
 def process_metrics(pid: int) -> ProcessMetrics:

@@ -39,16 +39,13 @@ class Renderer:
 
     Pixel centres are at integer coordinates; the exposure of row v has its middle at the time of
     the reference row plus ``camera.row_times(v)``.
-
-    `edge_samples`: pixels on the outline of a surface are the mean of this many samples squared.
-    `exposure_time` [s]: a row is the mean of its gray values over this time.
     """
 
     scene: Scene
     camera: RollingShutterCamera
     trajectory: Trajectory
-    edge_samples: int = 2
-    exposure_time: float = 0.0
+    edge_samples: int = 2   # squared, of pixels on the outline of a surface
+    exposure_time: float = 0.0   # [s] over which a row is averaged
     _rays: Array = field(init=False, repr=False)
     _tile_angles: Array = field(init=False, repr=False)
 
@@ -153,18 +150,13 @@ def _tile_angles(rays: Array) -> Array:
 
 
 class _Exposure(NamedTuple):
-    """Times and poses of the pixels.
+    """Times and poses of the pixels."""
 
-    `rays` (H, W, 3) in the camera frame, `tile_angles` (H, tiles) [rad] as `_tile_angles` has
-    them, `positions` (H, 3) and `rotations` (H, 3, 3) of the camera at each row, `pixel_angle`
-    [rad] in the middle of the image.
-    """
-
-    rays: Array
-    tile_angles: Array
-    positions: Array
-    rotations: Array
-    pixel_angle: float
+    rays: Array   # (H, W, 3) in the camera frame
+    tile_angles: Array   # (H, tiles) [rad] as `_tile_angles` has them
+    positions: Array   # (H, 3) of the camera at each row
+    rotations: Array   # (H, 3, 3) likewise
+    pixel_angle: float   # [rad] in the middle of the image
 
 
 # Columns of a face, a surface from one row's position: unit normal, height of the camera

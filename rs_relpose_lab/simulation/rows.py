@@ -24,19 +24,14 @@ _LEAST_DEPTH = 0.1  # [m]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """Projection of a camera at rest, and its row times.
+    """Projection of a camera at rest, and its row times."""
 
-    `project`: points (N, 3) in the camera frame to pixels (N, 2); NaN outside of the lens.
-    `unproject`: pixels (N, 2) to directions (N, 3) in the camera frame, of any length.
-    `line_delay`: time from one row to the row below [s]; `reference_row`: that is read at time 0.
-    """
-
-    project: Callable[[Array], Array]
-    unproject: Callable[[Array], Array]
+    project: Callable[[Array], Array]   # points (N, 3) to pixels (N, 2); NaN outside of the lens
+    unproject: Callable[[Array], Array]   # pixels (N, 2) to directions (N, 3) of any length
     width: int
     height: int
-    line_delay: float
-    reference_row: float
+    line_delay: float   # from one row to the row below [s]
+    reference_row: float   # that is read at time 0
 
 
 def uniform_motion(attitude: Rotation, position: Array, rate: Array, velocity: Array) -> Motion:

@@ -143,39 +143,33 @@ _ROOT = np.array([0.0, 0.0, 1.6])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """A textured rectangle, visible from the side opposite to ``across x down``.
+    """A textured rectangle, visible from the side opposite to ``across x down``."""
 
-    `corner`: world position [m] of the texture's upper left corner, as its viewer sees it.
-    `across`, `down`: unit vectors along the texture's rows and columns; `width`, `height` [m].
-    Texel (i, j) of `texture` (H, W) is centred at ``((j + 0.5) width / W, (i + 0.5) height / H)``.
-    """
-
-    corner: Array
-    across: Array
-    down: Array
-    width: float
-    height: float
+    corner: Array   # [m] world position of the texture's upper left, as its viewer sees it
+    across: Array   # unit vector along the texture's rows
+    down: Array   # and along its columns
+    width: float   # [m]
+    height: float   # [m]
+    # (H, W), texel (i, j) centred at ((j + 0.5) width / W, (i + 0.5) height / H).
     texture: NDArray[np.uint8]
 
 
 class Scene(NamedTuple):
     """S surfaces packed for the renderer, textures with their L mip levels.
 
-    `corners`, `across`, `down` (S, 3) and `sizes` (S, 2) [m] are those of `Surface`, `texels`
-    (S, 2) the size of a texel of level 0 [m]. Level l of texture s is the `shapes[s, l]` gray
-    values of `pixels` from `offsets[s, l]` on; its texel k is where level 0 has ``2^l k``. Texture
-    s has `levels[s]` of them.
+    Level l of texture s is the `shapes[s, l]` gray values of `pixels` from `offsets[s, l]` on; its
+    texel k is where level 0 has ``2^l k``.
     """
 
-    corners: Array
+    corners: Array   # (S, 3) as of `Surface`, likewise
     across: Array
     down: Array
-    sizes: Array
-    texels: Array
+    sizes: Array   # (S, 2) [m]
+    texels: Array   # (S, 2) size of a texel of level 0 [m]
     pixels: NDArray[np.uint8]
     offsets: NDArray[np.int64]
     shapes: NDArray[np.int64]
-    levels: NDArray[np.int64]
+    levels: NDArray[np.int64]   # (S,) of each texture
 
     @classmethod
     def of(cls, *surfaces: Surface) -> Scene:

@@ -21,19 +21,14 @@ GRAVITY = np.array([0.0, 0.0, -9.80665])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuModel:
-    """An IMU fixed to the camera: mounting, biases and noise.
-
-    ``v_cam = R_cam_imu v_imu``; `lever_arm`: position of the IMU in the camera frame [m].
-    `gyro_bias` [rad/s], `accel_bias` [m/s^2]: added to the truth, IMU frame; sigmas of a sample's
-    white noise, per axis: the density times the square root of the rate.
-    """
+    """An IMU fixed to the camera: mounting, biases and noise; ``v_cam = R_cam_imu v_imu``."""
 
     R_cam_imu: Array
-    lever_arm: ArrayLike = (0.0, 0.0, 0.0)
-    gyro_bias: ArrayLike = (0.0, 0.0, 0.0)
-    accel_bias: ArrayLike = (0.0, 0.0, 0.0)
-    gyro_sigma: float = 0.0
-    accel_sigma: float = 0.0
+    lever_arm: ArrayLike = (0.0, 0.0, 0.0)   # position of the IMU in the camera frame [m]
+    gyro_bias: ArrayLike = (0.0, 0.0, 0.0)   # [rad/s] added to the truth, IMU frame
+    accel_bias: ArrayLike = (0.0, 0.0, 0.0)   # [m/s^2] likewise
+    gyro_sigma: float = 0.0   # of a sample: density times the square root of the rate
+    accel_sigma: float = 0.0   # likewise
 
     def measure(self, states: CameraStates, rng: np.random.Generator) -> tuple[Array, Array]:
         """Measured angular velocities and specific forces (N, 3) in the IMU frame.

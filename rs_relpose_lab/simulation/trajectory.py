@@ -29,46 +29,34 @@ R_BODY_CAM = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """A stretch of one kind of motion, in seconds of the trajectory.
+    """A stretch of one kind of motion, in seconds of the trajectory."""
 
-    `kind`: 'walk', 'constant' (constant linear and angular velocity), 'still' or 'rotate' (about
-    the camera centre).
-    """
-
-    kind: str
+    kind: str   # 'walk', 'constant' velocities, 'still' or 'rotate' about the camera centre
     start: float
     end: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraStates:
-    """Poses of the camera optical frame in the world at N times, and their derivatives.
+    """Poses of the camera optical frame in the world at N times, and their derivatives."""
 
-    `position`, `velocity`, `acceleration` (N, 3): world frame [m], [m/s], [m/s^2].
-    `angular_velocity`, `angular_acceleration` (N, 3): camera frame [rad/s], [rad/s^2].
-    """
-
-    position: Array
+    position: Array   # (N, 3) world frame [m], [m/s], [m/s^2]
     R_world_cam: Array
     velocity: Array
     acceleration: Array
-    angular_velocity: Array
+    angular_velocity: Array   # (N, 3) camera frame [rad/s], [rad/s^2]
     angular_acceleration: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """Motion of the camera over an interval.
+    """Motion of the camera over an interval; angles are yaw, pitch and roll."""
 
-    `positions` (K, 3) [m], `angles` (K, 3) of yaw, pitch and roll [rad]: control points, one every
-        `spacing` [s] from `first_control` [s] on.
-    `segments`: labels of the stretches; between them one kind passes into the next.
-    """
-
-    positions: Array
-    angles: Array
-    first_control: float
-    spacing: float
+    positions: Array   # (K, 3) [m] of control points
+    angles: Array   # (K, 3) [rad] likewise
+    first_control: float   # [s]
+    spacing: float   # [s]
+    # Labels of the stretches; between them one kind passes into the next.
     segments: tuple[Segment, ...] = ()
     _spline: BSpline = field(init=False, repr=False)
 

@@ -174,15 +174,12 @@ class Topic:
 
 @dataclass(frozen=True, slots=True)
 class SensorTopics:
-    """Topics to read; `accel` only if the driver publishes the accelerometer separately.
-
-    `camera_info` is None only if it is not needed.
-    """
+    """Topics to read."""
 
     image: Topic
-    camera_info: Topic | None
+    camera_info: Topic | None   # None only if it is not needed
     imu: Topic
-    accel: Topic | None
+    accel: Topic | None   # only if the driver publishes it separately
     truth: Topic | None
 
 
@@ -197,15 +194,12 @@ class Chosen(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _TopicFinder:
-    """Finds the sensors' topics among all `topics` of a `bag`; `names`: those chosen, by role.
-
-    `complete`: a topic that is absent is an error.
-    """
+    """Finds the sensors' topics among all topics of a bag."""
 
     bag: Path
     topics: Sequence[Topic]
-    names: Mapping[str, str]
-    complete: bool = True
+    names: Mapping[str, str]   # those chosen, by role
+    complete: bool = True   # whether an absent topic is an error
 
     def find(self, needs_camera_info: bool) -> Chosen:
         image = self._one('image', 'image', IMAGE, COMPRESSED_IMAGE)

@@ -285,7 +285,7 @@ def _add_export_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_topic_arguments(parser, 'image', 'camera_info', 'imu', 'accel', 'truth')
 
 
-def _check_export(args: argparse.Namespace) -> None:
+def _export(args: argparse.Namespace) -> int:
     refuse_existing(args.out)
     refuse_unwritable(args.out.parent)
     if args.points < 0:
@@ -297,10 +297,6 @@ def _check_export(args: argparse.Namespace) -> None:
                          'they are kept in DIR/images')
     if args.link and (args.images or FORMATS[args.format].images) != export.RAW:
         raise InputError('--link is for raw images: use --images raw')
-
-
-def _export(args: argparse.Namespace) -> int:
-    _check_export(args)
     with beside(args.out) as part:
         trajectory = args.trajectory or part.with_name('odometry')
         if args.trajectory is None:

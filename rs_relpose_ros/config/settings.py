@@ -35,10 +35,7 @@ ANY_VALUE = {bool: 'true or false', str: 'text'}
 
 @dataclass(frozen=True, slots=True)
 class Declared:
-    """Declaration of a setting.
-
-    `live`: a running node may change it; `restarts`: it may, and begins again with the new value.
-    """
+    """Declaration of a setting."""
 
     description: str
     unit: str = ''
@@ -46,8 +43,8 @@ class Declared:
     high: float = math.inf
     choices: tuple[str, ...] = ()
     length: int | None = None
-    live: bool = False
-    restarts: bool = False
+    live: bool = False   # a running node may change it
+    restarts: bool = False   # it may, and begins again with the new value
     kind: type = float
 
     @property

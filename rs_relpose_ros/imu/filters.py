@@ -165,16 +165,12 @@ _OWN_GATE = 4.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GravityEstimate:
-    """Direction (3,) of free fall, unit, IMU frame; `sigma` [rad] per axis.
+    """Direction of gravity, and length of the specific force at rest as measured."""
 
-    `length` [m/s^2]: specific force at rest as measured by this accelerometer, scale and bias
-    along gravity included, with its 1 sigma.
-    """
-
-    direction: Array
-    sigma: float
-    length: float = STANDARD_GRAVITY
-    length_sigma: float = LENGTH_SIGMA
+    direction: Array   # (3,) of free fall, unit, IMU frame
+    sigma: float   # [rad] per axis
+    length: float = STANDARD_GRAVITY   # [m/s^2], scale and bias along gravity included
+    length_sigma: float = LENGTH_SIGMA   # 1 sigma
 
 
 class _Noise(NamedTuple):

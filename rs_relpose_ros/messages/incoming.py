@@ -87,9 +87,6 @@ def intrinsics_from_info(msg: Any) -> Intrinsics:
     pinhole = pinhole_of_matrix('k of CameraInfo', k)
     width, height = int(msg.width), int(msg.height)
     images.check_image_size(width, height)
-    coefficients = info_field(msg, 'd')
-    if len(coefficients) > 64:
-        raise InputError(f'd of CameraInfo has {len(coefficients)} coefficients')
     # 0 in these fields means "not set": no binning, and the full sensor.
     binning_x, binning_y = max(int(msg.binning_x), 1), max(int(msg.binning_y), 1)
     roi = msg.roi
@@ -97,7 +94,7 @@ def intrinsics_from_info(msg: Any) -> Intrinsics:
     return Intrinsics(
         width=width, height=height, **pinhole,
         distortion_model=str(msg.distortion_model)[:40],
-        distortion=tuple(float(value) for value in coefficients),
+        distortion=tuple(float(value) for value in info_field(msg, 'd')),
         x_offset=int(roi.x_offset), y_offset=int(roi.y_offset),
         binning_x=binning_x, binning_y=binning_y,
         image_width=roi_width // binning_x, image_height=roi_height // binning_y)

@@ -162,18 +162,13 @@ class Replay:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReplayOutcome:
-    """Results of a replay, or of a list of pairs.
-
-    `metrics`: content of summary.json without provenance; `health`: the worst finding of each
-    configured parameter; `files`: written so far (tables, bag and pictures); `intrinsics`:
-    active at the end.
-    """
+    """Results of a replay, or of a list of pairs."""
 
     records: list[PairRecord]
-    metrics: dict[str, Any]
-    health: Assessment
-    files: list[Path]
-    intrinsics: Intrinsics | None
+    metrics: dict[str, Any]   # content of summary.json without provenance
+    health: Assessment   # the worst finding of each configured parameter
+    files: list[Path]   # written so far: tables, bag and pictures
+    intrinsics: Intrinsics | None   # active at the end
 
 
 def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parameters, *,
@@ -352,7 +347,7 @@ def pairs_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Paramet
                'errors_against_truth': tables.errors_against_truth(
                    [record for record in records if record.pose])}
     return ReplayOutcome(records, metrics, NOT_EVALUATED,
-                                [folder / table.file for table in written], intrinsics)
+                         [folder / table.file for table in written], intrinsics)
 
 
 def related(bag: Bag, topics: SensorTopics, parameters: Parameters,

@@ -34,12 +34,10 @@ class UnrollReport:
 
 @dataclass(slots=True, eq=False)
 class _Place:
-    """A place in the new bag, in the order of receive times.
-
-    `writes`: one of each message, none for an omitted image, None until they are known.
-    """
+    """A place in the new bag, in the order of receive times."""
 
     bag_time_ns: int
+    # One of each message, none for an omitted image, None until they are known.
     writes: Sequence[Callable[[], None]] | None = None
 
 

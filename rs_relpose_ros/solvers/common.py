@@ -18,28 +18,20 @@ from rs_relpose_ros.jit import kernel, KernelInterface, small_kernel
 
 
 class Sample(NamedTuple):
-    """A minimal sample of n matches.
+    """A minimal sample of n matches."""
 
-    `f1`, `f2` (n, 3): unit rays, each in its own camera's frame, as measured or derotated by the
-    gyro (`Model.derotated`). `tau1`, `tau2` (n,): row times [s] relative to the reference row.
-    """
-
-    f1: Array
-    f2: Array
-    tau1: Array
-    tau2: Array
+    f1: Array   # (n, 3) unit rays in their camera's frame, derotated by the gyro if the model is
+    f2: Array   # likewise
+    tau1: Array   # (n,) row times [s] relative to the reference row
+    tau2: Array   # likewise
 
 
 class Knowledge(NamedTuple):
-    """Known quantities besides the matches; `Solver` has the ones that a solver uses.
+    """Known quantities besides the matches; `Solver` has the ones that a solver uses."""
 
-    `align1`, `align2` (3, 3): rotations of each camera's gravity onto +z (`gravity_alignment`).
-    `rotation` (3, 3): a predicted R, if `predicted`.
-    """
-
-    align1: Array
-    align2: Array
-    rotation: Array
+    align1: Array   # (3, 3) rotation of the camera's gravity onto +z (`gravity_alignment`)
+    align2: Array   # likewise
+    rotation: Array   # (3, 3) a predicted R, if `predicted`
     predicted: bool
 
 
@@ -145,16 +137,12 @@ def point_forward(sample: Sample, R: Array, x: Array) -> None:
 # (section 'Gravity and Angular Velocity Measurements'), for the inverse R and a vertical along y.
 
 class AlignedRays(NamedTuple):
-    """Rays in frames with gravity on z, the second rotated so that solutions cluster about yaw 0.
+    """Rays in frames with gravity on z, the second rotated so that solutions have yaws near 0."""
 
-    `a`, `b` (n, 3): ``A_1 f_1`` and ``Rz(centre) A_2 f_2``. `centre` [rad]: to be added to their
-    yaw. `zoom`: rms distance of a and b, about the width of the cluster.
-    """
-
-    a: Array
-    b: Array
-    centre: float
-    zoom: float
+    a: Array   # (n, 3) ``A_1 f_1``
+    b: Array   # (n, 3) ``Rz(centre) A_2 f_2``
+    centre: float   # [rad] to be added to their yaw
+    zoom: float   # rms distance of a and b, about the width of the cluster
 
 
 @kernel
@@ -245,17 +233,14 @@ def align_rays(sample: Sample, known: Knowledge) -> AlignedRays:
 # (`translation_and_velocities`).
 
 class RowTimeFactors(NamedTuple):
-    """p, q (n,), the mean row time m [s] and the scales s_p, s_q [s].
+    """Row times of a sample, scaled."""
 
-    `observable` is False for equal row times, from which velocities are not observable.
-    """
-
-    p: Array
-    q: Array
-    m: float
-    s_p: float
-    s_q: float
-    observable: bool
+    p: Array   # (n,)
+    q: Array   # (n,)
+    m: float   # mean row time [s]
+    s_p: float   # [s]
+    s_q: float   # [s]
+    observable: bool   # False for equal row times: velocities are then not observable
 
 
 @kernel

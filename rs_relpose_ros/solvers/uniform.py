@@ -178,20 +178,16 @@ _SINGULAR = 1e-13
 
 
 class _ElevenEquations(NamedTuple):
-    """``A(R) y = 0`` with the rows ``[n, p n, q n]``, and work arrays for one R.
-
-    `columns` (9, 11): of A. `bordered` (12, 11): ``[A Y, dA y / dtheta, A y]``, triangularised;
-    ``[8:11, 8:]`` is then the transposed derivative J of the three conditions, ``[11, 8:]`` the
-    conditions r. `work` (11, 11), `diagonal`, `scales` (9,): overwritten.
-    """
+    """``A(R) y = 0`` with the rows ``[n, p n, q n]``, and work arrays for one R."""
 
     sample: Sample
     factors: RowTimeFactors
-    columns: Array
+    columns: Array   # (9, 11) of A
+    # (12, 11) ``[A Y, dA y / dtheta, A y]``, triangularised: J^T in [8:11, 8:], r in [11, 8:].
     bordered: Array
-    work: Array
-    diagonal: Array
-    scales: Array
+    work: Array   # (11, 11), overwritten as the next two
+    diagonal: Array   # (9,)
+    scales: Array   # (9,)
 
 
 @kernel
