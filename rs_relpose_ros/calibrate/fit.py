@@ -517,7 +517,9 @@ def _disagreement(final: Fit) -> Array:
     difference = one.unknowns.parameters - other.unknowns.parameters
     difference[ROTATION:ROTATION + 3] = log_so3(
         one.unknowns.R_imu_cam @ other.unknowns.R_imu_cam.T)
-    variances = np.diag(one.covariance + other.covariance)
+    # The whole lets expect four times its own; less than half of that is chance, of few stretches.
+    variances = np.maximum(np.diag(one.covariance + other.covariance),
+                           2.0 * np.diag(final.covariance))
     squares = difference[free]**2 / variances[free]
     mean = float(np.minimum(squares, _GROSS).mean())
     factors = np.ones(GLOBAL)

@@ -22,22 +22,18 @@ from rs_relpose_ros.calibrate.procedure import (
 from rs_relpose_ros.calibrate.result import CalibrationResult, parameter_file, quantities
 from rs_relpose_ros.calibrate.stored import Calibrated, CameraId, Progress
 from rs_relpose_ros.config.settings import Parameters, TRACKED_IN_IMAGES
-from rs_relpose_ros.errors import InputError, RsRelposeError
+from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.messages.incoming import Role, stamp_ns
 from rs_relpose_ros.messages.transforms import AXES_SIGMA
 from rs_relpose_ros.pipeline.sequencer import Refusal, SequencerCounts
 
-# Length of the recording [s]: of the first fit, and of a lens that is not known; kept at most;
-# added before the next fit.
-_FIRST, _FIRST_OF_LENS, _LONGEST, _STEP = 6.0, 7.0, 60.0, 1.0
-# From this length on [s] values with wider sigmas suffice, as their doubt is in the covariances:
-# factor of the limits.
-_LONG, _WIDER = 7.0, 2.0
-# The same from the start, where the doubt moves poses by less than their own sigma.
-_UNNOTICED = 3.0
-# From this length on [s] a rotation as exact as that of a transform suffices: a robot on wheels
-# rotates about one axis only.
+# Length of the recording [s]: of the first fit; kept at most; added before the next fit.
+_FIRST, _LONGEST, _STEP = 7.0, 60.0, 1.0
+# Values with wider sigmas suffice, as their doubt is in the covariances: factors of the limits,
+# and of those where the doubt moves poses by less than their own sigma.
+_WIDER, _UNNOTICED = 2.0, 3.0
+# From this length [s] on the rotation of a transform suffices: wheels turn about one axis only.
 _WHEELS = 20.0
 # Images that wait to be tracked; more are left out.
 _WAITING = 8
@@ -45,11 +41,10 @@ _WAITING = 8
 _SILENCE = 2.0
 # Images without a usable CameraInfo after which the lens counts as uncalibrated.
 _WITHOUT_INFO = 15
-# Consecutive images that cannot be used after which the recording starts again, of another size,
-# or goes on with a clock that was set back.
+# Consecutive unusable images after which the recording starts again (other size), or goes on with
+# a clock that was set back.
 _MOST_REFUSED = 15
-# Niceness of the process of the fits: the node's own work goes first, but a loaded machine still
-# ends a fit.
+# Niceness of the process of the fits: the node goes first, but a loaded machine still ends a fit.
 _NICE = 5
 
 
@@ -86,10 +81,6 @@ class LiveCalibration:
     def intrinsics(self) -> Intrinsics | None:
         """Those of the last CameraInfo."""
         return self._recorder.intrinsics
-
-    @property
-    def _first(self) -> float:
-        return _FIRST if self.intrinsics is not None else _FIRST_OF_LENS
 
     @property
     def camera_info_problem(self) -> str:
@@ -148,11 +139,12 @@ class LiveCalibration:
         self._images += 1
         self._image_s = time.monotonic()
         error = self._recorder.add(role, message)
-        self._refused = 0 if error is None else self._refused + 1
-        if self._refused > _MOST_REFUSED:
-            self._use_clock_of(message)
         if error is not None:
+            self._refused += 1
+            if self._refused > _MOST_REFUSED:
+                self._use_clock_of(message)
             return error
+        self._refused = 0
         configured = self._parameters.intrinsics
         if configured.given:
             self._recorder.intrinsics = configured.of_image(*self._recorder.size)
@@ -173,12 +165,12 @@ class LiveCalibration:
 
     def _too_short(self) -> Progress | None:
         seconds = self._recorder.seconds
-        if (not self._short < seconds < self._first or self.waits_for
+        if (not self._short < seconds < _FIRST or self.waits_for
                 or time.monotonic() - self._image_s < _SILENCE):
             return None
         self._short = seconds
         return Progress(f'calibrating: the images ended after {seconds:.1f} s, too short: '
-                        f'at least {self._first:.0f} s are needed, 10 s or more are good')
+                        f'at least {_FIRST:.0f} s are needed, 10 s or more are good')
 
     def close(self) -> None:
         """End the process of the fits."""
@@ -193,19 +185,16 @@ class LiveCalibration:
                         else CameraId(frame_id, *size, self._topic))
         try:
             path = stored.path_of(config, self._camera)
-        except InputError as error:
-            return error
-        if not (self._use_stored and path.is_file()):
-            self._fits = None if self.waits_for else _Fits()
-            return Progress('calibrating: rotate the camera about all three axes, 20 to 60 deg/s, '
-                            'for some 20 s' if not self.waits_for else
-                            f'waiting for {self.waits_for}')
-        try:
-            _, day = stored.load(path, self._camera)
-            return Calibrated(self._camera, path.read_text(encoding='utf-8'),
-                              f'using the calibration of {day} in {path}', new=False)
+            if self._use_stored and path.is_file():
+                _, known = stored.load(path, self._camera)
+                return Calibrated(self._camera, path.read_text(encoding='utf-8'),
+                                  f'using the calibration of {known} in {path}', new=False)
         except RsRelposeError as error:
             return error
+        self._fits = None if self.waits_for else _Fits()
+        return Progress('calibrating: rotate the camera about all three axes, 20 to 60 deg/s, '
+                        'for some 20 s' if not self.waits_for else
+                        f'waiting for {self.waits_for}')
 
     def _after_fit(self) -> Progress | Calibrated | None:
         fits = self._fits
@@ -217,15 +206,13 @@ class LiveCalibration:
             return self._evaluated(result, recording)
         recorder = self._recorder
         grown = 1e-9 * (recorder.last_ns - self._fitted_ns) if self._fitted_ns else _STEP
-        if self.waits_for or recorder.seconds < self._first or grown < _STEP:
+        if self.waits_for or recorder.seconds < _FIRST or grown < _STEP:
             return None
         self._fitted_ns = recorder.last_ns
         sensor = self._parameters.sensor
         config = replace(TRACKED_IN_IMAGES, exposure_time=sensor.exposure_time,
-                         exposure_margin=sensor.exposure_margin,
+                         exposure_margin=sensor.exposure_margin, tolerance=_WIDER,
                          unnoticed_tolerance=_UNNOTICED)
-        if recorder.seconds >= _LONG:
-            config = replace(config, tolerance=_WIDER)
         if recorder.seconds >= _WHEELS and self.quat_prior is not None:
             config = replace(config, max_rotation_sigma=1.1 * AXES_SIGMA / _WIDER)
         if fits is None or fits.ended:
@@ -250,9 +237,8 @@ class LiveCalibration:
                 result, f'Calibration of {self._camera.name} by {seconds:.0f} s while running.',
                 camera=recording.camera), f'calibrated: {known}')
         missing = [of.remark for of in result.needed if not of.observable]
-        needed = '; '.join(dict.fromkeys(missing))
         return Progress(
-            f'calibrating, {seconds:.0f} s: {known}. Needed: {needed}',
+            f'calibrating, {seconds:.0f} s: {known}. Needed: {"; ".join(dict.fromkeys(missing))}',
             1.0 - len(missing) / len(result.needed),
             {name: text if of.observable else f'{text}; {of.remark}' for name, text, of in rows})
 
@@ -296,9 +282,7 @@ class _Fits:
 
     def result(self) -> CalibrationResult | RsRelposeError | None:
         """None while it runs."""
-        if self._result is None or not self._result.done():
-            return None
-        return self._result.result()
+        return self._result.result() if self._result and self._result.done() else None
 
     def stop(self) -> None:
         """End the process; signals of the terminal are blocked in it."""

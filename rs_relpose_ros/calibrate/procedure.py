@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict, deque
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 import logging
@@ -260,12 +260,10 @@ def _fit_with_lens(about: Callable[[Array], Observations], data: Observations, c
 
 _RECORD_MORE = ('too little rotation, too short, or too few points: record 10 s or more of a '
                 'textured scene while rotating 20 to 60 deg/s about all three axes')
-# Error of every focal length, relative: the residual is not linear in the noise of the points.
-_LEAST_FOCAL_SIGMA = 2e-4
 # A note if the intervals between frames vary for an unknown reason.
-_UNCLEAR = defaultdict(str, {Varying.UNCLEAR: (
+_UNCLEAR = {Varying.UNCLEAR: (
     'the intervals between frames vary neither as automatic exposure does nor as jitter: the '
-    'offset is assumed to be the same in all frames')})
+    'offset is assumed to be the same in all frames')}
 # Sigma, in those of an observable value, beyond which a rotation or focal length is of no use.
 _USELESS = 10.0
 # Largest sigmas of observable values: readout time and offset [s], its slope [s/s], bias [rad/s],
@@ -273,9 +271,10 @@ _USELESS = 10.0
 _MOST_READOUT, _MOST_OFFSET, _MOST_SLOPE, _MOST_BIAS, _MOST_FOCAL = 1.5e-3, 3e-3, 0.5, 0.01, 0.03
 # Errors (2, GLOBAL) that are common to a recording and not part of its scatter, without and with a
 # tracker: its own, measured on rendered bags with KLT [s, rad, rad/s]; of the slope [s/s], as the
-# exposure also changes within one step of the interval.
+# exposure also changes within one step of the interval; of the focal length (relative), as the
+# residual is not linear in the noise of the points.
 _COMMON = np.zeros((2, GLOBAL))
-_COMMON[:, FOCAL] = _LEAST_FOCAL_SIGMA
+_COMMON[:, FOCAL] = 2e-4
 _COMMON[1, [READOUT, OFFSET]], _COMMON[1, SLOPE] = 5e-5, 0.08
 _COMMON[1, ROTATION:ROTATION + 3], _COMMON[1, BIAS:BIAS + 3] = 1e-3, 2.5e-4
 
@@ -338,8 +337,8 @@ def evaluated(data: Observations, final: fit.Fit, curve: CostCurve,
         pixel_sigma=float(np.median(final.unknowns.noise)),
         inlier_ratio=float((final.weights > 0.25).mean()),
         frames=len(data.tracks), pairs=final.problem.pairs, matches=int(final.problem.begin[-1]),
-        frame_interval=data.interval,
-        warnings=tuple(filter(None, (unsettled, one_axis, beyond, _UNCLEAR[data.stamps.varying]))))
+        frame_interval=data.interval, warnings=tuple(filter(None, (
+            unsettled, one_axis, beyond, _UNCLEAR.get(data.stamps.varying)))))
 
 
 def _exposure(data: Observations, final: fit.Fit, square_sigma: float) -> Estimate:

@@ -131,7 +131,6 @@ class CalibrationResult:
 
 # Change of a gyro's bias from one start to the next [rad/s].
 _BIAS_CHANGE = 1e-3
-_FOUR_ZEROS = (0.0,) * 4
 _MS = 1e3
 
 
@@ -302,7 +301,7 @@ def _clock_values(result: CalibrationResult) -> list[SourcedValue]:
 
 def _lens_values(lens: LensEstimates, camera: RollingShutterCamera) -> list[SourcedValue]:
     focal, radial, column, row = lens
-    others = (0.0,) * (len(camera.distortion or _FOUR_ZEROS) - 1)
+    others = (0.0,) * ((len(camera.distortion) or 4) - 1)
     return [
         SourcedValue('camera_matrix', (
             round(camera.fx * focal.value, 2), 0.0, round(column.value, 2), 0.0,

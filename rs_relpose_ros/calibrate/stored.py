@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from datetime import datetime
+import math
 import os
 from pathlib import Path
 import re
@@ -11,6 +12,7 @@ from rs_relpose_ros.config.files import file_values, read_parameters
 from rs_relpose_ros.config.settings import StoredCalibrationConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.output_files import written
+from rs_relpose_ros.pipeline.findings import BY_NAME
 
 # Section of the file that identifies the camera; a node of another name ignores it.
 _SECTION = 'rs_relpose_calibration'
@@ -66,8 +68,17 @@ def path_of(config: StoredCalibrationConfig, camera: CameraId) -> Path:
     return home / 'rs_relpose' / f'{name}_{camera.width}x{camera.height}.yaml'
 
 
-def save(path: Path, camera: CameraId, parameters: str) -> None:
-    """Write a parameter file with its camera; InputError if it cannot be written."""
+def save(path: Path, camera: CameraId, parameters: str, *, replace: bool = True) -> None:
+    """Write a parameter file with its camera; InputError if it cannot be written.
+
+    A file that is damaged or of another camera stays unless `replace`.
+    """
+    if not replace and path.is_file():
+        try:
+            load(path, camera)
+        except InputError as error:
+            raise InputError(f'{error}. It is kept, and the new calibration is not stored: '
+                             '~/save_calibration would replace it') from error
     name = camera.name.replace("'", "''")
     text = (f"{parameters}{_SECTION}:\n  ros__parameters:\n    camera_name: '{name}'\n"
             f'    image_width: {camera.width}\n    image_height: {camera.height}\n'
@@ -83,7 +94,7 @@ def save(path: Path, camera: CameraId, parameters: str) -> None:
 
 
 def load(path: Path, camera: CameraId) -> tuple[dict[str, Any], str]:
-    """Parameters of a stored calibration by name, and its date.
+    """Parameters of a stored calibration by name, and its date with their sigmas in words.
 
     Raises
     ------
@@ -105,4 +116,9 @@ def load(path: Path, camera: CameraId) -> tuple[dict[str, Any], str]:
     if of != camera:
         raise InputError(f'{path} is for the camera {of.name!r} of {of.width}x{of.height}, not '
                          f'for {camera.name!r} of {camera.width}x{camera.height}')
-    return values, str(own['date'])
+    known = [f'{name.replace("_", " ")} '
+             + BY_NAME[name].with_sigma(values[name], values[f'{name}_sigma'])
+             for name in ('readout_time', 'time_offset') if f'{name}_sigma' in values]
+    if 'axes_sigma' in values:
+        known.append(f'axes +- {math.degrees(values["axes_sigma"]):.2f} deg')
+    return values, f'{own["date"]} ({", ".join(known)})'

@@ -11,6 +11,7 @@ import logging
 import os
 from pathlib import Path
 import sys
+import tempfile
 import threading
 import traceback
 from typing import Any, ClassVar, NoReturn, TYPE_CHECKING
@@ -103,6 +104,8 @@ def run_node(make: Callable[[], StoppableNode], name: str, description: str,
         logger.fatal(str(error).split(', at /')[0].strip())
         return 2
     _help(name, description).parse_args(own[1:])
+    if not (os.environ.get('HOME') or os.environ.get('ROS_HOME')):   # rcl has no folder to log in
+        os.environ.setdefault('ROS_LOG_DIR', tempfile.gettempdir())
     rclpy.init(args=list(given), signal_handler_options=SignalHandlerOptions.NO)
     executor, stopped = SingleThreadedExecutor(), threading.Event()
     on_started(lambda: executor.create_task(stopped.set))
@@ -246,6 +249,7 @@ class SensorNode(StoppableNode):
             self.create_service(Trigger, '~/save_calibration', self._save_now)
         else:
             self.create_subscription(String, 'calibration', self._on_calibration, LATCHED)
+        self._warm_timer = self.create_timer(0.02, self._subscribe_when_warm, clock=self._steady)
         self._begin(self._settings.current.calibration.calibrate_at_start == 'always')
         self.create_timer(1.0, self._report, clock=self._steady)
 
@@ -292,6 +296,7 @@ class SensorNode(StoppableNode):
     def _begin(self, calibrate: bool = False) -> None:
         """Estimate with the current parameters from here on, or calibrate before."""
         self._calibrating = calibrate
+        self._warm_timer.cancel()
         if self._worker is not None:
             self._worker.stop(_JOIN_TIMEOUT)
         self._active = parameters = self._settings.current
@@ -329,13 +334,13 @@ class SensorNode(StoppableNode):
                        'takes a minute or two, later ones some seconds')
         self._worker.start()
         # No subscription before the kernels are loaded: the first frames would be dropped.
-        self._warm_timer = self.create_timer(0.02, self._subscribe_when_warm, clock=self._steady)
+        self._warm_timer.reset()
 
     def _subscribe_when_warm(self) -> None:
         assert self._worker is not None
         if not self._worker.warm.is_set():
             return
-        self.destroy_timer(self._warm_timer)
+        self._warm_timer.cancel()
         if self._inputs is not None:
             self._inputs.hand_to(self._intake)
             self._frame_statistics.start()
@@ -401,7 +406,7 @@ class SensorNode(StoppableNode):
         try:
             path = stored.path_of(config, found.camera)
             if found.new and config.save_calibration:
-                stored.save(path, found.camera, found.parameters)
+                stored.save(path, found.camera, found.parameters, replace=False)
                 self._info(f'the calibration is stored in {path}')
         except InputError as error:
             self._error(str(error))
@@ -459,8 +464,7 @@ class SensorNode(StoppableNode):
 
     def _save_now(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Store the calibration that is used."""
-        found = self._calibrated
-        if found is None:
+        if (found := self._calibrated) is None:
             response.message = 'there is no calibration yet: call ~/calibrate'
             return response
         try:
