@@ -294,7 +294,7 @@ def own_node(ros_domain_id: int, request: pytest.FixtureRequest) -> Iterator[Odo
 @pytest.mark.parametrize('own_node', [0.1], indirect=True)
 def test_the_imu_is_read_at_a_low_rate_of_publication(own_node):
     assert min(timer.timer_period_ns for timer in own_node.timers) <= SECOND // 10
-    assert own_node._read_sensors in [timer.callback for timer in own_node.timers]
+    assert own_node._read in [timer.callback for timer in own_node.timers]
 
 
 def test_the_newest_state_is_published_before_pairs_are_used(own_node, monkeypatch):
@@ -305,7 +305,7 @@ def test_the_newest_state_is_published_before_pairs_are_used(own_node, monkeypat
     own_node._on_pair(pairs_message(walk('walk:2', 1.0).pairs[0], Assessment(())))
     assert own_node._estimator.waiting
     assert calls == []
-    own_node._publish_propagated()
+    own_node._read(publish=True)
     assert calls == ['state', 'pair']
 
 

@@ -155,7 +155,7 @@ def true_states(simulation: Simulation) -> TrueStates:
 
 def published(estimator: OdometryEstimator, feed: Feed) -> Iterator[Odometry]:
     """States that odometry_node publishes: at 30 Hz, each pair being processed when it arrives."""
-    path, waiting, next_ns = ContinuousPath(estimator), list(feed.pairs[::-1]), 0
+    path, waiting, next_ns = ContinuousPath(estimator.propagated), list(feed.pairs[::-1]), 0
     frames, last_ns = feed.frames[::-1], feed.samples[0][0]
     for arrives_ns, sample in feed.samples:
         if arrives_ns - last_ns > _SILENT_NS:

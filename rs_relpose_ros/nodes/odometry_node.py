@@ -1,6 +1,7 @@
 """odometry_node: metric odometry from the pairs of relpose_node and the IMU."""
 
 from collections import deque
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -31,8 +32,8 @@ _PAIRS = 'relpose_node/pairs'
 _IMU_DEPTH, _DEPTH = 2000, 50
 # Lowest rate at which the IMU is read [Hz]; the published rate may be lower.
 _LEAST_RATE = 10.0
-# Newest keyframes of ~/path, and its period for drawing [s].
-_PATH_LENGTH, _PATH_PERIOD = 3000, 1.0
+# Newest keyframes of ~/path.
+_PATH_LENGTH = 3000
 # Reports (one a second) without a message after which a topic counts as silent.
 _SILENCE = 2
 # Time without a sample after which the IMU is silent [s].
@@ -80,7 +81,7 @@ class OdometryNode(StoppableNode):
         """A path with these parameters, from the next pair on."""
         from rs_relpose_ros.odometry.estimator import OdometryEstimator
         self._estimator = OdometryEstimator(parameters)
-        self._continuous = ContinuousPath(self._estimator)
+        self._continuous = ContinuousPath(self._estimator.propagated)
         if self._estimator.base is None:
             self._lookup = inputs.TransformLookup(self)
 
@@ -98,34 +99,38 @@ class OdometryNode(StoppableNode):
         self.create_service(Trigger, '~/reset', self._reset)
         steady, rate = self._steady, self._config.odometry_rate
         if rate > 0.0:
-            self.create_timer(1.0 / rate, self._publish_propagated, clock=steady)
+            self.create_timer(1.0 / rate, lambda: self._read(publish=True), clock=steady)
         if rate < _LEAST_RATE:
-            self.create_timer(1.0 / _LEAST_RATE, self._read_sensors, clock=steady)
-        self.create_timer(_PATH_PERIOD, self._publish_path, clock=steady)
+            self.create_timer(1.0 / _LEAST_RATE, self._read, clock=steady)
         self.create_timer(1.0, self._report, clock=steady)
         self._info(f'ready: {" and ".join(self._silent)}')
 
     def _open_topics(self) -> None:
         overridable = QoSOverridingOptions.with_default_policies
-        pairs_type = message_class('diagnostic_msgs/msg/DiagnosticArray')
         self._odometry, self._keyframes = (self.create_publisher(
             message_class('nav_msgs/msg/Odometry'), topic, QoSProfile(depth=_DEPTH),
             qos_overriding_options=overridable()) for topic in ('~/odometry', '~/keyframes'))
         self._path_topic = self.create_publisher(message_class('nav_msgs/msg/Path'), '~/path', 1)
-        self._diagnostics = self.create_publisher(pairs_type, '/diagnostics', 10)
-        self.create_subscription(
-            pairs_type, _PAIRS, self._on_pair, QoSProfile(depth=outgoing.PAIR_HISTORY),
-            qos_overriding_options=overridable())
-        # Read as often as odometry is published: an IMU would wake the process for each sample.
-        self._sensors = [inputs.PolledSubscription(
-            self, message_class(PARTS[role].msgtypes[0]), role.value,
-            inputs.best_effort(_IMU_DEPTH), partial(self._on_sample, role), lambda: False,
-            raw=True, qos_overriding_options=overridable()) for role in (Role.IMU, Role.ACCEL)]
-        # Of each image: whether the camera still delivers where no pair comes.
-        self._sensors.append(inputs.PolledSubscription(
-            self, message_class('sensor_msgs/msg/CameraInfo'), Role.CAMERA_INFO.value,
-            inputs.best_effort(_DEPTH), lambda info: self._estimator.add_frame(
-                stamp_ns(info.header)), lambda: False, qos_overriding_options=overridable()))
+        self._diagnostics = self.create_publisher(
+            message_class('diagnostic_msgs/msg/DiagnosticArray'), '/diagnostics', 10)
+
+        def polled(topic: str, msgtype: str, qos: QoSProfile, receive: Callable[[Any], None],
+                   *, raw: bool = False) -> inputs.PolledSubscription:
+            return inputs.PolledSubscription(
+                self, message_class(msgtype), topic, qos, receive, lambda: False, raw=raw,
+                qos_overriding_options=overridable())
+
+        # Read as often as odometry is published: each message would wake the process.
+        # Of CameraInfo whether the camera still delivers where no pair comes.
+        self._inputs = [
+            *(polled(role.value, PARTS[role].msgtypes[0], inputs.best_effort(_IMU_DEPTH),
+                     partial(self._on_sample, role), raw=True)
+              for role in (Role.IMU, Role.ACCEL)),
+            polled(Role.CAMERA_INFO.value, 'sensor_msgs/msg/CameraInfo',
+                   inputs.best_effort(_DEPTH),
+                   lambda info: self._estimator.add_frame(stamp_ns(info.header))),
+            polled(_PAIRS, 'diagnostic_msgs/msg/DiagnosticArray',
+                   QoSProfile(depth=outgoing.PAIR_HISTORY), self._on_pair)]
         self._pairs, self._imu = map(self.resolve_topic_name, (_PAIRS, Role.IMU.value))
         # Reports since the last message, by topic.
         self._silent = {self._pairs: 0, self._imu: 0}
@@ -143,6 +148,10 @@ class OdometryNode(StoppableNode):
         self._silent[self._pairs] = 0
         try:
             pair = KeyframePair.of_message(message)
+        except InputError as error:
+            self._warn(f'{error}; {self._pairs} must be of a relpose_node of this release')
+            return
+        try:
             self._place_imu(pair.frame_id, self._frames.get(Role.IMU, ''))
             base = self._config.base_frame
             if self._estimator.base is None and (found := self._lookup(base, pair.frame_id)):
@@ -150,10 +159,6 @@ class OdometryNode(StoppableNode):
             self._estimator.add_pair(pair)
         except RsRelposeError as error:
             self._warn(str(error))
-            return
-        # Else with the next state: the graph must not delay it.
-        if self._config.odometry_rate < _LEAST_RATE:
-            self._read_sensors()
 
     def _place_imu(self, camera: str, imu: str) -> None:
         """Position of the IMU by /tf_static, if it is there before the path begins."""
@@ -185,19 +190,17 @@ class OdometryNode(StoppableNode):
         if role is Role.IMU:
             self._sample_at = self._steady.now()
 
-    def _publish_propagated(self) -> None:
-        """Publish the newest keyframe, propagated by the IMU, before the next pair takes time."""
-        for subscription in self._sensors:
+    def _read(self, *, publish: bool = False) -> None:
+        """Read all topics, publish the newest state, and use a pair then, which takes time."""
+        for subscription in self._inputs:
             subscription.drain()
-        self._publish(self._estimator.newest_ns)
-        self._read_sensors()
-
-    def _read_sensors(self) -> None:
-        for subscription in self._sensors:
-            subscription.drain()
+        if publish:
+            self._publish(self._estimator.newest_ns)
         for keyframe in self._estimator.take(most=1):
-            self._keyframes.publish(self._message(keyframe))
-            self._path.append(self._pose(keyframe))
+            message = self._message(keyframe)
+            self._keyframes.publish(message)
+            self._path.append(message_class('geometry_msgs/msg/PoseStamped')(
+                header=message.header, pose=message.pose.pose))
             if self._config.odometry_rate == 0.0:
                 self._publish(keyframe.imu_ns)
         silent = (self._steady.now() - self._sample_at).nanoseconds * 1e-9
@@ -207,12 +210,9 @@ class OdometryNode(StoppableNode):
             # A change of the state has the level of the state.
             (self._info, self._warn, self._error)[_LEVELS.get(text.partition(':')[0], 0)](text)
 
-    def _pose(self, odometry: Any) -> Any:
-        return outgoing.pose_stamped_message(odometry.stamp_ns, self._config.odometry_frame,
-                                             odometry.R, odometry.position, message_class)
-
     def _message(self, odometry: Any) -> Any:
-        pose = self._pose(odometry)
+        pose = outgoing.pose_stamped_message(odometry.stamp_ns, self._config.odometry_frame,
+                                             odometry.R, odometry.position, message_class)
         return message_class('nav_msgs/msg/Odometry')(
             header=pose.header, child_frame_id=odometry.frame_id,
             pose=message_class('geometry_msgs/msg/PoseWithCovariance')(
@@ -233,12 +233,10 @@ class OdometryNode(StoppableNode):
                 odometry.stamp_ns, self._config.odometry_frame, odometry.frame_id,
                 odometry.R, odometry.position, message_class))
 
-    def _publish_path(self) -> None:
+    def _report(self) -> None:
         if self._path and self._path_topic.get_subscription_count():
             self._path_topic.publish(message_class('nav_msgs/msg/Path')(
                 header=self._path[-1].header, poses=list(self._path)))
-
-    def _report(self) -> None:
         self.warn_of_namesake()
         estimator = self._estimator
         level, state = _LEVELS[estimator.state.value], estimator.state.value

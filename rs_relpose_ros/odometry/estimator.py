@@ -78,7 +78,7 @@ _CONTRADICTING, _WRONG_START, _GROSS = 4.0, 3.0, 5.0
 _WRONG_STARTS, _PROVEN = 3, 20
 _CONTRADICTION = ('pairs and IMU contradict each other: are relpose_node/pairs and imu of one '
                   'camera, and quat_cam_imu_xyzw and imu_position those of this IMU?')
-# Longest propagation of a lost path by the IMU [s]; largest delay of a pair behind its samples.
+# Longest propagation of a lost path by the IMU, and delay of pairs or samples behind others [s].
 _LONGEST_PROPAGATED, _LONGEST_DELAY = 10.0, 10.0
 # Longest start [s]; then a new one begins.
 _LONGEST_START = 8.0
@@ -171,7 +171,7 @@ class OdometryEstimator:
         self._longest_interval = parameters.keyframes.max_keyframe_interval
         self.state, self.reason = OdometryState.STARTING, 'no pair with a pose yet'
         self.intervals: list[StateInterval] = []   # with `keep`
-        self.corrections = 0   # number of changes to the newest keyframe
+        self._corrections = 0   # number of changes to the newest keyframe
         self.starts: list[StartReport] = []
         # Numbers of pairs and runs by outcome.
         self.counts: Counter[str] = Counter()
@@ -192,12 +192,15 @@ class OdometryEstimator:
 
     @property
     def blocking_reason(self) -> str:
-        """Unknown base or fault of the accelerometer that prevents a start; empty for none."""
+        """Unknown base, or fault or contradiction that prevents a start; empty for none."""
         if self.base is None:
             return (f'the camera is not known in base_frame {self._config.base_frame}: publish '
                     'their static transform on /tf_static (tf2_ros reads it), or set '
                     'base_to_camera')
-        return self._samples.fault if self.state is OdometryState.STARTING else ''
+        if self.state is not OdometryState.STARTING:
+            return ''
+        return self._samples.fault or (
+            _CONTRADICTION if self._wrong_starts >= _WRONG_STARTS else '')
 
     def add_imu(self, sample: ImuSample) -> None:
         """Add a sample; InputError for a stuck gyro."""
@@ -235,13 +238,24 @@ class OdometryEstimator:
         self._arrived_ns = self._samples.newest_ns or 0
 
     def add_pair(self, pair: KeyframePair) -> None:
-        """Add a pair; one without information is only counted. InputError for another camera."""
+        """Add a pair; one without information is only counted.
+
+        InputError for another camera, and for another clock than that of the samples.
+        """
         self._camera = self._camera or pair.frame_id
         if pair.frame_id != self._camera:
             raise InputError(f'a pair of {pair.frame_id} is not used, as the first was of '
                              f'{self._camera}: remap relpose_node/pairs to those of one camera; '
                              '~/reset accepts another one')
         self.counts['pairs'] += 1
+        newest_ns = self._samples.both_until_ns
+        if newest_ns is not None:
+            late = seconds_between(pair.current_ns, newest_ns)
+            if abs(late) > _LONGEST_DELAY:
+                self.counts['late'] += 1
+                raise InputError('a pair is not used, as its times differ by '
+                                 f'{abs(late):.0f} s from those of the newest samples: camera and '
+                                 'IMU must have one clock; was one of them set?')
         if pair.images is None and not pair.contradiction:
             self.counts['without images'] += 1
             self._unusable_ns = pair.current_ns
@@ -257,9 +271,7 @@ class OdometryEstimator:
         if len(self._waiting) > _MOST_WAITING:
             self.counts['dropped'] += _MOST_WAITING
             newest = max(self._waiting)
-            found = [one.contradiction for one in self._waiting.values() if one.contradiction]
-            self._waiting = {newest: replace(
-                self._waiting[newest], contradiction=found[-1] if found else '')}
+            self._waiting = {newest: self._waiting[newest]}
 
     def reset(self) -> None:
         """Forget the path: the next start is at the origin."""
@@ -274,10 +286,8 @@ class OdometryEstimator:
 
     def take(self, *, end: bool = False, most: int | None = None) -> list[Odometry]:
         """Finished keyframes, of at most `most` pairs; with `end`, no more input follows."""
-        out = []
-        taken = 0
-        while self._waiting and taken != most:
-            taken += 1
+        out: list[Odometry] = []
+        for _ in range(len(self._waiting) if most is None else min(most, len(self._waiting))):
             pair = self._waiting[min(self._waiting)]
             if not (end or self._ready(pair)):
                 break
@@ -391,7 +401,7 @@ class OdometryEstimator:
         run.stamps.append((pair.stamp_ns, pair.current_ns))
         run.recent.append((pair.current_ns, min(innovation, _CONTRADICTING), interval.duration))
         if innovation > gate:
-            self.corrections += 1
+            self._corrections += 1
             self._reject(run, pair)
             if self._run is None:
                 return None
@@ -404,7 +414,7 @@ class OdometryEstimator:
                 self._change(OdometryState.TRACKING, '', pair.current_ns)
         if not run.published and not self._known(run):
             return None
-        self.corrections += 1
+        self._corrections += 1
         return self._odometry(run, run.graph.newest, interval.rates[-1], pair.stamp_ns,
                               pair.current_ns)
 
@@ -455,7 +465,7 @@ class OdometryEstimator:
             return
         self._change(OdometryState.UNCERTAIN, f'no usable pair for {age:.2f} s', imu_ns)
         interval = self._samples.between(run.newest_ns, until_ns)
-        if self._waiting or interval is None:
+        if interval is None or any(due_ns <= imu_ns for due_ns in self._waiting):
             return
         if age > self._config.max_coast:
             self._end(f'no usable pair for {self._config.max_coast:g} s', imu_ns)
@@ -584,11 +594,9 @@ class OdometryEstimator:
         return False
 
     def _count_wrong_start(self) -> None:
-        self.counts['wrong starts'] += 1
         self._wrong_starts += 1
         if self._wrong_starts == _WRONG_STARTS:
             self.reason = _CONTRADICTION
-            self._warnings.append(_CONTRADICTION)
 
     def _end(self, reason: str, imu_ns: int) -> None:
         """End the run; the next one continues from its end."""
@@ -651,7 +659,7 @@ class OdometryEstimator:
         covariance = to_world @ state.covariance @ to_world.T + np.outer(by_heading, by_heading)
         covariance[:3, :3] += run.path_end.position_sigma**2 * np.eye(3)
         return Odometry(
-            stamp_ns, imu_ns, run.frame_id, run.path, R, position, covariance,
+            stamp_ns, imu_ns, run.frame_id, run.path, self._corrections, R, position, covariance,
             R.T @ (state.velocity + state.R @ np.cross(rate, c)), C @ rate, velocity)
 
 

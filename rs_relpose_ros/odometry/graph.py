@@ -146,7 +146,7 @@ class _Noise:
 class KeyframeGraph:
     """Keyframes since a start; each new one optimises the newest window.
 
-    `keep`: whether all is recorded for `smoothed`.
+    `newest`: with its covariance in the window. `keep`: whether all is recorded for `smoothed`.
     """
 
     def __init__(self, start: KeyframeState, R_cam_body: Array, imu: ImuConfig,
@@ -172,18 +172,13 @@ class KeyframeGraph:
         factors.addPriorVector(L(0), start.arm, _gaussian(start.covariance[ARM, ARM]))
         self._update(factors, values, 0, 0.0)
 
-    @property
-    def newest(self) -> KeyframeState:
-        """The newest keyframe, with its covariance in the window."""
-        return self._newest
-
     def propagated(self, interval: ImuInterval) -> KeyframeState:
         """The body after samples since the newest keyframe, without a new keyframe."""
         pim = self._preintegrated(interval)
         state, (by, noise, _) = self._predicted(pim), self._linearised(pim)
-        return replace(self._newest, R=state.attitude().matrix(), position=state.position(),
+        return replace(self.newest, R=state.attitude().matrix(), position=state.position(),
                        velocity=state.velocity(),
-                       covariance=by @ self._newest.covariance @ by.T + noise)
+                       covariance=by @ self.newest.covariance @ by.T + noise)
 
     def add(self, interval: ImuInterval, pair: KeyframePair | None, at_rest: bool, *,
             inflation: float = 1.0, gate: float = math.inf) -> float:
@@ -223,13 +218,13 @@ class KeyframeGraph:
         # States before a long bridge stay: the first pairs after it correct them, too.
         self._update(factors, values, j, self._seconds + min(
             interval.duration, _LONGEST_STEP * self._config.smoothing_lag),
-            _START_STEPS if gate == math.inf else 1)
+            _START_STEPS if pair is not None and gate == math.inf else 1)
         return innovation
 
     def scale_sigma(self) -> float:
         """1 sigma of the newest velocity, along its least certain direction, by its length."""
-        sigma = math.sqrt(np.linalg.norm(self._newest.covariance[VELOCITY, VELOCITY], 2))
-        return sigma / max(float(np.linalg.norm(self._newest.velocity)), _LEAST_SPEED)
+        sigma = math.sqrt(np.linalg.norm(self.newest.covariance[VELOCITY, VELOCITY], 2))
+        return sigma / max(float(np.linalg.norm(self.newest.velocity)), _LEAST_SPEED)
 
     def misfit(self) -> float:
         """Chi squared of the window per degree of freedom."""
@@ -329,12 +324,12 @@ class KeyframeGraph:
         Both (18, 18), as the covariance of a keyframe; values: of it and of the predicted one.
         """
         i, j, state, values = self._count - 1, self._count, self._predicted(pim), gtsam.Values()
-        for k, pose, velocity in ((i, self._values.atPose3(X(i)), self._newest.velocity),
+        for k, pose, velocity in ((i, self._values.atPose3(X(i)), self.newest.velocity),
                                   (j, state.pose(), state.velocity())):
             values.insert(X(k), pose)
             values.insert(V(k), velocity)
             values.insert(B(k), self._bias)
-        values.insert(L(0), self._newest.arm)
+        values.insert(L(0), self.newest.arm)
         # A_i d_i + A_j d_j is white noise, the keys being X_i, V_i, X_j, V_j, B_i, B_j.
         A, _ = _imu_factor(i, j, pim).linearize(values).jacobian()
         back = np.linalg.inv(A[:, np.r_[9:18, 24:30]])
@@ -357,7 +352,7 @@ class KeyframeGraph:
         of_both = second[:, 3:6] + (1.5 / seconds) * of_velocity
         by_accelerometer = (seconds**3 / 3.0 * of_both @ of_both.T
                             + seconds / 4.0 * of_velocity @ of_velocity.T)
-        return _Innovation(e, whole @ self._newest.covariance @ whole.T
+        return _Innovation(e, whole @ self.newest.covariance @ whole.T
                            + second @ noise @ second.T, by_accelerometer)
 
     def _pair_factor(self, i: int, j: int, pair: KeyframePair, rates: Array | None = None,
@@ -424,7 +419,7 @@ class KeyframeGraph:
         """Read the estimates of the smoother."""
         self._values = self._smoother.calculateEstimate()
         self._bias = self._values.atConstantBias(B(newest))
-        self._newest = _state(self._values, gtsam.Marginals(
+        self.newest = _state(self._values, gtsam.Marginals(
             _compact(self._smoother.getFactors()), self._values), newest)
         if self._record is not None:
             self._record[1].insert_or_assign(self._values)

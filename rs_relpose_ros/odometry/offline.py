@@ -46,7 +46,7 @@ class OdometryOutcome:
     smoothed: list[Odometry]
     metrics: dict[str, Any]
     warnings: list[str]
-    blocking_reason: str   # fault of the accelerometer that prevented a start
+    blocking_reason: str   # why it could not start
 
 
 def odometry_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parameters,

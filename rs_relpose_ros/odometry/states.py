@@ -5,11 +5,11 @@ Free of gtsam.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 import math
-from typing import NamedTuple, TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,9 +17,6 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3
 from rs_relpose_ros.geometry.timing import seconds_between
-
-if TYPE_CHECKING:
-    from rs_relpose_ros.odometry.estimator import OdometryEstimator
 
 # A larger step back of the stamps is a clock that was set back.
 _JUMP_NS = 1_000_000_000
@@ -71,6 +68,7 @@ class Odometry:
     imu_ns: int   # the same time on the IMU clock
     frame_id: str   # of the base
     path: int   # number of earlier starts in the same world
+    corrections: int   # of the keyframe from which it is propagated, since the first start
     R: Array   # (3, 3) from the base
     position: Array   # (3,) [m]
     pose_covariance: Array   # (6, 6) of (position, rotation), in the axes of the world
@@ -90,14 +88,14 @@ class StartReport:
 
 
 class ContinuousPath:
-    """States of an estimator at increasing times, without steps: corrections are blended in.
+    """States at increasing times, without steps: corrections are blended in.
 
-    What is not blended in yet is part of the covariance.
+    What is not blended in yet is part of the covariance. `propagated`: of an estimator.
     """
 
-    def __init__(self, estimator: OdometryEstimator) -> None:
-        self._estimator = estimator
-        self._corrections, self._offset = 0, np.zeros(6)   # position, rotation; in the world
+    def __init__(self, propagated: Callable[[int], Odometry | None]) -> None:
+        self._propagated = propagated
+        self._offset = np.zeros(6)   # position, rotation; in the world
         self.reset()
 
     def reset(self) -> None:
@@ -106,18 +104,18 @@ class ContinuousPath:
 
     def at(self, imu_ns: int) -> Odometry | None:
         """The state at a time; None without one, and if the time is not new."""
-        estimator, last = self._estimator, self._last
+        last = self._last
         if last is not None and last.imu_ns - _JUMP_NS < imu_ns <= last.imu_ns:
             return None
-        state = estimator.propagated(imu_ns)
+        state = self._propagated(imu_ns)
         if state is None:
             return None
         if last is None or last.path != state.path or imu_ns < last.imu_ns:
             self._offset = np.zeros(6)
         else:
             seconds = seconds_between(last.imu_ns, imu_ns)
-            if estimator.corrections != self._corrections:
-                before = estimator.propagated(last.imu_ns)
+            if state.corrections != last.corrections:
+                before = self._propagated(last.imu_ns)
                 if before is None:   # the newest keyframe is later: back at the mean velocity
                     way = 0.5 * seconds * (last.R @ last.velocity + state.R @ state.velocity)
                     turn = 0.5 * seconds * (last.angular_velocity + state.angular_velocity)
@@ -126,7 +124,6 @@ class ContinuousPath:
                 self._offset = np.concatenate([
                     last.position - before.position, log_so3(last.R @ before.R.T)])
             self._offset = self._offset * math.exp(-seconds / _BLENDING)
-        self._corrections = estimator.corrections
         self._last = replace(
             state, position=state.position + self._offset[:3],
             R=exp_so3(self._offset[3:]) @ state.R,
