@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,10 +106,11 @@ def simulated_flight(seed: int, points: int = 120,
         true_landmarks.append(Landmarks(
             VIEW.project(a.points[use]), VIEW.project(b.points[use]), a.points[use]))
         rows = a.rays[use], b.rays[use], a.tau[use], b.tau[use]
+        points = cache(partial(landmarks, pose, *rows, SENSOR.camera))
         stamps = [START_NS + round(1e9 * time) for time in TIMES[k:k + 2]]
         pairs.append(PairResult(
             *stamps, *stamps, 'camera', TIMES[k + 1] - TIMES[k], pose, matches, *rows[2:],
-            *rows[:2], 10.0, landmarks(pose, *rows, SENSOR.camera) if pose else None))
+            *rows[:2], 10.0, points if pose else None))
     positions = np.array([first.rotation.inv().apply(f.position - first.position) for f in frames])
     return Flight(pairs, positions, [(first.rotation.inv() * f.rotation).as_matrix()
                                      for f in frames], np.array(baselines), true_landmarks)

@@ -28,9 +28,9 @@ BUDGETS = {
     'rs_relpose_ros/nodes': (2176, 9),
     'rs_relpose_ros/odometry': (3139, 11),
     'rs_relpose_ros/offline': (2497, 9),
-    'rs_relpose_ros/pipeline': (3696, 12),
+    'rs_relpose_ros/pipeline': (3695, 12),
     'rs_relpose_ros/solvers': (1678, 6),
-    'rs_relpose_ros/tracking': (1224, 5),
+    'rs_relpose_ros/tracking': (1223, 5),
     'rs_relpose_lab': (10560, 50),
     'test': (18538, 49),
 }

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 import math
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -117,7 +118,7 @@ class PairResult:
     rays1: Array   # (N, 3) unit, derotated by the gyro to the stamped row
     rays2: Array
     parallax: float   # [px] median after derotation
-    landmarks: Landmarks | None = None   # of the matches; None without a pose
+    landmarks_of: Callable[[], Landmarks] | None = None   # None without a pose
     gyro_rotation: Array | None = None   # (3, 3) R_1^T R_2 integrated from the gyro
     # (3,) [rad] rotation by the images alone against the gyro's; None without either
     images_against_gyro: Array | None = None
@@ -128,10 +129,9 @@ class PairResult:
     image2: NDArray[np.uint8] | None = None   # only if the front end keeps images
 
     @property
-    def inlier_ratio(self) -> float:
-        """Share of the matches that are inliers; 0 without matches."""
-        inliers = np.count_nonzero(self.pose.inliers)
-        return inliers / len(self.matches) if len(self.matches) else 0.0
+    def landmarks(self) -> Landmarks | None:
+        """Landmarks of the matches, made when they are wanted; None without a pose."""
+        return None if self.landmarks_of is None else self.landmarks_of()
 
     @property
     def gyro_difference(self) -> float:
@@ -158,7 +158,8 @@ class PairMetric(NamedTuple):
 PAIR_METRICS = (
     PairMetric('matches', lambda pair: len(pair.matches), 0),
     PairMetric('inliers', lambda pair: int(np.count_nonzero(pair.pose.inliers)), 0),
-    PairMetric('inlier_ratio', lambda pair: pair.inlier_ratio, 3),
+    PairMetric('inlier_ratio', lambda pair: np.count_nonzero(pair.pose.inliers)
+               / max(len(pair.matches), 1), 3),
     PairMetric('parallax_px', lambda pair: pair.parallax, 1),
     PairMetric('residual_rms_px', lambda pair: pair.pose.residual_rms, 2),
     PairMetric('pixel_sigma_px', lambda pair: pair.pose.pixel_sigma, 3),
@@ -345,15 +346,17 @@ def pair_result(first: Frame[Any], second: Frame[Any], matches: Matches, rays1: 
                 rays2: DerotatedRays, pose: RelativePose, gyro: GyroRotation | None,
                 sensor: Sensor, parameters: Parameters) -> PairResult:
     """The pair with its pose and the values derived from it."""
-    later_ns, points = to_nanoseconds(sensor.pose_row_delay), None
+    later_ns = to_nanoseconds(sensor.pose_row_delay)
     if pose.status in _LACK_OF_MATCHES and is_dark(second.image):
         pose = replace(pose, reason=f'the image is dark: {pose.reason}')
-    if pose:
-        points = landmarks(pose, rays1.rays, rays2.rays, rays1.row_times, rays2.row_times,
-                           sensor.camera)
+
+    @cache
+    def points() -> Landmarks:
+        found = landmarks(pose, rays1.rays, rays2.rays, rays1.row_times, rays2.row_times,
+                          sensor.camera)
         to_image = sensor.intrinsics.to_image   # pixels of the published images
-        points = points._replace(pixels1=to_image(points.pixels1),
-                                 pixels2=to_image(points.pixels2))
+        return found._replace(pixels1=to_image(found.pixels1), pixels2=to_image(found.pixels2))
+
     return PairResult(
         reference_stamp_ns=first.stamp_ns + later_ns,
         stamp_ns=second.stamp_ns + later_ns,
@@ -361,7 +364,7 @@ def pair_result(first: Frame[Any], second: Frame[Any], matches: Matches, rays1: 
         frame_id=second.frame_id, interval=interval_of(first.imu, second.imu), pose=pose,
         matches=matches, row_times1=rays1.row_times, row_times2=rays2.row_times,
         rays1=rays1.rays, rays2=rays2.rays, parallax=parallax_of(rays1, rays2, gyro, sensor),
-        landmarks=points,
+        landmarks_of=points if pose else None,
         gyro_rotation=None if gyro is None else gyro.rotation,
         gyro_bias=None if gyro is None else parameters.sensor.R_cam_imu.T @ gyro.segment.bias)
 

@@ -96,7 +96,7 @@ class Pipeline(Processor[PairResult]):
 
     def reset(self) -> None:
         """Forget the reference keyframe: tracking restarts with the next frame."""
-        self._assess()   # live it is done by now
+        self.prepare()   # live it is done by now
         self._tracker.reset()
         self._stamps_ns.clear()
         self._reference: Frame[Any] | None = None
@@ -162,14 +162,10 @@ class Pipeline(Processor[PairResult]):
     def prepare(self) -> None:
         """Assess the configuration and search new corners, after a pair is published."""
         if self._compare is not None:
-            self._assess()
+            compare, self._compare = self._compare, None
+            compare()
+            self._monitor.assess()
             self._tracker.promote()
-
-    def _assess(self) -> None:
-        if self._compare is not None:
-            self._compare()
-            self._compare = None
-        self._monitor.assess()
 
     @property
     def health(self) -> findings.Assessment:
