@@ -30,6 +30,13 @@ SUMMARY_FILE = 'summary.json'
 BLUE, ORANGE, GREEN, RED = '#0072B2', '#E69F00', '#009E73', '#D55E00'
 
 
+def refuse_existing(*paths: Path) -> None:
+    """Raise an InputError if one of the files or folders to be written exists."""
+    for path in paths:
+        if path.exists():
+            raise InputError(f'{path} exists already: remove it or choose another path')
+
+
 def refuse_unwritable(folder: Path) -> None:
     """Raise an InputError if a folder cannot be created or written; it is not created."""
     nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists())

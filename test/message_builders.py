@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 from rosbags.typesys import get_typestore, Stores
 
+from rs_relpose_ros.messages import outgoing
+from rs_relpose_ros.pipeline.pair import PairResult
+
 Types = Callable[[str], Any]
 TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
 
@@ -33,6 +36,11 @@ def serialized(message: Any) -> bytes:
         return bytes(TYPESTORE.serialize_cdr(message, message.__msgtype__))
     from rclpy.serialization import serialize_message
     return bytes(serialize_message(message))
+
+
+def pair_messages(pair: PairResult, types: Types, reference_frame: str = '') -> dict[str, Any]:
+    parts = outgoing.pair_parts(pair, types, reference_frame)
+    return {topic: make() for topic, make in parts.items()}
 
 
 def byte_data(types: Types, data: bytes) -> Any:

@@ -81,7 +81,7 @@ configs = st.fixed_dictionaries({
     (lambda: validate.number('x', np.nan), 'x must be finite, got nan'),
     (lambda: validate.number('x', np.inf, 0), 'x must be >= 0 and finite, got inf'),
     (lambda: validate.number('x', 3, high=2), 'x must be <= 2 and finite, got 3'),
-    (lambda: validate.whole_number('x', 1.5, 1, 9), 'x must be a whole number, in [1, 9]'),
+    (lambda: validate.number('x', 1.5, 1, 9, whole=True), 'x must be a whole number, in [1, 9]'),
     (lambda: validate.choice('x', 'c', ('a', 'b')), "x must be one of a, b, got 'c'"),
     (lambda: validate.array('x', [1, 2], (3,)), 'x must have shape (3,), got (2,)'),
     (lambda: validate.array('x', np.zeros((2, 3)), ('N', 2)), 'x must have shape (N, 2), got'),

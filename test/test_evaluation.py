@@ -18,15 +18,7 @@ from rs_relpose_lab.experiments import penncosyvio_files as files
 from rs_relpose_lab.experiments.methods import run_method
 from rs_relpose_lab.experiments.oracle import Objective, oracle_estimate, start_at
 from rs_relpose_lab.experiments.paper import EXACT, paper_problem, SWEEPS
-from rs_relpose_lab.experiments.problems import (
-    BASELINES,
-    Cell,
-    CELLS,
-    FOCAL,
-    LINE_DELAY,
-    make_problem,
-    VIEW,
-)
+from rs_relpose_lab.experiments.problems import Cell, CELLS, make_problem, VIEW
 from rs_relpose_lab.experiments.scoring import pose_error
 from rs_relpose_lab.simulation import rows
 from rs_relpose_lab.simulation.rows import observe, uniform_motion
@@ -57,7 +49,7 @@ def test_auto_is_as_good_as_five_points_on_derotated_rays_at_constant_velocity()
 
 
 @pytest.mark.parametrize('method', ['auto', 'uniform_9pt'])
-@pytest.mark.parametrize('direction', BASELINES)
+@pytest.mark.parametrize('direction', problems.BASELINES)
 def test_exact_data_beat_the_papers_claim(method, direction):
     """The paper: rotation errors below 0.1 deg at every linear velocity; here below 0.001."""
     sweep = SWEEPS['linear_velocity']
@@ -197,13 +189,13 @@ def test_a_point_is_in_the_row_that_a_scan_of_all_rows_finds(w, v, reference_row
     world = rng.uniform([-12.0, -8.0, 6.0], [12.0, 8.0, 34.0], (60, 3))
     observed = observe(world, constant(w, v), replace(VIEW, reference_row=reference_row))
     all_rows = np.arange(VIEW.height, dtype=float)
-    times = (all_rows - reference_row) * LINE_DELAY
+    times = (all_rows - reference_row) * problems.LINE_DELAY
     attitudes = Rotation.from_rotvec(times[:, None] * np.array(w)).inv()
     compared = 0
     for point, found in zip(world, observed, strict=True):
         # Projection by each row's camera; the point is where it falls into that very row.
         local = attitudes.apply(point - times[:, None] * v)
-        pixels = FOCAL * local[:, :2] / local[:, 2:] + CENTRE
+        pixels = problems.FOCAL * local[:, :2] / local[:, 2:] + CENTRE
         away = pixels[:, 1] - all_rows
         crossing = np.flatnonzero(np.diff(np.sign(away)) != 0)
         assert len(crossing) <= 1

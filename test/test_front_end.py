@@ -32,14 +32,10 @@ from rs_relpose_ros.nodes.inputs import SensorInputs
 from rs_relpose_ros.nodes.relpose_node import PairPublishers, RelposeNode
 from rs_relpose_ros.nodes.sensor_node import Worker
 from rs_relpose_ros.pipeline import pair as pairs
+from rs_relpose_ros.pipeline import sequencer
 from rs_relpose_ros.pipeline.pair import DerotatedRays, Frame, median_parallax, PairResult
 from rs_relpose_ros.pipeline.pipeline import FrameFailed, FrontEnd, Outcome
-from rs_relpose_ros.pipeline.sequencer import (
-    FrameRefused,
-    MAILBOX_FRAMES,
-    QueuedFrame,
-    Refusal,
-)
+from rs_relpose_ros.pipeline.sequencer import MAILBOX_FRAMES, QueuedFrame, Refusal
 from rs_relpose_ros.tracking.images import CompressedImage, RawImage
 
 MS = 1_000_000
@@ -137,7 +133,7 @@ def test_a_refusal_is_an_outcome():
     front_end.sequencer.add_frame(noise(50, np.random.default_rng(0)), INTRINSICS)
     assert front_end.step() is None
     front_end.sequencer.close()
-    assert isinstance(front_end.step(), FrameRefused)
+    assert isinstance(front_end.step(), sequencer.FrameRefused)
 
 
 def test_a_busy_worker_costs_no_imu(monkeypatch):

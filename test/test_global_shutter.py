@@ -28,14 +28,8 @@ from rs_relpose_ros.geometry.camera import Intrinsics, RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
 from rs_relpose_ros.geometry.timing import ImageClock, Sensor
 from rs_relpose_ros.imu.buffer import ImuSample
-from rs_relpose_ros.messages.incoming import (
-    image_from_message,
-    Intake,
-    intrinsics_from_info,
-    Role,
-    sensor_messages,
-    stamp_ns,
-)
+from rs_relpose_ros.messages import incoming
+from rs_relpose_ros.messages.incoming import Intake, intrinsics_from_info, Role, stamp_ns
 from rs_relpose_ros.pipeline.findings import Assessment
 from rs_relpose_ros.pipeline.global_shutter import MiddleRow, unrolling_loop
 from rs_relpose_ros.pipeline.pair import Frame
@@ -319,7 +313,7 @@ def test_images_and_infos_have_the_stamp_of_the_middle_row(bag, unrolled):
             [stamp_ns(m.header) + delay for m in before[0]], abs=1)
     assert intrinsics_from_info(before[1][0]) == intrinsics_from_info(after[1][0])
     assert after[0][0].format.startswith('mono8; jpeg')
-    pixels = [image_from_message(images[20]).decoded().astype(int)
+    pixels = [incoming.image_from_message(images[20]).decoded().astype(int)
               for images, _ in (before, after)]
     assert 1.0 < np.abs(pixels[1] - pixels[0]).mean() < 40.0
 
@@ -437,7 +431,7 @@ def watched(bag: Path, parameters: Parameters, change: Callable[[Any], None], *,
     loop = unrolling_loop(parameters, offline=True, watched=lambda: is_watched)
     intake, found = Intake(loop.sequencer, parameters), []
     with open_bag(bag) as opened:
-        for role, message in sensor_messages(opened, opened.find_topics()):
+        for role, message in incoming.sensor_messages(opened, opened.find_topics()):
             if role is Role.IMU:
                 change(message.message.angular_velocity)
             intake.receive(role, message.message)

@@ -16,7 +16,7 @@ OF_PACKAGE = {path: text for path, text in MODULES.items() if path.parts[0] == P
 
 # Folder -> most lines and modules. A larger number needs its reason in the commit that raises it.
 BUDGETS = {
-    'rs_relpose_ros': (310, 5),
+    'rs_relpose_ros': (315, 5),
     'rs_relpose_ros/bags': (1699, 6),
     'rs_relpose_ros/calibrate': (3106, 9),
     'rs_relpose_ros/cli': (1114, 6),

@@ -26,13 +26,8 @@ from rs_relpose_lab.live.graph import diagnostic_values, Graph
 from rs_relpose_lab.live.processes import node_process, player_process, wait_until
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.bag import write_bag
-from rs_relpose_ros.bags.reader import (
-    CAMERA_FRAME,
-    COMPRESSED_TOPIC,
-    IMU_FRAME,
-    IMU_TOPIC,
-    open_bag,
-)
+from rs_relpose_ros.bags import reader
+from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.calibrate import live, stored
 from rs_relpose_ros.calibrate.live import LiveCalibration
 from rs_relpose_ros.calibrate.stored import Calibrated, CameraId, Progress
@@ -258,7 +253,7 @@ def test_a_node_waits_for_the_transform_and_names_the_missing_frame(
     (tmp_path / 'tf2_ros.py').write_text(FAKE_TF2_ROS)
     monkeypatch.setenv('PYTHONPATH', os.pathsep.join(
         [str(tmp_path), *filter(None, [os.environ.get('PYTHONPATH')])]))
-    monkeypatch.setenv('TF', f'{CAMERA_FRAME} {IMU_FRAME} {values}')
+    monkeypatch.setenv('TF', f'{reader.CAMERA_FRAME} {reader.IMU_FRAME} {values}')
     monkeypatch.setenv('TF_FILE', str(tmp_path / 'tf'))
     messages = faults.read_messages(bundled_bag, 1.5)
     given = {'readout_time': 0.03, 'calibrate_at_start': 'never', 'image_transport': 'raw'}
@@ -267,9 +262,10 @@ def test_a_node_waits_for_the_transform_and_names_the_missing_frame(
         node.wait_for('waiting for the first image')
         publishers = faults.drivers(graph)
         faults.play(publishers, messages)
-        node.wait_for(f'on /tf_static: "{IMU_FRAME}"')
+        node.wait_for(f'on /tf_static: "{reader.IMU_FRAME}"')
         (tmp_path / 'tf').touch()
-        node.wait_for(f'from /tf_static, {IMU_FRAME} in {CAMERA_FRAME}: quat_cam_imu_xyzw')
+        node.wait_for(f'from /tf_static, {reader.IMU_FRAME} in {reader.CAMERA_FRAME}: quat_cam_imu'
+                      '_xyzw')
         wait_until(lambda: node.output.count('ready:') == 1, 'a start', node)
         faults.play(publishers, messages, later=100.0)
         wait_until(lambda: poses, 'a pose', node)
@@ -335,7 +331,7 @@ def test_other_nodes_take_the_published_calibration(ros_domain_id):
 def test_a_node_without_parameters_calibrates_itself(bag, ros_domain_id, tmp_path, monkeypatch):
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
     start = {'parameters': {'image_transport': 'compressed',
-                            **faults.reliable(COMPRESSED_TOPIC, IMU_TOPIC)},
+                            **faults.reliable(reader.COMPRESSED_TOPIC, reader.IMU_TOPIC)},
              'remap': faults.BAG_TOPICS}
     path = tmp_path / 'rs_relpose' / 'camera_optical_frame_320x240.yaml'
     with Graph() as graph:

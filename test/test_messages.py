@@ -28,15 +28,10 @@ from rs_relpose_ros.errors import InputError, MissingInputError
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.imu.buffer import ImuSample
-from rs_relpose_ros.messages import incoming, outgoing
+from rs_relpose_ros.messages import incoming, outgoing, transforms
 from rs_relpose_ros.messages.incoming import Intake, Role, StuckCamera, StuckGyro
 from rs_relpose_ros.messages.published_pair import published_pair
-from rs_relpose_ros.messages.transforms import (
-    extrinsics,
-    FrameTree,
-    Transform,
-    with_extrinsics,
-)
+from rs_relpose_ros.messages.transforms import FrameTree, Transform, with_extrinsics
 from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState
 from rs_relpose_ros.pipeline.pair import PairResult
 from rs_relpose_ros.pipeline.sequencer import Refusal, Sequencer
@@ -550,7 +545,7 @@ def turned(degrees: float) -> Transform:
     ({'imu_position': (0.1, 0.2, 0.5), 'quat_cam_imu_xyzw': QUATERNION}, FOUND, [],
      ['0.3000', '0.5000'])])
 def test_configured_values_win_and_a_contradiction_has_both(given, found, names, contradiction):
-    result = extrinsics(Parameters.from_mapping(given), found, 'camera', 'imu')
+    result = transforms.extrinsics(Parameters.from_mapping(given), found, 'camera', 'imu')
     assert list(result.values) == names
     assert bool(result.contradiction) == bool(contradiction)
     assert all(text in result.contradiction for text in contradiction)
@@ -653,7 +648,7 @@ def values_of(messages: dict[str, Any]) -> dict[str, str]:
 def test_pair_messages(types):
     """Frames and conventions of ROS; `test_published_pair` reads all values back."""
     result = pair()
-    messages = outgoing.pair_messages(result, types)
+    messages = build.pair_messages(result, types)
     assert list(messages) == list(outgoing.PAIR_TOPICS)
     for topic, message in messages.items():
         assert incoming.stamp_ns(message.header) == result.stamp_ns
@@ -694,7 +689,7 @@ def test_pair_messages(types):
 @pytest.mark.parametrize(('state', 'level'), [('ok', 0), ('suspect', 1), ('wrong', 2)])
 def test_health_is_published_with_every_pair(types, state, level):
     finding = Finding('time_offset', FindingState(state), 'as it is')
-    messages = outgoing.pair_messages(replace(pair(), health=Assessment((finding,))), types)
+    messages = build.pair_messages(replace(pair(), health=Assessment((finding,))), types)
     values = values_of(messages)
     assert (values['health'], values['health_findings']) == (
         state, f'time_offset {state}: as it is')
@@ -710,7 +705,7 @@ def test_a_pair_without_a_pose(types, status):
     known = status is not Status.NO_CONSENSUS
     result = replace(whole, pose=whole.pose.without_translation(status, 'none') if known
                      else RelativePose(status=status, reason='none'))
-    messages = outgoing.pair_messages(result, types, 'base')
+    messages = build.pair_messages(result, types, 'base')
     assert list(messages) == ['relative_rotation'] * known + ['pairs']
     assert values_of(messages)['topics'] == 'relative_rotation' * known
     assert messages['pairs'].status[0].message == f'{status.value}: none'
@@ -738,9 +733,9 @@ def test_published_covariances_have_no_negative_eigenvalue():
 @build.both_types
 def test_matches_are_the_inliers(types):
     result = pair()
-    assert outgoing.pair_messages(result, types)['matches'].is_dense
+    assert build.pair_messages(result, types)['matches'].is_dense
     result.landmarks.points[result.pose.inliers.argmax()] = np.nan   # its rays are parallel
-    cloud = outgoing.pair_messages(result, types)['matches']
+    cloud = build.pair_messages(result, types)['matches']
     assert cloud.header.frame_id == 'camera_reference'
     assert not cloud.is_dense
     names = ['u1', 'v1', 'u2', 'v2', 'tau1', 'tau2', 'x1', 'y1', 'z1', 'x2', 'y2', 'z2',
@@ -765,7 +760,7 @@ def test_matches_are_the_inliers(types):
 
 
 def test_messages_of_rclpy_and_rosbags_serialise_alike():
-    ours, theirs = (outgoing.pair_messages(pair(), types)
+    ours, theirs = (build.pair_messages(pair(), types)
                     for types in (build.rclpy_types, build.rosbags_types))
     for topic, message in theirs.items():
         assert deserialize_message(build.serialized(message), type(ours[topic])) == ours[topic]

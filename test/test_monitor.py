@@ -19,12 +19,9 @@ from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.estimator.velocity import InertialEvidence
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.motion import FrameMotion
+from rs_relpose_ros.imu import integration
 from rs_relpose_ros.imu.buffer import force_fault
-from rs_relpose_ros.imu.integration import (
-    GyroSegment,
-    integrate_rotation,
-    rotation_sensitivity,
-)
+from rs_relpose_ros.imu.integration import integrate_rotation, rotation_sensitivity
 from rs_relpose_ros.messages import incoming
 from rs_relpose_ros.messages.incoming import Intake, Role, sensor_messages
 from rs_relpose_ros.nodes.sensor_node import Worker
@@ -118,7 +115,7 @@ def pair_data(start, end, c, camera=CAMERA):
         places[0][0][estimated], places[1][0][estimated], camera, *motions, end - start,
         (first.inv() * second).as_matrix(), t / np.linalg.norm(t), rotation, covariance,
         rotation_sensitivity(stamps_ns, rates, ImuConfig()),
-        GyroSegment(stamps_ns, rates, np.zeros(3), 3e-3),
+        integration.GyroSegment(stamps_ns, rates, np.zeros(3), 3e-3),
         R_CAM_IMU.as_matrix(), 0.01)
 
 

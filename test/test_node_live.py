@@ -14,6 +14,7 @@ from conftest import BUNDLED_PARAMETERS, ROOT
 from diagnostic_msgs.msg import DiagnosticArray
 import fault_stream as faults
 from fault_stream import BAG_TOPICS
+import message_builders as build
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
 import numpy as np
@@ -27,7 +28,7 @@ from rs_relpose_ros.bags.reader import COMPRESSED_TOPIC, IMU_TOPIC, open_bag
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.messages.incoming import stamp_ns, time_ns
-from rs_relpose_ros.messages.outgoing import pair_messages, PAIR_TOPICS
+from rs_relpose_ros.messages.outgoing import PAIR_TOPICS
 from rs_relpose_ros.nodes.diagnostics import FrameTimings
 from rs_relpose_ros.nodes.inputs import message_class
 from rs_relpose_ros.offline.replay import read_truth, Replay
@@ -84,7 +85,7 @@ def test_replay_of_the_same_frames_is_bit_equal(run, bundled_bag):
     with open_bag(bundled_bag) as bag:
         replay = Replay(bag, bag.find_topics(), read_parameters(BUNDLED_PARAMETERS),
                         stamps=frozenset(run.stamps))
-        replayed = [pair_messages(pair, message_class) for pair in replay.pairs()]
+        replayed = [build.pair_messages(pair, message_class) for pair in replay.pairs()]
     for topic, published in run.messages.items():
         assert published == [messages[topic] for messages in replayed if topic in messages]
     stamps = [stamp_ns(message.header) for message in run.messages['pairs']]
@@ -188,7 +189,7 @@ def recorded(bundled_bag: Path) -> list[dict[str, Any]]:
     """What the node publishes of the bundled bag, one pair lost on the way."""
     with open_bag(bundled_bag) as bag:
         replay = Replay(bag, bag.find_topics(), read_parameters(BUNDLED_PARAMETERS))
-        pairs = [pair_messages(pair, message_class) for pair in replay.pairs()]
+        pairs = [build.pair_messages(pair, message_class) for pair in replay.pairs()]
         return [*pairs[:LOST], *pairs[LOST + 1:]]
 
 

@@ -51,7 +51,6 @@ from rs_relpose_ros.estimator.result import Landmarks, RelativePose, Status
 from rs_relpose_ros.geometry.so3 import exp_so3, log_so3, skew
 from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.messages.incoming import PARTS, Role
-from rs_relpose_ros.messages.outgoing import pair_messages
 from rs_relpose_ros.nodes.odometry_node import OdometryNode
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.offline import aligned
@@ -95,7 +94,7 @@ def imu_message(sample: ImuSample) -> Imu:
 
 def pairs_message(pair: KeyframePair, health: Assessment) -> Any:
     """Message on ``~/pairs``, as of relpose_node."""
-    return pair_messages(pair_result(pair, health), build.rclpy_types)['pairs']
+    return build.pair_messages(pair_result(pair, health), build.rclpy_types)['pairs']
 
 
 def pair_result(pair: KeyframePair, health: Assessment) -> PairResult:

@@ -11,14 +11,7 @@ from scipy.spatial.transform import Rotation
 from test_odometry import PARAMETERS, ROW, run, SECOND, START_NS, walk, without
 
 from rs_relpose_lab.experiments import odometry_disturbances as disturbances
-from rs_relpose_lab.experiments import odometry_loops, odometry_recordings
-from rs_relpose_lab.experiments.trust_runs import (
-    Arrival,
-    simulated,
-    Source,
-    TrackNoise,
-    TRACKS,
-)
+from rs_relpose_lab.experiments import odometry_loops, odometry_recordings, trust_runs
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_ros.cli.main import main
 from rs_relpose_ros.estimator.covariance import ImageInformation
@@ -175,11 +168,12 @@ def test_states_through_a_disturbance():
 def test_a_recording_in_parts(monkeypatch, tmp_path):
     """A path and its halves, of which the first one has no pairs in its last second."""
     given = walk('walk:9', 9.0, imu_rate=100.0)
-    of_frames = simulated(Source('walk', TRACKS), simulate(SimulationConfig(duration=0.2)),
-                          TrackNoise(), np.random.default_rng(0))
+    of_frames = trust_runs.simulated(
+        trust_runs.Source('walk', trust_runs.TRACKS), simulate(SimulationConfig(duration=0.2)),
+        trust_runs.TrackNoise(), np.random.default_rng(0))
     recording = replace(
         of_frames, samples=given.samples, arrivals=[
-            Arrival(k, ns, ns) for k, ns in enumerate(given.stamps[::5].tolist())])
+            trust_runs.Arrival(k, ns, ns) for k, ns in enumerate(given.stamps[::5].tolist())])
 
     def feed_of(part):
         first, last = part.arrivals[0].stamp_ns, part.arrivals[-1].stamp_ns

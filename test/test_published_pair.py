@@ -18,7 +18,7 @@ from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.estimator.covariance import ImageInformation
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.messages import published_pair as module
-from rs_relpose_ros.messages.outgoing import inlier_records, MATCH_DTYPE, pair_messages
+from rs_relpose_ros.messages.outgoing import inlier_records, MATCH_DTYPE
 from rs_relpose_ros.messages.published_pair import PairSynchronizer, PoseChain, published_pair
 from rs_relpose_ros.pipeline.pair import PairResult
 
@@ -31,7 +31,7 @@ def results() -> list[PairResult]:
 @pytest.fixture(params=[build.rclpy_types, build.rosbags_types], ids=['rclpy', 'rosbags'])
 def pairs(request, results) -> list[dict[str, Any]]:
     """Messages of four pairs by topic, of their own: tests may damage them."""
-    return [pair_messages(result, request.param) for result in results]
+    return [build.pair_messages(result, request.param) for result in results]
 
 
 def rotation_only(result: PairResult, status: Status = Status.PURE_ROTATION) -> PairResult:
@@ -57,7 +57,7 @@ def test_the_table_of_a_live_run_is_that_of_the_replay(results, tmp_path):
         def wait_for_publisher(self, *_: Any) -> None:
             pass
 
-    published = [pair_messages(result, build.rclpy_types) for result in results]
+    published = [build.pair_messages(result, build.rclpy_types) for result in results]
     path = tmp_path / 'live.csv'
     assert Recorder(Topics(), None).write(path) == len(results)
     with path.open(encoding='ascii') as file:
@@ -85,7 +85,7 @@ def test_what_was_published_is_read_back(results, types, kind):
     result = kind(replace(
         results[0], gyro_bias=np.array([0.1, -2e-3, 1e-17]),
         pose=replace(results[0].pose, baseline=0.25, baseline_log_sigma=0.1)))
-    pair, pose = published_pair(pair_messages(result, types)), result.pose
+    pair, pose = published_pair(build.pair_messages(result, types)), result.pose
     assert (bool(pair), pair.rotation_known) == (bool(pose), pose.rotation_known)
     assert (pair.status, pair.reason, pair.frame_id) == (pose.status.value, pose.reason, 'camera')
     assert (pair.reference_stamp_ns, pair.stamp_ns, pair.reference_imu_ns,
@@ -110,7 +110,7 @@ def test_what_was_published_is_read_back(results, types, kind):
 @pytest.mark.parametrize(('kind', 'count'), [
     (lambda result: result, 6), (rotation_only, 2), (without_rotation, 1)])
 def test_messages_come_in_any_order(results, kind, count):
-    messages = pair_messages(kind(results[0]), build.rosbags_types)
+    messages = build.pair_messages(kind(results[0]), build.rosbags_types)
     synchronizer = PairSynchronizer()
     for *first, last in itertools.permutations(messages.items(), count):
         for item in first * 2:   # what comes again replaces the first
@@ -246,7 +246,7 @@ def test_usage_is_checked(call, expected):
 
 def published(pairs: list[PairResult]) -> list[module.PublishedPair]:
     """As a subscriber gets them: float32 matches."""
-    return [published_pair(pair_messages(pair, build.rosbags_types)) for pair in pairs]
+    return [published_pair(build.pair_messages(pair, build.rosbags_types)) for pair in pairs]
 
 
 def chained(pairs: list[PairResult], **options: int) -> list[module.PathStep]:

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.bag import write_bag, write_parameters
-from rs_relpose_ros.bags.writer import refuse_existing
 from rs_relpose_ros.cli.options import progress_bar
 from rs_relpose_ros.config.settings import Declared, declared
+from rs_relpose_ros.output_files import refuse_existing
 
 HELP = ('Render true rolling-shutter images (every row at its own time) of a textured scene '
         'along a hand-held-like walk, with IMU and ground truth, into a rosbag2 directory (MCAP) '

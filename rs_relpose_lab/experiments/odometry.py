@@ -16,15 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_lab.experiments import trust_runs
+from rs_relpose_lab.experiments import odometry_disturbances, trust_runs
 from rs_relpose_lab.experiments.harness import markdown_table, write_table
-from rs_relpose_lab.experiments.odometry_disturbances import (
-    errors_squared,
-    feed_of,
-    published,
-    true_states,
-    TrueStates,
-)
+from rs_relpose_lab.experiments.odometry_disturbances import published, TrueStates
 from rs_relpose_lab.experiments.trust_rows import Configured
 from rs_relpose_lab.experiments.trust_runs import Recording, Source
 from rs_relpose_lab.simulation import simulate, SimulationConfig
@@ -172,7 +166,7 @@ def on_walk(config: SimulationConfig) -> PathMetrics:
                     trust_runs.TRACKS, 'walk', config.scene, config.seed)
     recording = trust_runs.simulated(source, simulation, trust_runs.TrackNoise(),
                                      np.random.default_rng(config.seed))
-    return on_recording(recording, true_states(simulation))
+    return on_recording(recording, odometry_disturbances.true_states(simulation))
 
 
 def on_euroc(folder: Path, picture: Path) -> PathMetrics:
@@ -183,7 +177,8 @@ def on_euroc(folder: Path, picture: Path) -> PathMetrics:
 def on_recording(recording: Recording, truth: TrueStates | TrueTrajectory, *,
                  picture: Path | None = None) -> PathMetrics:
     """Odometry of a recording's pairs and samples; NEES if the truth is that of a simulation."""
-    feed = feed_of(recording)   # before: the time of the front end does not count
+    # Before: the time of the front end does not count.
+    feed = odometry_disturbances.feed_of(recording)
     parameters = Parameters.from_mapping(feed.values)
     warm_up_odometry()
     estimator = OdometryEstimator(parameters, keep=True)
@@ -193,7 +188,8 @@ def on_recording(recording: Recording, truth: TrueStates | TrueTrajectory, *,
     smoothed, nees = estimator.smoothed(), (math.nan,) * 3
     if isinstance(truth, TrueStates):
         states = list(published(OdometryEstimator(parameters), feed))
-        nees = (errors_squared(states, smoothed[0], truth).mean(axis=0) / 3.0).tolist()
+        chi = odometry_disturbances.errors_squared(states, smoothed[0], truth)
+        nees = (chi.mean(axis=0) / 3.0).tolist()
         truth = TrueTrajectory(truth.stamps_ns, truth.position,
                                Rotation.from_matrix(truth.R).as_quat())
     paths = {'live': offline.path_of(live, truth), 'smoothed': offline.path_of(smoothed, truth)}

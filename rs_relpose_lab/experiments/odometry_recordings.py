@@ -14,15 +14,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from rs_relpose_lab.experiments import odometry_disturbances
 from rs_relpose_lab.experiments.harness import markdown_table, write_table
 from rs_relpose_lab.experiments.odometry import drift
-from rs_relpose_lab.experiments.odometry_disturbances import (
-    errors_squared,
-    Feed,
-    feed_of,
-    published,
-    TrueStates,
-)
+from rs_relpose_lab.experiments.odometry_disturbances import Feed, published, TrueStates
 from rs_relpose_lab.experiments.trust_runs import Recording, recording_at
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.geometry.timing import seconds_between, to_nanoseconds
@@ -75,7 +70,7 @@ def on_recording(path: Path, seconds: float) -> Iterator[RecordedPart]:
 
 
 def _run(recording: Recording) -> tuple[OdometryEstimator, list[Odometry], Feed]:
-    feed = feed_of(recording)
+    feed = odometry_disturbances.feed_of(recording)
     estimator = OdometryEstimator(Parameters.from_mapping(feed.values), keep=True)
     return estimator, list(published(estimator, feed)), feed
 
@@ -101,7 +96,7 @@ def _metrics(name: str, begin: float, recording: Recording, estimator: OdometryE
         errors = path_of(states, of_path).errors
         assert errors is not None
         scale, end = 100.0 * errors.scale_error, drift(states, of_path)
-        chi = errors_squared(states, estimator.smoothed()[0], truth)[:, 0]
+        chi = odometry_disturbances.errors_squared(states, estimator.smoothed()[0], truth)[:, 0]
         beyond = 100.0 * float((chi > _BEYOND).mean())
         step = max(_step(one, two, truth, i, j) for (one, i), (two, j) in pairwise(
             zip(states, numbers.tolist(), strict=True)) if one.path == two.path)

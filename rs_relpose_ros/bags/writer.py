@@ -11,6 +11,7 @@ from rosbags.typesys import get_typestore, Stores
 
 from rs_relpose_ros.bags.reader import RawMessage, Topic
 from rs_relpose_ros.errors import InputError
+from rs_relpose_ros.output_files import refuse_existing
 
 # Of an unknown type in a bag without hashes: players use its name.
 _UNKNOWN_HASH = f'RIHS01_{64 * "0"}'
@@ -90,9 +91,3 @@ class BagWriter:
         """Append an unchanged message of an announced topic."""
         self._writer.write(self._copied[raw.topic, raw.msgtype], raw.bag_time_ns, raw.data)
 
-
-def refuse_existing(*paths: Path) -> None:
-    """Raise an InputError if one of the files or folders to be written exists."""
-    for path in paths:
-        if path.exists():
-            raise InputError(f'{path} exists already: remove it or choose another path')

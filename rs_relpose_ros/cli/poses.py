@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from rs_relpose_ros.bags.reader import Bag, SensorTopics
-from rs_relpose_ros.bags.writer import refuse_existing
 from rs_relpose_ros.cli import options
 from rs_relpose_ros.cli.main import Command, FAILED, make_parser
 from rs_relpose_ros.config.files import file_values, read_parameters
@@ -20,7 +19,7 @@ from rs_relpose_ros.odometry.formats import FORMATS, IMAGES
 from rs_relpose_ros.odometry.rows import camera_poses, ROWS_FILE, RowTrajectory, write_tum
 from rs_relpose_ros.offline import replay
 from rs_relpose_ros.offline.tables import POSES
-from rs_relpose_ros.output_files import beside, refuse_unwritable, SUMMARY_FILE
+from rs_relpose_ros.output_files import beside, refuse_existing, refuse_unwritable, SUMMARY_FILE
 
 TUM = 'tum'
 

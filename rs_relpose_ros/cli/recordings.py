@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 from rs_relpose_ros.bags import phones, video
 from rs_relpose_ros.bags.convert import Recording, write_bag
 from rs_relpose_ros.bags.reader import COMPRESSED_IMAGE, open_bag
-from rs_relpose_ros.bags.writer import refuse_existing
 from rs_relpose_ros.calibrate import result as calibration
 from rs_relpose_ros.calibrate.procedure import calibrate, read_recording
 from rs_relpose_ros.cli import options
@@ -25,7 +24,7 @@ from rs_relpose_ros.geometry.camera import DISTORTION_MODELS, RollingShutterCame
 from rs_relpose_ros.messages.transforms import bag_frames, extrinsics
 from rs_relpose_ros.offline.check import check_bag, CheckReport
 from rs_relpose_ros.offline.unroll import unroll
-from rs_relpose_ros.output_files import prepare_folder, refuse_unwritable, written
+from rs_relpose_ros.output_files import prepare_folder, refuse_existing, refuse_unwritable, written
 
 CALIBRATION_FILE = 'calibration.yaml'
 _CALIBRATION_FILES = (CALIBRATION_FILE, 'calibration.json', 'cost_over_readout.png')

@@ -20,6 +20,7 @@ import yaml
 
 from rs_relpose_ros.config.settings import ANY_VALUE, Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError
+from rs_relpose_ros.output_files import written
 
 _NODE = 'relpose_node'
 # Parameters of every ROS node, without effect offline.
@@ -87,14 +88,9 @@ def parameter_text(title: str, values: Sequence[SourcedValue]) -> str:
 
 
 def write_parameters(path: Path, title: str, values: Sequence[SourcedValue]) -> None:
-    """Write `parameter_text` to a new file."""
-    try:
-        with path.open('x', encoding='utf-8') as file:
-            file.write(parameter_text(title, values))
-    except FileExistsError:
-        raise InputError(f'{path} already exists: remove it or choose another path') from None
-    except OSError as error:
-        raise InputError(f'cannot write {path}: {error.strerror}') from error
+    """Write `parameter_text` to a file."""
+    with written(path) as file:
+        file.write(parameter_text(title, values))
 
 
 def comment(text: str, indent: str = '') -> list[str]:

@@ -19,13 +19,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.errors import InputError, MissingInputError
-from rs_relpose_ros.geometry import validate
-from rs_relpose_ros.geometry.camera import (
-    DISTORTION_MODELS,
-    Intrinsics,
-    READOUT_DIRECTIONS,
-    REFERENCE_ROWS,
-)
+from rs_relpose_ros.geometry import camera, validate
+from rs_relpose_ros.geometry.camera import DISTORTION_MODELS, Intrinsics
 from rs_relpose_ros.geometry.timing import ImageClock, Sensor, STAMP_EXPOSURES
 from rs_relpose_ros.solvers.api import SOLVERS
 
@@ -436,9 +431,9 @@ class SensorConfig(Settings):
     readout_time_sigma: float = _sigma('uncertainty of readout_time', 's', 1.0)
     readout_direction: str = setting(
         'down', 'whether row 0 is read first (down) or last (up)',
-        choices=READOUT_DIRECTIONS, restarts=True)
+        choices=camera.READOUT_DIRECTIONS, restarts=True)
     stamp_row: str = setting(
-        'first', 'row that the image stamp marks', choices=REFERENCE_ROWS, restarts=True)
+        'first', 'row that the image stamp marks', choices=camera.REFERENCE_ROWS, restarts=True)
     pose_row: str = setting(
         'stamp', 'rows that poses relate and their stamps mark: those of the image stamps, or the '
         'middle rows, between which the translation is more accurate', choices=('stamp', 'middle'))

@@ -213,7 +213,7 @@ class RollingShutterCamera:
 
     def __post_init__(self) -> None:
         for name in ('width', 'height'):
-            validate.whole_number(name, getattr(self, name), 1, _LARGEST_IMAGE, 'px')
+            validate.number(name, getattr(self, name), 1, _LARGEST_IMAGE, 'px', whole=True)
         for name, least in (('fx', 1.0 / _FARTHEST_PIXEL), ('fy', 1.0 / _FARTHEST_PIXEL),
                             ('cx', -_FARTHEST_PIXEL), ('cy', -_FARTHEST_PIXEL)):
             validate.number(name, getattr(self, name), least, _FARTHEST_PIXEL, 'px')

@@ -50,18 +50,11 @@ def legal_range(low: float, high: float, unit: str = '') -> str:
 
 
 def number(name: str, value: Number, low: float = -math.inf, high: float = math.inf,
-           unit: str = '') -> Number:
-    """A finite number in [low, high]."""
-    if not _is_within(value, low, high):
-        raise InputError(f'{name} must be {legal_range(low, high, unit)}, got {value!r}')
-    return value
-
-
-def whole_number(name: str, value: int, low: float, high: float = math.inf, unit: str = '') -> int:
-    """A whole number in [low, high]."""
-    if not (_is_within(value, low, high) and int(value) == value):
-        raise InputError(
-            f'{name} must be a whole number, {legal_range(low, high, unit)}, got {value!r}')
+           unit: str = '', *, whole: bool = False) -> Number:
+    """A finite number in [low, high]; `whole`: without a fraction."""
+    if not _is_within(value, low, high) or (whole and int(value) != value):
+        kind = 'a whole number, ' if whole else ''
+        raise InputError(f'{name} must be {kind}{legal_range(low, high, unit)}, got {value!r}')
     return value
 
 

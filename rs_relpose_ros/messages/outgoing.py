@@ -165,20 +165,14 @@ TOPICS_KEY = 'topics'
 
 # -- the messages of a pair ------------------------------------------------------------------
 
-def pair_messages(result: PairResult, types: MessageTypes,
-                  reference_frame: str = '') -> dict[str, Any]:
-    """Messages of a pair by topic, in the order of `PAIR_TOPICS`.
+def pair_parts(result: PairResult, types: MessageTypes,
+               reference_frame: str = '') -> dict[str, Callable[[], Any]]:
+    """Functions that make the messages of a pair, by topic, in the order of `PAIR_TOPICS`.
 
     Every pair has `pairs`, every known rotation `relative_rotation`, every pose all of them: no
     message stands for a missing value. `reference_frame`: frame_id of relative pose and rotation;
     empty for ``<camera frame>_reference``.
     """
-    return {topic: make() for topic, make in pair_parts(result, types, reference_frame).items()}
-
-
-def pair_parts(result: PairResult, types: MessageTypes,
-               reference_frame: str = '') -> dict[str, Callable[[], Any]]:
-    """Functions that make the messages of `pair_messages`."""
     pose, stamp_ns = result.pose, result.stamp_ns
     in_camera = header(stamp_ns, result.frame_id, types)
     in_reference = header(stamp_ns, reference_frame or f'{result.frame_id}_reference', types)

@@ -18,17 +18,17 @@ import numpy as np
 
 from rs_relpose_ros.bags.convert import check_file, read_rows, Row
 from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics
-from rs_relpose_ros.bags.writer import BagWriter, refuse_existing
+from rs_relpose_ros.bags.writer import BagWriter
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.messages.incoming import Intake, PARTS, ReasonCounts, Role, sensor_messages
-from rs_relpose_ros.messages.outgoing import pair_messages, PAIR_TOPICS
+from rs_relpose_ros.messages.outgoing import pair_parts, PAIR_TOPICS
 from rs_relpose_ros.offline import tables
 from rs_relpose_ros.offline.tables import ERRORS, median, PairRecord, POSES
 from rs_relpose_ros.offline.truth import TrueTrajectory
-from rs_relpose_ros.output_files import prepare_folder, SUMMARY_FILE
+from rs_relpose_ros.output_files import prepare_folder, refuse_existing, SUMMARY_FILE
 from rs_relpose_ros.pipeline.chosen_pairs import ChosenPairs, Stamps
 from rs_relpose_ros.pipeline.findings import Assessment, NOT_EVALUATED, worst_of
 from rs_relpose_ros.pipeline.pair import Frame, PAIR_METRICS, PairResult
@@ -199,10 +199,9 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
             last, health = pair, worst_of(health, pair.health)
             write_record(records[-1])
             if writer is not None:
-                messages = pair_messages(pair, writer.type, parameters.pair.reference_frame)
-                for topic, message in messages.items():
-                    writer.write(f'/relpose_node/{topic}', PAIR_TOPICS[topic], message,
-                                 run.last_ns)
+                parts = pair_parts(pair, writer.type, parameters.pair.reference_frame)
+                for topic, make in parts.items():
+                    writer.write(f'/relpose_node/{topic}', PAIR_TOPICS[topic], make(), run.last_ns)
             on_pair(pair)
             # The better picture: with a pose, many inliers and much parallax.
             rank = bool(pair.pose), float(pair.pose.inliers.sum() * pair.parallax)

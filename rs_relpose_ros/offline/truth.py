@@ -57,11 +57,9 @@ class TrueTrajectory:
     def covers(self, at_ns: int) -> bool:
         """Whether there are poses close enough before and after a time."""
         after = int(np.searchsorted(self._stamps, at_ns))
-        if after == len(self._stamps):
-            return False
-        if self._stamps[after] == at_ns:
-            return True
-        return after > 0 and bool(self._stamps[after] - self._stamps[after - 1] <= _MAX_GAP_NS)
+        return after < len(self._stamps) and bool(
+            self._stamps[after] == at_ns
+            or (after > 0 and self._stamps[after] - self._stamps[after - 1] <= _MAX_GAP_NS))
 
     def position(self, at_ns: int) -> Array:
         """Position (3,) [m] at a time that the poses cover."""
