@@ -75,9 +75,12 @@ def lens_of(seed: int, model: str) -> tuple[SimulationConfig, RollingShutterCame
         time_offset=round(rng.uniform(-0.08, 0.08), 4))
     camera, shift = config.camera, rng.uniform(-CENTER, CENTER, 2)
     others = (0.0,) * (3 if model == 'equidistant' else 4)
+    corners = np.array([[x, y] for x in (0.0, camera.width) for y in (0.0, camera.height)])
     camera = replace(
         camera, cx=0.5 * (camera.width - 1) + shift[0], cy=0.5 * (camera.height - 1) + shift[1],
         distortion_model=model, distortion=(float(rng.uniform(*MODELS[model])), *others))
+    while np.isnan(camera.unproject(corners)).any():
+        camera = replace(camera, distortion=(0.9 * camera.distortion[0], *others))   # no such lens
     axes = (Rotation.from_rotvec(rng.uniform(-MISALIGNED, MISALIGNED, 3), degrees=True)
             * Rotation.from_matrix(axis_maps()[rng.integers(24)]))
     return replace(config, quat_cam_imu_xyzw=tuple(axes.as_quat().tolist())), camera
