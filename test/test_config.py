@@ -16,6 +16,7 @@ from rs_relpose_ros.config.settings import Parameters, SensorConfig
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.messages.outgoing import PAIR_TOPICS
 from rs_relpose_ros.nodes import relpose_node as node_module
+from rs_relpose_ros.nodes.inputs import message_class
 from rs_relpose_ros.output_files import beside, written
 
 CONFIG = ROOT / 'config'
@@ -95,12 +96,20 @@ def test_launch_file_describes_its_arguments(path):
     assert {'camera_namespace', 'params_file', 'fastdds_profile'} <= described
 
 
-@pytest.mark.parametrize('layout', ['rs_relpose.rviz', 'rs_relpose_foxglove.json'])
-def test_layouts_show_topics_that_the_nodes_publish(layout):
-    topics = set(re.findall(r'/(?:relpose|odometry)_node/\w+', (CONFIG / layout).read_text()))
-    assert len(topics) >= 4
-    assert topics <= {'/odometry_node/odometry', '/odometry_node/path', *(
-        f'/relpose_node/{name}' for name in ('debug_image', *PAIR_TOPICS))}
+def test_layouts_show_topics_of_the_nodes_by_their_types():
+    types = {'/relpose_node/debug_image': 'sensor_msgs/msg/Image', '/diagnostics': '',
+             '/odometry_node/path': 'nav_msgs/msg/Path',
+             '/odometry_node/odometry': 'nav_msgs/msg/Odometry',
+             **{f'/relpose_node/{name}': msgtype for name, msgtype in PAIR_TOPICS.items()}}
+    rviz = yaml.safe_load((CONFIG / 'rs_relpose.rviz').read_text())['Visualization Manager']
+    shown = {display['Topic']['Value']: display['Class'].split('/')[1]
+             for display in rviz['Displays'] if 'Topic' in display}
+    assert len(shown) >= 4 and shown == {name: types[name].split('/')[-1] for name in shown}
+    for value in re.findall(r'"(/[^"]+)"', (CONFIG / 'rs_relpose_foxglove.json').read_text()):
+        topic, *fields = value.split('.')
+        plotted = message_class(types[topic])() if fields else types[topic]
+        for name in fields:
+            plotted = getattr(plotted, name)
 
 
 def test_an_exposure_is_given_once():
