@@ -655,12 +655,12 @@ class OdometryEstimator:
         # A later start has position and heading from the end of the path before.
         position, up = state.position + (state.R - first_R) @ c, np.array([0.0, 0.0, 1.0])
         by_heading = run.path_end.heading_sigma * np.concatenate([
-            np.cross(up, state.position + state.R @ c - run.path_end.position), up])
+            skew(up) @ (state.position + state.R @ c - run.path_end.position), up])
         covariance = to_world @ state.covariance @ to_world.T + np.outer(by_heading, by_heading)
         covariance[:3, :3] += run.path_end.position_sigma**2 * np.eye(3)
         return Odometry(
             stamp_ns, imu_ns, run.frame_id, run.path, self._corrections, R, position, covariance,
-            R.T @ (state.velocity + state.R @ np.cross(rate, c)), C @ rate, velocity)
+            R.T @ (state.velocity + state.R @ skew(rate) @ c), C @ rate, velocity)
 
 
 def _variances(state: KeyframeState) -> tuple[float, float]:

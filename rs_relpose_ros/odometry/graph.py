@@ -49,6 +49,8 @@ _LOOP_QUANTILE = 0.99
 
 # Columns of a pair's derivatives: pose and velocity of the first body, of the second one, camera.
 _BLOCKS = (slice(0, 6), slice(6, 9), slice(9, 15), slice(15, 18), slice(18, 21))
+# Columns of the derivatives of an IMU factor by its first body with biases, and by its second one.
+_OF_FIRST, _OF_SECOND = np.r_[0:9, 18:24], np.r_[9:18, 24:30]
 # Columns of the covariance of a keyframe.
 POSE, VELOCITY, BIAS, GYRO_BIAS, ARM = (
     slice(0, 6), slice(6, 9), slice(9, 15), slice(12, 15), slice(15, 18))
@@ -174,10 +176,10 @@ class KeyframeGraph:
 
     def propagated(self, interval: ImuInterval) -> KeyframeState:
         """The body after samples since the newest keyframe, without a new keyframe."""
-        pim = self._preintegrated(interval)
-        state, (by, noise, _) = self._predicted(pim), self._linearised(pim)
-        return replace(self.newest, R=state.attitude().matrix(), position=state.position(),
-                       velocity=state.velocity(),
+        by, noise, values = self._linearised(self._preintegrated(interval))
+        pose = values.atPose3(X(self._count))
+        return replace(self.newest, R=pose.rotation().matrix(), position=pose.translation(),
+                       velocity=values.atVector(V(self._count)),
                        covariance=by @ self.newest.covariance @ by.T + noise)
 
     def add(self, interval: ImuInterval, pair: KeyframePair | None, at_rest: bool, *,
@@ -321,20 +323,18 @@ class KeyframeGraph:
     def _linearised(self, pim: Any) -> tuple[Array, Array, Any]:
         """How errors of the newest keyframe propagate, the covariance of the samples, and values.
 
-        Both (18, 18), as the covariance of a keyframe; values: of it and of the predicted one.
+        Both (18, 18), as the covariance of a keyframe; values: of the window and of the predicted.
         """
-        i, j, state, values = self._count - 1, self._count, self._predicted(pim), gtsam.Values()
-        for k, pose, velocity in ((i, self._values.atPose3(X(i)), self.newest.velocity),
-                                  (j, state.pose(), state.velocity())):
-            values.insert(X(k), pose)
-            values.insert(V(k), velocity)
-            values.insert(B(k), self._bias)
-        values.insert(L(0), self.newest.arm)
+        i, j, state = self._count - 1, self._count, self._predicted(pim)
+        values = gtsam.Values(self._values)
+        values.insert(X(j), state.pose())
+        values.insert(V(j), state.velocity())
+        values.insert(B(j), self._bias)
         # A_i d_i + A_j d_j is white noise, the keys being X_i, V_i, X_j, V_j, B_i, B_j.
         A, _ = _imu_factor(i, j, pim).linearize(values).jacobian()
-        back = np.linalg.inv(A[:, np.r_[9:18, 24:30]])
+        back = np.linalg.inv(A[:, _OF_SECOND])
         by, noise = np.eye(18), np.zeros((18, 18))
-        by[:15, :15] = -back @ A[:, np.r_[0:9, 18:24]]
+        by[:15, :15] = -back @ A[:, _OF_FIRST]
         noise[:15, :15] = back @ back.T
         return by, noise, values
 
