@@ -470,8 +470,7 @@ def open_bag(path: Path | str) -> Iterator[Bag]:
         try:
             _check_path(path)
             reader = Reader1(path) if path.suffix == '.bag' and path.is_file() else Reader2(path)
-            reader.open()
-            stack.callback(reader.close)
+            stack.enter_context(reader)
             bag = Bag(path, reader)
         except RsRelposeError:
             raise

@@ -1,17 +1,17 @@
 """Write rosbag2 directories (MCAP storage) with ROS 2 Jazzy's messages."""
 
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-import shutil
 from typing import Any, Self
 
 from rosbags.interfaces import Connection
-from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
+from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 
 from rs_relpose_ros.bags.reader import RawMessage, Topic
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.output_files import refuse_existing
+from rs_relpose_ros.output_files import beside, refuse_existing
 
 # Of an unknown type in a bag without hashes: players use its name.
 _UNKNOWN_HASH = f'RIHS01_{64 * "0"}'
@@ -20,39 +20,32 @@ _UNKNOWN_HASH = f'RIHS01_{64 * "0"}'
 class BagWriter:
     """Writes one bag into a directory that it creates, with parents; use it as a context manager.
 
-    The bag is complete when the block ends normally; after an exception the directory is removed,
-    so that no partial bag remains. A path that exists or cannot be created raises InputError.
+    The bag appears, complete, when the block ends normally; after an exception nothing of it is
+    left. A path that exists or cannot be created raises InputError.
     """
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
         refuse_existing(self.path)
         self._typestore = get_typestore(Stores.ROS2_JAZZY)
-        self._writer = Writer(self.path, version=9, storage_plugin=StoragePlugin.MCAP)
         self._connections: dict[str, Connection] = {}
         self._copied: dict[tuple[str, str], Connection] = {}
 
+    @contextmanager
+    def _opened(self) -> Iterator[None]:
+        refuse_existing(self.path)
+        with beside(self.path) as part:
+            with Writer(part, version=9, storage_plugin=StoragePlugin.MCAP) as self._writer:
+                yield
+            part.rename(self.path)
+
     def __enter__(self) -> Self:
-        try:
-            self._writer.open()
-        except (OSError, WriterError) as error:
-            raise InputError(f'cannot create the bag {self.path}: {error}') from error
+        self._context = self._opened()
+        self._context.__enter__()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 _: object) -> None:
-        whole = False
-        try:
-            if kind is None:
-                self._writer.close()
-                whole = True
-        finally:
-            if not whole:
-                with suppress(Exception):
-                    self._writer.abort()
-                shutil.rmtree(self.path, ignore_errors=True)
-        if isinstance(error, OSError) and error.filename is None:   # a full disk
-            raise type(error)(error.errno, error.strerror, str(self.path)) from error
+    def __exit__(self, *error: Any) -> None:
+        self._context.__exit__(*error)
 
     def type(self, msgtype: str) -> Any:
         """Message class of a type name such as ``'sensor_msgs/msg/Imu'``."""

@@ -67,15 +67,12 @@ def angle_between(R: NDArray[np.float64], other: NDArray[np.float64], sigma: flo
     return math.degrees(angle) if angle > math.hypot(AXES_SIGMA, 3.0 * sigma) else 0.0
 
 
-class Extrinsics(NamedTuple):
-    """`values`: parameters by name that are not configured; `contradiction`: '' for none."""
+def extrinsics(parameters: Parameters, found: Transform, camera: str,
+               imu: str) -> tuple[dict[str, Any], str]:
+    """Rotation and position of the IMU by its pose `found` in the camera; configured ones win.
 
-    values: dict[str, Any]
-    contradiction: str = ''
-
-
-def extrinsics(parameters: Parameters, found: Transform, camera: str, imu: str) -> Extrinsics:
-    """Rotation and position of the IMU by its pose `found` in the camera; configured ones win."""
+    Parameters by name that are not configured, and a contradiction, '' for none.
+    """
     sensor, position = parameters.sensor, parameters.imu.imu_position
     rotation, head = Rotation.from_quat(found[3:]), f'/tf_static has {imu} in {camera}'
     values: dict[str, Any] = {}
@@ -83,17 +80,16 @@ def extrinsics(parameters: Parameters, found: Transform, camera: str, imu: str) 
         values = {'quat_cam_imu_xyzw': tuple(map(float, rotation.as_quat())),
                   'axes_sigma': AXES_SIGMA}
     elif angle := angle_between(rotation.as_matrix(), sensor.R_cam_imu, sensor.axes_sigma):
-        return Extrinsics({}, f'{head} rotated by {_text(found[3:])}, quat_cam_imu_xyzw is '
-                          f'{_text(sensor.quat_cam_imu_xyzw)}, {angle:.1f} deg apart: the '
-                          'parameter is used, and nothing of the transform')
+        return {}, (f'{head} rotated by {_text(found[3:])}, quat_cam_imu_xyzw is '
+                    f'{_text(sensor.quat_cam_imu_xyzw)}, {angle:.1f} deg apart: the parameter is '
+                    'used, and nothing of the transform')
     if not any(position):
-        return Extrinsics({**values, 'imu_position': found[:3],
-                           'imu_position_sigma': POSITION_SIGMA})
+        return values | {'imu_position': found[:3], 'imu_position_sigma': POSITION_SIGMA}, ''
     apart = float(np.abs(np.subtract(found[:3], position)).max())
     if apart > 3.0 * math.hypot(POSITION_SIGMA, parameters.imu.imu_position_sigma):
-        return Extrinsics(values, f'{head} at {_text(found[:3])} m, imu_position is '
-                          f'{_text(position)} m: the parameter is used')
-    return Extrinsics(values)
+        return values, (f'{head} at {_text(found[:3])} m, imu_position is {_text(position)} m: '
+                        'the parameter is used')
+    return values, ''
 
 
 def _text(values: tuple[float, ...]) -> str:
@@ -141,7 +137,7 @@ def with_extrinsics(bag: Any, topics: Any, parameters: Parameters) -> tuple[Para
     if not parameters.calibration.use_tf:
         return parameters, ''
     frames = bag_frames(bag, topics, base)
-    values, contradiction = Extrinsics({}) if (found := frames.imu_in_camera) is None else (
+    values, contradiction = ({}, '') if (found := frames.imu_in_camera) is None else (
         extrinsics(parameters, found, frames.camera, frames.imu))
     if base and parameters.odometry.base_to_camera is None and (
             found := frames.tree.lookup(base, frames.camera)):
