@@ -8,17 +8,11 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros import (
-    estimate_relative_pose,
-    EstimatorConfig,
-    FrameMotion,
-    InertialMotion,
-    InputError,
-    IntermediateFrame,
-    RollingShutterCamera,
-    Status,
-)
+from rs_relpose_ros import estimate_relative_pose, EstimatorConfig, InputError, Status
 from rs_relpose_ros.estimator import adjustment, frames_between
+from rs_relpose_ros.estimator.frames_between import IntermediateFrame
+from rs_relpose_ros.geometry.camera import RollingShutterCamera
+from rs_relpose_ros.geometry.motion import FrameMotion, InertialMotion
 
 CAMERA = RollingShutterCamera(
     width=640, height=480, fx=450.0, fy=455.0, cx=322.0, cy=238.0, distortion=(-0.1, 0.02, 0.0,

@@ -19,16 +19,7 @@ from rclpy.parameter import Parameter
 from rs_relpose_ros.config.settings import Declared, Parameters
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.nodes import diagnostics
-from rs_relpose_ros.nodes.diagnostics import (
-    ERROR,
-    LineFile,
-    OK,
-    ReasonLog,
-    Silence,
-    STARTING,
-    Statistics,
-    WARN,
-)
+from rs_relpose_ros.nodes.diagnostics import ERROR, OK, Silence, Statistics, WARN
 from rs_relpose_ros.nodes.parameters import NodeParameters
 from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState
 from rs_relpose_ros.pipeline.monitor import Applied, Tracked
@@ -46,7 +37,7 @@ def statistics(clock: Clock) -> Statistics:
 
 def test_a_reason_is_logged_once_and_later_with_its_number(clock):
     lines: list[str] = []
-    log = ReasonLog(lines.append, period=30.0, clock=clock)
+    log = diagnostics.ReasonLog(lines.append, period=30.0, clock=clock)
     for k in range(5):
         log(f'image has {k} bytes')
     log('something else')
@@ -60,7 +51,7 @@ def test_a_reason_is_logged_once_and_later_with_its_number(clock):
 
 def test_ever_new_reasons_do_not_fill_log_or_memory(clock):
     lines: list[str] = []
-    log = ReasonLog(lines.append, clock=clock)
+    log = diagnostics.ReasonLog(lines.append, clock=clock)
     for letters in itertools.product('abcdefghij', repeat=3):
         log(f'unknown encoding {"".join(letters)}')
     assert len(lines) <= 65
@@ -72,7 +63,8 @@ class Lines(list[tuple[str, str]]):
 
     def __init__(self, clock: Clock) -> None:
         self.log = diagnostics.HealthLog(*(
-            ReasonLog(lambda text, level=level: self.append((level, text)), clock=clock)
+            diagnostics.ReasonLog(lambda text, level=level: self.append((level, text)),
+                                  clock=clock)
             for level in ('info', 'warn', 'error')))
 
 
@@ -316,7 +308,7 @@ def test_level_and_text(statistics):
 
 
 def test_a_start_is_no_error_and_lost_images_are_a_warning(statistics):
-    starting = statistics.report(Counter(), None, problem=STARTING, missing=())
+    starting = statistics.report(Counter(), None, problem=diagnostics.STARTING, missing=())
     assert (starting.level, dict(starting.values)['state']) == (OK, 'not estimating')
     statistics.add_pair(pair(), 0)
     lost = statistics.report(Counter(image=9), counts(9, 9), problem='', missing=(),
@@ -443,7 +435,7 @@ def test_a_live_parameter_is_passed_on(node, parameters, name):
 @pytest.mark.skipif(not Path('/dev/full').exists(), reason='Linux has a device that is full')
 def test_a_file_ends_with_an_error_that_names_it():
     errors = []
-    file = LineFile('stamps_file', '/dev/full', errors.append)
+    file = diagnostics.LineFile('stamps_file', '/dev/full', errors.append)
     for _ in range(3):
         file.write('1')
     file.close()
