@@ -14,6 +14,8 @@ from rclpy.qos import qos_profile_sensor_data
 from scipy.spatial.transform import Rotation
 
 SIGNS = np.array([1.0, -1.0, -1.0])
+# Pause of the states after which they are of another path [us]: it was lost in between.
+PAUSE = 500_000
 
 
 def px4_fields(odometry):
@@ -40,6 +42,7 @@ class Px4Node(Node):
 
     def __init__(self):
         super().__init__('px4_odometry')
+        self.last, self.resets = None, 0
         from px4_msgs.msg import VehicleOdometry
         self.kind = VehicleOdometry
         self.publisher = self.create_publisher(
@@ -48,10 +51,13 @@ class Px4Node(Node):
 
     def receive(self, odometry):
         """Publish a state in the axes of PX4."""
+        fields = px4_fields(odometry)
+        last, self.last = self.last, fields['timestamp_sample']
+        self.resets += last is not None and not 0 < self.last - last < PAUSE
         self.publisher.publish(self.kind(
             timestamp=self.get_clock().now().nanoseconds // 1000,
             pose_frame=self.kind.POSE_FRAME_FRD, velocity_frame=self.kind.VELOCITY_FRAME_BODY_FRD,
-            **px4_fields(odometry)))
+            reset_counter=self.resets % 256, **fields))
 
 
 if __name__ == '__main__':
