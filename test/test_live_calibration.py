@@ -14,8 +14,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 import fault_stream as faults
 from geometry_msgs.msg import PoseWithCovarianceStamped
 import pytest
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 from scipy.spatial.transform import Rotation
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -358,9 +358,8 @@ def test_a_node_without_parameters_calibrates_itself(bag, ros_domain_id, tmp_pat
             with player_process(bag):
                 node.wait_for('using the calibration of')
             node.wait_for('ready')
-            request = SetParameters.Request(parameters=[Parameter(
-                name='readout_time', value=ParameterValue(
-                    type=ParameterType.PARAMETER_DOUBLE, double_value=value))
+            request = SetParameters.Request(parameters=[
+                Parameter('readout_time', value=value).to_parameter_msg()
                 for value in (0.0201, 0.0202)])   # the second while the kernels are loaded
             assert graph.call(SetParameters, '/relpose_node/set_parameters',
                               request).results[1].successful

@@ -18,8 +18,8 @@ from fault_stream import BAG_TOPICS, stamp_of
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 import numpy as np
 import pytest
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from scipy.spatial.transform import Rotation
@@ -115,9 +115,8 @@ def test_missing_inputs_are_reported(running):
         'no CameraInfo on', 'uncalibrated', 'no IMU message on')] == [1, 1, 1], lines
 
 
-def set_parameter(graph: Graph, name: str, value: float) -> Any:
-    request = SetParameters.Request(parameters=[Parameter(name=name, value=ParameterValue(
-        type=ParameterType.PARAMETER_DOUBLE, double_value=value))])
+def set_parameter(graph: Graph, name: str, value: Any) -> Any:
+    request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
     [result] = graph.call(SetParameters, '/relpose_node/set_parameters', request).results
     return result
 
@@ -128,6 +127,8 @@ def test_a_live_parameter_takes_effect(running):
     assert not refused.successful and 'threshold' in refused.reason
     assert set_parameter(running.graph, 'min_keyframe_parallax', 900.0).successful
     assert set_parameter(running.graph, 'max_keyframe_interval', 0.9).successful
+    # As ros2 param set sends floats and integers.
+    assert set_parameter(running.graph, 'gyro_bias', '[0.0, 0, 0]').successful
     running.play(Image, CameraInfo, Imu, later=20.0)
     # The report that counts the last frame.
     count = len(running.diagnostics)

@@ -2,7 +2,7 @@
 
 import array
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 import sys
 from typing import Any
 
@@ -10,6 +10,7 @@ from rcl_interfaces import msg
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+import yaml
 
 from rs_relpose_ros.config.settings import Declared, Parameters
 from rs_relpose_ros.errors import InputError
@@ -134,4 +135,7 @@ def _descriptor(declared: Declared) -> msg.ParameterDescriptor:
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, str) and value.startswith('['):
+        with suppress(yaml.YAMLError):   # a list of floats and integers, by `ros2 param set`
+            value = yaml.safe_load(value)
     return tuple(value) if isinstance(value, list | array.array) else value
