@@ -30,7 +30,7 @@ BUDGETS = {
     'rs_relpose_ros/offline': (2494, 9),
     'rs_relpose_ros/pipeline': (3695, 12),
     'rs_relpose_ros/solvers': (1678, 6),
-    'rs_relpose_ros/tracking': (1223, 5),
+    'rs_relpose_ros/tracking': (1224, 5),
     'rs_relpose_lab': (10300, 50),
     'test': (18500, 49),
 }
