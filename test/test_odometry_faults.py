@@ -109,7 +109,7 @@ def pair_result(pair: KeyframePair, health: Assessment) -> PairResult:
     return PairResult(
         pair.reference_ns, pair.stamp_ns, pair.reference_ns, pair.current_ns, pair.frame_id, 0.15,
         pose, Matches.none(), none[:, 0], none[:, 0], none, none, 10.0,
-        Landmarks(none[:, :2], none[:, :2], none), gyro_bias=pair.gyro_bias, health=health)
+        lambda: Landmarks(none[:, :2], none[:, :2], none), gyro_bias=pair.gyro_bias, health=health)
 
 
 @pytest.mark.parametrize('quantity, state, stops', [
