@@ -783,7 +783,7 @@ def test_a_wrong_parameter_is_reported_by_its_name(bundled_bag, monkeypatch, cas
 
 def test_a_pair_is_published_before_its_assessment(bundled_bag, monkeypatch):
     """Its health is that of the pairs before; the one that reveals a fault has a pose."""
-    assessed, assess = [], ConsistencyMonitor.assess
+    assessed, assess = [ConsistencyMonitor().health], ConsistencyMonitor.assess
 
     def noted(self):
         assess(self)
