@@ -17,11 +17,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from rs_relpose_lab.experiments.global_shutter import frames_of_bag
 from rs_relpose_lab.live.graph import diagnostic_values, Graph
 from rs_relpose_lab.live.processes import node_process, Process, wait_until, wait_until_quiet
+from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.config.files import read_parameters
-from rs_relpose_ros.pipeline.global_shutter import GlobalShutterFrame
+from rs_relpose_ros.messages.incoming import Intake, sensor_messages
+from rs_relpose_ros.offline.replay import outcomes
+from rs_relpose_ros.pipeline.global_shutter import GlobalShutterFrame, unrolling_loop
+from rs_relpose_ros.pipeline.pair import Frame
 
 # The node may have to compile the kernels.
 pytestmark = [pytest.mark.live, pytest.mark.timeout(600)]
@@ -39,8 +42,13 @@ def stamps_of(messages: list[Any]) -> list[int]:
 @pytest.fixture(scope='module')
 def expected(bundled_bag: Path) -> dict[int, GlobalShutterFrame]:
     """Derotated offline, by the stamps of the images in the bag."""
-    frames = frames_of_bag(bundled_bag, read_parameters(BUNDLED_PARAMETERS))
-    return {frame.original_stamp_ns: frame for frame in itertools.islice(frames, PLAYED)}
+    parameters = read_parameters(BUNDLED_PARAMETERS)
+    loop = unrolling_loop(parameters, offline=True)
+    with open_bag(bundled_bag) as bag:
+        found = outcomes(loop, Intake(loop.sequencer, parameters),
+                         sensor_messages(bag, bag.find_topics()))
+        frames = (item.result for item in found if isinstance(item, Frame) and item.result)
+        return {frame.original_stamp_ns: frame for frame in itertools.islice(frames, PLAYED)}
 
 
 @pytest.fixture(scope='module')
