@@ -194,8 +194,9 @@ parameters = read_parameters(sys.argv[2])
 warm_up_pipeline(parameters)
 before = kernels()
 with open_bag(sys.argv[1]) as bag:
-    statuses = {pair.pose.status.value
-                for pair in Replay(bag, bag.find_topics(), parameters).pairs()}
+    pairs = list(Replay(bag, bag.find_topics(), parameters).pairs())
+statuses = {pair.pose.status.value for pair in pairs}
+landmarks = [pair.landmarks for pair in pairs]   # wanted by subscribers of ~/matches
 after = kernels()
 print(json.dumps([sorted(statuses), [k for k in after if after[k] != before[k]],
                   sum(before.values())]))

@@ -53,6 +53,7 @@ class OdometryNode(StoppableNode):
     def __init__(self) -> None:
         super().__init__(NAME)
         need_gtsam()
+        self.log_compiling()
         warm_up_odometry()
         self._begun = False
         self._imu_lookup = (inputs.TransformLookup(self)

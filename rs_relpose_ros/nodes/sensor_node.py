@@ -75,6 +75,12 @@ class StoppableNode(Node):
     def _on_parameters(self, parameters: Parameters) -> None:
         """A live parameter was set."""
 
+    def log_compiling(self) -> None:
+        """Log that this start takes long, where it does."""
+        if not cache_is_filled():
+            self._info('compiling kernels, as the build has none for this machine: this start '
+                       'takes a minute or two, later ones some seconds')
+
     def warn_of_namesake(self) -> None:
         """Warn of another node of this name: services and parameters reach either of them."""
         own = self.get_name(), self.get_namespace()
@@ -329,9 +335,7 @@ class SensorNode(StoppableNode):
             self._loop = self._make_loop(parameters)
             self._intake = Intake(self._loop.sequencer, parameters)
             self._worker = Worker(self._loop, self._warm_up, self._consume)
-        if not cache_is_filled():
-            self._info('compiling kernels, as the build has none for this machine: this start '
-                       'takes a minute or two, later ones some seconds')
+        self.log_compiling()
         self._worker.start()
         # No subscription before the kernels are loaded: the first frames would be dropped.
         self._warm_timer.reset()

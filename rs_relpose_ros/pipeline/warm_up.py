@@ -69,7 +69,9 @@ def warm_up_pipeline(parameters: Parameters) -> None:
                                      'max_keyframe_frames': 1})
     warm_up(parameters.estimator)   # with a frame between
     for with_force in (True, False):
-        list(made_up_frames(FrontEnd(parameters, offline=True), with_force))
+        for frame in made_up_frames(FrontEnd(parameters, offline=True), with_force):
+            if frame.result is not None and frame.result.landmarks_of is not None:
+                frame.result.landmarks_of()
 
 
 def made_up_frames(loop: FrameLoop[Result], with_force: bool = True) -> Iterator[Frame[Result]]:
