@@ -79,7 +79,7 @@ def test_views_that_come_back_are_proposed():
     facing = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
     def path_of(turned):
-        return [Odometry(at, at, 'camera', 0, Rotation.from_euler(
+        return [Odometry(at, at, 'camera', 0, 0, Rotation.from_euler(
             'z', 180.0 if turned and k > 30 else 0.0, degrees=True).as_matrix() @ facing,
             np.array([0.0, 4.0 - abs(k - 30) * 0.1, 1.5]), np.eye(6), NAN, NAN, np.eye(6))
             for k in range(61) for at in [k * SECOND // 2]]
@@ -99,8 +99,8 @@ def test_views_that_come_back_are_proposed():
 
 
 def test_depth_of_the_scene_is_that_of_parallaxes():
-    poses = [Odometry(k, k, 'camera', 0, np.eye(3), np.array([0.1 * k, 0.0, 0.0]), np.eye(6), NAN,
-                      NAN, np.eye(6)) for k in range(4)]
+    poses = [Odometry(k, k, 'camera', 0, 0, np.eye(3), np.array([0.1 * k, 0.0, 0.0]), np.eye(6),
+                      NAN, NAN, np.eye(6)) for k in range(4)]
     views = {k: loops.View(k, parallax) for k, parallax in enumerate((9.0, 9.0, 9.0, 0.1))}
     assert loops.scene_depth(poses, views, 450.0) == pytest.approx(5.0)
     assert math.isnan(loops.scene_depth(poses[:1], views, 450.0))
