@@ -25,7 +25,7 @@ BUDGETS = {
     'rs_relpose_ros/geometry': (1268, 6),
     'rs_relpose_ros/imu': (1299, 4),
     'rs_relpose_ros/messages': (1545, 5),
-    'rs_relpose_ros/nodes': (2185, 9),
+    'rs_relpose_ros/nodes': (2190, 9),
     'rs_relpose_ros/odometry': (3139, 11),
     'rs_relpose_ros/offline': (2494, 9),
     'rs_relpose_ros/pipeline': (3697, 12),

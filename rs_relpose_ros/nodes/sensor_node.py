@@ -256,6 +256,7 @@ class SensorNode(StoppableNode):
         else:
             self.create_subscription(String, 'calibration', self._on_calibration, LATCHED)
         self._warm_timer = self.create_timer(0.02, self._subscribe_when_warm, clock=self._steady)
+        self._found_timer = self.create_timer(0.1, self._use_found, clock=self._steady)
         self._begin(self._settings.current.calibration.calibrate_at_start == 'always')
         self.create_timer(1.0, self._report, clock=self._steady)
 
@@ -303,6 +304,7 @@ class SensorNode(StoppableNode):
         """Estimate with the current parameters from here on, or calibrate before."""
         self._calibrating = calibrate
         self._warm_timer.cancel()
+        self._found_timer.cancel()
         if self._worker is not None:
             self._worker.stop(_JOIN_TIMEOUT)
         self._active = parameters = self._settings.current
@@ -330,7 +332,8 @@ class SensorNode(StoppableNode):
             self._calibration.quat_prior = self._quat_prior
             self._intake: Any = self._calibration
             self._progress = Progress('calibrating: waiting for images and gyro')
-            self._worker = Worker(self._intake, lambda: None, self._consume_calibration)
+            self._worker = Worker(self._intake, self._warm_up, self._consume_calibration)
+            self._found_timer.reset()
         else:
             self._loop = self._make_loop(parameters)
             self._intake = Intake(self._loop.sequencer, parameters)
@@ -391,7 +394,7 @@ class SensorNode(StoppableNode):
 
     def _consume_calibration(
             self, outcome: Progress | Calibrated | RsRelposeError | FrameFailed) -> None:
-        """By the worker; a calibration is used by `_report`, in the executor's thread."""
+        """By the worker; a calibration is used by `_use_found`, in the executor's thread."""
         if isinstance(outcome, FrameFailed):
             self._consume(outcome)
         elif isinstance(outcome, RsRelposeError):
@@ -401,6 +404,11 @@ class SensorNode(StoppableNode):
             self._progress = outcome
         else:
             self._found = outcome
+
+    def _use_found(self) -> None:
+        found, self._found = self._found, None
+        if found is not None:
+            self._use_calibration(found)
 
     def _use_calibration(self, found: Calibrated) -> None:
         """Store and publish a calibration, and estimate with it."""
@@ -526,9 +534,6 @@ class SensorNode(StoppableNode):
     # -- diagnostics -------------------------------------------------------------------------
 
     def _report(self) -> None:
-        found, self._found = self._found, None
-        if found is not None:
-            self._use_calibration(found)
         if self._lookup is not None and self._inputs is not None:
             self._use_transform(self._inputs.frame_ids)
         problem, missing = self._problem()
