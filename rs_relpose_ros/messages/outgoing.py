@@ -501,7 +501,7 @@ def draw_pair(result: PairResult) -> Color:
         canvas[:, :_BAR_WIDTH] = cv2.resize(_COLORS[:, None], (_BAR_WIDTH, len(canvas)))
         times = np.polyval(np.polyfit(points2[:, 1], result.row_times2, 1), (0, height - 1))
         for time, y in zip(times, (14, len(canvas) - 6), strict=True):
-            cv2.putText(canvas, f'{1e3 * time:.1f} ms', (_BAR_WIDTH + 4, y),
+            cv2.putText(canvas, f'{round(1e3 * time, 1) + 0.0:.1f} ms', (_BAR_WIDTH + 4, y),
                         cv2.FONT_HERSHEY_SIMPLEX, 0.42, _WHITE, 1, cv2.LINE_AA)
     return np.concatenate([canvas, _caption(result, int(inliers.sum()), size[0])])
 
