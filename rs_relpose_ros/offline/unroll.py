@@ -1,9 +1,8 @@
 """A bag with its images derotated to their middle row, and all other messages unchanged."""
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
 from rs_relpose_ros.bags import reader
@@ -32,15 +31,6 @@ class UnrollReport:
     warnings: list[str] = field(default_factory=list)
 
 
-@dataclass(slots=True, eq=False)
-class _Place:
-    """A place in the new bag, in the order of receive times."""
-
-    bag_time_ns: int
-    # One of each message, none for an omitted image, None until they are known.
-    writes: Sequence[Callable[[], None]] | None = None
-
-
 def unroll(bag: Bag, topics: SensorTopics, parameters: Parameters, out: Path) -> UnrollReport:
     """Write the bag `out`, a directory that must not exist, and appears when it is complete.
 
@@ -57,8 +47,8 @@ def unroll(bag: Bag, topics: SensorTopics, parameters: Parameters, out: Path) ->
 class _Unrolling:
     """One run over a bag.
 
-    Messages are written in the order of their receive times. Those after an image wait until the
-    gyro covers it.
+    Messages are written as soon as they are known, an image after its gyro: readers sort by the
+    receive times, which are indexed.
     """
 
     def __init__(self, bag: Bag, topics: SensorTopics, parameters: Parameters,
@@ -67,10 +57,8 @@ class _Unrolling:
         self._stamp_clock = parameters.global_shutter.stamp_clock
         self._loop = unrolling_loop(parameters, offline=True)
         self._intake = Intake(self._loop.sequencer, parameters)
-        self._places: deque[_Place] = deque()
-        # Undecided places of images by stamp.
-        self._images: dict[int, deque[_Place]] = {}
-        self._stamps: set[int] = set()
+        # By the stamps of all images, the receive times of those that are not yet derotated.
+        self._times: dict[int | None, deque[int]] = {}
         # Of other image topics: whether the stamp is an image's.
         self._shared: dict[str, list[bool]] = {}
         self._reasons = ReasonCounts()
@@ -78,77 +66,60 @@ class _Unrolling:
 
     def run(self) -> UnrollReport:
         """Write the new bag."""
+        report = self._report
         copied = [topic for topic in self._bag.topics if self._bag.can_be_copied(topic)]
         for topic in copied:
             self._writer.announce(topic, self._bag.origin(topic))
-        self._report.topics_copied = len({*copied} - {self._topics.image,
-                                                      self._topics.camera_info})
+        report.topics_copied = len({*copied} - {self._topics.image, self._topics.camera_info})
         for outcome in outcomes(self._loop, self._intake, self._messages(copied)):
-            if isinstance(outcome, MessageRefused) and not self._report.images:
+            times = self._times.get(outcome.stamp_ns)
+            bag_time_ns = times.popleft() if times else None
+            if isinstance(outcome, Frame):
+                if outcome.result is not None and bag_time_ns is not None:
+                    self._write(outcome.result, bag_time_ns)
+                continue
+            if isinstance(outcome, MessageRefused) and not report.images:
                 outcome.raise_without_intrinsics()
-            result = outcome.result if isinstance(outcome, Frame) else None
-            if not isinstance(outcome, Frame):
-                self._reasons.add(unused_reason(outcome))
-            if outcome.stamp_ns is not None:
-                self._settle(outcome.stamp_ns, result)
-        for place in self._places:
-            place.writes = place.writes or ()
-        self._flush()
-        self._report.reasons = self._reasons.most_common()
-        self._report.warnings += [f'{topic} is omitted: ROS 2 has no such message type'
-                                  for topic in self._bag.topics if topic not in copied]
+            self._reasons.add(unused_reason(outcome))
+        report.reasons = self._reasons.most_common()
+        report.warnings += [f'{topic} is omitted: ROS 2 has no such message type'
+                            for topic in self._bag.topics if topic not in copied]
         shared = [topic for topic, found in self._shared.items() if 2 * sum(found) > len(found)]
         if shared and self._stamp_clock == 'imu':
-            self._report.warnings.append(
+            report.warnings.append(
                 f'{", ".join(shared)} had the stamps of the derotated images and keep them, on '
                 "the camera's clock: set stamp_clock=camera if they are used together (depth, "
                 'stereo)')
-        return self._report
+        return report
 
     def _messages(self, topics: list[Topic]) -> Iterator[tuple[Role, BagMessage]]:
-        """Messages of camera and IMU; all messages get their places."""
+        """Messages of camera and IMU; all but images and CameraInfo are copied."""
         roles = {(topic.name, topic.msgtype): role for role in (
             Role.IMAGE, Role.CAMERA_INFO, Role.IMU, Role.ACCEL)
             if (topic := getattr(self._topics, role.value)) is not None}
         for raw in self._bag.raw_messages(topics):
-            self._flush()
             role = roles.get((raw.topic, raw.msgtype))
-            if role is Role.CAMERA_INFO:   # a new one is written with each image
-                message = self._bag.read(raw)
-            elif role is Role.IMAGE:
-                message = self._bag.read(raw)
+            if role not in (Role.IMAGE, Role.CAMERA_INFO):
+                self._report.copied += 1
+                self._writer.copy(raw)
+            if role is None:
+                if raw.msgtype in (reader.IMAGE, reader.COMPRESSED_IMAGE):
+                    self._shared.setdefault(raw.topic, []).append(
+                        stamp_ns(self._bag.read(raw).header) in self._times)
+                continue
+            message = self._bag.read(raw)
+            if role is Role.IMAGE:
                 self._report.images_in_bag += 1
                 try:
                     stamp: int = PARTS[role].read(message).stamp_ns
                 except RsRelposeError as error:
                     self._reasons.add(str(error))
                     continue
-                self._places.append(_Place(raw.bag_time_ns))
-                self._stamps.add(stamp)
-                self._images.setdefault(stamp, deque()).append(self._places[-1])
-            else:
-                self._report.copied += 1
-                self._places.append(_Place(raw.bag_time_ns, (partial(self._writer.copy, raw),)))
-                if role is None:
-                    if raw.msgtype in (reader.IMAGE, reader.COMPRESSED_IMAGE):
-                        # Whether an image of another topic has the stamp of an image.
-                        self._shared.setdefault(raw.topic, []).append(
-                            stamp_ns(self._bag.read(raw).header) in self._stamps)
-                    continue
-                message = self._bag.read(raw)
+                self._times.setdefault(stamp, deque()).append(raw.bag_time_ns)
             yield role, BagMessage(raw.topic, raw.bag_time_ns, message)
 
-    def _settle(self, stamp: int, result: GlobalShutterFrame | None) -> None:
-        """Fill the place of an image, with its CameraInfo."""
-        places = self._images.get(stamp)
-        if not places:
-            return
-        place = places.popleft()
-        if not places:
-            del self._images[stamp]
-        place.writes = ()
-        if result is None:
-            return
+    def _write(self, result: GlobalShutterFrame, bag_time_ns: int) -> None:
+        """Write an image with its CameraInfo."""
         topic, info, types = self._topics.image, self._topics.camera_info, self._writer.type
         header, pixels = (result.stamp_ns, result.frame_id), result.image()
         image = (outgoing.compressed_image_message(*header, pixels, png=result.is_png, types=types)
@@ -157,13 +128,7 @@ class _Unrolling:
         camera_info = outgoing.camera_info_message(
             *header, result.intrinsics, self._intake.camera_info_of(result.intrinsics), types)
         name = topic.camera_info if info is None else info.name
-        place.writes = tuple(partial(self._writer.write, *message, place.bag_time_ns)
-                             for message in ((name, reader.CAMERA_INFO, camera_info),
-                                             (topic.name, topic.msgtype, image)))
+        self._writer.write(name, reader.CAMERA_INFO, camera_info, bag_time_ns)
+        self._writer.write(topic.name, topic.msgtype, image, bag_time_ns)
         self._report.images += 1
         self._report.largest_shift = max(self._report.largest_shift, result.map.shift)
-
-    def _flush(self) -> None:
-        while self._places and self._places[0].writes is not None:
-            for write in self._places.popleft().writes or ():
-                write()
