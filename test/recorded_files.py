@@ -182,31 +182,6 @@ def make_mars(folder: Path, clock: str = 'REALTIME', difference: int = 0) -> Pat
     return folder
 
 
-CALIBRATION = {'cameras': [{
-    'focalLengthX': 55.0, 'focalLengthY': 56.0, 'principalPointX': 31.0, 'principalPointY': 24.0,
-    'model': 'kannala-brandt4', 'distortionCoefficients': [0.1, 0.02, -0.003, 0.0004],
-    'imageWidth': 64, 'imageHeight': 48,
-    'imuToCamera': [[0, -1, 0, 0], [-1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]}]}
-
-
-def make_jsonl(folder: Path, calibration: object = CALIBRATION) -> Path:
-    folder.mkdir(parents=True)
-    write_video(folder / 'data.mp4', VIDEO_TICKS)
-    lines = []
-    for k in range(40):
-        lines += [{'sensor': {'type': 'gyroscope', 'values': [0.1, -0.2, 0.3]}, 'time': k * 0.005},
-                  {'sensor': {'type': 'accelerometer', 'values': [0, 9.8, 0.1]},
-                   'time': k * 0.005 + 0.001},
-                  {'sensor': {'type': 'magnetometer', 'values': [1, 2, 3]}, 'time': k * 0.005}]
-    lines += [{'frames': [{'cameraInd': 0}], 'number': k, 'time': f'@0.0{k}3000001@'}
-              for k in range(len(STAMPS))]
-    text = '\n'.join(map(json.dumps, lines)).replace('"@', '').replace('@"', '')
-    (folder / 'data.jsonl').write_text(text + '\n\n')
-    if calibration is not None:
-        (folder / 'calibration.json').write_text(json.dumps(calibration))
-    return folder
-
-
 def make_tables(folder: Path, *, as_video: bool = False) -> Path:
     folder.mkdir(parents=True)
     if as_video:

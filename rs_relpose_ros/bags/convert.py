@@ -1,7 +1,7 @@
 """A recording of a camera with an IMU, from files of any format, written as a bag.
 
 A format has a reader that gives a `Recording`: `phones`, `video`, and those of public data sets in
-the laboratory. `read_rows`, `read_lines` and `read_object` read text files of such formats.
+the laboratory. `read_rows` and `read_object` read text files of such formats.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,7 +15,7 @@ import json
 import math
 from operator import attrgetter, itemgetter
 from pathlib import Path
-from typing import Any, TextIO, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -166,12 +166,8 @@ def _images(recording: Recording, bag: BagWriter,
 
 # -- Text files: each error names the file and the line -------------------------------------------
 
-@dataclass(frozen=True, slots=True)
-class Row:
-    """Words of one line of a file by the name of their column, or its number from 0.
-
-    Of a line of JSON, all values of an object; its numbers are words.
-    """
+class Row(NamedTuple):
+    """Words of one line of a file by the name of their column, or its number from 0."""
 
     path: Path
     line: int
@@ -198,11 +194,11 @@ class Row:
 
     def integer(self, column: str | int) -> int:
         """An integer with or without a sign."""
-        return self._number(column, 'an integer', _integer)
+        return self._number(column, 'an integer', int)
 
     def nanoseconds(self, column: str | int) -> int:
         """A stamp [ns], written in nanoseconds."""
-        return self._number(column, 'a stamp in nanoseconds, an integer', _integer, _is_stamp)
+        return self._number(column, 'a stamp in nanoseconds, an integer', int, _is_stamp)
 
     def seconds_as_nanoseconds(self, column: str | int, start_ns: int = 0) -> int:
         """A stamp [ns], written in decimal seconds since a start; rounded, without a float."""
@@ -220,13 +216,6 @@ class Row:
         raise self.error(f'column {name} must be {legal}, got {str(text)[:40]!r}')
 
 
-def _integer(text: str) -> int:
-    text = text.strip()
-    if not (text.isascii() and text.removeprefix('-').isdigit() and len(text) < 20):
-        raise ValueError
-    return int(text)
-
-
 def _is_stamp(value: int) -> bool:
     return 0 <= value < _END_NS
 
@@ -238,8 +227,8 @@ def read_rows(path: Path, columns: Sequence[str | int] | None = None,
     Each must have all `columns`; without them, the first line has their names. `separator`: None
     for white space. MissingInputError without the file.
     """
-    with _opened(path, _MAX_TABLE) as file:
-        lines = _lines(file)
+    with check_file(path, _MAX_TABLE).open(encoding='utf-8', errors='replace') as file:
+        lines = iter(lambda: file.readline(_MAX_LINE), '')
         if separator is None:
             lines = (' '.join(line.split()) for line in lines)
         rows = csv.reader(lines, delimiter=separator or ' ', quoting=csv.QUOTE_NONE)
@@ -274,20 +263,14 @@ def file_inside(folder: Path, row: Row, column: str | int) -> Path:
 
 def read_object(path: Path) -> dict[str, Any]:
     """The object in a JSON file."""
-    with _opened(path, _MAX_OBJECT) as file:
-        return _object(file.read(), str(path))
-
-
-def read_lines(path: Path) -> Iterator[Row]:
-    """Rows of a file with a JSON object in each line."""
-    with _opened(path, math.inf) as file:
-        for number, line in enumerate(_lines(file), start=1):
-            if line.strip():
-                yield Row(path, number, _object(line, f'{path}, line {number}', str))
-
-
-def _opened(path: Path, most_bytes: float) -> TextIO:
-    return check_file(path, most_bytes).open(encoding='utf-8', errors='replace')
+    with check_file(path, _MAX_OBJECT).open(encoding='utf-8', errors='replace') as file:
+        try:
+            value = json.load(file)
+        except (ValueError, RecursionError) as error:
+            raise InputError(f'{path}: no JSON: {error}') from error
+    if not isinstance(value, dict):
+        raise InputError(f'{path}: there must be a JSON object')
+    return value
 
 
 def check_file(path: Path, most_bytes: float = math.inf) -> Path:
@@ -297,21 +280,6 @@ def check_file(path: Path, most_bytes: float = math.inf) -> Path:
     if path.stat().st_size > most_bytes:
         raise InputError(f'{path} has more than {most_bytes} bytes: it is another file')
     return path
-
-
-def _lines(file: TextIO) -> Iterator[str]:
-    """Lines in pieces of bounded length."""
-    return iter(lambda: file.readline(_MAX_LINE), '')
-
-
-def _object(text: str, place: str, numbers: type[str] | None = None) -> dict[str, Any]:
-    try:
-        value = json.loads(text, parse_float=numbers, parse_int=numbers)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f'{place}: no JSON: {error}') from error
-    if not isinstance(value, dict):
-        raise InputError(f'{place}: there must be a JSON object')
-    return value
 
 
 def finite_numbers(value: object, shape: tuple[int, ...]) -> NDArray[np.float64] | None:

@@ -4,7 +4,6 @@ Formats: docs/recordings.md, "Files of the loggers".
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 import logging
 import math
 from pathlib import Path
@@ -15,10 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.bags import convert
 from rs_relpose_ros.bags.convert import read_object, read_table, Recording, Row
-from rs_relpose_ros.bags.video import readout_of_milliseconds, readout_values, Video
+from rs_relpose_ros.bags.video import readout_values, Video
 from rs_relpose_ros.config.files import SourcedValue
 from rs_relpose_ros.errors import InputError, MissingInputError
-from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.imu.buffer import ImuSample, Vector
 from rs_relpose_ros.messages.incoming import TruePose
@@ -65,12 +63,10 @@ def _axes(sensor_orientation: object = None) -> SourcedValue:
 
 def _readout(skews_ns: Sequence[float], column: str) -> list[SourcedValue]:
     """Median of the logged SENSOR_ROLLING_SHUTTER_SKEW [ns]; nothing if none is logged."""
-    if not skews_ns:
-        return []
-    reported = readout_of_milliseconds(float(np.median(skews_ns)) * _MILLISECOND, column)
-    return [] if reported is None else readout_values(
-        reported, f'Reported by the phone: median of {column}, which is that of the whole sensor: '
-        'less if the image is cropped at its top and bottom.')
+    return readout_values(
+        float(np.median(skews_ns or 0.0)) * _MILLISECOND, column, 'Reported by the phone: median '
+        f'of {column}, which is that of the whole sensor: less if the image is cropped at its top '
+        'and bottom.')
 
 
 def _exposure(exposures_ns: Sequence[float]) -> list[SourcedValue]:
@@ -145,90 +141,6 @@ def read_tables(folder: Path) -> Recording:
 
 def _stamp(row: Row) -> int:
     return row.nanoseconds(next((name for name in _STAMPS if name in row.words), _STAMPS[0]))
-
-
-_VIDEOS = ('data.mp4', 'data.mov', 'data.mkv')
-# Times can begin at any value, also below 0, where stamps cannot be.
-_START_NS = 1000 * NANOSECONDS
-# model -> its name here, and the possible numbers of its coefficients.
-_MODELS = {'pinhole': ('plumb_bob', (0, 3)), 'brown-conrady': ('plumb_bob', (0, 3, 4, 5, 8)),
-           'kannala-brandt4': ('equidistant', (4,))}
-
-
-def read_jsonl(folder: Path) -> Recording:
-    """Frames of the first camera, and the IMU, of Spectacular AI's recorders."""
-    times_ns, gyro, accel = _events(folder / 'data.jsonl')
-    path = next((folder / name for name in _VIDEOS if (folder / name).is_file()), None)
-    if path is None:
-        raise MissingInputError(f'{folder} has no video: {" or ".join(_VIDEOS)}')
-    video = _landscape_video(path)
-    camera, rotation = _calibration(folder / 'calibration.json', video)
-    return Recording(
-        camera, video.frames(times_ns, folder / 'data.jsonl'), gyro,
-        _title(folder, ': recorded as data.jsonl. `rs_relpose calibrate` estimates the readout '
-               'time'),
-        (convert.COMPRESSED, _STAMP_ROW, _TIME_OFFSET, rotation), accel=accel)
-
-
-def _events(path: Path) -> tuple[list[int], list[ImuSample], list[ImuSample]]:
-    """Stamps of the frames [ns] by their numbers, samples of gyro and accelerometer."""
-    frames: list[tuple[int, int]] = []
-    gyro: list[ImuSample] = []
-    accel: list[ImuSample] = []
-    for row in convert.read_lines(path):
-        sensor = row.words.get('sensor')
-        sensor = sensor if isinstance(sensor, dict) else {}
-        kind = sensor.get('type')
-        if 'frames' in row.words:
-            frames.append((row.integer('number'), row.seconds_as_nanoseconds('time', _START_NS)))
-        elif kind in ('gyroscope', 'accelerometer'):
-            values = sensor.get('values')
-            if not isinstance(values, list) or len(values) != 3:
-                raise row.error('values must be three numbers')
-            stamp_ns = row.seconds_as_nanoseconds('time', _START_NS)
-            vector = replace(row, words=dict(enumerate(values))).vector(0, 1, 2)
-            if kind == 'gyroscope':
-                gyro.append(ImuSample(stamp_ns, vector, None))
-            else:
-                accel.append(ImuSample(stamp_ns, None, vector))
-    return [stamp_ns for _, stamp_ns in sorted(frames)], gyro, accel
-
-
-def _calibration(path: Path, video: Video) -> tuple[RollingShutterCamera | None, SourcedValue]:
-    """Camera and rotation from IMU to camera, if the file has them."""
-    if not path.is_file():
-        return None, _axes()
-    cameras = read_object(path).get('cameras')
-    if not isinstance(cameras, list) or not cameras or not isinstance(cameras[0], dict):
-        raise InputError(f'{path} must have a list of cameras')
-    try:
-        camera = _calibrated_camera(cameras[0], video.width, video.height)
-        matrix = cameras[0].get('imuToCamera', cameras[0].get('imuToCameraMatrix'))
-        if matrix is None:
-            return camera, _axes()
-        rotation = Rotation.from_matrix(np.asarray(matrix, dtype=np.float64)[:3, :3])
-    except (ArithmeticError, LookupError, TypeError, ValueError) as error:
-        raise InputError(f'{path}: {error}') from error
-    quaternion = tuple(round(float(value), 8) for value in rotation.as_quat())
-    return camera, SourcedValue('quat_cam_imu_xyzw', quaternion,
-                                'imuToCamera of calibration.json.')
-
-
-def _calibrated_camera(found: dict[str, Any], width: int, height: int) -> RollingShutterCamera:
-    model, counts = _MODELS[found['model']]
-    coefficients: Sequence[float] = found.get('distortionCoefficients') or ()
-    if len(coefficients) not in counts:
-        raise InputError(f'{found["model"]} has {len(coefficients)} coefficients')
-    if (found['imageWidth'], found['imageHeight']) != (width, height):
-        raise InputError(f'the calibration is for {found["imageWidth"]}x{found["imageHeight"]}, '
-                         f'but the video has {width}x{height}')
-    if model == 'plumb_bob' and len(coefficients) == 3:   # radial ones only
-        coefficients = (coefficients[0], coefficients[1], 0.0, 0.0, coefficients[2])
-    # Readout time 0: the format has none, and calibrate estimates it.
-    return RollingShutterCamera(
-        width=width, height=height, fx=found['focalLengthX'], fy=found['focalLengthY'],
-        cx=found['principalPointX'], cy=found['principalPointY'], distortion_model=model,
-        distortion=tuple(coefficients), readout_time=0.0)
 
 
 # How far the two clocks may drift apart during a recording [ns]; beyond it the phone slept.
@@ -379,7 +291,6 @@ def _intrinsics(path: Path) -> list[SourcedValue]:
 LOGGERS: Mapping[str, tuple[tuple[str, ...], Callable[[Path], Recording]]] = {
     'PoseCam': (('poses.csv', 'imu.csv', 'frames'), read_posecam),
     'MARS Logger': (('movie.mp4', 'frame_timestamps.txt', 'gyro_accel.csv'), read_mars),
-    'data.jsonl': (('data.jsonl',), read_jsonl),
     'tables': (('frames.csv', 'gyro.csv'), read_tables),
 }
 

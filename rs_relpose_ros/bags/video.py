@@ -40,18 +40,12 @@ def read_video(path: Path, lens_profile: Path | None) -> Recording:
     duration_ns = max(times_ns[-1] - times_ns[0], 1)
     mode = VideoMode(telemetry.brand, telemetry.model, video.width, video.height,
                      (len(video) - 1) * NANOSECONDS / duration_ns)
-    camera, profile_readout = None, None
+    camera, readout = None, telemetry.readout
     if lens_profile is not None:
         camera, profile_readout = find_lens_profile(lens_profile, mode)
-    parameters = [convert.COMPRESSED]
-    if telemetry.readout is not None:
-        parameters += readout_values(telemetry.readout,
-                                     f'Reported by the file: {telemetry.readout.source}.')
-    elif profile_readout is not None:
-        parameters += readout_values(
-            profile_readout, f'A GUESS, not reported by the file: {profile_readout.source}. '
-            '`rs_relpose calibrate` measures it.')
-    parameters += [
+        readout = readout or profile_readout
+    parameters = [
+        convert.COMPRESSED, *readout,
         SourcedValue('stamp_row', 'first', 'Convention of time_offset here.'),
         SourcedValue('time_offset', 0.0, 'NOT KNOWN: the file does not report the start of its '
                      'IMU against its frames; tens of milliseconds are usual. `rs_relpose '
@@ -136,33 +130,20 @@ class Video:
 _BY_COLUMNS_MS = 10_000.0
 
 
-@dataclass(frozen=True, slots=True)
-class ReportedReadout:
-    """Readout time [s] and direction ('down' or 'up'), and who reports it."""
+def readout_values(milliseconds: float, name: str, source: str) -> list[SourcedValue]:
+    """Parameters of a readout time [ms], negative if read upwards; none for 0, if it is unknown.
 
-    seconds: float
-    direction: str
-    source: str
-
-
-def readout_of_milliseconds(milliseconds: float, source: str) -> ReportedReadout | None:
-    """A readout time [ms], negative if read upwards; None for 0, which means unknown.
-
-    InputError for a sensor that is read column by column.
+    `source`: in words. InputError, with the name of the value, for a sensor that is read column by
+    column.
     """
     if abs(milliseconds) >= _BY_COLUMNS_MS:
-        raise InputError(f'{source}: the sensor is read column by column, which the model of row '
+        raise InputError(f'{name}: the sensor is read column by column, which the model of row '
                          'times does not cover')
     if not 0.0 < abs(milliseconds) < 1000.0:
-        return None
-    direction = 'down' if milliseconds > 0.0 else 'up'
-    return ReportedReadout(round(abs(milliseconds) * 1e-3, 9), direction, source)
-
-
-def readout_values(readout: ReportedReadout, source: str) -> list[SourcedValue]:
-    """Readout time, with its source in words, and direction as parameters."""
-    return [SourcedValue('readout_time', readout.seconds, source),
-            SourcedValue('readout_direction', readout.direction, 'As the readout time.')]
+        return []
+    return [SourcedValue('readout_time', round(abs(milliseconds) * 1e-3, 9), source),
+            SourcedValue('readout_direction', 'down' if milliseconds > 0.0 else 'up',
+                         'As the readout time.')]
 
 
 # -- Telemetry: IMU, readout time, stabilisation --------------------------------------------------
@@ -203,7 +184,7 @@ class Telemetry:
     model: str
     gyro: list[ImuSample]   # with the accelerometer if it has the same rate
     accel: list[ImuSample]   # else separately
-    readout: ReportedReadout | None
+    readout: list[SourcedValue]   # its parameters, none if it is unknown
 
 
 def read_telemetry(path: Path, start_ns: int) -> Telemetry:
@@ -259,26 +240,22 @@ def _parsed(path: Path) -> tuple[Any, list[Mapping[str, Any]], list[Mapping[str,
         raise InputError(f'{path}: telemetry-parser cannot read it: {error}') from error
 
 
-def _readout(tags: Sequence[Mapping[str, Any]]) -> ReportedReadout | None:
+def _readout(tags: Sequence[Mapping[str, Any]]) -> list[SourcedValue]:
     for group, tag, name, source in _READOUTS:
         for value in _values(tags, group, tag):
-            direction = ''
-            if name:
-                if not isinstance(value, Mapping):
-                    continue
-                direction = str(value.get('frame_readout_direction', ''))
-                value = value.get(name)
+            fields = value if isinstance(value, Mapping) else {'': value}
+            direction = str(fields.get('frame_readout_direction', ''))
             try:
-                milliseconds = float(value)
+                milliseconds = float(fields.get(name, 0.0))
             except (TypeError, ValueError):
                 continue
             if direction in _COLUMNS:
-                milliseconds = math.copysign(math.inf, milliseconds)
-            elif direction in _UPWARDS:
-                milliseconds = -milliseconds
-            if readout := readout_of_milliseconds(milliseconds, source):
+                milliseconds = math.inf
+            if readout := readout_values(
+                    -milliseconds if direction in _UPWARDS else milliseconds, source,
+                    f'Reported by the file: {source}.'):
                 return readout
-    return None
+    return []
 
 
 def _values(tags: Sequence[Mapping[str, Any]], group: str, tag: str) -> list[Any]:
@@ -317,7 +294,7 @@ class VideoMode:
 
 
 def find_lens_profile(
-        path: Path, mode: VideoMode) -> tuple[RollingShutterCamera, ReportedReadout | None]:
+        path: Path, mode: VideoMode) -> tuple[RollingShutterCamera, list[SourcedValue]]:
     """Calibration (its readout time 0 if unknown) and readout time of a camera mode.
 
     `path` is a profile, or a folder with exactly one profile of the mode. MissingInputError if
@@ -348,7 +325,7 @@ def _is_of(profile: dict[str, Any], mode: VideoMode) -> bool:
 
 
 def _profile(path: Path, profile: dict[str, Any], mode: VideoMode
-             ) -> tuple[RollingShutterCamera, ReportedReadout | None]:
+             ) -> tuple[RollingShutterCamera, list[SourcedValue]]:
     size, fisheye = _size(profile, 'calib_dimension'), profile.get('fisheye_params')
     found = fisheye if isinstance(fisheye, dict) else {}
     matrix = convert.finite_numbers(found.get('camera_matrix'), (3, 3))
@@ -367,17 +344,19 @@ def _profile(path: Path, profile: dict[str, Any], mode: VideoMode
     if abs(scale_x / scale_y - 1.0) > _ASPECT_TOLERANCE:
         raise InputError(f'{path} is for images of {size[0]}x{size[1]}, another aspect ratio than '
                          f'that of the video, {mode.width}x{mode.height}')
-    milliseconds = profile.get('frame_readout_time')
-    readout = None
-    if isinstance(milliseconds, int | float) and math.isfinite(milliseconds):
-        readout = readout_of_milliseconds(milliseconds, f'lens profile {path.name}')
+    milliseconds, source = profile.get('frame_readout_time'), f'lens profile {path.name}'
+    if not isinstance(milliseconds, int | float):
+        milliseconds = 0.0
+    readout = readout_values(
+        milliseconds, source,
+        f'A GUESS, not reported by the file: {source}. `rs_relpose calibrate` measures it.')
     (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
     # Pixel centres have integer coordinates.
     return RollingShutterCamera(
         width=mode.width, height=mode.height, fx=scale_x * fx, fy=scale_y * fy,
         cx=scale_x * (cx + 0.5) - 0.5, cy=scale_y * (cy + 0.5) - 0.5,
         distortion_model='equidistant', distortion=tuple(coefficients.tolist()),
-        readout_time=readout.seconds if readout else 0.0), readout
+        readout_time=round(abs(milliseconds) * 1e-3, 9) if readout else 0.0), readout
 
 
 def _size(profile: dict[str, Any], name: str) -> tuple[int, int] | None:
