@@ -1,7 +1,6 @@
 """Many bags on real Dask clusters of processes, all on the loopback interface."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 import json
 import math
 import os
@@ -20,8 +19,7 @@ import numpy as np
 import pytest
 
 from rs_relpose_ros.cli import batch, main
-from rs_relpose_ros.offline import batch as runs
-from rs_relpose_ros.offline.batch import Bag, Job, Outcome, Request, run_batch, State, Store
+from rs_relpose_ros.cli.batch import Bag, DONE, Files, Job, Row, run_jobs
 
 pytest.importorskip('distributed', reason='needs the extra batch')
 # Clusters start, and a first run compiles kernels.
@@ -44,13 +42,13 @@ def test_bags_of_paths_and_globs(tmp_path, monkeypatch):
         (tmp_path / f'{name}.yaml').write_text(f'# {name}\n')
     (tmp_path / 'other').mkdir()
     (tmp_path / 'old.bag').write_bytes(b'12345')
-    found = runs.find_bags([str(tmp_path / name) for name in ('b', '*', 'absent')])
+    found = batch.find_bags([str(tmp_path / name) for name in ('b', '*', 'absent')])
     assert [Path(bag.path).name for bag in found] == ['b', 'a', 'old.bag', 'absent']
     assert [bag.size for bag in found] == [11, 11, 5, -1]
     assert [bag.parameters for bag in found] == ['# b\n', '# a\n', '', '']
     os.utime(tmp_path / 'a' / 'data.mcap', ns=(1, 4_000_000_000_000_000_000))
     monkeypatch.chdir(tmp_path.parent)
-    [relative] = runs.find_bags([f'{tmp_path.name}/a*'])
+    [relative] = batch.find_bags([f'{tmp_path.name}/a*'])
     assert relative.path == f'{tmp_path.name}/a'
     assert relative.changed_ns == 4_000_000_000_000_000_000
 
@@ -61,38 +59,37 @@ def test_bags_of_paths_and_globs(tmp_path, monkeypatch):
     (['/c/a/x', '/d/a/x'], ['c__a__x', 'd__a__x']),
     (['./x', 'x'], ['x_0', 'x_1'])])
 def test_names_of_results_differ(paths, names):
-    assert runs.unique_names(paths) == names
+    assert batch.unique_names(paths) == names
 
 
-@pytest.mark.parametrize('state', State)
+@pytest.mark.parametrize('state', batch.STATES)
 def test_result_is_reused_only_if_it_is_one_and_nothing_changed(tmp_path, state):
-    store, job = Store(tmp_path), Job(
-        'check', Bag('/bags/a', 5, 7, 'a: 1\n'), 'a', 'a: 1\n', ('--set', 'seed=1'), '1')
-    outcome = Outcome(job, state, 'because', 1.5, {'pairs': 3, 'shutter': None})
-    store.add(replace(outcome, files={'check.json': b'{}', 'in/it.txt': b'text'}))
+    bag = Bag('/bags/a', 5, 7, 'a: 1\n')
+    job = Job('check', bag, 'a', ('--set', 'seed=1'), '1')
+    row = job.row(state, 'because', 1.5, {'pairs': 3, 'shutter': None})
+    batch.store(job, row, {'check.json': b'{}', 'in/it.txt': b'text'}, tmp_path)
     assert (tmp_path / 'a' / 'in' / 'it.txt').read_bytes() == b'text'
-    lasts = state in (State.DONE, State.FINDINGS, State.REFUSED)
-    assert Store(tmp_path).done(job) == (outcome if lasts else None)
-    for changes in ({'bag': replace(job.bag, size=6)}, {'bag': replace(job.bag, changed_ns=8)},
-                    {'parameters': 'a: 2\n'}, {'options': ()}, {'version': '2'},
-                    {'command': 'replay'}, {'name': 'b'}):
-        assert store.done(replace(job, **changes)) is None
+    lasts = state in (DONE, batch.FINDINGS, batch.REFUSED)
+    assert batch.earlier(job, tmp_path) == (row if lasts else None)
+    for changes in ({'bag': bag._replace(size=6)}, {'bag': bag._replace(changed_ns=8)},
+                    {'bag': bag._replace(parameters='a: 2\n')}, {'options': ()},
+                    {'version': '2'}, {'command': 'replay'}, {'name': 'b'}):
+        assert batch.earlier(job._replace(**changes), tmp_path) is None
     (tmp_path / 'a' / 'check.json').unlink()
-    assert store.done(job) is None
+    assert batch.earlier(job, tmp_path) is None
     (tmp_path / 'a' / 'job.json').write_text('{')
-    assert store.done(job) is None
+    assert batch.earlier(job, tmp_path) is None
 
 
 @pytest.mark.skipif(not Path('/dev/full').exists(), reason='Linux has a device that is full')
 @pytest.mark.parametrize('file', ['a/check.json', 'a/job.json', 'results.csv'])
 def test_a_full_disk_is_reported_with_the_file(tmp_path, file):
-    store, bag = Store(tmp_path), Bag('/bags/a', 5, 7, '')
-    outcome = Outcome(Job('check', bag, 'a', '', (), '1'), State.DONE, files={'check.json': b'{}'})
+    job = Job('check', Bag('/bags/a', 5, 7, ''), 'a', (), '1')
     (tmp_path / 'a').mkdir()
     (tmp_path / f'{file}.part').symlink_to('/dev/full')
     with pytest.raises(OSError, match='No space left') as found:
-        store.add(outcome)
-        store.write_table([outcome])
+        batch.store(job, job.row(DONE), {'check.json': b'{}'}, tmp_path)
+        batch.write_table([job.row(DONE)], tmp_path)
     assert found.value.filename == str(tmp_path / file)
     assert not (tmp_path / file).exists()
 
@@ -108,17 +105,18 @@ def test_a_full_disk_is_reported_with_the_file(tmp_path, file):
     # Of two that disagree, neither is known to be wrong: the sigma grows.
     ([1.0, 2.0], [0.1, 0.1], 1.5, 0.5, 50.0, ())])
 def test_weighted_mean(values, sigmas, mean, sigma, chi2, outliers):
-    combined = runs.weighted_mean('x', 'abcdef'[:len(values)], values, sigmas)
-    assert (combined.mean, combined.sigma, combined.chi2) == pytest.approx((mean, sigma, chi2))
-    assert combined.outliers == outliers
-    assert combined.degrees_of_freedom == len(values) - len(outliers) - 1
+    combined = batch.weighted_mean('x', 'abcdef'[:len(values)], values, sigmas)
+    assert [combined[key] for key in ('mean', 'sigma', 'chi2')] == pytest.approx(
+        [mean, sigma, chi2])
+    assert combined['outliers'] == list(outliers)
+    assert combined['degrees_of_freedom'] == len(values) - len(outliers) - 1
 
 
 def calibration(readout: float, observable: bool = True, yaw: float = 0.0) -> dict:
     """Columns of what `calibrate` writes."""
     def estimate(value: float, observed: bool = True) -> dict:
         return {'value': value, 'sigma': 0.0002, 'observable': observed, 'remark': 'turn more'}
-    return runs.metrics_of('calibrate', {
+    return batch.metrics_of('calibrate', {
         'shutter': 'rolling', 'readout_time_s': estimate(readout, observable),
         'time_offset_s': estimate(-0.01), 'focal_px': None,
         'gyro_bias_rad_per_s': [estimate(0.001 * k) for k in range(3)],
@@ -128,18 +126,19 @@ def calibration(readout: float, observable: bool = True, yaw: float = 0.0) -> di
 
 
 def test_calibrations_of_one_camera():
-    one_camera = runs.combine(
-        {'a': calibration(0.0300, yaw=0.01), 'b': calibration(0.0302, yaw=0.012),
-         'c': calibration(0.0301, yaw=0.011), 'd': calibration(0.9, observable=False, yaw=0.011)})
-    combined = {one.metric: one for one in one_camera.metrics}
-    assert combined['readout_time_s'].mean == pytest.approx(0.0301)
-    assert combined['readout_time_s'].bags == ('a', 'b', 'c')
-    assert combined['time_offset_s'].degrees_of_freedom == 3
+    one_camera = batch.combine([{'name': name, **metrics} for name, metrics in {
+        'a': calibration(0.0300, yaw=0.01), 'b': calibration(0.0302, yaw=0.012),
+        'c': calibration(0.0301, yaw=0.011),
+        'd': calibration(0.9, observable=False, yaw=0.011)}.items()])
+    combined = {one['figure']: one for one in one_camera['figures']}
+    assert combined['readout_time_s']['mean'] == pytest.approx(0.0301)
+    assert combined['readout_time_s']['bags'] == ['a', 'b', 'c']
+    assert combined['time_offset_s']['degrees_of_freedom'] == 3
     assert 'focal_px' not in combined
     # 1 mrad to both sides of the mean.
-    assert combined['rotation_z_rad'].chi2 == pytest.approx(2.0, rel=1e-3)
-    assert combined['rotation_x_rad'].chi2 == pytest.approx(0.0, abs=1e-9)
-    np.testing.assert_allclose(one_camera.quat_cam_imu_xyzw,
+    assert combined['rotation_z_rad']['chi2'] == pytest.approx(2.0, rel=1e-3)
+    assert combined['rotation_x_rad']['chi2'] == pytest.approx(0.0, abs=1e-9)
+    np.testing.assert_allclose(one_camera['quat_cam_imu_xyzw'],
                                [0.0, 0.0, np.sin(0.0055), np.cos(0.0055)], atol=1e-9)
 
 
@@ -252,8 +251,8 @@ def test_each_worker_is_a_process_of_one_thread(client, tmp_path):
     client.wait_for_workers(2, timeout=60)
     assert set(client.nthreads().values()) == {1} and len(client.nthreads()) == 2
     assert all('//127.0.0.1:' in address for address in client.nthreads())
-    result = run_batch(client, request(tmp_path, 'a', 'b'), tmp_path / 'out', threads)
-    configured = [row.message.split() for row in result.rows]
+    rows, _ = run_jobs(client, jobs(client, tmp_path, 'a', 'b'), tmp_path / 'out', threads)
+    configured = [row['message'].split() for row in rows]
     assert [words[:2] for words in configured] == [['1', '1']] * 2
     assert os.getpid() not in {int(words[2]) for words in configured}
 
@@ -261,42 +260,44 @@ def test_each_worker_is_a_process_of_one_thread(client, tmp_path):
 # Work for clusters; the folder for marks is in the job's options.
 
 
-def die_in_mid_bag(job: Job) -> Outcome:
+def die_in_mid_bag(job: Job) -> tuple[Row, Files]:
     """Do the job, but the first worker is killed during it."""
     mark = Path(job.options[-1]) / f'{job.name}.died'
     if job.name == 'mortal' and not mark.exists():
         mark.touch()
         threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGKILL)).start()
-    outcome = batch.run_job(replace(job, options=('--no-pictures',)))
-    return replace(outcome, job=job)
+    return batch.run_job(job._replace(options=('--no-pictures',)))
 
 
-def die_always(job: Job) -> Outcome:
+def die_always(job: Job) -> tuple[Row, Files]:
     """The mortal one kills each worker; the others take their time."""
     if job.name == 'mortal':
         os.kill(os.getpid(), signal.SIGKILL)
     time.sleep(0.5)
     if job.name == 'faulty':
         raise ZeroDivisionError('no such number')
-    return Outcome(job, State.DONE)
+    return job.row(DONE), {}
 
 
-def threads(job: Job) -> Outcome:
-    return replace(batch.run_job(job), message=(
-        f'{os.environ["OMP_NUM_THREADS"]} {cv2.getNumThreads()} {os.getpid()}'))
+def threads(job: Job) -> tuple[Row, Files]:
+    row, files = batch.run_job(job)
+    configured = os.environ['OMP_NUM_THREADS'], cv2.getNumThreads(), os.getpid()
+    return {**row, 'message': ' '.join(map(str, configured))}, files
 
 
-def request(folder: Path, *names: str, options: tuple[str, ...] = ()) -> Request:
-    return Request('replay', tuple(str(folder / name) for name in names), None, options, VERSION)
+def jobs(client: Any, folder: Path, *names: str, options: tuple[str, ...] = (),
+         command: str = 'replay', parameters: str | None = None) -> list[Job]:
+    return batch.make_jobs(client, command, [str(folder / name) for name in names], parameters,
+                           options, VERSION)
 
 
 def test_worker_that_dies_in_mid_bag_is_replaced(client, bags, single, tmp_path):
     shutil.copytree(bags / 'first', tmp_path / 'in' / 'mortal')
     shutil.copy(bags / 'first.yaml', tmp_path / 'in' / 'mortal.yaml')
-    result = run_batch(client, request(tmp_path / 'in', 'mortal', options=(str(tmp_path),)),
+    rows, _ = run_jobs(client, jobs(client, tmp_path / 'in', 'mortal', options=(str(tmp_path),)),
                        tmp_path / 'out', die_in_mid_bag)
     assert (tmp_path / 'mortal.died').exists()
-    assert [row.state for row in result.rows] == [State.DONE]
+    assert [row['state'] for row in rows] == [DONE]
     assert (tmp_path / 'out' / 'mortal' / 'relative_poses.csv').read_bytes() == (
         single / 'relative_poses.csv').read_bytes()
 
@@ -304,29 +305,30 @@ def test_worker_that_dies_in_mid_bag_is_replaced(client, bags, single, tmp_path)
 def test_bag_that_kills_every_worker(client, tmp_path):
     for name in ('a', 'mortal', 'b', 'faulty', 'c'):
         make_bag(tmp_path / name)
-    result = run_batch(client, request(tmp_path, 'a', 'mortal', 'b', 'faulty', 'c'),
-                       tmp_path / 'out', die_always)
-    assert {row.job.name: row.state for row in result.rows} == {
-        'a': State.DONE, 'mortal': State.LOST, 'b': State.DONE, 'faulty': State.FAILED,
-        'c': State.DONE}
+    run_jobs(client, jobs(client, tmp_path, 'a', 'mortal', 'b', 'faulty', 'c'), tmp_path / 'out',
+             die_always)
     rows = results_of(tmp_path / 'out')
+    assert [rows[name]['state'] for name in ('a', 'mortal', 'b', 'faulty', 'c')] == [
+        'done', 'lost', 'done', 'failed', 'done']
     assert 'workers died over this bag' in rows['mortal']['message']
     assert rows['faulty']['message'] == 'ZeroDivisionError: no such number'
 
 
-def work_of_calibrations(job: Job) -> Outcome:
+def work_of_calibrations(job: Job) -> tuple[Row, Files]:
     """Results by the bag's name."""
     readout = {'cam1': 0.0300, 'cam2': 0.0301, 'wrong': 0.024}.get(job.name, 0.0302)
     observable = job.name != 'still5'
-    return Outcome(job, State.DONE if observable else State.FINDINGS,
-                   metrics=calibration(readout, observable))
+    metrics = calibration(readout, observable)
+    return job.row(DONE if observable else batch.FINDINGS, metrics=metrics), {}
 
 
 def test_summary_of_calibrations(client, tmp_path):
     names = ('cam1', 'cam2', 'wrong', 'cam4', 'still5')
-    paths = tuple(str(make_bag(tmp_path / name)) for name in names)
-    calibrations = Request('calibrate', paths, '', (), VERSION)
-    result = run_batch(client, calibrations, tmp_path / 'out', work_of_calibrations)
+    for name in names:
+        make_bag(tmp_path / name)
+    calibrations = jobs(client, tmp_path, *names, command='calibrate', parameters='')
+    found, reused = run_jobs(client, calibrations, tmp_path / 'out', work_of_calibrations)
+    lines = batch.write_summary(calibrations[0], found, reused, tmp_path / 'out')
     summary = json.loads((tmp_path / 'out' / 'summary.json').read_text())
     readout = next(one for one in summary['combined']['figures']
                    if one['figure'] == 'readout_time_s')
@@ -334,7 +336,6 @@ def test_summary_of_calibrations(client, tmp_path):
     rows = results_of(tmp_path / 'out')
     assert float(rows['wrong']['readout_time_s']) == 0.024
     assert rows['still5']['readout_time_s_observable'] == 'False'
-    lines = batch.report(result, tmp_path / 'out')
     assert any(line.startswith('readout_time_s: 0.03') and line.endswith('outliers: wrong')
                for line in lines)
 
@@ -348,7 +349,7 @@ def test_summary_of_calibrations(client, tmp_path):
     (['replay', 'x', '--options=--out=y'], '--options must not have --out=y'),
     (['replay', 'x', '--scheduler', 'tcp://127.0.0.1:1'], 'no Dask scheduler answers')])
 def test_bad_usage(tmp_path, capsys, monkeypatch, words, configured):
-    monkeypatch.setattr('rs_relpose_ros.offline.batch._TIMEOUT', 1.0)
+    monkeypatch.setattr('rs_relpose_ros.cli.batch._TIMEOUT', 1.0)
     assert main.main(['batch', *words, '--out', str(tmp_path / 'out')]) == 2
     assert configured in capsys.readouterr().err
     assert not (tmp_path / 'out').exists()
@@ -359,7 +360,7 @@ def test_clusters_that_are_refused(client, tmp_path, refused, monkeypatch):
     running = ['--scheduler', client.scheduler.address]
     refused('--workers is for local processes', *command, *running, '--workers', 2)
     refused('the workers find no bag at', *command, *running)
-    monkeypatch.setattr(batch, 'run_on_worker', lambda client, function: '9.9.9')
-    refused('the workers have version 9.9.9', *command, *running)
+    monkeypatch.setattr(batch, 'package_version', lambda: str(os.getpid()))
+    refused('the workers have version', *command, *running)
     monkeypatch.setitem(sys.modules, 'dask', None)
     refused("pip install 'dask[distributed]'", *command)

@@ -1,1 +1,1 @@
-"""Bags through the pipeline: replay, check, unroll, batch."""
+"""Bags through the pipeline: replay, check, unroll."""
