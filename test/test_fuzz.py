@@ -53,23 +53,23 @@ def share_and_all(share: int, full: int, seconds: int) -> pytest.MarkDecorator:
 
 
 def outcomes_of(attempt: Callable[..., Any], count: int, *strategies: Any) -> Counter[str]:
-    """Outcomes of many attempts, in bounded memory; a hang, even in C code, ends the process."""
+    """Outcomes of many attempts, each in bounded memory; a hang, even in C, ends the process."""
     outcomes: Counter[str] = Counter()
 
     @settings(max_examples=count, suppress_health_check=list(HealthCheck))
     @given(st.tuples(*strategies))
     def check(drawn: tuple[Any, ...]) -> None:
+        # Sets the peak to the present size (proc(5)), which has the examples that are kept.
+        Path('/proc/self/clear_refs').write_text('5')
+        before = peak_memory_mb()
         faulthandler.dump_traceback_later(PATIENCE, exit=True)
         try:
             outcomes.update(attempt(*drawn))
         finally:
             faulthandler.cancel_dump_traceback_later()
+        assert peak_memory_mb() - before < MOST_MEMORY_MB
 
-    # Sets the peak to the present size (proc(5)).
-    Path('/proc/self/clear_refs').write_text('5')
-    before = peak_memory_mb()
     check()
-    assert peak_memory_mb() - before < MOST_MEMORY_MB
     print(outcomes)
     return outcomes
 

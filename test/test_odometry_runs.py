@@ -184,7 +184,7 @@ def test_a_recording_in_parts(monkeypatch, tmp_path):
             [(sample.stamp_ns, sample) for sample in part.samples], [])
 
     monkeypatch.setattr(odometry_recordings, 'recording_at', lambda path: recording)
-    monkeypatch.setattr(odometry_recordings, 'feed_of', feed_of)
+    monkeypatch.setattr(disturbances, 'feed_of', feed_of)
     _, first, _ = found = list(odometry_recordings.on_recording(tmp_path / 'walk', 4.4))
     assert [one.begin for one in found] == [0.0, 0.0, 4.4]
     for one in found:
