@@ -153,7 +153,7 @@ def test_gravity_of_a_hand_held_camera(corners, given, recordings, R_cam_imu):
     R_imu_target = {frame.stamp_ns: R_cam_imu.T @ R
                     for frame, (R, _) in zip(corners, given, strict=True)
                     if imu.coverage(frame.stamp_ns, frame.stamp_ns) is Coverage.AVAILABLE}
-    up = np.mean([imu.specific_force(at, at)[1][0] @ R for at, R in R_imu_target.items()], axis=0)
+    up = np.mean([imu.force.between(at, at)[1][0] @ R for at, R in R_imu_target.items()], axis=0)
     errors, sigmas = [], []
     for at, R in R_imu_target.items():
         if at > corners[0].stamp_ns + 10_000_000_000:

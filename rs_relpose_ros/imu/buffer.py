@@ -71,11 +71,10 @@ class Series:
             if stamps[position] == stamp_ns:
                 return False
         if self._end == len(self._stamps):
-            values, size = self.values, max(256, 2 * len(stamps))
-            self._stamps = np.empty(size, dtype=np.int64)
-            self._values = np.empty((size, values.shape[1]))
+            more = max(256, len(stamps))
+            self._values = np.concatenate([self.values, np.empty((more, self._values.shape[1]))])
+            self._stamps = np.concatenate([stamps, np.empty(more, dtype=np.int64)])
             self._start, self._end = 0, len(stamps)
-            self._stamps[:self._end], self._values[:self._end] = stamps, values
         at = self._start + position
         self._stamps[at + 1:self._end + 1] = self._stamps[at:self._end]
         self._values[at + 1:self._end + 1] = self._values[at:self._end]
@@ -89,20 +88,20 @@ class Series:
         if keep > 0:
             self._start += keep
 
-    def between(self, start_ns: int, end_ns: int) -> tuple[Stamps, Array]:
-        """Stamps and values from `start_ns` to `end_ns`, both within the series.
+    def between(self, start_ns: int, end_ns: int) -> tuple[Stamps, Array] | None:
+        """Stamps (K,) and values (K, width) of an interval; None if it is not covered.
 
         The values at the two borders are interpolated; one entry where they are equal.
         """
-        first, last = (int(self.stamps.searchsorted(start_ns, 'right')),
-                       int(self.stamps.searchsorted(end_ns)))
+        if self.coverage(start_ns, end_ns) is not Coverage.AVAILABLE:
+            return None
         if start_ns == end_ns:
             return np.array([start_ns]), self._interpolated(start_ns)[None]
-        stamps, values = np.empty(last - first + 2, np.int64), np.empty((last - first + 2, 3))
-        stamps[0], stamps[1:-1], stamps[-1] = start_ns, self.stamps[first:last], end_ns
-        values[0], values[-1] = self._interpolated(start_ns), self._interpolated(end_ns)
-        values[1:-1] = self.values[first:last]
-        return stamps, values
+        inside = slice(int(self.stamps.searchsorted(start_ns, 'right')),
+                       int(self.stamps.searchsorted(end_ns)))
+        return (np.concatenate([[start_ns], self.stamps[inside], [end_ns]]),
+                np.concatenate([self._interpolated(start_ns)[None], self.values[inside],
+                                self._interpolated(end_ns)[None]]))
 
     def _interpolated(self, at_ns: int) -> Array:
         stamps, values = self.stamps, self.values
@@ -131,37 +130,23 @@ class Series:
 
 
 @dataclass(frozen=True, slots=True)
-class Orientation:
-    """Orientation computed by the IMU itself, reduced to the direction of gravity."""
-
-    down: Vector   # unit direction of free fall in the IMU frame: minus the world's z (REP-103)
-    sigma: float   # [rad] per axis of that direction
-
-
-@dataclass(frozen=True, slots=True)
 class ImuSample:
     """Content of one message, in the IMU frame; None for a sensor that it does not contain."""
 
     stamp_ns: int   # on the IMU clock
     angular_velocity: Vector | None   # [rad/s]
     linear_acceleration: Vector | None   # [m/s^2] specific force: 9.81 upwards at rest (REP-145)
-    orientation: Orientation | None = None   # only with a covariance in the message
-
-
-class AddResult(Enum):
-    """Outcome for a sample."""
-
-    ADDED = 'added'
-    DUPLICATE = 'duplicate'
-    LATE = 'late'
+    # Of an orientation that the IMU computes, with a covariance in the message: unit direction of
+    # free fall (minus the world's z, REP-103), and its sigma per axis [rad].
+    orientation: tuple[float, float, float, float] | None = None
 
 
 # Bounds of the mean length of the specific force over some seconds, in standard gravities: no
 # carrier accelerates for so long. In units of g it is 1 m/s^2, in mg or feet too large.
 _LIKELY_LENGTHS = (0.7, 1.4)
-# Consecutive samples that are bit-equal on one axis, close to the largest value there: the sensor
-# is at the end of its range, which is at least this many gravities.
-_CLIPPED_SAMPLES, _LEAST_RANGE = 3, 1.5
+# Three consecutive samples that are bit-equal on one axis, close to the largest value there, are
+# the end of the sensor's range, which is at least this many gravities.
+_LEAST_RANGE = 1.5
 
 
 class ForceFault(str):
@@ -190,11 +175,8 @@ def force_fault(forces: Array) -> str:
         return ''
     equal = (forces[1:] == forces[:-1]) & (size[1:] >= np.maximum(
         0.999 * size.max(axis=0), _LEAST_RANGE * STANDARD_GRAVITY))
-    run = np.lib.stride_tricks.sliding_window_view(equal, _CLIPPED_SAMPLES - 1, axis=0) \
-        if len(equal) >= _CLIPPED_SAMPLES - 1 else np.zeros((0, 3, 1), dtype=bool)
-    if run.all(axis=2).any():
-        return f'the accelerometer is clipped at {size.max():.3g} m/s^2'
-    return ''
+    clipped = (equal[1:] & equal[:-1]).any()
+    return f'the accelerometer is clipped at {size.max():.3g} m/s^2' if clipped else ''
 
 
 class ImuInterval(NamedTuple):
@@ -267,22 +249,16 @@ class ImuSamples:
         known = len(stamps) and stamps[-1] - stamps[0] >= _TESTED_NS
         return force_fault(self.force.values) if known else ''
 
-    def add(self, sample: ImuSample) -> AddResult:
-        """Store a sample; InputError if a value is not finite, and nothing is stored."""
+    def add(self, sample: ImuSample) -> bool:
+        """Store a sample, or False for a duplicate; InputError if a value is not finite."""
         for name, value in (('angular_velocity', sample.angular_velocity),
                             ('linear_acceleration', sample.linear_acceleration)):
             if value is not None and not all(map(math.isfinite, value)):
                 raise InputError(f'IMU sample at {sample.stamp_ns} ns: {name} must be finite, '
                                  f'got {list(value)}')
-        newest_ns, own = self.newest_ns, sample.orientation
         added = self.gyro.insert(sample.stamp_ns, sample.angular_velocity)
         added |= self.force.insert(sample.stamp_ns, sample.linear_acceleration)
-        if own is not None:
-            added |= self._down.insert(sample.stamp_ns, (*own.down, own.sigma))
-        if not added:
-            return AddResult.DUPLICATE
-        late = newest_ns is not None and sample.stamp_ns < newest_ns
-        return AddResult.LATE if late else AddResult.ADDED
+        return self._down.insert(sample.stamp_ns, sample.orientation) or added
 
     def prune(self, before_ns: int) -> None:
         """Remove what is older than `before_ns`."""
@@ -306,14 +282,12 @@ class ImuSamples:
 
     def between(self, start_ns: int, end_ns: int) -> ImuInterval | None:
         """Samples of both sensors from one time to a later one; None if one has a gap."""
-        sensors = self.gyro, self.force
-        if end_ns <= start_ns or any(series.coverage(start_ns, end_ns) is not Coverage.AVAILABLE
-                                     for series in sensors):
+        if (end_ns <= start_ns or (gyro := self.gyro.between(start_ns, end_ns)) is None
+                or (force := self.force.between(start_ns, end_ns)) is None):
             return None
-        (gyro_ns, rates), (force_ns, forces) = (s.between(start_ns, end_ns) for s in sensors)
         return ImuInterval(*integration.at_common_times(
-            (gyro_ns - start_ns) / NANOSECONDS, rates,
-            (force_ns - start_ns) / NANOSECONDS, forces))
+            (gyro[0] - start_ns) / NANOSECONDS, gyro[1],
+            (force[0] - start_ns) / NANOSECONDS, force[1]))
 
     def up_to(self, end_ns: int, seconds: float) -> ImuInterval | None:
         """Samples of both sensors of at most the last `seconds` before a time, if any."""
@@ -343,14 +317,14 @@ class ImuBuffer(ImuSamples):
         self._bias = filters.BiasTracker(self._config)
         self._filtered_ns = self._pruned_ns = int(np.iinfo(np.int64).min)
 
-    def add(self, sample: ImuSample) -> AddResult:
-        """Store a sample; InputError if a value is not finite, and nothing is stored."""
-        result = super().add(sample)
+    def add(self, sample: ImuSample) -> bool:
+        """Store a sample, or False for a duplicate; InputError if a value is not finite."""
+        added = super().add(sample)
         # Pruned when a tenth is too old: a search per sample would cost more than the memory.
         if sample.stamp_ns - self._pruned_ns > self._keep_ns * 11 // 10:
             self._pruned_ns = sample.stamp_ns - self._keep_ns
             self.prune(self._pruned_ns)
-        return result
+        return added
 
     def prune(self, before_ns: int) -> None:
         """Remove what is older than `before_ns`."""
@@ -367,33 +341,23 @@ class ImuBuffer(ImuSamples):
         if end_ns < start_ns:
             raise InputError(f'the interval must not end ({end_ns}) before it starts ({start_ns})')
         half = to_nanoseconds(0.5 * exposure)
-        coverage = self.coverage(start_ns - half, end_ns + half)
-        if coverage is not Coverage.AVAILABLE:
+        rows = self.gyro.between(start_ns, end_ns)
+        exposed = self.gyro.between(start_ns - half, end_ns + half) if half else rows
+        if exposed is None or rows is None:
             raise InputError(f'the gyro does not cover [{start_ns - half}, {end_ns + half}] ns: '
-                             f'{coverage.value}')
-        stamps_ns, rates = self.gyro.between(start_ns, end_ns)
+                             f'{self.coverage(start_ns - half, end_ns + half).value}')
+        stamps_ns, rates = rows
         if half:
-            rates = integration.mean_rates(
-                *self.gyro.between(start_ns - half, end_ns + half), stamps_ns, exposure)
+            rates = integration.mean_rates(*exposed, stamps_ns, exposure)
         return stamps_ns, rates - self.bias(end_ns).value
 
-    def specific_force(self, start_ns: int, end_ns: int) -> tuple[Stamps, Array] | None:
-        """Accelerometer over an interval, its borders interpolated; None if it has a gap there.
-
-        Stamps (K,) and specific forces (K, 3) [m/s^2] in the IMU frame.
-        """
-        available = self.force.coverage(start_ns, end_ns) is Coverage.AVAILABLE
-        return self.force.between(start_ns, end_ns) if available else None
-
-    def recent_forces(self, until_ns: int) -> Array:
-        """Specific forces (K, 3) [m/s^2] of the last seconds up to a time, IMU frame."""
-        # Half of the buffer, which is there independently of the time of the query.
-        return self._forces_between(until_ns - self._keep_ns // 2, until_ns)
-
-    def _forces_between(self, start_ns: int, end_ns: int) -> Array:
+    def recent_forces(self, until_ns: int, duration_ns: int | None = None) -> Array:
+        """Specific forces (K, 3) [m/s^2] up to a time, IMU frame."""
         stamps = self.force.stamps
+        # Half of the buffer, which is there independently of the time of the query.
+        start_ns = until_ns - (self._keep_ns // 2 if duration_ns is None else duration_ns)
         return self.force.values[int(np.searchsorted(stamps, start_ns)):
-                                  int(np.searchsorted(stamps, end_ns, side='right'))]
+                                  int(np.searchsorted(stamps, until_ns, side='right'))]
 
     def bias(self, at_ns: int) -> GyroBias:
         """Bias of the gyro at a time, from samples up to it; to be called in the order of time."""
@@ -417,8 +381,7 @@ class ImuBuffer(ImuSamples):
         that call, rotated back by the gyro.
         """
         if self._config.gravity_filter == 'mean':
-            estimate = filters.mean_gravity(
-                self._forces_between(at_ns - filters.MEAN_WINDOW_NS, at_ns))
+            estimate = filters.mean_gravity(self.recent_forces(at_ns, filters.MEAN_WINDOW_NS))
         else:
             self._run_filters(at_ns)
             estimate, stamp_ns = self._filter.estimate(), self._filter.stamp_ns
@@ -465,12 +428,11 @@ class ImuBuffer(ImuSamples):
     def _forces_at(self, stamps_ns: Stamps) -> Array:
         """Latest specific forces (K, 3) not after these stamps; NaN if older than a gap."""
         stamps = self.force.stamps
-        forces = np.full((len(stamps_ns), 3), np.nan)
+        if not len(stamps):
+            return np.full((len(stamps_ns), 3), np.nan)
         k = np.searchsorted(stamps, stamps_ns, side='right') - 1
-        fresh = k >= 0
-        fresh[fresh] = stamps_ns[fresh] - stamps[k[fresh]] <= self._gap_ns
-        forces[fresh] = self.force.values[k[fresh]]
-        return forces
+        fresh = (k >= 0) & (stamps_ns - stamps[k] <= self._gap_ns)
+        return np.where(fresh[:, None], self.force.values[k], np.nan)
 
 
 def frame_imu(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_cam_imu: Array,
@@ -513,11 +475,11 @@ def _frame_force(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int,
                  motion: FrameMotion, previous_reference_ns: int | None,
                  gravity: GravityEstimate | None) -> FrameForce | str:
     """The accelerometer's share of a frame, or the reason why there is none."""
-    first_ns = span_ns[0] if previous_reference_ns is None else previous_reference_ns
     if fault := force_fault(buffer.recent_forces(span_ns[1])):
         return fault
-    within = buffer.specific_force(*span_ns)
-    before = buffer.specific_force(min(first_ns, reference_ns), reference_ns)
+    first_ns = span_ns[0] if previous_reference_ns is None else previous_reference_ns
+    within = buffer.force.between(*span_ns)
+    before = buffer.force.between(min(first_ns, reference_ns), reference_ns)
     if within is None or before is None or gravity is None:
         return 'the accelerometer has a gap'
     stamps_ns, forces = within

@@ -21,7 +21,7 @@ from rs_relpose_ros.config.settings import Parameters, pinhole_of_matrix
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
-from rs_relpose_ros.imu.buffer import ImuSample, Orientation
+from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.pipeline.sequencer import Refusal, Sequencer
 from rs_relpose_ros.tracking import images
 
@@ -165,8 +165,9 @@ def _imu_of_cdr(data: bytes) -> tuple[int, tuple[float, ...]]:
     return _nanoseconds(seconds, nanoseconds), numbers
 
 
-def _orientation(quat_xyzw: Sequence[float], first: float, second: float) -> Orientation | None:
-    """Down in the IMU frame; None without usable variances, `first` and `second` of the diagonal.
+def _orientation(quat_xyzw: Sequence[float], first: float,
+                 second: float) -> tuple[float, float, float, float] | None:
+    """Down and its sigma; None without usable variances, `first` and `second` of the diagonal.
 
     Drivers without an orientation leave all zeros, "unknown" by REP-145.
     """
@@ -175,9 +176,8 @@ def _orientation(quat_xyzw: Sequence[float], first: float, second: float) -> Ori
     if not (first > 0.0 and 0.0 < variance < math.pi**2 and abs(norm2 - 1.0) < 0.02):
         return None
     # Minus the third row of R(q), world from IMU.
-    down = (-2.0 * (x * z - w * y) / norm2, -2.0 * (y * z + w * x) / norm2,
-            -(w * w - x * x - y * y + z * z) / norm2)
-    return Orientation(down, math.sqrt(variance))
+    return (-2.0 * (x * z - w * y) / norm2, -2.0 * (y * z + w * x) / norm2,
+            -(w * w - x * x - y * y + z * z) / norm2, math.sqrt(variance))
 
 
 def _vector(name: str, vector: Sequence[float], largest: float) -> tuple[float, float, float]:

@@ -20,7 +20,7 @@ from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import timing
 from rs_relpose_ros.geometry.camera import Intrinsics
 from rs_relpose_ros.geometry.timing import NANOSECONDS, seconds_between, to_nanoseconds
-from rs_relpose_ros.imu.buffer import AddResult, Coverage, frame_imu, ImuBuffer, ImuSample
+from rs_relpose_ros.imu.buffer import Coverage, frame_imu, ImuBuffer, ImuSample
 from rs_relpose_ros.pipeline.monitor import Applied
 from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.tracking.images import EncodedImage, GrayLevels
@@ -202,10 +202,10 @@ class Sequencer:
             before_ns = buffer.gyro.newest_ns
             added = buffer.add(sample)
             counts.imu_samples += 1
-            counts.imu_repeated += added is AddResult.DUPLICATE
+            counts.imu_repeated += not added
             if has_gyro and before_ns is not None:
                 # Of two topics one is always behind; late is a gyro sample behind another one.
-                counts.imu_late += added is AddResult.LATE and stamp_ns < before_ns
+                counts.imu_late += added and stamp_ns < before_ns
                 counts.imu_gaps += stamp_ns - before_ns > self._max_gap_ns
             if self._queue:
                 self._update_queue()
