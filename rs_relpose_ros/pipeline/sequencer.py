@@ -9,6 +9,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+import math
 import threading
 import time
 from typing import Any
@@ -100,46 +101,34 @@ class QueuedFrame:
     ready_ns: int | None = None   # None until the IMU covers its last row
 
 
-def _because(reason: str, queued: QueuedFrame) -> str:
-    """A reason for which a frame has no IMU data, and clocks that differ."""
-    apart = timing.clocks_apart(queued.ahead)
-    return f'{reason}: {apart}' if apart else reason
+class _StampOrder:
+    """Recognises single wild stamps, and runs of `patience` that only a clock set back produces.
 
+    Late messages are behind the newest, too, but come alone.
+    """
 
-class _BackwardStamps:
-    """Distinguishes stamps of a clock that was set back from those of late messages."""
-
-    def __init__(self, patience: int) -> None:
+    def __init__(self, patience: float) -> None:
         self._patience = patience
-        self._last_ns, self._count = 0, 0
-
-    def add(self, stamp_ns: int, newest_ns: int | None) -> bool:
-        """Whether this stamp ends a run of stamps that only a clock set back can produce."""
-        if newest_ns is None or stamp_ns >= newest_ns:
-            self._count = 0
-            return False
-        self._count = self._count + 1 if self._count and stamp_ns > self._last_ns else 1
-        self._last_ns = stamp_ns
-        if self._count < self._patience:
-            return False
-        self._count = 0
-        return True
-
-
-class _WildStamps:
-    """Recognises single stamps far from the one before: zeros, or far in the future."""
-
-    def __init__(self) -> None:
+        self._back_ns, self._count = 0, 0
         self._wild_ns: int | None = None   # the last one, unless the clock jumped to it
 
-    def add(self, stamp_ns: int, last_ns: int | None) -> bool:
-        """Whether this stamp is far from the last one, and no other came before it there."""
+    def is_wild(self, stamp_ns: int, last_ns: int | None) -> bool:
+        """Whether a stamp is far from the last one (zero), and no other came before it there."""
         if last_ns is None or abs(stamp_ns - last_ns) <= _FAR_NS:
             self._wild_ns = None
             return False
         confirmed = self._wild_ns is not None and 0 < stamp_ns - self._wild_ns <= _FAR_NS
         self._wild_ns = None if confirmed else stamp_ns
         return not confirmed
+
+    def is_set_back(self, stamp_ns: int, newest_ns: int | None) -> bool:
+        """Whether a stamp ends a run behind the newest one, each newer than the one before."""
+        if newest_ns is None or stamp_ns >= newest_ns:
+            self._count = 0
+            return False
+        continued = 0 < self._count < self._patience and stamp_ns > self._back_ns
+        self._back_ns, self._count = stamp_ns, self._count + 1 if continued else 1
+        return self._count >= self._patience
 
 
 class Sequencer:
@@ -165,13 +154,11 @@ class Sequencer:
         self._changed = threading.Condition()
         self._closed = False
         self._buffer = ImuBuffer(parameters.imu)
-        self._samples_back = _BackwardStamps(_BACK_SAMPLES)
         # Of samples without and with a gyro, and of frames.
-        self._wild_samples = _WildStamps(), _WildStamps()
-        self._wild_frames = _WildStamps()
+        self._sample_orders = _StampOrder(math.inf), _StampOrder(_BACK_SAMPLES)
+        self._frame_order = _StampOrder(_BACK_FRAMES)
         self._queue: deque[QueuedFrame] = deque()
         self._refusals: deque[FrameRefused] = deque(maxlen=None if offline else _REFUSALS_KEPT)
-        self._frames_back = _BackwardStamps(_BACK_FRAMES)
         self._last_stamp_ns: int | None = None
         self._intervals = timing.FrameIntervals()
         self._previous_ns: int | None = None   # reference time of the frame taken before
@@ -188,25 +175,24 @@ class Sequencer:
         """Store an IMU sample; InputError if it is unusable, and nothing is stored."""
         has_gyro, stamp_ns = sample.angular_velocity is not None, sample.stamp_ns
         with self._changed:
-            buffer, counts = self._buffer, self._counts
+            buffer, counts, order = self._buffer, self._counts, self._sample_orders[has_gyro]
             last_ns = (buffer.gyro if has_gyro else buffer.force).newest_ns
-            if self._wild_samples[has_gyro].add(stamp_ns, last_ns):
+            if order.is_wild(stamp_ns, last_ns):
                 counts.imu_wild += 1
                 return
-            set_back = has_gyro and self._samples_back.add(stamp_ns, buffer.gyro.newest_ns)
-            newest_ns = buffer.newest_ns
+            newest_ns, set_back = buffer.newest_ns, order.is_set_back(stamp_ns, last_ns)
             if newest_ns is not None and (set_back or stamp_ns < newest_ns - CLOCK_JUMP_NS):
-                self._jump('IMU stamps jumped back by '
-                           f'{seconds_between(stamp_ns, newest_ns):.3f} s')
+                self._restart(Refusal.CLOCK_JUMP, 'IMU stamps jumped back by '
+                              f'{seconds_between(stamp_ns, newest_ns):.3f} s')
                 buffer.clear()
-            before_ns = buffer.gyro.newest_ns
+                last_ns = None
             added = buffer.add(sample)
             counts.imu_samples += 1
             counts.imu_repeated += not added
-            if has_gyro and before_ns is not None:
+            if has_gyro and last_ns is not None:
                 # Of two topics one is always behind; late is a gyro sample behind another one.
-                counts.imu_late += added and stamp_ns < before_ns
-                counts.imu_gaps += stamp_ns - before_ns > self._max_gap_ns
+                counts.imu_late += added and stamp_ns < last_ns
+                counts.imu_gaps += stamp_ns - last_ns > self._max_gap_ns
             if self._queue:
                 self._update_queue()
 
@@ -301,15 +287,16 @@ class Sequencer:
                 taken_ns=taken_ns)
         except InputError as error:
             with self._changed:
-                return self._counted(image.stamp_ns, Refusal.BAD_IMAGE, str(error))
+                self._refuse(image.stamp_ns, Refusal.BAD_IMAGE, str(error))
+                return self._refusals.popleft()
         with self._changed:
             # Stamps may have jumped meanwhile, and the buffer then belongs to another time.
             span_ns = self._corrected(head.span_ns)
             if (head.generation != self._generation
                     or self._buffer.coverage(*span_ns) is not Coverage.AVAILABLE):
-                return self._counted(
-                    frame.stamp_ns, Refusal.CLOCK_JUMP,
-                    'stamps jumped while the frame was decoded: its gyro samples are lost')
+                self._refuse(frame.stamp_ns, Refusal.CLOCK_JUMP, 'stamps jumped while the frame '
+                             'was decoded: its gyro samples are lost')
+                return self._refusals.popleft()
             reference_ns, previous_ns = head.reference_ns + self._offset_ns, self._previous_ns
             if previous_ns is not None and reference_ns - previous_ns > self._longest_interval_ns:
                 previous_ns = None
@@ -330,56 +317,44 @@ class Sequencer:
 
     def _decided_head(self) -> QueuedFrame | FrameRefused | None:
         """The oldest refusal, or the oldest frame if it is ready or must be refused."""
-        if self._refusals:
-            return self._refusals.popleft()
-        if not self._queue:
-            return None
-        head = self._queue[0]
-        start_ns, end_ns = self._corrected(head.span_ns)
-        # A tracked offset may have moved a frame that was ready.
-        coverage = (self._buffer.coverage(start_ns, end_ns)
-                    if head.ready_ns is not None and self._imu_reaches(end_ns)
-                    else Coverage.NOT_YET)
-        if coverage is Coverage.AVAILABLE:
-            return self._queue.popleft()
-        if coverage is Coverage.NEVER:
-            refusal, reason = Refusal.IMU_GAP, _because(_IMU_GAP, head)
-        elif self._closed:
-            refusal, reason = Refusal.NO_IMU, _because(
-                'the gyro ends before the last row of the frame', head)
-        elif not self._offline and self._now() >= head.received_ns + MAX_IMU_WAIT_NS:
-            refusal, reason = Refusal.NO_IMU, _because(
-                'no gyro sample that covers the last row of the frame came within '
-                f'{MAX_IMU_WAIT_NS / NANOSECONDS:g} s', head)
-        else:
-            return None
-        self._queue.popleft()
-        return self._counted(head.image.stamp_ns, refusal, reason)
+        if self._queue and not self._refusals:
+            head = self._queue[0]
+            start_ns, end_ns = self._corrected(head.span_ns)
+            # A tracked offset may have moved a frame that was ready.
+            coverage = (self._buffer.coverage(start_ns, end_ns)
+                        if head.ready_ns is not None and self._imu_reaches(end_ns)
+                        else Coverage.NOT_YET)
+            if coverage is Coverage.AVAILABLE:
+                return self._queue.popleft()
+            if coverage is Coverage.NEVER:
+                self._drop(head, Refusal.IMU_GAP, _IMU_GAP)
+            elif self._closed:
+                self._drop(head, Refusal.NO_IMU, 'the gyro ends before the last row of the frame')
+            elif not self._offline and self._now() >= head.received_ns + MAX_IMU_WAIT_NS:
+                self._drop(head, Refusal.NO_IMU, 'no gyro sample that covers the last row of the '
+                           f'frame came within {MAX_IMU_WAIT_NS / NANOSECONDS:g} s')
+        return self._refusals.popleft() if self._refusals else None
 
     def _update_queue(self) -> None:
         """Mark the frames that the IMU covers by now, and keep the queue within its bounds."""
-        now_ns = self._now()
-        ready = 0
+        now_ns, ready = self._now(), 0
         for queued in tuple(self._queue):
             if queued.ready_ns is None:
                 if not self._imu_reaches(self._corrected(queued.span_ns)[1]):
                     break
                 if self._buffer.coverage(*queued.span_ns) is Coverage.NEVER:
                     # Refused at once: it must not count as a frame that waits for the worker.
-                    self._queue.remove(queued)
-                    self._refuse(queued.image.stamp_ns, Refusal.IMU_GAP,
-                                 _because(_IMU_GAP, queued))
+                    self._drop(queued, Refusal.IMU_GAP, _IMU_GAP)
                     continue
                 queued.ready_ns = now_ns
             ready += 1
         if not self._offline:
             for _ in range(ready - MAILBOX_FRAMES):
-                self._refuse(self._queue.popleft().image.stamp_ns, Refusal.OVERLOAD,
-                             'the worker was too slow, newer frames wait')
+                self._drop(self._queue[0], Refusal.OVERLOAD,
+                           'the worker was too slow, newer frames wait')
             while len(self._queue) > WAITING_FRAMES:
-                head = self._queue.popleft()
-                self._refuse(head.image.stamp_ns, Refusal.NO_IMU, _because(
-                    f'{WAITING_FRAMES} newer frames wait for the gyro', head))
+                self._drop(self._queue[0], Refusal.NO_IMU,
+                           f'{WAITING_FRAMES} newer frames wait for the gyro')
         if ready:
             self._changed.notify()
 
@@ -405,12 +380,12 @@ class Sequencer:
         A stamp that only a clock set back can produce is accepted: time restarts with it.
         """
         last_ns = self._last_stamp_ns
-        if last_ns is not None and self._wild_frames.add(stamp_ns, last_ns):
+        if last_ns is not None and self._frame_order.is_wild(stamp_ns, last_ns):
             self._refuse(stamp_ns, Refusal.OUT_OF_ORDER, 'the stamp of the frame is '
                          f'{seconds_between(last_ns, stamp_ns):.0f} s from the one before, and '
                          'no other is near it')
             return False
-        set_back = self._frames_back.add(stamp_ns, last_ns)
+        set_back = self._frame_order.is_set_back(stamp_ns, last_ns)
         if last_ns is None or stamp_ns > last_ns:
             return True
         if stamp_ns == last_ns:
@@ -421,7 +396,7 @@ class Sequencer:
             self._refuse(stamp_ns, Refusal.OUT_OF_ORDER,
                          f'the frame is {back:.3f} s older than the one before')
             return False
-        self._jump(f'image stamps jumped back by {back:.3f} s')
+        self._restart(Refusal.CLOCK_JUMP, f'image stamps jumped back by {back:.3f} s')
         # The IMU may have jumped already, and then has the samples of this frame. After a small
         # step back it may hold samples of two times at once.
         newest_ns = self._buffer.newest_ns
@@ -429,23 +404,25 @@ class Sequencer:
             self._buffer.clear()
         return True
 
-    def _counted(self, stamp_ns: int, refusal: Refusal, reason: str) -> FrameRefused:
-        self._counts.refused[refusal] += 1
-        return FrameRefused(stamp_ns, refusal, reason)
-
     def _refuse(self, stamp_ns: int, refusal: Refusal, reason: str) -> None:
-        self._refusals.append(self._counted(stamp_ns, refusal, reason))
+        self._counts.refused[refusal] += 1
+        self._refusals.append(FrameRefused(stamp_ns, refusal, reason))
         self._changed.notify()
 
-    def _jump(self, reason: str) -> None:
-        self._counts.clock_jumps += 1
-        self._restart(Refusal.CLOCK_JUMP, reason)
+    def _drop(self, queued: QueuedFrame, refusal: Refusal, reason: str) -> None:
+        """Refuse a frame of the queue; one without IMU data perhaps for clocks that differ."""
+        self._queue.remove(queued)
+        apart = timing.clocks_apart(queued.ahead)
+        if apart and refusal in (Refusal.NO_IMU, Refusal.IMU_GAP):
+            reason = f'{reason}: {apart}'
+        self._refuse(queued.image.stamp_ns, refusal, reason)
 
     def _restart(self, refusal: Refusal, reason: str) -> None:
         """Refuse all frames in the queue: they belong to the time before."""
         self._generation += 1
+        self._counts.clock_jumps += refusal is Refusal.CLOCK_JUMP
         while self._queue:
-            self._refuse(self._queue.popleft().image.stamp_ns, refusal, reason)
+            self._drop(self._queue[0], refusal, reason)
         self._last_stamp_ns = self._previous_ns = None
         self._intervals = timing.FrameIntervals()
 
