@@ -269,7 +269,6 @@ def _rotation(topic: str, quaternion: Any) -> Array:
 # and many tracks are observed in both: the ratio of a point's distances there, in the one baseline
 # and in the other, is the ratio of the baselines. Errors accumulate as in any odometry.
 
-_AGAIN = 'the path restarts, at another scale'
 # Squared sine of the angle between two rays; they are parallel below it.
 _PARALLEL = 1e-18
 
@@ -332,64 +331,52 @@ class PoseChain:
     def add(self, pair: PublishedPair) -> PathStep:
         """Append a pair, to the path or as the first of a new one."""
         if self._R is not None and pair.reference_stamp_ns != self._stamp_ns:
-            self._lose_rotation(f'a pair is missing: {_AGAIN}')
-        if pair:
-            return self._add_pose(pair)
-        if pair.status == Status.PURE_ROTATION.value:
-            return self._step(pair, np.zeros(3))
-        if pair.rotation_known:
-            self._lose_position(f'a pair has no translation ({pair.status}): {_AGAIN}')
-            self._rotate(pair)
-        else:
-            self._lose_rotation(f'a pair has no rotation ({pair.status}): {_AGAIN}')
-        return PathStep((), '', False, math.nan, 0, math.nan)
-
-    def _add_pose(self, pair: PublishedPair) -> PathStep:
-        distances1, distances2 = track_distances(pair)
-        ratios = np.array([self._distances[track] / distances1[track]
-                           for track in distances1.keys() & self._distances.keys()])
-        if self._scale is not None and len(ratios) < self._min_shared_tracks:
-            self._lose_position(f'{len(ratios)} shared tracks, the scale needs '
-                                f'{self._min_shared_tracks}: {_AGAIN}')
-        self._distances = distances2
-        if self._scale is None:
-            self._scale = 1.0
-            return self._step(pair, pair.t, 1.0)
-        median = float(np.median(ratios))
-        self._scale *= median
-        # Median of normal deviates: sqrt(pi / 2) sigma / sqrt(n), sigma = 1.4826 MAD.
-        scatter = float(np.median(np.abs(ratios - median))) / median
-        return self._step(pair, self._scale * pair.t, self._scale, len(ratios),
-                          1.2533 * 1.4826 * scatter / len(ratios)**0.5)
-
-    def _step(self, pair: PublishedPair, movement: Array, scale: float = math.nan,
-              shared_tracks: int = 0, scale_sigma: float = math.nan) -> PathStep:
-        """Step by `movement` (3,), in the reference camera and the units of the path."""
+            self._end('a pair is missing', new_axes=True)
+        scale, shared_tracks, sigma = (
+            self._rescaled(pair) if pair else (math.nan, 0, math.nan))
+        if not pair.rotation_known:
+            self._end(f'a pair has no rotation ({pair.status})', new_axes=True)
+            return PathStep((), '', False, scale, shared_tracks, sigma)
         start = np.eye(3) if self._R is None else self._R
+        self._stamp_ns, self._R = pair.stamp_ns, pair.R if self._R is None else start @ pair.R
+        if not pair and pair.status != Status.PURE_ROTATION.value:
+            self._end(f'a pair has no translation ({pair.status})')
+            return PathStep((), '', False, scale, shared_tracks, sigma)
         poses, new_path, new_axes = [], '', False
         if self._position is None:
             self._position = np.zeros(3)
             poses.append(PathPose(pair.reference_stamp_ns, start, self._position))
             new_path, new_axes, self._new_axes = self._reason, self._new_axes, False
+        movement = scale * pair.t if pair else np.zeros(3)   # in the reference camera
         self._position = self._position + start @ movement
-        poses.append(PathPose(pair.stamp_ns, self._rotate(pair), self._position))
-        return PathStep(tuple(poses), new_path, new_axes, scale, shared_tracks, scale_sigma)
+        poses.append(PathPose(pair.stamp_ns, self._R, self._position))
+        return PathStep(tuple(poses), new_path, new_axes, scale, shared_tracks, sigma)
 
-    def _rotate(self, pair: PublishedPair) -> Array:
-        self._stamp_ns = pair.stamp_ns
-        self._R = pair.R if self._R is None else self._R @ pair.R
-        return self._R
+    def _rescaled(self, pair: PublishedPair) -> tuple[float, int, float]:
+        """Scale of a pair with a pose, its shared tracks, and the relative sigma of the ratio."""
+        distances1, distances2 = track_distances(pair)
+        ratios = np.array([self._distances[track] / distances1[track]
+                           for track in distances1.keys() & self._distances.keys()])
+        if self._scale is not None and len(ratios) < self._min_shared_tracks:
+            self._end(f'{len(ratios)} shared tracks, the scale needs {self._min_shared_tracks}')
+        self._distances = distances2
+        if self._scale is None:
+            self._scale = 1.0
+            return self._scale, 0, math.nan
+        median = float(np.median(ratios))
+        self._scale *= median
+        # Median of normal deviates: sqrt(pi / 2) sigma / sqrt(n), sigma = 1.4826 MAD.
+        scatter = float(np.median(np.abs(ratios - median))) / median
+        return self._scale, len(ratios), 1.2533 * 1.4826 * scatter / len(ratios)**0.5
 
-    def _lose_position(self, reason: str) -> None:
-        """End the path; the first reason since is that of the next one."""
+    def _end(self, reason: str, *, new_axes: bool = False) -> None:
+        """End the path, with its axes if these are `new`; the first reason is the next path's."""
         if self._position is not None:
-            self._reason = reason
+            self._reason = f'{reason}: the path restarts, at another scale'
         self._position = self._scale = None
         self._distances = {}
-
-    def _lose_rotation(self, reason: str) -> None:
-        self._lose_position(reason)
-        self._R, self._new_axes = None, True
+        if new_axes:
+            self._R, self._new_axes = None, True
 
 
 def track_distances(pair: PublishedPair) -> tuple[dict[int, float], dict[int, float]]:
