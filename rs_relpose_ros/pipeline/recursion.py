@@ -93,9 +93,8 @@ class PairInformation:
 def pair_information(pair: PairData, active: Array, about: Array) -> PairInformation | None:
     """Information of a pair, linearised about the deviations `about` (11,).
 
-    The deviations `active` (11,) are applied to the data of the pair already. About others the
-    pair is fitted again, since its estimate followed the active ones. None if there are too few
-    matches, or if a fit far from the gyro's rotation diverges.
+    Those applied already are `active` (11,): about others the pair is fitted again. None if there
+    are too few matches, or if a fit far from the gyro's rotation diverges.
     """
     at, step = about - active, math.ceil(len(pair.points1) / _MOST_MATCHES) or 1
     pair = replace(pair, camera=_lens(pair.camera, *at[FOCAL:]),
@@ -104,15 +103,13 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
     problem = build_problem(pair.points1, pair.points2, pair.camera, pair.motion1, pair.motion2,
                             pair.gyro_rotation, noise)
     keep = problem.valid
-    if np.count_nonzero(keep) < PARAMETERS:
-        return None
-    assert problem.rotation is not None and problem.rotation_information is not None
-    observations = np.ascontiguousarray(problem.observations[keep])
-    D, rows = _gyro(pair), _Rows.of(pair, problem, keep)
     rotation, information = problem.rotation, problem.rotation_information
-    if at.any():
-        rotation = so3.exp_so3(D[:, :DEVIATIONS] @ at) @ rotation
-        observations = rows.displaced(observations, at)
+    if np.count_nonzero(keep) < PARAMETERS or rotation is None or information is None:
+        return None
+    D, turns, shares = _gyro(pair), *_by_rows(pair, problem, keep)
+    moved = (turns @ at[:FOCAL])[None], (shares * at[READOUT])[None]
+    rotation = so3.exp_so3(D[:, :DEVIATIONS] @ at) @ rotation
+    observations = _displaced(problem.observations[None, keep], *moved)[0]
     prior = priors.Priors(np.zeros(3), np.zeros(3), 0.0, 0.0, pair.gyro_sigma**-2,
                           np.ascontiguousarray(rotation), information,
                           priors.isotropic(_VELOCITY_SIGMA, 1.0 / pair.interval))
@@ -121,8 +118,11 @@ def pair_information(pair: PairData, active: Array, about: Array) -> PairInforma
     sigma = _noise(r)
     weights = 1.0 / (1.0 + (r / (_CAUCHY_SIGMAS * sigma)) ** 2) / sigma**2
     J_x = jacobian(observations, state)
-    J_c = np.hstack([rows.derivatives(observations, state, r),
-                     _by_lens(pair, problem, rows, keep, at, state, r)])
+    delays = np.zeros((FOCAL, *shares.shape))
+    delays[READOUT] = _STEP * shares
+    stepped = (_displaced(observations[None], _STEP * np.moveaxis(turns, -1, 0), delays),
+               _displaced(_by_lens(pair, problem, keep), *moved))
+    J_c = (residuals(np.vstack(stepped).reshape(-1, 20), state).reshape(-1, len(r)) - r).T / _STEP
     # The gyro's rotation: theta = Log(R R_gyro^T), which R_gyro rotated by D c makes smaller.
     theta = so3.log_so3(np.ascontiguousarray(state.R @ rotation.T))
     H, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
@@ -245,14 +245,13 @@ def _gyro(pair: PairData) -> Array:
     return D
 
 
-def _by_lens(pair: PairData, problem: TwoViewProblem, rows: _Rows, keep: NDArray[np.bool_],
-             at: Array, state: TwoViewState, r: Array) -> Array:
-    """Derivatives (N, 4) of the residuals by FOCAL, DISTORTION, and the principal point [px].
+def _by_lens(pair: PairData, problem: TwoViewProblem, keep: NDArray[np.bool_]) -> Array:
+    """Observations (4, N, 20) with steps of FOCAL, DISTORTION, and the principal point [px].
 
     Rays and their derivatives by the pixel change together: with smaller rays alone, residuals in
     pixels would shrink with a longer focal length.
     """
-    camera, n = pair.camera, len(r)
+    camera, n = pair.camera, int(np.count_nonzero(keep))
     centre, out = np.array([camera.cx, camera.cy]), np.empty((4 * n, 20))
     for k, (points, motion) in enumerate(((pair.points1[keep], problem.motion1),
                                           (pair.points2[keep], problem.motion2))):
@@ -267,49 +266,53 @@ def _by_lens(pair: PairData, problem: TwoViewProblem, rows: _Rows, keep: NDArray
         derotate(rays, jacobian, np.tile(motion.rotations(tau), (4, 1, 1)),
                  camera.line_delay * motion.angular_velocity, out[:, 9 * k:9 * k + 9])
         out[:, 18 + k] = np.tile(tau, 4)
-    if at.any():
-        out = np.vstack([rows.displaced(block, at) for block in out.reshape(4, n, 20)])
-    return (residuals(out, state).reshape(4, n) - r).T / _STEP
+    return out.reshape(4, n, 20)
 
 
-class _Rows(NamedTuple):
-    """Derivatives of observations within a frame by deviations."""
+def _by_rows(pair: PairData, problem: TwoViewProblem,
+             keep: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Derivatives of rays (N, 2, 3, 9), rotated from their row to the middle one, on the left.
 
-    turns: Array   # (2, N, 3, 9) of a ray from its row to the middle one, on its left
-    shares: Array   # (2, N) signed share of the readout after the middle row
+    By all deviations but those of the lens. Also the rows' signed shares (N, 2) of the readout
+    after the middle one.
+    """
+    camera, n = pair.camera, np.count_nonzero(keep)
+    turns, shares = np.empty((n, 2, 3, FOCAL)), np.empty((n, 2))
+    for k, (points, motion) in enumerate(((pair.points1, problem.motion1),
+                                          (pair.points2, problem.motion2))):
+        shares[:, k] = (points[keep, 1] - 0.5 * (camera.height - 1)) / camera.height
+        turn, tau = turns[:, k], problem.observations[keep, 18 + k]
+        rate, along = motion.angular_velocity, tau[:, None, None]
+        later = tau[:, None] * _acceleration(motion, camera.row_time_span)
+        # Exp(c) A Exp(-c) for the small rotation A = Exp(w tau): c x (w tau)
+        turn[:, :, AXES] = -along * so3.skew(rate)
+        turn[:, :, OFFSET] = later
+        turn[:, :, READOUT] = shares[:, k, None] * rate + middle_share(camera) * later
+        turn[:, :, BIAS] = -along * pair.R_cam_imu
+        turn[:, :, findings.SCALE] = tau[:, None] * rate
+    return turns, shares
 
-    @classmethod
-    def of(cls, pair: PairData, problem: TwoViewProblem, keep: NDArray[np.bool_]) -> _Rows:
-        camera, n = pair.camera, np.count_nonzero(keep)
-        turns, shares = np.empty((2, n, 3, FOCAL)), np.empty((2, n))
-        for k, (points, motion) in enumerate(((pair.points1, problem.motion1),
-                                              (pair.points2, problem.motion2))):
-            shares[k] = (points[keep, 1] - 0.5 * (camera.height - 1)) / camera.height
-            turn, tau = turns[k], problem.observations[keep, 18 + k]
-            rate, along = motion.angular_velocity, tau[:, None, None]
-            later = tau[:, None] * _acceleration(motion, camera.row_time_span)
-            # Exp(c) A Exp(-c) for the small rotation A = Exp(w tau): c x (w tau)
-            turn[:, :, AXES] = -along * so3.skew(rate)
-            turn[:, :, OFFSET] = later
-            turn[:, :, READOUT] = shares[k][:, None] * rate + middle_share(camera) * later
-            turn[:, :, BIAS] = -along * pair.R_cam_imu
-            turn[:, :, findings.SCALE] = tau[:, None] * rate
-        return cls(turns, shares)
 
-    def displaced(self, observations: Array, at: Array) -> Array:
-        """Observations (N, 20) with the deviations `at`, except those of the lens."""
-        out = np.empty_like(observations)
-        _displace(observations, self.turns @ at[:FOCAL], self.shares * at[READOUT], out)
-        return out
+@kernel
+def _displaced(observations: Array, turns: Array, delays: Array) -> Array:
+    """Observations (K, N, 20) with rays rotated by `turns` (M, N, 2, 3) on the left, rows later.
 
-    def derivatives(self, observations: Array, state: TwoViewState, r: Array) -> Array:
-        """Derivatives (N, 9) of the residuals by all deviations except those of the lens."""
-        n = len(observations)
-        out = np.empty((FOCAL * n, 20))
-        for c in range(FOCAL):
-            _displace(observations, _STEP * self.turns[..., c],
-                      _STEP * self.shares * (c == READOUT), out[c * n:(c + 1) * n])
-        return (residuals(out, state).reshape(FOCAL, n) - r).T / _STEP
+    K or M is 1; `delays` (M, N, 2) [s].
+    """
+    out = np.empty((max(len(observations), len(turns)), *observations.shape[1:]))
+    for m in range(out.shape[0]):
+        given, deviation = m % len(observations), m % len(turns)
+        for i in range(out.shape[1]):
+            for column in range(18):
+                first, image, k = column - column % 3, column // 9, column % 3
+                p, q, turn = (k + 1) % 3, (k + 2) % 3, turns[deviation, i, image]
+                out[m, i, column] = (observations[given, i, column]
+                                     + turn[p] * observations[given, i, first + q]
+                                     - turn[q] * observations[given, i, first + p])
+            for image in range(2):
+                out[m, i, 18 + image] = (observations[given, i, 18 + image]
+                                         + delays[deviation, i, image])
+    return out
 
 
 def middle_share(camera: RollingShutterCamera) -> float:
@@ -325,21 +328,6 @@ def _acceleration(motion: FrameMotion, span: tuple[float, float]) -> Array:
     first, last = motion.rotations([-half, half])
     forward, backward = so3.log_so3(last), -so3.log_so3(first)
     return np.asarray((forward - backward) / half**2)
-
-
-@kernel
-def _displace(observations: Array, turns: Array, delays: Array, out: Array) -> None:
-    """Observations with rays rotated on the left by `turns` (2, N, 3), rows later by `delays`."""
-    for i in range(observations.shape[0]):
-        for image in range(2):
-            out[i, 18 + image] = observations[i, 18 + image] + delays[image, i]
-            turn = turns[image, i]
-            for base in range(9 * image, 9 * image + 9, 3):
-                for k in range(3):
-                    p, q = (k + 1) % 3, (k + 2) % 3
-                    out[i, base + k] = (observations[i, base + k]
-                                        + turn[p] * observations[i, base + q]
-                                        - turn[q] * observations[i, base + p])
 
 
 # -- Other times of the rows -------------------------------------------------------------------
