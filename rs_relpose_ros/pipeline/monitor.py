@@ -249,7 +249,7 @@ class Tracked:
                    offset - along[READOUT] * float(configured.active[READOUT]),
                    math.sqrt(float(along @ estimated.covariance @ along)),
                    float(readout) * configured.direction, float(estimated.sigma[READOUT]),
-                   estimated.pairs)
+                   len(estimated.b))
 
 
 @dataclass(frozen=True, slots=True)

@@ -70,11 +70,6 @@ class PairData:
     R_cam_imu: Array
     gyro_sigma: float   # [rad/s] of the rate within a frame
 
-    @property
-    def rates(self) -> tuple[Array, Array]:
-        """Of the gyro, (3,) at the two stamped rows [rad/s]."""
-        return self.segment.angular_velocities[0], self.segment.angular_velocities[-1]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairInformation:
@@ -166,8 +161,8 @@ def _shifts(pair: PairData, problem: TwoViewProblem, state: TwoViewState, H: Arr
     covariance, tangent = inverse(H), so3.tangent_basis(state.t)
     moved = -covariance @ C
     to_middle = problem.motion1.rotations([problem.reference_row_time])[0]
-    share, rate1 = middle_share(pair.camera), to_middle @ pair.rates[0]
-    rate2 = to_middle @ (pair.gyro_rotation @ pair.rates[1])
+    share, rates = middle_share(pair.camera), pair.segment.angular_velocities
+    rate1, rate2 = to_middle @ rates[0], to_middle @ (pair.gyro_rotation @ rates[-1])
     moved[TANGENT:TANGENT + 2, READOUT] += share * (tangent.T @ so3.skew(rate1) @ state.t)
     moved[THETA:THETA + 3, READOUT] += share * (rate1 - rate2)
     spread = np.linalg.cholesky(covariance[_POSE[:, None], _POSE])
@@ -180,8 +175,7 @@ def _shifts(pair: PairData, problem: TwoViewProblem, state: TwoViewState, H: Arr
 def _common_noise(matches: FitMatches, J: Array, r: Array, S: Array) -> tuple[float, float]:
     """Variance of the score of the matches by image regions, over that by S; at least 1.
 
-    Residuals of neighbours are similar where images are dark or blurred, or where the distortion
-    is wrong: the second value is without those that a distortion explains. J (N, 11), r (N,):
+    The second value is without residuals that a distortion explains. J (N, 11), r (N,):
     derivatives and residuals of the fitted matches, S (11, 11): information of the pair.
     """
     scale = np.outer(PRIOR_SIGMA, PRIOR_SIGMA)
@@ -236,9 +230,9 @@ def _lens(camera: RollingShutterCamera, focal: float, distortion: float) -> Roll
 
 def _gyro(pair: PairData) -> Array:
     """Left derivative (3, 13) of the gyro's rotation between the middle rows, as of the rays."""
-    D = np.zeros((3, DEVIATIONS + 2))
+    D, rates = np.zeros((3, DEVIATIONS + 2)), pair.segment.angular_velocities
     D[:, AXES] = np.eye(3) - pair.gyro_rotation
-    D[:, OFFSET] = pair.gyro_rotation @ pair.rates[1] - pair.rates[0]
+    D[:, OFFSET] = pair.gyro_rotation @ rates[-1] - rates[0]
     D[:, READOUT] = middle_share(pair.camera) * D[:, OFFSET]
     D[:, BIAS] = -pair.gyro_sensitivity.by_rate @ pair.R_cam_imu
     D[:, findings.SCALE] = pair.gyro_sensitivity.by_scale
@@ -277,13 +271,17 @@ def _by_rows(pair: PairData, problem: TwoViewProblem,
     after the middle one.
     """
     camera, n = pair.camera, np.count_nonzero(keep)
+    half = 0.5 * (camera.row_time_span[1] - camera.row_time_span[0])
     turns, shares = np.empty((n, 2, 3, FOCAL)), np.empty((n, 2))
     for k, (points, motion) in enumerate(((pair.points1, problem.motion1),
                                           (pair.points2, problem.motion2))):
         shares[:, k] = (points[keep, 1] - 0.5 * (camera.height - 1)) / camera.height
         turn, tau = turns[:, k], problem.observations[keep, 18 + k]
-        rate, along = motion.angular_velocity, tau[:, None, None]
-        later = tau[:, None] * _acceleration(motion, camera.row_time_span)
+        rate, along, acceleration = motion.angular_velocity, tau[:, None, None], np.zeros(3)
+        if half > 0.0 and motion.knot_times is not None:   # of the second half against the first
+            first, last = map(so3.log_so3, motion.rotations([-half, half]))
+            acceleration = (last + first) / half**2
+        later = tau[:, None] * acceleration
         # Exp(c) A Exp(-c) for the small rotation A = Exp(w tau): c x (w tau)
         turn[:, :, AXES] = -along * so3.skew(rate)
         turn[:, :, OFFSET] = later
@@ -320,26 +318,15 @@ def middle_share(camera: RollingShutterCamera) -> float:
     return (0.5 * (camera.height - 1) - camera.reference_row_index) / camera.height
 
 
-def _acceleration(motion: FrameMotion, span: tuple[float, float]) -> Array:
-    """Angular acceleration [rad/s^2]: of the second half of the readout against its first."""
-    half = 0.5 * (span[1] - span[0])
-    if half <= 0.0 or motion.knot_times is None:
-        return np.zeros(3)
-    first, last = motion.rotations([-half, half])
-    forward, backward = so3.log_so3(last), -so3.log_so3(first)
-    return np.asarray((forward - backward) / half**2)
-
-
 # -- Other times of the rows -------------------------------------------------------------------
 
 _TIMES = [OFFSET, READOUT]
 
 
 def _at_other_times(pair: PairData, gyro: GyroSegment, deviations: Array) -> PairData | None:
-    """The pair with rows at the times of the deviations OFFSET and READOUT, not yet fitted.
+    """The pair with rows at the times of OFFSET and READOUT, not yet fitted.
 
-    By the deviations alone, rotations at other times are known to first order only: here `gyro`,
-    which extends beyond the pair, is integrated again. None if it does not cover all rows.
+    `gyro`, which extends beyond the pair, is integrated again; None if it does not cover all rows.
     """
     signed = pair.camera.line_delay * pair.camera.height + float(deviations[READOUT])
     camera = replace(pair.camera, readout_time=abs(signed),
@@ -404,11 +391,6 @@ class Calibration:
     widened: float   # and by the number of pairs
 
     @property
-    def pairs(self) -> int:
-        """Number of pairs."""
-        return len(self.b)
-
-    @property
     def sigma(self) -> Array:
         """(11,) 1 sigma."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
@@ -453,21 +435,14 @@ class Recursion:
 
     def add(self, stamp_ns: int, data: PairData, active: Array,
             about: Array) -> PairInformation | None:
-        """Add a pair, in the order of time; an earlier stamp restarts.
-
-        It is linearised about the deviations `about` (11,), which differ from those `active`
-        once a quantity is inconsistent. Returns the information of the pair, None if it has none.
-        """
+        """Add a pair, in the order of time; its information by `pair_information`."""
         information = pair_information(data, active, about)
         if information is not None:
             self._pairs.keep(_Entry(stamp_ns, data, active, about, information))
         return information
 
     def relinearise(self) -> bool:
-        """Linearise some older pairs about the last one's deviations, the furthest first.
-
-        Whether there were any.
-        """
+        """Linearise the furthest pairs about the last one's deviations; whether there are any."""
         last = self._pairs[-1]
         apart = np.linalg.norm(
             (np.array([pair.about for pair in self._pairs]) - last.about) / PRIOR_SIGMA, axis=1)
@@ -481,7 +456,7 @@ class Recursion:
         return bool(chosen)
 
     def _linearised(self, k: int, about: Array) -> PairInformation | None:
-        """Information of a pair about deviations, if these are of its times by the gyro there."""
+        """Information of pair `k` about other deviations; of its times, by the gyro there."""
         data, active = self._pairs[k].data, self._pairs[k].active
         if _far_in_time(about - active):
             gyro = data.segment
