@@ -103,13 +103,7 @@ class Effect(NamedTuple):
     """Shift of a pair's pose by deviations, or of its rotation alone if it has no translation."""
 
     shift: Array   # (5 or 3, 11) in sigmas of a correctly configured pose
-    # (6 or 3, 11) in the published sigmas, which may include the disagreement
-    claimed_shift: Array
-
-
-# Each quantity, and the log-determinant of the information of its prior.
-_PRIORS = tuple((quantity, -2.0 * float(np.log(PRIOR_SIGMA[quantity.part]).sum()))
-                for quantity in findings.QUANTITIES)
+    claimed_shift: Array   # (6 or 3, 11) in published sigmas, which may include the disagreement
 
 
 class Inconsistency(NamedTuple):
@@ -125,43 +119,38 @@ class Inconsistency(NamedTuple):
     claimed_shift: float
     alternative: Inconsistency | None = None   # hypothesis that fits the pairs as well
 
-    def matters(self, configured: Configured) -> bool:
-        """Whether it moves the pose by its sigma, and exceeds its configured sigma."""
-        beyond = np.abs(self.deviation) > _AS_CONFIGURED * configured.sigmas
-        return self.shift > _MATTERS and bool(beyond[self.quantity.part].any())
-
 
 def find_inconsistencies(estimated: Calibration, effects: Sequence[Effect],
                          configured: Configured) -> list[Inconsistency]:
     """The fewest deviations that fit the pairs, by forward selection; the strongest first.
 
     A fit of all quantities would distribute a deviation of one among all that few pairs cannot
-    distinguish. The quantity that gains most in chi-square is selected, and the others are
-    evaluated together with it. An alternative hypothesis is kept if it fits as well as the only
-    quantity.
+    distinguish. An alternative hypothesis is kept if it fits as well as the only quantity.
     """
     found: list[tuple[Quantity, float]] = []
-    alternative: tuple[Quantity, float] | None = None
+    alternative: Inconsistency | None = None
     selected = np.zeros(findings.DEVIATIONS, dtype=bool)
     together = _solved(selected, estimated, configured)
     while len(found) < _MOST_QUANTITIES:
-        (quantity, solution), (second, other) = sorted(
-            ((quantity, _solved(selected | _parts_of(quantity), estimated, configured))
-             for quantity in findings.QUANTITIES if not selected[quantity.part].any()),
-            key=lambda item: -item[1].gain(item[0].part))[:2]
+        (quantity, solution), (second, other) = _ranked([
+            quantity for quantity in findings.QUANTITIES if not selected[quantity.part].any()],
+            selected, estimated, configured)[:2]
         if (certainty := solution.certainty(quantity.part)) < _CERTAIN:
             break
         if not found and solution.gain(quantity.part) - other.gain(second.part) < _AS_GOOD:
-            alternative = second, other.certainty(second.part)
+            alternative = _inconsistency(second, other, other.certainty(second.part), effects)
         found.append((quantity, certainty))
         selected, together = selected | _parts_of(quantity), solution
     inconsistent = [_inconsistency(quantity, together, certainty, effects)
                     for quantity, certainty in found]
-    if alternative is not None and len(found) == 1:
-        inconsistent[0] = inconsistent[0]._replace(alternative=_inconsistency(
-            alternative[0], _solved(_parts_of(alternative[0]), estimated, configured),
-            alternative[1], effects))
-    return inconsistent
+    return [inconsistent[0]._replace(alternative=alternative)] if len(found) == 1 else inconsistent
+
+
+def _ranked(quantities: Sequence[Quantity], selected: NDArray[np.bool_], estimated: Calibration,
+            configured: Configured) -> list[tuple[Quantity, _Solution]]:
+    """Hypotheses that free one more quantity each; the one that gains most in chi-square first."""
+    return sorted(((quantity, _solved(selected | _parts_of(quantity), estimated, configured))
+                   for quantity in quantities), key=lambda item: -item[1].gain(item[0].part))
 
 
 def likely(estimated: Calibration, configured: Configured) -> Array:
@@ -169,10 +158,9 @@ def likely(estimated: Calibration, configured: Configured) -> Array:
 
     Far from an error of the times, pairs show little of it: they are linearised there, to see.
     """
-    (quantity, solution), _ = sorted(
-        ((quantity, _solved(_parts_of(quantity), estimated, configured))
-         for quantity in findings.QUANTITIES if quantity.tracking),
-        key=lambda item: -item[1].gain(item[0].part))
+    quantity, solution = _ranked([one for one in findings.QUANTITIES if one.tracking],
+                                 np.zeros(findings.DEVIATIONS, dtype=bool), estimated,
+                                 configured)[0]
     return np.where(_parts_of(quantity) & (solution.certainty(quantity.part) > _LIKELY),
                     solution.off, 0.0)
 
@@ -190,14 +178,16 @@ def undetermined(estimated: Calibration, configured: Configured) -> Array:
     odds, known = 0.0, configured.sigmas > 0.0
     known[findings.BIAS] = False
     estimated = replace(estimated, shared=1.0)
-    for quantity, of_prior in _PRIORS:
+    for quantity in findings.QUANTITIES:
         part = quantity.part
         if not known[part].any():
             solution = _solved(_parts_of(quantity), estimated, configured)
             covariance = np.ascontiguousarray(solution.covariance[part, part])
             gain = min(float(solution.off[part] @ inverse(covariance) @ solution.off[part]),
                        _LARGEST_GAIN)
-            odds += math.exp(0.5 * (log_determinant(covariance) + of_prior + gain)) / len(_PRIORS)
+            of_prior = -2.0 * float(np.log(PRIOR_SIGMA[part]).sum())
+            odds += math.exp(0.5 * (log_determinant(covariance) + of_prior + gain)) / len(
+                findings.QUANTITIES)
     share = odds / (1.0 + odds)
     within = _solved(np.zeros_like(known), estimated, configured).moment
     within[findings.BIAS] = within[:, findings.BIAS] = 0.0
@@ -232,11 +222,6 @@ class _Solution(NamedTuple):
         """(11,) 1 sigma, at least as the parts of the pairs scatter."""
         return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance),
                                              (self.by_pair**2).sum(axis=0))))
-
-    @property
-    def step(self) -> Array:
-        """(11,) from the deviations about which the pairs are linearised."""
-        return self.active + self.off - self.estimated.about
 
     @property
     def moment(self) -> Array:
@@ -280,14 +265,13 @@ def _solved(free: NDArray[np.bool_], estimated: Calibration, configured: Configu
 
 def _inconsistency(quantity: Quantity, solution: _Solution, certainty: float,
                    effects: Sequence[Effect]) -> Inconsistency:
-    def length(shifts: list[Array], quantile: float) -> float:
-        return float(np.quantile([np.linalg.norm(s) for s in shifts], quantile)) if shifts else 0.0
-
     deviation = np.where(_parts_of(quantity), solution.off, 0.0)
-    return Inconsistency(quantity, deviation, np.hypot(solution.sigma, _REMAINS * solution.step),
-                         certainty,
-                         length([effect.shift @ deviation for effect in effects], _OBSERVABLE_IN),
-                         length([effect.claimed_shift @ deviation for effect in effects], 0.5))
+    shift, claimed = (
+        float(np.quantile([np.linalg.norm(effect[k] @ deviation) for effect in effects], quantile))
+        if effects else 0.0 for k, quantile in enumerate((_OBSERVABLE_IN, 0.5)))
+    step = solution.active + solution.off - solution.estimated.about   # of the linearisation
+    return Inconsistency(quantity, deviation, np.hypot(solution.sigma, _REMAINS * step), certainty,
+                         shift, claimed)
 
 
 def assess(estimated: Calibration, inconsistent: list[Inconsistency], gross: tuple[Finding, ...],
@@ -299,10 +283,12 @@ def assess(estimated: Calibration, inconsistent: list[Inconsistency], gross: tup
             {finding.quantity for finding in gross}, gross[0].quantity))
     largest = max((one.shift for one in inconsistent), default=0.0)
     faults = {one.quantity.name: one for one in inconsistent
-              if one.matters(configured) and one.shift > _TRACE * largest}
-    faults |= {one.alternative.quantity.name: one.alternative for one in faults.values()
-               if one.alternative is not None}
-    alternatives = ' or '.join(faults) if any(one.alternative for one in faults.values()) else ''
+              if one.shift > max(_MATTERS, _TRACE * largest) and (np.abs(one.deviation) > (
+                  _AS_CONFIGURED * configured.sigmas))[one.quantity.part].any()}
+    others = {one.alternative.quantity.name: one.alternative for one in faults.values()
+              if one.alternative is not None}
+    faults |= others
+    alternatives = ' or '.join(faults) if others else ''
     found: list[Finding] = []
     for quantity in findings.QUANTITIES:
         part = quantity.part
@@ -352,8 +338,13 @@ def _fault_findings(one: Inconsistency, configured: Configured,
     if quantity.tracking and not getattr(configured.sensor, quantity.tracking) and (
             abs(estimated - (getattr(configured.sensor, quantity.name) or 0.0)) < quantity.reach):
         fix += f', or {quantity.tracking}: true'
-    if quantity.name == 'time_offset':
-        fix += _another_row(one, configured)
+    if quantity.name == 'time_offset':   # another stamped row may be equivalent
+        camera, sigma = configured.camera, one.sigma[findings.OFFSET]
+        rows = [row for row in REFERENCE_ROWS if row != camera.reference_row and abs(
+            one.deviation[findings.OFFSET] - camera.line_delay * (
+                camera.reference_row_index
+                - replace(camera, reference_row=row).reference_row_index)) < 2.0 * sigma]
+        fix += f' (stamp_row: {rows[0]} is equivalent)' if rows else ''
     if alternatives:
         fix += f' (ambiguous: {alternatives})'
     yield replace(found, fix=fix,
@@ -362,18 +353,6 @@ def _fault_findings(one: Inconsistency, configured: Configured,
             abs(estimated) < _LITTLE_OF * abs(found.configured)):
         yield _fault('image_geometry', 'hardly any distortion left in the images: they may be '
                      'rectified', 'subscribe to the original images', state)
-
-
-def _another_row(one: Inconsistency, configured: Configured) -> str:
-    """Remark on another stamped row that is equivalent to the same offset; empty for none."""
-    camera, sigma = configured.camera, one.sigma[findings.OFFSET]
-    for name in REFERENCE_ROWS:
-        row = replace(camera, reference_row=name).reference_row_index
-        makes = (camera.reference_row_index - row) * camera.line_delay
-        if name != camera.reference_row and (
-                abs(one.deviation[findings.OFFSET] - makes) < 2.0 * sigma):
-            return f' (stamp_row: {name} is equivalent)'
-    return ''
 
 
 def _fault(quantity: str, message: str, fix: str, state: FindingState = FindingState.WRONG,

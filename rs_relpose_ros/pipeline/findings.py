@@ -45,13 +45,7 @@ class FindingState(str, Enum):
     @property
     def verdict(self) -> str:
         """The state as `check` names it."""
-        return {FindingState.SUSPECT: 'warning', FindingState.WRONG: 'failure'}.get(
-            self, self.value)
-
-
-_ORDER = tuple(FindingState)
-# Order over a run: a quantity that was observable once is known.
-_WORSE = (FindingState.UNKNOWN, FindingState.OK, FindingState.SUSPECT, FindingState.WRONG)
+        return {'suspect': 'warning', 'wrong': 'failure'}.get(self.value, self.value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +96,7 @@ class Assessment:
     @property
     def state(self) -> FindingState:
         """State of the worst finding."""
-        return max((finding.state for finding in self.findings), key=_ORDER.index,
+        return max((finding.state for finding in self.findings), key=tuple(FindingState).index,
                    default=FindingState.UNKNOWN)
 
     @property
@@ -114,8 +108,7 @@ class Assessment:
     @property
     def is_gross(self) -> bool:
         """Whether the worst finding is a gross error (axes, unit, geometry), without a sigma."""
-        return bool(self.faults) and self.faults[0].state is FindingState.WRONG \
-            and self.faults[0].sigma is None
+        return self.state is FindingState.WRONG and self.faults[0].sigma is None
 
     @property
     def text(self) -> str:
@@ -139,10 +132,11 @@ def worst_of(before: Assessment, now: Assessment) -> Assessment:
     """
     traces = now.is_gross and not before.is_gross
     found = {} if traces else {finding.quantity: finding for finding in before.findings}
-    for finding in now.findings:
-        known = found.get(finding.quantity)
-        if known is None or _WORSE.index(finding.state) >= _WORSE.index(known.state):
-            found[finding.quantity] = finding
+    # What was observable once is known.
+    order = (FindingState.UNKNOWN, FindingState.OK, FindingState.SUSPECT, FindingState.WRONG)
+    for one in now.findings:
+        if order.index(found.setdefault(one.quantity, one).state) <= order.index(one.state):
+            found[one.quantity] = one
     return Assessment(tuple(found.values()))
 
 

@@ -34,8 +34,7 @@ _REMEMBERED, _PRIOR_PAIRS, _LARGEST_DISAGREEMENT = 20.0, 10.0, 20.0
 class ConsistencyMonitor:
     """Compares the configuration with frames and pairs in the order of time.
 
-    Each pair is added before its pose is published, and assessed after it. Live and in replay,
-    results are equal bit by bit.
+    Each pair is added before its pose is published, and assessed after it.
     """
 
     def __init__(self) -> None:
@@ -149,22 +148,17 @@ def suppressed(pose: RelativePose, health: Assessment) -> RelativePose:
 
 def _effect(information: recursion.PairInformation, pose: RelativePose) -> Effect:
     rows, claimed = slice(3, None), pose.covariance[3:, 3:]
-    shift = information.shift_by_deviation[:3]
-    if pose:
-        # t is a direction: along itself it has no variance, and nothing moves it there.
-        along = np.concatenate([pose.t, np.zeros(3)])
-        rows, claimed = slice(None), pose.covariance + np.outer(along, along)
-        shift = information.shift_by_deviation
-    return Effect(shift, solve_triangular(
+    if pose:   # t is a direction: along itself it has no variance, and nothing moves it there
+        rows, claimed = slice(None), pose.covariance + np.pad(np.outer(pose.t, pose.t), (0, 3))
+    return Effect(information.shift_by_deviation[:None if pose else 3], solve_triangular(
         np.linalg.cholesky(claimed), information.pose_by_deviation[rows], lower=True))
 
 
 class Agreement:
     """How far consecutive pairs agree about the direction of motion at the keyframe they share.
 
-    Errors that all tracks of a pair share (stamps, exposure, small errors of the calibration,
-    tilt) are not in its residuals, but in this difference. Of the pairs so far it gives a factor
-    for the covariances of those with frames between; two views give no velocity without priors.
+    Errors that all tracks of a pair share are not in its residuals, but in this difference. It
+    gives a factor for the covariances of pairs with frames between.
     """
 
     def __init__(self) -> None:
@@ -173,10 +167,7 @@ class Agreement:
 
     def enlarged(self, first_ns: int, second_ns: int, estimated: RelativePose,
                  assessed: RelativePose) -> RelativePose:
-        """Add a pair as estimated; the assessed pose with its covariance enlarged accordingly.
-
-        `first_ns`, `second_ns`: stamps of its keyframes. The factor is never below 1.
-        """
+        """Add a pair as estimated; the assessed pose with its covariance enlarged."""
         before, self._last = self._last, None
         if not (estimated and np.isfinite(estimated.linear_velocity1_covariance).all()):
             return assessed
@@ -236,10 +227,7 @@ class Tracked:
 
     @classmethod
     def of(cls, estimated: Calibration, configured: Configured) -> Tracked:
-        """Absolute values: configured plus estimated deviation.
-
-        The offset is the one that is consistent at the middle row, with the active readout time.
-        """
+        """Configured plus estimated values; the offset is that of the middle row."""
         along = np.zeros(len(estimated.c))
         along[OFFSET], along[READOUT] = 1.0, recursion.middle_share(configured.camera)
         offset = configured.sensor.time_offset + float(along @ estimated.c)
@@ -264,22 +252,17 @@ class Applied:
 
     def moved(self, estimated: Tracked, sensor: SensorConfig) -> Applied:
         """One step towards the estimate, or back to zero if the parameter is not tracked."""
-        offset = readout = 0.0
-        if sensor.track_time_offset:
-            known = estimated.time_offset_sigma < _APPLIED_SIGMA
-            offset = estimated.time_offset - sensor.time_offset if known else self.time_offset
-        if sensor.track_readout_time:
-            configured = sensor.readout_time or 0.0
-            known = estimated.readout_time_sigma < _APPLIED_SIGMA
-            readout = max(estimated.readout_time, 0.0) - configured if known else self.readout_time
-        # At most the rows that the frames so far cover.
-        readout = min(self.margin, _stepped(self.readout_time, readout, findings.LARGEST_READOUT,
-                                            _READOUT_STEP))
+        def stepped(tracked: bool, sigma: float, value: float, target: float, largest: float,
+                    step: float) -> float:
+            target = (target if sigma < _APPLIED_SIGMA else value) if tracked else 0.0
+            return value + min(max(min(max(target, -largest), largest) - value, -step), step)
+
+        offset = stepped(sensor.track_time_offset, estimated.time_offset_sigma, self.time_offset,
+                         estimated.time_offset - sensor.time_offset, findings.LARGEST_OFFSET,
+                         _OFFSET_STEP)
+        readout = min(self.margin, stepped(   # at most the rows that the frames so far cover
+            sensor.track_readout_time, estimated.readout_time_sigma, self.readout_time,
+            max(estimated.readout_time, 0.0) - (sensor.readout_time or 0.0),
+            findings.LARGEST_READOUT, _READOUT_STEP))
         ahead = _READOUT_STEP if sensor.track_readout_time else 0.0
-        return Applied(_stepped(self.time_offset, offset, findings.LARGEST_OFFSET, _OFFSET_STEP),
-                       readout, max(readout + ahead, 0.0))
-
-
-def _stepped(value: float, target: float, largest: float, step: float) -> float:
-    target = min(max(target, -largest), largest)
-    return value + min(max(target - value, -step), step)
+        return Applied(offset, readout, max(readout + ahead, 0.0))

@@ -34,10 +34,9 @@ _LOG_LIKELIHOOD = 20.0
 
 
 def rotation_of_rays(rays1: Array, rays2: Array) -> Array | None:
-    """Rotation vector (3,) of ``R_1^T R_2`` that aligns unit rays (N, 3) best.
+    """Rotation vector (3,) of ``R_1^T R_2`` that aligns unit rays (N, 3) best; None for too few.
 
-    Translation is not modelled: rays that move most have the least weight (Cauchy weights about
-    the median). None if there are too few rays.
+    Translation is not modelled: rays that move most have the least weight (Cauchy).
     """
     finite = np.isfinite(rays1 + rays2).all(axis=1)
     if np.count_nonzero(finite) < LEAST_RAYS:
@@ -75,17 +74,11 @@ class RotationComparison:
 
     @property
     def is_left_handed(self) -> bool:
-        """Whether a reflection fits the images better than any rotation, for certain.
-
-        If all rotations are about two axes both fit equally.
-        """
+        """Whether a reflection fits for certain better than any rotation, about three axes."""
         return self._certain(self.left_at_best, self.left_mirrored)
 
     def _certain(self, left: float, left_instead: float) -> bool:
-        """Whether the second hypothesis is better, by the ratio of the likelihoods.
-
-        Normal errors of unknown variance; a rotation has three components.
-        """
+        """Whether the second hypothesis is better, by the likelihoods of three components."""
         ratio = max(left, 1e-9) / max(left_instead, 1e-9)
         return 1.5 * self.count * math.log(ratio) > _LOG_LIKELIHOOD
 
@@ -110,24 +103,23 @@ class RotationSums(LastSeconds):
         if len(self) < _FEWEST:
             return None
         _, intervals, theta, phi = (np.array(column) for column in zip(*self, strict=True))
-        by_images = float(np.linalg.norm(theta, axis=1).sum())
-        by_gyro = float(np.linalg.norm(phi, axis=1).sum())
+        by_images, by_gyro = (float(np.linalg.norm(one, axis=1).sum()) for one in (theta, phi))
         if max(by_images, by_gyro) < _LEAST_ANGLE or by_gyro < 1e-3 * _LEAST_ANGLE:
             return None
         left_of_all = _left(float((theta * phi).sum()), theta, phi)
-        theta, phi = _unsteady(theta, intervals), _unsteady(phi, intervals)
+        theta, phi = (   # without the constant rate that fits best
+            one - np.outer(intervals, intervals @ one / (intervals @ intervals))
+            for one in (theta, phi))
         M = theta.T @ phi
         U, singular, Vt = np.linalg.svd(M)
         handed = math.copysign(1.0, float(np.linalg.det(U @ Vt)))
-        rotation = np.ascontiguousarray((U * (1.0, 1.0, handed)) @ Vt)
-        trace = float(singular[0] + singular[1] + handed * singular[2])
-        mirrored = float(singular[0] + singular[1] - handed * singular[2])
+        (rotation, trace), (reflection, mirrored) = (
+            (np.ascontiguousarray((U * (1.0, 1.0, sign)) @ Vt),
+             float(singular[0] + singular[1] + sign * singular[2])) for sign in (handed, -handed))
         return RotationComparison(
             _left(float(np.trace(M)), theta, phi), left_of_all, _left(trace, theta, phi),
-            _left(mirrored, theta, phi), rotation,
-            np.ascontiguousarray((U * (1.0, 1.0, -handed)) @ Vt),
-            trace / max(float((phi**2).sum()), _NO_ROTATION), by_gyro,
-            len(self))
+            _left(mirrored, theta, phi), rotation, reflection,
+            trace / max(float((phi**2).sum()), _NO_ROTATION), by_gyro, len(self))
 
 
 def _left(trace: float, theta: Array, phi: Array) -> float:
@@ -137,12 +129,6 @@ def _left(trace: float, theta: Array, phi: Array) -> float:
     """
     power = float((theta**2).sum()) * float((phi**2).sum())
     return 1.0 - trace * abs(trace) / max(power, _NO_ROTATION)
-
-
-def _unsteady(rotations: Array, intervals: Array) -> Array:
-    """Rotations (N, 3) over intervals (N,) [s] without the constant rate that fits best."""
-    rate = intervals @ rotations / (intervals @ intervals)
-    return np.asarray(rotations - np.outer(intervals, rate))
 
 
 # -- Accelerometer against images, by the pairs of the last seconds -------------------------------
@@ -189,18 +175,16 @@ class AccelerationSums(LastSeconds):
             message, _, fix = self._fault.partition(': ')
             return Finding('accel_scale', FindingState.SUSPECT, message, fix, observable=True)
         configured, opposite = self._sums()
+        likelihood = f'with the images (log-likelihood {configured:+.0f})'
         if self.contradicts:
-            fix = ('reverse its sign: at rest a specific force of +9.8 m/s^2 points up'
-                   if opposite > _CERTAIN else 'correct the driver: the axes differ from those of '
-                   'the gyro, or the data are of another IMU')
-            return Finding('accel_axes', FindingState.SUSPECT, 'accelerometer inconsistent with '
-                           f'the images (log-likelihood {configured:+.0f}), not used until both '
-                           'agree', fix, observable=True)
-        if configured > _CERTAIN:
-            return Finding('accel_axes', FindingState.OK, 'accelerometer consistent with the '
-                           f'images (log-likelihood {configured:+.0f})', observable=True)
-        return None
+            return Finding(
+                'accel_axes', FindingState.SUSPECT, f'accelerometer inconsistent {likelihood}, '
+                'not used until both agree',
+                'reverse its sign: at rest a specific force of +9.8 m/s^2 points up'
+                if opposite > _CERTAIN else 'correct the driver: the axes differ from those of '
+                'the gyro, or the data are of another IMU', observable=True)
+        return Finding('accel_axes', FindingState.OK, f'accelerometer consistent {likelihood}',
+                       observable=True) if configured > _CERTAIN else None
 
     def _sums(self) -> tuple[float, float]:
-        return (sum(configured for _, configured, _ in self),
-                sum(opposite for _, _, opposite in self))
+        return sum(configured for _, configured, _ in self), sum(one for _, _, one in self)
