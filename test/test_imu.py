@@ -85,7 +85,7 @@ def test_any_order_of_arrival_gives_the_same_bits(order, divided, data):
     for k, item in enumerate(arriving):
         b.add(item)
         if k == query:
-            b.coverage(START, START + SECOND)
+            b.gyro.coverage(START, START + SECOND)
             b.between(START, START + 10 * PERIOD)
     end = START + 59 * PERIOD - 1
     assert np.array_equal(a.rotation(START, end)[0], b.rotation(START, end)[0])
@@ -97,18 +97,18 @@ def test_any_order_of_arrival_gives_the_same_bits(order, divided, data):
 def test_coverage():
     buffer = ImuBuffer(ImuConfig(max_imu_gap=0.02))
     end = START + 9 * PERIOD
-    assert buffer.coverage(START, START + 1) is Coverage.NOT_YET
+    assert buffer.gyro.coverage(START, START + 1) is Coverage.NOT_YET
     for item in wobbling(10):
         buffer.add(item)
     assert buffer.complete(START, end) and not buffer.complete(START, end + 1)
     for start_ns, end_ns, expected in ((START, end, Coverage.AVAILABLE),
                                        (START - 1, end, Coverage.NEVER),
                                        (START, end + 1, Coverage.NOT_YET)):
-        assert buffer.coverage(start_ns, end_ns) is expected
+        assert buffer.gyro.coverage(start_ns, end_ns) is expected
         assert (buffer.between(start_ns, end_ns) is None) == (expected is not Coverage.AVAILABLE)
     buffer.add(ImuSample(end + 21_000_000, (0.0, 0.0, 0.0), tuple(UP)))
-    assert buffer.coverage(START, end + 1) is Coverage.NEVER
-    assert buffer.coverage(START, end) is Coverage.AVAILABLE
+    assert buffer.gyro.coverage(START, end + 1) is Coverage.NEVER
+    assert buffer.gyro.coverage(START, end) is Coverage.AVAILABLE
     assert not buffer.complete(START, end + 1)
     with pytest.raises(InputError, match='does not cover'):
         buffer.angular_velocity(START, end + 1)
@@ -123,7 +123,7 @@ def test_duplicates_are_reported_and_all_samples_can_be_removed():
         True, True, True, False]
     buffer.clear()
     assert buffer.newest_ns is None and buffer.gravity(START + PERIOD) is None
-    assert buffer.coverage(START, START + PERIOD) is Coverage.NOT_YET
+    assert buffer.gyro.coverage(START, START + PERIOD) is Coverage.NOT_YET
     assert buffer.add(replace(first, stamp_ns=0))
 
 
@@ -140,8 +140,8 @@ def test_nothing_of_a_broken_sample_is_kept(name, axis, value):
 def test_buffer_is_bounded():
     buffer = filled(wobbling(3000), imu_buffer_seconds=2.0)
     newest = START + 2999 * PERIOD
-    assert buffer.coverage(newest - 1_900_000_000, newest) is Coverage.AVAILABLE
-    assert buffer.coverage(newest - 2_300_000_000, newest) is Coverage.NEVER
+    assert buffer.gyro.coverage(newest - 1_900_000_000, newest) is Coverage.AVAILABLE
+    assert buffer.gyro.coverage(newest - 2_300_000_000, newest) is Coverage.NEVER
 
 
 @given(st.integers(0, 9 * PERIOD), st.integers(0, 9 * PERIOD))

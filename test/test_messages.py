@@ -1,6 +1,7 @@
 """Messages of rclpy and rosbags to arrays, and results to messages; transforms of a robot."""
 
 from dataclasses import replace
+from itertools import pairwise
 import json
 import math
 from pathlib import Path
@@ -29,13 +30,13 @@ from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.messages import incoming, outgoing, transforms
-from rs_relpose_ros.messages.incoming import Intake, Role, StuckCamera, StuckGyro
+from rs_relpose_ros.messages.incoming import Intake, repeats, Role, StuckGyro
 from rs_relpose_ros.messages.published_pair import published_pair
 from rs_relpose_ros.messages.transforms import FrameTree, Transform, with_extrinsics
 from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState
 from rs_relpose_ros.pipeline.pair import PairResult
 from rs_relpose_ros.pipeline.sequencer import Refusal, Sequencer
-from rs_relpose_ros.tracking.images import GrayLevels
+from rs_relpose_ros.tracking.images import CompressedImage, GrayLevels
 
 # Luma of ITU-R BT.601.
 WEIGHTS = np.array([0.299, 0.587, 0.114])
@@ -473,16 +474,13 @@ def test_sensors_may_repeat_values(values, options, count):
 
 
 def test_an_image_that_repeats_the_one_before():
-    camera = StuckCamera()
     pixels = np.random.default_rng(0).integers(0, 256, 8000, dtype=np.uint8)
     other = pixels.copy()
     other[5050] ^= 1
-    repeats = [bool(camera.problem(stamp, data))
-               for stamp, data in enumerate((
-                   pixels, pixels.copy(), other, other, pixels[:4000], pixels))]
-    assert repeats == [False, True, False, True, False, False]
-    # The same message once more.
-    assert camera.problem(5, pixels.copy()) == ''
+    images = [CompressedImage(data, 'jpeg', stamp, 'camera') for stamp, data in enumerate((
+        pixels, pixels.copy(), other, other, pixels[:4000], pixels))]
+    assert [repeats(*two) for two in pairwise(images)] == [True, False, True, False, False]
+    assert not repeats(images[-1], images[-1])   # the same message once more
 
 
 # -- Transforms of a robot: rules, bags, commands, calibration -------------------------------

@@ -129,7 +129,7 @@ def half_seconds(frames, imu):
     later = np.searchsorted(stamps, stamps + HALF_SECOND - 10_000_000)
     return [(i, j) for i, j in enumerate(later) if j < len(stamps)
             and abs(stamps[j] - stamps[i] - HALF_SECOND) < 10_000_000
-            and imu.coverage(int(stamps[i]), int(stamps[j])) is Coverage.AVAILABLE]
+            and imu.gyro.coverage(int(stamps[i]), int(stamps[j])) is Coverage.AVAILABLE]
 
 
 def test_gyro_over_half_a_second(corners, given, imu, R_cam_imu, recordings):
@@ -152,7 +152,7 @@ def test_gravity_of_a_hand_held_camera(corners, given, recordings, R_cam_imu):
     imu = all_samples(recordings / 'euroc_imu_april_corners', ImuConfig(gyro_bias=GYRO_BIAS))
     R_imu_target = {frame.stamp_ns: R_cam_imu.T @ R
                     for frame, (R, _) in zip(corners, given, strict=True)
-                    if imu.coverage(frame.stamp_ns, frame.stamp_ns) is Coverage.AVAILABLE}
+                    if imu.gyro.coverage(frame.stamp_ns, frame.stamp_ns) is Coverage.AVAILABLE}
     up = np.mean([imu.force.between(at, at)[1][0] @ R for at, R in R_imu_target.items()], axis=0)
     errors, sigmas = [], []
     for at, R in R_imu_target.items():

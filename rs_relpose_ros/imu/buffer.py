@@ -35,10 +35,7 @@ class Coverage(Enum):
 
 
 class Series:
-    """Stamped vectors (K, width) in the order of their stamps, in growing contiguous arrays.
-
-    `gap_ns`: largest step between samples that cover an interval.
-    """
+    """Stamped vectors (K, width) in order, in growing arrays; steps above `gap_ns` are gaps."""
 
     def __init__(self, gap_ns: int, width: int = 3) -> None:
         self._gap_ns = gap_ns
@@ -89,10 +86,7 @@ class Series:
             self._start += keep
 
     def between(self, start_ns: int, end_ns: int) -> tuple[Stamps, Array] | None:
-        """Stamps (K,) and values (K, width) of an interval; None if it is not covered.
-
-        The values at the two borders are interpolated; one entry where they are equal.
-        """
+        """Stamps (K,), values (K, width), borders interpolated; None if not covered."""
         if self.coverage(start_ns, end_ns) is not Coverage.AVAILABLE:
             return None
         if start_ns == end_ns:
@@ -180,10 +174,7 @@ def force_fault(forces: Array) -> str:
 
 
 class ImuInterval(NamedTuple):
-    """Samples between two times: seconds (K,) from the first, rates and forces (K, 3), IMU frame.
-
-    At the stamps of either sensor, the other one interpolated.
-    """
+    """Samples between two times at the stamps of both sensors: (K,), (K, 3), in the IMU frame."""
 
     seconds: Array
     rates: Array
@@ -214,11 +205,7 @@ _TESTED_NS = 1_000_000_000
 
 
 class ImuSamples:
-    """Gyro and accelerometer samples, and orientations; both sensors in one message or in two.
-
-    `max_gap` [s]: largest distance of samples that cover an interval. Equal samples in any order
-    give bit-equal answers.
-    """
+    """Samples of both sensors and orientations, in any order; `max_gap` [s] covers an interval."""
 
     def __init__(self, max_gap: float) -> None:
         self._gap_ns = to_nanoseconds(max_gap)
@@ -233,8 +220,8 @@ class ImuSamples:
     @property
     def newest_ns(self) -> int | None:
         """Newest stamp of any kind."""
-        return max((series.newest_ns for series in (self.gyro, self.force, self._down)
-                    if series.newest_ns is not None), default=None)
+        newest = (series.newest_ns for series in (self.gyro, self.force, self._down))
+        return max((stamp_ns for stamp_ns in newest if stamp_ns is not None), default=None)
 
     @property
     def both_until_ns(self) -> int | None:
@@ -264,10 +251,6 @@ class ImuSamples:
         """Remove what is older than `before_ns`."""
         for series in (self.gyro, self.force, self._down):
             series.prune(before_ns)
-
-    def coverage(self, start_ns: int, end_ns: int) -> Coverage:
-        """Whether the gyro covers [start_ns, end_ns] without a gap."""
-        return self.gyro.coverage(start_ns, end_ns)
 
     def complete(self, start_ns: int, end_ns: int) -> bool:
         """Whether all samples between two times seem to have arrived."""
@@ -300,8 +283,7 @@ class ImuSamples:
 class ImuBuffer(ImuSamples):
     """Samples of the last seconds, with causal filters of gravity and gyro bias.
 
-    Answers do not depend on the order of queries: the filters run sample by sample over the sorted
-    gyro, up to the requested time.
+    The filters run sample by sample over the sorted gyro, up to the requested time.
     """
 
     def __init__(self, config: ImuConfig) -> None:
@@ -333,10 +315,10 @@ class ImuBuffer(ImuSamples):
 
     def angular_velocity(self, start_ns: int, end_ns: int,
                          exposure: float = 0.0) -> tuple[Stamps, Array]:
-        """Gyro over an interval, its borders interpolated; one entry if they are equal.
+        """Stamps (K,), rates (K, 3) [rad/s] of an interval, borders interpolated, IMU frame.
 
-        Stamps (K,) and rates (K, 3) [rad/s] in the IMU frame, `bias` of `end_ns` subtracted; each
-        is the mean over `exposure` [s] about its stamp, as that of a row that is exposed so long.
+        The `bias` of `end_ns` is subtracted; each rate is the mean over `exposure` [s]
+        about its stamp.
         """
         if end_ns < start_ns:
             raise InputError(f'the interval must not end ({end_ns}) before it starts ({start_ns})')
@@ -345,7 +327,7 @@ class ImuBuffer(ImuSamples):
         exposed = self.gyro.between(start_ns - half, end_ns + half) if half else rows
         if exposed is None or rows is None:
             raise InputError(f'the gyro does not cover [{start_ns - half}, {end_ns + half}] ns: '
-                             f'{self.coverage(start_ns - half, end_ns + half).value}')
+                             f'{self.gyro.coverage(start_ns - half, end_ns + half).value}')
         stamps_ns, rates = rows
         if half:
             rates = integration.mean_rates(*exposed, stamps_ns, exposure)
@@ -365,20 +347,16 @@ class ImuBuffer(ImuSamples):
         return self._bias.estimate(at_ns)
 
     def rotation(self, start_ns: int, end_ns: int) -> tuple[Array, Array]:
-        """``R_start^T R_end`` (3, 3) in the IMU frame and the covariance of its error.
-
-        See `integrate_rotation`.
-        """
+        """``R_start^T R_end`` (3, 3) in the IMU frame, covariance: see `integrate_rotation`."""
         stamps_ns, rates = self.angular_velocity(start_ns, end_ns)
         return integration.integrate_rotation(stamps_ns, rates, self._config,
                                               self.bias(end_ns).sigma)
 
     def gravity(self, at_ns: int) -> GravityEstimate | None:
-        """Direction of gravity at a time that the gyro covers, from samples up to it.
+        """Direction of gravity at a time that the gyro covers, from samples up to it, if any.
 
-        None without accelerometer and orientation, or if the gyro does not cover the time. To be
-        called in the order of time: for a time before that of an earlier call, the estimate of
-        that call, rotated back by the gyro.
+        To be called in the order of time: before that of an earlier call, its estimate is
+        rotated back.
         """
         if self._config.gravity_filter == 'mean':
             estimate = filters.mean_gravity(self.recent_forces(at_ns, filters.MEAN_WINDOW_NS))
@@ -405,7 +383,7 @@ class ImuBuffer(ImuSamples):
                     to_ns: int) -> GravityEstimate | None:
         """An estimate propagated to another time by the gyro; None if that has a gap."""
         start_ns, end_ns = sorted((from_ns, to_ns))
-        if self.coverage(start_ns, end_ns) is not Coverage.AVAILABLE:
+        if self.gyro.coverage(start_ns, end_ns) is not Coverage.AVAILABLE:
             return None
         R, _ = self.rotation(start_ns, end_ns)
         return replace(estimate, direction=(R.T if from_ns < to_ns else R) @ estimate.direction)
@@ -437,11 +415,11 @@ class ImuBuffer(ImuSamples):
 
 def frame_imu(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_cam_imu: Array,
               previous_reference_ns: int | None = None, exposure: float = 0.0) -> FrameImu:
-    """The IMU's share of a frame from `buffer`; all times are on the IMU clock.
+    """The IMU's share of a frame; all times are on the IMU clock, ``v_cam = R_cam_imu v_imu``.
 
-    `span_ns`: begin of the first row's exposure and end of the last one's, which the buffer must
-    cover; `reference_ns` and `previous_reference_ns`: of the stamped rows of this frame and of the
-    one processed before; `exposure` [s]: of each row. ``v_cam = R_cam_imu v_imu``.
+    `span_ns`: from the first row's exposure to the end of the last one's; `reference_ns`,
+    `previous_reference_ns`: of the stamped rows of this frame and the one before; `exposure`
+    [s]: of a row.
     """
     half = to_nanoseconds(0.5 * exposure)
     start_ns, end_ns = span_ns = span_ns[0] + half, span_ns[1] - half   # of the rows' times
@@ -460,7 +438,7 @@ def frame_imu(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_
         gravity_sigma = estimate.sigma
     since_previous = None
     if (previous_reference_ns is not None and previous_reference_ns < reference_ns
-            and buffer.coverage(previous_reference_ns - half, reference_ns + half)
+            and buffer.gyro.coverage(previous_reference_ns - half, reference_ns + half)
             is Coverage.AVAILABLE):
         stamps_ns, rates = buffer.angular_velocity(previous_reference_ns, reference_ns, exposure)
         bias = buffer.bias(reference_ns)

@@ -62,8 +62,7 @@ def is_at_rest(rates: Array, forces: Array) -> bool:
                 and forces.std(axis=0).max() < _REST_FORCE)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class GyroBias:
+class GyroBias(NamedTuple):
     """Bias (3,) [rad/s] in the IMU frame and its `sigma` per axis."""
 
     value: Array
@@ -88,17 +87,13 @@ class BiasTracker:
         self._growth = self._prior / BIAS_MEMORY
         self._bias = np.array(config.gyro_bias)
         self._variance = self._prior
-        self._measured_ns: int | None = None
+        self._measured_ns = 0
         self._rest: _Rest | None = None
         self._pending: tuple[NDArray[np.int64], Array, Array] = (
             np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty((0, 3)))
 
     def run(self, stamps_ns: NDArray[np.int64], rates: Array, forces: Array) -> None:
-        """Process samples (K,) after those before, their stamps strictly increasing.
-
-        `rates` (K, 3) [rad/s]: as measured; `forces` (K, 3) [m/s^2]: specific force at these
-        stamps, NaN without one.
-        """
+        """Process later samples: stamps (K,), rates [rad/s], forces [m/s^2], or NaN."""
         if not self._follow:
             return
         old = self._pending
@@ -127,20 +122,14 @@ class BiasTracker:
         variance = self._variance_at(rest.end_ns) + rest.variance
         if float(np.abs(rest.mean - self._bias).max()) > _GATE * math.sqrt(variance):
             return
-        if before is not None:
-            self._measure(before)
         self._rest = rest
-
-    def _measure(self, rest: _Rest) -> None:
-        variance = self._variance_at(rest.end_ns)
-        gain = variance / (variance + rest.variance) if variance > 0.0 else 0.0
-        self._bias = self._bias + gain * (rest.mean - self._bias)
-        self._variance = (1.0 - gain) * variance
-        self._measured_ns = rest.end_ns
+        if before is not None:
+            variance = self._variance_at(before.end_ns)
+            gain = variance / (variance + before.variance) if variance > 0.0 else 0.0
+            self._bias = self._bias + gain * (before.mean - self._bias)
+            self._variance, self._measured_ns = (1.0 - gain) * variance, before.end_ns
 
     def _variance_at(self, at_ns: int) -> float:
-        if self._measured_ns is None:
-            return self._prior
         passed = max(at_ns - self._measured_ns, 0) * 1e-9
         return min(self._variance + self._growth * passed, self._prior)
 
@@ -249,10 +238,7 @@ class GravityFilter:
         return GravityEstimate(-up, math.sqrt(variance), float(length), math.sqrt(length_variance))
 
     def _begin(self, k: int, stamps_ns: NDArray[np.int64], rates: Array, forces: Array) -> int:
-        """Start from the first specific force at or after sample `k`; the index after it.
-
-        The bias and its variance are kept.
-        """
+        """Start from the first specific force at or after sample `k`; the index after it."""
         usable = np.flatnonzero(np.linalg.norm(forces[k:], axis=1) > 0.0)
         if len(usable) == 0:
             return len(stamps_ns)
@@ -271,10 +257,7 @@ class GravityFilter:
 @kernel
 def _advance(state: _State, noise: _Noise, stamp_ns: int, rate: Array,
              stamps_ns: NDArray[np.int64], rates: Array, forces: Array, gap_ns: int) -> int:
-    """Filter samples up to the first gap; their number.
-
-    `stamp_ns` and `rate` (3,) are those of the sample before.
-    """
+    """Filter samples after one of `stamp_ns` and `rate` (3,) up to the first gap; their number."""
     turn = np.empty(3)
     for k in range(len(stamps_ns)):
         if stamps_ns[k] - stamp_ns > gap_ns:
@@ -291,10 +274,7 @@ def _advance(state: _State, noise: _Noise, stamp_ns: int, rate: Array,
 
 @kernel
 def _direction_variance(length: float, acceleration: float) -> float:
-    """Variance per axis of the direction of a specific force of some length [m/s^2].
-
-    Excess of |f| is acceleration along gravity, and about as much is expected across it.
-    """
+    """Variance per axis of the direction of a force; excess of its length is as much across."""
     excess = length - STANDARD_GRAVITY
     return (acceleration + 4.0 * excess * excess) / (STANDARD_GRAVITY * STANDARD_GRAVITY)
 
@@ -427,8 +407,7 @@ def mean_gravity(forces: Array) -> GravityEstimate | None:
     """The paper's estimate: minus the mean specific force (K, 3) of a short window."""
     if len(forces) == 0:
         return None
-    mean = forces.mean(axis=0)
-    length = float(np.linalg.norm(mean))
+    length = float(np.linalg.norm(mean := forces.mean(axis=0)))
     if not length > 0.0:
         return None
     # Acceleration of the whole window; only its part along gravity shows in the length.
@@ -438,11 +417,7 @@ def mean_gravity(forces: Array) -> GravityEstimate | None:
 
 def agreed_gravity(own: GravityEstimate | None,
                    measured: GravityEstimate | None) -> GravityEstimate | None:
-    """The IMU's own estimate, unless it is absent or contradicts the accelerometer's.
-
-    An orientation may refer to another world frame (north-east-down, that of the start) or be a
-    placeholder: it is used only if it agrees with the accelerometer.
-    """
+    """The IMU's own estimate unless the accelerometer's contradicts (another world frame)."""
     if own is None:
         return measured
     own = replace(own, sigma=max(own.sigma, _LEAST_OWN_SIGMA))

@@ -80,10 +80,9 @@ class FrameImu:
 
 def mean_rates(stamps_ns: NDArray[np.int64], rates: Array, at_ns: NDArray[np.int64],
                width: float | Array) -> Array:
-    """Means (N, 3) of rates (K, 3), linear between samples, over `width` [s] about `at_ns` (N,).
+    """Exact means (N, 3) of rates (K, 3), linear between samples, over `width` [s] about `at_ns`.
 
-    Exact: the integral of the rates is quadratic between samples. Beyond the samples, the mean is
-    that of the part which they cover.
+    Beyond the samples, the mean is that of the part which they cover.
     """
     seconds = (stamps_ns - stamps_ns[0]) * 1e-9
     steps = np.diff(seconds)
@@ -229,10 +228,7 @@ _SKEW = np.array([skew(axis).ravel() for axis in np.eye(3)])
 
 def _error_derivatives(seconds: Array, rates: Array, rotations: Array, once: Array,
                        twice: Array) -> tuple[Array, Array]:
-    """Derivatives of (alpha, beta) by a bias of the force (6, 3), and by each step's rate.
-
-    `once`, `twice` (K, 3): integrals of the rotated specific force up to each sample.
-    """
+    """Derivatives of (alpha, beta) by a bias of the force (6, 3), and by the rate of each step."""
     steps = np.diff(seconds)
     middle = seconds[:-1] + 0.5 * steps
     left = seconds[-1] - middle
@@ -251,10 +247,7 @@ def _error_derivatives(seconds: Array, rates: Array, rotations: Array, once: Arr
 
 def inertial_motion(gyro: GyroSegment, forces: ForceSegment, frame1: FrameImu, frame2: FrameImu,
                     config: ImuConfig) -> InertialMotion | str:
-    """Motion of the IMU between the stamped rows of two frames, or the reason why there is none.
-
-    `gyro` and `forces` extend from the one to the other.
-    """
+    """Motion of the IMU between the stamped rows of two frames, or the reason for none."""
     first, second, sigma = frame1.force, frame2.force, frame2.gravity_sigma
     if isinstance(first, str):
         return first
@@ -288,10 +281,9 @@ def _resampled(gyro: GyroSegment, forces: ForceSegment) -> tuple[Array, Array, A
 
 def motions_on_the_way(whole: InertialMotion, first: FrameImu, since: FrameImu,
                        frames: Sequence[FrameImu]) -> list[InertialMotion | None]:
-    """Motions from the first frame to others before the last one, parts of its motion `whole`.
+    """Parts of the motion `whole` up to frames before the last one; None without accelerometer.
 
-    `since`: IMU data of the last frame since the first. None for a frame without accelerometer.
-    The gravity is the same in all of them; the covariances are zero.
+    `since`: IMU data of the last frame since the first. The covariances are zero.
     """
     gyro, force = since.since_previous, since.force
     if gyro is None or isinstance(force, str) or isinstance(first.force, str):

@@ -6,7 +6,6 @@ field is trusted: sizes are checked before memory is allocated, and an unusable 
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from enum import Enum
 from functools import partial
 import math
@@ -15,7 +14,6 @@ import struct
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_relpose_ros.config.settings import Parameters, pinhole_of_matrix
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
@@ -55,10 +53,7 @@ def _nanoseconds(seconds: int, nanoseconds: int) -> int:
 
 
 def image_from_message(msg: Any) -> images.EncodedImage:
-    """Image of a sensor_msgs/Image or CompressedImage; its `data` is a view of the message's.
-
-    Only the stamp is checked here; the other fields are checked when the image is decoded.
-    """
+    """Image of a sensor_msgs/Image or CompressedImage; a view, checked when it is decoded."""
     data = np.frombuffer(msg.data, dtype=np.uint8)
     stamp, frame_id = stamp_ns(msg.header), str(msg.header.frame_id)
     if hasattr(msg, 'format'):
@@ -75,10 +70,7 @@ def pose_from_message(msg: Any) -> TruePose:
 
 
 def intrinsics_from_info(msg: Any) -> Intrinsics:
-    """Intrinsics of a sensor_msgs/CameraInfo with region of interest and binning.
-
-    MissingInputError if it has none.
-    """
+    """Intrinsics of a CameraInfo, region of interest and binning included; MissingInputError."""
     k = [float(value) for value in info_field(msg, 'k')]
     if len(k) == 9 and k[0] == 0.0:
         raise MissingInputError(
@@ -115,28 +107,23 @@ def imu_sample_from_message(msg: Any, *, with_gyro: bool = True) -> ImuSample:
     """
     if isinstance(msg, bytes):
         stamp, numbers = _imu_of_cdr(msg)
-        quat_xyzw, variances = numbers[:4], (numbers[4], numbers[8])
-        rate, rate_variance, force, force_variance = (
-            numbers[13:16], numbers[16], numbers[25:28], numbers[28])
     else:
         q, w, f = msg.orientation, msg.angular_velocity, msg.linear_acceleration
-        variances = msg.orientation_covariance[0], msg.orientation_covariance[4]
-        stamp, quat_xyzw = stamp_ns(msg.header), (q.x, q.y, q.z, q.w)
-        rate, force = (w.x, w.y, w.z), (f.x, f.y, f.z)
-        rate_variance = msg.angular_velocity_covariance[0]
-        force_variance = msg.linear_acceleration_covariance[0]
+        stamp, numbers = stamp_ns(msg.header), (
+            q.x, q.y, q.z, q.w, *msg.orientation_covariance, w.x, w.y, w.z,
+            *msg.angular_velocity_covariance, f.x, f.y, f.z, *msg.linear_acceleration_covariance)
+    # Each vector is followed by its covariance (3, 3).
     angular_velocity = linear_acceleration = None
-    if with_gyro and rate_variance != -1.0:
-        angular_velocity = _vector('angular_velocity', rate, MAX_ANGULAR_VELOCITY)
-    if force_variance != -1.0:
-        linear_acceleration = _vector('linear_acceleration', force, MAX_LINEAR_ACCELERATION)
-        if linear_acceleration == (0.0, 0.0, 0.0):
-            linear_acceleration = None
+    if with_gyro and numbers[16] != -1.0:
+        angular_velocity = _vector('angular_velocity', numbers[13:16], MAX_ANGULAR_VELOCITY)
+    if numbers[28] != -1.0 and any(numbers[25:28]):
+        linear_acceleration = _vector('linear_acceleration', numbers[25:28],
+                                      MAX_LINEAR_ACCELERATION)
     if angular_velocity is None and linear_acceleration is None:
         raise InputError('an IMU message has neither gyro nor accelerometer: both are marked as '
                          'absent (covariance -1) or zero')
-    return ImuSample(stamp, angular_velocity, linear_acceleration,
-                     None if angular_velocity is None else _orientation(quat_xyzw, *variances))
+    return ImuSample(stamp, angular_velocity, linear_acceleration, None if angular_velocity is None
+                     else _orientation(numbers[:4], numbers[4], numbers[8]))
 
 
 # CDR of a header: kind and options of the encoding, stamp, size of frame_id with its end.
@@ -167,10 +154,7 @@ def _imu_of_cdr(data: bytes) -> tuple[int, tuple[float, ...]]:
 
 def _orientation(quat_xyzw: Sequence[float], first: float,
                  second: float) -> tuple[float, float, float, float] | None:
-    """Down and its sigma; None without usable variances, `first` and `second` of the diagonal.
-
-    Drivers without an orientation leave all zeros, "unknown" by REP-145.
-    """
+    """Down and its sigma; None without usable variances (0: unknown by REP-145)."""
     x, y, z, w = map(float, quat_xyzw)
     variance, norm2 = max(float(first), float(second)), x * x + y * y + z * z + w * w
     if not (first > 0.0 and 0.0 < variance < math.pi**2 and abs(norm2 - 1.0) < 0.02):
@@ -193,11 +177,7 @@ def _vector(name: str, vector: Sequence[float], largest: float) -> tuple[float, 
 # -- Topics by role, live and offline -------------------------------------------------------------
 
 class Role(str, Enum):
-    """Role of a topic.
-
-    The value is the name of the topic that the node subscribes to, and of the field with the topic
-    of a bag in `rs_relpose_ros.bags.reader.SensorTopics`.
-    """
+    """Role of a topic: name of the topic of the node, and the field of `SensorTopics`."""
 
     IMU = 'imu'
     ACCEL = 'accel'   # of drivers with a topic of its own for the accelerometer
@@ -206,8 +186,7 @@ class Role(str, Enum):
     TRUTH = 'truth'
 
 
-@dataclass(frozen=True, slots=True)
-class Part:
+class Part(NamedTuple):
     """Message types that can have a role, and the function that reads a message."""
 
     msgtypes: tuple[str, ...]
@@ -230,10 +209,7 @@ SENSOR_ROLES = (Role.IMU, Role.ACCEL, Role.CAMERA_INFO, Role.IMAGE)
 
 def sensor_messages(bag: Any, topics: Any,
                     roles: Collection[Role] = SENSOR_ROLES) -> Iterator[tuple[Role, Any]]:
-    """Messages of a `Bag` with one of the roles, as `BagMessage`, in bag order.
-
-    `topics` has a field for each role, None for a role without a topic (`SensorTopics`).
-    """
+    """Messages of a `Bag` with one of the roles, in bag order; `topics`: `SensorTopics`."""
     found = {topic.name: (role, topic) for role in reversed(Role)
              if role in roles and (topic := getattr(topics, role.value)) is not None}
     for message in bag.messages([topic for _, topic in found.values()]):
@@ -256,32 +232,19 @@ _LEAST_RANGE = 2.0
 _LEAST_CLIPPING = 0.2
 
 
-class StuckCamera:
-    """Compares each image, as it came, with the one before."""
-
-    def __init__(self) -> None:
-        self._previous: NDArray[np.uint8] | None = None
-        self._stamp_ns = 0
-
-    def problem(self, stamp_ns: int, data: NDArray[np.uint8]) -> str:
-        """Reason why an image is no new one; empty for none."""
-        previous, self._previous = self._previous, data
-        # A message that is delivered twice is no fault of the camera.
-        again, self._stamp_ns = stamp_ns == self._stamp_ns, stamp_ns
-        if (previous is not None and not again and len(previous) == len(data)
-                and np.array_equal(previous[::_STRIDE], data[::_STRIDE])
-                and np.array_equal(previous, data)):
-            return ('the image repeats the one before bit by bit: the camera or its driver is '
-                    'stuck, or the image is empty')
-        return ''
+def repeats(previous: images.EncodedImage, image: images.EncodedImage) -> bool:
+    """Whether an image is bit-equal to the one before, which no message delivered twice is."""
+    first, second = previous.data, image.data
+    return (previous.stamp_ns != image.stamp_ns and len(first) == len(second)
+            and np.array_equal(first[::_STRIDE], second[::_STRIDE])
+            and np.array_equal(first, second))
 
 
 class StuckGyro:
     """Detects repeated gyro samples.
 
-    Repetitions are not used from the first one on: between equal values interpolation gives the
-    same, if they were true, and drivers that publish faster than the sensor measures do repeat.
-    After `longest` [s] repetitions are a fault; 0 accepts all.
+    They are not used from the first one on: drivers that publish faster than the sensor measures
+    repeat, and interpolation gives the same. After `longest` [s] they are a fault; 0 accepts all.
     """
 
     def __init__(self, longest: float) -> None:
@@ -302,23 +265,20 @@ class StuckGyro:
                 self._counts[axis] = 0
             self._counts[axis] += 1
             self._largest[axis] = max(self._largest[axis], abs(value))
-        if min(self._counts) > 1:
-            if self._too_long(sample, max(self._since_ns), min(self._counts)):
-                raise InputError('the gyro repeats the same values bit by bit: it is stuck (set '
-                                 'stuck_gyro_time to 0 for a simulation without noise)')
-            return True
-        for name, value, largest, since_ns, count in zip(
-                'xyz', sample.angular_velocity, self._largest, self._since_ns, self._counts,
-                strict=True):
-            if count > 1 and abs(value) >= min(_LEAST_RANGE, max(_LEAST_CLIPPING, largest)):
-                if self._too_long(sample, since_ns, count):
-                    raise InputError(f'the {name} axis of the gyro repeats {value:.4g} rad/s bit '
-                                     'by bit: it is saturated')
-                return True
-        return False
-
-    def _too_long(self, sample: ImuSample, since_ns: int, count: int) -> bool:
-        return count >= _FEWEST_SAMPLES and sample.stamp_ns - since_ns > self._longest_ns
+        count, since_ns, fault = min(self._counts), max(self._since_ns), (
+            'the gyro repeats the same values bit by bit: it is stuck (set stuck_gyro_time to 0 '
+            'for a simulation without noise)')
+        if count == 1:
+            for axis, value in enumerate(sample.angular_velocity):
+                if self._counts[axis] > 1 and abs(value) >= min(
+                        _LEAST_RANGE, max(_LEAST_CLIPPING, self._largest[axis])):
+                    count, since_ns = self._counts[axis], self._since_ns[axis]
+                    fault = (f'the {"xyz"[axis]} axis of the gyro repeats {value:.4g} rad/s bit '
+                             'by bit: it is saturated')
+                    break
+        if count >= _FEWEST_SAMPLES and sample.stamp_ns - since_ns > self._longest_ns:
+            raise InputError(fault)
+        return count > 1
 
 
 # -- Into the sequencer, live and offline ---------------------------------------------------------
@@ -330,9 +290,9 @@ _HELD_IMAGES = 4
 class Intake:
     """Receives the messages of camera and IMU, and fills a sequencer; images stay encoded.
 
-    An image is combined with the intrinsics of `parameters`, or with the last CameraInfo if these
-    have none. Only images with one of the `chosen` stamps are handed over, all for None. Without
-    parameters a stuck gyro is not detected. Not thread-safe: one thread feeds it.
+    Intrinsics are those of `parameters`, else of the last CameraInfo. Only images with one of the
+    `chosen` stamps are handed over, all for None. Without parameters a stuck gyro is not detected.
+    Not thread-safe: one thread feeds it.
     """
 
     def __init__(self, sequencer: Sequencer, parameters: Parameters | None = None,
@@ -349,15 +309,11 @@ class Intake:
         configured = None if parameters is None else parameters.intrinsics
         self._configured = configured if configured is not None and configured.given else None
         self._held: list[images.EncodedImage] = []   # wait for the first CameraInfo
-        self._camera = StuckCamera()
+        self._last: images.EncodedImage | None = None
         self._gyro = StuckGyro(0.0 if parameters is None else parameters.imu.stuck_gyro_time)
 
     def receive(self, role: Role, message: Any) -> RsRelposeError | None:
-        """Hand a message over; the error of an unusable one, which the caller reports.
-
-        An unusable image is refused by the sequencer instead. After an unusable CameraInfo no
-        intrinsics are active, rather than outdated ones.
-        """
+        """Hand a message over; the error of an unusable one, but the sequencer refuses images."""
         self.images += role is Role.IMAGE
         if role is Role.CAMERA_INFO and self._configured is not None:
             return None
@@ -428,9 +384,11 @@ class Intake:
                 self.camera_info_problem or 'no CameraInfo came before or with the image')
             return
         # Compared before any image is dropped: after a gap a repeated image would pass as new.
-        problem = self._camera.problem(image.stamp_ns, image.data)
-        if problem:
-            self._sequencer.refuse(image.stamp_ns, Refusal.BAD_IMAGE, problem)
+        before, self._last = self._last, image
+        if before is not None and repeats(before, image):
+            self._sequencer.refuse(
+                image.stamp_ns, Refusal.BAD_IMAGE, 'the image repeats the one before bit by bit: '
+                'the camera or its driver is stuck, or the image is empty')
         else:
             self._sequencer.add_frame(image, self.intrinsics)
 

@@ -6,10 +6,9 @@ have the stamp of the current image.
 
 from array import array
 from collections.abc import Callable, Sequence
-from enum import auto, Enum
 import math
 import sys
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -64,57 +63,44 @@ _REGION = ('x_offset', 'y_offset', 'height', 'width')
 _LEAST_EIGENVALUE = 1e-14
 
 
-# Most characters of numbers in a text: the longest list has 66.
-_MOST_CHARACTERS = 2000
-
-
 # -- ~/pairs: the keys of a status, for writing here and for reading in `published_pair` ---------
-
-class Kind(Enum):
-    """Type of a value of ``~/pairs``; the text is empty if the value is unknown."""
-
-    TEXT = auto()
-    TIME = auto()   # timestamp [ns]
-    REAL = auto()
-    VECTOR = auto()   # 3 numbers
-    REALS = auto()   # any number of them
-
 
 class PairValue(NamedTuple):
     """A key of the status of a pair; `field`: of `PublishedPair`, if it has the value."""
 
     key: str
-    kind: Kind
+    # Time: a timestamp [ns]; reals: any number of them. An unknown value is an empty text.
+    kind: Literal['text', 'time', 'real', 'vector', 'reals']
     of: Callable[[PairResult], Any]
     field: str = ''
 
     def text(self, value: Any) -> str:
         """The value as in the message."""
-        if self.kind is Kind.REAL:
+        if self.kind == 'real':
             return number(value)
-        if self.kind in (Kind.VECTOR, Kind.REALS):
+        if self.kind in ('vector', 'reals'):
             return '' if value is None else ' '.join(map(number, value))
         return str(value)
 
     def value(self, text: str) -> Any:
         """The value of a text; unknown numbers are NaN. InputError if it is malformed."""
-        if self.kind is Kind.TEXT:
+        if self.kind == 'text':
             return text
-        if self.kind is Kind.TIME:
+        if self.kind == 'time':
             # At most the digits of an int64.
             if not (text.isascii() and text.isdigit() and len(text) < 20):
                 raise InputError(
                     f'{self.key} of ~/pairs must be a timestamp [ns], got {text[:40]!r}')
             return int(text)
         try:
-            values = [float(word) for word in text[:_MOST_CHARACTERS].split()]
+            values = [float(word) for word in text[:2000].split()]   # the longest list has 66
         except ValueError:
             values = []
         if text and not (values and all(map(math.isfinite, values))):
             raise InputError(f'{self.key} of ~/pairs must be finite, got {text[:60]!r}')
-        if self.kind is Kind.REAL:
+        if self.kind == 'real':
             return values[0] if values else math.nan
-        if self.kind is Kind.VECTOR:
+        if self.kind == 'vector':
             values = values or [math.nan] * 3
             if len(values) != 3:
                 raise InputError(f'{self.key} of ~/pairs must be three numbers, got {text[:60]!r}')
@@ -126,27 +112,27 @@ def _image_value(key: str, of: Callable[[ImageInformation], ArrayLike]) -> PairV
     def part(pair: PairResult) -> Array | None:
         numbers = np.nan if pair.pose.images is None else of(pair.pose.images)
         return np.atleast_1d(numbers) if np.isfinite(numbers).all() else None
-    return PairValue(key, Kind.REALS, part)
+    return PairValue(key, 'reals', part)
 
 
 # `TOPICS_KEY` follows: the other topics of the pair.
 PAIR_VALUES = {value.key: value for value in (
-    PairValue('reference_stamp_ns', Kind.TIME, lambda pair: pair.reference_stamp_ns,
+    PairValue('reference_stamp_ns', 'time', lambda pair: pair.reference_stamp_ns,
               'reference_stamp_ns'),
-    PairValue('status', Kind.TEXT, lambda pair: pair.pose.status.value, 'status'),
-    PairValue('reason', Kind.TEXT, lambda pair: pair.pose.reason, 'reason'),
-    PairValue('model', Kind.TEXT, lambda pair: pair.pose.model),
-    *(PairValue(metric.name, Kind.REAL, metric.of) for metric in PAIR_METRICS),
-    PairValue('baseline_m', Kind.REAL, lambda pair: pair.pose.baseline, 'baseline'),
-    PairValue('baseline_log_sigma', Kind.REAL, lambda pair: pair.pose.baseline_log_sigma,
+    PairValue('status', 'text', lambda pair: pair.pose.status.value, 'status'),
+    PairValue('reason', 'text', lambda pair: pair.pose.reason, 'reason'),
+    PairValue('model', 'text', lambda pair: pair.pose.model),
+    *(PairValue(metric.name, 'real', metric.of) for metric in PAIR_METRICS),
+    PairValue('baseline_m', 'real', lambda pair: pair.pose.baseline, 'baseline'),
+    PairValue('baseline_log_sigma', 'real', lambda pair: pair.pose.baseline_log_sigma,
               'baseline_log_sigma'),
-    PairValue('baseline_reason', Kind.TEXT, lambda pair: pair.pose.baseline_reason),
+    PairValue('baseline_reason', 'text', lambda pair: pair.pose.baseline_reason),
     # Of the current camera in its own frame.
-    PairValue('linear_velocity_m_s', Kind.VECTOR, lambda pair: (
+    PairValue('linear_velocity_m_s', 'vector', lambda pair: (
         pair.pose.metric_velocity2 if math.isfinite(pair.pose.baseline) else None)),
     # Times of the two stamped rows on the IMU's clock.
-    PairValue('reference_imu_ns', Kind.TIME, lambda pair: pair.reference_ns1, 'reference_imu_ns'),
-    PairValue('current_imu_ns', Kind.TIME, lambda pair: pair.reference_ns2, 'current_imu_ns'),
+    PairValue('reference_imu_ns', 'time', lambda pair: pair.reference_ns1, 'reference_imu_ns'),
+    PairValue('current_imu_ns', 'time', lambda pair: pair.reference_ns2, 'current_imu_ns'),
     # `ImageInformation`: the estimate of the images without the priors of the IMU.
     _image_value('image_row_s', lambda images: images.row_time),
     _image_value('image_rotation_xyzw',
@@ -156,9 +142,9 @@ PAIR_VALUES = {value.key: value for value in (
     _image_value('image_gradient', lambda images: images.gradient),
     _image_value('image_information',
                  lambda images: images.information[np.triu_indices(len(images.gradient))]),
-    PairValue('gyro_bias_rad_s', Kind.VECTOR, lambda pair: pair.gyro_bias, 'gyro_bias'),
-    PairValue('health', Kind.TEXT, lambda pair: pair.health.state.value, 'health'),
-    PairValue('health_findings', Kind.TEXT, lambda pair: pair.health.text),
+    PairValue('gyro_bias_rad_s', 'vector', lambda pair: pair.gyro_bias, 'gyro_bias'),
+    PairValue('health', 'text', lambda pair: pair.health.state.value, 'health'),
+    PairValue('health_findings', 'text', lambda pair: pair.health.text),
 )}
 TOPICS_KEY = 'topics'
 
@@ -214,8 +200,8 @@ def _status_of_pair(result: PairResult, topics: str, types: MessageTypes) -> Any
         level = 2
     else:
         level = 0 if pose and result.health.state is not FindingState.SUSPECT else 1
-    return diagnostics_message(result.stamp_ns, status_message(
-        level, 'keyframe pair', text, result.frame_id, values, types), types)
+    return diagnostics_message(result.stamp_ns, level, 'keyframe pair', text, result.frame_id,
+                               values, types)
 
 
 def _matches_message(points: NDArray[np.void], in_reference: Any, types: MessageTypes) -> Any:
@@ -234,9 +220,9 @@ def _matches_message(points: NDArray[np.void], in_reference: Any, types: Message
 def inlier_records(result: PairResult) -> NDArray[np.void]:
     """Inlier matches (N,) as records of `MATCH_DTYPE`.
 
-    Pixels of the published images, row times [s] from the stamped row, rays derotated to it, the
-    landmark in the reference camera [baselines], and the equivalent global-shutter pixels at the
-    times of the stamped rows.
+    Pixels of the published images, row times [s] from the stamped row, rays derotated to it,
+    the landmark in the reference camera [baselines], global-shutter pixels at the stamped
+    rows.
     """
     inliers, found = result.pose.inliers, result.landmarks
     assert found is not None, 'only pairs with a pose have inliers to publish'
@@ -362,11 +348,7 @@ def encoded_image_message(stamp_ns: int, frame_id: str, data: bytes | NDArray[np
 
 def camera_info_message(stamp_ns: int, frame_id: str, camera: Intrinsics | RollingShutterCamera,
                         published: Any, types: MessageTypes) -> Any:
-    """sensor_msgs/CameraInfo; all fields but the stamp are those of `published`, if there is one.
-
-    `published`: the CameraInfo of ROS 1 or 2 with these intrinsics; None: full sensor of `camera`.
-    The message has no field for the readout time.
-    """
+    """sensor_msgs/CameraInfo: that of `published` (ROS 1 or 2), or of the full sensor for None."""
     if published is None:
         model, binning, region = camera.distortion_model, (0, 0), dict.fromkeys(_REGION, 0)
         pinhole = camera.global_shutter_camera() if isinstance(camera, Intrinsics) else camera
@@ -389,20 +371,16 @@ def camera_info_message(stamp_ns: int, frame_id: str, camera: Intrinsics | Rolli
         **{name: np.array(values, dtype=np.float64) for name, values in arrays.items()})
 
 
-def diagnostics_message(stamp_ns: int, status: Any, types: MessageTypes) -> Any:
-    """diagnostic_msgs/DiagnosticArray of one status."""
-    return types('diagnostic_msgs/msg/DiagnosticArray')(
-        header=header(stamp_ns, '', types), status=[status])
-
-
-def status_message(level: int, name: str, text: str, hardware_id: str,
-                   values: Sequence[tuple[str, str]], types: MessageTypes) -> Any:
-    """diagnostic_msgs/DiagnosticStatus; `level` 0 OK, 1 warning, 2 error, 3 stale."""
+def diagnostics_message(stamp_ns: int, level: int, name: str, text: str, hardware_id: str,
+                        values: Sequence[tuple[str, str]], types: MessageTypes) -> Any:
+    """diagnostic_msgs/DiagnosticArray of one status; level 0 OK, 1 warning, 2 error, 3 stale."""
     key_value = types('diagnostic_msgs/msg/KeyValue')
     status_type = types('diagnostic_msgs/msg/DiagnosticStatus')
-    return status_type(
-        level=bytes([level]) if _is_rclpy(status_type) else level, name=name, message=text,
-        hardware_id=hardware_id, values=[key_value(key=key, value=value) for key, value in values])
+    return types('diagnostic_msgs/msg/DiagnosticArray')(
+        header=header(stamp_ns, '', types), status=[status_type(
+            level=bytes([level]) if _is_rclpy(status_type) else level, name=name, message=text,
+            hardware_id=hardware_id,
+            values=[key_value(key=key, value=value) for key, value in values])])
 
 
 def quat_xyzw(R: Array) -> Array:
@@ -412,10 +390,7 @@ def quat_xyzw(R: Array) -> Array:
 
 
 def published_covariance(covariance: Array) -> Array:
-    """A covariance (N, N) as in messages (N * N,): symmetric, without negative eigenvalues.
-
-    Rounding may make an eigenvalue of 0 negative: that of the translation along itself.
-    """
+    """A covariance (N, N) as in messages (N * N,): symmetric, no eigenvalue below 0."""
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     values = np.maximum(values, _LEAST_EIGENVALUE * values[-1])
     whole = (vectors * values) @ vectors.T
@@ -472,11 +447,9 @@ _SHIFT = 4
 
 
 def draw_pair(result: PairResult) -> Color:
-    """The current image (H, W, 3) in blue, green, red, with the matches of its pair.
+    """The current image (H, W, 3) in blue, green, red, with the matches of its pair as lines.
 
-    Each match is a line from its pixel in the reference keyframe to a dot at its current pixel.
-    Inliers have the colour of their row, explained with its time by the bar on the left; outliers
-    are cyan. A caption has the status. Needs the pair's image.
+    Inliers have the colour of their row (bar on the left, with times), outliers are cyan.
     """
     assert result.image2 is not None
     height, width = result.image2.shape
@@ -503,16 +476,11 @@ def draw_pair(result: PairResult) -> Color:
         for time, y in zip(times, (14, len(canvas) - 6), strict=True):
             cv2.putText(canvas, f'{round(1e3 * time, 1) + 0.0:.1f} ms', (_BAR_WIDTH + 4, y),
                         cv2.FONT_HERSHEY_SIMPLEX, 0.42, _WHITE, 1, cv2.LINE_AA)
-    return np.concatenate([canvas, _caption(result, int(inliers.sum()), size[0])])
-
-
-def _caption(result: PairResult, inliers: int, width: int) -> Color:
     pose = result.pose
-    what = f'{pose.status.value} {pose.model}' if pose else pose.status.value
-    text = (f'{what}: {inliers} of {len(result.matches.points1)} matches, parallax '
-            f'{result.parallax:.1f} px, {1e3 * result.interval:.0f} ms')
-    if pose:
-        text += f', residual {pose.residual_rms:.2f} px'
-    strip = np.zeros((_CAPTION_HEIGHT, width, 3), dtype=np.uint8)
-    cv2.putText(strip, text, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.42, _WHITE, 1, cv2.LINE_AA)
-    return strip
+    model, residual = (f' {pose.model}', f', residual {pose.residual_rms:.2f} px') if pose else (
+        '', '')
+    caption = np.zeros((_CAPTION_HEIGHT, size[0], 3), dtype=np.uint8)
+    cv2.putText(caption, f'{pose.status.value}{model}: {inliers.sum()} of {len(points1)} matches, '
+                f'parallax {result.parallax:.1f} px, {1e3 * result.interval:.0f} ms{residual}',
+                (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.42, _WHITE, 1, cv2.LINE_AA)
+    return np.concatenate([canvas, caption])

@@ -34,10 +34,8 @@ class PublishedPair:
 
     Pose of the current camera in the reference camera, ``X1 = R X2 + t``, with the covariance of
     ``(dt, dtheta)``: ``t_true = t + dt`` and ``R_true = Exp(dtheta) R``, in camera 1. `matches`
-    are the inliers: track ``id``, pixels ``u1 v1 u2 v2``, row times ``tau1 tau2`` [s], rays
-    ``x1 y1 z1 x2 y2 z2`` derotated to the stamped row, landmarks ``x y z`` in the reference camera
-    [baselines], equivalent global-shutter pixels ``u1_gs v1_gs u2_gs v2_gs`` at the times of the
-    stamped rows. Unknown values are NaN; there are no matches without a pose.
+    are the inliers as of `outgoing.inlier_records`. Unknown values are NaN; there are no matches
+    without a pose.
     """
 
     reference_stamp_ns: int   # header stamp of the reference keyframe
@@ -72,10 +70,7 @@ class PublishedPair:
 
 
 class PairStatus:
-    """Status of a diagnostic_msgs/DiagnosticArray of ``~/pairs``: its values by key.
-
-    InputError if one is absent or malformed.
-    """
+    """Values by key of the status of ``~/pairs``; InputError if one is absent or malformed."""
 
     def __init__(self, pairs: Any) -> None:
         if len(pairs.status) != 1:
@@ -134,9 +129,8 @@ class PairStatus:
 class PairSynchronizer:
     """Gathers the messages of a pair by their common stamp, in any order.
 
-    ``~/pairs``, which every pair has, lists its other topics. At most `capacity` stamps wait for
-    further messages; beyond it the oldest is dropped, so that lost messages do not accumulate.
-    `given_up` counts the dropped stamps.
+    ``~/pairs``, which every pair has, lists its other topics. At most `capacity` stamps wait;
+    beyond it the oldest is dropped. `given_up` counts the dropped stamps.
     """
 
     def __init__(self, capacity: int = 10) -> None:
@@ -145,24 +139,18 @@ class PairSynchronizer:
         self.given_up = 0
 
     def add(self, topic: str, message: Any) -> PublishedPair | None:
-        """Add a message; return the pair that it completes, with or without a pose.
+        """Add a message of one of `PAIR_TOPICS`; return the pair that it completes.
 
-        `topic` is one of `PAIR_TOPICS`, without ``~/``. InputError if the pair is unusable, or the
-        stamp is out of range.
+        InputError if the pair is unusable, or the stamp is out of range.
         """
         validate.choice('topic', topic, PAIR_TOPICS)
         stamp = stamp_ns(message.header)
-        messages = self._waiting.setdefault(stamp, {})
-        messages[topic] = message
+        messages = self._waiting.pop(stamp, {}) | {topic: message}
         if 'pairs' in messages:
-            try:
-                topics = PairStatus(messages['pairs']).topics()
-            except InputError:
-                del self._waiting[stamp]
-                raise
+            topics = PairStatus(messages['pairs']).topics()
             if topics <= messages.keys():
-                del self._waiting[stamp]
                 return published_pair({name: messages[name] for name in topics})
+        self._waiting[stamp] = messages
         if len(self._waiting) > self._capacity:
             del self._waiting[next(iter(self._waiting))]
             self.given_up += 1
@@ -382,10 +370,8 @@ class PoseChain:
 def track_distances(pair: PublishedPair) -> tuple[dict[int, float], dict[int, float]]:
     """Distances of the tracks from the reference and from the current camera [baselines], by id.
 
-    Each match has a baseline of its own, since the camera moves during the readout: (4) of
-    ``docs/conventions.md``, ``l_1 f_1 = l_2 R f_2 + t - tau_1 d_1 + tau_2 d_2``, by least squares,
-    with the velocity of the current camera for both. Tracks behind a camera or with parallel rays
-    are omitted.
+    By least squares of (4) of ``docs/conventions.md``, with the velocity of the current camera
+    for both; without tracks behind a camera or with parallel rays.
     """
     m = pair.matches
     f1 = np.stack([m[name] for name in ('x1', 'y1', 'z1')], axis=1).astype(np.float64)

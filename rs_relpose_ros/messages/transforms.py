@@ -69,10 +69,7 @@ def angle_between(R: NDArray[np.float64], other: NDArray[np.float64], sigma: flo
 
 def extrinsics(parameters: Parameters, found: Transform, camera: str,
                imu: str) -> tuple[dict[str, Any], str]:
-    """Rotation and position of the IMU by its pose `found` in the camera; configured ones win.
-
-    Parameters by name that are not configured, and a contradiction, '' for none.
-    """
+    """Parameters by the pose `found` of the IMU in the camera, or a contradiction."""
     sensor, position = parameters.sensor, parameters.imu.imu_position
     rotation, head = Rotation.from_quat(found[3:]), f'/tf_static has {imu} in {camera}'
     values: dict[str, Any] = {}
@@ -113,10 +110,7 @@ class BagFrames(NamedTuple):
 
 
 def bag_frames(bag: Any, topics: Any, base: str = '') -> BagFrames:
-    """Frames of a `Bag` with `SensorTopics`; /tf is read only if /tf_static does not suffice.
-
-    `base`: another frame that is needed.
-    """
+    """Frames of a `Bag` with `SensorTopics`; of /tf if /tf_static does not suffice (`base`)."""
     camera, imu = (next((str(message.message.header.frame_id).lstrip('/') for message
                          in bag.messages([topic])), '') if topic is not None else ''
                    for topic in (topics.image, topics.imu))

@@ -265,9 +265,9 @@ class OdometryNode(StoppableNode):
             values += [('started', 'at rest' if started.at_rest else 'in motion'),
                        ('start_scale_sigma', f'{started.scale_sigma:.3f}')]
         self._diagnostics.publish(outgoing.diagnostics_message(
-            self.get_clock().now().nanoseconds, outgoing.status_message(
-                level, f'{self.get_fully_qualified_name()}: odometry', state, self._pairs,
-                values, message_class), message_class))
+            self.get_clock().now().nanoseconds, level,
+            f'{self.get_fully_qualified_name()}: odometry', state, self._pairs, values,
+            message_class))
 
 
 main = partial(run_node, OdometryNode, NAME, _DESCRIPTION)

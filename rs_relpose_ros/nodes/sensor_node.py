@@ -545,11 +545,10 @@ class SensorNode(StoppableNode):
         report = self._frame_statistics.report(
             counts, None if source is None else source.counts(),
             problem=problem, missing=missing, progress=self._progress, warning=warning)
-        status = outgoing.status_message(
-            report.level, f'{self.get_fully_qualified_name()}: {self.task}', report.text,
-            self._image_topic(), report.values, message_class)
         self._diagnostics.publish(outgoing.diagnostics_message(
-            self.get_clock().now().nanoseconds, status, message_class))
+            self.get_clock().now().nanoseconds, report.level,
+            f'{self.get_fully_qualified_name()}: {self.task}', report.text, self._image_topic(),
+            report.values, message_class))
         if self._inputs is not None:
             self._log_silence(self._inputs, report.silence, problem)
             for role, frame_id in self._inputs.frame_ids.items():

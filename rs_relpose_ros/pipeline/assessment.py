@@ -246,10 +246,7 @@ class _Solution(NamedTuple):
 
 
 def _solved(free: NDArray[np.bool_], estimated: Calibration, configured: Configured) -> _Solution:
-    """Deviations if those `free` (11,) are within their wide prior.
-
-    All others are within their configured sigmas, and zero where there is none.
-    """
+    """Deviations, those `free` (11,) within their wide prior, others within configured sigmas."""
     sigmas, active = np.where(free, PRIOR_SIGMA, configured.sigmas), configured.active
     if free[findings.DISTORTION]:
         factors = estimated.if_distorted
@@ -398,10 +395,7 @@ def _values(quantity: Quantity, left: Array, sigmas: Array,
 
 def gross_errors(rotations: RotationComparison | None, ahead: float, configured: Configured,
                  before: tuple[Finding, ...] = ()) -> tuple[Finding, ...]:
-    """Axes, unit, flips and clocks; those found `before` until the rotations contradict them.
-
-    `ahead` [s]: stamps of the IMU are so far ahead of those of the images as they arrive.
-    """
+    """Axes, unit, flips, clocks (`ahead` [s]); those `before` until they are contradicted."""
     if rotations is None:
         return before
     if rotations.left_as_configured < _EXPLAINED_AT_BEST and (

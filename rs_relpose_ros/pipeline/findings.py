@@ -126,10 +126,7 @@ NOT_EVALUATED = Assessment(())
 
 
 def worst_of(before: Assessment, now: Assessment) -> Assessment:
-    """For a whole run: of each quantity the worse finding, of equal states the later one.
-
-    Small deviations that were found before a gross error are traces of it, and left out.
-    """
+    """The worse or later finding of each quantity; without traces of a gross error found later."""
     traces = now.is_gross and not before.is_gross
     found = {} if traces else {finding.quantity: finding for finding in before.findings}
     # What was observable once is known.

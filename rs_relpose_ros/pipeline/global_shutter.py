@@ -51,10 +51,7 @@ class RowMap(NamedTuple):
     shift: float   # [px] largest difference of a coordinate of a node and its source
 
     def bands(self) -> Iterator[tuple[slice, NDArray[np.float32]]]:
-        """Bands of rows of the image and their sources (N, W, 2), for `cv2.remap`.
-
-        A band fits into the processor's cache; a whole map would not.
-        """
+        """Bands of rows, which fit into a cache, and sources (N, W, 2) for `cv2.remap`."""
         for top in range(0, self.height, _BAND):
             bottom = min(top + _BAND, self.height)
             nodes = self.nodes[top // _STEP:math.ceil(bottom / _STEP) + 2]
@@ -65,10 +62,7 @@ class RowMap(NamedTuple):
 
 
 class MiddleRow:
-    """Maps of one camera; images are those that its `Intrinsics` publish.
-
-    `delay` [s]: from the camera's reference row to the middle row of the published image.
-    """
+    """Maps of published images; `delay` [s]: from the reference row to the middle one."""
 
     def __init__(self, sensor: Sensor) -> None:
         self.sensor = sensor
@@ -143,42 +137,35 @@ class GlobalShutterFrame:
 class Unroller(Processor[GlobalShutterFrame]):
     """Derotates frames.
 
-    With `track_time_offset` or `track_readout_time` the frames also pass through the pipeline of
-    relpose_node, after they are published, and its tracked corrections are applied here. Else,
-    while `watched`, the rotation of the images is compared with the gyro now and then.
+    For tracked corrections the frames also pass through the pipeline of relpose_node, after
+    they are published. Else, while `watched`, images are compared with the gyro now and then.
     """
 
     def __init__(self, watched: Callable[[], bool] = lambda: False) -> None:
-        self._pipeline: Pipeline | None = None
-        self._watch, self._watched = RotationWatch(), watched
-        self._levels = GrayLevels()
-        self._due: tuple[Frame[Any], Parameters] | None = None   # for the pipeline
+        self._follower: Pipeline | RotationWatch = RotationWatch()
+        self._watched, self._levels = watched, GrayLevels()
+        self._due: tuple[Frame[Any], Parameters] | None = None   # for the follower
         self._middle: MiddleRow | None = None
 
     def prepare(self) -> None:
         """Let the pipeline or the watch track the last frame."""
-        due, self._due = self._due, None
-        if due is None:
+        if self._due is None:
             return
-        frame, parameters = due
-        assert frame.encoded is not None
-        # The gray image of relpose_node, bit by bit.
-        if self._pipeline is not None:
-            self._pipeline.process(replace(
-                frame, image=frame.encoded.decoded(self._levels), encoded=None,
-                encoding='mono8'), parameters)
-            self.applied = self._pipeline.applied
-        elif not self._watched():
-            self._watch = RotationWatch()
-        elif self._watch.needs(frame):
-            self._watch.add(frame, frame.encoded.decoded(self._levels), parameters)
+        (frame, parameters), self._due = self._due, None
+        follower = self._follower
+        if isinstance(follower, RotationWatch) and not self._watched():
+            self._follower = RotationWatch()
+        elif isinstance(follower, Pipeline) or follower.needs(frame):
+            assert frame.encoded is not None
+            # The gray image of relpose_node, bit by bit.
+            follower.process(replace(frame, image=frame.encoded.decoded(self._levels),
+                                     encoded=None, encoding='mono8'), parameters)
+            self.applied = follower.applied
 
     def reset(self) -> None:
         """Forget the frames so far: tracking restarts with the next one."""
         self._due = None
-        self._watch.reset()
-        if self._pipeline is not None:
-            self._pipeline.reset()
+        self._follower.reset()
 
     def process(self, frame: Frame[Any], parameters: Parameters) -> GlobalShutterFrame:
         """The derotated frame."""
@@ -186,8 +173,9 @@ class Unroller(Processor[GlobalShutterFrame]):
         sensor, imu = parameters.sensor, frame.imu
         assert frame.encoded is not None
         # Once started it is kept: corrections that are no longer applied are taken back by steps.
-        if self._pipeline is None and (sensor.track_time_offset or sensor.track_readout_time):
-            self._pipeline = Pipeline(parameters)
+        if isinstance(self._follower, RotationWatch) and (
+                sensor.track_time_offset or sensor.track_readout_time):
+            self._follower = Pipeline(parameters)
         model = sensor_model(frame.intrinsics, sensor, self.applied.readout_time)
         if self._middle is None or self._middle.sensor != model:
             self._middle = MiddleRow(model)
@@ -201,20 +189,17 @@ class Unroller(Processor[GlobalShutterFrame]):
             reference_ns + to_nanoseconds(self._middle.delay),
             Pixels(frame.image, frame.encoding), frame.stamp_ns, frame.frame_id, frame.intrinsics,
             frame.encoded.is_png, self._middle.map(imu.motion), parameters.global_shutter.border,
-            imu.applied_offset_ns,
-            self._watch.health if self._pipeline is None else self._pipeline.health)
+            imu.applied_offset_ns, self._follower.health)
 
 
 # Time from one comparison to the next [ns].
 _WATCH_NS = to_nanoseconds(0.2)
 
 
-class RotationWatch:
+class RotationWatch(Processor[None]):
     """Compares the rotation between two frames, now and then, with the gyro: gross errors.
 
-    Two that follow each other: further apart a gyro in deg/s has turned more than once.
-
-    A few per cent of the processing time of relpose_node, which assesses all parameters.
+    Two that follow each other: further apart a gyro in deg/s has rotated more than once.
     """
 
     def __init__(self) -> None:
@@ -236,19 +221,19 @@ class RotationWatch:
         """Whether a frame ends a comparison or begins one; an earlier stamp begins one."""
         return self._begin is not None or not 0 <= frame.stamp_ns - self._last_ns < _WATCH_NS
 
-    def add(self, frame: Frame[Any], image: NDArray[np.uint8], parameters: Parameters) -> None:
-        """Follow points into a frame with this gray `image` (H, W)."""
+    def process(self, frame: Frame[Any], parameters: Parameters) -> None:
+        """Follow points into a frame."""
         self._monitor.ahead.append(frame.imu.ahead)
         begin = self._begin
         if (self._tracker is None or begin is None or frame.imu.since_previous is None
                 or frame.intrinsics != begin.intrinsics):
             self._tracker = self._tracker or make_tracker(parameters.tracking)
             self._tracker.reset()
-            self._tracker.start(image)
+            self._tracker.start(frame.image)
             self._begin, self._last_ns = frame, frame.stamp_ns
             return
         # Not predicted by the gyro, which may be wrong.
-        matches = self._tracker.track(image)
+        matches = self._tracker.track(frame.image)
         camera = sensor_model(frame.intrinsics, parameters.sensor).camera
         by_images = rotation_of_rays(*(camera.unproject(frame.intrinsics.to_sensor(points))
                                        for points in (matches.points1, matches.points2)))

@@ -102,10 +102,7 @@ class QueuedFrame:
 
 
 class _StampOrder:
-    """Recognises single wild stamps, and runs of `patience` that only a clock set back produces.
-
-    Late messages are behind the newest, too, but come alone.
-    """
+    """Recognises single wild stamps, and runs of `patience` that a clock set back produces."""
 
     def __init__(self, patience: float) -> None:
         self._patience = patience
@@ -251,20 +248,16 @@ class Sequencer:
     # -- output ------------------------------------------------------------------------------
 
     def apply(self, applied: Applied) -> None:
-        """Set the tracked corrections of the frames that are taken from now on.
+        """Set the tracked corrections of the frames taken from now on; only between two `take`.
 
-        Call it between `take` and `take`, from the thread that calls these: then the IMU data of a
-        frame depend only on the frames before it, live as well as offline.
+        The IMU data of a frame then depend only on the frames before it.
         """
         with self._changed:
             self._offset_ns = to_nanoseconds(applied.time_offset)
             self._margin_ns = to_nanoseconds(applied.margin)
 
     def take(self, timeout: float = 0.0) -> Frame[Any] | FrameRefused | None:
-        """The next frame in the order of stamps, or a refusal, or None after `timeout` seconds.
-
-        The image is decoded outside of the lock.
-        """
+        """The next frame in the order of stamps, or a refusal, or None after `timeout` seconds."""
         with self._changed:
             # Offline nothing comes while one waits.
             deadline_ns = self._now() + (0 if self._offline else round(timeout * NANOSECONDS))
@@ -293,7 +286,7 @@ class Sequencer:
             # Stamps may have jumped meanwhile, and the buffer then belongs to another time.
             span_ns = self._corrected(head.span_ns)
             if (head.generation != self._generation
-                    or self._buffer.coverage(*span_ns) is not Coverage.AVAILABLE):
+                    or self._buffer.gyro.coverage(*span_ns) is not Coverage.AVAILABLE):
                 self._refuse(frame.stamp_ns, Refusal.CLOCK_JUMP, 'stamps jumped while the frame '
                              'was decoded: its gyro samples are lost')
                 return self._refusals.popleft()
@@ -321,7 +314,7 @@ class Sequencer:
             head = self._queue[0]
             start_ns, end_ns = self._corrected(head.span_ns)
             # A tracked offset may have moved a frame that was ready.
-            coverage = (self._buffer.coverage(start_ns, end_ns)
+            coverage = (self._buffer.gyro.coverage(start_ns, end_ns)
                         if head.ready_ns is not None and self._imu_reaches(end_ns)
                         else Coverage.NOT_YET)
             if coverage is Coverage.AVAILABLE:
@@ -342,7 +335,7 @@ class Sequencer:
             if queued.ready_ns is None:
                 if not self._imu_reaches(self._corrected(queued.span_ns)[1]):
                     break
-                if self._buffer.coverage(*queued.span_ns) is Coverage.NEVER:
+                if self._buffer.gyro.coverage(*queued.span_ns) is Coverage.NEVER:
                     # Refused at once: it must not count as a frame that waits for the worker.
                     self._drop(queued, Refusal.IMU_GAP, _IMU_GAP)
                     continue
@@ -375,10 +368,7 @@ class Sequencer:
     # -- refusals and jumps of a clock -------------------------------------------------------
 
     def _accepts(self, stamp_ns: int, end_ns: int) -> bool:
-        """Whether a frame of this stamp is added to the queue; if not, it has been refused.
-
-        A stamp that only a clock set back can produce is accepted: time restarts with it.
-        """
+        """Whether a frame of this stamp is added; else it is refused. Time may restart with it."""
         last_ns = self._last_stamp_ns
         if last_ns is not None and self._frame_order.is_wild(stamp_ns, last_ns):
             self._refuse(stamp_ns, Refusal.OUT_OF_ORDER, 'the stamp of the frame is '
