@@ -14,7 +14,7 @@ from scipy.stats import norm, t
 from rs_relpose_lab.experiments import calibration as benchmark
 from rs_relpose_lab.experiments import calibration_tracks
 from rs_relpose_lab.experiments.calibration_tracks import drawn, record, Recorded, Truth
-from rs_relpose_ros.calibrate import coplanarity, observations, start
+from rs_relpose_ros.calibrate import coplanarity, observations
 from rs_relpose_ros.calibrate import fit as fitting
 from rs_relpose_ros.calibrate.coplanarity import (
     BIAS,
@@ -39,21 +39,16 @@ from rs_relpose_ros.calibrate.fit import (
 )
 from rs_relpose_ros.calibrate.observations import (
     frame_times,
+    GyroSeries,
     make_pairs,
+    noise_density,
     Observations,
     PairSelection,
     Tracks,
     Varying,
 )
 from rs_relpose_ros.calibrate.procedure import calibrate, CalibrationInput, evaluated
-from rs_relpose_ros.calibrate.result import (
-    CalibrationResult,
-    CostCurve,
-    Estimate,
-    parameter_file,
-    report,
-)
-from rs_relpose_ros.calibrate.start import GyroSeries, noise_density
+from rs_relpose_ros.calibrate.result import CalibrationResult, Estimate, parameter_file, report
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import CalibrationConfig, Parameters, TRACKED_IN_IMAGES
 from rs_relpose_ros.errors import InputError
@@ -119,10 +114,10 @@ def test_usual_recording_is_calibrated_from_nothing(tmp_path):
     assert result.shutter == 'rolling'
     np.testing.assert_array_equal(result.axis_map, np.rint(recorded.truth.R_cam_imu))
     assert result.lens is None and result.offset_by_interval is None
-    curve = result.curve
-    best = curve.readout_times[np.argmin(curve.costs)]
+    readouts, costs = result.curve
+    best = readouts[np.argmin(costs)]
     assert best == pytest.approx(recorded.truth.readout_time, abs=4e-3)
-    assert curve.costs[np.argmin(np.abs(curve.readout_times))] > 20.0
+    assert costs[np.argmin(np.abs(readouts))] > 20.0
     # The CameraInfo has the focal length.
     _, configured = written(result, camera_of(recorded.truth), tmp_path)
     sensor = configured.sensor
@@ -246,13 +241,13 @@ def few_points(tracks: Tracks) -> Tracks:
 
 UNUSABLE = {
     'too short: 10 frames': lambda tracks, gyro: (few_frames(tracks, 10), gyro),
-    'hardly rotates': lambda tracks, gyro: (tracks, start.GyroSeries(
+    'hardly rotates': lambda tracks, gyro: (tracks, GyroSeries(
         gyro.stamps_ns, 0.05 + 1e-3 * np.random.default_rng(0).standard_normal(
             gyro.rates.shape))),
     'too few points': lambda tracks, gyro: (few_points(tracks), gyro),
     'short exposure': lambda tracks, gyro: (
         dataclasses.replace(tracks, ids=np.arange(len(tracks.ids))), gyro),
-    'the gyro covers 0.0 s': lambda tracks, gyro: (tracks, start.GyroSeries(
+    'the gyro covers 0.0 s': lambda tracks, gyro: (tracks, GyroSeries(
         gyro.stamps_ns + 3600 * NANOSECONDS, gyro.rates)),
 }
 
@@ -276,12 +271,12 @@ def test_readout_longer_than_the_interval_is_refused():
 # -- parts ------------------------------------------------------------------------------------
 
 def test_every_axis_map_is_recognised():
-    maps = start.axis_maps()
+    maps = observations.axis_maps()
     assert len({m.tobytes() for m in maps}) == 24
     np.testing.assert_allclose(np.linalg.det(maps), 1.0)
     tilt = Rotation.from_rotvec([0.1, -0.2, 0.15]).as_matrix()
     for matrix in maps:
-        np.testing.assert_array_equal(start.nearest_axis_map(tilt @ matrix), matrix)
+        np.testing.assert_array_equal(observations.nearest_axis_map(tilt @ matrix), matrix)
 
 
 @pytest.mark.parametrize('rotation, axes', [
@@ -297,8 +292,8 @@ def test_search_finds_offset_and_rotation(rotation, axes):
     ends = begins + 0.033
     estimated = np.stack([np.interp(0.5 * (begins + ends) + 0.05, times, rates[:, i])
                           for i in range(3)], axis=1) @ R.T + 0.01 * rng.standard_normal((120, 3))
-    found, = start.find_starts(estimated, begins, ends, times, rates, max_offset=0.2, step=5e-3,
-                               focal_factors=np.ones(1), count=1)
+    found, *_ = observations.find_starts(estimated, begins, ends, times, rates, max_offset=0.2,
+                                         focal_factors=np.ones(1))
     assert found.offset == pytest.approx(0.05, abs=5e-3)
     assert found.misfit < 0.02
     np.testing.assert_allclose(found.R_cam_imu, R, atol=0.03)
@@ -313,9 +308,7 @@ def few_pairs() -> tuple[coplanarity.Problem, coplanarity.Unknowns, Truth]:
     pairs = make_pairs(tracks, (2,), PairSelection((), 60, 20, 99), 0.1, rng)
     problem = Observations.of(tracks, recorded.gyro, camera_of(truth)).problem(pairs, 0.05)
     # As of intervals that vary.
-    covariates = 0.01 * np.arange(len(pairs))
-    problem = problem._replace(view1=problem.view1._replace(covariates=covariates),
-                               view2=problem.view2._replace(covariates=2.0 * covariates))
+    problem = problem._replace(covariates=0.01 * np.outer([1.0, 2.0], np.arange(len(pairs))))
     middle_row = 0.5 * (truth.height - 1) / truth.height
     unknowns = initial(
         problem, truth.R_cam_imu.T, truth.time_offset + middle_row * truth.readout_time + 1e-3,
@@ -354,11 +347,9 @@ def test_residual_is_the_distance_in_pixels_to_the_nearest_pair_that_fits():
     h, n = 1e-4, 17
     gradient = np.zeros(4)
     for k in range(4):
-        name = f'view{1 + k // 2}'
-        view = getattr(problem, name)
-        points = view.points.copy()
-        points[n, k % 2] += h / truth.focal
-        moved = problem._replace(**{name: view._replace(points=points)})
+        points = problem.points.copy()
+        points[k // 2, n, k % 2] += h / truth.focal
+        moved = problem._replace(points=points)
         change = evaluate(moved, unknowns, derivatives=False).residuals[n] - residuals[n]
         gradient[k] = change / h
     assert np.linalg.norm(gradient) == pytest.approx(1.0, abs=0.01)
@@ -380,21 +371,21 @@ def test_rays_are_the_same_through_every_camera_model(model):
     tracks = few_frames(recorded.tracks, 3)
     camera = dataclasses.replace(pinhole, distortion_model=model, distortion=MODELS[model])
 
-    def view(points: np.ndarray, camera: RollingShutterCamera) -> coplanarity.View:
+    def problem(points: np.ndarray, camera: RollingShutterCamera) -> coplanarity.Problem:
         estimated = dataclasses.replace(tracks, points=points)
         data = Observations.of(estimated, recorded.gyro, camera)
         pairs = make_pairs(data.tracks, (1,), PairSelection((), 500, 1, 99), 1.0,
                            np.random.default_rng(0))
-        return data.problem(pairs, 0.0).view1
+        return data.problem(pairs, 0.0)
 
-    straight = view(tracks.points, pinhole).points
+    straight = problem(tracks.points, pinhole).points
     pixels = camera.project(pinhole.unproject(tracks.points))
-    np.testing.assert_allclose(view(pixels, camera).points, straight, atol=1e-9)
-    h, by_pixel = 1e-3, view(pixels, camera).by_pixel
+    np.testing.assert_allclose(problem(pixels, camera).points, straight, atol=1e-9)
+    h, by_pixel = 1e-3, problem(pixels, camera).by_pixel
     for k in range(2):
         step = h * np.eye(2)[k]
-        change = view(pixels + step, camera).points - view(pixels - step, camera).points
-        np.testing.assert_allclose(by_pixel[:, :, k], change / (2.0 * h), atol=1e-9)
+        change = problem(pixels + step, camera).points - problem(pixels - step, camera).points
+        np.testing.assert_allclose(by_pixel[..., k], change / (2.0 * h), atol=1e-9)
 
 
 def test_pairs_have_the_tracks_points_in_common():
@@ -402,10 +393,9 @@ def test_pairs_have_the_tracks_points_in_common():
                                     [5, 6, 6, 5, 7, 7, 6])),
                     np.arange(14.0).reshape(7, 2))
     pairs = make_pairs(tracks, (1, 2), PairSelection((), 9, 1, 99), 1.0, np.random.default_rng(0))
-    assert list(zip(pairs.first, pairs.second, strict=True)) == [(0, 1), (1, 3)]
-    np.testing.assert_array_equal(pairs.begin, [0, 2, 4])
-    np.testing.assert_array_equal(pairs.points1, tracks.points[[0, 1, 2, 4]])
-    np.testing.assert_array_equal(pairs.points2, tracks.points[[3, 2, 6, 5]])
+    assert [pair[:2] for pair in pairs] == [(0, 1), (1, 3)]
+    np.testing.assert_array_equal(pairs[0].rows, [[0, 1], [3, 2]])
+    np.testing.assert_array_equal(pairs[1].rows, [[2, 4], [6, 5]])
 
 
 MS = 1_000_000
@@ -429,7 +419,7 @@ def test_exposure_keeps_its_intervals_and_jitter_does_not():
     np.testing.assert_allclose(exposed.covariates[1:], 1e-3 * (plateaus - 40.1), atol=1e-9)
     jittered = frame_times(stamps_of(even + np.diff(late)))
     assert jittered.varying is Varying.JITTER
-    assert jittered.jitter == pytest.approx(2.4e-3, rel=0.2)
+    assert jittered.covariates.std() == pytest.approx(2.4e-3, rel=0.2)
     # The covariate is the lateness of each stamp.
     assert np.corrcoef(jittered.covariates, -late)[0, 1] > 0.97
     redrawn = frame_times(stamps_of(rng.choice([33.0, 40.0], 400)))
@@ -651,7 +641,7 @@ def evaluated_at(readout: float, sigma: float) -> tuple[CalibrationResult, Fit]:
     covariance[ROTATION, ROTATION] += 0.01 * sigma**2
     final = dataclasses.replace(final, unknowns=final.unknowns._replace(parameters=parameters),
                                 covariance=covariance, converged=True)
-    curve = CostCurve(np.linspace(-0.03, 0.03, 3), np.zeros(3))
+    curve = np.array([np.linspace(-0.03, 0.03, 3), np.zeros(3)])
     return evaluated(data, final, curve, CalibrationConfig()), final
 
 
@@ -676,7 +666,7 @@ def test_sigmas_of_the_lens_do_not_exceed_those_of_its_priors():
     covariance, sigma = final.covariance.copy(), 0.015 * data.camera.width
     covariance[CENTER, CENTER] += (10.0 * sigma)**2
     wide = dataclasses.replace(final, covariance=covariance)
-    curve = CostCurve(np.linspace(-0.03, 0.03, 3), np.zeros(3))
+    curve = np.array([np.linspace(-0.03, 0.03, 3), np.zeros(3)])
     result = evaluated(data, wide, curve, CalibrationConfig())
     *_, column, row = result.lens
     assert 0.9 * sigma < column.sigma < sigma

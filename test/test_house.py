@@ -18,7 +18,7 @@ OF_PACKAGE = {path: text for path, text in MODULES.items() if path.parts[0] == P
 BUDGETS = {
     'rs_relpose_ros': (315, 5),
     'rs_relpose_ros/bags': (1544, 6),
-    'rs_relpose_ros/calibrate': (3106, 9),
+    'rs_relpose_ros/calibrate': (2847, 8),
     'rs_relpose_ros/cli': (1523, 6),
     'rs_relpose_ros/config': (815, 3),
     'rs_relpose_ros/estimator': (3888, 12),
@@ -27,7 +27,7 @@ BUDGETS = {
     'rs_relpose_ros/messages': (1438, 5),
     'rs_relpose_ros/nodes': (2189, 9),
     'rs_relpose_ros/odometry': (3139, 11),
-    'rs_relpose_ros/offline': (1926, 8),
+    'rs_relpose_ros/offline': (1903, 8),
     'rs_relpose_ros/pipeline': (3543, 12),
     'rs_relpose_ros/solvers': (1678, 6),
     'rs_relpose_ros/tracking': (1224, 5),

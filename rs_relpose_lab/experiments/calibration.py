@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from rs_relpose_lab.experiments.harness import grouped, markdown_table, write_table
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.calibrate.observations import Tracks
-from rs_relpose_ros.calibrate.procedure import calibrate, CalibrationInput, read_recording
+from rs_relpose_ros.calibrate.procedure import CalibrationInput, read_recording
 from rs_relpose_ros.calibrate.result import CalibrationResult, Estimate
 from rs_relpose_ros.config.settings import TRACKED_IN_IMAGES, TrackingConfig
 from rs_relpose_ros.errors import InputError
@@ -74,8 +74,7 @@ def calibrated_parts(name: str, recording: CalibrationInput, seconds: float,
     """Calibration of each part; `refused` gets the reason why one cannot be used."""
     for begin, tracks in parts_of(recording.tracks, seconds):
         try:
-            result = calibrate(tracks, recording.gyro, recording.camera,
-                               focal_known=recording.focal_known, config=TRACKED_IN_IMAGES)
+            result = replace(recording, tracks=tracks).calibrated(TRACKED_IN_IMAGES)
         except InputError as error:
             refused(f'{name} from {begin:.0f} s: {error}')
             continue

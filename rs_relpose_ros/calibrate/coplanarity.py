@@ -3,36 +3,116 @@
 Frame i exposes row v at ``t_i(v) = stamp_i + offset + slope k_i + s(v) readout`` with
 ``s(v) = (v - middle row) / height``. With ``Q(t)`` the rotation by the gyro and ``n = (x, y, 1)``
 the undistorted point, ``m_i = M_i n_i`` with ``M_i = Q(t_i) R_imu_cam`` is the ray in a frame that
-does not rotate. Over a short span the velocity of the camera is assumed constant, so that between
-any row of frame 1 and any row of frame 2 it moves in the same direction b, and
+does not rotate, and with the displacement b of the camera
 
     e = b . (m_1 x m_2) = 0,      r = e / s,  s = |de / d(pixels)|               [px]
 
-with the exact derivative by all four pixel coordinates. The distance that the camera moves and the
-depth of the points cancel. Each pair has unknowns of its own: the unit vector `direction`; `bend`,
-a change of velocity, which adds ``bend (s_1 + s_2)`` to b; and `turn`, the rotation from frame 1
-to frame 2 that the noise of the gyro hides. Priors keep the last two small. The prior of `bend` is
-in units of |b| and independent of the readout time: a readout time that is too long gains no
-freedom by it.
-
-A row shows the mean of its exposure, so the gyro is averaged over it
-(`observations.exposed_rates`); what is not known of the exposure is an unknown with a prior. So is
-the lens: a point and its derivative by the pixel are linear in four parameters about the assumed
-camera (`observations.with_lens`), and the fit is repeated about its result.
+Each pair has unknowns of its own: the unit vector `direction`; `bend`, a change of velocity, which
+adds ``bend (s_1 + s_2)`` to b; and `turn`, the rotation that the noise of the gyro hides. The
+prior of `bend` is in units of |b|: a readout time that is too long gains no freedom by it. Points
+and their derivatives by the pixel are linear in the four parameters of the lens. All of it is in
+docs/calibration.md, "Method".
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
 
-from rs_relpose_ros.calibrate.start import GyroPath, knot_before, rotation_at
 from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.geometry.so3 import cross, dot, multiply, norm, rotated, rotated_back, Vector
 from rs_relpose_ros.jit import inlined_kernel, kernel
+
+# -- Orientation by the gyro at any time --------------------------------------------------------
+
+class GyroPath(NamedTuple):
+    """Integrated gyro with K knots: rates are linear between neighbouring knots."""
+
+    times: Array        # (K,) [s]
+    rates: Array        # (K, 3) without the bias [rad/s]
+    rotations: Array    # (K, 3, 3) R_start^T R_k, IMU frame
+    # (K, 3, 3) integral of the rotations over time [s]: a rate error db turns the rotation at knot
+    # k by ``turned_k db``, in the frame of the start.
+    turned: Array
+
+    @classmethod
+    def integrated(cls, times: Array, measured: Array, bias: Array) -> GyroPath:
+        """Integrate rates (K, 3) at times (K,) after subtracting a bias (3,)."""
+        rates = measured - bias
+        rotations = _integrated(times, rates)
+        return cls(times, rates, rotations,
+                   cumulative_trapezoid(rotations, times, axis=0, initial=0.0))
+
+    def at(self, times: Array) -> Array:
+        """Rotations (N, 3, 3) at times (N,); extrapolated outside of the knots."""
+        return _evaluated(self, times)
+
+
+@kernel
+def _integrated(times: Array, rates: Array) -> Array:
+    """``R <- R Exp((w_0 + w_1) dt / 2)``."""
+    rotations = np.empty((len(times), 3, 3))
+    rotations[0] = np.eye(3)
+    for k in range(len(times) - 1):
+        _path_rotation(rotations[k], rates[k], rates[k + 1], times[k + 1] - times[k],
+                       rotations[k + 1])
+    return rotations
+
+
+@inlined_kernel
+def _path_rotation(rotation: Array, rate1: Array, rate2: Array, dt: float, out: Array) -> None:
+    """Write ``R Exp(phi)`` with ``phi = (w_1 + w_2) dt / 2``: Rodrigues' formula for each row."""
+    phi = (0.5 * dt * (rate1[0] + rate2[0]), 0.5 * dt * (rate1[1] + rate2[1]),
+           0.5 * dt * (rate1[2] + rate2[2]))
+    square = dot(phi, phi)
+    if square < 0.01:   # to 1e-14; without sine and cosine twice as fast
+        a = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
+        b = 0.5 - square / 24.0 * (1.0 - square / 30.0 * (1.0 - square / 56.0))
+    else:
+        a, b = so3.rodrigues(square)
+    for i in range(3):
+        side = cross(rotation[i], phi)
+        back = cross(side, phi)
+        for j in range(3):
+            out[i, j] = rotation[i, j] + a * side[j] + b * back[j]
+
+
+@inlined_kernel
+def _rotation_at(path: GyroPath, time: float, k: int, rotation: Array, rate: Array) -> None:
+    """Fill the rotation (3, 3) and the rate (3,) at a time from knot `k` on."""
+    dt = time - path.times[k]
+    share = dt / (path.times[k + 1] - path.times[k])
+    for i in range(3):
+        rate[i] = path.rates[k, i] + share * (path.rates[k + 1, i] - path.rates[k, i])
+    _path_rotation(path.rotations[k], path.rates[k], rate, dt, rotation)
+
+
+@kernel
+def _knot_before(times: Array, time: float, near: int) -> int:
+    """Index of the last knot not after `time`, within [0, K - 2], searched from `near` on."""
+    k = min(max(near, 0), len(times) - 2)
+    while k > 0 and times[k] > time:
+        k -= 1
+    while k < len(times) - 2 and times[k + 1] <= time:
+        k += 1
+    return k
+
+
+@kernel
+def _evaluated(path: GyroPath, at: Array) -> Array:
+    out, rate = np.empty((len(at), 3, 3)), np.empty(3)
+    k = 0
+    for n in range(len(at)):
+        k = _knot_before(path.times, at[n], k)
+        _rotation_at(path, at[n], k, out[n], rate)
+    return out
+
+
+# -- Data and unknowns ----------------------------------------------------------------------------
 
 # Parameters of the calibration, in this order: readout time [s], offset of the middle row [s],
 # slope of the offset, rotation vector on the left of R_imu_cam (3) [rad], bias (3) [rad/s]; of the
@@ -51,18 +131,6 @@ LOCAL = ALL - GLOBAL
 ROBUST = 3.0
 
 
-class View(NamedTuple):
-    """One of the two frames of each of P pairs, with its side of their N matches."""
-
-    times: Array        # (P,) stamps [s]
-    covariates: Array   # (P,) covariates k_i of the offset; see `FrameTimes` [s]
-    points: Array       # (N, 2) undistorted and normalised with the assumed camera
-    rows: Array         # (N,) s(v) of the raw rows
-    by_pixel: Array     # (N, 2, 2) derivative of the normalised point by the pixel
-    by_lens: Array      # (N, 2, 4) derivative of the normalised point by the lens
-    by_pixel_by_lens: Array   # (N, 2, 2, 4) derivative of `by_pixel` by the lens
-
-
 class Problem(NamedTuple):
     """Data of a fit to P pairs with N matches in all."""
 
@@ -72,12 +140,18 @@ class Problem(NamedTuple):
     # [rad/s^2].
     blur_rates: Array
     blur_turns: Array
+    times: Array                  # (2, P) stamps of the frames of each pair [s]
+    covariates: Array             # (2, P) covariates k_i of the offset; see `FrameTimes` [s]
     begin: NDArray[np.int64]      # (P + 1,) matches of pair p: begin[p] to begin[p + 1]
     # (P,) knot of the gyro near the middle of the pair. `direction`, `bend` and `turn` are in the
     # frame of that knot: in that of the start they would rotate with each step of the bias.
     middle: NDArray[np.int64]
-    view1: View
-    view2: View
+    # Of both frames of each match:
+    rows: Array                   # (2, N) s(v) of the raw rows
+    points: Array                 # (2, N, 2) undistorted and normalised with the assumed camera
+    by_pixel: Array               # (2, N, 2, 2) derivative of the normalised point by the pixel
+    by_lens: Array                # (2, N, 2, 4) derivative of the normalised point by the lens
+    by_pixel_by_lens: Array       # (2, N, 2, 2, 4) derivative of `by_pixel` by the lens
     bend_sigma: Array             # (P,) 1 sigma of each component of `bend`
     turn_sigma: Array             # (P,) 1 sigma of each component of `turn` [rad]
     prior: Array                  # (GLOBAL,) inverse variances of the parameters
@@ -89,28 +163,29 @@ class Problem(NamedTuple):
         return len(self.middle)
 
     @property
+    def pair(self) -> NDArray[np.int64]:
+        """Pair (N,) of each match."""
+        return np.repeat(np.arange(self.pairs), np.diff(self.begin))
+
+    @property
     def middles(self) -> Array:
         """Times (P,) of the middle of each pair on the camera clock [s]."""
-        return 0.5 * (self.view1.times + self.view2.times)
+        return 0.5 * (self.times[0] + self.times[1])
 
     def matches(self, kept: NDArray[np.bool_]) -> Problem:
         """The same pairs with some of their matches (N,)."""
-        view1, view2 = (view._replace(points=view.points[kept], rows=view.rows[kept],
-                                      by_pixel=view.by_pixel[kept], by_lens=view.by_lens[kept],
-                                      by_pixel_by_lens=view.by_pixel_by_lens[kept])
-                        for view in (self.view1, self.view2))
-        return self._replace(begin=np.cumsum([0, *kept])[self.begin], view1=view1, view2=view2)
+        some: dict[str, Any] = {name: np.compress(kept, getattr(self, name), axis=1) for name in (
+            'rows', 'points', 'by_pixel', 'by_lens', 'by_pixel_by_lens')}
+        return self._replace(begin=np.cumsum([0, *kept])[self.begin], **some)
 
     def pairs_of(self, kept: NDArray[np.bool_]) -> Problem:
         """Some of the pairs (P,)."""
-        counts = np.diff(self.begin)
-        some = self.matches(np.repeat(kept, counts))
-        view1, view2 = (view._replace(times=view.times[kept], covariates=view.covariates[kept])
-                        for view in (some.view1, some.view2))
+        some = self.matches(kept[self.pair])
         return some._replace(
-            begin=np.cumsum([0, *counts[kept]]), middle=self.middle[kept],
-            bend_sigma=self.bend_sigma[kept], turn_sigma=self.turn_sigma[kept], view1=view1,
-            view2=view2)
+            times=np.compress(kept, self.times, axis=1),
+            covariates=np.compress(kept, self.covariates, axis=1),
+            begin=np.cumsum([0, *np.diff(self.begin)[kept]]), middle=self.middle[kept],
+            bend_sigma=self.bend_sigma[kept], turn_sigma=self.turn_sigma[kept])
 
 
 class Unknowns(NamedTuple):
@@ -149,75 +224,40 @@ class _Sight(NamedTuple):
     rate: Array      # (3,) of the IMU [rad/s]
     blur: Array      # (3,) turn of the IMU by the square of the exposure [rad/s^2]
     by_bias: Array   # (3, 3) integral of the rotations since the middle of the pair [s]
-    point: Array     # (2,) normalised point through the lens
-    by_pixel: Array   # (2, 2) its derivative by the pixel
-
-
-class _Residual(NamedTuple):
-    """Residual ``r = e / s`` of a match, and terms of its derivatives."""
-
-    r: float         # [px]
-    s: float
-    c1: Vector       # c_1 = m_2 x b and c_2 = b x m_1: e = m_1 . c_1 = m_2 . c_2
-    c2: Vector
-    k1: Vector       # k_i = M_i P_i P_i^T M_i^T c_i, P_i the derivative by the pixel
-    k2: Vector
-
-
-class _Derivatives(NamedTuple):
-    """Derivatives of a residual."""
-
-    by_m1: Vector   # by the rays m_1 and m_2
-    by_m2: Vector
-    by_1: Vector    # by a small rotation of all of frame 1, and of frame 2
-    by_2: Vector
-    by_b: Vector
 
 
 @kernel
 def _new_sight() -> _Sight:
     return _Sight(np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3),
-                  np.empty((3, 3)), np.empty(2), np.empty((2, 2)))
+                  np.empty((3, 3)))
 
 
 @inlined_kernel
-def _look(path: GyroPath, R_imu_cam: Array, correction: Array, time: float, near: int,
-          sight: _Sight) -> int:
-    """Fill Q, M and rate of `sight` at a time, and return the gyro's knot before it."""
-    k = knot_before(path.times, time, near)
-    rotation_at(path, time, k, sight.M, sight.rate)
+def _look(path: GyroPath, R_imu_cam: Array, correction: Array, point: Array, time: float,
+          near: int, sight: _Sight) -> tuple[int, Vector]:
+    """Fill Q, M and rate of `sight` at a time; the knot before it, and the ray of a point."""
+    k = _knot_before(path.times, time, near)
+    _rotation_at(path, time, k, sight.M, sight.rate)
     multiply(correction, sight.M, sight.Q)
     multiply(sight.Q, R_imu_cam, sight.M)
-    return k
+    return k, rotated(sight.M, (point[0], point[1], 1.0))
 
 
 @inlined_kernel
-def _start(view: View, p: int, parameters: Array) -> float:
-    """Time of the middle row on the clock of the gyro [s]."""
-    return view.times[p] + parameters[OFFSET] + parameters[SLOPE] * view.covariates[p]
+def _starts(problem: Problem, p: int, parameters: Array) -> tuple[float, float]:
+    """Times of the middle rows of a pair on the clock of the gyro [s]."""
+    return (
+        problem.times[0, p] + parameters[OFFSET] + parameters[SLOPE] * problem.covariates[0, p],
+        problem.times[1, p] + parameters[OFFSET] + parameters[SLOPE] * problem.covariates[1, p])
 
 
 @inlined_kernel
-def _through_lens(view: View, n: int, parameters: Array, sight: _Sight) -> Vector:
-    """Fill point and by_pixel of `sight` for a match, and return its ray ``m = M (x, y, 1)``."""
-    for i in range(2):
-        sight.point[i] = view.points[n, i]
-        for k in range(_OF_LENS):
-            sight.point[i] += view.by_lens[n, i, k] * parameters[FOCAL + k]
-        for j in range(2):
-            sight.by_pixel[i, j] = view.by_pixel[n, i, j]
-            for k in range(_OF_LENS):
-                sight.by_pixel[i, j] += view.by_pixel_by_lens[n, i, j, k] * parameters[FOCAL + k]
-    return rotated(sight.M, (sight.point[0], sight.point[1], 1.0))
-
-
-@inlined_kernel
-def _by_pixels(sight: _Sight, c: Vector) -> tuple[float, Vector]:
+def _by_pixels(M: Array, P: Array, c: Vector) -> tuple[float, Vector]:
     """``|P^T M^T c|^2`` and ``k = M P P^T M^T c`` with P the derivative by the pixel."""
-    h, P = rotated_back(sight.M, c), sight.by_pixel
+    h = rotated_back(M, c)
     q0 = P[0, 0] * h[0] + P[1, 0] * h[1]
     q1 = P[0, 1] * h[0] + P[1, 1] * h[1]
-    k = rotated(sight.M, (P[0, 0] * q0 + P[0, 1] * q1, P[1, 0] * q0 + P[1, 1] * q1, 0.0))
+    k = rotated(M, (P[0, 0] * q0 + P[0, 1] * q1, P[1, 0] * q0 + P[1, 1] * q1, 0.0))
     return q0 * q0 + q1 * q1, k
 
 
@@ -229,27 +269,20 @@ def _less(a: Vector, factor: float, b: Vector, divisor: float) -> Vector:
 
 
 @inlined_kernel
-def _residual(sight1: _Sight, sight2: _Sight, m1: Vector, m2: Vector, b: Vector) -> _Residual:
-    """``r = e / s`` with ``s^2 = |P_1^T M_1^T c_1|^2 + |P_2^T M_2^T c_2|^2``."""
-    c1, c2 = cross(m2, b), cross(b, m1)
-    square1, k1 = _by_pixels(sight1, c1)
-    square2, k2 = _by_pixels(sight2, c2)
-    s = math.sqrt(max(square1 + square2, 1e-16))
-    return _Residual(dot(m1, c1) / s, s, c1, c2, k1, k2)
+def _derivatives(r: float, s: float, m1: Vector, m2: Vector, b: Vector, c1: Vector, c2: Vector,
+                 k1: Vector, k2: Vector) -> tuple[Vector, Vector, Vector, Vector, Vector]:
+    """Of r by m_1 and m_2, by a small rotation of all of frame 1 and of frame 2, and by b.
 
-
-@inlined_kernel
-def _derivatives(found: _Residual, m1: Vector, m2: Vector, b: Vector) -> _Derivatives:
-    """``dr = (de - (e / s^2) (k_1 . dc_1 + k_2 . dc_2)) / s``."""
-    s, c1, c2, k1, k2 = found.s, found.c1, found.c2, found.k1, found.k2
-    ratio = found.r / s
+    ``dr = (de - (e / s^2) (k_1 . dc_1 + k_2 . dc_2)) / s``.
+    """
+    ratio = r / s
     by_m1 = _less(c1, ratio, cross(k2, b), s)
     by_m2 = _less(c2, ratio, cross(b, k1), s)
     # A rotation of a frame rotates its M together with its ray.
     by_1 = _less(cross(m1, by_m1), -ratio / s, cross(c1, k1), 1.0)
     by_2 = _less(cross(m2, by_m2), -ratio / s, cross(c2, k2), 1.0)
     by_b = _less(_less(cross(m1, m2), ratio, cross(k1, m2), 1.0), ratio, cross(m1, k2), s)
-    return _Derivatives(by_m1, by_m2, by_1, by_2, by_b)
+    return by_m1, by_m2, by_1, by_2, by_b
 
 
 @inlined_kernel
@@ -274,16 +307,16 @@ def _add_view(J: Array, by_turn: Vector, sight: _Sight, row: float, covariate: f
 
 
 @inlined_kernel
-def _add_lens(J: Array, view: View, n: int, by_m: Vector, c: Vector, sight: _Sight,
+def _add_lens(J: Array, problem: Problem, side: int, n: int, by_m: Vector, c: Vector, M: Array,
               ratio: float) -> None:
     """Add the derivatives by the lens through one frame: by its ray, and by s through P.
 
     ``s ds = (P^T h) . (dP^T h)`` with ``h = M^T c``; `ratio` is r / s^2.
     """
-    by_point, h, P = rotated_back(sight.M, by_m), rotated_back(sight.M, c), sight.by_pixel
+    by_point, h, P = rotated_back(M, by_m), rotated_back(M, c), problem.by_pixel[side, n]
     q0 = ratio * (P[0, 0] * h[0] + P[1, 0] * h[1])
     q1 = ratio * (P[0, 1] * h[0] + P[1, 1] * h[1])
-    by_lens, dP = view.by_lens[n], view.by_pixel_by_lens[n]
+    by_lens, dP = problem.by_lens[side, n], problem.by_pixel_by_lens[side, n]
     for k in range(_OF_LENS):
         J[FOCAL + k] += (by_point[0] * by_lens[0, k] + by_point[1] * by_lens[1, k]
                          - q0 * (dP[0, 0, k] * h[0] + dP[1, 0, k] * h[1])
@@ -291,23 +324,18 @@ def _add_lens(J: Array, view: View, n: int, by_m: Vector, c: Vector, sight: _Sig
 
 
 @inlined_kernel
-def _blur_at(problem: Problem, k: int, time: float, out: Array) -> None:
-    """Turn (3,) by the square of the exposure at a time after knot `k` [rad/s^2]."""
-    dt = time - problem.gyro_times[k]
-    half_share = 0.5 * dt / (problem.gyro_times[k + 1] - problem.gyro_times[k])
+def _integrate(problem: Problem, path: GyroPath, middle: int, k: int, time: float,
+               sight: _Sight) -> None:
+    """Fill blur and by_bias of `sight` at a time after knot `k`."""
+    dt = time - path.times[k]
+    half_share = 0.5 * dt / (path.times[k + 1] - path.times[k])
     for i in range(3):
         change = problem.blur_rates[k + 1, i] - problem.blur_rates[k, i]
-        out[i] = problem.blur_turns[k, i] + dt * (problem.blur_rates[k, i] + half_share * change)
-
-
-@inlined_kernel
-def _integral_since(path: GyroPath, middle: int, k: int, time: float, out: Array) -> None:
-    """Integral (3, 3) of the rotations from knot `middle` to a time after knot `k` [s]."""
-    dt = time - path.times[k]
-    for i in range(3):
+        sight.blur[i] = problem.blur_turns[k, i] + dt * (
+            problem.blur_rates[k, i] + half_share * change)
         for j in range(3):
-            out[i, j] = (path.turned[k, i, j] - path.turned[middle, i, j]
-                         + dt * path.rotations[k, i, j])
+            sight.by_bias[i, j] = (path.turned[k, i, j] - path.turned[middle, i, j]
+                                   + dt * path.rotations[k, i, j])
 
 
 @inlined_kernel
@@ -324,60 +352,56 @@ def accumulate(problem: Problem, path: GyroPath, unknowns: Unknowns, tangent: Ar
                derivatives: bool, sums: Sums) -> None:
     """Sum robust losses, gradients and Hessians over the matches of each pair, without priors.
 
-    `tangent` (P, 2, 3) holds the tangent vectors that span the steps of each direction.
-
-    With residual r, ``d^2 = (r / noise)^2`` and ``l = 1 / (1 + d^2 / ROBUST^2)`` the loss of a
-    match is ``d^2 l / 2`` (Geman-McClure) and its weight ``l^2 / noise^2``.
+    `tangent` (P, 2, 3) spans the steps of each direction. With ``d = r / noise`` and
+    ``l = 1 / (1 + d^2 / ROBUST^2)`` the loss of a match is ``d^2 l / 2`` (Geman-McClure).
     """
-    view1, view2, parameters = problem.view1, problem.view2, unknowns.parameters
+    parameters = unknowns.parameters
     readout = parameters[READOUT]
     sight1, sight2, J = _new_sight(), _new_sight(), np.empty(ALL)
     for p in range(len(problem.middle)):
-        middle = problem.middle[p]
+        middle, covariates = problem.middle[p], problem.covariates[:, p]
         Q_middle = path.rotations[middle]
         straight = rotated(Q_middle, unknowns.direction[p])
         bend = rotated(Q_middle, unknowns.bend[p])
         # Half of `turn` forwards in frame 2, and half of it backwards in frame 1.
         half = so3.exp_so3(0.5 * (Q_middle @ unknowns.turn[p]))
         half_back = np.ascontiguousarray(half.T)
-        start1, start2 = _start(view1, p, parameters), _start(view2, p, parameters)
+        starts = _starts(problem, p, parameters)
         k1 = k2 = middle
         per_noise2 = 1.0 / unknowns.noise[p] ** 2
-        loss = 0.0
+        sums.losses[p] = 0.0
         for n in range(problem.begin[p], problem.begin[p + 1]):
-            row1, row2 = view1.rows[n], view2.rows[n]
-            t1, t2 = start1 + row1 * readout, start2 + row2 * readout
-            k1 = _look(path, unknowns.R_imu_cam, half_back, t1, k1, sight1)
-            k2 = _look(path, unknowns.R_imu_cam, half, t2, k2, sight2)
-            m1 = _through_lens(view1, n, parameters, sight1)
-            m2 = _through_lens(view2, n, parameters, sight2)
+            row1, row2 = problem.rows[0, n], problem.rows[1, n]
+            t1, t2 = starts[0] + row1 * readout, starts[1] + row2 * readout
+            k1, m1 = _look(path, unknowns.R_imu_cam, half_back, problem.points[0, n], t1, k1,
+                           sight1)
+            k2, m2 = _look(path, unknowns.R_imu_cam, half, problem.points[1, n], t2, k2, sight2)
             rows = row1 + row2
             b = _less(straight, -rows, bend, 1.0)   # straight + rows bend
-            found = _residual(sight1, sight2, m1, m2, b)
-            sums.residuals[n] = found.r
-            distance2 = found.r**2 * per_noise2
+            c1, c2 = cross(m2, b), cross(b, m1)     # e = m_1 . c_1 = m_2 . c_2
+            square1, by_pixels1 = _by_pixels(sight1.M, problem.by_pixel[0, n], c1)
+            square2, by_pixels2 = _by_pixels(sight2.M, problem.by_pixel[1, n], c2)
+            s = math.sqrt(max(square1 + square2, 1e-16))
+            r = sums.residuals[n] = dot(m1, c1) / s
+            distance2 = r**2 * per_noise2
             level = 1.0 / (1.0 + distance2 / ROBUST**2)
-            loss += 0.5 * distance2 * level
+            sums.losses[p] += 0.5 * distance2 * level
             if not derivatives:
                 continue
-            by = _derivatives(found, m1, m2, b)
+            by_m1, by_m2, by_1, by_2, by_b = _derivatives(
+                r, s, m1, m2, b, c1, c2, by_pixels1, by_pixels2)
             J[:] = 0.0
-            _integral_since(path, middle, k1, t1, sight1.by_bias)
-            _integral_since(path, middle, k2, t2, sight2.by_bias)
-            _blur_at(problem, k1, t1, sight1.blur)
-            _blur_at(problem, k2, t2, sight2.blur)
-            _add_view(J, by.by_1, sight1, row1, view1.covariates[p], -0.5, Q_middle)
-            _add_view(J, by.by_2, sight2, row2, view2.covariates[p], 0.5, Q_middle)
-            ratio = found.r / found.s**2
-            _add_lens(J, view1, n, by.by_m1, found.c1, sight1, ratio)
-            _add_lens(J, view2, n, by.by_m2, found.c2, sight2, ratio)
-            by_b = rotated_back(Q_middle, by.by_b)
-            J[DIRECTION] = dot(tangent[p, 0], by_b)
-            J[DIRECTION + 1] = dot(tangent[p, 1], by_b)
+            _integrate(problem, path, middle, k1, t1, sight1)
+            _integrate(problem, path, middle, k2, t2, sight2)
+            _add_view(J, by_1, sight1, row1, covariates[0], -0.5, Q_middle)
+            _add_view(J, by_2, sight2, row2, covariates[1], 0.5, Q_middle)
+            _add_lens(J, problem, 0, n, by_m1, c1, sight1.M, r / s**2)
+            _add_lens(J, problem, 1, n, by_m2, c2, sight2.M, r / s**2)
+            by_b = rotated_back(Q_middle, by_b)
+            J[DIRECTION], J[DIRECTION + 1] = dot(tangent[p, 0], by_b), dot(tangent[p, 1], by_b)
             for i in range(3):
                 J[BEND + i] = rows * by_b[i]
-            _add_match(J, found.r, level * level * per_noise2, sums.gradient[p], sums.hessian[p])
-        sums.losses[p] = loss
+            _add_match(J, r, level * level * per_noise2, sums.gradient[p], sums.hessian[p])
 
 
 @kernel
@@ -427,12 +451,10 @@ def find_directions(problem: Problem, path: GyroPath, unknowns: Unknowns,
                     chosen: NDArray[np.int64], direction: Array) -> None:
     """Replace `direction` (P, 3) by the best of itself and of those that two matches each fix.
 
-    `chosen` (K, 2) are large random numbers that pick the matches. The best has the least
-    truncated cost.
+    `chosen` (K, 2) are large random numbers that pick the matches. The best has the least sum of
+    ``min((e / s)^2, limit)``; of each match ``e = normal . b`` and ``s^2 = b^T square b``.
     """
-    most = 0
-    for p in range(len(problem.middle)):
-        most = max(most, problem.begin[p + 1] - problem.begin[p])
+    most = np.diff(problem.begin).max()
     normals, squares = np.empty((most, 3)), np.empty((most, 3, 3))
     for p in range(len(problem.middle)):
         count = problem.begin[p + 1] - problem.begin[p]
@@ -449,59 +471,43 @@ def find_directions(problem: Problem, path: GyroPath, unknowns: Unknowns,
             if length < 1e-14:
                 continue
             b = (b[0] / length, b[1] / length, b[2] / length)
-            cost = _truncated_cost(normals, squares, count, b, limit, least)
+            cost = 0.0
+            for i in range(count):
+                s2 = max(dot(b, rotated(squares[i], b)), 1e-16)
+                cost += min(dot(normals[i], b) ** 2 / s2, limit)
+                if cost >= least:
+                    break
             if cost < least:
                 least, best = cost, b
         if least < np.inf:
-            in_middle = rotated_back(Q_middle, best)
-            for i in range(3):
-                direction[p, i] = in_middle[i]
+            direction[p, 0], direction[p, 1], direction[p, 2] = rotated_back(Q_middle, best)
 
 
 @kernel
 def _constraints(problem: Problem, path: GyroPath, unknowns: Unknowns, p: int, normals: Array,
                  squares: Array) -> None:
-    """Fill `normals` and `squares` of a pair: ``e = normal . b`` and ``s^2 = b^T square b``."""
-    view1, view2, parameters = problem.view1, problem.view2, unknowns.parameters
-    uncorrected = np.eye(3)
-    sight1, sight2 = _new_sight(), _new_sight()
-    start1, start2 = _start(view1, p, parameters), _start(view2, p, parameters)
+    """Fill `normals` and `squares` of the matches of a pair."""
+    parameters = unknowns.parameters
+    uncorrected, sight1, sight2 = np.eye(3), _new_sight(), _new_sight()
+    starts = _starts(problem, p, parameters)
     k1 = k2 = problem.middle[p]
     for i in range(problem.begin[p + 1] - problem.begin[p]):
         n = problem.begin[p] + i
-        k1 = _look(path, unknowns.R_imu_cam, uncorrected,
-                   start1 + view1.rows[n] * parameters[READOUT], k1, sight1)
-        k2 = _look(path, unknowns.R_imu_cam, uncorrected,
-                   start2 + view2.rows[n] * parameters[READOUT], k2, sight2)
-        m1 = _through_lens(view1, n, parameters, sight1)
-        m2 = _through_lens(view2, n, parameters, sight2)
-        normal = cross(m1, m2)
-        for c in range(3):
-            normals[i, c] = normal[c]
+        k1, m1 = _look(path, unknowns.R_imu_cam, uncorrected, problem.points[0, n],
+                       starts[0] + problem.rows[0, n] * parameters[READOUT], k1, sight1)
+        k2, m2 = _look(path, unknowns.R_imu_cam, uncorrected, problem.points[1, n],
+                       starts[1] + problem.rows[1, n] * parameters[READOUT], k2, sight2)
+        normals[i, 0], normals[i, 1], normals[i, 2] = cross(m1, m2)
         squares[i] = 0.0
-        _add_squares(sight1, m2, squares[i])
-        _add_squares(sight2, m1, squares[i])
+        _add_squares(problem.by_pixel[0, n], sight1.M, m2, squares[i])
+        _add_squares(problem.by_pixel[1, n], sight2.M, m1, squares[i])
 
 
 @inlined_kernel
-def _add_squares(sight: _Sight, other: Vector, square: Array) -> None:
+def _add_squares(P: Array, M: Array, other: Vector, square: Array) -> None:
     """Add ``g g^T`` of both pixel coordinates of one frame, with ``de/dpixel = g . b``."""
-    P = sight.by_pixel
     for r in range(2):
-        g = cross(rotated(sight.M, (P[0, r], P[1, r], 0.0)), other)
+        g = cross(rotated(M, (P[0, r], P[1, r], 0.0)), other)
         for c in range(3):
             for d in range(3):
                 square[c, d] += g[c] * g[d]
-
-
-@inlined_kernel
-def _truncated_cost(normals: Array, squares: Array, count: int, b: Vector, limit: float,
-                    least: float) -> float:
-    """Sum of ``min((e / s)^2, limit)``; any number from `least` on if it is not less."""
-    cost = 0.0
-    for i in range(count):
-        s2 = max(dot(b, rotated(squares[i], b)), 1e-16)
-        cost += min(dot(normals[i], b) ** 2 / s2, limit)
-        if cost >= least:
-            break
-    return cost

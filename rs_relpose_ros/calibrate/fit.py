@@ -1,17 +1,9 @@
 """Robust fit of the calibration (Levenberg-Marquardt, pairs eliminated), and its sigmas.
 
-Three kinds of errors exceed the noise of the matches:
-
-- errors that a part of the image shares all the time: tracks of a blurred edge, a moving object,
-  the lens. Scatter between stretches of time does not contain them; that between regions of the
-  image does (two-way clustering: A. C. Cameron, J. B. Gelbach, D. L. Miller, Robust inference with
-  multiway clustering, J. Bus. Econ. Stat. 29, 2011);
-- errors that last longer than a stretch: exposure that follows the light, a second optimum. Both
-  halves of the recording are fitted by themselves; if they differ by more than their sigmas, all
-  sigmas are widened by as much (R. T. Birge, The calculation of errors by the method of least
-  squares, Phys. Rev. 40, 1932);
-- errors that are constant and equal in all of the image: lens and gyro differ from their model
-  (`ModelErrors`). How far each moves the calibration follows from one evaluation.
+Steps 2 to 4 of docs/calibration.md, "Method": noise of matches by a jackknife over stretches of
+time; errors that regions of the image share (two-way clustering: A. C. Cameron, J. B. Gelbach,
+D. L. Miller, J. Bus. Econ. Stat. 29, 2011); errors that both halves of the recording do not share
+(R. T. Birge, Phys. Rev. 40, 1932); errors of the models of lens and gyro (`ModelErrors`).
 """
 
 from collections.abc import Callable, Iterator
@@ -34,8 +26,6 @@ from rs_relpose_ros.calibrate.coplanarity import (
     ROTATION,
     Unknowns,
 )
-from rs_relpose_ros.calibrate.result import CostCurve
-from rs_relpose_ros.calibrate.start import GyroPath
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import log_so3
 
@@ -53,23 +43,19 @@ def stretches(times: Array) -> NDArray[np.int64]:
 
 def jackknife(scores: Array, curvatures: Array, groups: NDArray[np.int64],
               prior: Array) -> Array:
-    """Delete-a-group jackknife, each refit by one Newton step from the optimum.
+    """Covariance (G, G) by deleting a group each: one Newton step from the optimum.
 
-    It contains all differences between the groups: noise of points, of long tracks, of the gyro,
-    and motion that is not modelled. Unlike the sandwich estimate (the sum of the groups' squared
-    scores), it is not biased by the parameters having been fitted to the few groups.
-
-    `scores` (P, G) are the gradients of the cost at the optimum by pair, `curvatures` (P, G, G)
-    their derivatives, `prior` (G,) inverse variances that count as known; returns (G, G). See
-    B. Efron and R. Tibshirani, An Introduction to the Bootstrap, 1993, chapter 11.
+    Unlike the sandwich estimate, it is not biased by the parameters having been fitted to the few
+    groups (B. Efron, R. Tibshirani, An Introduction to the Bootstrap, 1993, chapter 11). `scores`
+    (P, G): gradients of the cost by pair; `curvatures` (P, G, G): their derivatives; `prior` (G,):
+    inverse variances that count as known.
     """
     total = curvatures.sum(axis=0) + np.diag(prior)
-    names = np.unique(groups)
     moves = np.stack([
         np.linalg.pinv(total - curvatures[groups == name].sum(axis=0), hermitian=True)
-        @ scores[groups == name].sum(axis=0) for name in names])
+        @ scores[groups == name].sum(axis=0) for name in np.unique(groups)])
     inverse = np.linalg.pinv(total, hermitian=True)
-    return np.asarray(jackknife_of(moves) + inverse @ np.diag(prior) @ inverse)
+    return jackknife_of(moves) + inverse @ np.diag(prior) @ inverse
 
 
 def jackknife_of(moves: Array) -> Array:
@@ -97,12 +83,11 @@ _NOISE_RANGE = (0.6, 4.0)
 
 
 def initial(problem: Problem, R_imu_cam: Array, offset: float, readout: float = 0.0,
-            bias: Array | None = None, noise: float = _NOISE_AT_START) -> Unknowns:
+            bias: Array | float = 0.0, noise: float = _NOISE_AT_START) -> Unknowns:
     """A calibration with the assumed lens, and the most likely directions of the pairs."""
     parameters, pairs = np.zeros(GLOBAL), problem.pairs
     parameters[[READOUT, model.OFFSET]] = readout, offset
-    if bias is not None:
-        parameters[model.BIAS:model.BIAS + 3] = bias
+    parameters[model.BIAS:model.FOCAL] = bias
     # R_imu_cam is contiguous: a transposed one would have the kernels compiled a second time.
     return redirected(problem, Unknowns(
         parameters, np.ascontiguousarray(R_imu_cam), np.tile([1.0, 0.0, 0.0], (pairs, 1)),
@@ -111,13 +96,10 @@ def initial(problem: Problem, R_imu_cam: Array, offset: float, readout: float = 
 
 
 def restarted(problem: Problem, unknowns: Unknowns, caution: float = 1.0) -> Unknowns:
-    """The calibration of `unknowns` for other pairs, with a multiple of its median noise.
-
-    `problem` is about the lens of `unknowns`.
-    """
+    """The calibration for other pairs, about its own lens, with a multiple of its median noise."""
     p = unknowns.parameters
     return initial(problem, unknowns.R_imu_cam, p[model.OFFSET], p[READOUT],
-                   p[model.BIAS:model.BIAS + 3], caution * float(np.median(unknowns.noise)))
+                   p[model.BIAS:model.FOCAL], caution * float(np.median(unknowns.noise)))
 
 
 _STAY = np.zeros((1, LOCAL))
@@ -126,8 +108,8 @@ _STAY = np.zeros((1, LOCAL))
 def stepped(unknowns: Unknowns, step: Array, local: Array = _STAY) -> Unknowns:
     """Unknowns after a step of the parameters (GLOBAL,) and of each pair (P, LOCAL)."""
     parameters = unknowns.parameters + step
-    parameters[ROTATION:ROTATION + 3] = 0.0
-    rotation = Rotation.from_rotvec(step[ROTATION:ROTATION + 3]).as_matrix()
+    parameters[ROTATION:model.BIAS] = 0.0
+    rotation = Rotation.from_rotvec(step[ROTATION:model.BIAS]).as_matrix()
     # At most about a right angle: matches may not determine a step.
     along = np.clip(local[:, :2], -1.0, 1.0)
     direction = unknowns.direction + np.einsum('pk,pki->pi', along, _tangents(unknowns.direction))
@@ -147,10 +129,7 @@ def _tangents(directions: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluation:
-    """Cost of all pairs, and their normal equations without the pairs' own unknowns.
-
-    The last three are empty unless derivatives are requested.
-    """
+    """Cost of all pairs, and, if requested, their normal equations without their own unknowns."""
 
     losses: Array       # (P,) robust losses of the matches and the prior of the pair
     residuals: Array    # (N,) [px]
@@ -172,7 +151,8 @@ def redirected(problem: Problem, unknowns: Unknowns) -> Unknowns:
     """Unknowns with the best direction of each pair among many that two of its matches fix."""
     direction = unknowns.direction.copy()
     chosen = np.random.default_rng(0).integers(0, 2**30, (_HYPOTHESES, 2))
-    model.find_directions(problem, _path(problem, unknowns), unknowns, chosen, direction)
+    model.find_directions(_through_lens(problem, unknowns), _path(problem, unknowns), unknowns,
+                          chosen, direction)
     changed = (np.abs((direction * unknowns.direction).sum(axis=1)) < 0.999)[:, None]
     return unknowns._replace(
         direction=direction, bend=np.where(changed, 0.0, unknowns.bend),
@@ -185,26 +165,25 @@ def evaluate(problem: Problem, unknowns: Unknowns, derivatives: bool = True) -> 
 
 
 def _sums(problem: Problem, unknowns: Unknowns, derivatives: bool) -> model.Sums:
-    pairs = problem.pairs
-    size = pairs if derivatives else 0
-    sums = model.Sums(np.empty(pairs), np.empty(len(problem.view1.points)),
+    size = problem.pairs if derivatives else 0
+    sums = model.Sums(np.empty(problem.pairs), np.empty(len(problem.rows[0])),
                       np.zeros((size, model.ALL)), np.zeros((size, model.ALL, model.ALL)))
-    model.accumulate(problem, _path(problem, unknowns), unknowns, _tangents(unknowns.direction),
-                     derivatives, sums)
+    model.accumulate(_through_lens(problem, unknowns), _path(problem, unknowns), unknowns,
+                     _tangents(unknowns.direction), derivatives, sums)
     return sums
 
 
 def _evaluation(problem: Problem, unknowns: Unknowns, sums: model.Sums) -> Evaluation:
     """Add the priors of the pairs' own unknowns, and eliminate these."""
-    pairs, size = problem.pairs, len(sums.gradient)
-    own = np.hstack([np.zeros((pairs, 2)), unknowns.bend, unknowns.turn])
-    weights = _local_priors(problem)
+    size, weights = len(sums.gradient), _local_priors(problem)
+    own = np.hstack([np.zeros((problem.pairs, 2)), unknowns.bend, unknowns.turn])
     result = Evaluation(
         sums.losses + 0.5 * (weights * own**2).sum(axis=1), sums.residuals,
         np.empty((size, GLOBAL)), np.empty((size, GLOBAL, GLOBAL)),
         np.empty((size, LOCAL, GLOBAL + 1)))
     if size:
-        gradient = sums.gradient + np.hstack([np.zeros((pairs, GLOBAL)), weights * own])
+        gradient = sums.gradient.copy()
+        gradient[:, GLOBAL:] += weights * own
         model.eliminate(sums._replace(gradient=gradient), weights, unknowns.damping,
                         result.score, result.reduced, result.back)
     return result
@@ -220,18 +199,25 @@ def _local_priors(problem: Problem) -> Array:
 def with_bends(problem: Problem, unknowns: Unknowns) -> Problem:
     """Problem with priors of `bend` from the parallax per second of the matches."""
     path, parameters = _path(problem, unknowns), unknowns.parameters
-    pair = np.repeat(np.arange(problem.pairs), np.diff(problem.begin))
     rays = []
-    for view in (problem.view1, problem.view2):
-        at = view.times[pair] + parameters[model.OFFSET] + parameters[READOUT] * view.rows
-        turns = path.at(at) @ unknowns.R_imu_cam
-        points = view.points + view.by_lens @ parameters[model.LENS]
+    for times, rows, points in zip(problem.times, problem.rows,
+                                   _through_lens(problem, unknowns).points, strict=True):
+        at = times[problem.pair] + parameters[model.OFFSET] + parameters[READOUT] * rows
         directions = np.column_stack([points, np.ones(len(points))])
-        rays.append(np.einsum('nij,nj->ni', turns,
+        rays.append(np.einsum('nij,nj->ni', path.at(at) @ unknowns.R_imu_cam,
                               directions / np.linalg.norm(directions, axis=1)[:, None]))
     angles = _medians(problem, np.linalg.norm(np.cross(rays[0], rays[1]), axis=1))
-    passing = np.maximum(angles / (problem.view2.times - problem.view1.times), 1e-6)
+    passing = np.maximum(angles / (problem.times[1] - problem.times[0]), 1e-6)
     return problem._replace(bend_sigma=np.clip(_BEND / passing, *_BEND_RANGE))
+
+
+def _through_lens(problem: Problem, unknowns: Unknowns) -> Problem:
+    """Problem with the points and their derivatives by the pixel through the estimated lens."""
+    lens = unknowns.parameters[model.LENS]
+    if not lens.any():
+        return problem
+    return problem._replace(points=problem.points + problem.by_lens @ lens,
+                            by_pixel=problem.by_pixel + problem.by_pixel_by_lens @ lens)
 
 
 def _medians(problem: Problem, values: Array) -> Array:
@@ -240,11 +226,11 @@ def _medians(problem: Problem, values: Array) -> Array:
                      for begin, end in itertools.pairwise(problem.begin)])
 
 
-def _path(problem: Problem, unknowns: Unknowns) -> GyroPath:
+def _path(problem: Problem, unknowns: Unknowns) -> model.GyroPath:
     parameters = unknowns.parameters
     estimated = problem.gyro_rates + parameters[model.EXPOSURE] * problem.blur_rates
-    return GyroPath.integrated(problem.gyro_times, estimated,
-                               parameters[model.BIAS:model.BIAS + 3])
+    return model.GyroPath.integrated(problem.gyro_times, estimated,
+                                     parameters[model.BIAS:model.FOCAL])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -302,8 +288,8 @@ def fit(problem: Problem, unknowns: Unknowns, free: NDArray[np.bool_], *, rounds
 
 
 def cost_curve(problem: Problem, final: Fit, interval: float,
-               progress: Callable[[float], object]) -> CostCurve:
-    """Cost of `problem` with the readout time fixed, from an interval upwards to one downwards."""
+               progress: Callable[[float], object]) -> Array:
+    """Readout times from an interval upwards to one downwards, and the costs with each (2, K)."""
     best = float(final.unknowns.parameters[READOUT])
     held = final.free.copy()
     held[READOUT] = False
@@ -323,7 +309,8 @@ def cost_curve(problem: Problem, final: Fit, interval: float,
     information = (final.information * (problem.begin[-1] / final.problem.begin[-1])
                    + np.diag(problem.prior))[np.ix_(final.free, final.free)]
     naive = float(np.linalg.inv(information)[0, 0])
-    return CostCurve(values, (costs - costs.min()) * naive / final.covariance[READOUT, READOUT])
+    return np.array([values,
+                     (costs - costs.min()) * naive / final.covariance[READOUT, READOUT]])
 
 
 def _refitted(problem: Problem, unknowns: Unknowns, free: NDArray[np.bool_],
@@ -473,7 +460,7 @@ def _between_regions(final: Fit) -> Array:
     """
     problem, free, curve = final.problem, final.free, bent(final.weights)
     index = np.ix_(free, free)
-    region, stretch = _regions(problem.view1.points), stretches(problem.middles)
+    region, stretch = _regions(problem.points[0]), stretches(problem.middles)
     sums = _sums(problem, final.unknowns, derivatives=True)
     whole = _evaluation(problem, final.unknowns, sums)
     prior = np.diag(problem.prior)
@@ -504,18 +491,14 @@ def _regions(points: Array) -> NDArray[np.int64]:
 
 
 def _disagreement(final: Fit) -> Array:
-    """Factors (G,) of the variances by the difference of both halves; 1 if it is by chance.
-
-    Common is the mean square of the differences in sigmas, each limited to `_GROSS`; a parameter
-    with a larger one has that.
-    """
+    """Factors (G,) of the variances by the difference of both halves; 1 if it is by chance."""
     middles, free = final.problem.middles, final.free
     first = middles < np.median(middles)
     one, other = (
         fit(final.problem.pairs_of(part), final.unknowns.pairs_of(part), free, rounds=15)
         for part in (first, ~first))
     difference = one.unknowns.parameters - other.unknowns.parameters
-    difference[ROTATION:ROTATION + 3] = log_so3(
+    difference[ROTATION:model.BIAS] = log_so3(
         one.unknowns.R_imu_cam @ other.unknowns.R_imu_cam.T)
     # The whole lets expect four times its own; less than half of that is chance, of few stretches.
     variances = np.maximum(np.diag(one.covariance + other.covariance),
@@ -531,21 +514,17 @@ def _disagreement(final: Fit) -> Array:
 def _perturbed(final: Fit, errors: ModelErrors) -> Iterator[tuple[Problem, Unknowns]]:
     """Data and unknowns with one sigma of each error of the model."""
     problem, unknowns = final.problem, final.unknowns
-    view = problem.view1
-    center = errors.center * float(np.ptp(view.points[:, 0]) / np.mean(view.by_pixel[:, 0, 0]))
+    center = errors.center * float(
+        np.ptp(problem.points[0, :, 0]) / np.mean(problem.by_pixel[0, :, 0, 0]))
     for k, error in enumerate((errors.focal, errors.radial, center, center)):
         if error:
             parameters = unknowns.parameters.copy()
             parameters[model.FOCAL + k] += error
             yield problem, unknowns._replace(parameters=parameters)
-    lenses: list[Callable[[Array], Array]] = [
-        lambda points: points / [1.0, 1.0 + errors.aspect],
-        lambda points: points * (
-            1.0 - errors.second * (points**2).sum(axis=1, keepdims=True)**2)]
-    for lens in lenses:
-        view1, view2 = (view._replace(points=np.ascontiguousarray(lens(view.points)))
-                        for view in (problem.view1, problem.view2))
-        yield problem._replace(view1=view1, view2=view2), unknowns
+    squares = (problem.points**2).sum(axis=2, keepdims=True)
+    for points in (problem.points / [1.0, 1.0 + errors.aspect],
+                   problem.points * (1.0 - errors.second * squares**2)):
+        yield problem._replace(points=points), unknowns
     for i in range(3):
         for j in range(i + 1):
             mixing = np.zeros((3, 3))
@@ -554,15 +533,12 @@ def _perturbed(final: Fit, errors: ModelErrors) -> Iterator[tuple[Problem, Unkno
                 gyro_rates=problem.gyro_rates @ (np.eye(3) + mixing)), unknowns
 
 
-# Sigma of the direction of motion of a pair [rad], beyond which it is hardly known.
+# Sigma of the direction of motion of a pair by the noise of its matches [rad], at the most.
 _KNOWN_DIRECTION = 0.1
 
 
 def move_of_poses(final: Fit, covariance: Array) -> float:
-    """Move of the direction of the median pair by the doubt of the parameters, over its sigma.
-
-    The latter is by the noise of its matches, `_KNOWN_DIRECTION` at the most.
-    """
+    """Move of the direction of the median pair by the doubt of the parameters, over its sigma."""
     problem, sums = final.problem, _sums(final.problem, final.unknowns, derivatives=True)
     H = sums.hessian[:, GLOBAL:, GLOBAL:]
     H = H + np.tril(H, -1).swapaxes(1, 2) + _local_priors(problem)[:, :, None] * np.eye(LOCAL)

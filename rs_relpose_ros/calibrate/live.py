@@ -13,12 +13,7 @@ import time
 from typing import Any
 
 from rs_relpose_ros.calibrate import stored
-from rs_relpose_ros.calibrate.procedure import (
-    calibrate,
-    CalibrationInput,
-    Recorder,
-    warm_up_fit,
-)
+from rs_relpose_ros.calibrate.procedure import CalibrationInput, Recorder, warm_up_fit
 from rs_relpose_ros.calibrate.result import CalibrationResult, parameter_file, quantities
 from rs_relpose_ros.calibrate.stored import Calibrated, CameraId, Progress
 from rs_relpose_ros.config.settings import Parameters, TRACKED_IN_IMAGES
@@ -56,6 +51,8 @@ class LiveCalibration:
     a fit. `topic`: of the images. `quat_prior`: rotation IMU to camera of a transform, +- 5 deg.
     """
 
+    camera_info_problem = ''   # an uncalibrated CameraInfo is none: the lens is calibrated, too
+
     def __init__(self, parameters: Parameters, *, use_stored: bool, waits_for: str = '',
                  topic: str = '') -> None:
         self._parameters, self._topic = parameters, topic
@@ -81,11 +78,6 @@ class LiveCalibration:
     def intrinsics(self) -> Intrinsics | None:
         """Those of the last CameraInfo."""
         return self._recorder.intrinsics
-
-    @property
-    def camera_info_problem(self) -> str:
-        """An uncalibrated CameraInfo is none: the lens is calibrated, too."""
-        return ''
 
     @property
     def fitting(self) -> bool:
@@ -115,36 +107,30 @@ class LiveCalibration:
                                Counter({Refusal.OVERLOAD: self._left_out}))
 
     def step(self, timeout: float = 0.0) -> Progress | Calibrated | RsRelposeError | None:
-        """Use a message; the state after a fit, the error of the message, or None.
-
-        Nothing follows a `Calibrated`.
-        """
-        if self._done:
-            time.sleep(timeout)
-            return None
-        outcome = self._next(timeout)
-        self._done = isinstance(outcome, Calibrated)
-        if self._done:
+        """Use a message; the state after a fit, the error of the message, or None."""
+        outcome: Progress | Calibrated | RsRelposeError | None = None
+        try:
+            message = self._queue.get(timeout=timeout)
+            outcome = None if self._done else self._used(*message)
+        except Empty:
+            outcome = None if self._done else self._after_fit() or self._too_short()
+        if isinstance(outcome, Calibrated):
+            self._done = True
             self.close()
         return outcome
 
-    def _next(self, timeout: float) -> Progress | Calibrated | RsRelposeError | None:
-        try:
-            role, message = self._queue.get(timeout=timeout)
-        except Empty:
-            return self._after_fit() or self._too_short()
+    def _used(self, role: Role, message: Any) -> Progress | Calibrated | RsRelposeError | None:
         if role is not Role.IMAGE:
             return self._recorder.add(role, message)
         self._taken += 1
         self._images += 1
         self._image_s = time.monotonic()
         error = self._recorder.add(role, message)
+        self._refused = 0 if error is None else self._refused + 1
+        if self._refused > _MOST_REFUSED:
+            self._use_clock_of(message)
         if error is not None:
-            self._refused += 1
-            if self._refused > _MOST_REFUSED:
-                self._use_clock_of(message)
             return error
-        self._refused = 0
         configured = self._parameters.intrinsics
         if configured.given:
             self._recorder.intrinsics = configured.of_image(*self._recorder.size)
@@ -199,11 +185,10 @@ class LiveCalibration:
     def _after_fit(self) -> Progress | Calibrated | None:
         fits = self._fits
         if fits is not None and fits.recording is not None:
-            result = fits.result()
-            if result is None:
+            if not fits.found.done():
                 return None
             recording, fits.recording = fits.recording, None
-            return self._evaluated(result, recording)
+            return self._evaluated(fits.found.result(), recording)
         recorder = self._recorder
         grown = 1e-9 * (recorder.last_ns - self._fitted_ns) if self._fitted_ns else _STEP
         if self.waits_for or recorder.seconds < _FIRST or grown < _STEP:
@@ -215,7 +200,7 @@ class LiveCalibration:
                          unnoticed_tolerance=_UNNOTICED)
         if recorder.seconds >= _WHEELS and self.quat_prior is not None:
             config = replace(config, max_rotation_sigma=1.1 * AXES_SIGMA / _WIDER)
-        if fits is None or fits.ended:
+        if fits is None or fits.process.poll() is not None:
             self.close()
             self._fits = fits = _Fits()
         try:
@@ -247,49 +232,39 @@ class _Fits:
     """Process that fits one recording after the other, with no share of the interpreter's lock.
 
     Not by multiprocessing, which unblocks the signals of the calling thread. It imports and loads
-    its kernels while the first images are recorded.
+    its kernels while the first images are recorded; signals of the terminal are blocked in it.
     """
 
     def __init__(self) -> None:
         self.recording: CalibrationInput | None = None   # while its fit runs
-        self._process = subprocess.Popen([sys.executable, '-m', __name__], stdin=subprocess.PIPE,
-                                         stdout=subprocess.PIPE)
+        self.found: Future[CalibrationResult | RsRelposeError] = Future()
+        self.process = subprocess.Popen([sys.executable, '-m', __name__], stdin=subprocess.PIPE,
+                                        stdout=subprocess.PIPE)
         self._thread = ThreadPoolExecutor(1)
-        self._result: Future[CalibrationResult | RsRelposeError] | None = None
 
     def begin(self, recording: CalibrationInput, *others: Any) -> None:
         """Fit a recording; `others`: configuration, and rotation of a transform."""
         self.recording = recording
-        self._result = self._thread.submit(self._answer, (recording, *others))
+        self.found = self._thread.submit(self._answer, (recording, *others))
 
     def _answer(self, arguments: tuple[Any, ...]) -> CalibrationResult | RsRelposeError:
-        requests, answers = self._process.stdin, self._process.stdout
-        assert requests is not None
-        assert answers is not None
+        requests, answers = self.process.stdin, self.process.stdout
+        assert requests is not None and answers is not None
         try:
             pickle.dump(arguments, requests, protocol=5)   # without copies of the arrays
             requests.flush()
             found: CalibrationResult | RsRelposeError = pickle.load(answers)   # noqa: S301
         except (OSError, EOFError, pickle.UnpicklingError):
-            self._process.kill()
+            self.process.kill()
             found = RsRelposeError('the process of the fit ended early: out of memory?')
         return found
 
-    @property
-    def ended(self) -> bool:
-        """Whether the process has ended."""
-        return self._process.poll() is not None
-
-    def result(self) -> CalibrationResult | RsRelposeError | None:
-        """None while it runs."""
-        return self._result.result() if self._result and self._result.done() else None
-
     def stop(self) -> None:
-        """End the process; signals of the terminal are blocked in it."""
-        self._process.kill()
-        self._process.wait()
+        """End the process."""
+        self.process.kill()
+        self.process.wait()
         self._thread.shutdown()
-        for pipe in (self._process.stdin, self._process.stdout):
+        for pipe in (self.process.stdin, self.process.stdout):
             with suppress(OSError):   # the rest of a request
                 pipe.close()   # type: ignore[union-attr]
 
@@ -303,10 +278,9 @@ def _serve() -> None:
             recording, config, quat_prior = pickle.load(sys.stdin.buffer)  # noqa: S301 of the node
         except EOFError:   # the node has ended
             return
+        result: CalibrationResult | RsRelposeError
         try:
-            result: CalibrationResult | RsRelposeError = calibrate(
-                recording.tracks, recording.gyro, recording.camera,
-                focal_known=recording.focal_known, config=config, quat_prior=quat_prior)
+            result = recording.calibrated(config, quat_prior=quat_prior)
         except RsRelposeError as error:
             result = error
         pickle.dump(result, sys.stdout.buffer)

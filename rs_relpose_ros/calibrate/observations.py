@@ -1,10 +1,11 @@
-"""Tracks and gyro on one time axis, and the data of search and fit made from them."""
+"""Tracks and gyro on one time axis, the data of the fit made from them, and where it starts."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from functools import cache
 import itertools
 import math
 from typing import NamedTuple
@@ -13,27 +14,18 @@ import numpy as np
 from numpy.polynomial.polynomial import polyfit
 from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import cumulative_trapezoid
+from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.calibrate.coplanarity import (
-    BIAS,
-    CENTER,
-    EXPOSURE,
-    GLOBAL,
-    LENS,
-    Problem,
-    RADIAL,
-    SLOPE,
-    View,
-)
-from rs_relpose_ros.calibrate.result import AXES
-from rs_relpose_ros.calibrate.start import GyroSeries, noise_density
+from rs_relpose_ros.calibrate import coplanarity as model
 from rs_relpose_ros.config.settings import CalibrationConfig
 from rs_relpose_ros.errors import InputError
-from rs_relpose_ros.geometry import Array
+from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.geometry.camera import DISTORTION_MODELS, RollingShutterCamera
 from rs_relpose_ros.geometry.timing import correlation_of_steps, FrameIntervals, NANOSECONDS
 from rs_relpose_ros.imu.integration import mean_rates
 from rs_relpose_ros.pipeline.rotations import rotation_of_rays
+
+AXES = ('x (pitch)', 'y (yaw)', 'z (roll)')
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,25 +42,27 @@ class Tracks:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pairs:
-    """Pairs of frames with their common points, matches of a pair one after the other."""
+class GyroSeries:
+    """Samples of a gyro."""
 
-    first: NDArray[np.int64]     # (P,) frames
-    second: NDArray[np.int64]
-    begin: NDArray[np.int64]     # (P + 1,) matches of pair p: begin[p] to begin[p + 1]
-    points1: Array               # (N, 2) raw pixels
-    points2: Array
+    stamps_ns: NDArray[np.int64]    # (K,) IMU clock, strictly increasing
+    rates: Array                    # (K, 3) as measured, IMU frame [rad/s]
 
     def __len__(self) -> int:
-        return len(self.first)
+        return len(self.stamps_ns)
 
-    def chosen(self, pairs: NDArray[np.int64] | NDArray[np.bool_]) -> Pairs:
-        """Some of the pairs, by indices in their order or by mask."""
-        kept, counts = np.zeros(len(self), dtype=bool), np.diff(self.begin)
-        kept[pairs] = True
-        rows = np.repeat(kept, counts)
-        return Pairs(self.first[kept], self.second[kept], np.cumsum([0, *counts[kept]]),
-                     self.points1[rows], self.points2[rows])
+
+class Pair(NamedTuple):
+    """Two frames with their common points."""
+
+    first: int
+    second: int
+    rows: NDArray[np.int64]     # (2, n) observations of the points in both
+
+
+def frames_of(pairs: Sequence[Pair]) -> NDArray[np.int64]:
+    """Frames (2, P) of pairs."""
+    return np.array([pair[:2] for pair in pairs], dtype=np.int64).reshape(-1, 2).T
 
 
 class PairSelection(NamedTuple):
@@ -81,15 +75,12 @@ class PairSelection(NamedTuple):
 
 
 def make_pairs(tracks: Tracks, gaps: Sequence[int], selection: PairSelection,
-               max_interval: float, rng: np.random.Generator) -> Pairs:
-    """Pairs of frames `gaps` frames apart, at every frame, with the matches of `selection`.
-
-    Pairs further apart than `max_interval` times the gap [s] have lost frames, and are left out.
-    """
+               max_interval: float, rng: np.random.Generator) -> list[Pair]:
+    """Pairs `gaps` frames apart; none further apart than `max_interval` times the gap [s]."""
     borders = np.searchsorted(tracks.frames, np.arange(len(tracks) + 1))
     order = np.lexsort((tracks.ids, tracks.frames))
     ids = tracks.ids[order]
-    frames, counts, rows = [], [], [np.empty((2, 0), dtype=np.int64)]
+    pairs = []
     for i, j in ((i, i + gap) for gap in gaps for i in range(len(tracks) - gap)):
         if (tracks.stamps_ns[j] - tracks.stamps_ns[i]) * 1e-9 > (j - i) * max_interval:
             continue
@@ -102,21 +93,15 @@ def make_pairs(tracks: Tracks, gaps: Sequence[int], selection: PairSelection,
         if matches.shape[1] > selection.max_matches:
             matches = matches[:, rng.choice(matches.shape[1], selection.max_matches,
                                             replace=False)]
-        frames.append((i, j))
-        counts.append(matches.shape[1])
-        rows.append(order[borders[[[i], [j]]] + matches])
-    first, second = np.array(frames, dtype=np.int64).reshape(-1, 2).T
-    points1, points2 = tracks.points[np.hstack(rows)]
-    return Pairs(first, second, np.cumsum([0, *counts]), points1, points2)
+        pairs.append(Pair(i, j, order[borders[[[i], [j]]] + matches]))
+    return pairs
 
 
 # -- Stamps of the frames: exposure that changes, or stamps that jitter -------------------------
 #
 # Both make the offset of a frame depend on the interval T to the previous frame, by about the same
 # -0.5: a driver that stamps a fixed time of a longer and longer exposure, and a stamp that is late
-# by d, so that T is longer by d and the offset less by d. Only the first is due to the camera.
-# They differ in time: automatic exposure keeps an interval for many frames (successive T are
-# equal), while jitter makes one interval longer and the next one shorter (correlation -0.5).
+# by d, so that T is longer by d and the offset less by d. Only the first keeps T for many frames.
 
 # Intervals that differ by more than this share may have exposures that differ.
 _VARYING = 0.02
@@ -142,36 +127,29 @@ class FrameTimes(NamedTuple):
     # (F,) [s]: T less its median where the exposure varies, the smooth line less the stamp where
     # stamps jitter; otherwise zero.
     covariates: Array
-    jitter: float = 0.0     # rms of the stamps about the smooth line [s]; 0 unless they jitter
 
 
 def frame_times(stamps_ns: NDArray[np.int64]) -> FrameTimes:
     """Evaluate F stamps [ns]; at least two."""
     tracker = FrameIntervals()
     kept = [tracker.add(int(stamp)) for stamp in stamps_ns]
-    steps = np.diff(stamps_ns) / NANOSECONDS
     median = float(np.median(np.diff(stamps_ns))) / NANOSECONDS
     # As in the node: the first frame has no T, and so none that differs.
     longer = np.array([0.0, *(np.array(kept[1:]) / NANOSECONDS - median)])
     low, high = np.quantile(longer, (0.1, 0.9))
     if high - low <= _VARYING * median:
         return FrameTimes(Varying.NOT, np.zeros(len(stamps_ns)))
-    correlation = correlation_of_steps(steps / median)
+    correlation = correlation_of_steps(np.diff(stamps_ns) / NANOSECONDS / median)
     if correlation > _DISTINCT:
         return FrameTimes(Varying.EXPOSURE, longer)
-    if correlation < -_DISTINCT:
-        late = _smooth(stamps_ns, median)
-        return FrameTimes(Varying.JITTER, late, float(np.sqrt((late**2).mean())))
-    return FrameTimes(Varying.UNCLEAR, np.zeros(len(stamps_ns)))
-
-
-def _smooth(stamps_ns: NDArray[np.int64], interval: float) -> Array:
-    """A smooth line through the stamps less the stamps (F,) [s]: straight near each frame."""
+    if correlation >= -_DISTINCT:
+        return FrameTimes(Varying.UNCLEAR, np.zeros(len(stamps_ns)))
+    # A smooth line through the stamps less the stamps: straight near each frame.
     times = (stamps_ns - stamps_ns[0]) / NANOSECONDS
-    numbers = np.cumsum([0.0, *np.maximum(np.rint(np.diff(times) / interval), 1.0)])
+    numbers = np.cumsum([0.0, *np.maximum(np.rint(np.diff(times) / median), 1.0)])
     lines = (polyfit(numbers - number, times, 1,
                      w=np.exp(-0.25 * ((numbers - number) / _SMOOTH) ** 2)) for number in numbers)
-    return np.array([line[0] for line in lines]) - times
+    return FrameTimes(Varying.JITTER, np.array([line[0] for line in lines]) - times)
 
 
 # -- Exposure: the gyro is averaged over it -----------------------------------------------------
@@ -193,12 +171,11 @@ class Exposure(NamedTuple):
     def of(cls, times: Array, stamps: FrameTimes, config: CalibrationConfig) -> Exposure:
         """Of frames at times (F,) [s]: as given, by automatic exposure, or at most an interval."""
         interval = float(np.median(np.diff(times)))
-        margin = config.exposure_margin
-        if not margin and stamps.varying is Varying.EXPOSURE and not config.exposure_time:
+        margin, follows = config.exposure_margin, stamps.varying is Varying.EXPOSURE
+        if not margin and follows and not config.exposure_time:
             margin = _MARGIN
         if margin and config.exposed:
-            longer = stamps.covariates if stamps.varying is Varying.EXPOSURE else 0.0 * times
-            exposure = np.maximum(interval + longer - margin, 0.0)
+            exposure = np.maximum(interval + follows * stamps.covariates - margin, 0.0)
             doubt = 0.0 if config.exposure_margin else _MARGIN_SIGMA
             return cls(exposure, 2.0 * doubt * float(np.median(exposure)), margin)
         if config.exposure_time or not config.exposed:
@@ -220,6 +197,19 @@ def exposed_rates(gyro: GyroSeries, exposure: Array) -> tuple[Array, Array]:
 
     rates = mean(exposure)
     return rates, (mean(np.sqrt(exposure**2 + _SQUARE)) - rates) / _SQUARE
+
+
+def noise_density(times: Array, rates: Array) -> float:
+    """White noise [rad/s/sqrt(Hz)] of rates (K, 3), by third differences: without motion."""
+    steps = np.diff(times)
+    step = float(np.median(steps))
+    even = np.abs(steps - step) < 0.2 * step
+    even = even[2:] & even[1:-1] & even[:-2]
+    third = np.abs(np.diff(rates, n=3, axis=0))[even]
+    if len(third) == 0:
+        return 0.0
+    # 1, -3, 3, -1 of independent samples; the median of a normal deviate's size is 0.6745.
+    return float(np.median(third) / 0.6745 / np.sqrt(20.0) * np.sqrt(step))
 
 
 def with_lens(camera: RollingShutterCamera, lens: Array) -> RollingShutterCamera:
@@ -261,7 +251,7 @@ class Observations:
     camera: RollingShutterCamera    # as assumed, moved by `lens`; its readout time is not used
     lens: Array                     # (4,) as of `with_lens`
     times: Array                    # (F,) stamps of the frames [s]
-    stamps: FrameTimes              # exposure and jitter by the stamps
+    stamps: FrameTimes
     exposure: Exposure              # before the fit
     gyro_times: Array               # (K,) [s]
     gyro_rates: Array               # (K, 3) mean over the assumed exposure [rad/s]
@@ -292,49 +282,37 @@ class Observations:
         """Median interval between frames [s]."""
         return float(np.median(np.diff(self.times)))
 
-    @property
-    def gyro_steps(self) -> Array:
-        """Steps (K - 1,) between samples of the gyro [s]."""
-        return np.diff(self.gyro_times)
-
     def excitation(self, bias: Array, R_cam_imu: Array) -> tuple[Array, str, Array]:
-        """Rms rates (3,) about the camera's axes [rad/s], what is missing (empty: nothing), axis.
-
-        The latter (3,) is that of the most rotation, a unit vector of the camera.
-        """
+        """Rms rates (3,) about the camera's axes [rad/s], what is missing, main axis (3,)."""
         inside = (self.gyro_times >= self.times[0]) & (self.gyro_times <= self.times[-1])
         rates = (self.gyro_rates[inside] - bias) @ R_cam_imu.T
         rates = rates - rates.mean(axis=0)
-        rms = np.sqrt((rates**2).mean(axis=0))
         values, vectors = np.linalg.eigh(rates.T @ rates / len(rates))
-        # Two axes fix a rotation.
-        if np.sqrt(max(values[1], 0.0)) >= LEAST_ROTATION:
-            return rms, '', vectors[:, 2]
-        main = vectors[:, 2]
-        lacking = [AXES[i] for i in np.argsort(np.abs(main))[:2]]
-        about = AXES[int(np.argmax(np.abs(main)))]
-        return rms, (f'the camera rotates about one axis only, nearly {about}, so the rotation '
-                     f'about it is not observable: rotate about {lacking[0]} and {lacking[1]} '
-                     'too, 20 to 60 deg/s'), main
+        main, text = vectors[:, 2], ''
+        if np.sqrt(max(values[1], 0.0)) < LEAST_ROTATION:   # two axes fix a rotation
+            first, second, about = (AXES[i] for i in np.argsort(np.abs(main)))
+            text = (f'the camera rotates about one axis only, nearly {about}, so the rotation '
+                    f'about it is not observable: rotate about {first} and {second} too, 20 to 60 '
+                    'deg/s')
+        return np.sqrt((rates**2).mean(axis=0)), text, main
 
-    def pairs(self, selection: PairSelection, rng: np.random.Generator) -> Pairs:
+    def pairs(self, selection: PairSelection, rng: np.random.Generator) -> list[Pair]:
         """All pairs of these spans without lost frames."""
         gaps = sorted({max(1, round(span / self.interval)) for span in selection.spans})
         return make_pairs(self.tracks, gaps, selection, _LOST * self.interval, rng)
 
     def selected_problem(self, selection: PairSelection, offset: float,
-                         rng: np.random.Generator) -> Problem:
+                         rng: np.random.Generator) -> model.Problem:
         """Data of a fit to pairs all of whose rows lie within the gyro and touch no gap of it.
 
         `offset` [s] is about that of the clocks. InputError if there are fewer than ten pairs.
         """
         pairs, half = self.pairs(selection, rng), 0.5 * self.interval + 0.01
-        begin = self.times[pairs.first] + offset - half
-        end = self.times[pairs.second] + offset + half
+        begin, end = self.times[frames_of(pairs)] + offset + [[-half], [half]]
         clear = (begin >= self.gyro_times[0]) & (end <= self.gyro_times[-1])
-        for k in np.flatnonzero(self.gyro_steps > MAX_GYRO_GAP):
+        for k in np.flatnonzero(np.diff(self.gyro_times) > MAX_GYRO_GAP):
             clear &= (end <= self.gyro_times[k]) | (begin >= self.gyro_times[k + 1])
-        pairs = pairs.chosen(clear)
+        pairs = list(itertools.compress(pairs, clear))
         if len(pairs) < _LEAST_PAIRS:
             raise InputError(
                 f'only {len(pairs)} pairs of images have {selection.min_matches} points in common '
@@ -342,52 +320,155 @@ class Observations:
                 'of the gyro')
         most = min(selection.most_pairs, round(_PAIRS_PER_SECOND * self.times[-1]))
         if len(pairs) > most:
-            pairs = pairs.chosen(np.linspace(0, len(pairs) - 1, most).astype(np.int64))
+            pairs = [pairs[int(k)] for k in np.linspace(0, len(pairs) - 1, most)]
         return self.problem(pairs, offset)
 
-    def image_rates(self, pairs: Pairs) -> Array:
+    def image_rates(self, pairs: Sequence[Pair]) -> Array:
         """Angular velocity (P, 3) [rad/s], camera frame, that rotates the rays of each pair."""
-        rays1, rays2 = map(self.camera.unproject, (pairs.points1, pairs.points2))
-        rotations = [rotation_of_rays(rays1[begin:end], rays2[begin:end])
-                     for begin, end in itertools.pairwise(pairs.begin)]
-        return np.array(rotations).reshape(-1, 3) / (
-            self.times[pairs.second] - self.times[pairs.first])[:, None]
+        rays, times = self.camera.unproject(self.tracks.points), self.times[frames_of(pairs)]
+        rotations = [rotation_of_rays(*rays[pair.rows]) for pair in pairs]
+        return np.array(rotations).reshape(-1, 3) / (times[1] - times[0])[:, None]
 
-    def problem(self, pairs: Pairs, offset: float) -> Problem:
+    def problem(self, pairs: Sequence[Pair], offset: float) -> model.Problem:
         """Data of a fit to `pairs`, which the gyro covers at about this `offset` [s]."""
-        times1, times2 = self.times[pairs.first], self.times[pairs.second]
+        frames = frames_of(pairs)
+        times1, times2 = self.times[frames]
         middles = np.searchsorted(self.gyro_times, 0.5 * (times1 + times2) + offset)
         turn_sigma = np.sqrt(self.gyro_density**2 * (times2 - times1) + _LEAST_ROTATION**2)
-        prior, center = np.zeros(GLOBAL), np.zeros(GLOBAL)
-        center[LENS] = -self.lens
-        prior[BIAS:BIAS + 3] = _BIAS_SIGMA**-2
-        prior[SLOPE] = _SLOPE_SIGMA**-2
-        prior[RADIAL] = _RADIAL_SIGMA**-2
-        prior[CENTER:CENTER + 2] = (_CENTER_SIGMA * self.camera.width)**-2
+        prior, center = np.zeros(model.GLOBAL), np.zeros(model.GLOBAL)
+        center[model.LENS] = -self.lens
+        prior[model.BIAS:model.BIAS + 3] = _BIAS_SIGMA**-2
+        prior[model.SLOPE] = _SLOPE_SIGMA**-2
+        prior[model.RADIAL] = _RADIAL_SIGMA**-2
+        prior[model.CENTER:model.CENTER + 2] = (_CENTER_SIGMA * self.camera.width)**-2
         if self.exposure.square_sigma:
-            prior[EXPOSURE] = self.exposure.square_sigma**-2
+            prior[model.EXPOSURE] = self.exposure.square_sigma**-2
         blur_turns = cumulative_trapezoid(self.blur_rates, self.gyro_times, axis=0, initial=0.0)
-        return Problem(
-            self.gyro_times, self.gyro_rates, self.blur_rates, blur_turns, pairs.begin, middles,
-            self._view(pairs.first, pairs.points1), self._view(pairs.second, pairs.points2),
-            np.full(len(pairs), _BEND_AT_START), turn_sigma, prior, center)
-
-    def _view(self, frames: NDArray[np.int64], pixels: Array) -> View:
+        pixels = self.tracks.points[np.hstack([pair.rows for pair in pairs])]
+        height = self.camera.height
         points, by_pixel = _normalized(self.camera, pixels)
-        by_lens, by_both = np.empty((len(pixels), 2, 4)), np.empty((len(pixels), 2, 2, 4))
+        by_lens, by_both = np.empty((*points.shape, 4)), np.empty((*by_pixel.shape, 4))
         for k, step in enumerate(_LENS_STEPS):
             moved = _normalized(with_lens(self.camera, step * np.eye(4)[k]), pixels)
-            by_lens[:, :, k] = (moved[0] - points) / step
-            by_both[:, :, :, k] = (moved[1] - by_pixel) / step
-        height = self.camera.height
-        return View(self.times[frames], self.stamps.covariates[frames], points,
-                    (pixels[:, 1] - 0.5 * (height - 1)) / height, by_pixel, by_lens, by_both)
+            by_lens[..., k] = (moved[0] - points) / step
+            by_both[..., k] = (moved[1] - by_pixel) / step
+        return model.Problem(
+            self.gyro_times, self.gyro_rates, self.blur_rates, blur_turns,
+            self.times[frames], self.stamps.covariates[frames],
+            np.cumsum([0, *(pair.rows.shape[1] for pair in pairs)]), middles,
+            (pixels[:, :, 1] - 0.5 * (height - 1)) / height, points, by_pixel, by_lens, by_both,
+            np.full(len(pairs), _BEND_AT_START), turn_sigma, prior, center)
 
 
 def _normalized(camera: RollingShutterCamera, pixels: Array) -> tuple[Array, Array]:
-    """Normalised points (N, 2) of pixels, and their derivatives (N, 2, 2) by them."""
-    rays, by_pixel = camera.unproject_with_jacobian(pixels)
+    """Normalised points (2, N, 2) of pixels, and their derivatives (2, N, 2, 2) by them."""
+    rays, by_pixel = camera.unproject_with_jacobian(pixels.reshape(-1, 2))
     # n = m_xy / m_z, so dn = (dm_xy - n dm_z) / m_z.
     points = rays[:, :2] / rays[:, 2:]
     by_pixel = (by_pixel[:, :2] - points[:, :, None] * by_pixel[:, 2:]) / rays[:, 2:, None]
-    return np.ascontiguousarray(points), np.ascontiguousarray(by_pixel)
+    return points.reshape(pixels.shape), by_pixel.reshape(*pixels.shape, 2)
+
+
+# -- Initial clock offset, axes and focal length: rotation of the images against the gyro ---------
+
+@cache
+def axis_maps() -> Array:
+    """All 24 rotations (24, 3, 3) that map axes to axes."""
+    maps = np.array([np.diag(signs) @ np.eye(3)[list(columns)] + 0.0    # no zero is negative
+                     for columns in itertools.permutations(range(3))
+                     for signs in itertools.product((1.0, -1.0), repeat=3)])
+    maps = maps[np.linalg.det(maps) > 0.0]
+    maps.setflags(write=False)      # shared
+    return maps
+
+
+def nearest_axis_map(R: Array) -> Array:
+    """The axis map (3, 3) nearest to a rotation."""
+    maps = axis_maps()
+    return np.array(maps[int(np.argmax(np.einsum('kij,ij->k', maps, R)))])
+
+
+def axes_text(axis_map: Array) -> str:
+    """An axis map (3, 3) as text: ``cam x = -imu y, ...``."""
+    parts = []
+    for row, axis in zip(axis_map, 'xyz', strict=True):
+        k = int(np.argmax(np.abs(row)))
+        parts.append(f"cam {axis} = {'-' if row[k] < 0 else '+'}imu {'xyz'[k]}")
+    return ', '.join(parts)
+
+
+# Step of the offsets that are searched [s].
+_STEP = 5e-3
+# If the second axis of the common rotation is weaker than this share of the first, an axis map
+# determines it.
+_ONE_AXIS = 0.05
+
+
+class Start(NamedTuple):
+    """A coarse calibration."""
+
+    offset: float          # of the middle row [s]: t_imu = stamp + offset
+    R_cam_imu: Array       # (3, 3)
+    focal_factor: float
+    misfit: float          # share of the variance of the rotation that is not common
+
+
+def find_starts(rates: Array, begins: Array, ends: Array, gyro_times: Array, gyro_rates: Array, *,
+                max_offset: float, focal_factors: Array,
+                R_prior: Array | None = None) -> list[Start]:
+    """Offsets at which the rotated gyro agrees best with the images; best first.
+
+    `rates` (P, 3) of the camera hold between `begins` and `ends` (P,) [s] on its clock. Offsets to
+    +- `max_offset` [s] are searched, with each of the `focal_factors` of the assumed focal length;
+    at most three starts of different offsets are returned. Where the rotation about one axis is
+    not determined, it is that of `R_prior`, or of an axis map.
+    """
+    turned = cumulative_trapezoid(gyro_rates, gyro_times, axis=0, initial=0.0)
+
+    def aligned(offset: float, factors: ArrayLike) -> Start | None:
+        inside = ((begins + offset >= gyro_times[0]) & (ends + offset <= gyro_times[-1]))
+        # An offset at which the gyro misses most frames cannot be evaluated.
+        if inside.sum() < max(10, 0.5 * len(rates)):
+            return None
+        begin, end = begins[inside] + offset, ends[inside] + offset
+        measured = np.stack([
+            (np.interp(end, gyro_times, of_axis) - np.interp(begin, gyro_times, of_axis))
+            / (end - begin) for of_axis in turned.T], axis=1)
+        return min((_aligned(rates[inside] * [1.0 / factor, 1.0 / factor, 1.0], measured,
+                             offset, float(factor), R_prior) for factor in np.atleast_1d(factors)),
+                   key=lambda start: start.misfit)
+
+    # The best offsets hardly depend on the focal length.
+    offsets = np.arange(-max_offset, max_offset + 0.5 * _STEP, _STEP)
+    starts = [start for offset in offsets
+              if (start := aligned(float(offset), np.median(focal_factors)))]
+    chosen: list[Start] = []
+    for start in sorted(starts, key=lambda start: start.misfit):
+        if all(abs(start.offset - other.offset) >= 4.0 * _STEP for other in chosen):
+            chosen.append(start)
+    return sorted(filter(None, (aligned(start.offset, focal_factors) for start in chosen[:3])),
+                  key=lambda start: start.misfit)
+
+
+def _aligned(estimated: Array, measured: Array, offset: float, focal_factor: float,
+             R_prior: Array | None) -> Start:
+    """Start with the rotation between two series of rates (P, 3) without their outliers."""
+    kept = np.ones(len(estimated), dtype=bool)
+    start = Start(offset, np.eye(3), focal_factor, 1.0)
+    for _ in range(3):
+        # A bias and a constant translation drop out with the means.
+        a, b = (rates - rates[kept].mean(axis=0) for rates in (estimated, measured))
+        C = a[kept].T @ b[kept]
+        u, s, vt = np.linalg.svd(C)
+        if s[1] < _ONE_AXIS * s[0]:   # the rotation nearest to a known one
+            nearest = nearest_axis_map(C) if R_prior is None else R_prior
+            tilt, _ = Rotation.align_vectors(u[:, :1].T, vt[:1] @ nearest.T)
+            R = np.asarray(tilt.as_matrix() @ nearest)
+        else:
+            R = so3.aligning_rotation(C)
+        squares = ((a - b @ R.T)**2).sum(axis=1)
+        both = float((a[kept]**2).sum()) + float((b[kept]**2).sum())
+        start = start._replace(
+            R_cam_imu=R, misfit=float(squares[kept].sum()) / max(both, 1e-12))
+        kept = squares <= 9.0 * max(float(np.median(squares)), 1e-10)
+    return start

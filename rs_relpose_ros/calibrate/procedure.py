@@ -15,36 +15,10 @@ from scipy import special  # scipy.stats takes seconds to import, at the start o
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.bags.reader import Bag, SensorTopics
-from rs_relpose_ros.calibrate import fit
-from rs_relpose_ros.calibrate.coplanarity import (
-    BIAS,
-    EXPOSURE,
-    FOCAL,
-    GLOBAL,
-    LENS,
-    OFFSET,
-    RADIAL,
-    READOUT,
-    ROTATION,
-    SLOPE,
-    Unknowns,
-)
-from rs_relpose_ros.calibrate.observations import (
-    LEAST_ROTATION,
-    MAX_GYRO_GAP,
-    Observations,
-    PairSelection,
-    Tracks,
-    Varying,
-    with_lens,
-)
-from rs_relpose_ros.calibrate.result import (
-    CalibrationResult,
-    CostCurve,
-    Estimate,
-    LensEstimates,
-)
-from rs_relpose_ros.calibrate.start import find_starts, GyroSeries, nearest_axis_map, Start
+from rs_relpose_ros.calibrate import coplanarity as model
+from rs_relpose_ros.calibrate import fit, observations
+from rs_relpose_ros.calibrate.observations import GyroSeries, Observations, PairSelection, Tracks
+from rs_relpose_ros.calibrate.result import CalibrationResult, Estimate, LensEstimates
 from rs_relpose_ros.config.settings import CalibrationConfig, TrackingConfig
 from rs_relpose_ros.errors import InputError, MissingInputError, RsRelposeError
 from rs_relpose_ros.geometry import Array
@@ -80,15 +54,12 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
               progress: Callable[[float], object] = lambda share: None) -> CalibrationResult:
     """Readout time, clock offset, rotation, gyro bias and perhaps focal length, without a guess.
 
-    Matches of every pair of frames are coplanar at the times of their rows; see
-    `rs_relpose_ros.calibrate.coplanarity` and docs/calibration.md.
-
-    The clock of `gyro` differs from the camera's by at most ``config.max_time_offset``; the
-    readout time of `camera` is not used. `quat_prior`: rotation IMU to camera of a transform, x y
-    z w, +- 5 deg. Unless `focal_known`, fx and fy are a guess within a factor of 2, whose ratio
-    holds, and focal length, first coefficient of the distortion and principal point are estimated.
-    `rng` selects matches if there are more than needed; `progress` is called with the finished
-    share of the work.
+    See `rs_relpose_ros.calibrate.coplanarity` and docs/calibration.md. The clock of `gyro` differs
+    from the camera's by at most ``config.max_time_offset``; the readout time of `camera` is not
+    used. `quat_prior`: rotation IMU to camera of a transform, x y z w, +- 5 deg. Unless
+    `focal_known`, fx and fy are a guess within a factor of 2, whose ratio holds, and focal length,
+    first coefficient of the distortion and principal point are estimated. `rng` selects matches if
+    there are more than needed; `progress` is called with the finished share of the work.
     InputError if the recording cannot be used, with what to record instead.
     """
     config = CalibrationConfig() if config is None else config
@@ -99,23 +70,22 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
                          'at least 10 s with both')
     data = Observations.of(tracks, gyro, camera, config)
     _check_recording(data, config)
-    starts = _starts(data, focal_known, R_prior, config, rng)
     progress(0.15)
 
     def about(lens: Array) -> Observations:
         return data if not lens.any() else Observations.of(tracks, gyro, camera, config, lens)
 
-    free = np.ones(GLOBAL, dtype=bool)
-    free[[SLOPE, EXPOSURE]] = False
-    free[LENS] = False
-    free[FOCAL] = not focal_known
-    data, coarse = _coarse_fit(about, starts, free, rng)
-    free[LENS] = not focal_known
+    free = np.ones(model.GLOBAL, dtype=bool)
+    free[[model.SLOPE, model.EXPOSURE]] = free[model.LENS] = False
+    free[model.FOCAL] = not focal_known
+    data, coarse = _coarse_fit(about, data, free, R_prior, config, rng)
+    free[model.LENS] = not focal_known
     if not focal_known:
         data, settled = _fit_with_lens(about, data, coarse, free, _SOME_PAIRS, rng)
         coarse = settled.unknowns
     progress(0.4)
-    free[[SLOPE, EXPOSURE]] = data.stamps.covariates.any(), data.exposure.square_sigma > 0.0
+    free[model.SLOPE] = data.stamps.covariates.any()
+    free[model.EXPOSURE] = data.exposure.square_sigma > 0.0
     data, final = _fit_with_lens(about, data, coarse, free, _ALL_PAIRS, rng)
     progress(0.7)
     errors = None
@@ -123,7 +93,7 @@ def calibrate(tracks: Tracks, gyro: GyroSeries, camera: RollingShutterCamera, *,
         errors = fit.ModelErrors() if focal_known else fit.ESTIMATED_LENS
     final = fit.widened(final, errors)
     progress(0.8)
-    some = data.selected_problem(_SOME_PAIRS, final.unknowns.parameters[OFFSET], rng)
+    some = data.selected_problem(_SOME_PAIRS, final.unknowns.parameters[model.OFFSET], rng)
     curve = fit.cost_curve(fit.with_bends(some, final.unknowns), final, data.interval,
                            lambda share: progress(0.8 + 0.2 * share))
     final, axes_known = _with_axes(data, final, R_prior)
@@ -143,7 +113,7 @@ def warm_up_fit() -> None:
     data.image_rates(data.pairs(_NEIGHBOURS, rng))
     problem = data.selected_problem(_SOME_PAIRS, 0.0, rng)
     begin = fit.initial(problem, np.eye(3), 0.0)
-    fit.fit(fit.with_bends(problem, begin), begin, np.ones(GLOBAL, dtype=bool), rounds=1)
+    fit.fit(fit.with_bends(problem, begin), begin, np.ones(model.GLOBAL, dtype=bool), rounds=1)
 
 
 def _with_axes(data: Observations, final: fit.Fit,
@@ -151,9 +121,9 @@ def _with_axes(data: Observations, final: fit.Fit,
     """The fit joined with the rotation of a transform, and whether: not if they contradict."""
     if R_prior is None:
         return final, False
-    R, part = final.unknowns.R_imu_cam, slice(ROTATION, ROTATION + 3)
+    R, part = final.unknowns.R_imu_cam, slice(model.ROTATION, model.BIAS)
     covariance = final.covariance.copy()
-    _, one_axis, axis = data.excitation(final.unknowns.parameters[BIAS:BIAS + 3], R.T)
+    _, one_axis, axis = data.excitation(final.unknowns.parameters[model.BIAS:model.FOCAL], R.T)
     if one_axis:   # about which the fit means nothing
         axis = R @ axis
         covariance[part] -= np.outer(axis, axis @ covariance[part])
@@ -183,46 +153,43 @@ def _check_recording(data: Observations, config: CalibrationConfig) -> None:
             f'the gyro covers {max(last - first, 0.0):.1f} s of the {data.times[-1]:.1f} s of '
             'images: record both together, and let the clocks differ by less than '
             f'{config.max_time_offset:g} s')
-    if np.median(data.gyro_steps) > MAX_GYRO_GAP:
+    step = float(np.median(np.diff(data.gyro_times)))
+    if step > observations.MAX_GYRO_GAP:
         raise InputError(
-            f'the gyro has {1.0 / np.median(data.gyro_steps):.0f} samples per second, at least '
-            f'{1.0 / MAX_GYRO_GAP:.0f} are needed, 200 are good')
-    counts = np.bincount(data.tracks.frames, minlength=frames)
-    if np.median(counts) < _LEAST_MATCHES:
+            f'the gyro has {1.0 / step:.0f} samples per second, at least '
+            f'{1.0 / observations.MAX_GYRO_GAP:.0f} are needed, 200 are good')
+    count = np.median(np.bincount(data.tracks.frames, minlength=frames))
+    if count < _LEAST_MATCHES:
         raise InputError(
-            f'there are too few points to follow: {np.median(counts):.0f} per image in the '
+            f'there are too few points to follow: {count:.0f} per image in the '
             f'median, at least {_LEAST_MATCHES} are needed. Record a scene with texture, in good '
             'light and focus')
     spread = data.gyro_rates - np.median(data.gyro_rates, axis=0)
     rate = float(np.sqrt((spread**2).sum(axis=1).mean()))
-    if rate < LEAST_ROTATION:
+    if rate < observations.LEAST_ROTATION:
         raise InputError(
             f'the camera hardly rotates: {np.degrees(rate):.2f} deg/s rms by the gyro, at least '
-            f'{np.degrees(LEAST_ROTATION):.1f} are needed. Rotate it to and fro about '
-            'all three axes, 20 to 60 deg/s')
+            f'{np.degrees(observations.LEAST_ROTATION):.1f} are needed. Rotate it to and fro '
+            'about all three axes, 20 to 60 deg/s')
 
 
-def _starts(data: Observations, focal_known: bool, R_prior: Array | None,
-            config: CalibrationConfig, rng: np.random.Generator) -> list[Start]:
+def _coarse_fit(about: Callable[[Array], Observations], data: Observations,
+                free: NDArray[np.bool_], R_prior: Array | None, config: CalibrationConfig,
+                rng: np.random.Generator) -> tuple[Observations, model.Unknowns]:
+    """The best of the fits to a few pairs from each of the starts, and its data."""
     pairs = data.pairs(_NEIGHBOURS, rng)
     if len(pairs) < 0.5 * len(data.tracks):
         raise InputError(
             f'points can be followed over {len(pairs)} of {len(data.tracks) - 1} steps between '
             'images only: the images are blurred, the scene has no texture, or it moves too fast. '
             'Record with a short exposure in good light, and rotate more slowly')
-    found = find_starts(
-        data.image_rates(pairs), data.times[pairs.first], data.times[pairs.second],
-        data.gyro_times, data.gyro_rates, max_offset=config.max_time_offset + 0.02, step=5e-3,
-        focal_factors=np.ones(1) if focal_known else _FOCAL_FACTORS, count=3, R_prior=R_prior)
-    if not found:
+    begins, ends = data.times[observations.frames_of(pairs)]
+    starts = observations.find_starts(
+        data.image_rates(pairs), begins, ends, data.gyro_times, data.gyro_rates,
+        max_offset=config.max_time_offset + 0.02, R_prior=R_prior,
+        focal_factors=_FOCAL_FACTORS if free[model.FOCAL] else np.ones(1))
+    if not starts:
         raise InputError('the gyro does not cover the images: record both together')
-    return found
-
-
-def _coarse_fit(about: Callable[[Array], Observations], starts: list[Start],
-                free: NDArray[np.bool_], rng: np.random.Generator,
-                ) -> tuple[Observations, Unknowns]:
-    """The best of the fits to a few pairs from each of the starts, and its data."""
     fits = []
     for start in starts:
         data = about(np.array([np.log(start.focal_factor), 0.0, 0.0, 0.0]))
@@ -233,24 +200,24 @@ def _coarse_fit(about: Callable[[Array], Observations], starts: list[Start],
     return min(fits, key=lambda found: float(np.median(found[1].noise)))
 
 
-def _fit_with_lens(about: Callable[[Array], Observations], data: Observations, coarse: Unknowns,
-                   free: NDArray[np.bool_], selection: PairSelection,
+def _fit_with_lens(about: Callable[[Array], Observations], data: Observations,
+                   coarse: model.Unknowns, free: NDArray[np.bool_], selection: PairSelection,
                    rng: np.random.Generator) -> tuple[Observations, fit.Fit]:
     """Fit from `coarse`, linear in the lens, repeated about its own lens until that stays."""
-    seed, offset, found = int(rng.integers(2**32)), coarse.parameters[OFFSET], None
+    seed, offset, found = int(rng.integers(2**32)), coarse.parameters[model.OFFSET], None
     for _ in range(_LENS_ROUNDS):
-        data = about(data.lens + coarse.parameters[LENS])
+        data = about(data.lens + coarse.parameters[model.LENS])
         problem = data.selected_problem(selection, offset, np.random.default_rng(seed))
-        if found is not None and np.array_equal(problem.view1.rows, found.problem.view1.rows):
+        if found is not None and np.array_equal(problem.rows[0], found.problem.rows[0]):
             # The same matches: only the lens is linearised again.
             parameters = coarse.parameters.copy()
-            parameters[LENS] = 0.0
+            parameters[model.LENS] = 0.0
             begin = coarse._replace(parameters=parameters)
         else:
             begin = fit.restarted(problem, coarse, 2.0)
         found = fit.fit(fit.with_bends(problem, begin), begin, free)
         coarse = found.unknowns
-        if (np.abs(coarse.parameters[LENS]) <= _LENS_STAYS).all():
+        if (np.abs(coarse.parameters[model.LENS]) <= _LENS_STAYS).all():
             break
     assert found is not None
     return data, found
@@ -261,78 +228,80 @@ def _fit_with_lens(about: Callable[[Array], Observations], data: Observations, c
 _RECORD_MORE = ('too little rotation, too short, or too few points: record 10 s or more of a '
                 'textured scene while rotating 20 to 60 deg/s about all three axes')
 # A note if the intervals between frames vary for an unknown reason.
-_UNCLEAR = {Varying.UNCLEAR: (
+_UNCLEAR = {observations.Varying.UNCLEAR: (
     'the intervals between frames vary neither as automatic exposure does nor as jitter: the '
     'offset is assumed to be the same in all frames')}
 # Sigma, in those of an observable value, beyond which a rotation or focal length is of no use.
 _USELESS = 10.0
 # Largest sigmas of observable values: readout time and offset [s], its slope [s/s], bias [rad/s],
 # focal length (relative).
-_MOST_READOUT, _MOST_OFFSET, _MOST_SLOPE, _MOST_BIAS, _MOST_FOCAL = 1.5e-3, 3e-3, 0.5, 0.01, 0.03
+_MOST = np.zeros(model.GLOBAL)
+_MOST[[model.READOUT, model.OFFSET, model.SLOPE, model.FOCAL]] = 1.5e-3, 3e-3, 0.5, 0.03
+_MOST[model.BIAS:model.FOCAL] = 0.01
 # Errors (2, GLOBAL) that are common to a recording and not part of its scatter, without and with a
 # tracker: its own, measured on rendered bags with KLT [s, rad, rad/s]; of the slope [s/s], as the
 # exposure also changes within one step of the interval; of the focal length (relative), as the
 # residual is not linear in the noise of the points.
-_COMMON = np.zeros((2, GLOBAL))
-_COMMON[:, FOCAL] = 2e-4
-_COMMON[1, [READOUT, OFFSET]], _COMMON[1, SLOPE] = 5e-5, 0.08
-_COMMON[1, ROTATION:ROTATION + 3], _COMMON[1, BIAS:BIAS + 3] = 1e-3, 2.5e-4
+_COMMON = np.zeros((2, model.GLOBAL))
+_COMMON[:, model.FOCAL] = 2e-4
+_COMMON[1, [model.READOUT, model.OFFSET]], _COMMON[1, model.SLOPE] = 5e-5, 0.08
+_COMMON[1, model.ROTATION:model.BIAS], _COMMON[1, model.BIAS:model.FOCAL] = 1e-3, 2.5e-4
 
 
-def evaluated(data: Observations, final: fit.Fit, curve: CostCurve,
+def evaluated(data: Observations, final: fit.Fit, curve: Array,
               config: CalibrationConfig, *, axes_known: bool = False) -> CalibrationResult:
     """Result of a fit; `axes_known`: also of a transform. InputError for a readout too long."""
     common = np.where(final.free, _COMMON[int(config.exposed)], 0.0)
-    covariance = final.covariance + np.diag(common**2)
-    unknowns = final.unknowns
-    if final.free[FOCAL]:
+    unknowns, covariance = final.unknowns, final.covariance + np.diag(common**2)
+    if final.free[model.FOCAL]:
         # Widened, the sigmas of the lens may exceed those of its priors.
-        known = slice(RADIAL, EXPOSURE)
+        known = slice(model.RADIAL, model.EXPOSURE)
         unknowns, covariance = joined(unknowns, covariance, known, final.problem.center[known],
                                        1.0 / final.problem.prior[known])
     bounded, covariance, beyond = _bounded(unknowns, covariance, data.interval)
     parameters, R_cam_imu = bounded.parameters, bounded.R_imu_cam.T
-    rates, one_axis, _ = data.excitation(parameters[BIAS:BIAS + 3], R_cam_imu)
+    rates, one_axis, _ = data.excitation(parameters[model.BIAS:model.FOCAL], R_cam_imu)
     sigmas, wide = np.sqrt(np.diag(covariance)), config.tolerance
     if fit.move_of_poses(final, covariance) <= 1.0:
         wide = max(wide, config.unnoticed_tolerance)
     # Row 0 is read this share of the readout before the middle row.
-    to_first = np.zeros(GLOBAL)
-    height = data.camera.height
-    to_first[[OFFSET, READOUT]] = 1.0, -0.5 * (height - 1) / height
-    # Rotations about the axes of the camera.
-    part = slice(ROTATION, ROTATION + 3)
+    to_first, height = np.zeros(model.GLOBAL), data.camera.height
+    to_first[[model.OFFSET, model.READOUT]] = 1.0, -0.5 * (height - 1) / height
+    part = slice(model.ROTATION, model.BIAS)   # about the axes of the camera
     rotation_sigma = np.sqrt(np.diag(R_cam_imu @ covariance[part, part] @ R_cam_imu.T))
-    axis_map = nearest_axis_map(R_cam_imu)
+    axis_map = observations.nearest_axis_map(R_cam_imu)
     cosine = (np.trace(R_cam_imu @ axis_map.T) - 1.0) / 2.0
-    bias_x, bias_y, bias_z = (_estimate(parameters[i], sigmas[i], wide * _MOST_BIAS)
-                              for i in range(BIAS, BIAS + 3))
+
+    def of(k: int) -> Estimate:
+        return _estimate(parameters[k], sigmas[k], wide * _MOST[k])
+
     slope = lens = None
-    if final.free[FOCAL]:
-        camera = with_lens(data.camera, parameters[LENS])
-        factor = math.exp(data.lens[0] + parameters[FOCAL])
+    if final.free[model.FOCAL]:
+        camera = observations.with_lens(data.camera, parameters[model.LENS])
+        focal, *others = sigmas[model.LENS]
+        factor = math.exp(data.lens[0] + parameters[model.FOCAL])
         lens = LensEstimates(
-            _estimate(factor, factor * sigmas[FOCAL], factor * wide * _MOST_FOCAL, one_axis),
+            _estimate(factor, factor * focal, factor * wide * _MOST[model.FOCAL], one_axis),
             *(Estimate(value, float(sigma), True) for value, sigma in zip(
-                (camera.distortion[0], camera.cx, camera.cy), sigmas[LENS][1:], strict=True)))
-    if final.free[SLOPE]:
-        slope = _estimate(parameters[SLOPE], sigmas[SLOPE], _MOST_SLOPE)
-    jitters = data.stamps.varying is Varying.JITTER
+                (camera.distortion[0], camera.cx, camera.cy), others, strict=True)))
+    if final.free[model.SLOPE]:
+        slope = _estimate(parameters[model.SLOPE], sigmas[model.SLOPE], _MOST[model.SLOPE])
+    jitters = data.stamps.varying is observations.Varying.JITTER
     unsettled = '' if final.converged else 'the fit has not converged'
     return CalibrationResult(
-        readout_time=replace(_estimate(parameters[READOUT], sigmas[READOUT],
-                                       wide * _MOST_READOUT), determined=True),
-        fitted_readout=float(unknowns.parameters[READOUT]),
+        readout_time=replace(of(model.READOUT), determined=True),
+        fitted_readout=float(unknowns.parameters[model.READOUT]),
         time_offset=_estimate(float(to_first @ parameters), math.sqrt(
-            to_first @ covariance @ to_first), wide * _MOST_OFFSET),
+            to_first @ covariance @ to_first), wide * _MOST[model.OFFSET]),
         R_cam_imu=R_cam_imu, rotation_sigma=rotation_sigma,
         rotation=_estimate(math.acos(np.clip(cosine, -1.0, 1.0)), rotation_sigma.max(),
                            wide * config.max_rotation_sigma, '' if axes_known else one_axis),
-        axis_map=axis_map, gyro_bias=(bias_x, bias_y, bias_z), lens=lens,
-        exposure=_exposure(data, final, sigmas[EXPOSURE]),
+        axis_map=axis_map, gyro_bias=tuple(map(of, range(model.BIAS, model.FOCAL))), lens=lens,
+        exposure=_exposure(data, final, sigmas[model.EXPOSURE]),
         exposure_margin=data.exposure.margin,
         offset_by_interval=None if jitters else slope,
-        offset_by_jitter=slope if jitters else None, stamp_jitter=data.stamps.jitter,
+        offset_by_jitter=slope if jitters else None,
+        stamp_jitter=jitters * float(np.sqrt((data.stamps.covariates**2).mean())),
         rotation_rates=rates, curve=curve,
         pixel_sigma=float(np.median(final.unknowns.noise)),
         inlier_ratio=float((final.weights > 0.25).mean()),
@@ -344,39 +313,36 @@ def evaluated(data: Observations, final: fit.Fit, curve: CostCurve,
 def _exposure(data: Observations, final: fit.Fit, square_sigma: float) -> Estimate:
     """Exposure at the median interval [s]."""
     assumed = float(np.median(data.exposure.assumed))
-    square = assumed**2 + float(final.unknowns.parameters[EXPOSURE])
+    square = assumed**2 + float(final.unknowns.parameters[model.EXPOSURE])
     value = min(math.sqrt(max(square, 0.0)), data.interval)
     # Also of a square near zero, where the root has no derivative.
     sigma = math.sqrt(value**2 + square_sigma) - value
     return Estimate(value, sigma, sigma <= 0.5 * value, 'the images do not show any')
 
 
-def joined(unknowns: Unknowns, covariance: Array, known: slice, values: Array | float,
-           variances: Array | float) -> tuple[Unknowns, Array]:
+def joined(unknowns: model.Unknowns, covariance: Array, known: slice, values: Array | float,
+           variances: Array | float) -> tuple[model.Unknowns, Array]:
     """The calibration with independent values of some parameters, and its covariance."""
     own = covariance[known, known]
     gain = covariance[:, known] @ np.linalg.inv(own + variances * np.eye(len(own)))
     step = gain @ (values - unknowns.parameters[known])
-    return (fit.stepped(unknowns, step),
-            covariance - gain @ covariance[known])
+    return fit.stepped(unknowns, step), covariance - gain @ covariance[known]
 
 
-def _bounded(unknowns: Unknowns, covariance: Array,
-             interval: float) -> tuple[Unknowns, Array, str]:
+def _bounded(unknowns: model.Unknowns, covariance: Array,
+             interval: float) -> tuple[model.Unknowns, Array, str]:
     """The calibration with its readout within an interval T between frames, and a note.
 
-    No camera reads longer than that. The readout time is the mean of its normal distribution
-    between these bounds, and the others follow by their covariance with it. Sigmas are kept: an
-    estimate beyond the bound has errors that the bound does not limit. An estimate less certain
-    than the bound itself, T / 2 +- T / sqrt(12) if read downwards, is joined with that.
+    The readout time is the mean of its normal distribution between these bounds, and the others
+    follow by their covariance with it; an estimate less certain than the bound itself is joined
+    with that. See docs/calibration.md, "Interpretation of the results".
     """
-    known = interval / math.sqrt(12.0)
-    if covariance[READOUT, READOUT] > known**2:
-        return (*joined(unknowns, covariance, slice(READOUT, READOUT + 1), 0.5 * interval,
-                         known**2),
+    k, known = model.READOUT, interval / math.sqrt(12.0)
+    if covariance[k, k] > known**2:
+        return (*joined(unknowns, covariance, slice(k, k + 1), 0.5 * interval, known**2),
                 ('the images hardly determine the readout time: it is mostly that of any camera '
                 f'that is read downwards within the {1e3 * interval:.1f} ms between frames'))
-    readout, sigma = float(unknowns.parameters[READOUT]), math.sqrt(covariance[READOUT, READOUT])
+    readout, sigma = float(unknowns.parameters[k]), math.sqrt(covariance[k, k])
     found = 'the readout time is estimated as ' + BY_NAME['readout_time'].with_sigma(
         abs(readout), sigma)
     if abs(readout) - 3.0 * sigma > interval:
@@ -388,7 +354,7 @@ def _bounded(unknowns: Unknowns, covariance: Array,
     ends = (np.array([-interval, interval]) - readout) / sigma
     density, below = np.exp(-0.5 * ends**2) / math.sqrt(2.0 * math.pi), special.ndtr(ends)
     mean = readout - sigma * float(np.diff(density)[0] / np.diff(below)[0])
-    step = covariance[:, READOUT] * ((mean - readout) / sigma**2)
+    step = covariance[:, k] * ((mean - readout) / sigma**2)
     note = '' if abs(readout) <= interval else (
         f'{found}, but is at most the {1e3 * interval:.1f} ms between frames: all parameters are '
         f'for {1e3 * abs(mean):.1f} ms, the mean below that')
@@ -396,10 +362,7 @@ def _bounded(unknowns: Unknowns, covariance: Array,
 
 
 def _estimate(value: float, sigma: float, limit: float, blocking_reason: str = '') -> Estimate:
-    """Estimate, observable if its sigma is within `limit` and nothing blocks it.
-
-    Beyond `_USELESS` limits a value is of no use.
-    """
+    """Estimate, observable if its sigma is within `limit` and nothing blocks it."""
     good = bool(sigma <= limit and not blocking_reason)
     return Estimate(float(value), float(sigma), good,
                     '' if good else blocking_reason or _RECORD_MORE,
@@ -429,6 +392,11 @@ class CalibrationInput:
     focal_known: bool               # by the CameraInfo; else `camera` is a guess
     unused: dict[str, int]          # messages that were not used, by reason
     is_whole: bool = True           # whether the images show the whole sensor, without binning
+
+    def calibrated(self, config: CalibrationConfig, **options: Any) -> CalibrationResult:
+        """Its calibration; `options` of `calibrate`."""
+        return calibrate(self.tracks, self.gyro, self.camera, focal_known=self.focal_known,
+                         config=config, **options)
 
     def with_unknown_lens(self, distortion_model: str) -> CalibrationInput:
         """The same for a lens that is to be estimated; InputError if it has a distortion."""
@@ -464,15 +432,12 @@ def read_recording(bag: Bag, topics: SensorTopics, tracking: TrackingConfig, *,
 
 
 class Recorder:
-    """Follows points from image to image by the chosen tracker, and keeps the gyro.
-
-    Of the last `longest` seconds. Without a calibrated CameraInfo the lens is `uncalibrated`;
-    `unused`: messages that were not used.
-    """
+    """Follows points by the chosen tracker, and keeps the gyro, of the last `longest` seconds."""
 
     def __init__(self, tracking: TrackingConfig, longest: float = math.inf) -> None:
         self.intrinsics: Intrinsics | None = None
-        self.uncalibrated, self.unused = False, ReasonCounts()
+        self.uncalibrated = False   # whether there is no calibrated CameraInfo
+        self.unused = ReasonCounts()   # messages
         self._longest = longest
         self._tracker, self._levels = make_tracker(tracking), GrayLevels()
         self._since_renewed = 0     # images
@@ -568,20 +533,18 @@ class Recorder:
         frames = np.repeat(np.arange(len(ids)), list(map(len, ids)))
         tracks = Tracks(np.array(of_frames), frames, np.concatenate(ids), points)
         gyro = GyroSeries(np.array(stamps), np.array([self._gyro[stamp] for stamp in stamps]))
-        camera = _camera(intrinsics, *self.size)
+        width, height = self.size
+        if intrinsics is None:
+            guess = _FOCAL_GUESS * max(width, height)
+            camera = RollingShutterCamera(
+                width=width, height=height, fx=guess, fy=guess, cx=0.5 * (width - 1),
+                cy=0.5 * (height - 1), readout_time=0.0)
+        elif (width, height) == (intrinsics.image_width, intrinsics.image_height):
+            camera = intrinsics.global_shutter_camera()
+        else:
+            raise InputError(
+                f'the images are {width}x{height}, but the CameraInfo is for '
+                f'{intrinsics.image_width}x{intrinsics.image_height}: a resized image needs a '
+                'CameraInfo of its own')
         return CalibrationInput(tracks, gyro, camera, intrinsics is not None, unused,
                                 self.size == (camera.width, camera.height))
-
-
-def _camera(intrinsics: Intrinsics | None, width: int, height: int) -> RollingShutterCamera:
-    """Camera of images of this size; a guess without intrinsics."""
-    if intrinsics is None:
-        guess = _FOCAL_GUESS * max(width, height)
-        return RollingShutterCamera(
-            width=width, height=height, fx=guess, fy=guess, cx=0.5 * (width - 1),
-            cy=0.5 * (height - 1), readout_time=0.0)
-    if (width, height) != (intrinsics.image_width, intrinsics.image_height):
-        raise InputError(
-            f'the images are {width}x{height}, but the CameraInfo is for {intrinsics.image_width}x'
-            f'{intrinsics.image_height}: a resized image needs a CameraInfo of its own')
-    return intrinsics.global_shutter_camera()

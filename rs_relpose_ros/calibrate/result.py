@@ -1,6 +1,6 @@
 """Result of a calibration: values and sigmas, as report, parameter file, JSON and picture."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 import math
 from pathlib import Path
@@ -9,14 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rs_relpose_ros.calibrate.start import axes_text
+from rs_relpose_ros.calibrate.observations import AXES, axes_text
 from rs_relpose_ros.config.files import parameter_text, SourcedValue
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.camera import RollingShutterCamera
 from rs_relpose_ros.output_files import BLUE, ORANGE, save_picture
 from rs_relpose_ros.pipeline.findings import BY_NAME
-
-AXES = ('x (pitch)', 'y (yaw)', 'z (roll)')
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,15 +41,6 @@ class LensEstimates(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CostCurve:
-    """Cost of the whole fit over the readout time, with all other parameters fitted again."""
-
-    readout_times: Array    # (K,) signed [s]: negative is read upwards
-    # (K,) log-likelihood lost against the best; scaled to independent pairs.
-    costs: Array
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class CalibrationResult:
     """Calibration of a rolling-shutter camera against a gyro.
 
@@ -66,7 +55,7 @@ class CalibrationResult:
     rotation_sigma: Array                   # (3,) 1 sigma about the camera's axes [rad]
     rotation: Estimate                      # angle to `axis_map` [rad], with the largest sigma
     axis_map: Array                         # (3, 3) the nearest rotation between axes
-    gyro_bias: tuple[Estimate, Estimate, Estimate]   # IMU frame [rad/s]
+    gyro_bias: tuple[Estimate, ...]         # of the three axes of the IMU [rad/s]
     lens: LensEstimates | None              # None if known
     exposure: Estimate                      # at the median interval between frames [s]
     exposure_margin: float                  # that interval less the exposure, if it follows it
@@ -78,7 +67,9 @@ class CalibrationResult:
     offset_by_jitter: Estimate | None
     stamp_jitter: float                     # rms about the smooth line [s]
     rotation_rates: Array                   # (3,) rms about the camera's axes less mean [rad/s]
-    curve: CostCurve
+    # (2, K) signed readout times [s], and the log-likelihood lost against the best with all other
+    # parameters fitted again, scaled to independent pairs.
+    curve: Array
     pixel_sigma: float                      # of a match [px]
     inlier_ratio: float
     frames: int
@@ -137,45 +128,42 @@ _MS = 1e3
 def quantities(result: CalibrationResult,
                camera: RollingShutterCamera) -> list[tuple[str, str, Estimate]]:
     """Each quantity: its name, its value with 1 sigma in words, and its estimate."""
-    readout, lens = result.readout_time, result.lens
+    readout, exposure = result.readout_time, result.exposure
     slope, jitter = result.offset_by_interval, result.offset_by_jitter
-    sigmas = ', '.join(f'{np.degrees(sigma):.3f}' for sigma in result.rotation_sigma)
     rows = [('readout time', _shown('readout_time', readout, abs(readout.value))
              + (', read upwards' if readout.value < 0.0 else ''), readout),
             ('time offset (row 0)', _shown('time_offset', result.time_offset),
              result.time_offset)]
     if slope is not None:
-        text = (f'{slope.value:.3f} +- {slope.sigma:.3f} ms per ms of the interval to the '
-                f'previous frame, {_MS * result.frame_interval:.2f} ms in the median (automatic '
-                'exposure)')
+        text = (f'{_rounded(slope, 3)} ms per ms of the interval to the previous frame, '
+                f'{_MS * result.frame_interval:.2f} ms in the median (automatic exposure)')
         rows.append(('offset by interval', text, slope))
     if jitter is not None:
         text = (f'{_MS * result.stamp_jitter:.2f} ms rms about a smooth line, which the images '
-                f'follow by {jitter.value:.2f} +- {jitter.sigma:.2f} (1: the stamps alone '
-                'jitter); not automatic exposure')
+                f'follow by {_rounded(jitter, 2)} (1: the stamps alone jitter); not automatic '
+                'exposure')
         rows.append(('jitter of stamps', text, jitter))
+    sigmas = ', '.join(f'{np.degrees(sigma):.3f}' for sigma in result.rotation_sigma)
     text = (f'{axes_text(result.axis_map)}, and {np.degrees(result.rotation.value):.2f} deg off '
             f"it; 1 sigma about the camera's x, y, z: {sigmas} deg")
-    rows.append(('rotation IMU to camera', text, result.rotation))
-    rows += [(f'gyro bias {axis}', _shown('gyro_bias', bias), bias)
-             for axis, bias in zip('xyz', result.gyro_bias, strict=True)]
-    exposure = result.exposure
+    rows += [('rotation IMU to camera', text, result.rotation),
+             *((f'gyro bias {axis}', _shown('gyro_bias', bias), bias)
+               for axis, bias in zip('xyz', result.gyro_bias, strict=True))]
     if exposure.sigma:
-        text = (f'{_MS * exposure.value:.1f} +- {_MS * exposure.sigma:.1f} ms at the median '
-                'interval, over which the gyro is averaged')
+        text = (f'{_rounded(exposure, 1, _MS)} ms at the median interval, over which the gyro is '
+                'averaged')
         if result.exposure_margin:
             text += (f' (assumed: the interval less {_MS * result.exposure_margin:.0f} ms, as '
                      'automatic exposure lengthens it)')
         rows.append(('exposure', text, exposure))
-    if lens is not None:
-        focal, radial, column, row = lens
+    if result.lens is not None:
+        focal, radial, column, row = result.lens
+        text = f'{_rounded(radial, 3)} (first coefficient of {camera.distortion_model})'
         rows += [
             ('focal length', BY_NAME['focal_length'].with_sigma(
                 camera.fx * focal.value, camera.fx * focal.sigma), focal),
-            ('distortion', (f'{radial.value:.3f} +- {radial.sigma:.3f} (first '
-             f'coefficient of {camera.distortion_model})'), radial),
-            ('principal point', (f'{column.value:.1f} +- {column.sigma:.1f}, {row.value:.1f} +- '
-             f'{row.sigma:.1f} px'), column)]
+            ('distortion', text, radial),
+            ('principal point', f'{_rounded(column, 1)}, {_rounded(row, 1)} px', column)]
     return rows
 
 
@@ -183,20 +171,23 @@ def report(result: CalibrationResult, camera: RollingShutterCamera) -> list[str]
     """Lines for a reader: each quantity with its 1 sigma and its observability."""
     rates = ', '.join(f'{axis} {np.degrees(rate):.1f}'
                       for axis, rate in zip(AXES, result.rotation_rates, strict=True))
-    return [
-        (f'{result.frames} frames, {result.pairs} pairs, {result.matches} matches; '
-         f'{100 * result.inlier_ratio:.0f} % inliers, noise of a match '
-         f'{result.pixel_sigma:.2f} px'),
-        f'rotation of the camera, rms [deg/s]: {rates}', f'shutter: {_shutter_text(result)}',
-        *(f'{name}: {text} [{_state(of)}]' for name, text, of in quantities(result, camera)),
-        'quaternion x y z w: ' + ', '.join(f'{v:.6f}' for v in result.quat_cam_imu_xyzw),
-        *(f'note: {warning}' for warning in result.warnings)]
+    text = (f'{result.frames} frames, {result.pairs} pairs, {result.matches} matches; '
+            f'{100 * result.inlier_ratio:.0f} % inliers, noise of a match '
+            f'{result.pixel_sigma:.2f} px')
+    lines = [text, f'rotation of the camera, rms [deg/s]: {rates}',
+             f'shutter: {_shutter_text(result)}']
+    for name, text, of in quantities(result, camera):
+        state = 'observable' if of.observable else (
+            'weak: ' if of.determined else 'NOT OBSERVABLE: ') + of.remark
+        lines.append(f'{name}: {text} [{state}]')
+    return [*lines,
+            'quaternion x y z w: ' + ', '.join(f'{v:.6f}' for v in result.quat_cam_imu_xyzw),
+            *(f'note: {warning}' for warning in result.warnings)]
 
 
-def _state(estimate: Estimate) -> str:
-    if estimate.observable:
-        return 'observable'
-    return ('weak: ' if estimate.determined else 'NOT OBSERVABLE: ') + estimate.remark
+def _rounded(estimate: Estimate, digits: int, factor: float = 1.0) -> str:
+    """Value and sigma."""
+    return f'{factor * estimate.value:.{digits}f} +- {factor * estimate.sigma:.{digits}f}'
 
 
 def _shown(name: str, estimate: Estimate, value: float | None = None) -> str:
@@ -205,16 +196,18 @@ def _shown(name: str, estimate: Estimate, value: float | None = None) -> str:
 
 
 def _shutter_text(result: CalibrationResult) -> str:
-    readout = result.readout_time
+    readout, shown = result.readout_time, _shown('readout_time', result.readout_time)
     if result.shutter == 'global':
-        return f'global: the readout time is {_shown("readout_time", readout)}'
+        return f'global: the readout time is {shown}'
     if result.shutter == 'unsure':
-        return (f'unsure: {_shown("readout_time", readout)}; record longer, and rotate the camera '
-                'faster')
+        return f'unsure: {shown}; record longer, and rotate the camera faster'
     sigmas = abs(readout.value) / max(readout.sigma, 1e-9)
-    at_zero = float(np.interp(0.0, result.curve.readout_times, result.curve.costs))
     return (f'rolling: the readout time is {sigmas:.0f} sigma from 0, and the log-likelihood '
-            f'of a global shutter is lower by {at_zero:.0f}')
+            f'of a global shutter is lower by {np.interp(0.0, *result.curve):.0f}')
+
+
+# Parameter of the node: name, value and source.
+_Parameter = tuple[str, float | str | tuple[float, ...], str]
 
 
 def parameter_file(result: CalibrationResult, title: str, *, camera: RollingShutterCamera,
@@ -226,90 +219,79 @@ def parameter_file(result: CalibrationResult, title: str, *, camera: RollingShut
     `camera` is that of the calibration: a guess if the lens was not known. `compressed`: the
     images of a bag. `placed`: parameters of a transform.
     """
-    # Parameters of each quantity, if it is determined.
-    groups = [
-        (result.readout_time, 'readout_time', _readout_values(result)),
-        (result.time_offset, 'time_offset', _clock_values(result)),
-        (result.rotation, 'quat_cam_imu_xyzw', [
-            SourcedValue('quat_cam_imu_xyzw',
-                         tuple(round(v, 7) for v in result.quat_cam_imu_xyzw),
-                         f'{axes_text(result.axis_map)}, '
-                         f'{np.degrees(result.rotation.value):.2f} deg off.'),
-            _sigma('axes', result.rotation.sigma, 5, 'Of the worst axis [rad].')])]
-    biases = result.gyro_bias
-    groups += [(max(biases, key=lambda bias: bias.sigma), 'gyro_bias', [
-        SourcedValue('gyro_bias', tuple(round(bias.value, 5) for bias in biases), '1 sigma '
-                     + ', '.join(f'{bias.sigma:.5f}' for bias in biases) + ' rad/s.'),
-        _sigma('gyro_bias', result.bias_sigma, 5,
-               f'Of the worst axis, and {_BIAS_CHANGE:g} rad/s from one start to the next.')])]
+    values: list[_Parameter] = [] if compressed is None else [(
+        'image_transport', 'compressed' if compressed else 'raw', 'As the bag has them.')]
+    groups = [*_parameters(result)]
     if result.lens is not None:
         groups.append((result.lens.focal_factor, 'camera_matrix',
-                       _lens_values(result.lens, camera)))
-    values = [] if compressed is None else [SourcedValue(
-        'image_transport', 'compressed' if compressed else 'raw', 'As the bag has them.')]
-    values += [value for part, _, group in groups if part.determined for value in group]
+                       _lens_parameters(result.lens, camera)))
+    for part, _, group in groups:
+        values += group if part.determined else []
     if feature_rows[1] > 0.0:
-        values.append(SourcedValue('feature_rows', tuple(feature_rows), 'As given to calibrate.'))
-    values += [SourcedValue(name, value, 'By /tf_static.')
-               for name, value in (placed or {}).items()]
+        values.append(('feature_rows', tuple(feature_rows), 'As given to calibrate.'))
+    values += [(name, value, 'By /tf_static.') for name, value in (placed or {}).items()]
     missing = [f'{name} ({part.remark})' for part, name, _ in groups if not part.determined]
     if missing:
         title += ' Not observable in this recording, so left out: ' + '; '.join(missing) + '.'
-    return parameter_text(title, values)
+    return parameter_text(title, [SourcedValue(*value) for value in values])
 
 
-def _sigma(name: str, value: float, digits: int, source: str = '') -> SourcedValue:
-    return SourcedValue(f'{name}_sigma', max(round(value, digits), 10.0**-digits), source)
+def _sigma(name: str, value: float, digits: int, source: str = '') -> _Parameter:
+    return f'{name}_sigma', max(round(value, digits), 10.0**-digits), source
 
 
-def _readout_values(result: CalibrationResult) -> list[SourcedValue]:
-    readout, shutter = result.readout_time, _shutter_text(result)
+def _parameters(result: CalibrationResult) -> Iterator[tuple[Estimate, str, list[_Parameter]]]:
+    """Estimate, main parameter and all parameters of each quantity but the lens."""
+    readout, offset, exposure = result.readout_time, result.time_offset, result.exposure
+    slope, biases, shutter = result.offset_by_interval, result.gyro_bias, _shutter_text(result)
     rolling = result.shutter != 'global'
-    return [
-        SourcedValue('readout_time', round(abs(readout.value), 6) if rolling else 0.0,
-                     f'{shutter[:1].upper()}{shutter[1:]}. Estimate '
-                     f'{_shown("readout_time", readout)} (1 sigma); at most the '
-                     f'{_MS * result.frame_interval:.1f} ms between frames.'),
+    source = (f'{shutter[:1].upper()}{shutter[1:]}. Estimate {_shown("readout_time", readout)} (1 '
+              f'sigma); at most the {_MS * result.frame_interval:.1f} ms between frames.')
+    yield readout, 'readout_time', [
+        ('readout_time', round(abs(readout.value), 6) if rolling else 0.0, source),
         _sigma('readout_time', readout.sigma, 6),
-        SourcedValue('readout_direction', 'up' if rolling and readout.value < 0.0 else 'down',
-                     'By the sign of that estimate.')]
-
-
-def _clock_values(result: CalibrationResult) -> list[SourcedValue]:
-    offset, slope, exposure = result.time_offset, result.offset_by_interval, result.exposure
-    values = [SourcedValue('stamp_row', 'first', 'Convention of time_offset here.'),
-              SourcedValue('time_offset', round(offset.value, 6),
-                           'To the middle of the exposure of row 0.'),
-              _sigma('time_offset', offset.sigma, 6)]
+        ('readout_direction', 'up' if rolling and readout.value < 0.0 else 'down',
+         'By the sign of that estimate.')]
+    clock: list[_Parameter] = [
+        ('stamp_row', 'first', 'Convention of time_offset here.'),
+        ('time_offset', round(offset.value, 6), 'To the middle of the exposure of row 0.'),
+        _sigma('time_offset', offset.sigma, 6)]
     if slope is not None:
-        values += [
-            SourcedValue('time_offset_per_interval', round(slope.value, 4), 'Automatic exposure.'),
-            _sigma('time_offset_per_interval', slope.sigma, 4),
-            SourcedValue('time_offset_reference_interval', round(result.frame_interval, 6),
-                         'Median interval between frames, to which time_offset refers.')]
+        clock += [('time_offset_per_interval', round(slope.value, 4), 'Automatic exposure.'),
+                  _sigma('time_offset_per_interval', slope.sigma, 4),
+                  ('time_offset_reference_interval', round(result.frame_interval, 6),
+                   'Median interval between frames, to which time_offset refers.')]
     if result.exposure_margin:
         margin = max(result.frame_interval - exposure.value, 1e-3)
-        values.append(SourcedValue(
-            'exposure_margin', round(margin, 5), f'Exposure {_MS * exposure.value:.1f} +- '
-            f'{_MS * exposure.sigma:.1f} ms at that interval, assumed as '
-            f'{_MS * result.exposure_margin:.0f} ms less than it before the fit.'))
+        source = (f'Exposure {_rounded(exposure, 1, _MS)} ms at that interval, assumed as '
+                  f'{_MS * result.exposure_margin:.0f} ms less than it before the fit.')
+        clock.append(('exposure_margin', round(margin, 5), source))
     elif exposure.value > 2.0 * exposure.sigma:
-        values.append(SourcedValue('exposure_time', round(exposure.value, 5),
-                                   f'1 sigma {_MS * exposure.sigma:.1f} ms.'))
-    return values
+        clock.append(('exposure_time', round(exposure.value, 5),
+                      f'1 sigma {_MS * exposure.sigma:.1f} ms.'))
+    yield offset, 'time_offset', clock
+    yield result.rotation, 'quat_cam_imu_xyzw', [
+        ('quat_cam_imu_xyzw', tuple(round(v, 7) for v in result.quat_cam_imu_xyzw),
+         f'{axes_text(result.axis_map)}, {np.degrees(result.rotation.value):.2f} deg off.'),
+        _sigma('axes', result.rotation.sigma, 5, 'Of the worst axis [rad].')]
+    yield max(biases, key=lambda bias: bias.sigma), 'gyro_bias', [
+        ('gyro_bias', tuple(round(bias.value, 5) for bias in biases),
+         f'1 sigma {", ".join(f"{bias.sigma:.5f}" for bias in biases)} rad/s.'),
+        _sigma('gyro_bias', result.bias_sigma, 5,
+               f'Of the worst axis, and {_BIAS_CHANGE:g} rad/s from one start to the next.')]
 
 
-def _lens_values(lens: LensEstimates, camera: RollingShutterCamera) -> list[SourcedValue]:
+def _lens_parameters(lens: LensEstimates, camera: RollingShutterCamera) -> list[_Parameter]:
     focal, radial, column, row = lens
     others = (0.0,) * ((len(camera.distortion) or 4) - 1)
     return [
-        SourcedValue('camera_matrix', (
+        ('camera_matrix', (
             round(camera.fx * focal.value, 2), 0.0, round(column.value, 2), 0.0,
             round(camera.fy * focal.value, 2), round(row.value, 2), 0.0, 0.0, 1.0),
-            f'For images of {camera.width}x{camera.height}, in place of their CameraInfo.'),
-        SourcedValue('distortion_model', camera.distortion_model, ''),
-        SourcedValue('distortion_coefficients', (round(radial.value, 5), *others),
-                     'The first coefficient is estimated, the others are assumed to be zero.'),
+         f'For images of {camera.width}x{camera.height}, in place of their CameraInfo.'),
+        ('distortion_model', camera.distortion_model, ''),
+        ('distortion_coefficients', (round(radial.value, 5), *others),
+         'The first coefficient is estimated, the others are assumed to be zero.'),
         _sigma('focal_length', focal.sigma / focal.value, 5, 'Relative.'),
         _sigma('distortion', radial.sigma, 5),
         _sigma('principal_point', max(column.sigma, row.sigma), 2, 'In pixels.')]
@@ -339,8 +321,8 @@ def as_mapping(result: CalibrationResult, camera: RollingShutterCamera) -> dict[
         'frames': result.frames, 'pairs': result.pairs, 'matches': result.matches,
         'inlier_ratio': result.inlier_ratio, 'pixel_sigma': result.pixel_sigma,
         'frame_interval_s': result.frame_interval, 'warnings': list(result.warnings),
-        'cost_over_readout': {'readout_s': result.curve.readout_times.tolist(),
-                              'cost': result.curve.costs.tolist()}}
+        'cost_over_readout': dict(zip(('readout_s', 'cost'), result.curve.tolist(),
+                                      strict=True))}
 
 
 def draw_curve(result: CalibrationResult, path: Path) -> None:
@@ -349,10 +331,9 @@ def draw_curve(result: CalibrationResult, path: Path) -> None:
     from matplotlib.figure import Figure
     picture = Figure(figsize=(7.5, 4.5), dpi=110, layout='constrained')
     axes = picture.subplots()
-    readout = result.readout_time
+    readout, (tried, costs) = result.readout_time, result.curve
     # The root of a parabola is straight on both sides of the best.
-    axes.plot(_MS * result.curve.readout_times, np.sqrt(2.0 * result.curve.costs), 'o-',
-              color=BLUE)
+    axes.plot(_MS * tried, np.sqrt(2.0 * costs), 'o-', color=BLUE)
     axes.axvline(0.0, color='0.6', linewidth=0.8)
     axes.axvline(_MS * readout.value, color=ORANGE, label=_shown('readout_time', readout))
     axes.axvspan(_MS * (readout.value - 3 * readout.sigma),

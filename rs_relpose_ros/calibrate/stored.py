@@ -96,10 +96,7 @@ def save(path: Path, camera: CameraId, parameters: str, *, replace: bool = True)
 def load(path: Path, camera: CameraId) -> tuple[dict[str, Any], str]:
     """Parameters of a stored calibration by name, and its date with their sigmas in words.
 
-    Raises
-    ------
-    InputError
-        The file is damaged, or of another camera or image size.
+    InputError if the file is damaged, or of another camera or image size.
     """
     try:
         own, values = file_values(path, _SECTION), file_values(path)

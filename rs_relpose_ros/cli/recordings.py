@@ -14,7 +14,7 @@ from rs_relpose_ros.bags import phones, video
 from rs_relpose_ros.bags.convert import Recording, write_bag
 from rs_relpose_ros.bags.reader import COMPRESSED_IMAGE, open_bag
 from rs_relpose_ros.calibrate import result as calibration
-from rs_relpose_ros.calibrate.procedure import calibrate, read_recording
+from rs_relpose_ros.calibrate.procedure import read_recording
 from rs_relpose_ros.cli import options
 from rs_relpose_ros.cli.main import Command, FAILED, LABORATORY
 from rs_relpose_ros.config import settings
@@ -85,10 +85,9 @@ def calibrate_bag(
                          f'{recording.camera.height} rows: give the first and the last to use')
     options.warn_unused(recording.unused)
     with options.progress_bar(100, '%', 'fitting') as bar:
-        result = calibrate(recording.tracks, recording.gyro, recording.camera,
-                           focal_known=recording.focal_known, config=config, quat_prior=placed
-                           and placed[3:],
-                           progress=lambda share: bar.update(round(100 * share) - bar.n))
+        result = recording.calibrated(
+            config, quat_prior=placed and placed[3:],
+            progress=lambda share: bar.update(round(100 * share) - bar.n))
     values: dict[str, Any] = {}
     if placed is not None:
         values, contradiction = extrinsics(

@@ -1,6 +1,8 @@
 """The check of a bag: choose topics, read it once, report findings."""
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 import math
 import textwrap
@@ -9,10 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rs_relpose_ros.bags import reader
-from rs_relpose_ros.bags.reader import Bag, BagMessage, Chosen, SensorTopics, Topic
-from rs_relpose_ros.calibrate.observations import frame_times, Varying
-from rs_relpose_ros.calibrate.start import axes_text, nearest_axis_map
+from rs_relpose_ros.bags.reader import Bag, Chosen, SensorTopics, Topic
+from rs_relpose_ros.calibrate import observations
+from rs_relpose_ros.calibrate.observations import axes_text, frame_times, Varying
 from rs_relpose_ros.config.settings import Parameters, sensor_model
+from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.imu.buffer import length_fault
 from rs_relpose_ros.messages.incoming import Role, sensor_messages
 from rs_relpose_ros.messages.transforms import with_extrinsics
@@ -62,10 +65,9 @@ class CheckReport:
             text = finding.message + (f' -> {finding.fix}' if finding.fix else '')
             lines += textwrap.wrap(text, width, initial_indent=head,
                                    subsequent_indent=' ' * len(head), break_on_hyphens=False)
-        states = [finding.state for finding in self.findings]
-        counts = [f'{states.count(state)} {state.verdict}' for state in FindingState]
-        lines.append(f'{self.bag}: {", ".join(counts)}')
-        return lines
+        counts = Counter(finding.state for finding in self.findings)
+        return [*lines, f'{self.bag}: ' + ', '.join(
+            f'{counts[state]} {state.verdict}' for state in FindingState)]
 
     def to_mapping(self) -> dict[str, Any]:
         """The report as data for JSON."""
@@ -82,19 +84,14 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
     images = chosen.image.count if chosen.image else 0
     parameters, contradiction = with_extrinsics(bag, chosen, parameters)
     scan = Scan(images, parameters.intrinsics)
-    completion, sample, topics = Completion(parameters, None, ''), None, None
+    completion, sample, topics = Completion(parameters), None, None
     if chosen.image is not None and chosen.imu is not None:
         topics = SensorTopics(chosen.image, chosen.camera_info, chosen.imu, chosen.accel, None)
         completion = check_recording.completed(bag, topics, parameters)
         if not completion.parameters.sensor.missing():
             sample = SampleRun(images, completion.parameters)
 
-    def scanned() -> Iterator[tuple[Role, BagMessage]]:
-        for role, message in sensor_messages(bag, chosen):
-            scan.add(role, message)
-            yield role, message
-
-    source = scanned()
+    source = scan.added(sensor_messages(bag, chosen))
     if sample is not None:
         sample.run(source)
     for _ in source:   # all of it without a sample
@@ -104,12 +101,17 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
         findings.append(Finding('transforms', SUSPECT, contradiction, 'correct the description of '
                                 'the robot (URDF), or the parameter', measured={}))
     if chosen.image is not None:
-        findings += image_findings(scan, chosen.image, bag.reliability(chosen.image), parameters)
+        findings += [
+            *_encoding(scan, chosen.image, parameters), _rate(scan.stamps(Role.IMAGE)),
+            stamp_finding('image stamps', scan.stamps(Role.IMAGE), 'the camera'),
+            _calibration(scan), _transport(scan, chosen.image, bag.reliability(chosen.image))]
     if chosen.imu is not None:
-        findings += imu_findings(scan, bag.reliability(chosen.imu), parameters)
+        findings += _imu(scan, bag.reliability(chosen.imu), parameters)
     if topics is not None:
         if sample is not None and sample.is_lost and completion.found is None:
-            completion = check_recording.recalibrated(bag, topics, completion)
+            with suppress(InputError):   # the recording permits no calibration
+                completion = completion._replace(found=check_recording.calibrated(
+                    bag, topics, completion.parameters))
         findings += joint_findings(scan, sample, completion, parameters)
     return CheckReport(str(bag.path), tuple(findings))
 
@@ -133,7 +135,7 @@ def _parameters(parameters: Parameters) -> Finding:
         return Finding('parameters', SUSPECT, f'{" and ".join(missing)} not configured',
                        'the node needs them: add --params FILE, or estimate them from a recording '
                        'with "rs_relpose calibrate"', measured={'missing': missing})
-    nearest = axes_text(nearest_axis_map(sensor.R_cam_imu))
+    nearest = axes_text(observations.nearest_axis_map(sensor.R_cam_imu))
     return by_case('parameters', f'readout_time {1e3 * (sensor.readout_time or 0.0):.1f} ms, '
                    f'time_offset {1e3 * sensor.time_offset:.1f} ms, quat_cam_imu_xyzw (about '
                    f'{nearest})', {'missing': [], 'nearest': nearest})
@@ -148,31 +150,25 @@ _SLOW = 8.0
 _MISSED_SHARE = 0.05
 # First stamps, enough to distinguish jitter from automatic exposure.
 _MOST_STAMPS = 1000
-# Fix of stamps that do not increase.
-_NO_STEP = 'record longer, and correct the stamps of the driver'
 
 
-def image_findings(scan: Scan, topic: Topic, reliability: str,
-                   parameters: Parameters) -> list[Finding]:
-    """Findings on the images, their CameraInfo and their transport."""
-    stamps_ns = np.unique(scan.image_stamps.ns[:_MOST_STAMPS])
-    varying = frame_times(stamps_ns).varying if len(stamps_ns) > 2 else Varying.UNCLEAR
-    return [*_encoding(scan, topic, parameters), _rate(scan.image_stamps),
-            stamp_finding('image stamps', scan.image_stamps, 'the camera', varying),
-            _calibration(scan), _transport(scan, topic, reliability)]
+def _no_step(name: str, stamps: Stamps, measured: dict[str, Any]) -> Finding:
+    return Finding(name, WRONG, f'{stamps.count} message(s), no two of increasing stamps',
+                   'record longer, and correct the stamps of the driver', measured=measured)
 
 
-def stamp_finding(name: str, stamps: Stamps, of: str,
-                  varying: Varying = Varying.JITTER) -> Finding:
-    """Order and evenness of stamps; `varying`: why their intervals differ."""
+def stamp_finding(name: str, stamps: Stamps, of: str) -> Finding:
+    """Order and evenness of stamps; those of images may follow an exposure."""
+    varying, first_ns = Varying.JITTER, np.unique(stamps.ns[:_MOST_STAMPS])
+    if of == 'the camera':
+        varying = frame_times(first_ns).varying if len(first_ns) > 2 else Varying.UNCLEAR
     repeated, backwards = int((stamps.steps == 0.0).sum()), int((stamps.steps < 0.0).sum())
     jitter, furthest_back = stamps.jitter, abs(float(stamps.steps.min(initial=0.0)))
     measured = {'jitter_s': jitter, 'repeated': repeated, 'backwards': backwards,
                 'furthest_back_s': furthest_back,
                 'delay_s': stamps.delay if stamps.count else None}
     if not stamps.interval > 0.0:
-        return Finding(name, WRONG, f'{stamps.count} message(s), no two of increasing stamps',
-                       _NO_STEP, measured=measured)
+        return _no_step(name, stamps, measured)
     text, unordered = f'jitter {1e3 * jitter:.2f} ms', repeated + backwards
     if unordered:
         text += (f', {repeated} repeated, {backwards} back in time (by up to {furthest_back:.3f} '
@@ -199,11 +195,11 @@ def _encoding(scan: Scan, topic: Topic, parameters: Parameters) -> list[Finding]
     sizes = ', '.join(f'{width}x{height}' for width, height in scan.sizes)
     found = by_case(
         'images', f'{sizes} {", ".join(scan.encodings)}'.strip(),
-        {'encodings': dict(scan.encodings), 'bad_images': scan.bad_images,
+        {'encodings': dict(scan.encodings), 'bad_images': scan.unusable[Role.IMAGE],
          'sizes': [list(size) for size in scan.sizes]},
-        Case(scan.bad_images > 0, SUSPECT if scan.sizes else WRONG,
+        Case(scan.unusable[Role.IMAGE] > 0, SUSPECT if scan.sizes else WRONG,
              'publish original images of a known encoding, or JPEG or PNG',
-             f'; {scan.bad_images} cannot be used: {scan.problems.get(Role.IMAGE)}'),
+             f'; {scan.unusable[Role.IMAGE]} cannot be used: {scan.problems.get(Role.IMAGE)}'),
         Case('image_rect' in topic.name, WRONG, 'record the original (raw) images: rectified rows '
              'have no common time', f'; {topic.name} is rectified'),
         Case(len(scan.sizes) > 1, SUSPECT,
@@ -251,7 +247,7 @@ def _calibration(scan: Scan) -> Finding:
     return by_case(
         name, f'{intrinsics.width}x{intrinsics.height}, f {intrinsics.fx:.1f} '
         f'{intrinsics.fy:.1f} px, {intrinsics.distortion_model}'
-        + (' by camera_matrix' if scan.by_parameters else ''),
+        + (' by camera_matrix' if scan.configured.given else ''),
         {'fx': intrinsics.fx, 'fy': intrinsics.fy,
          'distortion_model': intrinsics.distortion_model, 'different': scan.calibrations},
         Case(other != size, WRONG, 'publish the CameraInfo of this resolution, region of interest '
@@ -286,39 +282,33 @@ _PLAUSIBLE_FORCE = (9.4, 10.8)
 _FASTEST_MEDIAN = 8.0
 
 
-def imu_findings(scan: Scan, reliability: str, parameters: Parameters) -> list[Finding]:
+def _imu(scan: Scan, reliability: str, parameters: Parameters) -> list[Finding]:
     """Findings on the IMU by itself."""
     if not len(scan.rates):
         problem = scan.problems.get(Role.IMU, 'all messages mark the gyro as absent')
         return [Finding('gyro', WRONG, f'no gyro: {problem}', 'choose a topic that has '
                         'angular_velocity with --imu-topic', measured={})]
-    return [_imu_rate(scan, reliability, parameters),
-            stamp_finding('imu stamps', scan.imu_stamps, 'the IMU'), _gyro(scan),
+    stamps, gap = scan.stamps(Role.IMU), parameters.imu.max_imu_gap
+    rate = _no_step('imu rate', stamps, {})
+    if stamps.interval > 0.0:
+        gaps, longest = int((stamps.forwards > gap).sum()), stamps.longest
+        hertz, unusable = 1.0 / stamps.interval, scan.unusable[Role.IMU]
+        rate = by_case(
+            'imu rate', f'{hertz:.0f} Hz, {stamps.count} in {stamps.duration:.1f} s, longest step '
+            f'{1e3 * longest:.1f} ms' + f', recorded as {reliability}' * bool(reliability),
+            {'rate_hz': hertz, 'count': stamps.count, 'gaps': gaps, 'longest_step_s': longest,
+             'unusable': unusable, 'reliability': reliability or None},
+            Case(stamps.interval > gap, WRONG, f'steps longer than max_imu_gap = {gap:g} s are '
+                 'not interpolated: raise the rate to 100 Hz or more'),
+            Case(unusable > 0, SUSPECT, 'correct the driver',
+                 f'; {unusable} messages cannot be used: {scan.problems.get(Role.IMU)}'),
+            Case(gaps > 0, SUSPECT, "frames in a gap are refused: give the IMU's subscription a "
+                 'deeper queue, or record on the machine of the driver',
+                 f'; {gaps} gaps above {1e3 * gap:.0f} ms'),
+            Case(hertz < _SLOW_IMU, SUSPECT, 'publish 200 Hz or more, which resolves the rotation '
+                 'of a hand within one readout'))
+    return [rate, stamp_finding('imu stamps', stamps, 'the IMU'), _gyro(scan),
             _bias(scan, parameters), _accelerometer(scan)]
-
-
-def _imu_rate(scan: Scan, reliability: str, parameters: Parameters) -> Finding:
-    name, stamps, gap = 'imu rate', scan.imu_stamps, parameters.imu.max_imu_gap
-    interval = stamps.interval
-    if not interval > 0.0:
-        return Finding(name, WRONG, f'{stamps.count} message(s), no two of increasing stamps',
-                       _NO_STEP, measured={})
-    gaps, longest = int((stamps.forwards > gap).sum()), stamps.longest
-    text = (f'{1.0 / interval:.0f} Hz, {stamps.count} in {stamps.duration:.1f} s, longest '
-            f'step {1e3 * longest:.1f} ms' + f', recorded as {reliability}' * bool(reliability))
-    return by_case(
-        name, text, {'rate_hz': 1.0 / interval, 'count': stamps.count, 'gaps': gaps,
-                     'longest_step_s': longest, 'unusable': scan.bad_imu,
-                     'reliability': reliability or None},
-        Case(interval > gap, WRONG, f'steps longer than max_imu_gap = {gap:g} s are not '
-             'interpolated: raise the rate to 100 Hz or more'),
-        Case(scan.bad_imu > 0, SUSPECT, 'correct the driver',
-             f'; {scan.bad_imu} messages cannot be used: {scan.problems.get(Role.IMU)}'),
-        Case(gaps > 0, SUSPECT, "frames in a gap are refused: give the IMU's subscription a "
-             'deeper queue, or record on the machine of the driver',
-             f'; {gaps} gaps above {1e3 * gap:.0f} ms'),
-        Case(1.0 / interval < _SLOW_IMU, SUSPECT,
-             'publish 200 Hz or more, which resolves the rotation of a hand within one readout'))
 
 
 def _gyro(scan: Scan) -> Finding:
@@ -412,16 +402,14 @@ def joint_findings(scan: Scan, sample: SampleRun | None, completion: Completion,
 
 def _overlap(scan: Scan, parameters: Parameters) -> Finding:
     """Whether the gyro covers the images in time, as stamped."""
-    name, images, imu = 'clocks', scan.image_stamps, scan.imu_stamps
+    name, images, imu = 'clocks', scan.stamps(Role.IMAGE), scan.stamps(Role.IMU)
     if not images.count or not imu.count:
         return Finding(name, WRONG, 'no stamps to compare', 'correct the topics above',
                        measured={})
-    offset_ns = round(parameters.sensor.time_offset * 1e9)
-    image_ns, imu_ns = images.ns + offset_ns, imu.ns
+    image_ns, imu_ns = images.ns + round(parameters.sensor.time_offset * 1e9), imu.ns
     common = int(min(image_ns.max(), imu_ns.max()) - max(image_ns.min(), imu_ns.min())) * 1e-9
-    delay, imu_delay = images.delay, imu.delay
-    apart = delay - imu_delay
-    measured = {'common_s': common, 'image_delay_s': delay, 'imu_delay_s': imu_delay}
+    apart = images.delay - imu.delay
+    measured = {'common_s': common, 'image_delay_s': images.delay, 'imu_delay_s': imu.delay}
     if common <= 0.0 or abs(apart + parameters.sensor.time_offset) > max(
             _SAME_CLOCK, 0.5 * images.duration):
         return Finding(name, WRONG, f'images and IMU are stamped {abs(apart):.3f} s apart',
@@ -429,8 +417,8 @@ def _overlap(scan: Scan, parameters: Parameters) -> Finding:
                        f'time_offset: {apart:.3f} if the difference is constant',
                        measured=measured)
     return by_case(
-        name, f'{common:.1f} s in common; recorded {1e3 * delay:.0f} ms (images) and '
-        f'{1e3 * imu_delay:.0f} ms (IMU) after their stamps', measured,
+        name, f'{common:.1f} s in common; recorded {1e3 * images.delay:.0f} ms (images) and '
+        f'{1e3 * imu.delay:.0f} ms (IMU) after their stamps', measured,
         Case(common < 0.8 * images.duration, SUSPECT, "images outside of the IMU's time are "
              'refused: start the IMU first and stop it last'),
         Case(abs(apart) > _SAME_CLOCK, SUSPECT,

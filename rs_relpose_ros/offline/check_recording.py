@@ -8,16 +8,16 @@ parameters that are missing, and replaces those that are too far off for the fro
 from array import array
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.bags.reader import Bag, BagMessage, SensorTopics
-from rs_relpose_ros.calibrate.procedure import calibrate, read_recording
+from rs_relpose_ros.calibrate.procedure import read_recording
 from rs_relpose_ros.calibrate.result import CalibrationResult
 from rs_relpose_ros.config import settings
 from rs_relpose_ros.config.settings import ImuConfig, IntrinsicsConfig, Parameters
@@ -65,13 +65,11 @@ class Stamps:
 class Scan:
     """Statistics of all streams; `images` is the number of images to come.
 
-    `configured`: intrinsics in place of the CameraInfo's, if there are any. Derived values are
-    those of all messages: read them after the last one.
+    `configured`: intrinsics in place of the CameraInfo's, if there are any.
     """
 
     def __init__(self, images: int, configured: IntrinsicsConfig) -> None:
-        self._configured = configured
-        self.by_parameters = configured.given
+        self.configured = configured
         self._every = max(images // _DECODED, 1)
         self._stamps = {role: (array('q'), array('d')) for role in (Role.IMAGE, Role.IMU)}
         self._rates, self._forces = array('d'), array('d')
@@ -82,7 +80,7 @@ class Scan:
         self.largest_image = 0                         # message of an image [bytes]
         self.intrinsics: Intrinsics | None = None
         self.calibrations = 0                          # number of changes of them
-        self.bad_images = self.bad_imu = 0             # messages that cannot be used
+        self.unusable: Counter[Role] = Counter()       # messages
         self.problems: dict[Role, str] = {}            # the first reason
 
     def add(self, role: Role, message: BagMessage) -> None:
@@ -100,13 +98,20 @@ class Scan:
                 self._forces.extend(data.linear_acceleration or ())
                 self._rates.extend(data.angular_velocity or ())
                 self._buffer.add(data)
-            elif not self.by_parameters:
+            elif not self.configured.given:
                 self.calibrations += data != self.intrinsics
                 self.intrinsics = data
         except RsRelposeError as error:
-            self.bad_images += role is Role.IMAGE
-            self.bad_imu += role in (Role.IMU, Role.ACCEL)
-            self.problems.setdefault(Role.IMU if role is Role.ACCEL else role, str(error))
+            role = Role.IMU if role is Role.ACCEL else role
+            self.unusable[role] += 1
+            self.problems.setdefault(role, str(error))
+
+    def added(self, source: Iterator[tuple[Role, BagMessage]],
+              ) -> Iterator[tuple[Role, BagMessage]]:
+        """The messages of a source, each added."""
+        for role, message in source:
+            self.add(role, message)
+            yield role, message
 
     def _add_image(self, image: EncodedImage) -> None:
         encoding = image.encoding[:60]
@@ -117,22 +122,16 @@ class Scan:
             return
         height, width = image.decoded().shape
         self.sizes[width, height] += 1
-        if self.by_parameters:
-            self.intrinsics = self._configured.of_image(width, height)
+        if self.configured.given:
+            self.intrinsics = self.configured.of_image(width, height)
 
-    @cached_property
-    def image_stamps(self) -> Stamps:
-        """Stamps of the images."""
-        return Stamps(*self._stamps[Role.IMAGE])
-
-    @cached_property
-    def imu_stamps(self) -> Stamps:
-        """Stamps of the IMU, without those of a separate accelerometer."""
-        return Stamps(*self._stamps[Role.IMU])
+    def stamps(self, role: Role) -> Stamps:
+        """Stamps so far of the images or of the IMU, without those of a separate accelerometer."""
+        return Stamps(*self._stamps[role])
 
     @cached_property
     def rates(self) -> Array:
-        """Rates (K, 3) of the gyro [rad/s]."""
+        """Rates (K, 3) of the gyro [rad/s]; read this and the next after the last message."""
         return np.array(self._rates).reshape(-1, 3)
 
     @cached_property
@@ -168,16 +167,15 @@ _CERTAIN = 4.0
 _LEAST_ANGLE, _LEAST_TIME = math.radians(5.0), 8e-3
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Completion:
+class Completion(NamedTuple):
     """Parameters with the estimates of those that are not configured."""
 
     parameters: Parameters
-    found: CalibrationResult | None   # None if none was needed, or possible
-    problem: str   # reason why a parameter is still missing
+    found: CalibrationResult | None = None   # None if none was needed, or possible
+    problem: str = ''   # reason why a parameter is still missing
 
 
-def _calibrated(bag: Bag, topics: SensorTopics, parameters: Parameters) -> CalibrationResult:
+def calibrated(bag: Bag, topics: SensorTopics, parameters: Parameters) -> CalibrationResult:
     """Calibration without initial values, of images in the middle of the recording."""
     tracking, images = parameters.tracking, topics.image.count
     first = max(images - _CALIBRATED_IMAGES, 0) // 2
@@ -185,42 +183,33 @@ def _calibrated(bag: Bag, topics: SensorTopics, parameters: Parameters) -> Calib
         bag, topics, settings.TrackingConfig(detector=tracking.detector,
                                              feature_rows=tracking.feature_rows),
         images=range(first, first + min(images, _CALIBRATED_IMAGES)))
-    if parameters.intrinsics.given:
-        size = recording.camera.width, recording.camera.height
-        recording = replace(recording, focal_known=True, camera=parameters.intrinsics.of_image(
-            *size).global_shutter_camera())
-    return calibrate(recording.tracks, recording.gyro, recording.camera,
-                     focal_known=recording.focal_known, config=settings.TRACKED_IN_IMAGES)
+    camera, given = recording.camera, parameters.intrinsics
+    if given.given:
+        recording = replace(recording, focal_known=True, camera=given.of_image(
+            camera.width, camera.height).global_shutter_camera())
+    return recording.calibrated(settings.TRACKED_IN_IMAGES)
 
 
 def completed(bag: Bag, topics: SensorTopics, parameters: Parameters) -> Completion:
     """`parameters` with estimates of readout time and axes, if these are missing."""
     missing = parameters.sensor.missing()
     if not missing:
-        return Completion(parameters, None, '')
+        return Completion(parameters)
     try:
-        found = _calibrated(bag, topics, parameters)
+        found = calibrated(bag, topics, parameters)
     except InputError as error:
         return Completion(parameters, None, str(error))
-    readout, axes, problem = found.readout_time, found.rotation, ''
+    readout, axes = found.readout_time, found.rotation
     values: dict[str, Any] = {}
-    if 'quat_cam_imu_xyzw' in missing:
-        problem = '' if axes.observable else axes.remark
-        values |= {'quat_cam_imu_xyzw': found.quat_cam_imu_xyzw} if axes.observable else {}
+    problems = [estimate.remark for name, estimate in (
+        ('quat_cam_imu_xyzw', axes), ('readout_time', readout))
+        if name in missing and not estimate.observable]
+    if 'quat_cam_imu_xyzw' in missing and axes.observable:
+        values['quat_cam_imu_xyzw'] = found.quat_cam_imu_xyzw
     if 'readout_time' in missing and readout.observable:
         values |= {'readout_time': abs(readout.value),
                    'readout_direction': 'up' if readout.value < 0.0 else 'down'}
-    elif 'readout_time' in missing:
-        problem = problem or readout.remark
-    return Completion(parameters.updated(values), found, problem)
-
-
-def recalibrated(bag: Bag, topics: SensorTopics, completion: Completion) -> Completion:
-    """The same with a calibration; unchanged if the recording permits none."""
-    try:
-        return replace(completion, found=_calibrated(bag, topics, completion.parameters))
-    except InputError:
-        return completion
+    return Completion(parameters.updated(values), found, next(iter(problems), ''))
 
 
 def contradicted(found: CalibrationResult, sensor: settings.SensorConfig,
