@@ -141,35 +141,14 @@ def refine_alternating(observations: Array, inliers: NDArray[np.bool_], start: T
     `observations` (N, 20), `pixel_sigma` [px]: noise of a match. Without `velocities`,
     ``d_1 = d_2 = 0`` (angular and global models).
     """
+    from scipy.optimize import least_squares  # a tenth of the imports of a node
+
     used = np.ascontiguousarray(observations[inliers])
     state, cost = start, np.inf
-    for _ in range(ALTERNATIONS):
-        previous = cost
-        state, cost = _with_translation_refined(
-            used, _with_rotation_refined(used, state, pixel_sigma), pixel_sigma, velocities)
-        if previous - cost < 1e-6 * cost:
-            break
-    scale = float(np.linalg.norm(state.t))
-    return state._replace(t=state.t / scale, d1=state.d1 / scale, d2=state.d2 / scale)
 
-
-def _with_rotation_refined(used: Array, state: TwoViewState, sigma: float) -> TwoViewState:
     def rotated(theta: Array) -> TwoViewState:
         return state._replace(R=np.ascontiguousarray(
             Rotation.from_rotvec(theta).as_matrix() @ state.R))
-
-    from scipy.optimize import least_squares  # a tenth of the imports of a node
-    # At Exp(theta) R the local derivative is by another rotation on the left, J(theta) dtheta.
-    found = least_squares(
-        lambda theta: sampson.residuals(used, rotated(theta)) / sigma, np.zeros(3), method='lm',
-        jac=lambda theta: (sampson.jacobian(used, rotated(theta))[:, :3]
-                           @ so3.left_jacobian_so3(theta) / sigma))
-    return rotated(found.x)
-
-
-def _with_translation_refined(used: Array, state: TwoViewState, sigma: float,
-                              velocities: bool) -> tuple[TwoViewState, float]:
-    from scipy.optimize import least_squares
 
     def placed(x: Array) -> TwoViewState:
         d = x[3:] if velocities else np.zeros(6)
@@ -177,30 +156,20 @@ def _with_translation_refined(used: Array, state: TwoViewState, sigma: float,
 
     def errors(x: Array) -> Array:
         return np.concatenate([
-            sampson.residuals(used, placed(x)) / sigma,
+            sampson.residuals(used, placed(x)) / pixel_sigma,
             [np.sqrt(TRANSLATION_WEIGHT) * (np.linalg.norm(x[:3]) - 1.0)],
             np.sqrt(VELOCITY_WEIGHT) * x[3:]])
 
-    def derivatives(x: Array) -> Array:
-        at, length = placed(x), float(np.linalg.norm(x[:3]))
-        unit = x[:3] / length
-        full = sampson.jacobian(used, at._replace(
-            t=unit, d1=at.d1 / length, d2=at.d2 / length)) / length
-        by_d1, by_d2 = full[:, 5:8], full[:, 8:11]
-        # The error does not change with a common scale of (t, d_1, d_2): Euler's relation gives
-        # the radial derivative from the others.
-        radial = -(by_d1 @ at.d1 + by_d2 @ at.d2) / length
-        by_t = full[:, 3:5] @ so3.tangent_basis(unit).T + radial[:, None] * unit
-        by_d = np.hstack([by_d1, by_d2]) if velocities else np.zeros((len(full), 6))
-        jacobian = np.zeros((len(full) + 7, 9))
-        jacobian[:-7] = np.hstack([by_t, by_d]) / sigma
-        jacobian[-7, :3] = np.sqrt(TRANSLATION_WEIGHT) * unit
-        jacobian[-6:, 3:] = np.sqrt(VELOCITY_WEIGHT) * np.eye(6)
-        return jacobian
-
-    start = np.concatenate([state.t, state.d1, state.d2])
-    least = least_squares(errors, start, jac=derivatives, method='lm')
-    return placed(least.x), float(least.cost)
+    for _ in range(ALTERNATIONS):
+        state = rotated(least_squares(
+            lambda theta: sampson.residuals(used, rotated(theta)) / pixel_sigma, np.zeros(3),
+            method='lm').x)
+        found = least_squares(errors, np.concatenate([state.t, state.d1, state.d2]), method='lm')
+        state, previous, cost = placed(found.x), cost, float(found.cost)
+        if previous - cost < 1e-6 * cost:
+            break
+    scale = float(np.linalg.norm(state.t))
+    return state._replace(t=state.t / scale, d1=state.d1 / scale, d2=state.d2 / scale)
 
 
 # -- Rotation alone: a robust fit with the gyro's prior -------------------------------------------

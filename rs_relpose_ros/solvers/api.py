@@ -27,15 +27,15 @@ ANGULAR = Model('angular', derotated=True, velocities=False)
 GLOBAL = Model('global', derotated=False, velocities=False)
 
 SOLVERS = {solver.name: solver for solver in (
-    Solver('uniform_9pt', 9, UNIFORM, uniform.solve_gravity_9pt, uniform.MAX_9PT,
+    Solver('uniform_9pt', 9, UNIFORM, uniform.solve_with_gravity, uniform.MAX_9PT,
            'Uniform 9-point algorithm: gravity and angular velocity known.', needs_gravity=True),
     Solver('uniform_11pt', 11, UNIFORM, uniform.solve_uniform_11pt, uniform.MAX_11PT,
            'Uniform 11-point algorithm: angular velocity known.', starts_from_rotation=True),
-    Solver('linear_9pt', 9, LINEAR, uniform.solve_gravity_9pt, uniform.MAX_9PT,
+    Solver('linear_9pt', 9, LINEAR, uniform.solve_with_gravity, uniform.MAX_9PT,
            'Linear 9-point algorithm: gravity known, no angular velocity.', needs_gravity=True),
     Solver('angular_5pt', 5, ANGULAR, angular.solve_5pt, angular.MAX_5PT,
            'Angular 5-point algorithm: angular velocity known, no linear velocity.'),
-    Solver('angular_3pt', 3, ANGULAR, angular.solve_angular_3pt, angular.MAX_3PT,
+    Solver('angular_3pt', 3, ANGULAR, uniform.solve_with_gravity, uniform.MAX_3PT,
            'Angular 3-point algorithm: gravity and angular velocity known, no linear velocity.',
            needs_gravity=True),
     Solver('global_5pt', 5, GLOBAL, angular.solve_5pt, angular.MAX_5PT,

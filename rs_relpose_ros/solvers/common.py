@@ -13,8 +13,19 @@ import numba
 import numpy as np
 
 from rs_relpose_ros.geometry import Array
-from rs_relpose_ros.geometry.so3 import copy_matrix, cross, dot, norm, rotated, rotated_back
+from rs_relpose_ros.geometry.so3 import (
+    copy_matrix,
+    copy_vector,
+    cross,
+    dot,
+    exp_so3,
+    multiply,
+    norm,
+    rotated,
+    rotated_back,
+)
 from rs_relpose_ros.jit import kernel, KernelInterface, small_kernel
+from rs_relpose_ros.solvers.algebra import cholesky, lu_factor, lu_solve, newton_step, normalise
 
 
 class Sample(NamedTuple):
@@ -119,15 +130,6 @@ def cheirality_votes(sample: Sample, R: Array, x: Array) -> tuple[int, int]:
     return front, behind
 
 
-@small_kernel
-def point_forward(sample: Sample, R: Array, x: Array) -> None:
-    """Give `x` (9,) the sign with more points in front of both cameras."""
-    front, behind = cheirality_votes(sample, R, x)
-    if behind > front:
-        for i in range(9):
-            x[i] = 0.0 - x[i]  # not -x: a velocity of zero stays +0
-
-
 # Gravity as two degrees of freedom of the relative rotation: with ``A_i g_i = z`` for the unit
 # gravity directions g_i of the two cameras,
 #
@@ -135,15 +137,6 @@ def point_forward(sample: Sample, R: Array, x: Array) -> None:
 #
 # has one unknown angle psi. The paper has ``R = R(phi_2, theta_2)^T R(psi) R(phi_1, theta_1)``
 # (section 'Gravity and Angular Velocity Measurements'), for the inverse R and a vertical along y.
-
-class AlignedRays(NamedTuple):
-    """Rays in frames with gravity on z, the second rotated so that solutions have yaws near 0."""
-
-    a: Array   # (n, 3) ``A_1 f_1``
-    b: Array   # (n, 3) ``Rz(centre) A_2 f_2``
-    centre: float   # [rad] to be added to their yaw
-    zoom: float   # rms distance of a and b, about the width of the cluster
-
 
 @kernel
 def gravity_alignment(gravity: Array) -> Array:
@@ -177,47 +170,23 @@ def rotation_from_yaw(psi: float, known: Knowledge, R: Array) -> None:
 
 
 @kernel
-def normals_at_yaw(rays: AlignedRays, c: float, s: float, normals: Array,
-                   derivatives: Array) -> None:
-    """Write epipolar normals ``n = a x h`` (n, 3) with ``h = Rz(psi) b``, and ``dn / dpsi``.
+def yaw_cluster(sample: Sample, known: Knowledge) -> tuple[float, float]:
+    """Centre and width [rad] of the cluster of solutions in psi.
 
-    `c`, `s`: cosine and sine of psi. Normals are in the aligned frame, ``A_1 (f_1 x R f_2)``.
-    """
-    for k in range(rays.a.shape[0]):
-        a, b = rays.a[k], rays.b[k]
-        h = (c * b[0] - s * b[1], s * b[0] + c * b[1], b[2])
-        n = cross(a, h)
-        # dh / dpsi = (-h_y, h_x, 0)
-        dn = (-a[2] * h[0], -a[2] * h[1], a[0] * h[0] + a[1] * h[1])
-        for i in range(3):
-            normals[k, i], derivatives[k, i] = n[i], dn[i]
-
-
-@kernel
-def align_rays(sample: Sample, known: Knowledge) -> AlignedRays:
-    """Rotate gravity onto z, and the rays of the second camera onto those of the first.
-
-    The normals ``a x Rz(psi) b`` of distant points all nearly vanish at the true yaw, so that the
-    zeros of their determinants cluster there, within about the parallax. The centre of the cluster
-    is about ``argmax sum a . Rz(psi) b``. The zoom is in [1e-3, 1].
+    The normals of distant points all nearly vanish at the true yaw, so that the zeros of their
+    determinants cluster there, within about the parallax. With the aligned rays a and b, the
+    centre is about ``argmax sum a . Rz(psi) b``, the width their rms distance, in [1e-3, 1].
     """
     count = sample.f1.shape[0]
-    a, b = np.empty((count, 3)), np.empty((count, 3))
-    along, across = 0.0, 0.0
+    along, across, total = 0.0, 0.0, 0.0
     for k in range(count):
-        a_k, b_k = rotated(known.align1, sample.f1[k]), rotated(known.align2, sample.f2[k])
-        for i in range(3):
-            a[k, i], b[k, i] = a_k[i], b_k[i]
-        along += a_k[0] * b_k[0] + a_k[1] * b_k[1]
-        across += a_k[1] * b_k[0] - a_k[0] * b_k[1]
-    length = math.sqrt(along * along + across * across)
-    c, s = (along / length, across / length) if length > 0.0 else (1.0, 0.0)
-    total = 0.0
-    for k in range(count):
-        b[k, 0], b[k, 1] = c * b[k, 0] - s * b[k, 1], s * b[k, 0] + c * b[k, 1]
-        total += (a[k, 0] - b[k, 0]) ** 2 + (a[k, 1] - b[k, 1]) ** 2 + (a[k, 2] - b[k, 2]) ** 2
-    zoom = min(max(math.sqrt(total / count), 1e-3), 1.0)
-    return AlignedRays(a, b, math.atan2(s, c), zoom)
+        a, b = rotated(known.align1, sample.f1[k]), rotated(known.align2, sample.f2[k])
+        along += a[0] * b[0] + a[1] * b[1]
+        across += a[1] * b[0] - a[0] * b[1]
+        total += dot(a, a) + dot(b, b) - 2.0 * a[2] * b[2]
+    # Less the largest sum of the horizontal parts.
+    total -= 2.0 * math.sqrt(along * along + across * across)
+    return math.atan2(across, along), min(max(math.sqrt(max(total, 0.0) / count), 1e-3), 1.0)
 
 
 # The nine columns of the uniform and linear models, well conditioned. A row of the paper's
@@ -230,7 +199,7 @@ def align_rays(sample: Sample, known: Knowledge) -> AlignedRays:
 #
 # with the mean row time m and p, q of size 1; the two sets of columns span the same space for any
 # rotation: determinants differ by a constant factor, solutions by a linear map
-# (`translation_and_velocities`).
+# (`write_solution`).
 
 class RowTimeFactors(NamedTuple):
     """Row times of a sample, scaled."""
@@ -268,22 +237,131 @@ def row_time_factors(sample: Sample) -> RowTimeFactors:
     return RowTimeFactors(p, q, m, s_p, s_q, observable)
 
 
+# All solvers end with Newton's method on ``A(R) y = 0``, which removes the rounding of polynomials
+# and eliminations: y is t, or (y_1, y_2, y_3), of length 1.
+
 @kernel
-def translation_and_velocities(y: Array, factors: RowTimeFactors, x: Array) -> bool:
-    """``x = (t, d_1, d_2)`` with ``|t| = 1`` from `y` (9,); False if t vanishes."""
-    norm2 = 0.0
+def write_rows(sample: Sample, factors: RowTimeFactors, R: Array, A: Array, first: int) -> None:
+    """Write A(R), rows n or ``[n, p n, q n]``, into the columns of `A` from `first` on."""
+    for k in range(sample.f1.shape[0]):
+        n = cross(sample.f1[k], rotated(R, sample.f2[k]))
+        for i in range(3):
+            A[k, first + i] = n[i]
+            if A.shape[1] - first > 3:
+                A[k, first + 3 + i] = factors.p[k] * n[i]
+                A[k, first + 6 + i] = factors.q[k] * n[i]
+
+
+@kernel
+def write_nearest_vector(sample: Sample, factors: RowTimeFactors, R: Array, y: Array) -> None:
+    """Write the vector of the smallest singular value of A(R) into `y`, by inverse iteration."""
+    m = y.shape[0]
+    A, factor = np.empty((sample.f1.shape[0], m)), np.zeros((m, m))
+    write_rows(sample, factors, R, A, 0)
+    gram = A.T @ A
+    for i in range(m):
+        gram[i, i] += 1e-13
+        y[i] = 1.0
+    cholesky(gram, factor)
+    for _ in range(3):
+        copy_vector(newton_step(factor, y), y)
+        normalise(y)
+
+
+@kernel
+def polish(sample: Sample, factors: RowTimeFactors, axes: Array, R: Array, y: Array,
+           steps: int) -> bool:
+    """Newton's method from `R` (3, 3) and `y` (m,), in place; whether it has converged.
+
+    R moves about the `axes` (k, 3), n equations having n + 1 = m + k unknowns with ``|y| = 1``. A
+    step that does not reduce the error is shortened.
+    """
+    n, k, m = sample.f1.shape[0], axes.shape[0], y.shape[0]
+    system, right, pivots = np.zeros((n + 1, n + 1)), np.empty(n + 1), np.empty(n + 1, np.int64)
+    step, turn, error = np.zeros(n + 1), np.empty(3), math.inf
+    R_new, y_new = R.copy(), y.copy()
+    for _ in range(steps):
+        write_rows(sample, factors, R_new, system, k)
+        squares, size2 = 0.0, 0.0
+        for i in range(n):
+            # b = y_1 + p y_2 + q y_3, and d((f_1 x h) . b) = theta . (h x (b x f_1)), h = R f_2
+            b = (y_new[0], y_new[1], y_new[2])
+            if m > 3:
+                p, q = factors.p[i], factors.q[i]
+                b = (b[0] + p * y_new[3] + q * y_new[6], b[1] + p * y_new[4] + q * y_new[7],
+                     b[2] + p * y_new[5] + q * y_new[8])
+            by_theta = cross(rotated(R_new, sample.f2[i]), cross(b, sample.f1[i]))
+            for j in range(k):
+                system[i, j] = dot(axes[j], by_theta)
+            right[i] = 0.0
+            for j in range(m):
+                right[i] -= system[i, k + j] * y_new[j]
+                size2 += system[i, k + j] ** 2
+            squares += right[i] * right[i]
+        if squares < error:
+            error = squares
+            copy_matrix(R_new, R)
+            copy_vector(y_new, y)
+            if error < 1e-30 * size2:   # rounding
+                return True
+            for j in range(n + 1):
+                system[n, j] = y[j - k] if j >= k else 0.0
+            right[n] = 0.0
+            lu_factor(system, pivots)
+            lu_solve(system, pivots, right)
+            copy_vector(right, step)
+        elif error < 1e-27 * size2:
+            return True
+        else:
+            step *= 0.25
+        turn[:] = 0.0
+        for j in range(k):
+            for i in range(3):
+                turn[i] += step[j] * axes[j, i]
+        length = norm(turn)
+        if length > 0.2:
+            step *= 0.2 / length
+            turn *= 0.2 / length
+        multiply(exp_so3(turn), R, R_new)
+        for j in range(m):
+            y_new[j] = y[j] + step[k + j]
+        normalise(y_new)
+    return error < 1e-24 * size2
+
+
+@small_kernel
+def is_known(R: Array, rotations: Array) -> bool:
+    """Whether a rotation (3, 3) repeats one of `rotations` (K, 3, 3)."""
+    for other in rotations:
+        gap = 0.0
+        for i in range(3):
+            gap += abs(other[i, 0] - R[i, 0]) + abs(other[i, 1] - R[i, 1])
+        if gap < 1e-9:
+            return True
+    return False
+
+
+@kernel
+def write_solution(sample: Sample, factors: RowTimeFactors, R: Array, y: Array, x: Array) -> bool:
+    """Write ``x = (t, d_1, d_2)`` with ``|t| = 1`` from `y`; False if there is no translation.
+
+    With the sign that has more points in front of both cameras.
+    """
     for i in range(3):
-        difference = y[3 + i] / factors.s_p  # d_2 - d_1
-        x[6 + i] = y[6 + i] / factors.s_q
-        x[3 + i] = x[6 + i] - difference
+        difference = 0.0   # d_2 - d_1
+        if len(y) > 3:
+            difference, x[6 + i] = y[3 + i] / factors.s_p, y[6 + i] / factors.s_q
+            x[3 + i] = x[6 + i] - difference
         x[i] = y[i] - factors.m * difference
-        norm2 += x[i] * x[i]
+    length2 = dot(x, x)
     # |y| = 1: a translation of this size is rounding.
-    if not norm2 > 1e-20:
+    if not 1e-20 < length2 < math.inf:
         return False
-    scale = 1.0 / math.sqrt(norm2)
-    for i in range(9):
-        x[i] *= scale
+    x *= 1.0 / math.sqrt(length2)
+    front, behind = cheirality_votes(sample, R, x)
+    if behind > front:
+        for i in range(9):
+            x[i] = 0.0 - x[i]   # not -x: a velocity of zero stays +0
     return True
 
 
