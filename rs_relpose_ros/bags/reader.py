@@ -332,8 +332,8 @@ class Bag:
         self._is_ros2 = isinstance(reader, Reader2)
         # Gets the topic of each message that is read, for a progress bar.
         self.on_message: Callable[[str], object] = lambda topic: None
-        self._types = _types(self._is_ros2)
         counts: dict[tuple[str, str], int] = {}
+        self._by_topic: dict[tuple[str, str], Connection] = {}
         # Typed, but metadata is YAML: any value can be of any type.
         connections: Any = reader.connections
         for connection in connections:
@@ -343,6 +343,7 @@ class Bag:
                 raise InputError(f'{path} is damaged: in its metadata, name, type or number of '
                                  'messages of a topic is invalid')
             key = connection.topic, connection.msgtype
+            self._by_topic.setdefault(key, connection)
             counts[key] = counts.get(key, 0) + connection.msgcount
         self.topics = tuple(Topic(name, msgtype, count)
                             for (name, msgtype), count in sorted(counts.items()))
@@ -394,9 +395,8 @@ class Bag:
 
         A damaged bag or a message that cannot be decoded raises InputError.
         """
-        read = self._types.deserialize_cdr if self._is_ros2 else self._types.deserialize_ros1
-        for connection, bag_time_ns, data in self._raw(topics):
-            yield BagMessage(connection.topic, bag_time_ns, self._read(connection, read, data))
+        for raw in self.raw_messages(topics):
+            yield BagMessage(raw.topic, raw.bag_time_ns, self.read(raw))
 
     def raw_messages(self, topics: Sequence[Topic]) -> Iterator[RawMessage]:
         """Messages of `topics` in the order of bag time, in CDR as publishers expect them.
@@ -416,9 +416,8 @@ class Bag:
 
     def read(self, raw: RawMessage) -> Any:
         """The ROS 2 message of an item of `raw_messages`; InputError if it cannot be decoded."""
-        connection = next(c for c in self._reader.connections
-                          if (c.topic, c.msgtype) == (raw.topic, raw.msgtype))
-        return self._read(connection, _types(of_ros2=True).deserialize_cdr, raw.data)
+        connection = self._by_topic[raw.topic, raw.msgtype]
+        return self._decoded(connection, _types(of_ros2=True).deserialize_cdr, raw.data)
 
     def _connections(self, topics: Sequence[Topic]) -> list[Connection]:
         chosen = {(topic.name, topic.msgtype) for topic in topics}
@@ -439,17 +438,14 @@ class Bag:
         except Exception as error:
             raise InputError(f'{self.path} is damaged: {_message(error)}') from error
 
-    def _read(self, connection: Connection, decode: Callable[..., Any], data: bytes) -> Any:
+    def _decoded(self, connection: Connection, decode: Callable[..., Any], data: bytes) -> Any:
         """Decode a message, unless its type had other fields in the ROS of the recorder."""
-        if (connection.msgtype in self._types.fielddefs and connection.digest
+        if (connection.msgtype in _types(self._is_ros2).fielddefs and connection.digest
                 and connection.digest != _type_hash(connection.msgtype, self._is_ros2)):
             name = 'ROS 2 Jazzy' if self._is_ros2 else 'ROS 1 Noetic'
             raise InputError(f'topic {connection.topic} of {self.path} is of another '
                              f'{connection.msgtype} than that of {name}: its type hash is '
                              f'{str(connection.digest)[:80]!r}')
-        return self._decoded(connection, decode, data)
-
-    def _decoded(self, connection: Connection, decode: Callable[..., Any], data: bytes) -> Any:
         try:
             return decode(data, connection.msgtype)
         except Exception as error:

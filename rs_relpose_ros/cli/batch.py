@@ -32,7 +32,7 @@ from scipy.spatial.transform import Rotation
 from rs_relpose_ros.calibrate.result import as_mapping
 from rs_relpose_ros.cli.main import FAILED as EXIT_FAILED
 from rs_relpose_ros.cli.main import make_parser
-from rs_relpose_ros.cli.options import add_parameter_arguments, package_version, progress_bar
+from rs_relpose_ros.cli.options import declared, package_version, PARAMETERS, progress_bar
 from rs_relpose_ros.cli.poses import replay_bag
 from rs_relpose_ros.cli.recordings import calibrate_bag, inspect_bag
 from rs_relpose_ros.config.files import read_parameters
@@ -96,7 +96,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         'this package (the same version), and one thread each')
     parser.add_argument('--workers', metavar='N', type=int,
                         help='processes of this machine (default: one for each processor)')
-    add_parameter_arguments(parser)
+    declared(PARAMETERS)(parser)
     parser.add_argument('--options', metavar='TEXT', default='',
                         help='further options of COMMAND, in quotes: --options="--no-pictures"')
 

@@ -19,15 +19,6 @@ from rs_relpose_ros.offline.replay import need_sensor_parameters
 from rs_relpose_ros.offline.tables import write_summary
 from rs_relpose_ros.output_files import refuse_unwritable, SUMMARY_FILE
 
-_TOPICS = {
-    'image': 'Image or CompressedImage',
-    'camera_info': 'CameraInfo',
-    'imu': 'Imu: gyro, and accelerometer unless it is separate',
-    'accel': 'Imu of a separate accelerometer',
-    'truth': 'PoseStamped: ground truth of the camera',
-}
-
-
 _logger = logging.getLogger(__name__)
 
 # Results of a bag; `metrics`: content of summary.json without provenance.
@@ -36,41 +27,49 @@ Made = TypeVar('Made', bound=Any)
 Work = Callable[[Path, Bag, SensorTopics, Parameters], Made]
 
 
-def add_bag_argument(parser: argparse.ArgumentParser) -> None:
-    """Declare BAG, the input."""
-    parser.add_argument('bag', metavar='BAG', type=Path,
-                        help='rosbag2 directory, or a .mcap, .db3 or ROS 1 .bag file')
+# Arguments by name, as of `ArgumentParser.add_argument`.
+Arguments = Mapping[str, Mapping[str, Any]]
+
+BAG: Arguments = {'bag': {
+    'metavar': 'BAG', 'type': Path, 'help': 'rosbag2 directory, or a .mcap, .db3 or ROS 1 .bag '
+    'file'}}
+PARAMETERS: Arguments = {
+    '--params': {'metavar': 'FILE', 'type': Path,
+                 'help': "the node's parameter file (ROS format)"},
+    '--set': {'metavar': 'NAME=VALUE', 'action': 'append', 'default': [],
+              'help': 'set a parameter, after --params; may be repeated'}}
+# Of each field of `SensorTopics`; in a group of their own.
+TOPICS: Arguments = {f'--{role}-topic': {'metavar': 'TOPIC', 'default': '', 'help': text}
+                     for role, text in {
+    'image': 'Image or CompressedImage', 'camera-info': 'CameraInfo',
+    'imu': 'Imu: gyro, and accelerometer unless it is separate',
+    'accel': 'Imu of a separate accelerometer',
+    'truth': 'PoseStamped: ground truth of the camera'}.items()}
+SENSOR_TOPICS = {name: values for name, values in TOPICS.items() if name != '--truth-topic'}
 
 
-def add_parameter_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare --params and --set, the node's parameters."""
-    parser.add_argument('--params', metavar='FILE', type=Path,
-                        help="the node's parameter file (ROS format)")
-    parser.add_argument('--set', metavar='NAME=VALUE', action='append', default=[],
-                        help='set a parameter, after --params; may be repeated')
+def out(suffix: str) -> Arguments:
+    """--out, which is BAGNAME_`suffix` by default."""
+    return {'--out': {
+        'metavar': 'DIR', 'type': Path, 'help': f'directory of the results (default: '
+        f'BAGNAME_{suffix} in the current one); those of an earlier run are replaced'}}
 
 
-def add_topic_arguments(parser: argparse.ArgumentParser, *roles: str) -> None:
-    """Declare --ROLE-topic for each role: a field of `SensorTopics`."""
-    group = parser.add_argument_group('topics', 'found by type where that is unambiguous')
-    for role in roles:
-        group.add_argument(f'--{role.replace("_", "-")}-topic', metavar='TOPIC', default='',
-                           help=_TOPICS[role])
+def of_run(suffix: str) -> Arguments:
+    """Those of `run_on_bag`."""
+    return {**BAG, **PARAMETERS, **out(suffix), **TOPICS}
 
 
-def add_out_argument(parser: argparse.ArgumentParser, suffix: str) -> None:
-    """Declare --out, which is BAGNAME_`suffix` by default."""
-    parser.add_argument('--out', metavar='DIR', type=Path,
-                        help=f'directory of the results (default: BAGNAME_{suffix} in the current '
-                        'one); those of an earlier run are replaced')
-
-
-def add_run_arguments(parser: argparse.ArgumentParser, suffix: str) -> None:
-    """Declare the options of `run_on_bag`."""
-    add_bag_argument(parser)
-    add_parameter_arguments(parser)
-    add_out_argument(parser, suffix)
-    add_topic_arguments(parser, *_TOPICS)
+def declared(arguments: Arguments) -> Callable[[argparse.ArgumentParser], None]:
+    """A function that declares arguments."""
+    def add(parser: argparse.ArgumentParser) -> None:
+        topics = None
+        for name, values in arguments.items():
+            if name in TOPICS:
+                topics = topics or parser.add_argument_group(
+                    'topics', 'found by type where that is unambiguous')
+            (topics if name in TOPICS and topics else parser).add_argument(name, **values)
+    return add
 
 
 def run_on_bag(args: argparse.Namespace, suffix: str, work: Work[Made],
@@ -91,7 +90,7 @@ def run_on_bag(args: argparse.Namespace, suffix: str, work: Work[Made],
 
 
 def out_folder(args: argparse.Namespace, suffix: str) -> Path:
-    """Folder of the results, of the option that `add_out_argument` declared."""
+    """Folder of the results, of the option `out`."""
     return args.out or Path(f'{bag_name(args.bag)}_{suffix}')
 
 
@@ -102,7 +101,7 @@ def warn_unused(reasons: Mapping[str, int], what: str = 'not used') -> None:
 
 
 def topic_options(args: argparse.Namespace) -> dict[str, str]:
-    """Names by role, of the options that `add_topic_arguments` declared."""
+    """Names by role, of the options `TOPICS`."""
     return {name.removesuffix('_topic'): value for name, value in vars(args).items()
             if name.endswith('_topic')}
 

@@ -28,20 +28,6 @@ _MOST_REASONS = 5
 _logger = logging.getLogger(__name__)
 
 
-def _add_replay_arguments(parser: argparse.ArgumentParser) -> None:
-    options.add_run_arguments(parser, 'relpose')
-    parser.add_argument('--stamps', metavar='FILE', type=Path,
-                        help='use only the frames whose stamps [ns] are in FILE, one per line, as '
-                        'the parameter stamps_file of a live node wrote them: the poses are then '
-                        'equal to its poses, bit by bit')
-    parser.add_argument('--calibrate', action='store_true',
-                        help='first calibrate from the bag into OUT/calibration, as `rs_relpose '
-                        'calibrate` does; parameters that are given stay')
-    parser.add_argument('--no-pictures', action='store_true', help='tables and summary only')
-    parser.add_argument('--bag', dest='with_bag', action='store_true',
-                        help="write the node's topics as an MCAP bag, too")
-
-
 def replay_bag(args: argparse.Namespace) -> tuple[Path, replay.ReplayOutcome]:
     """Replay and write the files of the command, into the folder that is returned."""
     stamps = None if args.stamps is None else replay.read_stamps(args.stamps)
@@ -149,13 +135,18 @@ REPLAY = Command(
     "ground truth of the camera (geometry_msgs/PoseStamped of the optical frame, IMU's clock). "
     'Translations are unit vectors. Reports configured parameters (axes, time_offset, ...) that '
     'contradict images and IMU. Exit code 1: the bag was processed, but no pair has a pose, or '
-    'one of these parameters is wrong.', _add_replay_arguments, _replay)
-
-
-def _add_pairs_arguments(parser: argparse.ArgumentParser) -> None:
-    options.add_run_arguments(parser, 'pairs')
-    parser.add_argument('--list', metavar='FILE', type=Path, required=True,
-                        help='the pairs (CSV): stamps of their images [ns]')
+    'one of these parameters is wrong.', options.declared({
+        **options.of_run('relpose'),
+        '--stamps': {
+            'metavar': 'FILE', 'type': Path, 'help': 'use only the frames whose stamps [ns] are '
+            'in FILE, one per line, as the parameter stamps_file of a live node wrote them: the '
+            'poses are then equal to its poses, bit by bit'},
+        '--calibrate': {
+            'action': 'store_true', 'help': 'first calibrate from the bag into OUT/calibration, '
+            'as `rs_relpose calibrate` does; parameters that are given stay'},
+        '--no-pictures': {'action': 'store_true', 'help': 'tables and summary only'},
+        '--bag': {'dest': 'with_bag', 'action': 'store_true',
+                  'help': "write the node's topics as an MCAP bag, too"}}), _replay)
 
 
 def _pairs(args: argparse.Namespace) -> int:
@@ -189,16 +180,10 @@ PAIRS = Command(
     'a row for each row of the list, in its order: the columns of replay and the reason of a pair '
     'without a pose; summary.json; and errors.csv if the bag contains ground truth of the camera. '
     'The configured parameters are used as they are: run check or replay first. Exit code 1: no '
-    'pair has a pose.', _add_pairs_arguments, _pairs)
-
-
-def _add_odometry_arguments(parser: argparse.ArgumentParser) -> None:
-    options.add_run_arguments(parser, 'odometry')
-    parser.add_argument('--loops', action='store_true',
-                        help='add loop closures to the smoothed path: keyframes far apart in time '
-                        'with a common view, related as by `rs_relpose pairs`')
-    parser.add_argument('--rate', metavar='HZ', type=rate_in_hertz, default=0.0,
-                        help='also write trajectory_rows.tum: smoothed poses at this rate')
+    'pair has a pose.', options.declared({
+        **options.of_run('pairs'),
+        '--list': {'metavar': 'FILE', 'type': Path, 'required': True,
+                   'help': 'the pairs (CSV): stamps of their images [ns]'}}), _pairs)
 
 
 def rate_in_hertz(text: str) -> float:
@@ -258,30 +243,14 @@ ODOMETRY = Command(
     'RowTrajectory in Python), tracks.npz (for export), summary.json and a picture; with errors '
     'if the bag contains ground truth of the camera. The parameter imu_position should be '
     'configured. Exit code 1: odometry did not start.',
-    _add_odometry_arguments, _odometry)
-
-
-def _add_export_arguments(parser: argparse.ArgumentParser) -> None:
-    options.add_bag_argument(parser)
-    parser.add_argument('out', metavar='OUT', type=Path,
-                        help='directory to create (tum: the file)')
-    parser.add_argument('--format', choices=(TUM, *FORMATS), required=True,
-                        help='what reads the result (docs/reconstruction.md)')
-    parser.add_argument('--rate', metavar='HZ', type=rate_in_hertz, default=0.0,
-                        help='images, at most so many a second, or poses (tum); default: those of '
-                        'the keyframes, in which points are observed')
-    parser.add_argument('--images', choices=export.IMAGE_CHOICES, default='',
-                        help='as recorded, derotated to their middle row, or none; default: '
-                        'unrolled for colmap, which has one pose per image, else raw')
-    parser.add_argument('--trajectory', metavar='DIR', type=Path,
-                        help='results of `rs_relpose odometry` of this bag; default: it is run, '
-                        'into OUT/odometry')
-    parser.add_argument('--link', action='store_true',
-                        help='keep raw images once in DIR/images of --trajectory and link them')
-    parser.add_argument('--points', metavar='N', type=int, default=export.Options('').most_points,
-                        help='at most so many points, the best ones (default: %(default)s)')
-    options.add_parameter_arguments(parser)
-    options.add_topic_arguments(parser, 'image', 'camera_info', 'imu', 'accel', 'truth')
+    options.declared({
+        **options.of_run('odometry'),
+        '--loops': {
+            'action': 'store_true', 'help': 'add loop closures to the smoothed path: keyframes '
+            'far apart in time with a common view, related as by `rs_relpose pairs`'},
+        '--rate': {
+            'metavar': 'HZ', 'type': rate_in_hertz, 'default': 0.0,
+            'help': 'also write trajectory_rows.tum: smoothed poses at this rate'}}), _odometry)
 
 
 def _export(args: argparse.Namespace) -> int:
@@ -309,9 +278,9 @@ def _export(args: argparse.Namespace) -> int:
         else:
             part.mkdir()
             with options.opened(args, read_parameters(args.params, args.set)) as opened:
-                report = export.export_into(part, *opened, trajectory, export.Options(
-                    args.format, args.images, args.rate, args.points,
-                    trajectory / IMAGES if args.link else None))
+                report = export.export_into(
+                    part, *opened, trajectory, args.format, args.images, args.rate, args.points,
+                    trajectory / IMAGES if args.link else None)
             _print_report(args, report)
             if args.trajectory is None:
                 trajectory.rename(part / 'odometry')
@@ -321,15 +290,19 @@ def _export(args: argparse.Namespace) -> int:
     return 0
 
 
-def _print_report(args: argparse.Namespace, report: export.ExportReport) -> None:
-    print(f'{report.images} images, {report.points} points in {report.observations} observations')
-    if report.reprojection is None or report.formula is None:
+def _print_report(args: argparse.Namespace, report: dict[str, Any]) -> None:
+    print('{images} images, {points} points in {observations} observations'.format(**report))
+    if report['formula_px'] is None:
         print('no points: no track over three keyframes with a pose and enough parallax')
     else:
-        print(f'points in the images, at the poses of their rows: {report.reprojection.text}')
-        print(f'{args.format} has {FORMATS[args.format].poses}: off that by {report.formula.text}')
-    options.warn_unused(report.reasons(), f'left out (stamps in {export.REPORT_FILE})')
-    for begin_ns, end_ns in report.gaps:
+        reprojection, formula = (
+            'mean {mean:.2f} px, median {median:.2f}, 95 % {most:.2f}, largest {largest:.2f}'
+            .format(**report[name]) for name in ('reprojection_px', 'formula_px'))
+        print(f'points in the images, at the poses of their rows: {reprojection}')
+        print(f'{args.format} has {FORMATS[args.format].poses}: off that by {formula}')
+    options.warn_unused(dict(Counter(one['reason'] for one in report['left_out']).most_common()),
+                        f'left out (stamps in {export.REPORT_FILE})')
+    for begin_ns, end_ns in report['trajectory_gaps_ns']:
         _logger.warning('no poses from %d to %d ns on the clock of the IMU', begin_ns, end_ns)
 
 
@@ -340,4 +313,26 @@ EXPORT = Command(
     f'a pose are left out and listed in {export.REPORT_FILE}. Prints how far the points are from '
     'their pixels, and how far the interpolation of the format is from the trajectory. The '
     'directory appears when it is complete. Exit code 1: odometry did not start.',
-    _add_export_arguments, _export)
+    options.declared({
+        **options.BAG,
+        'out': {'metavar': 'OUT', 'type': Path, 'help': 'directory to create (tum: the file)'},
+        '--format': {'choices': (TUM, *FORMATS), 'required': True,
+                     'help': 'what reads the result (docs/reconstruction.md)'},
+        '--rate': {
+            'metavar': 'HZ', 'type': rate_in_hertz, 'default': 0.0, 'help': 'images, at most so '
+            'many a second, or poses (tum); default: those of the keyframes, in which points are '
+            'observed'},
+        '--images': {
+            'choices': export.IMAGE_CHOICES, 'default': '', 'help': 'as recorded, derotated to '
+            'their middle row, or none; default: unrolled for colmap, which has one pose per '
+            'image, else raw'},
+        '--trajectory': {
+            'metavar': 'DIR', 'type': Path, 'help': 'results of `rs_relpose odometry` of this '
+            'bag; default: it is run, into OUT/odometry'},
+        '--link': {
+            'action': 'store_true', 'help': 'keep raw images once in DIR/images of --trajectory '
+            'and link them'},
+        '--points': {
+            'metavar': 'N', 'type': int, 'default': export.MOST_POINTS,
+            'help': 'at most so many points, the best ones (default: %(default)s)'},
+        **options.PARAMETERS, **options.TOPICS}), _export)

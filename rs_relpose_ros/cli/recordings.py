@@ -32,30 +32,6 @@ _CALIBRATION_FILES = (CALIBRATION_FILE, 'calibration.json', 'cost_over_readout.p
 _logger = logging.getLogger(__name__)
 
 
-def _add_calibrate_arguments(parser: argparse.ArgumentParser) -> None:
-    options.add_bag_argument(parser)
-    options.add_out_argument(parser, 'calibration')
-    parser.add_argument('--rows', metavar=('FIRST', 'LAST'), type=float, nargs=2,
-                        default=(0.0, 0.0), help='use only these image rows, such as those above '
-                        'a dashboard that moves with the camera')
-    parser.add_argument('--detector', choices=tuple(settings.TRACKERS),
-                        default=settings.TrackingConfig().detector,
-                        help='tracker that follows the points, as the parameter of the node '
-                        '(default: %(default)s)')
-    parser.add_argument('--max-offset', metavar='S', type=float,
-                        default=settings.CalibrationConfig().max_time_offset,
-                        help='bound of the clock offset [s] (default: %(default)s)')
-    parser.add_argument('--lens', metavar='MODEL', choices=tuple(DISTORTION_MODELS), nargs='?',
-                        const='plumb_bob', help='estimate focal length, first coefficient of the '
-                        'distortion of this model (default: plumb_bob) and principal point, also '
-                        'if the CameraInfo has a camera matrix without distortion')
-    for name, text in (('time', 'exposure of a row [s]'),
-                       ('margin', 'frame interval less exposure [s]')):
-        parser.add_argument(f'--exposure-{name}', metavar='S', type=float, default=0.0,
-                            help=f'{text}, if it is known')
-    options.add_topic_arguments(parser, 'image', 'camera_info', 'imu')
-
-
 def calibrate_bag(
         args: argparse.Namespace) -> tuple[calibration.CalibrationResult, RollingShutterCamera]:
     """Calibrate and write the files of the command."""
@@ -126,15 +102,29 @@ CALIBRATE = Command(
     '10 s of a static, textured scene with a short exposure; rotate the camera about all three '
     'axes, 20 to 60 deg/s. Writes calibration.yaml (parameters of relpose_node), calibration.json '
     'and cost_over_readout.png. Exit code 1: a parameter is not observable in this recording and '
-    'left out; the report describes the motion to record instead.', _add_calibrate_arguments,
-    _calibrate)
-
-
-def _add_check_arguments(parser: argparse.ArgumentParser) -> None:
-    options.add_bag_argument(parser)
-    options.add_parameter_arguments(parser)
-    parser.add_argument('--json', action='store_true', help='print the report as JSON')
-    options.add_topic_arguments(parser, 'image', 'camera_info', 'imu', 'accel')
+    'left out; the report describes the motion to record instead.', options.declared({
+        **options.BAG, **options.out('calibration'),
+        '--rows': {
+            'metavar': ('FIRST', 'LAST'), 'type': float, 'nargs': 2, 'default': (0.0, 0.0),
+            'help': 'use only these image rows, such as those above a dashboard that moves with '
+            'the camera'},
+        '--detector': {
+            'choices': tuple(settings.TRACKERS), 'default': settings.TrackingConfig().detector,
+            'help': 'tracker that follows the points, as the parameter of the node (default: '
+            '%(default)s)'},
+        '--max-offset': {
+            'metavar': 'S', 'type': float, 'default': settings.CalibrationConfig().max_time_offset,
+            'help': 'bound of the clock offset [s] (default: %(default)s)'},
+        '--lens': {
+            'metavar': 'MODEL', 'choices': tuple(DISTORTION_MODELS), 'nargs': '?',
+            'const': 'plumb_bob', 'help': 'estimate focal length, first coefficient of the '
+            'distortion of this model (default: plumb_bob) and principal point, also if the '
+            'CameraInfo has a camera matrix without distortion'},
+        **{f'--exposure-{name}': {'metavar': 'S', 'type': float, 'default': 0.0,
+                                  'help': f'{text}, if it is known'} for name, text in (
+            ('time', 'exposure of a row [s]'), ('margin', 'frame interval less exposure [s]'))},
+        **{name: options.TOPICS[name] for name in (
+            '--image-topic', '--camera-info-topic', '--imu-topic')}}), _calibrate)
 
 
 def inspect_bag(args: argparse.Namespace) -> CheckReport:
@@ -166,7 +156,10 @@ CHECK = Command(
     'stamps, clocks, encodings, transport; and, by a test run of half a minute of it, axes, time '
     'offset, readout time, bias, units, focal length and lens. Prints a line for each, with a '
     'verdict (ok, unknown, warning, failure) and the suggested fix. Exit code 1: a defect makes '
-    'the estimation fail or its poses wrong.', _add_check_arguments, _check)
+    'the estimation fail or its poses wrong.', options.declared({
+        **options.BAG, **options.PARAMETERS,
+        '--json': {'action': 'store_true', 'help': 'print the report as JSON'},
+        **options.SENSOR_TOPICS}), _check)
 
 
 class Source(NamedTuple):
@@ -248,15 +241,6 @@ CONVERT = Command(
     'describes a source.', _add_convert_arguments, _convert)
 
 
-def _add_unroll_arguments(parser: argparse.ArgumentParser) -> None:
-    options.add_bag_argument(parser)
-    parser.add_argument('out_bag', metavar='OUT_BAG', type=Path,
-                        help='directory of the new bag; it must not exist, and appears when the '
-                        'bag is complete')
-    options.add_parameter_arguments(parser)
-    options.add_topic_arguments(parser, 'image', 'camera_info', 'imu', 'accel')
-
-
 def _unroll(args: argparse.Namespace) -> int:
     refuse_existing(args.out_bag)
     refuse_unwritable(args.out_bag.parent)
@@ -284,4 +268,9 @@ UNROLL = Command(
     "CameraInfo on the same topics, stamped with the time of the middle row on the IMU's clock "
     "(the time offset between camera and IMU is then 0), or on the camera's if the parameter "
     'stamp_clock is camera. All other topics are copied bit by bit. Images that the gyro does not '
-    'cover are omitted. Exit code 1: no image could be derotated.', _add_unroll_arguments, _unroll)
+    'cover are omitted. Exit code 1: no image could be derotated.', options.declared({
+        **options.BAG,
+        'out_bag': {
+            'metavar': 'OUT_BAG', 'type': Path, 'help': 'directory of the new bag; it must not '
+            'exist, and appears when the bag is complete'},
+        **options.PARAMETERS, **options.SENSOR_TOPICS}), _unroll)

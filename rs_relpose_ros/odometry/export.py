@@ -39,88 +39,55 @@ RAW, UNROLLED, NO_IMAGES = IMAGE_CHOICES = ('raw', 'unrolled', 'none')
 REPORT_FILE, PICTURE = 'export.json', 'model.png'
 # Times within this belong to one image: tracked corrections may come a frame later.
 _SAME_NS = 1_000_000
-_NO_POSE = 'there is no pose: it is before, after or in a gap of the trajectory'
-
-
-class Options(NamedTuple):
-    """What is exported; `images` and `rate`: empty and 0 for the format's own and keyframes."""
-
-    format: str
-    images: str = ''
-    rate: float = 0.0   # of the images, at most [Hz]
-    most_points: int = 50_000
-    store: Path | None = None   # folder in which raw images are kept, to be linked
-
-
-class Spread(NamedTuple):
-    """Deviations of pixels [px]."""
-
-    mean: float
-    median: float
-    most: float   # 95 %
-    largest: float
-
-    @classmethod
-    def of(cls, differences: Array) -> Spread:
-        """Of differences (N, 2), of which those that are NaN do not count."""
-        lengths = np.linalg.norm(differences[np.isfinite(differences).all(axis=1)], axis=1)
-        if not len(lengths):
-            return cls(*[math.nan] * 4)
-        return cls(float(lengths.mean()), *np.percentile(lengths, [50.0, 95.0, 100.0]).tolist())
-
-    @property
-    def text(self) -> str:
-        """For the console."""
-        return (f'mean {self.mean:.2f} px, median {self.median:.2f}, 95 % {self.most:.2f}, '
-                f'largest {self.largest:.2f}')
-
-
-@dataclass(slots=True)
-class ExportReport:
-    """Summary of an export."""
-
-    images: int = 0
-    points: int = 0
-    observations: int = 0
-    # Of the observed pixels from the points at the poses of their rows; and of the format's own
-    # formula for the place of a point from that.
-    reprojection: Spread | None = None
-    formula: Spread | None = None
-    left_out: list[tuple[int, str]] = field(default_factory=list)   # stamps and reasons
-    gaps: list[tuple[int, int]] = field(default_factory=list)   # of the trajectory, IMU clock [ns]
-
-    def reasons(self) -> dict[str, int]:
-        """Number of images that were left out, by reason."""
-        return dict(Counter(reason for _, reason in self.left_out).most_common())
+# Points of an export, at most.
+MOST_POINTS = 50_000
 
 
 def export_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parameters,
-                trajectory: Path, options: Options) -> ExportReport:
-    """Write a bag's images, cameras and points into an empty folder.
+                trajectory: Path, to: str, images: str = '', rate: float = 0.0,
+                most_points: int = MOST_POINTS, store: Path | None = None) -> dict[str, Any]:
+    """Write a bag's images, cameras and points into an empty folder; content of export.json.
 
-    `trajectory`: folder of `rs_relpose odometry` with the same bag.
+    `trajectory`: folder of `rs_relpose odometry` with the same bag. `to`: the format. `images`
+    and `rate` (at most so many a second [Hz]): empty and 0 for the format's own and keyframes.
+    `store`: folder in which raw images are kept, to be linked. InputError if no image has a pose,
+    or none can be used.
     """
     rows = RowTrajectory.load(trajectory / ROWS_FILE)
     tracks = Tracks.load(trajectory / TRACKS_FILE)
-    chosen = FORMATS[options.format]
-    options = options._replace(images=options.images or chosen.images)
-    run = _Frames(folder, bag, topics, parameters, rows, tracks, options)
+    chosen = FORMATS[to]
+    kind = images or chosen.images
+    run = _Frames(folder, rows, tracks, parameters, kind, rate, most_points, store)
+    loop = FrameLoop(parameters, run.unroller, offline=True, colors=True)
+    intake = Intake(loop.sequencer, parameters)
+    for outcome in outcomes(loop, intake, sensor_messages(bag, topics)):
+        if isinstance(outcome, Frame):
+            run.add(outcome)
+        elif isinstance(outcome, MessageRefused):
+            if not run.views:
+                outcome.raise_without_intrinsics()
+        elif outcome.stamp_ns is not None:
+            run.leave_out(outcome.stamp_ns, unused_reason(outcome))
+    if not run.views:
+        reasons = Counter(one['reason'] for one in run.left_out)
+        reason = max(reasons, key=reasons.__getitem__, default='none is a keyframe of the '
+                     'trajectory')
+        raise InputError(f'no image of {bag.path} can be exported: {reason}. Is the trajectory '
+                         'that of this bag?')
     model = run.model()
-    report = run.report
-    exported = model
-    if options.images == UNROLLED:
-        exported = derotated(model, rows)
+    exported = derotated(model, rows) if kind == UNROLLED else model
     exported = replace(exported, camera=formats.fitted(exported.camera, chosen.radial))
-    _measure(report, model, exported, rows, chosen)
+    reprojection, formula = _deviations(model, exported, rows, chosen)
     chosen.write(exported, folder)
     _draw(model, rows, folder / PICTURE)
-    (folder / REPORT_FILE).write_text(json.dumps({
-        'format': options.format, 'images': report.images, 'image_kind': options.images,
-        'points': report.points, 'observations': report.observations,
-        **{f'{name}_px': spread and spread._asdict() for name, spread in (
-            ('reprojection', report.reprojection), ('formula', report.formula))},
-        'left_out': [{'stamp_ns': stamp, 'reason': reason} for stamp, reason in report.left_out],
-        'trajectory_gaps_ns': report.gaps}, indent=1) + '\n', encoding='utf-8')
+    report = {
+        'format': to, 'images': len(model.names), 'image_kind': kind, 'points': len(model.points),
+        'observations': len(model.pixels), 'reprojection_px': reprojection, 'formula_px': formula,
+        'left_out': run.left_out, 'trajectory_gaps_ns': [
+            (end, begin) for end, begin in zip(
+                rows.spans[:-1, 1].tolist(), rows.spans[1:, 0].tolist(), strict=True)
+            if begin > end]}
+    (folder / REPORT_FILE).write_text(json.dumps(report, indent=1) + '\n', encoding='utf-8')
     return report
 
 
@@ -133,105 +100,83 @@ class _View(NamedTuple):
     times_ns: Ints   # (3,)
 
 
+@dataclass(slots=True, eq=False)
 class _Frames:
     """The pass over the images of a bag: those that are chosen are written."""
 
-    def __init__(self, folder: Path, bag: Bag, topics: SensorTopics, parameters: Parameters,
-                 rows: RowTrajectory, tracks: Tracks, options: Options) -> None:
-        self._folder, self._bag, self._topics, self._rows = folder, bag, topics, rows
-        self._parameters, self._options = parameters, options
-        self._tracks = tracks
-        self._keyframes = np.unique(tracks.keyframes_ns)
-        self._next_ns = 0
-        self._unroller = Unroller()
-        self._sensor: Sensor | None = None
-        self._landmarks: Landmarks | None = None
-        self._views: list[_View] = []
-        self.report = ExportReport(gaps=[
-            (int(end), int(begin)) for end, begin in zip(rows.spans[:-1, 1], rows.spans[1:, 0],
-                                                         strict=True) if begin > end])
+    folder: Path
+    rows: RowTrajectory
+    tracks: Tracks
+    parameters: Parameters
+    kind: str   # of images
+    rate: float
+    most_points: int
+    store: Path | None
+    unroller: Unroller = field(default_factory=Unroller)
+    views: list[_View] = field(default_factory=list)
+    left_out: list[dict[str, Any]] = field(default_factory=list)   # stamps and reasons
+    next_ns: int = 0
+    # From the first frame on.
+    sensor: Sensor = field(init=False)
+    landmarks: Landmarks | None = None
+    order: Ints = field(init=False)   # of the observations, by keyframes
+    colors: NDArray[np.uint8] = field(init=False)
 
-    def model(self) -> Model:
-        """Write the images, and return the model of the raw ones.
+    def leave_out(self, stamp_ns: int, reason: str) -> None:
+        """Count an image that is not exported."""
+        self.left_out.append({'stamp_ns': stamp_ns, 'reason': reason})
 
-        Raises
-        ------
-        InputError
-            No image has a pose, or none can be used.
-        """
-        loop = FrameLoop(self._parameters, self._unroller, offline=True, colors=True)
-        intake = Intake(loop.sequencer, self._parameters)
-        for outcome in outcomes(loop, intake, sensor_messages(self._bag, self._topics)):
-            if isinstance(outcome, Frame):
-                self._add(outcome)
-            elif isinstance(outcome, MessageRefused):
-                if not self._views:
-                    outcome.raise_without_intrinsics()
-            elif outcome.stamp_ns is not None:
-                self.report.left_out.append((outcome.stamp_ns, unused_reason(outcome)))
-        if not self._views or self._sensor is None or self._landmarks is None:
-            reason = next(iter(self.report.reasons()), 'none is a keyframe of the trajectory')
-            raise InputError(f'no image of {self._bag.path} can be exported: {reason}. Is the '
-                             'trajectory that of this bag?')
-        return self._made(self._sensor, self._landmarks)
-
-    def _add(self, frame: Frame[GlobalShutterFrame]) -> None:
-        sensor = sensor_model(frame.intrinsics, self._parameters.sensor,
-                              self._unroller.applied.readout_time)
-        if self._sensor is None:
-            self._landmarks = triangulated(self._tracks, self._rows, sensor,
-                                           self._options.most_points)
-            self._colors = np.full((len(self._landmarks.positions), 3), 128, dtype=np.uint8)
-            self._order = np.argsort(self._landmarks.observations.keyframes_ns, kind='stable')
-            self._sensor = sensor
+    def add(self, frame: Frame[GlobalShutterFrame]) -> None:
+        """Take colours of points from a frame, and write it if it is chosen."""
+        sensor = sensor_model(frame.intrinsics, self.parameters.sensor,
+                              self.unroller.applied.readout_time)
+        if self.landmarks is None:
+            self.landmarks = triangulated(self.tracks, self.rows, sensor, self.most_points)
+            self.colors = np.full((len(self.landmarks.positions), 3), 128, dtype=np.uint8)
+            self.order = np.argsort(self.landmarks.observations.keyframes_ns, kind='stable')
+            self.sensor = sensor
         at_ns = frame.imu.reference_ns
-        self._sample_colors(frame)
+        found = self._observations(self.landmarks, at_ns)
+        if len(found):
+            u, v = np.rint(self.landmarks.observations.pixels[found]).astype(int).T
+            height, width = frame.image.shape[:2]
+            self.colors[self.landmarks.points[found]] = _rgb(
+                frame.image[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)], frame.encoding)
         if not self._is_chosen(at_ns):
             return
-        if frame.intrinsics != self._sensor.intrinsics:
-            self.report.left_out.append((frame.stamp_ns, 'it has other intrinsics'))
+        if frame.intrinsics != self.sensor.intrinsics:
+            self.leave_out(frame.stamp_ns, 'it has other intrinsics')
             return
         edges = sensor.intrinsics.to_sensor(
             np.array([[0.0, 0.0], [0.0, 0.5], [0.0, 1.0]]) * (frame.intrinsics.image_height - 1))
         times = at_ns + np.rint(NANOSECONDS * np.sort(
             sensor.camera.row_times(edges[:, 1]))).astype(np.int64)
-        if not self._rows.covers(times).all():
-            self.report.left_out.append((frame.stamp_ns, _NO_POSE))
-            return
-        self._views.append(_View(self._write(frame), frame.stamp_ns, at_ns, times))
+        if self.rows.covers(times).all():
+            self.views.append(_View(self._write(frame), frame.stamp_ns, at_ns, times))
+        else:
+            self.leave_out(frame.stamp_ns, 'there is no pose: it is before, after or in a gap of '
+                           'the trajectory')
 
     def _is_chosen(self, at_ns: int) -> bool:
-        if not self._options.rate:
-            return _nearest(self._keyframes, at_ns) is not None
-        if at_ns < self._next_ns - _SAME_NS:
+        if not self.rate:
+            return bool((np.abs(self.tracks.keyframes_ns - at_ns) <= _SAME_NS).any())
+        if at_ns < self.next_ns - _SAME_NS:
             return False
-        step = to_nanoseconds(1.0 / self._options.rate)
-        self._next_ns = max(self._next_ns + step, at_ns + step // 2) if self._next_ns else (
+        step = to_nanoseconds(1.0 / self.rate)
+        self.next_ns = max(self.next_ns + step, at_ns + step // 2) if self.next_ns else (
             at_ns + step)
         return True
 
-    def _observations(self, at_ns: int) -> Ints:
+    def _observations(self, landmarks: Landmarks, at_ns: int) -> Ints:
         """Indices of the landmarks' observations in an image."""
-        assert self._landmarks is not None
-        nearest = _nearest(self._keyframes, at_ns)
-        if nearest is None:
-            return np.zeros(0, dtype=np.int64)
-        first, last = np.searchsorted(self._landmarks.observations.keyframes_ns,
-                                      [nearest, nearest + 1], sorter=self._order)
-        return self._order[first:last]
-
-    def _sample_colors(self, frame: Frame[Any]) -> None:
-        found = self._observations(frame.imu.reference_ns)
-        if len(found):
-            assert self._landmarks is not None
-            u, v = np.rint(self._landmarks.observations.pixels[found]).astype(int).T
-            height, width = frame.image.shape[:2]
-            self._colors[self._landmarks.points[found]] = _rgb(
-                frame.image[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)], frame.encoding)
+        keyframes = landmarks.observations.keyframes_ns
+        first, last = np.searchsorted(keyframes, [at_ns - _SAME_NS, at_ns + _SAME_NS + 1],
+                                      sorter=self.order)
+        return self.order[first:last]
 
     def _write(self, frame: Frame[GlobalShutterFrame]) -> str:
         """Write an image if requested, and return its name."""
-        kind, encoded = self._options.images, frame.encoded
+        kind, encoded = self.kind, frame.encoded
         assert encoded is not None and frame.result is not None
         if isinstance(encoded, CompressedImage) and kind != UNROLLED:
             suffix, data = ('png' if encoded.is_png else 'jpg'), encoded.data.tobytes()
@@ -244,38 +189,29 @@ class _Frames:
                 pixels, png=encoded.is_png or not isinstance(encoded, CompressedImage))
         name = f'{frame.stamp_ns:019d}.{suffix.replace("jpeg", "jpg")}'
         if kind != NO_IMAGES:
-            target = self._folder / IMAGES / name
+            target = self.folder / IMAGES / name
             target.parent.mkdir(exist_ok=True)
-            store = self._options.store
-            if store is None:
+            if self.store is None:
                 target.write_bytes(data)
             else:
-                _link(store / name, target, data)
+                _link(self.store / name, target, data)
         return name
 
-    def _made(self, sensor: Sensor, landmarks: Landmarks) -> Model:
-        views, found = self._views, landmarks.observations
+    def model(self) -> Model:
+        """The model of the raw images."""
+        views, landmarks = self.views, self.landmarks
+        assert landmarks is not None
         times = np.array([view.times_ns for view in views])
-        middles = times[:, formats.MIDDLE]
-        R, p = self._rows.pose(times)
-        velocities, rates = self._rows.velocity(middles)
-        parts = [self._observations(view.reference_ns) for view in views]
+        R, p = self.rows.pose(times)
+        parts = [self._observations(landmarks, view.reference_ns) for view in views]
         order = np.concatenate(parts).astype(np.int64)
         frames = np.repeat(np.arange(len(views)), [len(part) for part in parts])
-        self.report.images = len(views)
-        self.report.points = len(landmarks.positions)
-        self.report.observations = len(order)
         return Model(
-            _published(sensor), self._parameters.sensor.exposure_time,
+            _published(self.sensor), self.parameters.sensor.exposure_time,
             tuple(view.name for view in views), np.array([view.stamp_ns for view in views]), times,
-            R, p, velocities, rates, landmarks.positions, self._colors, landmarks.errors,
-            np.column_stack([frames, landmarks.points[order]]), found.pixels[order])
-
-
-def _nearest(times: Ints, at_ns: int) -> int | None:
-    """The one of the sorted times that is the same; None if there is none."""
-    k = int(np.searchsorted(times, at_ns - _SAME_NS))
-    return int(times[k]) if k < len(times) and times[k] <= at_ns + _SAME_NS else None
+            R, p, *self.rows.velocity(times[:, formats.MIDDLE]), landmarks.positions, self.colors,
+            landmarks.errors, np.column_stack([frames, landmarks.points[order]]),
+            landmarks.observations.pixels[order])
 
 
 def _rgb(values: NDArray[Any], encoding: str) -> NDArray[np.uint8]:
@@ -327,18 +263,27 @@ def derotated(model: Model, rows: RowTrajectory) -> Model:
         pixels=_shown(model, rows, model.observed[:, 0], model.pixels))
 
 
-def _measure(report: ExportReport, model: Model, exported: Model, rows: RowTrajectory,
-             chosen: Format) -> None:
-    """Deviations of the observed points: in the raw images, and of the format's formula."""
+def _deviations(model: Model, exported: Model, rows: RowTrajectory, chosen: Format,
+                ) -> tuple[dict[str, float] | None, dict[str, float] | None]:
+    """Of observed pixels from points at the poses of their rows, and of the format from that.
+
+    The latter by its own formula for the place of a point; None without points.
+    """
     k, points = model.observed[:, 0], model.points[model.observed[:, 1]]
     if not len(k):
-        return
+        return None, None
     by_path = formats.projected(formats.path(rows), model, k, points, model.pixels[:, 1])
-    report.reprojection = Spread.of(by_path - model.pixels)
-    if not exported.rolls:
-        by_path = _shown(model, rows, k, by_path)
-    report.formula = Spread.of(formats.projected(
-        chosen.place, exported, k, points, model.pixels[:, 1]) - by_path)
+    shown = by_path if exported.rolls else _shown(model, rows, k, by_path)
+    return _spread(by_path - model.pixels), _spread(formats.projected(
+        chosen.place, exported, k, points, model.pixels[:, 1]) - shown)
+
+
+def _spread(differences: Array) -> dict[str, float]:
+    """Of differences (N, 2) [px], of which those that are NaN do not count; most: 95 %."""
+    lengths = np.linalg.norm(differences[np.isfinite(differences).all(axis=1)], axis=1)
+    values = [lengths.mean(), *np.percentile(lengths, [50.0, 95.0, 100.0])] if len(lengths) else (
+        [math.nan] * 4)
+    return dict(zip(('mean', 'median', 'most', 'largest'), map(float, values), strict=True))
 
 
 def _draw(model: Model, rows: RowTrajectory, path: Path) -> None:
