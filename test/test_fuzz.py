@@ -23,8 +23,8 @@ from recorded_files import make_posecam, make_realsense, make_tables
 
 from rs_relpose_lab.datasets import read_realsense
 from rs_relpose_ros.bags.convert import write_bag
-from rs_relpose_ros.bags.phones import read_posecam, read_tables
 from rs_relpose_ros.bags.reader import open_bag
+from rs_relpose_ros.bags.recorders import read_posecam, read_tables
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.geometry.camera import RollingShutterCamera

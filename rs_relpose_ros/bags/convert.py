@@ -1,7 +1,7 @@
 """A recording of a camera with an IMU, from files of any format, written as a bag.
 
-A format has a reader that gives a `Recording`: `phones`, `video`, and those of public data sets in
-the laboratory. `read_rows` and `read_object` read text files of such formats.
+A format has a reader that gives a `Recording`: `recorders`, and those of public data sets in the
+laboratory. `read_rows` and `read_object` read text files of such formats.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -9,16 +9,14 @@ from contextlib import suppress
 import csv
 from dataclasses import dataclass
 from decimal import Decimal
-import heapq
 from itertools import pairwise
 import json
 import math
-from operator import attrgetter, itemgetter
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_relpose_ros.bags import reader
 from rs_relpose_ros.bags.writer import BagWriter
@@ -105,63 +103,50 @@ class Recording:
         return [sample for sample in samples if sample.stamp_ns <= end_ns]
 
 
-# Bag time [ns], topic, type, message.
-_Entry = tuple[int, str, str, Any]
-
-
 def write_bag(recording: Recording, path: Path | str,
               on_image: Callable[[], object] = lambda: None) -> None:
-    """Write a recording as a bag, in the order in which drivers would have delivered.
+    """Write a recording as a bag, with the receive times of a driver, by which readers sort.
 
     Stamps and JPEG bytes are not changed. `on_image` is called after each image. If the bag cannot
     be created or an image cannot be used, no bag is left.
     """
-    imu_delay_ns = to_nanoseconds(reader.IMU_DELAY)
-
-    def imu(samples: Sequence[ImuSample], topic: str) -> Iterator[_Entry]:
-        for sample in recording.cropped(samples):
-            yield (sample.stamp_ns + imu_delay_ns, topic, reader.IMU, outgoing.imu_message(
-                sample.stamp_ns, reader.IMU_FRAME, sample.angular_velocity,
-                sample.linear_acceleration, bag.type))
-
-    with BagWriter(path) as bag:
-        truth = ((pose.stamp_ns + imu_delay_ns, reader.GROUND_TRUTH_TOPIC, reader.POSE_STAMPED,
-                  outgoing.pose_stamped_message(pose.stamp_ns, reader.WORLD_FRAME, pose.quat_xyzw,
-                                                pose.position, bag.type))
-                 for pose in recording.truth)
-        streams = (_images(recording, bag, on_image),
-                   imu(recording.imu, reader.GYRO_TOPIC if recording.accel else reader.IMU_TOPIC),
-                   imu(recording.accel, reader.ACCEL_TOPIC), truth)
-        for bag_time_ns, topic, msgtype, message in heapq.merge(*streams, key=itemgetter(0)):
-            bag.write(topic, msgtype, message, bag_time_ns)
-
-
-def _images(recording: Recording, bag: BagWriter,
-            on_image: Callable[[], object]) -> Iterator[_Entry]:
-    camera = recording.camera
-    size, reference = None, 'the first image has'
-    delay = reader.IMAGE_DELAY
+    camera, imu_delay_ns = recording.camera, to_nanoseconds(reader.IMU_DELAY)
+    size, reference, delay = None, 'the first image has', reader.IMAGE_DELAY
     if camera is not None:
         size, reference = (camera.width, camera.height), 'the calibration is for'
         delay += camera.readout_time
-    for image in recording.images:
-        data = image.encoded()
-        try:
-            found = encoded_image_size(np.frombuffer(data, dtype=np.uint8))
-        except InputError as error:
-            raise InputError(f'{image.name}: {error}') from error
-        size = size or found
-        if found != size:
-            raise InputError(f'{image.name} has {found[0]}x{found[1]} pixels, but {reference} '
-                             f'{size[0]}x{size[1]}')
-        bag_time_ns = image.stamp_ns + to_nanoseconds(delay)
-        place = image.stamp_ns, reader.CAMERA_FRAME
-        if camera is not None:
-            yield (bag_time_ns, reader.CAMERA_INFO_TOPIC, reader.CAMERA_INFO,
-                   outgoing.camera_info_message(*place, camera, None, bag.type))
-        yield (bag_time_ns, reader.COMPRESSED_TOPIC, reader.COMPRESSED_IMAGE,
-               outgoing.encoded_image_message(*place, data, bag.type, recording.image_format))
-        on_image()
+    with BagWriter(path) as bag:
+        for image in recording.images:
+            data = image.encoded()
+            try:
+                found = encoded_image_size(np.frombuffer(data, dtype=np.uint8))
+            except InputError as error:
+                raise InputError(f'{image.name}: {error}') from error
+            size = size or found
+            if found != size:
+                raise InputError(f'{image.name} has {found[0]}x{found[1]} pixels, but {reference} '
+                                 f'{size[0]}x{size[1]}')
+            bag_time_ns = image.stamp_ns + to_nanoseconds(delay)
+            place = image.stamp_ns, reader.CAMERA_FRAME
+            if camera is not None:
+                bag.write(reader.CAMERA_INFO_TOPIC, reader.CAMERA_INFO,
+                          outgoing.camera_info_message(*place, camera, None, bag.type),
+                          bag_time_ns)
+            bag.write(reader.COMPRESSED_TOPIC, reader.COMPRESSED_IMAGE,
+                      outgoing.encoded_image_message(*place, data, bag.type,
+                                                     recording.image_format), bag_time_ns)
+            on_image()
+        imu_topic = reader.GYRO_TOPIC if recording.accel else reader.IMU_TOPIC
+        for topic, samples in ((imu_topic, recording.imu), (reader.ACCEL_TOPIC, recording.accel)):
+            for sample in recording.cropped(samples):
+                bag.write(topic, reader.IMU, outgoing.imu_message(
+                    sample.stamp_ns, reader.IMU_FRAME, sample.angular_velocity,
+                    sample.linear_acceleration, bag.type), sample.stamp_ns + imu_delay_ns)
+        for pose in recording.truth:
+            bag.write(reader.GROUND_TRUTH_TOPIC, reader.POSE_STAMPED,
+                      outgoing.pose_stamped_message(pose.stamp_ns, reader.WORLD_FRAME,
+                                                    pose.quat_xyzw, pose.position, bag.type),
+                      pose.stamp_ns + imu_delay_ns)
 
 
 # -- Text files: each error names the file and the line -------------------------------------------
@@ -280,14 +265,3 @@ def check_file(path: Path, most_bytes: float = math.inf) -> Path:
     if path.stat().st_size > most_bytes:
         raise InputError(f'{path} has more than {most_bytes} bytes: it is another file')
     return path
-
-
-def finite_numbers(value: object, shape: tuple[int, ...]) -> NDArray[np.float64] | None:
-    """Finite numbers of a JSON list of this shape, else None."""
-    try:
-        array = np.asarray(value)
-    except ValueError:
-        return None
-    if array.shape != shape or array.dtype.kind not in 'if' or not np.isfinite(array).all():
-        return None
-    return array.astype(np.float64)

@@ -214,10 +214,7 @@ class _TopicFinder:
 
     def _one(self, role: str, content: str, *msgtypes: str, fix: str = '', hint: str = '',
              without: Topic | None = None) -> Topic | None:
-        """The chosen topic, or the only one of these types.
-
-        `fix` if there is none, `hint` if there are several.
-        """
+        """The chosen topic, or the only one of these types; `fix` if there is none."""
         if chosen := self._chosen(role, *msgtypes):
             return chosen
         candidates = [topic for topic in self._of_type(*msgtypes) if topic != without]
@@ -391,18 +388,12 @@ class Bag:
         return _TopicFinder(self.path, self.topics, names, complete=False).find(False)
 
     def messages(self, topics: Sequence[Topic]) -> Iterator[BagMessage]:
-        """Messages of `topics` in the order of bag time; their arrays are read-only.
-
-        A damaged bag or a message that cannot be decoded raises InputError.
-        """
+        """Messages of `topics` in the order of bag time, with arrays that are read-only."""
         for raw in self.raw_messages(topics):
             yield BagMessage(raw.topic, raw.bag_time_ns, self.read(raw))
 
     def raw_messages(self, topics: Sequence[Topic]) -> Iterator[RawMessage]:
-        """Messages of `topics` in the order of bag time, in CDR as publishers expect them.
-
-        A damaged bag or a ROS 1 message without a counterpart in ROS 2 raises InputError.
-        """
+        """Messages of `topics` in the order of bag time, in CDR as publishers expect them."""
         # Of ROS 2, not of the bag: headers of ROS 1 have an additional number.
         typestore = _types(of_ros2=True)
         for connection, bag_time_ns, data in self._raw(topics):
@@ -456,11 +447,7 @@ class Bag:
 
 @contextmanager
 def open_bag(path: Path | str) -> Iterator[Bag]:
-    """Open a rosbag2 directory, or a single ``.mcap``, ``.db3`` or ROS 1 ``.bag`` file.
-
-    MissingInputError if `path` does not exist; InputError, with the reason in one line, if it is
-    no bag, truncated or damaged.
-    """
+    """Open a rosbag2 directory, or a single ``.mcap``, ``.db3`` or ROS 1 ``.bag`` file."""
     path = Path(path)
     with ExitStack() as stack:
         try:

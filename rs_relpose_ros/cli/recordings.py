@@ -10,7 +10,7 @@ import shutil
 import sys
 from typing import Any, NamedTuple
 
-from rs_relpose_ros.bags import phones, video
+from rs_relpose_ros.bags import recorders
 from rs_relpose_ros.bags.convert import Recording, write_bag
 from rs_relpose_ros.bags.reader import COMPRESSED_IMAGE, open_bag
 from rs_relpose_ros.calibrate import result as calibration
@@ -181,10 +181,10 @@ SOURCES: Mapping[str, Source] = {
     'video': Source(
         'video of a camera that logs its IMU: GoPro, and others that telemetry-parser reads '
         '(pip install telemetry-parser av). Recordings that the camera stabilised are refused.',
-        'FILE', video.read_video, has_lens_profile=True),
+        'FILE', recorders.read_video, has_lens_profile=True),
     'android': Source(
-        f"folder of a phone's logger, recognised by its files: {phones.known_loggers()}", 'FOLDER',
-        lambda folder, _: phones.read_android(folder)),
+        f"folder of a phone's logger, recognised by its files: {recorders.known_loggers()}",
+        'FOLDER', lambda folder, _: recorders.read_android(folder)),
     'realsense_rgb_rs': Source(
         'colour camera, gyro and accelerometer of a RealSense, from '
         'github.com/Zoltan3057/DM-VIO-dataset (imu.txt, frames.csv, camera.txt, images/)',
@@ -249,7 +249,7 @@ def _unroll(args: argparse.Namespace) -> int:
         report = unroll(*opened, args.out_bag)
     for line in report.warnings:
         _logger.warning('%s', line)
-    options.warn_unused(report.reasons, 'omitted')
+    options.warn_unused(report.reasons.most_common(), 'omitted')
     omitted = report.images_in_bag - report.images
     text = (f'{report.images} of {report.images_in_bag} images derotated'
             + (f', {omitted} omitted' if omitted else ''))
