@@ -14,7 +14,8 @@ from rs_relpose_lab.experiments.methods import METHODS
 from rs_relpose_lab.experiments.paper import EXACT, PaperRun, Sweep, SWEEPS
 from rs_relpose_lab.experiments.penncosyvio import EXPERIMENT, PennCosyvioRun
 from rs_relpose_lab.experiments.problems import BASELINES
-from rs_relpose_ros.cli.options import package_version, progress_bar
+from rs_relpose_ros.cli.main import package_version
+from rs_relpose_ros.cli.options import progress_bar
 from rs_relpose_ros.errors import MissingInputError
 from rs_relpose_ros.estimator.result import Status
 from rs_relpose_ros.geometry.camera import REFERENCE_ROWS

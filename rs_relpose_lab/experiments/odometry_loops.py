@@ -105,7 +105,8 @@ def on_walk(config: SimulationConfig, trajectory: Trajectory) -> LoopMetrics:
     (end1, turn1, ate1), (end2, turn2, ate2) = (
         _errors([pose for path in paths for _, pose in path], truth) for paths in (before, after))
     return LoopMetrics(
-        recording.source.name, sum(map(len, before)), report.offered, report.related, report.taken,
+        recording.source.name, sum(map(len, before)), report['offered'],
+        report['related'], report['taken'],
         max((_misfit(pair, simulation) for pair in taken), default=math.nan),
         end1, end2, turn1, turn2, ate1, ate2)
 

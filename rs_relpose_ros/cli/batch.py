@@ -1,7 +1,4 @@
-"""``rs_relpose batch``: check, calibrate or replay over many bags, on a Dask cluster.
-
-A folder for each bag, one table, one picture, one calibration.
-"""
+"""``rs_relpose batch``: check, calibrate or replay over many bags, on a Dask cluster."""
 
 import argparse
 from collections import Counter
@@ -31,8 +28,8 @@ from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.calibrate.result import as_mapping
 from rs_relpose_ros.cli.main import FAILED as EXIT_FAILED
-from rs_relpose_ros.cli.main import make_parser
-from rs_relpose_ros.cli.options import declared, package_version, PARAMETERS, progress_bar
+from rs_relpose_ros.cli.main import make_parser, package_version
+from rs_relpose_ros.cli.options import declared, PARAMETERS, progress_bar
 from rs_relpose_ros.cli.poses import replay_bag
 from rs_relpose_ros.cli.recordings import calibrate_bag, inspect_bag
 from rs_relpose_ros.config.files import read_parameters
@@ -214,10 +211,7 @@ def unique_names(paths: Sequence[str]) -> list[str]:
 
 def make_jobs(client: Any, command: str, paths: Sequence[str], parameters: str | None,
               options: tuple[str, ...], version: str) -> list[Job]:
-    """Jobs for bags, or globs of them, as the workers find them; MissingInputError for none.
-
-    `parameters`: None for the file next to each bag.
-    """
+    """Jobs for bags, or globs of them; `parameters`: None for the file next to each bag."""
     bags: list[Bag] = client.submit(find_bags, paths, pure=False).result()
     if all(bag.size < 0 for bag in bags):
         raise MissingInputError(f'the workers find no bag at {", ".join(paths)}')
@@ -332,11 +326,7 @@ def _problems(command: str, results: Mapping[str, Any]) -> str:
 
 @contextmanager
 def open_cluster(scheduler: str | None, workers: int | None) -> Iterator[Any]:
-    """A client of a running scheduler, or of `workers` local processes of one thread each.
-
-    By default as many as this process may use processors. MissingInputError without Dask, or
-    without workers; InputError if no scheduler answers.
-    """
+    """A client of a running scheduler, or of `workers` local processes of one thread each."""
     dask, distributed = library('dask', _ABSENT), library('distributed', _ABSENT)
     # It logs starts and ends of processes; errors of the work are in the rows.
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
@@ -440,10 +430,7 @@ def write_table(rows: Sequence[Row], folder: Path) -> None:
 
 
 def write_summary(job: Job, rows: Sequence[Row], reused: int, folder: Path) -> list[str]:
-    """Write summary.json and the picture of a run with jobs such as this; lines for the console.
-
-    `reused`: number of bags with results of an earlier run.
-    """
+    """Write summary.json and the picture of a run with jobs such as this; lines to print."""
     combined = combine([row for row in rows if job.command == 'calibrate'
                         and row['state'] in (DONE, FINDINGS)])
     states = {state: [row['state'] for row in rows].count(state) for state in STATES}
@@ -550,10 +537,7 @@ _DRAWN = {
 
 def draw(command: str, rows: Sequence[Row], combined: Sequence[Mapping[str, Any]],
          path: Path) -> None:
-    """Draw the rows, from top to bottom in their order, and weighted means with their sigma.
-
-    Outliers of a mean are red, unobservable values orange.
-    """
+    """Draw rows in their order; red: outliers of the mean, orange: unobservable values."""
     picture = Figure(figsize=(10.0, 1.2 + 0.3 * len(rows)), dpi=110, layout='constrained')
     both, means = picture.subplots(1, 2, sharey=True), {one['figure']: one for one in combined}
     for axes, (column, factor, label) in zip(both, _DRAWN[command], strict=True):

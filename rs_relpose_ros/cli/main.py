@@ -2,6 +2,8 @@
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 import logging
 import os
 import sys
@@ -62,13 +64,11 @@ class Command(NamedTuple):
     run: Callable[[argparse.Namespace], int]
 
 
-class _Version(argparse.Action):
-    """``--version``, looked up on demand."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: Any, **__: Any) -> None:
-        from importlib.metadata import version
-        print(f'{PROGRAM} {version("rs_relpose_ros")}')
-        parser.exit()
+def package_version() -> str:
+    """Version of the installed package."""
+    with suppress(PackageNotFoundError):   # run from a source tree
+        return version('rs_relpose_ros')
+    return 'not installed'
 
 
 def load_command(name: str) -> Command:
@@ -87,7 +87,8 @@ def make_parser(selected: str | None) -> argparse.ArgumentParser:
         description='Relative poses of rolling-shutter images, aided by an IMU: offline tools.',
         epilog=f'"{PROGRAM} COMMAND --help" describes a command. Exit codes: 0 done, 1 the work '
                'ran and failed, 2 bad usage or bad input.')
-    parser.add_argument('--version', action=_Version, nargs=0, help='print the version and exit')
+    parser.add_argument('--version', action='version', version=f'{PROGRAM} {package_version()}',
+                        help='print the version and exit')
     _add_verbose(parser, default=0)
     commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
     for name, (_, one_line) in COMMANDS.items():

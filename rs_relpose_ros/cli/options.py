@@ -3,7 +3,6 @@
 import argparse
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from importlib.metadata import PackageNotFoundError, version
 import logging
 from pathlib import Path
 import sys
@@ -12,6 +11,7 @@ from typing import Any, TypeVar
 from tqdm import tqdm
 
 from rs_relpose_ros.bags.reader import Bag, open_bag, SensorTopics, Topic
+from rs_relpose_ros.cli.main import package_version
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.messages.transforms import with_extrinsics
@@ -74,10 +74,7 @@ def declared(arguments: Arguments) -> Callable[[argparse.ArgumentParser], None]:
 
 def run_on_bag(args: argparse.Namespace, suffix: str, work: Work[Made],
                calibration: Mapping[str, Any] | None = None) -> tuple[Path, Made]:
-    """Run `work` and write summary.json into its folder; return the folder and the results.
-
-    `calibration`: parameters by name where `args` do not give others.
-    """
+    """Run `work` and write summary.json; `calibration`: parameters where `args` give no others."""
     parameters = read_parameters(args.params, args.set)
     parameters = Parameters().updated({**(calibration or {}), **parameters.given()})
     folder = out_folder(args, suffix)
@@ -144,11 +141,3 @@ def image_progress(bag: Bag, image: Topic, description: str) -> tqdm:
     bar = progress_bar(image.count, 'image', description)
     bag.on_message = lambda topic: bar.update(topic == image.name)
     return bar
-
-
-def package_version() -> str:
-    """Version of the installed package."""
-    try:
-        return version('rs_relpose_ros')
-    except PackageNotFoundError:   # run from a source tree
-        return 'not installed'

@@ -592,13 +592,7 @@ class Parameters:
         return cls().updated(values)
 
     def updated(self, values: Mapping[str, Any]) -> Parameters:
-        """A copy with other values, by flat name.
-
-        Raises
-        ------
-        InputError
-            An unknown name (the message lists similar names), or an illegal value.
-        """
+        """A copy with other values by name; InputError for unknown names and illegal values."""
         known = [name for name, _, _ in self.declarations()]
         for name in values:
             if name not in known:

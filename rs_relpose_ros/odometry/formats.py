@@ -138,10 +138,7 @@ def path(rows: RowTrajectory) -> Placement:
 
 
 def projected(place: Placement, model: Model, k: Ints, points: Array, rows: Array) -> Array:
-    """Pixels (N, 2) of points (N, 3) in frames (N,), each at the pose of the row that shows it.
-
-    `rows` (N,): first guesses.
-    """
+    """Pixels (N, 2) of points at the poses of their own rows; `rows` (N,): first guesses."""
     pixels = np.column_stack([rows, rows])
     for _ in range(6):
         pixels = model.camera.project(place(model, k, points, pixels[:, 1]))
@@ -243,21 +240,20 @@ def _write_colmap(model: Model, folder: Path) -> None:
                    model.points, model.colors, model.errors, tracks, strict=True))))
 
 
-def _transforms(model: Model) -> dict[str, Any]:
-    """Entries of a transforms.json that instant-ngp and nerfstudio share."""
+def _write_transforms(model: Model, folder: Path, more: Mapping[str, Any],
+                      of_frame: Callable[[int], Mapping[str, Any]]) -> None:
+    """The transforms.json of instant-ngp and nerfstudio, with entries of their own."""
     camera, lens = model.camera, lens_of(model.camera)
-    names = zip(('k1', 'k2', 'k3', 'k4'), lens.k, strict=False)
-    return {'w': camera.width, 'h': camera.height, 'fl_x': camera.fx, 'fl_y': camera.fy,
-            'cx': camera.cx + 0.5, 'cy': camera.cy + 0.5,
-            **{name: value for name, value in names if value},
-            **{name: value for name, value in zip(('p1', 'p2'), lens.p, strict=True) if value}}
-
-
-def _frames(model: Model, of_frame: Callable[[int], Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Entries of the images."""
-    return [{'file_path': f'{IMAGES}/{name}', **{
-        key: np.asarray(value).tolist() for key, value in of_frame(f).items()}}
-        for f, name in enumerate(model.names)]
+    terms = [*zip(('k1', 'k2', 'k3', 'k4'), lens.k, strict=False),
+             *zip(('p1', 'p2'), lens.p, strict=True)]
+    value = {
+        'w': camera.width, 'h': camera.height, 'fl_x': camera.fx, 'fl_y': camera.fy,
+        'cx': camera.cx + 0.5, 'cy': camera.cy + 0.5,
+        **{name: value for name, value in terms if value}, **more,
+        'frames': [{'file_path': f'{IMAGES}/{name}', **{
+            key: np.asarray(value).tolist() for key, value in of_frame(f).items()}}
+            for f, name in enumerate(model.names)]}
+    _lines(folder / 'transforms.json', json.dumps(value, indent=1))
 
 
 def _write_nerfstudio(model: Model, folder: Path) -> None:
@@ -271,15 +267,13 @@ def _write_nerfstudio(model: Model, folder: Path) -> None:
     """
     sign = 1.0 if model.camera.readout_direction == 'down' else -1.0
     flip, poses = sign * np.diag(_OPENGL)[:3], model.poses[:, MIDDLE] @ _OPENGL
-    value = {**_transforms(model),
-             'camera_model': 'OPENCV_FISHEYE' if lens_of(model.camera).fisheye else 'OPENCV',
-             'orientation_override': 'none', 'auto_scale_poses_override': False,
-             'ply_file_path': 'sparse_pc.ply', 'rolling_shutter_time': model.camera.readout_time,
-             'exposure_time': model.exposure_time, 'frames': _frames(model, lambda f: {
-                 'transform_matrix': poses[f],
-                 'camera_linear_velocity': flip * model.velocities[f],
-                 'camera_angular_velocity': flip * model.rates[f]})}
-    _lines(folder / 'transforms.json', json.dumps(value, indent=1))
+    _write_transforms(model, folder, {
+        'camera_model': 'OPENCV_FISHEYE' if lens_of(model.camera).fisheye else 'OPENCV',
+        'orientation_override': 'none', 'auto_scale_poses_override': False,
+        'ply_file_path': 'sparse_pc.ply', 'rolling_shutter_time': model.camera.readout_time,
+        'exposure_time': model.exposure_time}, lambda f: {
+            'transform_matrix': poses[f], 'camera_linear_velocity': flip * model.velocities[f],
+            'camera_angular_velocity': flip * model.rates[f]})
     _lines(folder / 'sparse_pc.ply', 'ply', 'format ascii 1.0',
            f'element vertex {len(model.points)}', *(f'property float {axis}' for axis in 'xyz'),
            *(f'property uchar {name}' for name in ('red', 'green', 'blue')), 'end_header',
@@ -301,13 +295,12 @@ def _write_instant_ngp(model: Model, folder: Path) -> None:
     shutter = np.array([-0.5, 0.0, height, 0.0]) / (height - 1.0)
     if model.camera.readout_direction == 'up':
         shutter = np.array([1.0, 0.0, 0.0, 0.0]) - shutter
-    value = {**_transforms(model), 'is_fisheye': lens_of(model.camera).fisheye,
-             'rolling_shutter': (model.rolls * shutter).tolist(), 'aabb_scale': 32,
-             'scale': scale, 'offset': (0.5 - 0.5 * scale * (low + high)).tolist(),
-             'frames': _frames(model, lambda f: {
-                 'transform_matrix': poses[f, MIDDLE], 'transform_matrix_start': poses[f, START],
-                 'transform_matrix_end': poses[f, END]})}
-    _lines(folder / 'transforms.json', json.dumps(value, indent=1))
+    _write_transforms(model, folder, {
+        'is_fisheye': lens_of(model.camera).fisheye,
+        'rolling_shutter': (model.rolls * shutter).tolist(), 'aabb_scale': 32, 'scale': scale,
+        'offset': (0.5 - 0.5 * scale * (low + high)).tolist()}, lambda f: {
+            'transform_matrix': poses[f, MIDDLE], 'transform_matrix_start': poses[f, START],
+            'transform_matrix_end': poses[f, END]})
 
 
 def _write_gsplat(model: Model, folder: Path) -> None:
@@ -368,20 +361,20 @@ def _write_ncore(model: Model, folder: Path) -> None:
     writer = v4.SequenceComponentGroupsWriter(
         folder, 'recording', 'recording', HalfClosedInterval.from_start_end(
             int(ends[0]), int(ends[-1])), {})
-    writer.register_component_writer(v4.PosesComponent.Writer, 'default').store_dynamic_pose(
+    register = writer.register_component_writer
+    register(v4.PosesComponent.Writer, 'default').store_dynamic_pose(
         CAMERA_ID, 'world', model.poses[:, both].reshape(-1, 4, 4)[first], ends)
-    writer.register_component_writer(
-        v4.IntrinsicsComponent.Writer, 'default').store_camera_intrinsics(CAMERA_ID, parameters)
-    writer.register_component_writer(
-        v4.MasksComponent.Writer, 'default').store_camera_masks(CAMERA_ID, {})
-    # Its loader requires them, if only empty.
-    writer.register_component_writer(v4.CuboidsComponent.Writer, 'default').store_observations([])
-    frames = writer.register_component_writer(v4.CameraSensorComponent.Writer, CAMERA_ID)
+    register(v4.IntrinsicsComponent.Writer, 'default').store_camera_intrinsics(
+        CAMERA_ID, parameters)
+    # Its loader requires masks and cuboids, if only empty.
+    register(v4.MasksComponent.Writer, 'default').store_camera_masks(CAMERA_ID, {})
+    register(v4.CuboidsComponent.Writer, 'default').store_observations([])
+    frames = register(v4.CameraSensorComponent.Writer, CAMERA_ID)
     for name, span in zip(model.names, times, strict=True):
         image = folder / IMAGES / name
         frames.store_frame(image.read_bytes(), image.suffix[1:].replace('jpg', 'jpeg'), span, {},
                            {})
-    clouds = writer.register_component_writer(
+    clouds = register(
         v4.PointCloudsComponent.Writer, 'landmarks',
         coordinate_unit=types.PointCloud.CoordinateUnit.METERS, attribute_schemas={
             'rgb': v4.PointCloudsComponent.AttributeSchema(

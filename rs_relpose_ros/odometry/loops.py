@@ -1,10 +1,9 @@
 """Loop closures: keyframes far apart in time that probably have the same view."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -40,10 +39,7 @@ class View(NamedTuple):
 
 
 def scene_depth(path: Sequence[Odometry], views: Mapping[int, View], focal_length: float) -> float:
-    """Median distance of the scene [m], by baselines and parallaxes; NaN without any.
-
-    `views`: by `imu_ns`; `focal_length` [px].
-    """
+    """Median distance of the scene [m]; `views`: by `imu_ns`; NaN without any."""
     depths = [focal_length * float(np.linalg.norm(two.position - one.position)) / parallax
               for one, two in pairwise(path)
               if (parallax := views[two.imu_ns].parallax) > _LEAST_PARALLAX]
@@ -90,30 +86,10 @@ def _common_views(earlier: Sequence[Odometry], pose: Odometry, depth: float,
     return [(share, k) for k, share in zip(near, shares, strict=True) if share >= _LEAST_OVERLAP]
 
 
-@dataclass(frozen=True, slots=True)
-class LoopReport:
-    """Numbers of loops, and the change of the path by those that were taken.
-
-    `shift`: of the keyframes' positions, root mean square and largest one; `end_to_start`:
-    distance of the last keyframe from the first one, without and with loops.
-    """
-
-    offered: int
-    related: int
-    taken: int
-    shift_m: float
-    largest_shift_m: float
-    end_to_start_without_m: float
-    end_to_start_m: float
-
-
 def close_loops(estimator: OdometryEstimator, paths: Paths, views: Mapping[int, View],
                 sensor: Sensor, relate: Callable[[list[Stamps]], Sequence[PairResult]],
-                ) -> tuple[Paths, LoopReport, list[KeyframePair]]:
-    """Add loop closures to the smoothed paths of an estimator: paths, report, taken loops.
-
-    `views`: of keyframes, by `imu_ns`. `relate`: results of pairs of images, by their stamps.
-    """
+                ) -> tuple[Paths, dict[str, Any], list[KeyframePair]]:
+    """Add loops to smoothed paths; `views`: by `imu_ns`; `relate`: results of pairs of stamps."""
     smoothed = [pose for path in paths for _, pose in path]
     base, later_ns = estimator.base or Base(), to_nanoseconds(sensor.pose_row_delay)
     path = [base.camera(pose) for pose in smoothed if pose.imu_ns in views]
@@ -130,7 +106,7 @@ def close_loops(estimator: OdometryEstimator, paths: Paths, views: Mapping[int, 
                        for pose in closed])
     before, after = (float(np.linalg.norm(poses[-1].position - poses[0].position))
                      for poses in (smoothed, closed))
-    report = LoopReport(
-        len(offered), len(informative), len(taken), float(np.sqrt((shifts**2).mean())),
-        float(shifts.max()), before, after)
-    return paths, report, taken
+    return paths, {   # for summary.json; shifts: of the keyframes' positions
+        'offered': len(offered), 'related': len(informative), 'taken': len(taken),
+        'shift_m': float(np.sqrt((shifts**2).mean())), 'largest_shift_m': float(shifts.max()),
+        'end_to_start_without_m': before, 'end_to_start_m': after}, taken

@@ -86,7 +86,7 @@ def odometry_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Para
     base = estimator.base or Base()
     drawn = {name: path_of([base.camera(pose) for pose in trajectory], truth)
              for name, trajectory in (('live', live), ('smoothed', smoothed))}
-    metrics = {**_metrics(estimator, live), 'loops': closed and asdict(closed),
+    metrics = {**_metrics(estimator, live), 'loops': closed,
                'health': replay.health.state.value,
                **{name: path.errors and path.errors.as_json() for name, path in drawn.items()}}
     write_tum(folder / LIVE_FILE, live)

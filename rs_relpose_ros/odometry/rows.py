@@ -117,13 +117,7 @@ class RowTrajectory(ArrayFile):
     @classmethod
     def of_paths(cls, paths: Iterable[Sequence[Knot]], samples: ImuSamples, mounts: Array,
                  loops_ns: Sequence[tuple[int, int]] = ()) -> RowTrajectory:
-        """From the keyframes of consecutive paths and the samples of the IMU.
-
-        Raises
-        ------
-        InputError
-            There are no two consecutive keyframes.
-        """
+        """From the keyframes of consecutive paths and the samples of the IMU, at least two."""
         spans: list[tuple[int, int]] = []
         knots: list[Knot] = []
         parts = []

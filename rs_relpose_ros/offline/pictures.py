@@ -1,7 +1,4 @@
-"""Pictures of a replay: matches of a pair, errors and residuals over time, orientation.
-
-They are drawn on canvases of their own, without matplotlib's global state.
-"""
+"""Pictures of a replay: matches of a pair, errors and residuals over time, orientation."""
 
 from collections.abc import Mapping, Sequence
 from itertools import cycle
@@ -42,10 +39,7 @@ def draw_replay(paths: Sequence[Path], records: Sequence[PairRecord], shown: Pai
 
 def draw_errors(records: Sequence[PairRecord], path: Path,
                 baselines: Mapping[str, Sequence[PairErrors | None]] | None = None) -> None:
-    """Errors against the ground truth over time, with the estimated sigmas.
-
-    `baselines`: errors of other methods, by name, of the pairs with a pose.
-    """
+    """Errors over time, with estimated sigmas; `baselines`: those of other methods, by name."""
     picture = _over_time(2, 'errors of the relative poses against the ground truth')
     start_ns = records[0].reference_ns1
     known = [(r, r.errors) for r in records if r.pose and r.errors is not None]

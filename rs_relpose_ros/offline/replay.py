@@ -113,10 +113,7 @@ class Replay:
         self.reasons = ReasonCounts()
 
     def pairs(self) -> Iterator[PairResult]:
-        """Run over the bag, and yield every pair; `last_ns` is then its bag time.
-
-        Raises if the bag is damaged, its camera is not calibrated, or no frame could be used.
-        """
+        """Run over the bag, and yield every pair; `last_ns` is then its bag time."""
         warm_up(self._front_end.parameters.estimator)
         started = time.perf_counter()
         for outcome in outcomes(self._front_end, self.intake, self._messages()):
@@ -327,10 +324,7 @@ def read_pairs(path: Path) -> list[Stamps]:
 
 def pairs_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parameters,
                pairs: Sequence[Stamps]) -> ReplayOutcome:
-    """Write a row for each of the pairs, in their order, into tables in `folder`.
-
-    Those of an earlier run are replaced.
-    """
+    """Write a row for each of the pairs, in their order, into tables in `folder`."""
     prepare_folder(folder, (POSES.file, ERRORS.file, SUMMARY_FILE))
     truth = read_truth(bag, topics)
     results, intrinsics = related(bag, topics, parameters, pairs)

@@ -102,10 +102,7 @@ ERRORS = Table('errors.csv', (
 
 @contextmanager
 def table_writer(folder: Path, tables: Sequence[Table]) -> Iterator[Callable[[PairRecord], None]]:
-    """Create the files of tables; the result appends a record to all of them.
-
-    Until the end of the context the files are those of `written`, in which each row is complete.
-    """
+    """Create files of tables, each row complete; the result appends a record to all of them."""
     with ExitStack() as stack:
         writers = [csv.writer(stack.enter_context(
             written(folder / table.file)), lineterminator='\n') for table in tables]

@@ -1,8 +1,9 @@
 """A bag with its images derotated to their middle row, and all other messages unchanged."""
 
+from __future__ import annotations
+
 from collections import deque
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator
 from pathlib import Path
 
 from rs_relpose_ros.bags import reader
@@ -18,34 +19,22 @@ from rs_relpose_ros.pipeline.global_shutter import GlobalShutterFrame, unrolling
 from rs_relpose_ros.pipeline.pair import Frame
 
 
-@dataclass(slots=True)
-class UnrollReport:
-    """Summary of a run."""
-
-    images_in_bag: int = 0
-    images: int = 0   # derotated and written
-    largest_shift: float = 0.0   # [px] of any pixel
-    copied: int = 0   # messages of other topics
-    topics_copied: int = 0
-    reasons: Mapping[str, int] = field(default_factory=dict)   # of omitted images
-    warnings: list[str] = field(default_factory=list)
-
-
-def unroll(bag: Bag, topics: SensorTopics, parameters: Parameters, out: Path) -> UnrollReport:
+def unroll(bag: Bag, topics: SensorTopics, parameters: Parameters, out: Path) -> Unrolling:
     """Write the bag `out`, a directory that must not exist, and appears when it is complete.
 
     Nothing is written if no image can be derotated.
     """
     with beside(out) as part:
         with BagWriter(part) as writer:
-            report = _Unrolling(bag, topics, parameters, writer).run()
-        if report.images:
+            run = Unrolling(bag, topics, parameters, writer)
+            run.write(parameters.global_shutter.stamp_clock)
+        if run.images:
             part.rename(out)
-    return report
+    return run
 
 
-class _Unrolling:
-    """One run over a bag.
+class Unrolling:
+    """One run over a bag, and its summary.
 
     Messages are written as soon as they are known, an image after its gyro: readers sort by the
     receive times, which are indexed.
@@ -53,24 +42,25 @@ class _Unrolling:
 
     def __init__(self, bag: Bag, topics: SensorTopics, parameters: Parameters,
                  writer: BagWriter) -> None:
+        self.images_in_bag = self.images = 0   # those that were derotated and written
+        self.largest_shift = 0.0   # [px] of any pixel
+        self.copied = self.topics_copied = 0   # messages of other topics
+        self.reasons = ReasonCounts()   # of omitted images
+        self.warnings: list[str] = []
         self._bag, self._topics, self._writer = bag, topics, writer
-        self._stamp_clock = parameters.global_shutter.stamp_clock
         self._loop = unrolling_loop(parameters, offline=True)
         self._intake = Intake(self._loop.sequencer, parameters)
         # By the stamps of all images, the receive times of those that are not yet derotated.
         self._times: dict[int | None, deque[int]] = {}
         # Of other image topics: whether the stamp is an image's.
         self._shared: dict[str, list[bool]] = {}
-        self._reasons = ReasonCounts()
-        self._report = UnrollReport()
 
-    def run(self) -> UnrollReport:
+    def write(self, stamp_clock: str) -> None:
         """Write the new bag."""
-        report = self._report
         copied = [topic for topic in self._bag.topics if self._bag.can_be_copied(topic)]
         for topic in copied:
             self._writer.announce(topic, self._bag.origin(topic))
-        report.topics_copied = len({*copied} - {self._topics.image, self._topics.camera_info})
+        self.topics_copied = len({*copied} - {self._topics.image, self._topics.camera_info})
         for outcome in outcomes(self._loop, self._intake, self._messages(copied)):
             times = self._times.get(outcome.stamp_ns)
             bag_time_ns = times.popleft() if times else None
@@ -78,19 +68,17 @@ class _Unrolling:
                 if outcome.result is not None and bag_time_ns is not None:
                     self._write(outcome.result, bag_time_ns)
                 continue
-            if isinstance(outcome, MessageRefused) and not report.images:
+            if isinstance(outcome, MessageRefused) and not self.images:
                 outcome.raise_without_intrinsics()
-            self._reasons.add(unused_reason(outcome))
-        report.reasons = self._reasons.most_common()
-        report.warnings += [f'{topic} is omitted: ROS 2 has no such message type'
-                            for topic in self._bag.topics if topic not in copied]
+            self.reasons.add(unused_reason(outcome))
+        self.warnings += [f'{topic} is omitted: ROS 2 has no such message type'
+                          for topic in self._bag.topics if topic not in copied]
         shared = [topic for topic, found in self._shared.items() if 2 * sum(found) > len(found)]
-        if shared and self._stamp_clock == 'imu':
-            report.warnings.append(
+        if shared and stamp_clock == 'imu':
+            self.warnings.append(
                 f'{", ".join(shared)} had the stamps of the derotated images and keep them, on '
                 "the camera's clock: set stamp_clock=camera if they are used together (depth, "
                 'stereo)')
-        return report
 
     def _messages(self, topics: list[Topic]) -> Iterator[tuple[Role, BagMessage]]:
         """Messages of camera and IMU; all but images and CameraInfo are copied."""
@@ -100,7 +88,7 @@ class _Unrolling:
         for raw in self._bag.raw_messages(topics):
             role = roles.get((raw.topic, raw.msgtype))
             if role not in (Role.IMAGE, Role.CAMERA_INFO):
-                self._report.copied += 1
+                self.copied += 1
                 self._writer.copy(raw)
             if role is None:
                 if raw.msgtype in (reader.IMAGE, reader.COMPRESSED_IMAGE):
@@ -109,11 +97,11 @@ class _Unrolling:
                 continue
             message = self._bag.read(raw)
             if role is Role.IMAGE:
-                self._report.images_in_bag += 1
+                self.images_in_bag += 1
                 try:
                     stamp: int = PARTS[role].read(message).stamp_ns
                 except RsRelposeError as error:
-                    self._reasons.add(str(error))
+                    self.reasons.add(str(error))
                     continue
                 self._times.setdefault(stamp, deque()).append(raw.bag_time_ns)
             yield role, BagMessage(raw.topic, raw.bag_time_ns, message)
@@ -130,5 +118,5 @@ class _Unrolling:
         name = topic.camera_info if info is None else info.name
         self._writer.write(name, reader.CAMERA_INFO, camera_info, bag_time_ns)
         self._writer.write(topic.name, topic.msgtype, image, bag_time_ns)
-        self._report.images += 1
-        self._report.largest_shift = max(self._report.largest_shift, result.map.shift)
+        self.images += 1
+        self.largest_shift = max(self.largest_shift, result.map.shift)
