@@ -27,7 +27,7 @@ BUDGETS = {
     'rs_relpose_ros/messages': (1438, 5),
     'rs_relpose_ros/nodes': (2189, 9),
     'rs_relpose_ros/odometry': (3047, 11),
-    'rs_relpose_ros/offline': (1899, 8),
+    'rs_relpose_ros/offline': (1876, 8),
     'rs_relpose_ros/pipeline': (3543, 12),
     'rs_relpose_ros/solvers': (1181, 6),
     'rs_relpose_ros/tracking': (1224, 5),
