@@ -357,9 +357,9 @@ def test_residual_is_the_distance_in_pixels_to_the_nearest_pair_that_fits():
 
 def test_search_finds_the_direction_again():
     problem, unknowns, _ = few_pairs()
-    lost = unknowns._replace(direction=np.tile([0.0, 0.0, 1.0], (problem.pairs, 1)))
+    lost = unknowns._replace(own=np.tile(np.eye(9)[2], (problem.pairs, 1)))
     found = redirected(problem, lost)
-    assert np.abs((found.direction * unknowns.direction).sum(axis=1)).min() > 0.99
+    assert np.abs((found.own * unknowns.own)[:, :3].sum(axis=1)).min() > 0.99
     assert evaluate(problem, found).cost < evaluate(problem, lost).cost
 
 

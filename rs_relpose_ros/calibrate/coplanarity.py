@@ -194,16 +194,13 @@ class Unknowns(NamedTuple):
     # (GLOBAL,) with zeros in place of the rotation, which is `R_imu_cam`.
     parameters: Array
     R_imu_cam: Array    # (3, 3)
-    direction: Array    # (P, 3) unit vectors
-    bend: Array         # (P, 3)
-    turn: Array         # (P, 3) [rad]
+    own: Array          # (P, 9) of each pair: unit vector `direction`, `bend`, and `turn` [rad]
     noise: Array        # (P,) 1 sigma of the residuals [px]
     damping: Array      # (P,) Levenberg-Marquardt damping of the pair's own unknowns
 
     def pairs_of(self, kept: NDArray[np.bool_]) -> Unknowns:
         """The same calibration for some of the pairs (P,)."""
-        return self._replace(direction=self.direction[kept], bend=self.bend[kept],
-                             turn=self.turn[kept], noise=self.noise[kept],
+        return self._replace(own=self.own[kept], noise=self.noise[kept],
                              damping=self.damping[kept])
 
 
@@ -228,8 +225,7 @@ class _Sight(NamedTuple):
 
 @kernel
 def _new_sight() -> _Sight:
-    return _Sight(np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3),
-                  np.empty((3, 3)))
+    return _Sight(np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((3, 3)))
 
 
 @inlined_kernel
@@ -361,10 +357,10 @@ def accumulate(problem: Problem, path: GyroPath, unknowns: Unknowns, tangent: Ar
     for p in range(len(problem.middle)):
         middle, covariates = problem.middle[p], problem.covariates[:, p]
         Q_middle = path.rotations[middle]
-        straight = rotated(Q_middle, unknowns.direction[p])
-        bend = rotated(Q_middle, unknowns.bend[p])
+        straight = rotated(Q_middle, unknowns.own[p, :3])
+        bend = rotated(Q_middle, unknowns.own[p, 3:6])
         # Half of `turn` forwards in frame 2, and half of it backwards in frame 1.
-        half = so3.exp_so3(0.5 * (Q_middle @ unknowns.turn[p]))
+        half = so3.exp_so3(0.5 * (Q_middle @ unknowns.own[p, 6:]))
         half_back = np.ascontiguousarray(half.T)
         starts = _starts(problem, p, parameters)
         k1 = k2 = middle
@@ -448,8 +444,8 @@ def eliminate(sums: Sums, prior: Array, damping: Array, score: Array, reduced: A
 
 @kernel
 def find_directions(problem: Problem, path: GyroPath, unknowns: Unknowns,
-                    chosen: NDArray[np.int64], direction: Array) -> None:
-    """Replace `direction` (P, 3) by the best of itself and of those that two matches each fix.
+                    chosen: NDArray[np.int64]) -> None:
+    """Replace each direction by the best of itself and of those that two matches each fix.
 
     `chosen` (K, 2) are large random numbers that pick the matches. The best has the least sum of
     ``min((e / s)^2, limit)``; of each match ``e = normal . b`` and ``s^2 = b^T square b``.
@@ -464,7 +460,7 @@ def find_directions(problem: Problem, path: GyroPath, unknowns: Unknowns,
         least, best = np.inf, (0.0, 0.0, 0.0)
         for h in range(-1, len(chosen)):
             if h < 0:
-                b = rotated(Q_middle, direction[p])
+                b = rotated(Q_middle, unknowns.own[p, :3])
             else:
                 b = cross(normals[chosen[h, 0] % count], normals[chosen[h, 1] % count])
             length = norm(b)
@@ -480,7 +476,8 @@ def find_directions(problem: Problem, path: GyroPath, unknowns: Unknowns,
             if cost < least:
                 least, best = cost, b
         if least < np.inf:
-            direction[p, 0], direction[p, 1], direction[p, 2] = rotated_back(Q_middle, best)
+            own = unknowns.own[p]
+            own[0], own[1], own[2] = rotated_back(Q_middle, best)
 
 
 @kernel

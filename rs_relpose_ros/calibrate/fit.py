@@ -90,9 +90,8 @@ def initial(problem: Problem, R_imu_cam: Array, offset: float, readout: float = 
     parameters[model.BIAS:model.FOCAL] = bias
     # R_imu_cam is contiguous: a transposed one would have the kernels compiled a second time.
     return redirected(problem, Unknowns(
-        parameters, np.ascontiguousarray(R_imu_cam), np.tile([1.0, 0.0, 0.0], (pairs, 1)),
-        np.zeros((pairs, 3)), np.zeros((pairs, 3)), np.full(pairs, noise),
-        np.full(pairs, _DAMPING[0])))
+        parameters, np.ascontiguousarray(R_imu_cam), np.tile(np.eye(9)[0], (pairs, 1)),
+        np.full(pairs, noise), np.full(pairs, _DAMPING[0])))
 
 
 def restarted(problem: Problem, unknowns: Unknowns, caution: float = 1.0) -> Unknowns:
@@ -112,15 +111,16 @@ def stepped(unknowns: Unknowns, step: Array, local: Array = _STAY) -> Unknowns:
     rotation = Rotation.from_rotvec(step[ROTATION:model.BIAS]).as_matrix()
     # At most about a right angle: matches may not determine a step.
     along = np.clip(local[:, :2], -1.0, 1.0)
-    direction = unknowns.direction + np.einsum('pk,pki->pi', along, _tangents(unknowns.direction))
+    direction = unknowns.own[:, :3] + np.einsum('pk,pki->pi', along, _tangents(unknowns))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     return unknowns._replace(
-        parameters=parameters, R_imu_cam=rotation @ unknowns.R_imu_cam, direction=direction,
-        bend=unknowns.bend + local[:, 2:5], turn=unknowns.turn + local[:, 5:])
+        parameters=parameters, R_imu_cam=rotation @ unknowns.R_imu_cam,
+        own=np.hstack([direction, unknowns.own[:, 3:] + local[:, 2:]]))
 
 
-def _tangents(directions: Array) -> Array:
-    """Two unit vectors (P, 2, 3) at right angles to each unit vector (P, 3) and to each other."""
+def _tangents(unknowns: Unknowns) -> Array:
+    """Two unit vectors (P, 2, 3) at right angles to each direction and to each other."""
+    directions = unknowns.own[:, :3]
     first = np.eye(3)[np.argmin(np.abs(directions), axis=1)]
     first = first - (first * directions).sum(axis=1, keepdims=True) * directions
     first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -149,14 +149,12 @@ class Evaluation:
 
 def redirected(problem: Problem, unknowns: Unknowns) -> Unknowns:
     """Unknowns with the best direction of each pair among many that two of its matches fix."""
-    direction = unknowns.direction.copy()
+    moved = unknowns._replace(own=unknowns.own.copy())
     chosen = np.random.default_rng(0).integers(0, 2**30, (_HYPOTHESES, 2))
-    model.find_directions(_through_lens(problem, unknowns), _path(problem, unknowns), unknowns,
-                          chosen, direction)
-    changed = (np.abs((direction * unknowns.direction).sum(axis=1)) < 0.999)[:, None]
-    return unknowns._replace(
-        direction=direction, bend=np.where(changed, 0.0, unknowns.bend),
-        turn=np.where(changed, 0.0, unknowns.turn))
+    model.find_directions(_through_lens(problem, moved), _path(problem, moved), moved, chosen)
+    cosines = (moved.own[:, :3] * unknowns.own[:, :3]).sum(axis=1)
+    moved.own[np.abs(cosines) < 0.999, 3:] = 0.0
+    return moved
 
 
 def evaluate(problem: Problem, unknowns: Unknowns, derivatives: bool = True) -> Evaluation:
@@ -169,14 +167,14 @@ def _sums(problem: Problem, unknowns: Unknowns, derivatives: bool) -> model.Sums
     sums = model.Sums(np.empty(problem.pairs), np.empty(len(problem.rows[0])),
                       np.zeros((size, model.ALL)), np.zeros((size, model.ALL, model.ALL)))
     model.accumulate(_through_lens(problem, unknowns), _path(problem, unknowns), unknowns,
-                     _tangents(unknowns.direction), derivatives, sums)
+                     _tangents(unknowns), derivatives, sums)
     return sums
 
 
 def _evaluation(problem: Problem, unknowns: Unknowns, sums: model.Sums) -> Evaluation:
     """Add the priors of the pairs' own unknowns, and eliminate these."""
     size, weights = len(sums.gradient), _local_priors(problem)
-    own = np.hstack([np.zeros((problem.pairs, 2)), unknowns.bend, unknowns.turn])
+    own = np.hstack([np.zeros((problem.pairs, 2)), unknowns.own[:, 3:]])
     result = Evaluation(
         sums.losses + 0.5 * (weights * own**2).sum(axis=1), sums.residuals,
         np.empty((size, GLOBAL)), np.empty((size, GLOBAL, GLOBAL)),
@@ -271,12 +269,11 @@ def fit(problem: Problem, unknowns: Unknowns, free: NDArray[np.bool_], *, rounds
             # The cost is not convex in the directions: less noise distinguishes more of them.
             unknowns = _chosen(problem, _settled(problem, redirected(problem, unknowns)),
                                _settled(problem, unknowns))[0]
-        at = _Iterate(unknowns, evaluate(problem, unknowns), np.zeros_like(at.newton),
-                      at.damping)
+        at = _Iterate(unknowns, evaluate(problem, unknowns), np.zeros_like(at.newton), at.damping)
     unknowns = at.unknowns._replace(damping=np.zeros(problem.pairs))
     evaluation = evaluate(problem, unknowns)
-    noise = np.repeat(unknowns.noise, np.diff(problem.begin))
-    weights = np.asarray((1.0 + (evaluation.residuals / (model.ROBUST * noise)) ** 2) ** -2)
+    limits = model.ROBUST * unknowns.noise[problem.pair]
+    weights = np.asarray((1.0 + (evaluation.residuals / limits) ** 2) ** -2)
     covariance = np.zeros((GLOBAL, GLOBAL))
     covariance[np.ix_(free, free)] = jackknife(
         evaluation.score[:, free], bent(weights) * evaluation.reduced[:, free][:, :, free],
@@ -309,8 +306,7 @@ def cost_curve(problem: Problem, final: Fit, interval: float,
     information = (final.information * (problem.begin[-1] / final.problem.begin[-1])
                    + np.diag(problem.prior))[np.ix_(final.free, final.free)]
     naive = float(np.linalg.inv(information)[0, 0])
-    return np.array([values,
-                     (costs - costs.min()) * naive / final.covariance[READOUT, READOUT]])
+    return np.array([values, (costs - costs.min()) * naive / final.covariance[READOUT, READOUT]])
 
 
 def _refitted(problem: Problem, unknowns: Unknowns, free: NDArray[np.bool_],
@@ -345,14 +341,12 @@ def _settled(problem: Problem, unknowns: Unknowns) -> Unknowns:
 
 def _chosen(problem: Problem, moved: Unknowns, kept: Unknowns) -> tuple[Unknowns, float]:
     """The calibration of `moved`, each pair with the better of its unknowns in both; the cost."""
-    stay = moved._replace(direction=kept.direction, bend=kept.bend, turn=kept.turn)
+    stay = moved._replace(own=kept.own)
     losses = evaluate(problem, moved, derivatives=False).losses
     others = evaluate(problem, stay, derivatives=False).losses
     better = losses <= others
-    pairs = better[:, None]
     unknowns = moved._replace(
-        direction=np.where(pairs, moved.direction, kept.direction),
-        bend=np.where(pairs, moved.bend, kept.bend), turn=np.where(pairs, moved.turn, kept.turn),
+        own=np.where(better[:, None], moved.own, kept.own),
         damping=np.clip(kept.damping * np.where(better, 0.2, 10.0), *_DAMPING))
     return unknowns, float(np.minimum(losses, others).sum())
 
@@ -498,8 +492,7 @@ def _disagreement(final: Fit) -> Array:
         fit(final.problem.pairs_of(part), final.unknowns.pairs_of(part), free, rounds=15)
         for part in (first, ~first))
     difference = one.unknowns.parameters - other.unknowns.parameters
-    difference[ROTATION:model.BIAS] = log_so3(
-        one.unknowns.R_imu_cam @ other.unknowns.R_imu_cam.T)
+    difference[ROTATION:model.BIAS] = log_so3(one.unknowns.R_imu_cam @ other.unknowns.R_imu_cam.T)
     # The whole lets expect four times its own; less than half of that is chance, of few stretches.
     variances = np.maximum(np.diag(one.covariance + other.covariance),
                            2.0 * np.diag(final.covariance))
@@ -529,8 +522,7 @@ def _perturbed(final: Fit, errors: ModelErrors) -> Iterator[tuple[Problem, Unkno
         for j in range(i + 1):
             mixing = np.zeros((3, 3))
             mixing[i, j] = mixing[j, i] = errors.gyro_scale if i == j else errors.gyro_skew
-            yield problem._replace(
-                gyro_rates=problem.gyro_rates @ (np.eye(3) + mixing)), unknowns
+            yield problem._replace(gyro_rates=problem.gyro_rates @ (np.eye(3) + mixing)), unknowns
 
 
 # Sigma of the direction of motion of a pair by the noise of its matches [rad], at the most.

@@ -468,7 +468,6 @@ def _aligned(estimated: Array, measured: Array, offset: float, focal_factor: flo
             R = so3.aligning_rotation(C)
         squares = ((a - b @ R.T)**2).sum(axis=1)
         both = float((a[kept]**2).sum()) + float((b[kept]**2).sum())
-        start = start._replace(
-            R_cam_imu=R, misfit=float(squares[kept].sum()) / max(both, 1e-12))
+        start = start._replace(R_cam_imu=R, misfit=float(squares[kept].sum()) / max(both, 1e-12))
         kept = squares <= 9.0 * max(float(np.median(squares)), 1e-10)
     return start

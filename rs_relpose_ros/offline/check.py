@@ -20,7 +20,7 @@ from rs_relpose_ros.imu.buffer import length_fault
 from rs_relpose_ros.messages.incoming import Role, sensor_messages
 from rs_relpose_ros.messages.transforms import with_extrinsics
 from rs_relpose_ros.offline import check_recording
-from rs_relpose_ros.offline.check_recording import Completion, SampleRun, Scan, Stamps
+from rs_relpose_ros.offline.check_recording import Completion, Sample, Scan, Stamps
 from rs_relpose_ros.pipeline.assessment import not_evaluated
 from rs_relpose_ros.pipeline.findings import Assessment, BY_NAME, Finding, FindingState
 
@@ -85,15 +85,12 @@ def check_bag(bag: Bag, chosen: Chosen, parameters: Parameters) -> CheckReport:
     parameters, contradiction = with_extrinsics(bag, chosen, parameters)
     scan = Scan(images, parameters.intrinsics)
     completion, sample, topics = Completion(parameters), None, None
+    source = scan.added(sensor_messages(bag, chosen))
     if chosen.image is not None and chosen.imu is not None:
         topics = SensorTopics(chosen.image, chosen.camera_info, chosen.imu, chosen.accel, None)
         completion = check_recording.completed(bag, topics, parameters)
         if not completion.parameters.sensor.missing():
-            sample = SampleRun(images, completion.parameters)
-
-    source = scan.added(sensor_messages(bag, chosen))
-    if sample is not None:
-        sample.run(source)
+            sample = check_recording.sampled(source, images, completion.parameters)
     for _ in source:   # all of it without a sample
         pass
     findings = [_topics(bag, chosen, parameters), _parameters(parameters)]
@@ -381,7 +378,7 @@ _READOUT = frozenset(('readout_time', 'readout_direction'))
 _SET_BY = {'quat_cam_imu_xyzw': 'axes', 'readout_time': 'readout_time'}
 
 
-def joint_findings(scan: Scan, sample: SampleRun | None, completion: Completion,
+def joint_findings(scan: Scan, sample: Sample | None, completion: Completion,
                    parameters: Parameters) -> list[Finding]:
     """Findings on both sensors together.
 
@@ -425,10 +422,9 @@ def _overlap(scan: Scan, parameters: Parameters) -> Finding:
              'the delays differ: verify that both stamp the time of measurement'))
 
 
-def _pairs(sample: SampleRun, health: Assessment) -> Finding:
+def _pairs(sample: Sample, health: Assessment) -> Finding:
     pairs, posed = len(sample.matches), sample.poses
-    reason = next(iter((sample.poseless if pairs else sample.reasons).most_common()),
-                  'too few images were processed')
+    reason = next(iter(sample.reasons.most_common()), 'too few images were processed')
     return by_case(
         'pairs', f'{pairs} pairs in {sample.frames} images, {posed} with a pose',
         {'images': sample.frames, 'pairs': pairs, 'poses': posed},
@@ -442,7 +438,7 @@ def _pairs(sample: SampleRun, health: Assessment) -> Finding:
              f'; without: {reason}'))
 
 
-def _texture(sample: SampleRun, health: Assessment) -> Finding:
+def _texture(sample: Sample, health: Assessment) -> Finding:
     if not sample.matches:
         return Finding('texture', UNKNOWN, 'not measured: there is no pair of images', measured={})
     median = float(np.median(sample.matches))
@@ -459,7 +455,7 @@ def _texture(sample: SampleRun, health: Assessment) -> Finding:
              f', fewer than {_FEW_MATCHES} in {100 * poor:.0f} %'))
 
 
-def _with_calibration(sample: SampleRun, scan: Scan, completion: Completion) -> Assessment:
+def _with_calibration(sample: Sample, scan: Scan, completion: Completion) -> Assessment:
     """Findings of the sample; if it is lost, the parameters that a calibration contradicts."""
     found, health = completion.found, sample.health
     # No calibration finds another unit, nor axes that no rotation corrects.

@@ -31,7 +31,7 @@ from rs_relpose_ros.messages.incoming import Intake, PARTS, ReasonCounts, Role, 
 from rs_relpose_ros.offline.replay import MessageRefused, outcomes
 from rs_relpose_ros.pipeline import findings
 from rs_relpose_ros.pipeline.findings import Assessment, BY_NAME, Finding, FindingState
-from rs_relpose_ros.pipeline.pair import Frame, PairResult
+from rs_relpose_ros.pipeline.pair import Frame
 from rs_relpose_ros.pipeline.pipeline import FrontEnd
 from rs_relpose_ros.pipeline.warm_up import warm_up
 from rs_relpose_ros.tracking.images import EncodedImage
@@ -254,82 +254,77 @@ def _contradiction(name: str, configured: float, estimated: float, sigma: float,
                    configured, estimated, sigma, quantity.unit, True)
 
 
-class SampleRun:
+class Sample(NamedTuple):
+    """What the front end made of parts of a recording."""
+
+    frames: int
+    matches: list[int]      # of each pair
+    poses: int
+    reasons: ReasonCounts   # of frames that were not used, or of pairs without a pose
+    health: Assessment      # of each quantity the worst finding of all parts
+    is_refused: bool        # hardly any image could be used
+
+    @property
+    def few_poses(self) -> bool:
+        """Whether many pairs have no pose."""
+        return self.poses < _MOST_POSED * len(self.matches)
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether a deviation may be too large to be estimated from pairs."""
+        return bool(self.matches) and (self.few_poses or not _FAR_OFF.isdisjoint(
+            fault.quantity for fault in self.health.faults))
+
+
+def sampled(source: Iterable[tuple[Role, BagMessage]], images: int,
+            parameters: Parameters) -> Sample:
     """Parts of a recording of so many `images` through the front end.
 
     Parameters are used as configured: nothing is tracked, nothing is suppressed.
     """
+    warm_up(parameters.estimator)
+    parameters = parameters.updated({'withhold_when_wrong': False, 'track_time_offset': False,
+                                     'track_readout_time': False})
+    front_end = FrontEnd(parameters, offline=True)
+    # Indices of the first images of the parts, which overlap in a short recording.
+    firsts = [part * max(images - _PART_IMAGES, 0) // (_PARTS - 1) for part in range(_PARTS)]
+    unused, poseless, matches, poses = ReasonCounts(), ReasonCounts(), list[int](), 0
+    handed = done = frames = part_since_ns = last_ns = 0
+    before = findings.NOT_EVALUATED   # of the settled parts
 
-    def __init__(self, images: int, parameters: Parameters) -> None:
-        warm_up(parameters.estimator)
-        configured = parameters.updated({
-            'withhold_when_wrong': False, 'track_time_offset': False,
-            'track_readout_time': False})
-        self._front_end = FrontEnd(configured, offline=True)
-        self._intake = Intake(self._front_end.sequencer, configured)
-        # Indices of the first images of the parts, which overlap in a short recording.
-        self._firsts = [part * max(images - _PART_IMAGES, 0) // (_PARTS - 1)
-                        for part in range(_PARTS)]
-        self._before = findings.NOT_EVALUATED   # of the settled parts
-        self._last: PairResult | None = None
-        self._part_since_ns = 0
-        self.frames = self._handed = self._done = 0
-        self.reasons = ReasonCounts()   # of frames that were not used
-        self.matches: list[int] = []   # of each pair
-        self.poses = 0
-        self.poseless = ReasonCounts()   # reasons of pairs without a pose
-        # Whether hardly any image could be used; many pairs have no pose; a deviation may be too
-        # large to be estimated from pairs.
-        self.is_refused = self.few_poses = self.is_lost = False
-
-    def run(self, source: Iterable[tuple[Role, BagMessage]]) -> None:
-        """Process the messages of the bag; those that cannot be used are counted."""
-        for outcome in outcomes(self._front_end, self._intake, self._chosen(source)):
-            if isinstance(outcome, MessageRefused):
-                self.reasons.add(str(outcome.error))
-                continue
-            self._done += 1
-            if not isinstance(outcome, Frame):
-                self.reasons.add(outcome.reason)
-                continue
-            self.frames += 1
-            pair = outcome.result
-            if pair is None:
-                continue
-            self.matches.append(len(pair.matches))
-            if pair.pose:
-                self.poses += 1
-            else:
-                self.poseless.add(pair.pose.reason)
-            last, self._last = self._last, pair
-            if last is None or not 0 <= pair.stamp_ns - last.stamp_ns < _APART_NS:
-                self._before = findings.worst_of(self._before, pair.health)
-                self._part_since_ns = pair.stamp_ns
-            if pair.stamp_ns - self._part_since_ns >= _SETTLED_NS:
-                self._before = self.health
-        self.is_refused = self.frames < _FEW_USED * self._handed
-        self.few_poses = self.poses < _MOST_POSED * len(self.matches)
-        self.is_lost = bool(self.matches) and (self.few_poses or not _FAR_OFF.isdisjoint(
-            fault.quantity for fault in self.health.faults))
-
-    @property
-    def health(self) -> Assessment:
-        """Of each quantity the worst finding of all parts."""
-        return findings.worst_of(self._before, self._front_end.health)
-
-    def _chosen(self, source: Iterable[tuple[Role, BagMessage]],
-                ) -> Iterator[tuple[Role, BagMessage]]:
+    def chosen() -> Iterator[tuple[Role, BagMessage]]:
         """The messages without the images that belong to no part."""
+        nonlocal handed
         index = -1
         for role, message in source:
-            if role is Role.IMAGE:
-                index += 1
-                if not any(0 <= index - first < _PART_IMAGES for first in self._firsts) or (
-                        self._handed - self._done >= _MOST_WAITING):
-                    try:
-                        self._front_end.sequencer.pass_over(stamp_ns(message.message.header))
-                    except RsRelposeError as error:
-                        self.reasons.add(str(error))
-                    continue
-                self._handed += 1
+            index += role is Role.IMAGE
+            if role is Role.IMAGE and (handed - done >= _MOST_WAITING or not any(
+                    0 <= index - first < _PART_IMAGES for first in firsts)):
+                try:
+                    front_end.sequencer.pass_over(stamp_ns(message.message.header))
+                except RsRelposeError as error:
+                    unused.add(str(error))
+                continue
+            handed += role is Role.IMAGE
             yield role, message
+
+    for outcome in outcomes(front_end, Intake(front_end.sequencer, parameters), chosen()):
+        done += not isinstance(outcome, MessageRefused)
+        if not isinstance(outcome, Frame):
+            unused.add(str(outcome.error) if isinstance(outcome, MessageRefused)
+                       else outcome.reason)
+            continue
+        frames += 1
+        if (pair := outcome.result) is None:
+            continue
+        poses += bool(pair.pose)
+        if not pair.pose:
+            poseless.add(pair.pose.reason)
+        if not matches or not 0 <= pair.stamp_ns - last_ns < _APART_NS:
+            before, part_since_ns = findings.worst_of(before, pair.health), pair.stamp_ns
+        if pair.stamp_ns - part_since_ns >= _SETTLED_NS:
+            before = findings.worst_of(before, front_end.health)
+        matches.append(len(pair.matches))
+        last_ns = pair.stamp_ns
+    return Sample(frames, matches, poses, poseless if matches else unused,
+                  findings.worst_of(before, front_end.health), frames < _FEW_USED * handed)
