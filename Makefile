@@ -50,6 +50,8 @@ lint: $(test_stamp)
 	$(bin)/ruff check .
 	$(bin)/mypy
 
+# The kernels, which need nothing of ROS, are compiled meanwhile. A failure there is reported by the
+# last step, which does what is left.
 # Removed, a sixth of the environment: the libraries' own tests, GTSAM's data sets, headers, and two
 # of three copies of Fast DDS, which are links outside a wheel.
 $(stamp): export PYTHONDONTWRITEBYTECODE :=
@@ -58,12 +60,16 @@ $(stamp): requirements/base.txt requirements/demo.txt $(CONSTRAINTS) setup.py se
 	    { echo '$(PYTHON) is no Python 3.11 or later; choose one: make PYTHON=python3.12 ...' >&2; exit 1; }
 	@echo 'Setting up $(VENV): a minute or two and 0.8 GB.'
 	@$(bin)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)
-	$(pip) install --no-compile -r requirements/demo.txt $(CONSTRAINTS:%=-c %)
+	grep -v -e '^#' -e '^ros-' requirements/base.txt | \
+	    xargs $(pip) install --no-compile $(CONSTRAINTS:%=-c %)
+	$(bin)/python -m rs_relpose_ros.pipeline.warm_up & kernels=$$!; \
+	$(pip) install --no-compile -r requirements/demo.txt $(CONSTRAINTS:%=-c %) && \
 	find $(VENV)/lib -type d '(' -name tests -o -name gtsam_unstable -o -path '*/gtsam/Data' ')' \
-	    -prune -exec rm -rf {} +
-	rm -rf $(VENV)/include
-	find $(VENV)/lib -maxdepth 1 '(' -name libfastrtps.so -o -name 'libfastrtps.so.*.*.*' ')' -delete
-	$(bin)/python -c 'import $(first_run)'
+	    -prune -exec rm -rf {} + && \
+	rm -rf $(VENV)/include && \
+	find $(VENV)/lib -maxdepth 1 '(' -name libfastrtps.so -o -name 'libfastrtps.so.*.*.*' ')' -delete && \
+	$(bin)/python -c 'import $(first_run)'; \
+	installed=$$?; wait $$kernels; exit $$installed
 	$(pip) install --no-deps --no-build-isolation --editable .
 	touch $@
 

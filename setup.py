@@ -14,7 +14,7 @@ NAME = 'rs_relpose_ros'
 LABORATORY = 'rs_relpose_lab'
 # Module -> call in it that compiles the kernels of a node with its default parameters.
 WARM_UPS = {
-    'pipeline.warm_up': 'fill_cache()',
+    'pipeline.warm_up': 'cache_is_filled() or module.fill_cache()',
     'calibrate.procedure': 'warm_up_fit()',
     'pipeline.global_shutter': 'warm_up_unroller(module.Parameters())',
     'odometry.pair': 'warm_up_odometry()',
@@ -41,14 +41,17 @@ def compile_kernels(folder: str) -> None:
     paths = [path for path in os.environ.get('PYTHONPATH', '').split(os.pathsep)
              if path and not (Path(path) / 'sitecustomize.py').exists()]
     environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(paths)}
-    for module, call in WARM_UPS.items():
-        command = f'import {NAME}.{module} as module; module.{call}'
-        filled = subprocess.run([sys.executable, '-c', command], cwd=folder, env=environment,
-                                stderr=subprocess.PIPE, text=True, check=False)
-        if filled.returncode:
-            reason = (filled.stderr.splitlines() or ['no reason given'])[-1]
-            logging.getLogger(NAME).warning(
-                'kernels will be compiled by the first start of the node: %s', reason)
+    commands = [[sys.executable, '-c', f'import {NAME}.{module} as module; module.{call}']
+                for module, call in WARM_UPS.items()]
+    # The first one uses two cores, and has most of what the others need.
+    for group in (commands[:1], commands[1:]):
+        for process in [subprocess.Popen(command, cwd=folder, env=environment, text=True,
+                                         stderr=subprocess.PIPE) for command in group]:
+            _, errors = process.communicate()
+            if process.returncode:
+                reason = (errors.splitlines() or ['no reason given'])[-1]
+                logging.getLogger(NAME).warning(
+                    'kernels will be compiled by the first start of the node: %s', reason)
 
 
 class BuildWithKernels(build_py):

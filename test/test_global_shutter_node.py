@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from rs_relpose_lab.live.graph import diagnostic_values, Graph
-from rs_relpose_lab.live.processes import node_process, Process, wait_until, wait_until_quiet
+from rs_relpose_lab.live.processes import node_process, wait_until, wait_until_quiet
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.messages.incoming import Intake, sensor_messages
@@ -139,22 +139,6 @@ def test_diagnostics_count_all_frames(session):
     assert 0.0 < float(values['latency_p50_ms']) <= float(values['latency_p99_ms'])
     # At most that the machine was busy, and that the player came late.
     assert session.output.count('[WARN]') <= 2 and '[ERROR]' not in session.output
-
-
-def test_other_images_of_the_same_driver_are_reported(ros_domain_id):
-    def started(namespace: str, clock: str) -> Process:
-        return node_process(
-            BUNDLED_PARAMETERS, remap={**BAG_TOPICS, '__ns': namespace},
-            node='global_shutter_node',
-            parameters={'image_transport': 'raw', 'stamp_clock': clock})
-
-    with Graph() as graph:
-        for topic in ('/camera/image_raw', '/camera/depth'):
-            graph.node.create_publisher(Image, topic, 1)
-        with started('/a', 'imu') as node, started('/b', 'camera') as silent:
-            silent.wait_for('ready')
-            node.wait_for('/camera/depth of the same driver keep stamps on the clock of the camer')
-            assert 'same driver' not in silent.output
 
 
 def status_of_relpose(state: str) -> DiagnosticArray:

@@ -414,12 +414,13 @@ class ImuBuffer(ImuSamples):
 
 
 def frame_imu(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_cam_imu: Array,
-              previous_reference_ns: int | None = None, exposure: float = 0.0) -> FrameImu:
+              previous_reference_ns: int | None = None, exposure: float = 0.0, *,
+              gyro_only: bool = False) -> FrameImu:
     """The IMU's share of a frame; all times are on the IMU clock, ``v_cam = R_cam_imu v_imu``.
 
     `span_ns`: from the first row's exposure to the end of the last one's; `reference_ns`,
     `previous_reference_ns`: of the stamped rows of this frame and the one before; `exposure`
-    [s]: of a row.
+    [s]: of a row; `gyro_only`: without gravity and specific force.
     """
     half = to_nanoseconds(0.5 * exposure)
     start_ns, end_ns = span_ns = span_ns[0] + half, span_ns[1] - half   # of the rows' times
@@ -431,7 +432,7 @@ def frame_imu(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_
         motion = FrameMotion(rates[0])
     gravity_sigma = None
     # Causal up to the last row, then propagated back to the stamped row.
-    estimate = buffer.gravity(end_ns)
+    estimate = None if gyro_only else buffer.gravity(end_ns)
     if estimate is not None:
         R = motion.rotations([(end_ns - reference_ns) * 1e-9])[0]
         motion = validate.replaced(motion, gravity=R @ (R_cam_imu @ estimate.direction))
@@ -445,8 +446,9 @@ def frame_imu(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_
         since_previous = GyroSegment(stamps_ns, rates @ R_cam_imu.T, R_cam_imu @ bias.value,
                                      bias.sigma)
     return FrameImu(motion, gravity_sigma, reference_ns, since_previous, exposure=exposure,
-                    force=_frame_force(buffer, span_ns, reference_ns, R_cam_imu, motion,
-                                       previous_reference_ns, estimate))
+                    force='not needed' if gyro_only else _frame_force(
+                        buffer, span_ns, reference_ns, R_cam_imu, motion, previous_reference_ns,
+                        estimate))
 
 
 def _frame_force(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_cam_imu: Array,

@@ -139,17 +139,26 @@ def frame_id_of_cdr(data: bytes) -> str:
     return data[_HEADER.size:end].decode(errors='replace')
 
 
+def stamp_of_cdr(data: bytes) -> int:
+    """Stamp [ns] of the CDR of a message with a header."""
+    try:
+        encoding, seconds, nanoseconds, _ = _HEADER.unpack_from(data)
+    except struct.error as error:
+        raise InputError(f'the CDR of a message is too short: {error}') from None
+    if encoding != _LITTLE_ENDIAN:
+        raise InputError('the CDR of a message is not little-endian')
+    return _nanoseconds(seconds, nanoseconds)
+
+
 def _imu_of_cdr(data: bytes) -> tuple[int, tuple[float, ...]]:
     """Stamp [ns] and numbers of a sensor_msgs/Imu, sooner than by its deserialisation."""
+    stamp = stamp_of_cdr(data)
+    # Aligned to 8 bytes from the end of kind and options (4).
+    start = 4 - -(_HEADER.size - 4 + _HEADER.unpack_from(data)[3]) // 8 * 8
     try:
-        encoding, seconds, nanoseconds, size = _HEADER.unpack_from(data)
-        # Aligned to 8 bytes from the end of kind and options (4).
-        numbers = _IMU_NUMBERS.unpack_from(data, 4 - -(_HEADER.size - 4 + size) // 8 * 8)
+        return stamp, _IMU_NUMBERS.unpack_from(data, start)
     except struct.error as error:
         raise InputError(f'the CDR of an IMU message is too short: {error}') from None
-    if encoding != _LITTLE_ENDIAN:
-        raise InputError('the CDR of an IMU message is not little-endian')
-    return _nanoseconds(seconds, nanoseconds), numbers
 
 
 def _orientation(quat_xyzw: Sequence[float], first: float,

@@ -12,7 +12,6 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.messages import outgoing
-from rs_relpose_ros.messages.incoming import PARTS, Role
 from rs_relpose_ros.nodes.diagnostics import (
     ERROR,
     FrameStatistics,
@@ -21,7 +20,7 @@ from rs_relpose_ros.nodes.diagnostics import (
     RELATIVE_POSE,
     WARN,
 )
-from rs_relpose_ros.nodes.inputs import message_class
+from rs_relpose_ros.nodes.inputs import message_class, Serialised
 from rs_relpose_ros.nodes.sensor_node import run_node, SensorNode
 from rs_relpose_ros.pipeline import global_shutter
 from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState, NOT_EVALUATED
@@ -34,7 +33,6 @@ NAME = 'global_shutter_node'
 _DEPTH = 10
 # Age of a state of relpose_node, which comes once a second [s].
 _FRESH = 3.0
-_IMAGE_TYPES = PARTS[Role.IMAGE].msgtypes
 _DESCRIPTION = (
     'Derotated images of a rolling-shutter camera: every row rotated by the gyro to the time of\n'
     'the middle one.\n\n'
@@ -108,11 +106,11 @@ class GlobalShutterNode(SensorNode):
             return self.create_publisher(
                 message_class(msgtype), topic, QoSProfile(depth=_DEPTH),
                 qos_overriding_options=QoSOverridingOptions.with_default_policies())
-        self._image, self._compressed = (
-            publisher(msgtype, topic) for msgtype, topic in zip(
-                _IMAGE_TYPES, ('~/image', '~/image/compressed'), strict=True))
-        self._mask = publisher(_IMAGE_TYPES[0], '~/mask')
-        self._camera_info = publisher('sensor_msgs/msg/CameraInfo', '~/camera_info')
+        self._image, self._compressed, self._mask, self._camera_info = (
+            publisher(f'sensor_msgs/msg/{name}', f'~/{topic}') for name, topic in (
+                ('Image', 'image'), ('CompressedImage', 'image/compressed'), ('Image', 'mask'),
+                ('CameraInfo', 'camera_info')))
+        self._images, self._camera_infos = Serialised(), Serialised()
         self._log_health = HealthLog(self._info, self._warn, self._error, 'images')
 
     def _make_loop(self, parameters: Parameters) -> FrameLoop[global_shutter.GlobalShutterFrame]:
@@ -121,11 +119,6 @@ class GlobalShutterNode(SensorNode):
 
     def _warm_up(self) -> None:
         global_shutter.warm_up_unroller(self._settings.current)
-
-    def _on_ready(self) -> None:
-        if self._settings.current.global_shutter.stamp_clock == 'imu':
-            self._sibling_timer = self.create_timer(1.0, self._look_for_siblings,
-                                                    clock=self._steady)
 
     def _on_processed(self, frame: Frame[global_shutter.GlobalShutterFrame]) -> None:
         result = frame.result
@@ -154,47 +147,26 @@ class GlobalShutterNode(SensorNode):
 
     def _publish(self, frame: global_shutter.GlobalShutterFrame) -> None:
         """Publish the topics that are subscribed."""
-        header = frame.stamp_ns, frame.frame_id
+        stamp_ns, frame_id, intrinsics = frame.stamp_ns, frame.frame_id, frame.intrinsics
         raw, compressed, mask = (topic.get_subscription_count() for topic in (
             self._image, self._compressed, self._mask))
         if raw or compressed:
             pixels = frame.image()
             if raw:
-                self._image.publish(outgoing.image_message(*header, pixels, message_class))
+                self._image.publish(self._images(
+                    stamp_ns, (frame_id, pixels.values.shape, pixels.encoding), partial(
+                        outgoing.image_message, 0, frame_id, pixels, message_class),
+                    pixels.values.tobytes()))
             if compressed:
                 self._compressed.publish(outgoing.compressed_image_message(
-                    *header, pixels, png=frame.is_png, types=message_class))
-        self._camera_info.publish(outgoing.camera_info_message(
-            *header, frame.intrinsics, self._intake.camera_info_of(frame.intrinsics),
-            message_class))
+                    stamp_ns, frame_id, pixels, png=frame.is_png, types=message_class))
+        published = self._intake.camera_info_of(intrinsics)
+        self._camera_info.publish(self._camera_infos(
+            stamp_ns, (frame_id, intrinsics, published), partial(
+                outgoing.camera_info_message, 0, frame_id, intrinsics, published, message_class)))
         if mask:
-            self._mask.publish(outgoing.image_message(*header, frame.mask(), message_class))
-
-    def _look_for_siblings(self) -> None:
-        """Warn of other images of the same driver, whose stamps stay on the camera's clock."""
-        assert self._inputs is not None
-        own = next(iter(self._inputs.topics.values()))
-        drivers = self._publishing_nodes(own)
-        if not drivers:
-            return
-        self.destroy_timer(self._sibling_timer)
-        base = own.removesuffix('/compressed')
-        # Transports of the same image lie below it.
-        others = sorted(
-            name for name, types in self.get_topic_names_and_types()
-            if set(types) & set(_IMAGE_TYPES) and not f'{name}/'.startswith(f'{base}/')
-            and drivers & self._publishing_nodes(name))
-        if others:
-            self._warn(
-                f'{", ".join(others)} of the same driver keep stamps on the clock of the camera, '
-                "while those of the derotated images are on the IMU's: set stamp_clock: camera "
-                'where they are used together (depth, stereo)')
-
-    def _publishing_nodes(self, topic: str) -> set[tuple[str, str]]:
-        """Namespaces and names of the publishers of a topic, as far as they are known by now."""
-        return {(info.node_namespace, info.node_name)
-                for info in self.get_publishers_info_by_topic(topic)
-                if info.node_namespace.startswith('/')}
+            self._mask.publish(outgoing.image_message(
+                stamp_ns, frame_id, frame.mask(), message_class))
 
 
 main = partial(run_node, GlobalShutterNode, NAME, _DESCRIPTION)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable
+from contextlib import ExitStack
 import functools
 from functools import partial
 import importlib
+import struct
 import time
 from typing import Any, TYPE_CHECKING
 
@@ -14,11 +16,12 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidHandle
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from rclpy.serialization import deserialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.time import Time
 
 from rs_relpose_ros.errors import MissingInputError
@@ -29,48 +32,123 @@ from rs_relpose_ros.nodes.diagnostics import INVALID, SILENCE, TOPICS
 if TYPE_CHECKING:
     from rs_relpose_ros.calibrate.live import LiveCalibration
 
-# -- Subscriptions that are read on demand --------------------------------------------------------
+# -- Few wake-ups, and cheap ones -----------------------------------------------------------------
 #
-# A wake-up costs rclpy more than the message itself, because it builds a new wait set of all
-# entities of the node. An IMU would wake it hundreds of times a second, while its samples are
-# needed only when a frame waits for them, some thirty times. Until then they stay in the queue of
-# the middleware.
+# For each message rclpy builds two wait sets of all entities of the node, in Python: that costs
+# more than the message. `KeptWaitSet` lists them once. An IMU would still wake it hundreds of
+# times a second, while its samples are needed only when a frame waits for them, some thirty times.
+# Until then they stay in the queue of the middleware.
+
+# Period [s] at which events, such as a publisher whose QoS does not match, are looked for: rclpy
+# logs them.
+_EVENTS_PERIOD = 1.0
+
+
+class KeptWaitSet(SingleThreadedExecutor):
+    """Executor of one node that calls subscriptions and timers itself, and rclpy for the rest.
+
+    Its lists are kept until an entity is made or destroyed, which triggers the guard of rclpy's
+    executor.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._in_use = ExitStack()   # handles that must not be destroyed
+        self._wait_set: Any = None
+        self._events_at = 0.0
+
+    def spin_once(self, timeout_sec: float | None = None) -> None:
+        """Wait without a time limit for something to do, and do it."""
+        if self._wait_set is None:
+            self._list_entities()
+        wait_set, now = self._wait_set, time.monotonic()
+        wait_set.clear_entities()
+        wait_set.add_guard_condition(self._guard.handle)
+        for timer in self._timers:
+            wait_set.add_timer(timer.handle)
+        for service in self._services:
+            wait_set.add_service(service.handle)
+        for subscription in self._subscriptions:
+            group = subscription.callback_group
+            if not isinstance(group, _WhileUrgent) or group.can_execute(subscription):
+                wait_set.add_subscription(subscription.handle)
+        events = self._events if now > self._events_at + _EVENTS_PERIOD else ()
+        for event in events:
+            self._events_at = now
+            event.add_to_wait_set(wait_set)
+        wait_set.wait(-1)
+        if not self.context.ok():
+            raise ExternalShutdownException
+        if (wait_set.get_ready_entities('guard_condition')
+                or wait_set.get_ready_entities('service')
+                or any(event.is_ready(wait_set) for event in events)):
+            self.release()
+            super().spin_once(0.0)
+            self._cb_iter = None   # forget what else was ready
+            return
+        ready = wait_set.get_ready_entities('timer')
+        for timer in self._timers if ready else ():
+            if timer.handle.pointer in ready and timer.handle.is_timer_ready():
+                timer.handle.call_timer()
+                timer.callback()
+        ready = wait_set.get_ready_entities('subscription')
+        for subscription in self._subscriptions if ready else ():
+            if subscription.handle.pointer in ready:
+                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+                if taken is not None:
+                    subscription.callback(taken[0])
+
+    def release(self) -> None:
+        """Let entities be destroyed; the next `spin_once` lists them again."""
+        self._in_use.close()
+        self._wait_set = None
+
+    def _list_entities(self) -> None:
+        node, = self.get_nodes()
+        self._timers, self._services = [*node.timers], [*node.services]
+        self._subscriptions, self._events = [*node.subscriptions], [*node.waitables]
+        handled: Any = (*self._timers, *self._services, *self._subscriptions, self._guard,
+                        self.context)
+        for used in (*(entity.handle for entity in handled), *self._events):
+            self._in_use.enter_context(used)
+        self._wait_set = rclpy_implementation.WaitSet(
+            len(self._subscriptions), 1, len(self._timers), 0, len(self._services),
+            sum(event.get_num_entities().num_events for event in self._events),
+            self.context.handle)
+
 
 # Most messages that are taken at once, so that other callbacks get their turn.
 _MOST_AT_ONCE = 2000
-# Bytes of CDR before the frame_id of a message with a header: encapsulation (4) and stamp (8).
-_STAMPED = 12
+# Bytes of a serialised message with a header before its stamp, and before its frame_id.
+_STAMP, _STAMPED = 4, 12
 
 
 class PolledSubscription:
     """A subscription that is read by `drain`, and wakes the executor only while it is urgent.
 
-    `receive` gets each message, or its bytes with `raw` among the `options`, which are those of
+    `receive` gets the messages, or their bytes with `raw` among the `options`, which are those of
     ``create_subscription``; `urgent` is called before the executor waits. The depth of `qos` must
     hold the messages between two calls of `drain`.
     """
 
     def __init__(self, node: Node, msgtype: type, topic: str, qos: QoSProfile,
-                 receive: Callable[[Any], None], urgent: Callable[[], bool],
+                 receive: Callable[[list[Any]], None], urgent: Callable[[], bool],
                  **options: Any) -> None:
         self._receive = receive
         self._subscription = node.create_subscription(
-            msgtype, topic, self._on_message, qos, callback_group=_WhileUrgent(urgent),
+            msgtype, topic, self.drain, qos, callback_group=_WhileUrgent(urgent),
             **options)
 
-    def drain(self) -> None:
-        """Receive all messages of the queue."""
-        subscription = self._subscription
+    def drain(self, *received: Any) -> None:
+        """Receive all messages of the queue, after those that the executor has taken from it."""
+        subscription, messages = self._subscription, [*received]
         with subscription.handle:
-            for _ in range(_MOST_AT_ONCE):
-                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
-                if taken is None:
-                    return
-                self._receive(taken[0])
-
-    def _on_message(self, msg: Any) -> None:
-        self._receive(msg)
-        self.drain()
+            take = subscription.handle.take_message
+            while (len(messages) < _MOST_AT_ONCE and (taken := take(
+                    subscription.msg_type, subscription.raw)) is not None):
+                messages.append(taken[0])
+        if messages:
+            self._receive(messages)
 
 
 class _WhileUrgent(CallbackGroup):
@@ -105,6 +183,26 @@ def message_class(msgtype: str) -> Any:
     except (ImportError, AttributeError):
         raise MissingInputError(f'message type {msgtype} is not installed; install its package, '
                                 'or choose other topics') from None
+
+
+class Serialised:
+    """Serialises messages of a topic that differ in their stamps and their ends alone.
+
+    rclpy takes a tenth of the time for bytes that it takes for a message with its parts.
+    """
+
+    def __init__(self) -> None:
+        self._key: Any = None
+        self._bytes = b''
+
+    def __call__(self, stamp_ns: int, key: Any, make: Callable[[], Any],
+                 end: bytes = b'') -> bytes:
+        """The message that `make` returns for another `key` than before, with `end` at its end."""
+        if key != self._key:
+            self._key, self._bytes = key, serialize_message(make())
+        return b''.join((
+            self._bytes[:_STAMP], struct.pack('=iI', *divmod(stamp_ns, NANOSECONDS)),
+            self._bytes[_STAMPED:len(self._bytes) - len(end)], end))
 
 
 def transform_broadcaster(node: Node, parameter: str) -> Any:
@@ -222,7 +320,7 @@ class SensorInputs:
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
         self._imu = [PolledSubscription(
             node, types[role], role.value, best_effort(_IMU_DEPTH),
-            partial(self._on_sample, role), lambda: self._intake.waits_for_imu(), raw=True,
+            partial(self._on_samples, role), lambda: self._intake.waits_for_imu(), raw=True,
             qos_overriding_options=overridable())
             for role in (Role.IMU, Role.ACCEL)]
         node.create_subscription(
@@ -254,19 +352,21 @@ class SensorInputs:
         self._drain()
         self._timer.reset()   # no wake-up of its own while images come
 
-    def _on_info(self, data: bytes, *, latched: bool) -> None:
-        """Receive a serialised CameraInfo that differs by more than its stamp: few do."""
+    def _on_info(self, messages: list[bytes], *, latched: bool) -> None:
+        """Receive each serialised CameraInfo that differs by more than its stamp: few do."""
         if not latched:
-            self._count(Role.CAMERA_INFO)
-        if data[_STAMPED:] != self._last_info:
-            self._last_info = data[_STAMPED:]
-            self._info = deserialize_message(data, self._info_type)
-            self._receive(Role.CAMERA_INFO, self._info)
+            self._count(Role.CAMERA_INFO, len(messages))
+        for data in messages:
+            if data[_STAMPED:] != self._last_info:
+                self._last_info = data[_STAMPED:]
+                self._info = deserialize_message(data, self._info_type)
+                self._receive(Role.CAMERA_INFO, self._info)
 
-    def _on_sample(self, role: Role, data: bytes) -> None:
-        self._count(role)
-        self.frame_ids[role] = frame_id_of_cdr(data)
-        self._receive(role, data)
+    def _on_samples(self, role: Role, messages: list[bytes]) -> None:
+        self._count(role, len(messages))
+        self.frame_ids[role] = frame_id_of_cdr(messages[-1])
+        for data in messages:
+            self._receive(role, data)
 
     def _receive(self, role: Role, message: Any) -> None:
         error = self._intake.receive(role, message)
@@ -274,8 +374,8 @@ class SensorInputs:
             self.counts[INVALID] += 1
             self._on_invalid(str(error))
 
-    def _count(self, role: Role) -> None:
-        self.counts[role] += 1
+    def _count(self, role: Role, messages: int = 1) -> None:
+        self.counts[role] += messages
         self._last_ns[role] = time.monotonic_ns()
 
     def _drain(self) -> None:

@@ -3,19 +3,19 @@
 from collections import deque
 from collections.abc import Callable
 from functools import partial
+import time
 from typing import Any
 
+import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from rs_relpose_ros.config.files import text_values
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError, RsRelposeError
 from rs_relpose_ros.messages import outgoing
-from rs_relpose_ros.messages.incoming import frame_id_of_cdr, PARTS, Role, stamp_ns
+from rs_relpose_ros.messages.incoming import frame_id_of_cdr, PARTS, Role, stamp_of_cdr
 from rs_relpose_ros.messages.transforms import extrinsics
 from rs_relpose_ros.nodes import inputs
 from rs_relpose_ros.nodes.inputs import message_class
@@ -23,7 +23,7 @@ from rs_relpose_ros.nodes.parameters import legal_qos
 from rs_relpose_ros.nodes.sensor_node import run_node, StoppableNode
 from rs_relpose_ros.odometry import need_gtsam
 from rs_relpose_ros.odometry.pair import KeyframePair, warm_up_odometry
-from rs_relpose_ros.odometry.states import Base, ContinuousPath
+from rs_relpose_ros.odometry.states import Base, ContinuousPath, Odometry
 
 NAME = 'odometry_node'
 
@@ -58,19 +58,13 @@ class OdometryNode(StoppableNode):
         self._begun = False
         self._imu_lookup = (inputs.TransformLookup(self)
                             if self._settings.current.calibration.use_tf else None)
-        self.create_subscription(String, 'calibration', self._on_calibration, inputs.LATCHED)
+        self.use_calibrations()
         missing = self._settings.current.sensor.missing()
         if missing:
             self._info(f'waiting for {" and ".join(missing)}: parameters, or the calibration of '
                        f'relpose_node on {self.resolve_topic_name("calibration")}')
         else:
             self._begin(self._settings.current)
-
-    def _on_calibration(self, message: String) -> None:
-        try:
-            self._settings.adopt(text_values(message.data, 'calibration'))
-        except InputError as error:
-            self._error(str(error))
 
     def _on_parameters(self, parameters: Parameters) -> None:
         if self._begun:
@@ -89,8 +83,8 @@ class OdometryNode(StoppableNode):
     def _begin(self, parameters: Parameters) -> None:
         self._begun, self._config = True, parameters.odometry
         self._use(parameters)
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._sample_at = self._steady.now()
+        self._sample_at = time.monotonic()
+        self._serialised = inputs.Serialised()
         self._frames: dict[Role, str] = {}   # of the samples
         self._path: deque[Any] = deque(maxlen=_PATH_LENGTH)
         self._transforms = (inputs.transform_broadcaster(self, 'publish_odometry_tf')
@@ -98,7 +92,7 @@ class OdometryNode(StoppableNode):
         with legal_qos():
             self._open_topics()
         self.create_service(Trigger, '~/reset', self._reset)
-        steady, rate = self._steady, self._config.odometry_rate
+        steady, rate = Clock(clock_type=ClockType.STEADY_TIME), self._config.odometry_rate
         if rate > 0.0:
             self.create_timer(1.0 / rate, lambda: self._read(publish=True), clock=steady)
         if rate < _LEAST_RATE:
@@ -112,26 +106,27 @@ class OdometryNode(StoppableNode):
             message_class('nav_msgs/msg/Odometry'), topic, QoSProfile(depth=_DEPTH),
             qos_overriding_options=overridable()) for topic in ('~/odometry', '~/keyframes'))
         self._path_topic = self.create_publisher(message_class('nav_msgs/msg/Path'), '~/path', 1)
-        self._diagnostics = self.create_publisher(
-            message_class('diagnostic_msgs/msg/DiagnosticArray'), '/diagnostics', 10)
 
         def polled(topic: str, msgtype: str, qos: QoSProfile, receive: Callable[[Any], None],
-                   *, raw: bool = False) -> inputs.PolledSubscription:
+                   *, raw: bool = True) -> inputs.PolledSubscription:
+            def receive_all(messages: list[Any]) -> None:
+                for message in messages:
+                    receive(message)
             return inputs.PolledSubscription(
-                self, message_class(msgtype), topic, qos, receive, lambda: False, raw=raw,
+                self, message_class(msgtype), topic, qos, receive_all, lambda: False, raw=raw,
                 qos_overriding_options=overridable())
 
         # Read as often as odometry is published: each message would wake the process.
         # Of CameraInfo whether the camera still delivers where no pair comes.
         self._inputs = [
             *(polled(role.value, PARTS[role].msgtypes[0], inputs.best_effort(_IMU_DEPTH),
-                     partial(self._on_sample, role), raw=True)
+                     partial(self._on_sample, role))
               for role in (Role.IMU, Role.ACCEL)),
             polled(Role.CAMERA_INFO.value, 'sensor_msgs/msg/CameraInfo',
                    inputs.best_effort(_DEPTH),
-                   lambda info: self._estimator.add_frame(stamp_ns(info.header))),
+                   lambda info: self._estimator.add_frame(stamp_of_cdr(info))),
             polled(_PAIRS, 'diagnostic_msgs/msg/DiagnosticArray',
-                   QoSProfile(depth=outgoing.PAIR_HISTORY), self._on_pair)]
+                   QoSProfile(depth=outgoing.PAIR_HISTORY), self._on_pair, raw=False)]
         self._pairs, self._imu = map(self.resolve_topic_name, (_PAIRS, Role.IMU.value))
         # Reports since the last message, by topic.
         self._silent = {self._pairs: 0, self._imu: 0}
@@ -189,39 +184,40 @@ class OdometryNode(StoppableNode):
             self._warn(str(error))
             return
         if role is Role.IMU:
-            self._sample_at = self._steady.now()
+            self._sample_at = time.monotonic()
 
     def _read(self, *, publish: bool = False) -> None:
         """Read all topics, publish the newest state, and use a pair then, which takes time."""
         for subscription in self._inputs:
             subscription.drain()
+        silent = time.monotonic() - self._sample_at
+        if silent > _SILENT_IMU:
+            self._estimator.imu_is_silent(silent)
         if publish:
             self._publish(self._estimator.newest_ns)
         for keyframe in self._estimator.take(most=1):
-            message = self._message(keyframe)
-            self._keyframes.publish(message)
-            self._path.append(message_class('geometry_msgs/msg/PoseStamped')(
-                header=message.header, pose=message.pose.pose))
+            self._keyframes.publish(self._message(keyframe))
+            self._path.append(outgoing.pose_stamped_message(
+                keyframe.stamp_ns, self._config.odometry_frame, keyframe.R, keyframe.position,
+                message_class))
             if self._config.odometry_rate == 0.0:
                 self._publish(keyframe.imu_ns)
-        silent = (self._steady.now() - self._sample_at).nanoseconds * 1e-9
-        if silent > _SILENT_IMU:
-            self._estimator.imu_is_silent(silent)
         for text in self._estimator.warnings():
             # A change of the state has the level of the state.
             (self._info, self._warn, self._error)[_LEVELS.get(text.partition(':')[0], 0)](text)
 
-    def _message(self, odometry: Any) -> Any:
-        pose = outgoing.pose_stamped_message(odometry.stamp_ns, self._config.odometry_frame,
-                                             odometry.R, odometry.position, message_class)
-        return message_class('nav_msgs/msg/Odometry')(
-            header=pose.header, child_frame_id=odometry.frame_id,
-            pose=message_class('geometry_msgs/msg/PoseWithCovariance')(
-                pose=pose.pose,
-                covariance=outgoing.published_covariance(odometry.pose_covariance)),
-            # In the axes of the child frame.
-            twist=outgoing.twist_message(odometry.velocity, odometry.angular_velocity,
-                                         odometry.velocity_covariance, message_class))
+    def _message(self, odometry: Odometry) -> bytes:
+        """A serialised nav_msgs/Odometry, whose numbers are its end."""
+        def empty() -> Any:
+            return message_class('nav_msgs/msg/Odometry')(
+                header=outgoing.header(0, self._config.odometry_frame, message_class),
+                child_frame_id=odometry.frame_id)
+        of_pose, of_twist = map(outgoing.published_covariance, (
+            odometry.pose_covariance, odometry.velocity_covariance))
+        # The twist is in the axes of the child frame.
+        return self._serialised(odometry.stamp_ns, odometry.frame_id, empty, np.concatenate([
+            odometry.position, outgoing.quat_xyzw(odometry.R), of_pose,
+            odometry.velocity, odometry.angular_velocity, of_twist]).tobytes())
 
     def _publish(self, imu_ns: int) -> None:
         """Publish the state at a time, if it is known and newer than the last one."""
@@ -264,10 +260,7 @@ class OdometryNode(StoppableNode):
             started = estimator.starts[-1]
             values += [('started', 'at rest' if started.at_rest else 'in motion'),
                        ('start_scale_sigma', f'{started.scale_sigma:.3f}')]
-        self._diagnostics.publish(outgoing.diagnostics_message(
-            self.get_clock().now().nanoseconds, level,
-            f'{self.get_fully_qualified_name()}: odometry', state, self._pairs, values,
-            message_class))
+        self.publish_status(level, 'odometry', state, self._pairs, values)
 
 
 main = partial(run_node, OdometryNode, NAME, _DESCRIPTION)

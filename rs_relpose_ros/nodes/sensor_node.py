@@ -19,7 +19,7 @@ from typing import Any, ClassVar, NoReturn, TYPE_CHECKING
 from diagnostic_msgs.msg import DiagnosticArray
 import rclpy
 from rclpy.clock import Clock, ClockType
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -39,6 +39,7 @@ from rs_relpose_ros.nodes import diagnostics
 from rs_relpose_ros.nodes import parameters as ros_parameters
 from rs_relpose_ros.nodes.diagnostics import LineFile, PATIENCE, ReasonLog, SILENCE, STARTING
 from rs_relpose_ros.nodes.inputs import (
+    KeptWaitSet,
     LATCHED,
     message_class,
     SensorInputs,
@@ -68,12 +69,35 @@ class StoppableNode(Node):
         self._info = ReasonLog(lambda text: logger.info(text))
         self._warn = ReasonLog(lambda text: logger.warning(text))
         self._error = ReasonLog(lambda text: logger.error(text))
+        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._settings = ros_parameters.NodeParameters(self, self._on_parameters)
         for warning in ros_parameters.unknown_overrides(self):
             self._warn(warning)
 
     def _on_parameters(self, parameters: Parameters) -> None:
         """A live parameter was set."""
+
+    def use_calibrations(self) -> None:
+        """Use the calibrations that relpose_node publishes."""
+        def use(message: String) -> None:
+            self._info('using the calibration of relpose_node')
+            self.adopt(message.data, 'calibration')
+        self.create_subscription(String, 'calibration', use, LATCHED)
+
+    def adopt(self, parameters: str, source: str) -> None:
+        """Set the parameters of a file that the user has not given; an error is logged."""
+        try:
+            self._settings.adopt(text_values(parameters, source))
+        except InputError as error:
+            self._error(str(error))
+
+    def publish_status(self, level: int, task: str, text: str, hardware_id: str,
+                       values: Sequence[tuple[str, str]]) -> None:
+        """Publish a status on /diagnostics."""
+        self._diagnostics.publish(outgoing.diagnostics_message(
+            self.get_clock().now().nanoseconds, level,
+            f'{self.get_fully_qualified_name()}: {task}', text, hardware_id, values,
+            message_class))
 
     def log_compiling(self) -> None:
         """Log that this start takes long, where it does."""
@@ -113,7 +137,7 @@ def run_node(make: Callable[[], StoppableNode], name: str, description: str,
     if not (os.environ.get('HOME') or os.environ.get('ROS_HOME')):   # rcl has no folder to log in
         os.environ.setdefault('ROS_LOG_DIR', tempfile.gettempdir())
     rclpy.init(args=list(given), signal_handler_options=SignalHandlerOptions.NO)
-    executor, stopped = SingleThreadedExecutor(), threading.Event()
+    executor, stopped = KeptWaitSet(), threading.Event()
     on_started(lambda: executor.create_task(stopped.set))
     node: StoppableNode | None = None
     try:
@@ -131,6 +155,7 @@ def run_node(make: Callable[[], StoppableNode], name: str, description: str,
             if not node.stop():
                 # The thread compiles or loads kernels, which cannot be interrupted.
                 leave(0)
+            executor.release()
             node.destroy_node()
         rclpy.try_shutdown()
     return 0
@@ -241,7 +266,6 @@ class SensorNode(StoppableNode):
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         with ros_parameters.legal_qos():
             self._open_outputs(self._settings.current)
-        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_service(Trigger, '~/reset', self._reset)
         # None once its transform is used; the rotation IMU to camera in it.
         self._lookup = (TransformLookup(self) if self._settings.current.calibration.use_tf
@@ -254,7 +278,7 @@ class SensorNode(StoppableNode):
             self.create_service(Trigger, '~/calibrate', self._calibrate_now)
             self.create_service(Trigger, '~/save_calibration', self._save_now)
         else:
-            self.create_subscription(String, 'calibration', self._on_calibration, LATCHED)
+            self.use_calibrations()
         self._warm_timer = self.create_timer(0.02, self._subscribe_when_warm, clock=self._steady)
         self._found_timer = self.create_timer(0.1, self._use_found, clock=self._steady)
         self._begin(self._settings.current.calibration.calibrate_at_start == 'always')
@@ -275,9 +299,6 @@ class SensorNode(StoppableNode):
     @abstractmethod
     def _on_processed(self, frame: Frame[Any]) -> None:
         """Publish the result of a frame; by the worker."""
-
-    def _on_ready(self) -> None:
-        """Do what needs the subscriptions, which have just been made."""
 
     # -- start and stop ----------------------------------------------------------------------
 
@@ -363,7 +384,6 @@ class SensorNode(StoppableNode):
         gc.freeze()
         self._inputs = inputs
         self._frame_statistics.start()
-        self._on_ready()
         self._log_ready(inputs)
 
     def _log_ready(self, inputs: SensorInputs) -> None:
@@ -424,7 +444,7 @@ class SensorNode(StoppableNode):
             self._error(str(error))
         if self.calibrates:
             self._published.publish(String(data=found.parameters))
-        self._adopt(found.parameters, str(path))
+        self.adopt(found.parameters, str(path))
         if self._calibration is not None:   # nothing in it was new, or it cannot be used
             missing = self._settings.current.sensor.missing()
             if missing:
@@ -456,16 +476,6 @@ class SensorNode(StoppableNode):
         if values:
             self._info(f'from /tf_static, {imu} in {camera}: {", ".join(values)}')
             self._settings.adopt(values)
-
-    def _adopt(self, parameters: str, source: str) -> None:
-        try:
-            self._settings.adopt(text_values(parameters, source))
-        except InputError as error:
-            self._error(str(error))
-
-    def _on_calibration(self, message: String) -> None:
-        self._info('using the calibration of relpose_node')
-        self._adopt(message.data, 'calibration')
 
     def _calibrate_now(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Calibrate from here on; values that the user has given stay."""
@@ -545,10 +555,8 @@ class SensorNode(StoppableNode):
         report = self._frame_statistics.report(
             counts, None if source is None else source.counts(),
             problem=problem, missing=missing, progress=self._progress, warning=warning)
-        self._diagnostics.publish(outgoing.diagnostics_message(
-            self.get_clock().now().nanoseconds, report.level,
-            f'{self.get_fully_qualified_name()}: {self.task}', report.text, self._image_topic(),
-            report.values, message_class))
+        self.publish_status(report.level, self.task, report.text, self._image_topic(),
+                            report.values)
         if self._inputs is not None:
             self._log_silence(self._inputs, report.silence, problem)
             for role, frame_id in self._inputs.frame_ids.items():

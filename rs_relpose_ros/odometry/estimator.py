@@ -216,10 +216,10 @@ class OdometryEstimator:
             return   # too late for any pair
         if not self._gyro.repeats(sample):
             self._samples.add(sample)
-            self._samples.prune(sample.stamp_ns - to_nanoseconds(
-                max(_LONGEST_PROPAGATED, self._config.max_coast) + _LONGEST_DELAY))
         if sample.stamp_ns >= self._watched_ns + _WATCH_NS:
             self._watched_ns = sample.stamp_ns
+            self._samples.prune(sample.stamp_ns - to_nanoseconds(
+                max(_LONGEST_PROPAGATED, self._config.max_coast) + _LONGEST_DELAY))
             try:
                 self._watch(sample.stamp_ns)
             except GraphError as error:

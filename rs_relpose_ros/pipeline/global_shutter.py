@@ -7,6 +7,7 @@ readout is not corrected: the gyro does not measure it, and its effect depends o
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 import math
 from typing import Any, NamedTuple
 
@@ -96,7 +97,7 @@ class MiddleRow:
 _BORDERS = {'replicate': cv2.BORDER_REPLICATE, 'black': cv2.BORDER_CONSTANT}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class GlobalShutterFrame:
     """A frame as of a global shutter at the time of the middle row."""
 
@@ -106,10 +107,16 @@ class GlobalShutterFrame:
     frame_id: str
     intrinsics: Intrinsics
     is_png: bool   # whether the original came as a PNG
-    map: RowMap
+    middle: MiddleRow
+    motion: FrameMotion
     border: str   # of `_BORDERS`
     applied_offset_ns: int   # tracked time offset in the stamp, beyond the parameter's
     health: Assessment   # by the frames before, if they are watched or tracked
+
+    @cached_property
+    def map(self) -> RowMap:
+        """Where the pixels come from; made where it is used."""
+        return self.middle.map(self.motion)
 
     def image(self) -> Pixels:
         """The derotated image, in the encoding of the original."""
@@ -167,14 +174,19 @@ class Unroller(Processor[GlobalShutterFrame]):
         self._due = None
         self._follower.reset()
 
+    def gyro_only(self, parameters: Parameters) -> bool:
+        """Whether no pipeline works on the next frame."""
+        sensor = parameters.sensor
+        return isinstance(self._follower, RotationWatch) and not (
+            sensor.track_time_offset or sensor.track_readout_time)
+
     def process(self, frame: Frame[Any], parameters: Parameters) -> GlobalShutterFrame:
         """The derotated frame."""
         self.prepare()
         sensor, imu = parameters.sensor, frame.imu
         assert frame.encoded is not None
         # Once started it is kept: corrections that are no longer applied are taken back by steps.
-        if isinstance(self._follower, RotationWatch) and (
-                sensor.track_time_offset or sensor.track_readout_time):
+        if isinstance(self._follower, RotationWatch) and not self.gyro_only(parameters):
             self._follower = Pipeline(parameters)
         model = sensor_model(frame.intrinsics, sensor, self.applied.readout_time)
         if self._middle is None or self._middle.sensor != model:
@@ -188,7 +200,7 @@ class Unroller(Processor[GlobalShutterFrame]):
         return GlobalShutterFrame(
             reference_ns + to_nanoseconds(self._middle.delay),
             Pixels(frame.image, frame.encoding), frame.stamp_ns, frame.frame_id, frame.intrinsics,
-            frame.encoded.is_png, self._middle.map(imu.motion), parameters.global_shutter.border,
+            frame.encoded.is_png, self._middle, imu.motion, parameters.global_shutter.border,
             imu.applied_offset_ns, self._follower.health)
 
 

@@ -67,6 +67,10 @@ class Processor(Generic[Result]):
     def reset(self) -> None:
         """Forget the frames so far."""
 
+    def gyro_only(self, parameters: Parameters) -> bool:
+        """Whether the next frame is needed without gravity and specific force."""
+        return False
+
     @abstractmethod
     def process(self, frame: Frame[Any], parameters: Parameters) -> Result | None:
         """Result of a frame, or None."""
@@ -352,6 +356,7 @@ class FrameLoop(Generic[Result]):
             if not self._offline:
                 # The result of the step before is published: no subscriber waits meanwhile.
                 processor.prepare()
+            self.sequencer.gyro_only = processor.gyro_only(self.parameters)
             frame = self.sequencer.take(timeout)
             if not isinstance(frame, Frame):
                 return frame

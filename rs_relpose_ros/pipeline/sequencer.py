@@ -142,6 +142,7 @@ class Sequencer:
         self._R_cam_imu = parameters.sensor.R_cam_imu
         self._offline = offline
         self._colors, self._levels = colors, GrayLevels()
+        self.gyro_only = False   # whether frames are without gravity and specific force
         self._now: Callable[[], int] = (lambda: 0) if offline else clock
         self._max_gap_ns = to_nanoseconds(parameters.imu.max_imu_gap)
         # Longest interval of frames that the gyro is integrated over. The history that is left
@@ -295,7 +296,8 @@ class Sequencer:
                 previous_ns = None
             frame.imu_data = replace(
                 frame_imu(self._buffer, span_ns, reference_ns, self._R_cam_imu, previous_ns,
-                          head.exposure), applied_offset_ns=self._offset_ns, ahead=head.ahead)
+                          head.exposure, gyro_only=self.gyro_only),
+                applied_offset_ns=self._offset_ns, ahead=head.ahead)
             frame.restart = self._taken_generation != self._generation
             self._previous_ns, self._taken_generation = reference_ns, self._generation
             self._counts.frames_taken += 1
