@@ -365,19 +365,13 @@ class ImuBuffer(ImuSamples):
             estimate, stamp_ns = self._filter.estimate(), self._filter.stamp_ns
             if estimate is not None and stamp_ns is not None:
                 estimate = self._propagated(estimate, stamp_ns, at_ns)
-        if not self._config.use_imu_orientation:
-            return estimate
-        return filters.agreed_gravity(self._own_gravity(at_ns), estimate)
-
-    def _own_gravity(self, at_ns: int) -> GravityEstimate | None:
-        """Gravity from the last orientation message up to a time; None if it is old."""
-        stamps = self._down.stamps
-        last = int(np.searchsorted(stamps, at_ns, side='right')) - 1
-        if last < 0 or at_ns - int(stamps[last]) > self._gap_ns:
-            return None
-        value = self._down.values[last]
-        return self._propagated(GravityEstimate(value[:3], float(value[3])), int(stamps[last]),
-                                at_ns)
+        last = int(np.searchsorted(self._down.stamps, at_ns, side='right')) - 1
+        if last >= 0 and self._config.use_imu_orientation:
+            own_ns, (*down, sigma) = int(self._down.stamps[last]), self._down.values[last].tolist()
+            if at_ns - own_ns <= self._gap_ns and (own := self._propagated(
+                    GravityEstimate(np.array(down), sigma), own_ns, at_ns)) is not None:
+                return filters.agreed_gravity(own, estimate)
+        return estimate
 
     def _propagated(self, estimate: GravityEstimate, from_ns: int,
                     to_ns: int) -> GravityEstimate | None:
@@ -392,25 +386,21 @@ class ImuBuffer(ImuSamples):
         """Filter the samples up to a time that were not filtered yet."""
         if until_ns <= self._filtered_ns:
             return
-        stamps = self.gyro.stamps
-        first = int(np.searchsorted(stamps, self._filtered_ns, side='right'))
-        last = int(np.searchsorted(stamps, until_ns, side='right'))
+        bounds = np.array([self._filtered_ns, until_ns])
+        first, last = np.searchsorted(self.gyro.stamps, bounds, side='right')
         if first < last:
-            rates, forces = self.gyro.values[first:last], self._forces_at(stamps[first:last])
-            self._bias.run(stamps[first:last], rates, forces)
+            stamps, rates = self.gyro.stamps[first:last], self.gyro.values[first:last]
+            # The latest specific forces not after these stamps; NaN if older than a gap.
+            forces = np.full((len(stamps), 3), np.nan)
+            if len(self.force.stamps):
+                k = np.searchsorted(self.force.stamps, stamps, side='right') - 1
+                fresh = (k >= 0) & (stamps - self.force.stamps[k] <= self._gap_ns)
+                forces[fresh] = self.force.values[k[fresh]]
+            self._bias.run(stamps, rates, forces)
             # With the configured bias only: the gravity filter estimates the rest.
             if self._config.gravity_filter == 'complementary':
-                self._filter.run(stamps[first:last], rates - self._configured_bias, forces)
-            self._filtered_ns = int(stamps[last - 1])
-
-    def _forces_at(self, stamps_ns: Stamps) -> Array:
-        """Latest specific forces (K, 3) not after these stamps; NaN if older than a gap."""
-        stamps = self.force.stamps
-        if not len(stamps):
-            return np.full((len(stamps_ns), 3), np.nan)
-        k = np.searchsorted(stamps, stamps_ns, side='right') - 1
-        fresh = (k >= 0) & (stamps_ns - stamps[k] <= self._gap_ns)
-        return np.where(fresh[:, None], self.force.values[k], np.nan)
+                self._filter.run(stamps, rates - self._configured_bias, forces)
+            self._filtered_ns = int(stamps[-1])
 
 
 def frame_imu(buffer: ImuBuffer, span_ns: tuple[int, int], reference_ns: int, R_cam_imu: Array,

@@ -415,11 +415,8 @@ def mean_gravity(forces: Array) -> GravityEstimate | None:
     return GravityEstimate(-mean / length, math.hypot(0.1, excess))
 
 
-def agreed_gravity(own: GravityEstimate | None,
-                   measured: GravityEstimate | None) -> GravityEstimate | None:
+def agreed_gravity(own: GravityEstimate, measured: GravityEstimate | None) -> GravityEstimate:
     """The IMU's own estimate unless the accelerometer's contradicts (another world frame)."""
-    if own is None:
-        return measured
     own = replace(own, sigma=max(own.sigma, _LEAST_OWN_SIGMA))
     if measured is None:
         return own

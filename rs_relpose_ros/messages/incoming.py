@@ -94,7 +94,7 @@ def intrinsics_from_info(msg: Any) -> Intrinsics:
 
 def info_field(msg: Any, name: str) -> Any:
     """A field of a CameraInfo that has a capital name in ROS 1."""
-    return getattr(msg, name) if hasattr(msg, name) else getattr(msg, name.upper())
+    return getattr(msg, name if hasattr(msg, name) else name.upper())
 
 
 def imu_sample_from_message(msg: Any, *, with_gyro: bool = True) -> ImuSample:
@@ -371,11 +371,9 @@ class Intake:
                 self._sequencer.pass_over(image.stamp_ns)
                 return
             self.stamps_found.add(image.stamp_ns)
-        if self.intrinsics or self._configured or self.camera_info_problem:
-            self._add_frame(image)
-            return
         self._held.append(image)
-        if len(self._held) > _HELD_IMAGES:
+        known = self.intrinsics or self._configured or self.camera_info_problem
+        while len(self._held) > (0 if known else _HELD_IMAGES):
             self._add_frame(self._held.pop(0))
 
     def _add_frame(self, image: images.EncodedImage) -> None:

@@ -26,10 +26,8 @@ from rs_relpose_ros.pipeline.findings import Finding, FindingState, Quantity
 from rs_relpose_ros.pipeline.recursion import Calibration, PRIOR_SIGMA
 from rs_relpose_ros.pipeline.rotations import RotationComparison
 
-# Sigmas beyond which a deviation is certain.
-_CERTAIN = 4.0
-# The same that suffices to linearise about a deviation.
-_LIKELY = 2.5
+# Sigmas beyond which a deviation is certain, and those that suffice to linearise about it.
+_CERTAIN, _LIKELY = 4.0, 2.5
 # Shift of the pose in its own sigmas (Mahalanobis) that matters, and that leaves its covariance.
 _MATTERS, _OUTSIDE = 1.0, 3.0
 # Axes and unit are wrong if a correction leaves less than this share of the images' rotation.
@@ -38,10 +36,9 @@ _EXPLAINED_AT_BEST = 0.5
 _UNIT_FACTOR = 5.0
 # Rotation of the gyro [rad] after which images must agree, and the share that may remain.
 _LONG_ROTATION, _INDEPENDENT = 2.0, 0.85
-# Rotations within this [rad] of half a turn about an axis of the image also are flipped images.
-_HALF_TURN = 0.6
-# The same for a quarter of a turn about the optical axis.
-_QUARTER_TURN = 0.3
+# Rotations within these [rad] of half a turn about an axis of the image, or of a quarter of one
+# about the optical axis, also are flipped images.
+_HALF_TURN, _QUARTER_TURN = 0.6, 0.3
 # Quantile of the pairs' shifts that decides whether a deviation matters: pairs of little motion
 # hide it.
 _OBSERVABLE_IN = 0.9
@@ -54,12 +51,10 @@ _REMAINS[[findings.OFFSET, findings.READOUT]] = 1.0
 # Error of a suggested value, 1 sigma as a share of the deviation: matches and inliers were
 # selected with the wrong value. About 0.08 on recordings.
 _SELECTED = 0.1
-# Gain in chi-square beyond which there is no doubt.
-_LARGEST_GAIN = 100.0
+# Gain in chi-square beyond which there is no doubt, and below which a hypothesis fits as well.
+_LARGEST_GAIN, _AS_GOOD = 100.0, 4.0
 # Most inconsistent quantities: traces of a gross error need some, too.
 _MOST_QUANTITIES = 4
-# Chi-square by which an alternative hypothesis may fit less, and still fits as well.
-_AS_GOOD = 4.0
 # Part of the configured distortion that rectified images have at most.
 _LITTLE_OF = 0.25
 # Deviations that move the pose by less than this share of the largest shift are not evaluated:
@@ -292,10 +287,9 @@ def assess(estimated: Calibration, inconsistent: list[Inconsistency], gross: tup
         if quantity.name in faults:
             found += _fault_findings(faults[quantity.name], configured, alternatives)
         elif float(estimated.sigma[part].max()) > quantity.observable:
-            found.append(_unknown(quantity, 'not observable in this motion, or too few pairs'))
+            found.append(quantity.unknown('not observable in this motion, or too few pairs'))
         elif faults:
-            found.append(_unknown(
-                quantity, 'not evaluated while another parameter is inconsistent'))
+            found.append(quantity.unknown('not evaluated while another parameter is inconsistent'))
         else:
             found.append(_values(quantity, (estimated.c - configured.active)[part],
                                  estimated.sigma[part], configured)[0])
@@ -304,12 +298,8 @@ def assess(estimated: Calibration, inconsistent: list[Inconsistency], gross: tup
 
 def not_evaluated(named: set[str], wrong: str) -> tuple[Finding, ...]:
     """Findings on the quantities that are not `named`, while another one is `wrong`."""
-    return tuple(_unknown(quantity, f'not evaluated while {wrong} is wrong')
+    return tuple(quantity.unknown(f'not evaluated while {wrong} is wrong')
                  for quantity in findings.QUANTITIES if quantity.name not in named)
-
-
-def _unknown(quantity: Quantity, reason: str) -> Finding:
-    return Finding(quantity.name, FindingState.UNKNOWN, reason, unit=quantity.unit)
 
 
 def _fault_findings(one: Inconsistency, configured: Configured,

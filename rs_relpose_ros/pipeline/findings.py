@@ -157,6 +157,10 @@ class Quantity(NamedTuple):
     tracking: str = ''   # parameter that has it tracked
     reach: float = 0.0   # largest deviation that tracking applies
 
+    def unknown(self, reason: str) -> Finding:
+        """A finding without values."""
+        return Finding(self.name, FindingState.UNKNOWN, reason, unit=self.unit)
+
     def number(self, values: ArrayLike) -> str:
         """A value, or a list of those of a vector, in the unit of messages but without it."""
         shown = self.factor * np.atleast_1d(values)

@@ -20,10 +20,8 @@ from rs_relpose_ros.pipeline.findings import Assessment, BIAS, DEVIATIONS, Findi
 from rs_relpose_ros.pipeline.recursion import Calibration, Recursion
 from rs_relpose_ros.pipeline.rotations import AccelerationSums, RotationSums
 
-# Frames by which clocks are compared.
-_ARRIVALS = 20
-# Latest pairs whose shift by a deviation is evaluated.
-_EFFECTS = 30
+# Frames by which clocks are compared, and latest pairs whose shift by a deviation is evaluated.
+_ARRIVALS, _EFFECTS = 20, 30
 # Largest deviations about which a pair is linearised: lens and readout must stay possible.
 _LARGEST = np.array([0.5] * 3 + [0.06, 0.1] + [0.2] * 3 + [0.3, 0.45, 0.6])
 # Pairs whose agreement is remembered, pairs as which the prior counts (covariances are right),
@@ -68,15 +66,36 @@ class ConsistencyMonitor:
 
         `data` is None if the pair has no rotation or no gyro. `assess` completes it.
         """
-        self.latest, estimated = None, pose
-        if data is not None:
-            try:
-                pose = self._add(stamp_ns, data, pose, configured)
-            except np.linalg.LinAlgError:
-                # A pair without rank has no information on the calibration; its pose is kept.
-                self._inconsistent = []
-        self._due = self.latest, estimated, configured
-        return pose
+        self.latest, self._due = None, (None, pose, configured)
+        if data is None:
+            return pose
+        try:
+            # The effect of an inconsistent quantity is evaluated at its estimate: where poses are
+            # off already, a little more or less may hardly move them.
+            self.latest = information = self._recursion.add(
+                stamp_ns, data, configured.active, np.asarray(
+                    configured.active + np.clip(self._likely, -_LARGEST, _LARGEST)))
+            if information is None:
+                return pose
+            self._due = information, pose, configured
+            self.calibration = self._recursion.solved()
+            by_deviation = information.pose_by_deviation
+            shift = by_deviation @ self._deviation()
+            by_center = configured.center_sigma * information.pose_by_center
+            if self._undetermined is None:
+                self._undetermined = assessment.undetermined(self.calibration, configured)
+        except np.linalg.LinAlgError:
+            # A pair without rank has no information on the calibration; its pose is kept.
+            self._inconsistent = []
+            return pose
+        # The inconsistency, deviations that the pairs so far have not excluded, and the center.
+        doubt = np.outer(shift, shift) + by_center @ by_center.T + (
+            by_deviation @ self._undetermined @ by_deviation.T)
+        widened = replace(pose, covariance=pose.covariance + doubt)
+        # The effect of an inconsistent parameter on the baseline is not known.
+        return widened.without_baseline(
+            'baseline not known: a configured parameter is inconsistent (see health)'
+        ) if shift.any() and pose else widened
 
     def assess(self) -> None:
         """Assess all quantities after the last pair, for the next one: its pose does not wait."""
@@ -107,29 +126,6 @@ class ConsistencyMonitor:
             self.acceleration.clear()
         if (finding := self.acceleration.finding()) is not None:
             self.health = Assessment((*self.health.findings, finding))
-
-    def _add(self, stamp_ns: int, data: recursion.PairData, pose: RelativePose,
-             configured: Configured) -> RelativePose:
-        # The effect of an inconsistent quantity is evaluated at its estimate: where poses are
-        # off already, a little more or less may hardly move them.
-        information = self._recursion.add(stamp_ns, data, configured.active, np.asarray(
-            configured.active + np.clip(self._likely, -_LARGEST, _LARGEST)))
-        if information is None:
-            return pose
-        self.latest = information
-        self.calibration = self._recursion.solved()
-        by_deviation = information.pose_by_deviation
-        shift = by_deviation @ self._deviation()
-        # The inconsistency, deviations that the pairs so far have not excluded, and the center.
-        by_center = configured.center_sigma * information.pose_by_center
-        if self._undetermined is None:
-            self._undetermined = assessment.undetermined(self.calibration, configured)
-        doubt = np.outer(shift, shift) + by_center @ by_center.T + (
-            by_deviation @ self._undetermined @ by_deviation.T)
-        pose = replace(pose, covariance=pose.covariance + doubt)
-        # The effect of an inconsistent parameter on the baseline is not known.
-        return pose.without_baseline('baseline not known: a configured parameter is inconsistent '
-                                     '(see health)') if shift.any() and pose else pose
 
     def _deviation(self) -> Array:
         """(11,) from the active values, of all inconsistent quantities."""

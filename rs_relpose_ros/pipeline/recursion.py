@@ -450,34 +450,28 @@ class Recursion:
             apart[-2] = math.inf   # now the gyro after it is known
         chosen = [k for k in np.argsort(apart, kind='stable')[::-1][:_AGAIN] if apart[k] >= _NEAR]
         for k in chosen:
-            information = self._linearised(k, last.about)
-            if information is not None:
+            data, active = self._pairs[k].data, self._pairs[k].active
+            gyro, later = data.segment, last.about - active
+            if _far_in_time(later):   # by the gyro there
+                for n in (k - 1, k + 1):
+                    other = self._pairs[n].data.segment if 0 <= n < len(self._pairs) else gyro
+                    first, second = (other, gyro) if n < k else (gyro, other)
+                    if first.stamps_ns[-1] == second.stamps_ns[0]:
+                        gyro = first.joined(second)
+                if (moved := _at_other_times(data, gyro, later)) is not None:
+                    data, active = moved, active.copy()
+                    active[_TIMES] = last.about[_TIMES]
+            if (information := pair_information(data, active, last.about)) is not None:
                 self._pairs[k] = self._pairs[k]._replace(about=last.about, information=information)
         return bool(chosen)
-
-    def _linearised(self, k: int, about: Array) -> PairInformation | None:
-        """Information of pair `k` about other deviations; of its times, by the gyro there."""
-        data, active = self._pairs[k].data, self._pairs[k].active
-        if _far_in_time(about - active):
-            gyro = data.segment
-            if k and self._pairs[k - 1].data.segment.stamps_ns[-1] == gyro.stamps_ns[0]:
-                gyro = self._pairs[k - 1].data.segment.joined(gyro)
-            if k + 1 < len(self._pairs) and (
-                    later := self._pairs[k + 1].data.segment).stamps_ns[0] == gyro.stamps_ns[-1]:
-                gyro = gyro.joined(later)
-            moved = _at_other_times(data, gyro, about - active)
-            if moved is not None:
-                data, active = moved, active.copy()
-                active[_TIMES] = about[_TIMES]
-        return pair_information(data, active, about)
 
     def solved(self) -> Calibration:
         """The calibration that fits all pairs."""
         n = len(self._pairs)
         if not n:
             return NOTHING_ESTIMATED
-        S = np.array([pair.information.S for pair in self._pairs])
-        b = np.array([pair.information.b for pair in self._pairs])
+        S, b, if_distorted = (np.array([getattr(pair.information, name) for pair in self._pairs])
+                              for name in ('S', 'b', 'if_distorted'))
         # Scaled by the prior: the deviations have different units.
         scale = PRIOR_SIGMA
         hessian = S.sum(axis=0) * np.outer(scale, scale) + np.eye(DEVIATIONS)
@@ -492,5 +486,4 @@ class Recursion:
         about = (weights * [pair.about for pair in self._pairs]).sum(axis=0) / np.maximum(
             weights.sum(axis=0), np.finfo(float).tiny)
         return Calibration(c, shared * covariance * np.sqrt(np.outer(ratios, ratios)), S, b,
-                           np.array([pair.information.if_distorted for pair in self._pairs]),
-                           about, float(np.median(ratios)), shared, widened)
+                           if_distorted, about, float(np.median(ratios)), shared, widened)

@@ -32,12 +32,9 @@ CLOCK_JUMP_NS = NANOSECONDS
 _FAR_NS = 10 * NANOSECONDS
 # Number of consecutive stamps behind the newest, each newer than the one before, that indicate a
 # clock that was set back by less than that: messages out of order come alone.
-_BACK_FRAMES = 3
-_BACK_SAMPLES = 20
-# Most frames that wait for the worker: bounds the latency of an overloaded node.
-MAILBOX_FRAMES = 5
-# Most frames that wait for the IMU: bounds the memory.
-WAITING_FRAMES = 16
+_BACK_FRAMES, _BACK_SAMPLES = 3, 20
+# Most frames that wait for the worker (bounds the latency), and for the IMU (the memory).
+MAILBOX_FRAMES, WAITING_FRAMES = 5, 16
 # Longest time [ns] that a frame waits for the IMU.
 MAX_IMU_WAIT_NS = NANOSECONDS
 # Delay [ns] behind the gyro above which an accelerometer on its own topic counts as stopped:
@@ -138,16 +135,14 @@ class Sequencer:
 
     def __init__(self, parameters: Parameters, *, offline: bool = False, colors: bool = False,
                  clock: Callable[[], int] = time.monotonic_ns) -> None:
-        self._parameters = parameters
+        self._parameters, self._offline = parameters, offline
         self._R_cam_imu = parameters.sensor.R_cam_imu
-        self._offline = offline
         self._colors, self._levels = colors, GrayLevels()
         self.gyro_only = False   # whether frames are without gravity and specific force
         self._now: Callable[[], int] = (lambda: 0) if offline else clock
         self._max_gap_ns = to_nanoseconds(parameters.imu.max_imu_gap)
-        # Longest interval of frames that the gyro is integrated over. The history that is left
-        # depends on when a frame is taken; half of it is left in any case, so that live and replay
-        # agree.
+        # Longest interval of frames that the gyro is integrated over: half of the history is left
+        # independently of when a frame is taken, so that live and replay agree.
         self._longest_interval_ns = to_nanoseconds(0.5 * parameters.imu.imu_buffer_seconds)
         self._changed = threading.Condition()
         self._closed = False
