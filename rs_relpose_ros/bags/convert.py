@@ -64,8 +64,7 @@ def image_file(stamp_ns: int, path: Path) -> RecordedImage:
 class Recording:
     """One camera and one IMU, at least one image and one sample, and the node's parameters.
 
-    Images and poses in the order of their stamps, each by its sensor's clock. Samples are sorted;
-    the node drops repeated ones.
+    Images and poses in the order of their stamps, each by its sensor's clock.
     """
 
     camera: RollingShutterCamera | None   # None: not calibrated, and the bag has no CameraInfo
@@ -107,8 +106,7 @@ def write_bag(recording: Recording, path: Path | str,
               on_image: Callable[[], object] = lambda: None) -> None:
     """Write a recording as a bag, with the receive times of a driver, by which readers sort.
 
-    Stamps and JPEG bytes are not changed. `on_image` is called after each image. If the bag cannot
-    be created or an image cannot be used, no bag is left.
+    Stamps and JPEG bytes are not changed. `on_image` is called after each image.
     """
     camera, imu_delay_ns = recording.camera, to_nanoseconds(reader.IMU_DELAY)
     size, reference, delay = None, 'the first image has', reader.IMAGE_DELAY
@@ -209,8 +207,8 @@ def read_rows(path: Path, columns: Sequence[str | int] | None = None,
               separator: str | None = ',') -> Iterator[Row]:
     """Rows of a text file, without empty lines and those that begin with '#'.
 
-    Each must have all `columns`; without them, the first line has their names. `separator`: None
-    for white space. MissingInputError without the file.
+    Each must have all `columns`: without them those of the first line. `separator`: None for white
+    space.
     """
     with check_file(path, _MAX_TABLE).open(encoding='utf-8', errors='replace') as file:
         lines = iter(lambda: file.readline(_MAX_LINE), '')

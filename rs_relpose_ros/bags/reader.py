@@ -202,29 +202,39 @@ class _TopicFinder:
     complete: bool = True   # whether an absent topic is an error
 
     def find(self, needs_camera_info: bool) -> Chosen:
-        image = self._one('image', 'image', IMAGE, COMPRESSED_IMAGE)
+        image = self.one('image', 'image', IMAGE, COMPRESSED_IMAGE)
         if self.complete and image and 'image_rect' in image.name:
             raise InputError(f'{image.name} is a rectified image, in which a row no longer has '
                              'one time: choose the raw one with --image-topic')
         imu, accel = self._imu()
         camera_info = None
         if needs_camera_info or self.names.get('camera_info') or self._of_type(CAMERA_INFO):
-            camera_info = self._camera_info(image)
+            camera_info = self.one(
+                'camera_info', 'CameraInfo', CAMERA_INFO, preferred=image.camera_info if image
+                else '', fix='; give camera_matrix, whose focal length "rs_relpose calibrate" '
+                'estimates')
         return Chosen(image, camera_info, imu, accel)
 
-    def _one(self, role: str, content: str, *msgtypes: str, fix: str = '', hint: str = '',
-             without: Topic | None = None) -> Topic | None:
-        """The chosen topic, or the only one of these types; `fix` if there is none."""
+    def one(self, role: str, content: str, *msgtypes: str, fix: str = '', hint: str = '',
+            preferred: str = '', without: Topic | None = None) -> Topic | None:
+        """The chosen topic, or that of a name, or the only one of these types.
+
+        `fix` if there is none, `hint` if there are several; the ground truth may be absent.
+        """
         if chosen := self._chosen(role, *msgtypes):
             return chosen
         candidates = [topic for topic in self._of_type(*msgtypes) if topic != without]
-        if not (candidates or self.complete):
-            return None
+        candidates = [topic for topic in candidates if topic.name == preferred] or candidates
+        several = (f'{self.bag} has several {content} topics, choose one with {_option(role)}'
+                   f'{hint}: {", ".join(map(str, candidates))}')
+        if role == 'truth' or not (candidates or self.complete):
+            if len(candidates) > 1:
+                _logger.warning('%s; none is used', several)
+            return candidates[0] if len(candidates) == 1 else None
         if not candidates:
             raise self._missing(f'{content} topic ({" or ".join(msgtypes)}){fix}')
         if len(candidates) > 1:
-            raise InputError(f'{self.bag} has several {content} topics, choose one with '
-                             f'{_option(role)}{hint}: {", ".join(map(str, candidates))}')
+            raise InputError(several)
         return candidates[0]
 
     def _chosen(self, role: str, *msgtypes: str) -> Topic | None:
@@ -241,14 +251,6 @@ class _TopicFinder:
             raise MissingInputError(f'topic {name} ({option}) of {self.bag} has no messages')
         return found[0]
 
-    def _camera_info(self, image: Topic | None) -> Topic | None:
-        for topic in self._of_type(CAMERA_INFO):
-            if image and topic.name == image.camera_info and not self.names.get('camera_info'):
-                return topic
-        return self._one('camera_info', 'CameraInfo', CAMERA_INFO,
-                         fix='; give camera_matrix, whose focal length "rs_relpose calibrate" '
-                         'estimates')
-
     def _imu(self) -> tuple[Topic | None, Topic | None]:
         """Topics of the gyro, and of a separate accelerometer."""
         accel = self._chosen('accel', IMU)
@@ -258,19 +260,8 @@ class _TopicFinder:
                              for word in ('gyro', 'accel'))
             if len(gyros) == 1 and len(accels) == 1 and gyros != accels:
                 return gyros[0], accels[0]
-        return self._one('imu', 'IMU', IMU, without=accel,
+        return self.one('imu', 'IMU', IMU, without=accel,
                          hint=' (and --accel-topic for a separate accelerometer)'), accel
-
-    def truth(self) -> Topic | None:
-        if chosen := self._chosen('truth', POSE_STAMPED):
-            return chosen
-        candidates = self._of_type(POSE_STAMPED)
-        named = [topic for topic in candidates if topic.name == GROUND_TRUTH_TOPIC]
-        if not named and len(candidates) > 1:
-            _logger.warning('several topics could be the ground truth and none is used; choose '
-                            'one with --truth-topic: %s', ', '.join(map(str, candidates)))
-            return None
-        return next(iter(named or candidates), None)
 
     def _of_type(self, *msgtypes: str) -> list[Topic]:
         return [topic for topic in self.topics if topic.msgtype in msgtypes and topic.count]
@@ -306,9 +297,8 @@ class RawMessage(NamedTuple):
 def _types(of_ros2: bool) -> Typestore:
     """Message types of one ROS, by their names alone.
 
-    The definitions in a bag are not used: rosbags would parse them and make code of them, also of
-    unused topics. An expression in IDL can take any time and memory to parse, an array of empty
-    messages any memory to read.
+    Definitions in a bag are not used: an expression in IDL can take any time and memory to parse,
+    an array of empty messages any memory to read.
     """
     return get_typestore(Stores.ROS2_JAZZY if of_ros2 else Stores.ROS1_NOETIC)
 
@@ -375,13 +365,13 @@ class Bag:
 
         `names`: those chosen, by field of `SensorTopics`; empty ones are as if absent. Of several
         CameraInfo topics, that next to the image is used, and of two Imu topics one with 'gyro'
-        and one with 'accel' in its name make a pair (RealSense). MissingInputError if a topic is
-        absent; InputError if several are possible, or one has another type.
+        and one with 'accel' in its name make a pair (RealSense).
         """
         finder = _TopicFinder(self.path, self.topics, names or {})
         found = finder.find(needs_camera_info)
         assert found.image is not None and found.imu is not None
-        return SensorTopics(found.image, found.camera_info, found.imu, found.accel, finder.truth())
+        truth = finder.one('truth', 'ground truth', POSE_STAMPED, preferred=GROUND_TRUTH_TOPIC)
+        return SensorTopics(found.image, found.camera_info, found.imu, found.accel, truth)
 
     def choose_topics(self, names: Mapping[str, str]) -> Chosen:
         """The same, but None for those that are absent; a rectified image is chosen, too."""

@@ -136,10 +136,9 @@ _BY_COLUMNS_MS = 10_000.0
 
 
 def readout_values(milliseconds: float, name: str, source: str) -> list[SourcedValue]:
-    """Parameters of a readout time [ms], negative if read upwards; none for 0, if it is unknown.
+    """Parameters of a readout time [ms], negative if read upwards; none for 0: unknown.
 
-    `source`: in words. InputError, with the name of the value, for a sensor that is read column by
-    column.
+    InputError, with `name`, for a sensor read by columns. `source`: of the value, in words.
     """
     if abs(milliseconds) >= _BY_COLUMNS_MS:
         raise InputError(f'{name}: the sensor is read column by column, which the model of row '
@@ -193,11 +192,7 @@ class Telemetry:
 
 
 def read_telemetry(path: Path, start_ns: int) -> Telemetry:
-    """Telemetry of a video whose first frame is stamped `start_ns`.
-
-    MissingInputError if the file has none, or no gyro; InputError if the images are stabilised:
-    then a row has no single time.
-    """
+    """Telemetry of a video whose first frame is stamped `start_ns`; no stabilised images."""
     parser, tags, samples = _parsed(path)
     for group, tag, off, name, switch in _STABILISATION:
         for value in _values(tags, group, tag):
@@ -380,9 +375,15 @@ def read_android(folder: Path) -> Recording:
     raise MissingInputError(f'{folder} is of no known logger, by its files: {known_loggers()}')
 
 
-def _title(folder: Path, details: str) -> str:
-    return (f'Parameters of relpose_node for {folder.name} (`rs_relpose convert android`)'
-            f'{details}.')
+def _recording(folder: Path, details: str, images: Sequence[convert.RecordedImage],
+               imu: Sequence[ImuSample], accel: Sequence[ImuSample] = (),
+               values: Sequence[SourcedValue] = (), time_offset: SourcedValue = _TIME_OFFSET,
+               orientation: object = None, truth: tuple[TruePose, ...] = ()) -> Recording:
+    """A recording of a phone, which is not calibrated; its parameters, with own `values`."""
+    title = (f'Parameters of relpose_node for {folder.name} (`rs_relpose convert android`)'
+             f'{details}.')
+    return Recording(None, images, imu, title, (
+        convert.COMPRESSED, *values, _STAMP_ROW, time_offset, _axes(orientation)), accel, truth)
 
 
 def _axes(sensor_orientation: object = None) -> SourcedValue:
@@ -451,9 +452,6 @@ def _reals(rows: list[Row], column: str) -> list[float]:
     return [row.real(column) for row in rows if row.words.get(column, '') not in ('', 'null')]
 
 
-_STAMPS = ('stamp_ns', 'timestamp_ns')
-
-
 def read_tables(folder: Path) -> Recording:
     """Recordings of any logger as tables with a header line."""
     gyro = [ImuSample(_stamp(row), row.vector(*'xyz'), None)
@@ -472,14 +470,12 @@ def read_tables(folder: Path) -> Recording:
             raise InputError(f'{frames[0].path} has no column file, and {folder} has '
                              f'{len(videos)} videos (.mp4, .mov): there must be one')
         images = _landscape_video(videos[0]).frames(stamps_ns, frames[0].path)
-    return Recording(
-        None, images, gyro, _title(
-            folder, '. `rs_relpose calibrate` estimates readout time and focal length'),
-        (convert.COMPRESSED, _STAMP_ROW, _TIME_OFFSET, _axes()), accel=accel)
+    return _recording(folder, '. `rs_relpose calibrate` estimates readout time and focal length',
+                      images, gyro, accel)
 
 
 def _stamp(row: Row) -> int:
-    return row.nanoseconds(next((name for name in _STAMPS if name in row.words), _STAMPS[0]))
+    return row.nanoseconds('timestamp_ns' if 'timestamp_ns' in row.words else 'stamp_ns')
 
 
 # How far the two clocks may drift apart during a recording [ns]; beyond it the phone slept.
@@ -503,14 +499,12 @@ def read_mars(folder: Path) -> Recording:
     lens = [] if min(fx, fy) <= 0.0 else [_camera_matrix(
         (fx, fy, (video.width - 1) / 2.0, (video.height - 1) / 2.0), "A GUESS: the lens's "
         'nominal focal length as logged, principal point in the middle, no distortion.')]
-    return Recording(
-        None, video.frames(stamps_ns, stamps), imu,
-        _title(folder, ': recorded with the MARS Logger'),
-        (convert.COMPRESSED, *_skew(_reals(metadata, readout), readout),
-         *_exposure(_reals(metadata, 'Exposure time[nanosec]')),
-         *lens, _STAMP_ROW,
-         SourcedValue('time_offset', 0.0, f'NOT KNOWN: {clock}. `rs_relpose calibrate` measures '
-                      'it.'), _axes()))
+    return _recording(
+        folder, ': recorded with the MARS Logger', video.frames(stamps_ns, stamps), imu, (),
+        [*_skew(_reals(metadata, readout), readout),
+         *_exposure(_reals(metadata, 'Exposure time[nanosec]')), *lens],
+        SourcedValue('time_offset', 0.0, f'NOT KNOWN: {clock}. `rs_relpose calibrate` measures '
+                     'it.'))
 
 
 def _clock(path: Path) -> tuple[int, str]:
@@ -552,13 +546,12 @@ def read_posecam(folder: Path) -> Recording:
                         metadata[0].path)
     skew = 'rolling_shutter_skew_ns'
     camera = _optional_object(folder / 'device.json').get('camera')
-    return Recording(
-        None, images, gyro, _title(folder, ': recorded with PoseCam'),
-        (convert.COMPRESSED, *_skew(_reals(metadata, skew), skew),
-         *_exposure(_reals(metadata, 'exposure_time_ns')), _STAMP_ROW, _TIME_OFFSET,
-         _axes(camera.get('sensor_orientation_deg') if isinstance(camera, Mapping) else None),
-         *_intrinsics(folder / 'intrinsics.json'), *bias),
-        accel=accel, truth=_truth(poses, folder / 'manifest.json'))
+    return _recording(
+        folder, ': recorded with PoseCam', images, gyro, accel,
+        [*_skew(_reals(metadata, skew), skew), *_exposure(_reals(metadata, 'exposure_time_ns')),
+         *_intrinsics(folder / 'intrinsics.json'), *bias],
+        orientation=camera.get('sensor_orientation_deg') if isinstance(camera, Mapping) else None,
+        truth=_truth(poses, folder / 'manifest.json'))
 
 
 def _posecam_imu(path: Path) -> tuple[list[ImuSample], list[ImuSample], list[SourcedValue]]:

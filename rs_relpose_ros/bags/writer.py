@@ -54,11 +54,7 @@ class BagWriter:
         return self._typestore.types[msgtype]
 
     def write(self, topic: str, msgtype: str, message: Any, bag_time_ns: int) -> None:
-        """Append a message; a topic is announced at its first message and has one type.
-
-        `message` is an instance of `type(msgtype)`, e.g. from `rs_relpose_ros.messages.outgoing`
-        with ``types=bag.type``; `bag_time_ns` is its receive time, not the header's stamp.
-        """
+        """Append a message, an instance of `type(msgtype)`; `bag_time_ns`: its receive time."""
         self.type(msgtype)
         connection = self._connections.get(topic)
         if connection is None:

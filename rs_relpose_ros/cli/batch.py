@@ -120,10 +120,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _options(args: argparse.Namespace) -> tuple[tuple[str, ...], str | None]:
-    """Options of the command, and the text of a parameter file for all bags, None for their own.
-
-    Wrong ones are refused before any work.
-    """
+    """Checked options of the command, and text of a parameter file, None for the bags' own."""
     command: str = args.batch_command
     options = [word for value in args.set for word in ('--set', value)]
     options += shlex.split(args.options)
@@ -198,15 +195,12 @@ def find_bags(paths: Sequence[str]) -> list[Bag]:
 
 
 def unique_names(paths: Sequence[str]) -> list[str]:
-    """Names for the results of bags: their own, with as many folders as make them unique."""
-    parts = [[part for part in (path.with_suffix('') if path.suffix in _BAG_SUFFIXES
-                                else path).parts if part not in ('/', '..')]
-             for path in map(Path, paths)]
-    names = ['__'.join(own[-next((depth for depth in range(1, len(own)) if sum(
-        other[-depth:] == own[-depth:] for other in parts) == 1), len(own)):]) for own in parts]
-    # The same path in two spellings.
-    return names if len(set(names)) == len(names) else [
-        f'{name}_{number}' for number, name in enumerate(names)]
+    """Names for the results of bags: their own, with the folders below the one of all."""
+    bags = [Path(path).absolute() for path in paths]
+    common = os.path.commonpath([bag.parent for bag in bags])
+    long = [bag.relative_to(common) for bag in bags]
+    short = [name.with_suffix('') if name.suffix in _BAG_SUFFIXES else name for name in long]
+    return ['__'.join(name.parts) for name in (short if len({*short}) == len(short) else long)]
 
 
 def make_jobs(client: Any, command: str, paths: Sequence[str], parameters: str | None,
@@ -358,8 +352,7 @@ def run_jobs(client: Any, jobs: Sequence[Job], folder: Path,
              on_bag: Callable[[], object] = lambda: None) -> tuple[list[Row], int]:
     """Rows of the jobs, written with their files into a folder; how many an earlier run had.
 
-    `work` runs on the workers, which must be able to import it. A worker that dies is replaced,
-    and its job repeated, by another worker if possible. `on_bag` is called after each.
+    `work` runs on the workers. A worker that dies is replaced, and its job repeated.
     """
     distributed = library('distributed', _ABSENT)
     folder.mkdir(parents=True, exist_ok=True)

@@ -3,11 +3,18 @@
 import argparse
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import fields
+import json
 import logging
 from pathlib import Path
+import platform
 import sys
 from typing import Any, TypeVar
 
+import cv2
+import numba
+import numpy as np
+import scipy
 from tqdm import tqdm
 
 from rs_relpose_ros.bags.reader import Bag, open_bag, SensorTopics, Topic
@@ -16,8 +23,7 @@ from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.messages.transforms import with_extrinsics
 from rs_relpose_ros.offline.replay import need_sensor_parameters
-from rs_relpose_ros.offline.tables import write_summary
-from rs_relpose_ros.output_files import refuse_unwritable, SUMMARY_FILE
+from rs_relpose_ros.output_files import refuse_unwritable, SUMMARY_FILE, written
 
 _logger = logging.getLogger(__name__)
 
@@ -81,8 +87,16 @@ def run_on_bag(args: argparse.Namespace, suffix: str, work: Work[Made],
     refuse_unwritable(folder)
     with opened(args, parameters) as (bag, topics, parameters):
         results = work(folder, bag, topics, parameters)
-    write_summary(folder / SUMMARY_FILE, results.metrics, bag=args.bag, topics=topics,
-                  parameters=parameters, command=sys.argv, package_version=package_version())
+    by_role = {one.name: getattr(topics, one.name) for one in fields(topics)}
+    summary = {
+        'bag': str(args.bag),
+        'topics': {role: topic and topic.name for role, topic in by_role.items()},
+        **results.metrics, 'parameters': parameters.to_mapping(), 'command': sys.argv,
+        'versions': {'rs_relpose_ros': package_version(), 'python': platform.python_version(),
+                     'numpy': np.__version__, 'scipy': scipy.__version__,
+                     'opencv': cv2.__version__, 'numba': numba.__version__}}
+    with written(folder / SUMMARY_FILE) as file:   # JSON has no NaN
+        file.write(json.dumps(summary, indent=2, allow_nan=False) + '\n')
     return folder, results
 
 
@@ -108,8 +122,7 @@ def opened(args: argparse.Namespace,
            parameters: Parameters) -> Iterator[tuple[Bag, SensorTopics, Parameters]]:
     """A bag and its topics, and `parameters` with the extrinsics of its transforms.
 
-    A progress bar shows its images. MissingInputError for required parameters that no message
-    contains. `args` have `bag` and the options of topics and parameters.
+    A progress bar shows its images. `args` have `bag` and the options of topics and parameters.
     """
     with open_bag(args.bag) as bag:
         topics = bag.find_topics(topic_options(args),

@@ -70,8 +70,7 @@ def setting(default: Any, description: str, unit: str = '', *, kind: type | None
             **legal: Any) -> Any:
     """Field of a configuration dataclass, with its declaration as metadata.
 
-    `legal`: other fields of `Declared`. A tuple setting declares its `length`, and a setting
-    without a default (None) its `kind`.
+    `legal`: other fields of `Declared`. A setting without a default (None) declares its `kind`.
     """
     legal.setdefault('live', legal.get('restarts', False))
     declared = Declared(description, unit, kind=type(default) if kind is None else kind, **legal)

@@ -174,9 +174,8 @@ def replay_into(folder: Path, bag: Bag, topics: SensorTopics, parameters: Parame
                 on_pair: Callable[[PairResult], object] = lambda pair: None) -> ReplayOutcome:
     """Run `bag` through the pipeline and write tables, pictures and a bag into `folder`.
 
-    Files of an earlier run in `folder` are replaced; it is created if necessary. `stamps`
-    are those of `Replay`; `with_bag`: whether to write the node's topics as a bag.
-    `on_pair` is called with each pair, which has its image if `pictures` are drawn.
+    Files of an earlier run are replaced. `stamps`: as of `Replay`; `with_bag`: of the node's
+    topics. `on_pair` is called with each pair, which has its image if `pictures` are drawn.
     """
     run = Replay(bag, topics, parameters, stamps=stamps, keep_images=pictures)
     truth = read_truth(bag, topics)

@@ -1,22 +1,15 @@
-"""Records of pairs, their rows in the tables, and ``summary.json``."""
+"""Records of pairs, their rows in the tables, and their statistics for ``summary.json``."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, ExitStack
 import csv
-from dataclasses import dataclass, field, fields
-import json
+from dataclasses import dataclass, field
 import math
 from pathlib import Path
-import platform
 from typing import Any, NamedTuple, Self
 
-import cv2
-import numba
 import numpy as np
-import scipy
 
-from rs_relpose_ros.bags.reader import SensorTopics
-from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.estimator.result import RelativePose
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.messages.incoming import ReasonCounts
@@ -120,10 +113,9 @@ def table_writer(folder: Path, tables: Sequence[Table]) -> Iterator[Callable[[Pa
 
 
 def translation_sigmas(covariance: Array) -> tuple[float, float]:
-    """1 sigma of the translation direction [rad], larger and smaller axis.
+    """1 sigma of the translation direction [rad], larger and smaller axis; NaN without one.
 
-    The covariance (6, 6) of (dt, dtheta) has no variance along t, so two of three axes remain. NaN
-    without a translation.
+    The covariance (6, 6) of (dt, dtheta) has no variance along t, so two of three axes remain.
     """
     if np.isnan(covariance[0, 0]):
         return math.nan, math.nan
@@ -136,24 +128,6 @@ def rotation_sigmas(covariance: Array) -> tuple[float, float, float]:
     """1 sigma of the rotation about the axes x, y, z of camera 1 [rad]."""
     x, y, z = np.sqrt(np.maximum(np.diag(covariance)[3:], 0.0))
     return float(x), float(y), float(z)
-
-
-def write_summary(path: Path, metrics: dict[str, Any], *, bag: Path, topics: SensorTopics,
-                  parameters: Parameters, command: Sequence[str], package_version: str) -> None:
-    """Write metrics and their provenance as JSON, which has no NaN."""
-    by_role = {one.name: getattr(topics, one.name) for one in fields(topics)}
-    summary = {
-        'bag': str(bag),
-        'topics': {role: topic and topic.name for role, topic in by_role.items()},
-        **metrics,
-        'parameters': parameters.to_mapping(),
-        'command': list(command),
-        'versions': {'rs_relpose_ros': package_version, 'python': platform.python_version(),
-                     'numpy': np.__version__, 'scipy': scipy.__version__,
-                     'opencv': cv2.__version__, 'numba': numba.__version__},
-    }
-    with written(path) as file:
-        file.write(json.dumps(summary, indent=2, allow_nan=False) + '\n')
 
 
 def baselines(answered: Sequence[PairRecord]) -> dict[str, Any]:

@@ -1,7 +1,5 @@
 """A bag with its images derotated to their middle row, and all other messages unchanged."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,20 +15,6 @@ from rs_relpose_ros.offline.replay import MessageRefused, outcomes, unused_reaso
 from rs_relpose_ros.output_files import beside
 from rs_relpose_ros.pipeline.global_shutter import GlobalShutterFrame, unrolling_loop
 from rs_relpose_ros.pipeline.pair import Frame
-
-
-def unroll(bag: Bag, topics: SensorTopics, parameters: Parameters, out: Path) -> Unrolling:
-    """Write the bag `out`, a directory that must not exist, and appears when it is complete.
-
-    Nothing is written if no image can be derotated.
-    """
-    with beside(out) as part:
-        with BagWriter(part) as writer:
-            run = Unrolling(bag, topics, parameters, writer)
-            run.write(parameters.global_shutter.stamp_clock)
-        if run.images:
-            part.rename(out)
-    return run
 
 
 class Unrolling:
@@ -120,3 +104,17 @@ class Unrolling:
         self._writer.write(topic.name, topic.msgtype, image, bag_time_ns)
         self.images += 1
         self.largest_shift = max(self.largest_shift, result.map.shift)
+
+
+def unroll(bag: Bag, topics: SensorTopics, parameters: Parameters, out: Path) -> Unrolling:
+    """Write the bag `out`, a directory that must not exist, and appears when it is complete.
+
+    Nothing is written if no image can be derotated.
+    """
+    with beside(out) as part:
+        with BagWriter(part) as writer:
+            run = Unrolling(bag, topics, parameters, writer)
+            run.write(parameters.global_shutter.stamp_clock)
+        if run.images:
+            part.rename(out)
+    return run
