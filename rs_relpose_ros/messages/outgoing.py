@@ -29,8 +29,7 @@ MessageTypes = Callable[[str], Any]
 
 _UINT32, _FLOAT32 = 6, 7   # sensor_msgs/PointField
 
-# Floats first: `sensor_msgs_py.point_cloud2.read_points_numpy` reads only fields of the type of
-# the first.
+# Floats first: `point_cloud2.read_points_numpy` reads only fields of the type of the first.
 MATCH_DTYPE = np.dtype([(name, '<f4') for name in (
     'u1', 'v1', 'u2', 'v2', 'tau1', 'tau2', 'x1', 'y1', 'z1', 'x2', 'y2', 'z2', 'x', 'y', 'z',
     'u1_gs', 'v1_gs', 'u2_gs', 'v2_gs')] + [('id', '<u4')])
@@ -58,8 +57,7 @@ DEBUG_IMAGE = 'debug_image'
 _JPEG_QUALITY = 95
 # Integer fields of sensor_msgs/RegionOfInterest.
 _REGION = ('x_offset', 'y_offset', 'height', 'width')
-# Lower bound of the eigenvalues of a published covariance, relative to the largest: those of a
-# matrix of rank 5 are then not negative by rounding.
+# Least eigenvalue of a published covariance of rank 5, relative to the largest, against rounding.
 _LEAST_EIGENVALUE = 1e-14
 
 
@@ -179,8 +177,7 @@ def pair_parts(result: PairResult, types: MessageTypes,
         'matches': lambda: _matches_message(inlier_records(result), in_reference, types)}
     if pose.rotation_known:
         # Errors of the rotation are about the axes of the reference camera, as in
-        # ``~/relative_pose``; the angular velocity is in the current camera's, as in
-        # ``~/velocity``.
+        # ``~/relative_pose``; the rates are those of ``~/velocity``.
         parts['relative_rotation'] = lambda: imu_message(
             stamp_ns, in_reference.frame_id, pose.angular_velocity2, None, types,
             angular_velocity_covariance=published_covariance(pose.velocity_covariance[3:, 3:]),

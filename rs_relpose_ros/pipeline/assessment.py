@@ -39,8 +39,7 @@ _LONG_ROTATION, _INDEPENDENT = 2.0, 0.85
 # Rotations within these [rad] of half a turn about an axis of the image, or of a quarter of one
 # about the optical axis, also are flipped images.
 _HALF_TURN, _QUARTER_TURN = 0.6, 0.3
-# Quantile of the pairs' shifts that decides whether a deviation matters: pairs of little motion
-# hide it.
+# Quantile of the pairs' shifts by which a deviation matters: pairs of little motion hide it.
 _OBSERVABLE_IN = 0.9
 # Sigmas within which a parameter that was configured with a sigma is as configured.
 _AS_CONFIGURED = 3.0
@@ -57,8 +56,7 @@ _LARGEST_GAIN, _AS_GOOD = 100.0, 4.0
 _MOST_QUANTITIES = 4
 # Part of the configured distortion that rectified images have at most.
 _LITTLE_OF = 0.25
-# Deviations that move the pose by less than this share of the largest shift are not evaluated:
-# a gross error leaves traces in all quantities.
+# Share of the largest shift below which others are traces of a gross error, and not evaluated.
 _TRACE = 0.34
 
 

@@ -242,8 +242,7 @@ class Applied:
 
     time_offset: float = 0.0   # [s]
     readout_time: float = 0.0   # [s]
-    # [s] before the first and after the last configured row that the IMU must cover, too: a
-    # longer readout time is applied to an earlier keyframe.
+    # [s] beyond the configured rows that the IMU must cover, too, for a longer readout time.
     margin: float = 0.0
 
     def moved(self, estimated: Tracked, sensor: SensorConfig) -> Applied:

@@ -37,8 +37,7 @@ _BACK_FRAMES, _BACK_SAMPLES = 3, 20
 MAILBOX_FRAMES, WAITING_FRAMES = 5, 16
 # Longest time [ns] that a frame waits for the IMU.
 MAX_IMU_WAIT_NS = NANOSECONDS
-# Delay [ns] behind the gyro above which an accelerometer on its own topic counts as stopped:
-# frames no longer wait for it.
+# Delay [ns] behind the gyro above which frames do not wait for an accelerometer of its own topic.
 _ACCELEROMETER_STALE_NS = NANOSECONDS // 10
 # Most refusals that are kept until they are taken; the counters lose none.
 _REFUSALS_KEPT = 256
