@@ -26,7 +26,7 @@ from rs_relpose_ros.odometry import need_gtsam
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.graph import KeyframeGraph, KeyframeState
 from rs_relpose_ros.odometry.offline import draw_paths, path_of, write_tum
-from rs_relpose_ros.odometry.pair import BodyState, deviations, KeyframePair, Mounting
+from rs_relpose_ros.odometry.pair import deviations, KeyframePair
 from rs_relpose_ros.odometry.states import Base, ContinuousPath, OdometryState
 from rs_relpose_ros.offline.truth import TrueTrajectory
 
@@ -153,35 +153,34 @@ def ate(keyframes, truth):
 def test_derivatives_of_deviations_are_those_of_finite_differences():
     rng = np.random.default_rng(0)
     C = Rotation.random(random_state=1).as_matrix()
-    mounting = Mounting(C, np.array([0.1, -0.05, 0.03]))
-    first, second = (BodyState(
-        Rotation.from_rotvec(0.1 * rng.normal(size=3)).as_matrix(),
-        np.array([0.3 * k, 0.0, 0.1]), rng.normal(size=3), rng.normal(size=3)) for k in range(2))
-    cameras = [(body.R @ C.T, body.position + body.R @ mounting.position)
-               for body in (first, second)]
-    R = np.ascontiguousarray(cameras[0][0].T @ cameras[1][0])
-    q = cameras[0][0].T @ (cameras[1][1] - cameras[0][1])
+    arm = np.array([0.1, -0.05, 0.03])
+    # R to the world, position, velocity, rate.
+    bodies = [(Rotation.from_rotvec(0.1 * rng.normal(size=3)).as_matrix(),
+               np.array([0.3 * k, 0.0, 0.1]), rng.normal(size=3), rng.normal(size=3))
+              for k in range(2)]
+    (R1, c1), (R2, c2) = ((R @ C.T, p + R @ arm) for R, p, _, _ in bodies)
+    R, q = np.ascontiguousarray(R1.T @ R2), R1.T @ (c2 - c1)
     t, velocities = q / np.linalg.norm(q), rng.normal(size=6)
-    exact, _ = deviations(first, second, mounting, R, t, velocities)
+    exact, _ = deviations(*bodies[0], *bodies[1], C, arm, R, t, velocities)
     np.testing.assert_allclose(exact[:5], 0.0, atol=1e-12)
-    for body, row in ((first, 5), (second, 8)):
-        moving = body.velocity + body.R @ np.cross(body.rate, mounting.position)
+    for (body_R, _, v, w), row in zip(bodies, (5, 8), strict=True):
+        moving = v + body_R @ np.cross(w, arm)
         np.testing.assert_allclose(
-            exact[row:row + 3], cameras[0][0].T @ moving / np.linalg.norm(q)
-            - velocities[row - 5:row - 2], atol=1e-12)
+            exact[row:row + 3], R1.T @ moving / np.linalg.norm(q) - velocities[row - 5:row - 2],
+            atol=1e-12)
 
     t = t + 0.05 * rng.normal(size=3)
     t /= np.linalg.norm(t)
 
     def moved(body, x):
-        return BodyState(body.R @ Rotation.from_rotvec(x[:3]).as_matrix(),
-                         body.position + body.R @ x[3:6], body.velocity + x[6:9], body.rate)
+        R, p, v, w = body
+        return R @ Rotation.from_rotvec(x[:3]).as_matrix(), p + R @ x[3:6], v + x[6:9], w
 
-    _, by = deviations(first, second, mounting, R, t, velocities)
+    _, by = deviations(*bodies[0], *bodies[1], C, arm, R, t, velocities)
     for k, step in enumerate(1e-6 * np.eye(21)):
         plus, minus = (deviations(
-            moved(first, x[:9]), moved(second, x[9:18]),
-            Mounting(C, mounting.position + x[18:]), R, t, velocities)[0] for x in (step, -step))
+            *moved(bodies[0], x[:9]), *moved(bodies[1], x[9:18]), C, arm + x[18:], R, t,
+            velocities)[0] for x in (step, -step))
         np.testing.assert_allclose(by[:, k], (plus - minus) / 2e-6, atol=1e-6)
 
 

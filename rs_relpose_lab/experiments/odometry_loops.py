@@ -26,7 +26,7 @@ from rs_relpose_ros.geometry.timing import to_nanoseconds
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.loops import close_loops, View
 from rs_relpose_ros.odometry.offline import follow, path_of
-from rs_relpose_ros.odometry.pair import BodyState, deviations, KeyframePair, Mounting, square_root
+from rs_relpose_ros.odometry.pair import deviations, KeyframePair, square_root
 from rs_relpose_ros.odometry.states import Odometry
 from rs_relpose_ros.offline.truth import TrueTrajectory
 from rs_relpose_ros.pipeline.chosen_pairs import ChosenPairs, Stamps
@@ -146,11 +146,11 @@ def _misfit(pair: KeyframePair, simulation: Simulation) -> float:
     """Chi squared of a loop at the true poses, by its 3 sigma bound."""
     states, images = simulation.states([pair.reference_ns, pair.current_ns]), pair.images
     assert images is not None
-    bodies = [BodyState(np.ascontiguousarray(states.R_world_cam[k]), states.position[k],
-                        states.velocity[k], states.angular_velocity[k]) for k in range(2)]
+    bodies = [(np.ascontiguousarray(states.R_world_cam[k]), states.position[k],
+               states.velocity[k], states.angular_velocity[k]) for k in range(2)]
     A, a = square_root(images.information, images.gradient)
     deviation, _ = deviations(
-        bodies[0], bodies[1], Mounting(np.eye(3), np.zeros(3)), images.R,
+        *bodies[0], *bodies[1], np.eye(3), np.zeros(3), images.R,
         np.nan_to_num(images.t, nan=1.0), np.zeros(6))
     error = A @ deviation[:A.shape[1]] + a
     return float(error @ error) / float(chi2.isf(_BEYOND, len(error)))

@@ -22,7 +22,7 @@ from rs_relpose_ros.errors import RsRelposeError
 from rs_relpose_ros.geometry import Array
 from rs_relpose_ros.geometry.so3 import skew, STANDARD_GRAVITY
 from rs_relpose_ros.imu.buffer import ImuInterval
-from rs_relpose_ros.odometry.pair import BodyState, deviations, KeyframePair, Mounting, square_root
+from rs_relpose_ros.odometry.pair import deviations, KeyframePair, square_root
 
 # 1 sigma of the velocity of a body at rest [m/s], per axis.
 _REST_VELOCITY_SIGMA = 0.005
@@ -176,10 +176,10 @@ class KeyframeGraph:
 
     def propagated(self, interval: ImuInterval) -> KeyframeState:
         """The body after samples since the newest keyframe, without a new keyframe."""
-        by, noise, values = self._linearised(self._preintegrated(interval))
-        pose = values.atPose3(X(self._count))
+        by, noise = self._linearised(self._predicted(interval))
+        pose = self._ahead.atPose3(X(self._count))
         return replace(self.newest, R=pose.rotation().matrix(), position=pose.translation(),
-                       velocity=values.atVector(V(self._count)),
+                       velocity=self._ahead.atVector(V(self._count)),
                        covariance=by @ self.newest.covariance @ by.T + noise)
 
     def add(self, interval: ImuInterval, pair: KeyframePair | None, at_rest: bool, *,
@@ -192,12 +192,11 @@ class KeyframeGraph:
         above 1, too.
         """
         i, j = self._count - 1, self._count
-        pim = self._preintegrated(interval)
-        state = self._predicted(pim)
+        pim = self._predicted(interval)
         rates = interval.rates[[0, -1]] - self._bias.gyroscope()
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        values.insert(X(j), state.pose())
-        values.insert(V(j), state.velocity())
+        values.insert(X(j), self._ahead.atPose3(X(j)))
+        values.insert(V(j), self._ahead.atVector(V(j)))
         values.insert(B(j), self._bias)
         factors.add(_imu_factor(i, j, pim))
         innovation = 0.0
@@ -304,50 +303,54 @@ class KeyframeGraph:
             factors, self._record[1], _optimizer()).optimize()
         return values, gtsam.Marginals(factors, values)
 
-    def _preintegrated(self, interval: ImuInterval) -> Any:
-        """``gtsam.PreintegratedCombinedMeasurements``, by the mean of two samples each."""
-        self._preintegration.setAccelerometerCovariance((
-            self._imu.accel_noise_density**2 + self._noise.accel_errors**2) * np.eye(3))
-        out = gtsam.PreintegratedCombinedMeasurements(self._preintegration, self._bias)
-        rates = 0.5 * (interval.rates[1:] + interval.rates[:-1])
-        forces = 0.5 * (interval.forces[1:] + interval.forces[:-1])
-        for force, rate, step in zip(forces, rates, np.diff(interval.seconds), strict=True):
-            out.integrateMeasurement(force, rate, step)
-        return out
+    def _predicted(self, interval: ImuInterval) -> Any:
+        """Predict the next keyframe in `_ahead`; ``gtsam.PreintegratedCombinedMeasurements``.
 
-    def _predicted(self, pim: Any) -> Any:
-        state = gtsam.NavState(self._values.atPose3(X(self._count - 1)),
-                               self._values.atVector(V(self._count - 1)))
-        return pim.predict(state, self._bias)
-
-    def _linearised(self, pim: Any) -> tuple[Array, Array, Any]:
-        """How errors of the newest keyframe propagate, the covariance of the samples, and values.
-
-        Both (18, 18), as the covariance of a keyframe; values: of the window and of the predicted.
+        By the mean of two samples each; those of the prediction before are not repeated.
         """
-        i, j, state = self._count - 1, self._count, self._predicted(pim)
-        values = gtsam.Values(self._values)
-        values.insert(X(j), state.pose())
-        values.insert(V(j), state.velocity())
-        values.insert(B(j), self._bias)
+        (known, pim), n = self._integrated, 1
+        if known and all(np.array_equal(old, new[:len(old)])
+                         for old, new in zip(known, interval, strict=True)):
+            n = len(known.seconds)
+        else:
+            self._preintegration.setAccelerometerCovariance((
+                self._imu.accel_noise_density**2 + self._noise.accel_errors**2) * np.eye(3))
+            pim = gtsam.PreintegratedCombinedMeasurements(self._preintegration, self._bias)
+        seconds, rates, forces = (samples[n - 1:] for samples in interval)
+        for force, rate, step in zip(0.5 * (forces[1:] + forces[:-1]),
+                                     0.5 * (rates[1:] + rates[:-1]), np.diff(seconds),
+                                     strict=True):
+            pim.integrateMeasurement(force, rate, step)
+        self._integrated = interval, pim
+        state = pim.predict(self._nav_state, self._bias)
+        self._ahead.update(X(self._count), state.pose())
+        self._ahead.update(V(self._count), state.velocity())
+        return pim
+
+    def _linearised(self, pim: Any) -> tuple[Array, Array]:
+        """How errors of the newest keyframe propagate, and the covariance of the samples.
+
+        Both (18, 18), as the covariance of a keyframe.
+        """
+        factor = _imu_factor(self._count - 1, self._count, pim)
         # A_i d_i + A_j d_j is white noise, the keys being X_i, V_i, X_j, V_j, B_i, B_j.
-        A, _ = _imu_factor(i, j, pim).linearize(values).jacobian()
+        A, _ = factor.linearize(self._ahead).jacobian()
         back = np.linalg.inv(A[:, _OF_SECOND])
         by, noise = np.eye(18), np.zeros((18, 18))
         by[:15, :15] = -back @ A[:, _OF_FIRST]
         noise[:15, :15] = back @ back.T
-        return by, noise, values
+        return by, noise
 
     def _innovation(self, pim: Any, of_pair: Any) -> _Innovation:
-        by, noise, values = self._linearised(pim)
-        H, e = of_pair.linearize(values).jacobian()
+        by, noise = self._linearised(pim)
+        H, e = of_pair.linearize(self._ahead).jacobian()
         second = np.zeros((len(e), 18))
         second[:, :9] = H[:, 9:18]
         whole = second @ by
         whole[:, :9] += H[:, :9]
         whole[:, ARM] += H[:, 18:]
         # White noise of the acceleration in position and velocity of the second body.
-        seconds, R = pim.deltaTij(), values.atPose3(X(self._count)).rotation().matrix()
+        seconds, R = pim.deltaTij(), self._ahead.atPose3(X(self._count)).rotation().matrix()
         of_velocity = second[:, VELOCITY] @ R
         of_both = second[:, 3:6] + (1.5 / seconds) * of_velocity
         by_accelerometer = (seconds**3 / 3.0 * of_both @ of_both.T
@@ -366,23 +369,26 @@ class KeyframeGraph:
         t, velocities = (images.t, images.velocities) if pair.has_direction else (
             np.array([0.0, 0.0, 1.0]), np.zeros(6))
         # Only velocities depend on the rates.
-        rates = np.zeros((2, 3)) if rates is None else rates
+        w1, w2 = np.zeros((2, 3)) if rates is None else rates
         noise = _diagonal([sigma] * len(offset))
         if robust:
             noise = gtsam.noiseModel.Robust.Create(
                 gtsam.noiseModel.mEstimator.Huber.Create(_loop_bound(len(offset))), noise)
 
-        def error(factor: Any, values: Any, jacobians: Any) -> Array:
-            x1, v1, x2, v2, arm = factor.keys()
-            e, by = deviations(_body(values, x1, v1, rates[0]), _body(values, x2, v2, rates[1]),
-                               Mounting(C, values.atVector(arm)), R, t, velocities)
+        keys = x1, v1, x2, v2, arm = [X(i), V(i), X(j), V(j), L(0)]
+
+        def error(_: Any, values: Any, jacobians: Any) -> Array:
+            P1, P2 = values.atPose3(x1).matrix(), values.atPose3(x2).matrix()
+            e, by = deviations(
+                P1[:3, :3].copy(), P1[:3, 3], values.atVector(v1), w1, P2[:3, :3].copy(),
+                P2[:3, 3], values.atVector(v2), w2, C, values.atVector(arm), R, t, velocities)
             if jacobians is not None:
                 whole = (by[:n].T @ root.T).T   # column-major, as gtsam requires
                 for block, columns in enumerate(_BLOCKS):
                     jacobians[block] = whole[:, columns]
             return np.asarray(root @ e[:n] + offset)
 
-        return gtsam.CustomFactor(noise, [X(i), V(i), X(j), V(j), L(0)], error)
+        return gtsam.CustomFactor(noise, keys, error)
 
     def _still_factor(self, i: int, j: int) -> Any:
         """The camera keeps its position under any rotation of the body."""
@@ -421,6 +427,14 @@ class KeyframeGraph:
         self._bias = self._values.atConstantBias(B(newest))
         self.newest = _state(self._values, gtsam.Marginals(
             _compact(self._smoother.getFactors()), self._values), newest)
+        self._nav_state = gtsam.NavState(self._values.atPose3(X(newest)),
+                                         self._values.atVector(V(newest)))
+        # The window, with a place for the prediction of the next keyframe, and its samples so far.
+        self._ahead = gtsam.Values(self._values)
+        self._ahead.insert(X(newest + 1), self._nav_state.pose())
+        self._ahead.insert(V(newest + 1), self._nav_state.velocity())
+        self._ahead.insert(B(newest + 1), self._bias)
+        self._integrated: tuple[ImuInterval | None, Any] = None, None
         if self._record is not None:
             self._record[1].insert_or_assign(self._values)
 
@@ -439,11 +453,6 @@ def _solving() -> Iterator[None]:
     except RuntimeError as error:   # of several lines
         first_line = str(error).strip().partition('\n')[0]
         raise GraphError(f'the graph cannot be solved: {first_line}') from error
-
-
-def _body(values: Any, pose_key: int, velocity_key: int, rate: Array) -> BodyState:
-    pose = values.atPose3(pose_key).matrix()
-    return BodyState(pose[:3, :3].copy(), pose[:3, 3], values.atVector(velocity_key), rate)
 
 
 def _compact(graph: Any) -> Any:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -137,25 +137,6 @@ def _contradiction(state: str, findings: str) -> str:
 _LEAST_BASELINE = 1e-4
 
 
-class Mounting(NamedTuple):
-    """Camera on a body: ``v_cam = R v_body``, `position` of the camera in the body [m]."""
-
-    R: Array
-    position: Array
-
-
-class BodyState(NamedTuple):
-    """Body in the world: ``R`` (3, 3) from its axes, position [m], velocity [m/s], rate [rad/s].
-
-    The rate is in the axes of the body.
-    """
-
-    R: Array
-    position: Array
-    velocity: Array
-    rate: Array
-
-
 @kernel
 def _skew(v: Array) -> Array:
     """``_skew(a) @ b = a x b``."""
@@ -163,20 +144,20 @@ def _skew(v: Array) -> Array:
 
 
 @kernel
-def deviations(first: BodyState, second: BodyState, mounting: Mounting, R: Array, t: Array,
+def deviations(R1: Array, p1: Array, v1: Array, w1: Array, R2: Array, p2: Array, v2: Array,
+               w2: Array, C: Array, c: Array, R: Array, t: Array,
                velocities: Array) -> tuple[Array, Array]:
-    """Deviations (11,) of a measured pair, and their derivatives (11, 21).
+    """Deviations (11,) of a measured pair (R, t, velocities), and their derivatives (11, 21).
 
-    With respect to small rotations and translations of the first body (in its axes), its velocity
-    (in the world), the same for the second body, and the position of the camera in the body. All
-    arrays are contiguous.
+    Of bodies with ``R_k`` to the world, position [m] and velocity [m/s] there, and rate ``w_k``
+    [rad/s] in their own axes. With respect to small rotations and translations of the first one
+    (in its axes), its velocity, the same of the second one, and c. All arrays are contiguous.
     """
-    C, c = mounting.R, mounting.position
     arm = _skew(c)
-    back = C @ first.R.T
-    R12 = back @ second.R @ C.T
+    back = C @ R1.T
+    R12 = back @ R2 @ C.T
     R12C = R12 @ C
-    q = back @ (second.position + second.R @ c - first.position - first.R @ c)
+    q = back @ (p2 + R2 @ c - p1 - R1 @ c)
     b = max(norm(q), _LEAST_BASELINE)
     u = q / b
     dq = np.zeros((3, 21))
@@ -193,16 +174,16 @@ def deviations(first: BodyState, second: BodyState, mounting: Mounting, R: Array
     e[3:5] = B.T @ u / along
     by[3:5] = (B.T @ du - np.outer(e[3:5], t @ du)) / along
     for k in range(2):
-        body = first if k == 0 else second
+        R_k, v_k, w_k = (R1, v1, w1) if k == 0 else (R2, v2, w2)
         # The lever arm rotates with the body.
-        swing = _skew(body.rate) @ c
-        w = back @ (body.velocity + body.R @ swing)
+        swing = _skew(w_k) @ c
+        w = back @ (v_k + R_k @ swing)
         own, rows = 9 * k, slice(5 + 3 * k, 8 + 3 * k)
         e[rows] = w / b - velocities[3 * k:3 * k + 3]
         by[rows, 0:3] += _skew(w) @ C
         by[rows, own:own + 3] -= (C if k == 0 else R12C) @ _skew(swing)
         by[rows, own + 6:own + 9] = back
-        by[rows, 18:21] = (C if k == 0 else R12C) @ _skew(body.rate)
+        by[rows, 18:21] = (C if k == 0 else R12C) @ _skew(w_k)
         by[rows] = (by[rows] - np.outer(w / b, db)) / b
     return e, by
 
@@ -221,6 +202,5 @@ def square_root(information: Array, gradient: Array) -> tuple[Array, Array]:
 def warm_up_odometry() -> None:
     """Compile (or load from the cache) the kernels of odometry: a made-up pair, an IMU at rest."""
     eye, z = np.eye(3), np.array([0.0, 0.0, 1.0])
-    first, second = (BodyState(eye, k * z, z, np.zeros(3)) for k in range(2))
-    deviations(first, second, Mounting(eye, np.zeros(3)), eye, z, np.zeros(6))
+    deviations(eye, 0.0 * z, z, z, eye, z, z, z, eye, z, eye, z, np.zeros(6))
     ImuInterval(np.arange(2.0), np.zeros((2, 3)), np.ones((2, 3))).mean_force(np.zeros(3))
