@@ -216,22 +216,18 @@ def fit_rotation(observations: Array, valid: NDArray[np.bool_], start: Array, pr
             if not valid[i]:
                 continue
             o = observations[i]
-            hx = R[0, 0] * o[9] + R[0, 1] * o[10] + R[0, 2] * o[11]
-            hy = R[1, 0] * o[9] + R[1, 1] * o[10] + R[1, 2] * o[11]
-            hz = R[2, 0] * o[9] + R[2, 1] * o[10] + R[2, 2] * o[11]
-            dx, dy, dz = o[0] - hx, o[1] - hy, o[2] - hz
-            w = weight / (1.0 + weight * (dx * dx + dy * dy + dz * dz) / scale2)
+            h = so3.rotated(R, o[9:12])
+            d = (o[0] - h[0], o[1] - h[1], o[2] - h[2])
+            w = weight / (1.0 + weight * so3.dot(d, d) / scale2)
             # d(f_1 - h) = -theta x h: gradient -(h x (f_1 - h)), Hessian |h|^2 I - h h^T
-            gradient[0] -= w * (hy * dz - hz * dy)
-            gradient[1] -= w * (hz * dx - hx * dz)
-            gradient[2] -= w * (hx * dy - hy * dx)
-            hessian[0, 0] += w * (hy * hy + hz * hz)
-            hessian[1, 1] += w * (hx * hx + hz * hz)
-            hessian[2, 2] += w * (hx * hx + hy * hy)
-            hessian[0, 1] -= w * hx * hy
-            hessian[0, 2] -= w * hx * hz
-            hessian[1, 2] -= w * hy * hz
-        hessian[1, 0], hessian[2, 0], hessian[2, 1] = hessian[0, 1], hessian[0, 2], hessian[1, 2]
+            turn = so3.cross(h, d)
+            for j in range(3):
+                k, m = (j + 1) % 3, (j + 2) % 3
+                gradient[j] -= w * turn[j]
+                hessian[j, j] += w * (h[k] * h[k] + h[m] * h[m])
+                for k in range(j):
+                    hessian[k, j] -= w * h[k] * h[j]
+                    hessian[j, k] = hessian[k, j]
         # The rotation about rays that all coincide is not observable: a floor above rounding.
         floor = 1e-9 * (1.0 + hessian[0, 0] + hessian[1, 1] + hessian[2, 2])
         for i in range(3):

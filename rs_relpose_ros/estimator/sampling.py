@@ -343,17 +343,6 @@ def _truncated_cost(r: Array, valid: NDArray[np.bool_], threshold: float, sigma:
     return cost / (sigma * sigma)
 
 
-@small_kernel
-def _take_least(costs: Array) -> int:
-    """Index of the least cost, the first of equal ones, which becomes infinite."""
-    least = 0
-    for k in range(1, len(costs)):
-        if costs[k] < costs[least] or not costs[least] < math.inf:
-            least = k
-    costs[least] = math.inf
-    return least
-
-
 @kernel
 def optimise(matches: RayMatches, hypotheses: Solutions, prior: Priors, sigma: float,
              threshold: float) -> tuple[TwoViewState, bool]:
@@ -393,7 +382,10 @@ def optimise(matches: RayMatches, hypotheses: Solutions, prior: Priors, sigma: f
         good = (costs < math.inf).sum()
         if good == 0:
             return states[0], False
-        better = [_take_least(costs) for _ in range((good + 1) // 2)]
+        better = [0 for _ in range((good + 1) // 2)]
+        for k in range(len(better)):
+            better[k] = int(np.argmin(costs))
+            costs[better[k]] = math.inf
         states, r = [states[k] for k in better], [r[k] for k in better]
     return states[0], True
 

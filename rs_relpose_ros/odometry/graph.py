@@ -156,6 +156,8 @@ class KeyframeGraph:
         self._R_cam_body, self._config = R_cam_body, config
         self._preintegration, self._imu = _preintegration(imu, config), imu
         self._noise = _Noise()
+        # Samples since the newest keyframe, and their integral.
+        self._integrated: tuple[ImuInterval | None, Any] = None, None
         # Each update is one step of the optimisation, which the next keyframe continues.
         self._smoother = gtsam.BatchFixedLagSmoother(config.smoothing_lag, _optimizer(1))
         # All factors and states since the start, for the final smoothing.
@@ -229,8 +231,9 @@ class KeyframeGraph:
 
     def misfit(self) -> float:
         """Chi squared of the window per degree of freedom."""
-        graph = _compact(self._smoother.getFactors())
-        equations = sum(graph.at(k).dim() for k in range(graph.size()))
+        graph: Any = self._smoother.getFactors()   # removed ones are None
+        equations = sum(factor.dim() for k in range(graph.size())
+                        if (factor := graph.at(k)) is not None)
         return 2.0 * graph.error(self._values) / max(equations - self._values.dim(), 1)
 
     def smoothed(self) -> list[KeyframeState]:
@@ -270,8 +273,7 @@ class KeyframeGraph:
         graph = gtsam.NonlinearFactorGraph(self._record[0])
         for loop in loops:
             graph.add(self._pair_factor(*loop, robust=True))
-        return graph, gtsam.LevenbergMarquardtOptimizer(
-            _compact(graph), values, _optimizer()).optimize()
+        return graph, gtsam.LevenbergMarquardtOptimizer(graph, values, _optimizer()).optimize()
 
     def _misfit(self, loop: Loop, values: Any, marginals: Any = None) -> float:
         """Chi squared of a loop by its bound; `marginals`: of a path without it."""
@@ -298,9 +300,8 @@ class KeyframeGraph:
     def _smoothed(self) -> tuple[Any, Any]:
         """Values and marginals of the whole record."""
         assert self._record is not None
-        factors = _compact(self._record[0])
-        values = gtsam.LevenbergMarquardtOptimizer(
-            factors, self._record[1], _optimizer()).optimize()
+        factors, values = self._record
+        values = gtsam.LevenbergMarquardtOptimizer(factors, values, _optimizer()).optimize()
         return values, gtsam.Marginals(factors, values)
 
     def _predicted(self, interval: ImuInterval) -> Any:
@@ -426,15 +427,15 @@ class KeyframeGraph:
         self._values = self._smoother.calculateEstimate()
         self._bias = self._values.atConstantBias(B(newest))
         self.newest = _state(self._values, gtsam.Marginals(
-            _compact(self._smoother.getFactors()), self._values), newest)
+            self._smoother.getFactors(), self._values), newest)
         self._nav_state = gtsam.NavState(self._values.atPose3(X(newest)),
                                          self._values.atVector(V(newest)))
-        # The window, with a place for the prediction of the next keyframe, and its samples so far.
+        # The window, with a place for the prediction of the next keyframe.
         self._ahead = gtsam.Values(self._values)
         self._ahead.insert(X(newest + 1), self._nav_state.pose())
         self._ahead.insert(V(newest + 1), self._nav_state.velocity())
         self._ahead.insert(B(newest + 1), self._bias)
-        self._integrated: tuple[ImuInterval | None, Any] = None, None
+        self._integrated = None, None
         if self._record is not None:
             self._record[1].insert_or_assign(self._values)
 
@@ -453,15 +454,6 @@ def _solving() -> Iterator[None]:
     except RuntimeError as error:   # of several lines
         first_line = str(error).strip().partition('\n')[0]
         raise GraphError(f'the graph cannot be solved: {first_line}') from error
-
-
-def _compact(graph: Any) -> Any:
-    """The graph without removed factors."""
-    out = gtsam.NonlinearFactorGraph()
-    for k in range(graph.size()):
-        if graph.at(k) is not None:
-            out.add(graph.at(k))
-    return out
 
 
 def _state(values: Any, marginals: Any, k: int) -> KeyframeState:
