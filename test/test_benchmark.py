@@ -105,7 +105,7 @@ def test_gravity_off_by_a_degree_does_not_end_the_search(seed):
 
 
 def test_speed_and_its_report(tmp_path):
-    timings = speed.compare('forward-base', 100, trials=1, repeats=1)
+    timings = speed.compare('forward-base', 100, trials=1)
     assert [timing.method for timing in timings] == list(speed.COMPARED)
     assert all(timing.matches == 100 and timing.duration > 0.0 for timing in timings)
     report = speed.write_report(tmp_path, timings, timings)

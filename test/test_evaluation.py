@@ -14,7 +14,6 @@ from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.experiments import oracle, penncosyvio, problems
-from rs_relpose_lab.experiments import penncosyvio_files as files
 from rs_relpose_lab.experiments.methods import run_method
 from rs_relpose_lab.experiments.oracle import Objective, oracle_estimate, start_at
 from rs_relpose_lab.experiments.paper import EXACT, paper_problem, SWEEPS
@@ -91,34 +90,22 @@ SMALL = {**C2, 'ss': [a * 4.0**(k - 1) for k, a in enumerate(C2['ss'])], 'xc': 1
          'width': 480, 'height': 360}
 
 
-FRAME_TIME = 1.0 / 30.0
-FRAMES = 62
-FIRST_STAMP = 0.026
-READOUT = 0.03
-
-
-def way():
-    """Two seconds of a walk, looking ahead: optical frame in a world with z up."""
-    seconds = np.arange(FRAMES) * FRAME_TIME
-    ahead = Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
-    angles = np.column_stack([0.3 * np.sin(3.0 * seconds), 0.05 * np.sin(5.0 * seconds),
-                             0.04 * np.cos(4.0 * seconds)])
-    positions = np.column_stack([1.3 * seconds, 0.1 * np.sin(4.0 * seconds),
-                                 1.6 + 0.03 * np.sin(8.0 * seconds)])
-    stamps = np.rint((FIRST_STAMP + seconds) * 1e6).astype(np.int64) * 1000
-    return files.Poses(stamps, positions, Rotation.from_euler('ZYX', angles) * ahead)
-
-
 @pytest.fixture(scope='module')
 def made(tmp_path_factory):
     """A folder as the data set's repository has it."""
     folder = tmp_path_factory.mktemp('penncosyvio')
     for name in ('data/ground_truth/as', 'tools/intrinsic_calibration'):
         (folder / name).mkdir(parents=True)
-    poses = way()
-    matrices = np.dstack([poses.rotations.as_matrix(), poses.positions])
+    # Two seconds of a walk, looking ahead: optical frame in a world with z up.
+    seconds = np.arange(62) / 30.0
+    ahead = Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    angles = np.column_stack([0.3 * np.sin(3.0 * seconds), 0.05 * np.sin(5.0 * seconds),
+                              0.04 * np.cos(4.0 * seconds)])
+    positions = np.column_stack([1.3 * seconds, 0.1 * np.sin(4.0 * seconds),
+                                 1.6 + 0.03 * np.sin(8.0 * seconds)])
+    R = (Rotation.from_euler('ZYX', angles) * ahead).as_matrix()
     np.savetxt(folder / 'data/ground_truth/as/pose.txt', np.column_stack(
-        [1e-9 * poses.stamps_ns, matrices.reshape(-1, 12)]), fmt='%.9f')
+        [0.026 + seconds, np.dstack([R, positions]).reshape(-1, 12)]), fmt='%.9f')
     cells = np.empty((1, 7), dtype=object)
     cells[0, :] = [SMALL] * 7
     savemat(folder / 'tools/intrinsic_calibration/cc.mat', {'cc': cells})

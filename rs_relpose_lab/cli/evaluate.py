@@ -18,7 +18,6 @@ from rs_relpose_ros.cli.main import package_version
 from rs_relpose_ros.cli.options import progress_bar
 from rs_relpose_ros.errors import MissingInputError
 from rs_relpose_ros.estimator.result import Status
-from rs_relpose_ros.geometry.camera import REFERENCE_ROWS
 
 HELP = 'Repeat an experiment of the paper: tables (printed and CSV), box plots (PNG).'
 
@@ -67,11 +66,7 @@ def _add_penncosyvio(parser: argparse.ArgumentParser) -> None:
     _names(parser, '--sequences', list(penncosyvio.STRETCHES), 'both')
     _option(parser, '--readout-time', defaults['readout_time'], 'S',
             "of the camera, the GoPro C2; not measured, but the authors' value")
-    parser.add_argument('--stamp-row', choices=REFERENCE_ROWS, default=defaults['stamp_row'],
-                        help='row that a stamp marks (default: %(default)s)')
     _option(parser, '--every', defaults['every'], 'N', 'frames from one pair to the next')
-    _option(parser, '--distance', defaults['distance'], 'N',
-            'frames from the first of a pair to the second')
     parser.add_argument('--trajectory-only', action='store_true',
                         help='the only mode; accepted for scripts that name it')
     _option(parser, '--pixel-noise', defaults['pixel_noise'], 'PX', 'of the points, 1 sigma')
@@ -134,7 +129,7 @@ def _run_penncosyvio(args: argparse.Namespace) -> int:
     run = PennCosyvioRun(
         sequences=_once(args.sequences), methods=_once(args.solvers),
         **{name: getattr(args, name) for name in (
-            'readout_time', 'stamp_row', 'every', 'distance', 'seed', 'pixel_noise', 'outliers')})
+            'readout_time', 'every', 'seed', 'pixel_noise', 'outliers')})
     if not args.folder.is_dir():
         raise MissingInputError(f'there is no folder {args.folder}')
     with progress_bar(len(run.pairs()), 'pair') as bar:

@@ -1,10 +1,7 @@
 """The estimator against the oracle: many random problems in each cell of the experiment."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
-import functools
+from dataclasses import astuple, dataclass, replace
 import hashlib
 import json
 from operator import attrgetter
@@ -56,52 +53,55 @@ class AccuracyRun:
         return len(self.cells) * len(self.noises) * len(self.sigma_factors) * self.trials
 
 
-@dataclass(frozen=True, slots=True)
-class _Task:
-    run: AccuracyRun
-    cell: str
-    noise: Noise
-    seeds: tuple[int, ...]
-    known: dict[int, PoseError]
-
-
-def run_accuracy(run: AccuracyRun, cache: OracleCache, jobs: int = 1,
+def run_accuracy(run: AccuracyRun, kept: Path, jobs: int = 1,
                  on_trials: Callable[[int], object] = lambda count: None) -> list[Trial]:
     """Run all trials.
 
+    `kept`: folder of the oracle's errors. It need not run again while the estimator is developed.
     `jobs`: processes; durations are comparable only where each has a core of its own.
     `on_trials`: called with the number of estimates that have been added.
     """
+    # One file for each state of what decides its content.
+    source = b''.join(Path(str(module.__file__)).read_bytes() for module in (
+        rows, problems, oracle))
+    path = kept / f'{hashlib.sha256(source).hexdigest()[:24]}.json'
+    known = json.loads(path.read_text()) if path.is_file() else {}
+    kept.mkdir(parents=True, exist_ok=True)
     seeds, chunk = range(run.first_seed, run.first_seed + run.trials), 10
-    tasks = [_Task(run, cell, noise, tuple(seeds[first:first + chunk]),
-                   cache.load(CELLS[cell], noise))
+    tasks = [(run, cell, noise, [(seed, known.get(f'{cell} {noise} {seed}'))
+                                 for seed in seeds[first:first + chunk]])
              for cell in run.cells for noise in run.noises
              for first in range(0, run.trials, chunk)]
     trials: list[Trial] = []
-    for task, done in zip(tasks, in_processes(_run, tasks, jobs, warm_up), strict=True):
+    for done in in_processes(_run, tasks, jobs, warm_up):
         trials += done
-        cache.add(CELLS[task.cell], task.noise,
-                  {trial.seed: trial.oracle for trial in done if trial.seed not in task.known})
+        known |= {f'{trial.cell} {trial.noise} {trial.seed}': astuple(trial.oracle)
+                  for trial in done}
+        # Replaced as a whole, so that an interrupted run leaves no partial file.
+        path.with_suffix('.new').write_text(json.dumps(known))
+        path.with_suffix('.new').replace(path)
         on_trials(len(done))
     return trials
 
 
-def _run(task: _Task) -> list[Trial]:
-    cell = CELLS[task.cell]
-    method = replace(METHODS['auto'], solver=task.run.solver)
+def _run(task: tuple[AccuracyRun, str, Noise, list[tuple[int, list[float] | None]]],
+         ) -> list[Trial]:
+    """Some seeds of a cell, with the oracle's errors where they are known."""
+    run, name, noise, seeds = task
+    cell, method = CELLS[name], replace(METHODS['auto'], solver=run.solver)
     trials = []
-    for seed in task.seeds:
-        problem = make_problem(cell, seed, task.noise)
-        best = task.known.get(seed) or _oracle_error(cell, problem)
-        for factor in task.run.sigma_factors:
+    for seed, known in seeds:
+        problem = make_problem(cell, seed, noise)
+        best = PoseError(*known) if known else _oracle_error(cell, problem)
+        for factor in run.sigma_factors:
             pair = as_pair(problem, cell, factor)
             call = prepared(method, pair, seed)
             started = time.perf_counter()
             pose = call()
             duration = time.perf_counter() - started
             assert isinstance(pose, RelativePose)
-            trials.append(Trial(task.cell, task.noise, factor, seed, pose.status.value,
-                                pair.error(pose), best, duration))
+            trials.append(Trial(name, noise, factor, seed, pose.status.value, pair.error(pose),
+                                best, duration))
     return trials
 
 
@@ -109,49 +109,6 @@ def _oracle_error(cell: Cell, problem: TwoViewProblem) -> PoseError:
     best = oracle_estimate(problem, cell.pixel_noise, float(np.radians(cell.gravity_noise)),
                            float(np.radians(cell.gyro_noise)))
     return pose_error(best.R, best.t, problem.R, problem.t, best.covariance)
-
-
-@dataclass(frozen=True, slots=True)
-class OracleCache:
-    """The oracle's errors on disk: it need not run again while the estimator is developed.
-
-    A folder with one file per cell and kind of noise. A file's name holds the digest of
-    all that decides its content: the cell, the noise, and the source of generator and oracle.
-    """
-
-    folder: Path
-
-    def load(self, cell: Cell, noise: Noise) -> dict[int, PoseError]:
-        """Errors of the oracle by seed."""
-        path = self._path(cell, noise)
-        if not path.is_file():
-            return {}
-        return {int(seed): PoseError(*error)
-                for seed, error in json.loads(path.read_text()).items()}
-
-    def add(self, cell: Cell, noise: Noise, errors: dict[int, PoseError]) -> None:
-        """Add errors by seed to those already kept."""
-        path = self._path(cell, noise)
-        if not errors:
-            return
-        path.parent.mkdir(parents=True, exist_ok=True)
-        merged = {**self.load(cell, noise), **errors}
-        # Replaced as a whole, so that an interrupted run leaves no partial file.
-        new = path.with_suffix('.new')
-        new.write_text(json.dumps({
-            seed: (error.rotation, error.translation, error.nees)
-            for seed, error in sorted(merged.items())}))
-        new.replace(path)
-
-    def _path(self, cell: Cell, noise: Noise) -> Path:
-        digest = hashlib.sha256(json.dumps([asdict(cell), noise]).encode() + _source())
-        return self.folder / f'{digest.hexdigest()[:24]}.json'
-
-
-@functools.cache
-def _source() -> bytes:
-    """Source of generator and oracle when first read."""
-    return b''.join(Path(str(module.__file__)).read_bytes() for module in (rows, problems, oracle))
 
 
 # -- report: statistics of each cell, against the project's limits ----------------------------

@@ -305,25 +305,25 @@ def memory_drift(course: Course) -> float:
 
 # -- two checkouts by turns: times of one run compare, those of two hours do not ------------------
 
+TURNS = 3
 # Columns of live.csv, the same in all releases.
 COMPARED = ('latency_p50', 'latency_p99', 'end_to_end_p50', 'end_to_end_p99', 'cpu',
             'memory_end', 'rotation_error_p50', 'translation_error_p50')
 
 
-def compare_checkouts(this: Path, other: Path, cells: Sequence[str], options: Sequence[str],
-                      turns: int, folder: Path,
+def compare_checkouts(this: Path, other: Path, cells: Sequence[str], duration: float, folder: Path,
                       on_run: Callable[[], object] = lambda: None) -> str:
     """Run the live benchmark of two checkouts by turns; the report of the ratios this / other.
 
-    `options`: of ``benchmark live``. Each checkout runs its own command, with this interpreter,
-    and has its tables in a folder of its own.
+    Each checkout runs its own command, with this interpreter, and has its tables in a folder of
+    its own.
     """
     ratios = []
-    for turn in range(turns):
+    for turn in range(TURNS):
         for cell in cells:
             measured = []
             for name, checkout in (('this', this), ('other', other)):
-                measured.append(_measured_by(checkout, cell, options, folder / name))
+                measured.append(_measured_by(checkout, cell, duration, folder / name))
                 on_run()
             ratios.append({'cell': cell, 'turn': turn, **{
                 column: a / b for column, a, b in zip(COMPARED, *measured, strict=True)}})
@@ -334,15 +334,16 @@ def compare_checkouts(this: Path, other: Path, cells: Sequence[str], options: Se
         rows.append((cell, *(f'{median:.2f} ({low:.2f} to {high:.2f})' for low, median, high in
                              np.percentile(of_cell, (0.0, 50.0, 100.0), axis=0).T)))
     return write_table(folder, 'against', ratios, '\n'.join([
-        f'# This checkout / {other}\n', f'Median ratio of {turns} turns, least and largest.\n',
+        f'# This checkout / {other}\n', f'Median ratio of {TURNS} turns, least and largest.\n',
         markdown_table(('cell', *COMPARED), rows)]))
 
 
-def _measured_by(checkout: Path, cell: str, options: Sequence[str], folder: Path) -> list[float]:
+def _measured_by(checkout: Path, cell: str, duration: float, folder: Path) -> list[float]:
     """The `COMPARED` columns of a cell."""
     done = subprocess.run(
         [sys.executable, '-m', 'rs_relpose_ros.cli.main', 'benchmark', 'live', '--cells', cell,
-         '--output', str(folder.resolve()), *options], cwd=checkout, check=False, text=True,
+         '--output', str(folder.resolve()), '--duration', str(duration)],
+        cwd=checkout, check=False, text=True,
         env={**os.environ, 'PYTHONPATH': str(checkout.resolve())}, stderr=subprocess.PIPE,
         stdout=subprocess.DEVNULL)
     if done.returncode:

@@ -224,12 +224,9 @@ class DisturbedRun:
     largest_step: float   # between published states, in sigmas of the position
 
 
-def tasks(seeds: int, first_seed: int, only: str | None = None) -> list[tuple[str, int]]:
-    """All disturbances, or one of them, on as many walks."""
-    if only not in (None, *DISTURBANCES):
-        raise InputError(f'there is no disturbance {only}: {"; ".join(DISTURBANCES)}')
-    return [(name, first_seed + k) for name in DISTURBANCES if only in (None, name)
-            for k in range(seeds)]
+def tasks(seeds: int, first_seed: int) -> list[tuple[str, int]]:
+    """All disturbances on as many walks."""
+    return [(name, first_seed + k) for name in DISTURBANCES for k in range(seeds)]
 
 
 def measure(task: tuple[str, int]) -> DisturbedRun:

@@ -2,24 +2,24 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-import gc
 from importlib.metadata import PackageNotFoundError, version
 import math
 from operator import attrgetter
 from pathlib import Path
 import platform
-import time
+import timeit
 
 import cv2
 import numpy as np
 
 from rs_relpose_lab.experiments.harness import grouped, markdown_table, write_csv
-from rs_relpose_lab.experiments.methods import as_pair, Estimate, METHODS, prepared
+from rs_relpose_lab.experiments.methods import as_pair, METHODS, prepared
 from rs_relpose_lab.experiments.problems import CELLS, make_problem
 from rs_relpose_lab.experiments.scoring import Quantiles
 from rs_relpose_ros import warm_up
 
 THRESHOLD = 1.5  # [px], of OpenCV and PoseLib
+REPEATS = 3
 LIBRARY = 'rs_relpose_ros'
 REFERENCE = 'PoseLib, derotated points'
 # In the report; PoseLib's only where it is installed.
@@ -43,11 +43,11 @@ class Timing:
     translation: float
 
 
-def compare(cell_name: str, matches: int, trials: int, repeats: int, first_seed: int = 0,
+def compare(cell_name: str, matches: int, trials: int, first_seed: int = 0,
             on_problem: Callable[[], object] = lambda: None) -> list[Timing]:
     """Run every method on the same problems of a cell.
 
-    The methods alternate on each problem, and the shortest of a few repeats counts, so that other
+    The methods alternate on each problem, and the shortest of three repeats counts, so that other
     load of the machine affects all methods alike.
     """
     cell = replace(CELLS[cell_name], matches=matches)
@@ -59,26 +59,12 @@ def compare(cell_name: str, matches: int, trials: int, repeats: int, first_seed:
         pair = as_pair(make_problem(cell, seed), cell)
         for name, method in COMPARED.items():
             call = prepared(method, pair, seed)
-            duration = 1e3 * _shortest(call, repeats)
+            duration = 1e3 * min(timeit.repeat(call, number=1, repeat=REPEATS))
             error = pair.error(call())
             timings.append(Timing(cell_name, matches, name, seed, duration, error.rotation,
                                   error.translation))
         on_problem()
     return timings
-
-
-def _shortest(call: Estimate, repeats: int) -> float:
-    """The shortest time of a call [s]."""
-    durations = []
-    gc.disable()
-    try:
-        for _ in range(repeats):
-            started = time.perf_counter()
-            call()
-            durations.append(time.perf_counter() - started)
-    finally:
-        gc.enable()
-    return min(durations)
 
 
 def medians(timings: Sequence[Timing], method: str) -> dict[int, float]:
