@@ -172,7 +172,8 @@ def _shipped(name: str) -> Path:
     Argument('--solver', {'choices': SOLVER_CHOICES, 'default': 'auto',
                           'help': '(default: auto)'}),
     _paths('--cache', 'DIR', "folder that keeps the oracle's results (default: OUTPUT/oracle)"),
-    _seed(0, 'problem of a cell'), _JOBS)
+    _seed(0, 'problem of a cell'), _number(
+        '--jobs', 1, 'processes; times are comparable only where each has its own core', low=1))
 def _run_accuracy(args: argparse.Namespace) -> int:
     from rs_relpose_lab.experiments import accuracy
     from rs_relpose_lab.experiments.problems import CELLS

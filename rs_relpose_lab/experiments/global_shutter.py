@@ -19,7 +19,7 @@ from rs_relpose_lab.experiments.harness import markdown_table, write_csv
 from rs_relpose_lab.experiments.methods import OPENCV_ESTIMATORS
 from rs_relpose_lab.simulation import simulate, Simulation, SimulationConfig
 from rs_relpose_lab.simulation.bag import intrinsics_of, render_once, right_parameters
-from rs_relpose_lab.simulation.render import Renderer, view_of
+from rs_relpose_lab.simulation.render import view_of
 from rs_relpose_lab.simulation.rows import observe
 from rs_relpose_lab.simulation.scene import SCENES
 from rs_relpose_lab.simulation.trajectory import Trajectory
@@ -66,12 +66,10 @@ class MapErrors:
     map_p90: float
 
 
-def swinging(rate: float, seconds: float, tilt: float = 0.3) -> Trajectory:
-    """A camera that swings about a fixed centre, mostly about the vertical; largest rate [rad/s].
-
-    `tilt`: share of the rate about the other axes.
-    """
-    spacing, frequency = 0.02, 1.1
+def swinging(rate: float, seconds: float) -> Trajectory:
+    """A camera that swings about a point, mostly about the vertical; largest rate [rad/s]."""
+    # Of the rate, about the other axes.
+    spacing, frequency, tilt = 0.02, 1.1, 0.3
     times = np.arange(-1.0, seconds + 1.0, spacing)
     phase = 2.0 * np.pi * frequency * times
     swing = rate / (2.0 * np.pi * frequency) / np.hypot(1.0, tilt) * np.sin(phase)
@@ -112,31 +110,21 @@ def _derotated(loop: FrameLoop[GlobalShutterFrame], image: RawImage,
     return outcome.result
 
 
-def middle_renderer(simulation: Simulation) -> Renderer:
-    """The same camera with all rows read at the same time."""
-    return Renderer(simulation.renderer.scene, replace(simulation.camera, readout_time=0.0),
-                    simulation.trajectory, simulation.config.edge_samples)
-
-
-def middle_seconds(simulation: Simulation, index: int) -> float:
-    """Time of the middle row of a frame on the trajectory [s]."""
-    camera = simulation.camera
-    return simulation.seconds(simulation.reference_ns(index)) + float(
-        camera.row_times(0.5 * (camera.height - 1)))
-
-
 def map_errors(name: str, config: SimulationConfig,
                trajectory: Trajectory | None = None) -> MapErrors:
     """Compare the maps of all frames of a recording with the truth."""
     simulation = simulate(config, trajectory=trajectory)
-    still, camera = middle_renderer(simulation), simulation.camera
+    camera = simulation.camera
+    # The same camera with all rows read at the time of the middle one.
+    still = replace(simulation.renderer, camera=replace(camera, readout_time=0.0))
+    middle_row = float(camera.row_times(0.5 * (camera.height - 1)))
     points = np.stack(np.meshgrid(np.arange(0.0, config.width, _SPACING),
                                   np.arange(0.0, config.height, _SPACING)), -1).reshape(-1, 2)
     columns, rows = points.astype(int).T
     distances, rate = [], 0.0
     for index, derotated in derotated_frames(simulation, configured(simulation)):
-        middle = middle_seconds(simulation, index)
         reference = simulation.seconds(simulation.reference_ns(index))
+        middle = reference + middle_row
         world, _ = still.locate(middle, points)
         observed = simulation.renderer.project(reference, world)
         by_rotation = _observed_by_rotation(simulation, reference, world, middle)

@@ -123,7 +123,7 @@ class Course:
     private: Array   # (M,) [MB] that are not shared
 
 
-def run_cell(cell: LiveCell, clip: live_clip.Clip, duration: float, folder: Path, profile: Path,
+def run_cell(cell: LiveCell, clip: tuple[Path, Path], duration: float, folder: Path, profile: Path,
              on_second: Callable[[], object] = lambda: None) -> tuple[LiveStatistics, Course]:
     """Play a clip of the cell's size to a new node; logs and tables into `folder`.
 
@@ -137,8 +137,7 @@ def run_cell(cell: LiveCell, clip: live_clip.Clip, duration: float, folder: Path
     player = ['--best-effort', '--loop', str(live_clip.PERIOD), '--duration', str(duration),
               '--topics', *topics, *([] if compressed else ['--decode', cell.image_format])]
     run = measure(Play(
-        clip.bag, clip.parameters,
-        {'image': RAW_TOPIC, 'camera_info': CAMERA_INFO_TOPIC, 'imu': topics[2]},
+        *clip, {'image': RAW_TOPIC, 'camera_info': CAMERA_INFO_TOPIC, 'imu': topics[2]},
         'compressed' if compressed else 'raw', tuple(player), profile if cell.is_big else None),
         folder, on_second)
     # Processor time and memory of the node, a line per second.

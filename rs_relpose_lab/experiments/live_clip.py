@@ -1,7 +1,6 @@
 """A short recording without a seam, for the live benchmark: rendered once, played for hours."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 import math
 from pathlib import Path
 from typing import Any
@@ -33,14 +32,6 @@ FPS = 30.0
 IMU_RATES = (200, 400)
 
 
-@dataclass(frozen=True, slots=True)
-class Clip:
-    """Parameter file of the node, and bag: JPEG in colour, CameraInfo, IMU at all `IMU_RATES`."""
-
-    bag: Path
-    parameters: Path
-
-
 def imu_topic(rate: int) -> str:
     """Topic of the clip's IMU of so many samples per second."""
     return f'/imu_{rate}/data_raw'
@@ -54,8 +45,11 @@ def configuration(width: int, height: int, imu_rate: int = IMU_RATES[0]) -> Simu
 
 
 def prepare_clip(folder: Path, width: int, height: int,
-                 on_frame: Callable[[], object] = lambda: None) -> Clip:
-    """Render a clip into a folder, unless it exists; `on_frame` is called after each image."""
+                 on_frame: Callable[[], object] = lambda: None) -> tuple[Path, Path]:
+    """Render a clip into a folder, unless it exists: a bag, and the parameter file of the node.
+
+    Images are JPEG in colour, the IMU has all `IMU_RATES`; `on_frame` is called after each image.
+    """
     def render(path: Path, parameters: Path) -> None:
         trajectory = closed_loop(PERIOD)
         first = simulate(configuration(width, height), trajectory=trajectory)
@@ -68,7 +62,7 @@ def prepare_clip(folder: Path, width: int, height: int,
                              for simulation in (first, *others)))
         write_parameters(first, parameters)
 
-    return Clip(*made_once(folder, f'{width}x{height}', render))
+    return made_once(folder, f'{width}x{height}', render)
 
 
 def coloured(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:

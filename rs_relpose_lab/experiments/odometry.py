@@ -162,10 +162,8 @@ def walks(count: int, first_seed: int, seconds: float = SHORT, *, readout: float
 def on_walk(config: SimulationConfig) -> PathMetrics:
     """Odometry of a simulated recording."""
     simulation = simulate(config)
-    source = Source(f'{config.scene} {config.seed}' + (', in motion' if config.plan else ''),
-                    trust_runs.TRACKS, 'walk', config.scene, config.seed)
-    recording = trust_runs.simulated(source, simulation, trust_runs.TrackNoise(),
-                                     np.random.default_rng(config.seed))
+    recording = trust_runs.walk_of(simulation, np.random.default_rng(config.seed),
+                                   ', in motion' if config.plan else '')
     return on_recording(recording, odometry_disturbances.true_states(simulation))
 
 
@@ -190,8 +188,7 @@ def on_recording(recording: Recording, truth: TrueStates | TrueTrajectory, *,
         states = list(published(OdometryEstimator(parameters), feed))
         chi = odometry_disturbances.errors_squared(states, smoothed[0], truth)
         nees = (chi.mean(axis=0) / 3.0).tolist()
-        truth = TrueTrajectory(truth.stamps_ns, truth.position,
-                               Rotation.from_matrix(truth.R).as_quat())
+        truth = truth.trajectory
     paths = {'live': offline.path_of(live, truth), 'smoothed': offline.path_of(smoothed, truth)}
     errors = [path.errors for path in paths.values() if path.errors is not None]
     if len(errors) < 2:

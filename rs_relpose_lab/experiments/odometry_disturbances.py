@@ -32,6 +32,7 @@ from rs_relpose_ros.imu.buffer import ImuSample
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.pair import KeyframePair
 from rs_relpose_ros.odometry.states import ContinuousPath, Odometry, OdometryState
+from rs_relpose_ros.offline.truth import TrueTrajectory
 
 # Before and after a disturbance [s]; afterwards all is to be normal again [s].
 _MARGIN, NORMAL_AGAIN = 6.0, 2.0
@@ -124,6 +125,12 @@ class TrueStates:
     position: Array
     R: Array
     velocity: Array
+
+    @property
+    def trajectory(self) -> TrueTrajectory:
+        """Its poses."""
+        return TrueTrajectory(self.stamps_ns, self.position,
+                              Rotation.from_matrix(self.R).as_quat())
 
 
 class Feed(NamedTuple):
@@ -233,12 +240,8 @@ def measure(task: tuple[str, int]) -> DisturbedRun:
     """A disturbance on the walk of a seed."""
     name, seed = task
     what = DISTURBANCES[name]
-    config = configuration(what, seed)
-    simulation, rng = simulate(config), np.random.default_rng(seed)
-    recording = trust_runs.simulated(
-        trust_runs.Source(f'{config.scene} {seed}', trust_runs.TRACKS), simulation,
-        trust_runs.TrackNoise(), rng)
-    feed = feed_of(disturbed(recording, simulation, what, rng))
+    simulation, rng = simulate(configuration(what, seed)), np.random.default_rng(seed)
+    feed = feed_of(disturbed(trust_runs.walk_of(simulation, rng), simulation, what, rng))
     return on_feed(name, seed, feed, true_states(simulation))
 
 

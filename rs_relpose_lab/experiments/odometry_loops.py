@@ -9,12 +9,12 @@ import math
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from rs_relpose_lab.experiments import trust_runs
 from rs_relpose_lab.experiments.harness import markdown_table, write_table
-from rs_relpose_lab.experiments.trust_runs import Gray, Recording, Source, TrackNoise, TRACKS
+from rs_relpose_lab.experiments.odometry_disturbances import true_states
+from rs_relpose_lab.experiments.trust_runs import Gray, Recording
 from rs_relpose_lab.simulation import simulate, SimulationConfig
 from rs_relpose_lab.simulation.simulation import Simulation
 from rs_relpose_lab.simulation.trajectory import Trajectory
@@ -82,8 +82,7 @@ def on_seed(seed: int) -> LoopMetrics:
 def on_walk(config: SimulationConfig, trajectory: Trajectory) -> LoopMetrics:
     """Odometry of a walk with loop closures."""
     simulation = simulate(config, trajectory=trajectory)
-    recording = trust_runs.simulated(Source(f'{config.scene} {config.seed}', TRACKS), simulation,
-                          TrackNoise(), np.random.default_rng(config.seed))
+    recording = trust_runs.walk_of(simulation, np.random.default_rng(config.seed))
     parameters = Parameters.from_mapping(recording.configured.values)
     arrives = {arrival.stamp_ns: arrival.arrives_ns for arrival in recording.arrivals}
     pairs, views = [], {}
@@ -99,9 +98,7 @@ def on_walk(config: SimulationConfig, trajectory: Trajectory) -> LoopMetrics:
     sensor = sensor_model(recording.configured.intrinsics, parameters.sensor)
     after, report, taken = close_loops(estimator, before, views, sensor, lambda stamps: _related(
         recording, simulation, stamps))
-    states = simulation.states(simulation.imu.stamps_ns)
-    truth = TrueTrajectory(simulation.imu.stamps_ns, states.position,
-                           Rotation.from_matrix(states.R_world_cam).as_quat())
+    truth = true_states(simulation).trajectory
     (end1, turn1, ate1), (end2, turn2, ate2) = (
         _errors([pose for path in paths for _, pose in path], truth) for paths in (before, after))
     return LoopMetrics(

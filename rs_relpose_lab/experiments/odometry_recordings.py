@@ -11,7 +11,6 @@ import math
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from rs_relpose_lab.experiments import odometry_disturbances
@@ -25,7 +24,6 @@ from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.offline import path_of, row_trajectory
 from rs_relpose_ros.odometry.rows import RowTrajectory
 from rs_relpose_ros.odometry.states import Base, Odometry, OdometryState
-from rs_relpose_ros.offline.truth import TrueTrajectory
 
 # Quantile of chi squared of 3 degrees of freedom: 3 sigma.
 _BEYOND = float(chi2.ppf(0.9973, 3))
@@ -91,8 +89,7 @@ def _metrics(name: str, begin: float, recording: Recording, estimator: OdometryE
         speed = float((np.linalg.norm(first.velocity)
                        - np.linalg.norm(truth.velocity[numbers[0]])) / math.sqrt(
             along @ first.velocity_covariance[:3, :3] @ along))
-        of_path = TrueTrajectory(truth.stamps_ns, truth.position,
-                                 Rotation.from_matrix(truth.R).as_quat())
+        of_path = truth.trajectory
         errors = path_of(states, of_path).errors
         assert errors is not None
         scale, end = 100.0 * errors.scale_error, drift(states, of_path)

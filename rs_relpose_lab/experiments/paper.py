@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 import math
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 import numpy as np
 
-from rs_relpose_lab.experiments.harness import in_processes, markdown_table, write_csv
+from rs_relpose_lab.experiments.harness import grouped, in_processes, markdown_table, write_csv
 from rs_relpose_lab.experiments.methods import as_pair, METHODS, PairProblem, run_method
 from rs_relpose_lab.experiments.problems import BASELINES, Cell, make_problem
 from rs_relpose_lab.experiments.scoring import PoseError
@@ -66,13 +68,10 @@ def by_case(records: Sequence[Record], *, totals: bool = False) -> Cases:
     """Errors in every box, in the order of the records; `totals`: a box of all levels, too."""
     if totals:
         records = [*records, *(replace(record, level=ALL_LEVELS) for record in records)]
-    grouped: dict[tuple[str, str], dict[str, dict[str, list[Record]]]] = {}
-    for record in records:
-        levels = grouped.setdefault((record.experiment, record.case), {})
-        levels.setdefault(record.level, {}).setdefault(record.method, []).append(record)
-    return {case: {level: {method: _errors(found) for method, found in methods.items()}
-                   for level, methods in levels.items()}
-            for case, levels in grouped.items()}
+    return {case: {level: {method: _errors(found) for method, found
+                           in grouped(of_level, attrgetter('method')).items()}
+                   for level, of_level in grouped(of_case, attrgetter('level')).items()}
+            for case, of_case in grouped(records, attrgetter('experiment', 'case')).items()}
 
 
 def _errors(records: Sequence[Record]) -> BoxErrors:
@@ -297,22 +296,11 @@ class PaperRun:
                 raise InputError(f'{field} must be in [0, {high:g}], '
                                  f'got {getattr(self.base, field):g}')
 
-    def tasks(self) -> list[Task]:
-        """Every problem, in the order of the tables."""
-        return [Task(SWEEPS[name], direction, level, trial, self)
+    def tasks(self) -> list[tuple[str, str, float, int]]:
+        """Sweep, direction, level and trial of every problem, in the order of the tables."""
+        return [(name, direction, level, trial)
                 for name in self.sweeps for direction in self.directions
                 for level in SWEEPS[name].levels for trial in range(self.trials)]
-
-
-@dataclass(frozen=True, slots=True)
-class Task:
-    """One problem, for all methods."""
-
-    sweep: Sweep
-    direction: str
-    level: float
-    trial: int
-    run: PaperRun
 
 
 def run_paper(run: PaperRun, jobs: int = 1,
@@ -321,18 +309,18 @@ def run_paper(run: PaperRun, jobs: int = 1,
     if jobs < 1:
         raise InputError(f'jobs must be at least 1, got {jobs}')
     records = []
-    for found in in_processes(run_task, run.tasks(), jobs):
+    for found in in_processes(partial(_run_task, run), run.tasks(), jobs):
         records += found
         on_problem()
     return records
 
 
-def run_task(task: Task) -> list[Record]:
+def _run_task(run: PaperRun, task: tuple[str, str, float, int]) -> list[Record]:
     """Draw a problem and estimate it by every method."""
-    problem = paper_problem(task.sweep.cell(task.level, task.run.base), task.direction,
-                            task.run.seed, task.trial)
-    return [Record(task.sweep.name, task.direction, f'{task.level:g}', name, task.trial,
-                   *run_method(name, problem, task.trial)) for name in task.run.methods]
+    sweep, direction, level, trial = task
+    problem = paper_problem(SWEEPS[sweep].cell(level, run.base), direction, run.seed, trial)
+    return [Record(sweep, direction, f'{level:g}', name, trial, *run_method(name, problem, trial))
+            for name in run.methods]
 
 
 def paper_problem(cell: Cell, direction: str, seed: int, trial: int) -> PairProblem:

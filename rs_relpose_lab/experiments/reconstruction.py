@@ -13,16 +13,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rs_relpose_lab.experiments.harness import markdown_table, write_table
-from rs_relpose_lab.experiments.trust_runs import run, simulated, Source, TrackNoise, TRACKS
+from rs_relpose_lab.experiments.odometry_disturbances import feed_of
+from rs_relpose_lab.experiments.trust_runs import walk_of
 from rs_relpose_lab.simulation import simulate, Simulation, SimulationConfig
-from rs_relpose_ros.bags.reader import IMU_DELAY
 from rs_relpose_ros.config.settings import Parameters
 from rs_relpose_ros.errors import InputError
 from rs_relpose_ros.geometry import Array
-from rs_relpose_ros.geometry.timing import NANOSECONDS, to_nanoseconds
+from rs_relpose_ros.geometry.timing import NANOSECONDS
 from rs_relpose_ros.odometry.estimator import OdometryEstimator
 from rs_relpose_ros.odometry.offline import aligned, follow, row_trajectory
-from rs_relpose_ros.odometry.pair import KeyframePair
 from rs_relpose_ros.odometry.rows import RowTrajectory
 from rs_relpose_ros.odometry.states import Base
 
@@ -68,17 +67,13 @@ class _Linear(NamedTuple):
 def on_walk(config: SimulationConfig) -> RowMetrics:
     """Poses of rows of a simulated recording."""
     simulation = simulate(config)
-    source = Source(f'{config.scene} {config.seed}', TRACKS, 'walk', config.scene, config.seed)
-    recording = simulated(source, simulation, TrackNoise(), np.random.default_rng(config.seed))
-    parameters = Parameters.from_mapping(recording.configured.values)
-    arrives = {arrival.stamp_ns: arrival.arrives_ns for arrival in recording.arrivals}
+    recording = walk_of(simulation, np.random.default_rng(config.seed))
+    parameters, feed = Parameters.from_mapping(recording.configured.values), feed_of(recording)
     estimator = OdometryEstimator(parameters, keep=True)
-    follow(estimator, [(arrives[pair.stamp_ns], KeyframePair.of_result(pair))
-                       for pair, _ in run(recording, recording.configured)],
-           [(sample.stamp_ns + to_nanoseconds(IMU_DELAY), sample) for sample in recording.samples])
+    follow(estimator, feed.pairs, feed.samples)
     paths = estimator.smoothed_paths()
     if not paths:
-        raise InputError(f'{source.name}: odometry did not start')
+        raise InputError(f'{recording.source.name}: odometry did not start')
     rows = row_trajectory(paths, estimator.base or Base(), parameters, recording.samples)
     keyframes = rows.keyframes_ns[:, 1]
     error, A, t = _position_error(simulation, rows, keyframes)
@@ -88,7 +83,7 @@ def on_walk(config: SimulationConfig) -> RowMetrics:
     times = [firsts + part for part in (0, span // 2, span)]
     first, middle, last = (_position_error(simulation, rows, at)[0] / error for at in times)
     turned = max(_rotation_error(simulation, rows, at) for at in times)
-    return RowMetrics(source.name, 1e3 * config.readout_time, error, first, middle, last,
+    return RowMetrics(recording.source.name, 1e3 * config.readout_time, error, first, middle, last,
                       turned, *_rendered(simulation, rows, times, A, t))
 
 

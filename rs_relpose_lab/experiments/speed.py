@@ -67,20 +67,6 @@ def compare(cell_name: str, matches: int, trials: int, first_seed: int = 0,
     return timings
 
 
-def medians(timings: Sequence[Timing], method: str) -> dict[int, float]:
-    """Median time [ms] of a method by the number of matches."""
-    return {size: float(np.median([timing.duration for timing in timings
-                                   if (timing.matches, timing.method) == (size, method)]))
-            for size in sorted({timing.matches for timing in timings})}
-
-
-def exponent(times: dict[int, float]) -> float:
-    """Slope of log time over log matches: 1 is linear."""
-    if len(times) < 2:
-        return float('nan')
-    return float(np.polyfit(np.log(list(times)), np.log(list(times.values())), 1)[0])
-
-
 # -- report -----------------------------------------------------------------------------------
 
 @dataclass(frozen=True, slots=True)
@@ -146,12 +132,13 @@ def _report(compared: Sequence[MethodStatistics], scaling: Sequence[Timing]) -> 
 
 
 def _scaling_table(scaling: Sequence[Timing]) -> str:
-    methods = list(dict.fromkeys(timing.method for timing in scaling))
-    sizes = sorted({timing.matches for timing in scaling})
-    rows = []
-    for method in methods:
-        times = medians(scaling, method)
-        rows.append((method, *(f'{times[size]:.2f}' for size in sizes), f'{exponent(times):.2f}'))
+    """Median times, and the slope of log time over log matches: 1 is linear."""
+    sizes, rows = sorted({timing.matches for timing in scaling}), []
+    for method, timings in grouped(scaling, attrgetter('method')).items():
+        times = [float(np.median([one.duration for one in timings if one.matches == size]))
+                 for size in sizes]
+        slope = np.polyfit(np.log(sizes), np.log(times), 1)[0] if len(sizes) > 1 else math.nan
+        rows.append((method, *(f'{time:.2f}' for time in times), f'{slope:.2f}'))
     return '\n'.join([
         f'## Median time [ms] by the number of matches ({scaling[0].cell})\n',
         markdown_table(('method', *map(str, sizes), 'exponent'), rows),

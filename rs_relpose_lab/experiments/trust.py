@@ -5,7 +5,6 @@ Each bag is simulated once, run with the right configuration, and then with ever
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-import json
 import math
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -199,12 +198,12 @@ def bag_row(recording: trust_runs.Recording, name: str, informative: NDArray[np.
     row, source = ROWS[name], recording.source
     clocks = [_clock(informative, pair.at) for pair in pairs]
     flags = [(clock, pair) for clock, pair in zip(clocks, pairs, strict=True)
-             if pair.verdict.state in trust_runs.FLAGGED]
+             if pair.state in trust_runs.FLAGGED]
     in_time = [pair for clock, pair in flags if clock <= row.within]
     # Its last report within the time.
-    named = in_time[-1].verdict.named if in_time else ()
+    named = in_time[-1].named if in_time else ()
     published = [(clock, pair) for clock, pair in zip(clocks, pairs, strict=True)
-                 if pair.has_pose and pair.verdict.state not in trust_runs.FLAGGED]
+                 if pair.has_pose and pair.state not in trust_runs.FLAGGED]
     every, later = [p for _, p in published], [p for clock, p in published if clock > 1.0]
     counted = later if name != RIGHT else every
     seconds = _clock(informative, recording.seconds)
@@ -308,9 +307,9 @@ def right_summary(kind: str, bags: Sequence[BagRow]) -> dict[str, Any]:
 
 
 def write_report(folder: Path, bags: Sequence[BagRow]) -> str:
-    """Write every bag and row (CSV), the summaries (JSON) and the tables (Markdown)."""
+    """Write every bag and row (CSV) and the tables (Markdown)."""
     write_csv(folder / 'trust_bags.csv', bags)
-    parts, summaries = [], {}
+    parts = []
     # A recording without truth has no poses that can be evaluated.
     with_truth = {bag.bag for bag in bags if bag.kind != trust_runs.RECORDING or bag.all_poses}
     for kind, title in _TITLES.items():
@@ -321,7 +320,6 @@ def write_report(folder: Path, bags: Sequence[BagRow]) -> str:
         if len(rows) > 1:
             rows.append(summary('all rows', of_kind))
         if rows:
-            summaries[kind] = rows
             parts.append(f'{title} (shares in per cent):\n\n{_table("row", rows, _ROW_COLUMNS)}')
     recorded = [bag for bag in bags if bag.kind == trust_runs.RECORDING]
     if recorded:
@@ -332,10 +330,6 @@ def write_report(folder: Path, bags: Sequence[BagRow]) -> str:
     if right:
         parts.append(f'Right configuration:\n\n{_table("kind", right, _RIGHT_COLUMNS)}')
     text = '\n'.join(parts)
-    (folder / 'trust.json').write_text(json.dumps(
-        {kind: [{name: None if value != value else value for name, value in row.items()}
-                for row in rows] for kind, rows in {**summaries, 'right': right}.items()},
-        indent=1), encoding='utf-8')
     (folder / 'trust.md').write_text(text, encoding='utf-8')
     return text
 

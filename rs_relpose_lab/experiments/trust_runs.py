@@ -323,18 +323,21 @@ def simulated(source: Source, simulation: Simulation, noise: TrackNoise | None,
         true_pose, imu.stamps_ns, simulation.states(imu.stamps_ns).angular_velocity)
 
 
-class Verdict(NamedTuple):
-    """State of the consistency monitor with a pair, and the parameters that it names."""
 
-    state: str
-    named: tuple[str, ...]
+def walk_of(simulation: Simulation, rng: np.random.Generator, remark: str = '') -> Recording:
+    """Tracks of a simulated walk with the usual noise."""
+    config = simulation.config
+    return simulated(Source(f'{config.scene} {config.seed}{remark}', TRACKS), simulation,
+                     TrackNoise(), rng)
+
+
 @dataclass(frozen=True, slots=True)
 class EvaluatedPair:
     """A pair of a run, against the truth; NaN without a pose."""
 
     at: float   # stamp since the recording's first [s]
-    status: str
-    verdict: Verdict
+    state: str   # of the consistency monitor
+    named: tuple[str, ...]   # parameters that it names
     seconds: float   # wall time of its frame
     chi_direction: float = math.nan   # error squared in sigmas, 2 degrees of freedom
     chi_rotation: float = math.nan   # likewise, 3
@@ -402,17 +405,17 @@ def evaluated(recording: Recording, pair: PairResult, seconds: float) -> Evaluat
     """A pair against the truth."""
     at = seconds_between(recording.arrivals[0].stamp_ns, pair.stamp_ns)
     pose = pair.pose
-    verdict = Verdict(pair.health.state.value, tuple(
-        finding.quantity for finding in pair.health.findings if finding.state in FLAGGED))
+    verdict = pair.health.state.value, tuple(
+        finding.quantity for finding in pair.health.findings if finding.state in FLAGGED)
     truth = recording.true_pose(pair.reference_stamp_ns, pair.stamp_ns) if pose else None
     if truth is None or not np.linalg.norm(truth[1]) > 0.0:
-        return EvaluatedPair(at, pose.status.value, verdict, seconds)
+        return EvaluatedPair(at, *verdict, seconds)
     error = pose_error(pose.R, pose.t, *truth)
     chi = chi_squares(pose.R, pose.t, *truth, pose.covariance)
     # Of the two directions across t the mean variance.
     sigma = math.degrees(math.sqrt(0.5 * float(np.trace(pose.covariance[:3, :3]))))
-    return EvaluatedPair(at, pose.status.value, verdict, seconds, chi.translation, chi.rotation,
-                         error.translation, error.rotation, sigma)
+    return EvaluatedPair(at, *verdict, seconds, chi.translation, chi.rotation, error.translation,
+                         error.rotation, sigma)
 
 
 def informative_motion(recording: Recording,
