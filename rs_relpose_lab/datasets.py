@@ -29,7 +29,7 @@ def _prose(comment: str) -> str:
 
 
 def _readout_time(parameters: Iterable[SourcedValue]) -> float:
-    return next(item.value for item in parameters if item.name == 'readout_time')
+    return float(str(next(item.value for item in parameters if item.name == 'readout_time')))
 
 
 _XIAOMI_IMAGE = re.compile(r'RE_frame-([0-9]{1,6})\.jpg')

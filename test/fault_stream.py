@@ -1,6 +1,5 @@
 """A sensor stream with faults: phases of a bag, each good, then faulty, then good again."""
 
-from array import array
 from collections.abc import Callable, Collection, Iterable, Iterator
 import copy
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 
 from rs_relpose_lab.live.graph import Graph
+from rs_relpose_lab.live.live_cases import gray_image, pixels_of
 from rs_relpose_ros.bags.reader import CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMU_TOPIC, RAW_TOPIC
 from rs_relpose_ros.messages.incoming import stamp_ns
 
@@ -172,17 +172,6 @@ def play(publishers: dict[type, Any], messages: list[tuple[int, Any]], later: fl
         (publishers[type(message)], bag_time_ns,
          with_stamp(message, stamp_of(message) + round(later * SECOND)))
         for bag_time_ns, message in messages if type(message) in publishers)
-
-
-def gray_image(header: Any, pixels: np.ndarray) -> Image:
-    data = array('B')
-    data.frombytes(np.ascontiguousarray(pixels).tobytes())
-    return Image(header=header, height=pixels.shape[0], width=pixels.shape[1], encoding='mono8',
-                 step=pixels.shape[1], data=data)
-
-
-def pixels_of(image: Image) -> np.ndarray:
-    return np.frombuffer(image.data, np.uint8).reshape(image.height, image.width)
 
 
 def stamp_of(message: Any) -> int:
