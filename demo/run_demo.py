@@ -26,7 +26,7 @@ from rs_relpose_lab.experiments.comparison import (
     score_table,
 )
 from rs_relpose_lab.experiments.global_shutter import five_point_when_derotated
-from rs_relpose_lab.live.live_run import LiveRun, run_live
+from rs_relpose_lab.live.live_run import run_live
 from rs_relpose_ros.bags.reader import open_bag
 from rs_relpose_ros.config.files import read_parameters
 from rs_relpose_ros.errors import RsRelposeError
@@ -47,7 +47,7 @@ BEFORE_AND_AFTER, PATH = 'global_shutter.png', 'path.png'
 STARTED = time.monotonic()
 
 
-def compare(live: LiveRun) -> list[str]:
+def compare(table: Path, stamps: Path) -> list[str]:
     """Replay the bag with all methods in parallel; the lines to print."""
     log("replaying it offline: the node's pipeline, the paper's algorithms, OpenCV's 5-point, a "
         'metric path ...')
@@ -55,7 +55,7 @@ def compare(live: LiveRun) -> list[str]:
         paper = [pool.submit(score_of_paper, name) for name in PAPER_ALGORITHMS]
         derotated = pool.submit(five_point_when_derotated, BAG, read_parameters(PARAMETERS), OUT)
         path = pool.submit(metric_path)
-        replayed = compare_live(live.table, live.stamps, BAG, PARAMETERS, OUT, pictures=True)
+        replayed = compare_live(table, stamps, BAG, PARAMETERS, OUT, pictures=True)
         opencv = replayed.opencv_scores()
         shift = draw_before_and_after()
         scores = [replayed.node, score_of_records('the same, replayed', replayed.records),
@@ -121,7 +121,7 @@ def main() -> int:
     OUT.mkdir(exist_ok=True)
     try:
         log(f'playing {BAG.relative_to(ROOT)} to relpose_node over Fast DDS, in real time ...')
-        lines = compare(run_live(BAG, PARAMETERS, OUT))
+        lines = compare(*run_live(BAG, PARAMETERS, OUT))
     except RsRelposeError as error:
         print(f'demo: {error}', file=sys.stderr)
         return 1

@@ -130,16 +130,16 @@ def run_cell(cell: LiveCell, clip: tuple[Path, Path], duration: float, folder: P
     `duration` [s]; `profile`: of Fast DDS, for big images; `on_second`: called once a second.
     """
     # Here, so that the names of cells are known without ROS.
-    from rs_relpose_lab.live.live_run import measure, Play
+    from rs_relpose_lab.live.live_run import measure
     folder.mkdir(parents=True, exist_ok=True)
     compressed = cell.image_format == 'jpeg'
     topics = (COMPRESSED_TOPIC, CAMERA_INFO_TOPIC, live_clip.imu_topic(cell.imu_rate))
     player = ['--best-effort', '--loop', str(live_clip.PERIOD), '--duration', str(duration),
               '--topics', *topics, *([] if compressed else ['--decode', cell.image_format])]
-    run = measure(Play(
+    run = measure(
         *clip, {'image': RAW_TOPIC, 'camera_info': CAMERA_INFO_TOPIC, 'imu': topics[2]},
-        'compressed' if compressed else 'raw', tuple(player), profile if cell.is_big else None),
-        folder, on_second)
+        'compressed' if compressed else 'raw', player, profile if cell.is_big else None, folder,
+        on_second)
     # Processor time and memory of the node, a line per second.
     write_csv(folder / 'node.csv', run.metrics)
     return statistics_of(cell, duration, run), course_of(run)

@@ -3,7 +3,7 @@
 For the demo and for measurements. This process only subscribes, and reads /proc once a second.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 import csv
 from dataclasses import dataclass
 import os
@@ -27,31 +27,26 @@ from rs_relpose_ros.nodes.inputs import message_class
 from rs_relpose_ros.offline.tables import POSES, rotation_sigmas, translation_sigmas
 
 
-@dataclass(frozen=True, slots=True)
-class LiveRun:
-    """Files of a live run: published poses, and stamps of the processed frames."""
+def run_live(bag: Path, parameters: Path, folder: Path) -> tuple[Path, Path]:
+    """Play `bag` to a new relpose_node; tables and logs into `folder`, which exists.
 
-    table: Path
-    stamps: Path
-
-
-def run_live(bag: Path, parameters: Path, folder: Path) -> LiveRun:
-    """Play `bag` to a new relpose_node; tables and logs into `folder`, which exists."""
+    Returns the tables of the published poses and of the stamps of the processed frames.
+    """
     remap, duration = _remap_and_duration(bag)
-    run = LiveRun(folder / 'live.csv', folder / 'live_stamps.txt')
+    table, stamps = folder / 'live.csv', folder / 'live_stamps.txt'
     with private_domain(), Graph() as graph, processes.node_process(
-            parameters, remap=remap, parameters={'stamps_file': run.stamps},
+            parameters, remap=remap, parameters={'stamps_file': stamps},
             log=folder / 'relpose_node.log') as node:
         recorder = Recorder(graph, node)
         with processes.player_process(bag, log=folder / 'player.log') as player:
             processes.wait_until(player.ended, 'the end of the player', node,
                                  timeout=2.0 * processes.PATIENCE + duration)
         # The node is done when it has processed no frame for a second.
-        processes.wait_until_quiet(lambda: run.stamps.stat().st_size, 1.0, node)
+        processes.wait_until_quiet(lambda: stamps.stat().st_size, 1.0, node)
         node.stop()
-        if not recorder.write(run.table):
+        if not recorder.write(table):
             raise processes.LiveRunError(f'the node published no pose:\n{node.output}')
-    return run
+    return table, stamps
 
 
 def _remap_and_duration(bag: Path) -> tuple[dict[str, str], float]:
@@ -116,19 +111,6 @@ _QUIET = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Play:
-    """A bag to be played to the node, and how."""
-
-    bag: Path
-    parameters: Path   # file of the node
-    # The node's topics `image`, `camera_info` and `imu` by their names in the bag.
-    remap: dict[str, str]
-    transport: str   # its `image_transport`
-    player: tuple[str, ...]   # options of the player
-    profile: Path | None   # of Fast DDS, for all processes
-
-
-@dataclass(frozen=True, slots=True)
 class ReceivedPose:
     """A relative pose, and its time of receipt on the monotonic clock."""
 
@@ -177,30 +159,33 @@ class _Listener:
         return received
 
 
-def measure(play: Play, folder: Path,
-            on_second: Callable[[], object] = lambda: None) -> MeasuredRun:
+def measure(bag: Path, parameters: Path, remap: dict[str, str], transport: str,
+            player_options: Sequence[str], profile: Path | None, folder: Path,
+            on_second: Callable[[], object]) -> MeasuredRun:
     """Play a bag to a new node and measure; logs and tables into `folder`, which exists.
 
+    `parameters`: file of the node, `remap`: its topics image, camera_info and imu by their names
+    in the bag, `transport`: its `image_transport`. `profile`: of Fast DDS, for all processes.
     `on_second`: called once a second while messages are played.
     """
     timings, log = folder / 'frames.csv', folder / 'player.npy'
     log.unlink(missing_ok=True)
     with private_domain():
-        if play.profile is not None:
-            os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(play.profile)
+        if profile is not None:
+            os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(profile)
         else:
             os.environ.pop('FASTRTPS_DEFAULT_PROFILES_FILE', None)
         with Graph() as graph:
             listener = _Listener(graph)
             started_ns = time.monotonic_ns()
             with processes.node_process(
-                    play.parameters, remap=play.remap, log=folder / 'relpose_node.log',
+                    parameters, remap=remap, log=folder / 'relpose_node.log',
                     parameters={'timings_file': timings,
-                                'image_transport': play.transport}) as node:
-                processes.wait_until(lambda: graph.node.count_subscribers(play.remap['imu']),
+                                'image_transport': transport}) as node:
+                processes.wait_until(lambda: graph.node.count_subscribers(remap['imu']),
                                      'a subscription of the node', node)
                 ready_ns = time.monotonic_ns()
-                with processes.player_process(play.bag, '--log', str(log), *play.player,
+                with processes.player_process(bag, '--log', str(log), *player_options,
                                               log=folder / 'player.log') as player:
                     metrics = _watch(node, player, listener, on_second)
                 processes.wait_until_quiet(lambda: len(listener.poses), _QUIET, node)
