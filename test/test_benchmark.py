@@ -299,7 +299,7 @@ def information_of(rotvec, rate1=(0.0, 0.0, 0.0), rate2=(0.0, 0.0, 0.0)):
     rates = [np.tile(rate, (120, 1)) for rate in (rate1, rate2)]
     return trust_rows.pair_information(trust_rows.TruePair(
         *pixels, R, t, 0.2, *rates, np.array(rate1), np.array(rate2), 0.2, 2e-4),
-        TRUE_CAMERA).quantities
+        TRUE_CAMERA)[0]
 
 
 def sigma_of(quantity, *motion):

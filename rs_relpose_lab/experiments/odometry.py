@@ -10,7 +10,6 @@ import math
 from pathlib import Path
 import tarfile
 import time
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,12 +58,6 @@ _GYRO_BIAS = (-0.0016, 0.0250, 0.0777)
 _CORNERS = 144
 
 
-class _Corners(NamedTuple):
-    stamp_ns: int
-    ids: NDArray[np.int64]   # (N,) increasing
-    pixels: Array   # (N, 2)
-
-
 def read_euroc(folder: Path) -> tuple[Recording, TrueTrajectory]:
     """The recording and its truth, the world being the target; MissingInputError without it."""
     try:
@@ -81,7 +74,8 @@ def read_euroc(folder: Path) -> tuple[Recording, TrueTrajectory]:
     except OSError as error:
         raise MissingInputError(f"there are no corners of EuRoC's in {folder}: {error}") from error
     frames = sorted((frame for frame in found if frame is not None),
-                    key=lambda frame: frame.stamp_ns)
+                    key=lambda frame: frame[0])
+    stamps_ns, ids, pixels = zip(*frames, strict=True)
     R = Rotation.from_quat(poses[:, [1, 2, 3, 0]])   # X_cam = R X_target + t
     truth = TrueTrajectory(stamps, -R.inv().apply(poses[:, 4:]), R.inv().as_quat())
     C = _BODY_FROM_CAMERA[:, :3].T
@@ -91,14 +85,13 @@ def read_euroc(folder: Path) -> tuple[Recording, TrueTrajectory]:
         'imu_position': tuple((-C @ _BODY_FROM_CAMERA[:, 3]).tolist())}, intrinsics_of(_CAMERA))
     zeros = np.zeros((_CORNERS, 2))
     sightings = trust_runs.Sightings(
-        tuple(frame.ids for frame in frames), tuple(frame.pixels for frame in frames),
-        tuple(np.zeros_like(frame.pixels) for frame in frames), np.zeros(len(frames)), zeros,
-        zeros, trust_runs.TrackNoise(white=0.0))
+        ids, pixels, tuple(map(np.zeros_like, pixels)), np.zeros(len(ids)), zeros, zeros,
+        trust_runs.TrackNoise(white=0.0))
     delay_ns, shape = to_nanoseconds(IMAGE_DELAY), (_CAMERA.height, _CAMERA.width)
     recording = Recording(
         Source(NAME, trust_runs.TRACKS), configured, _CAMERA,
-        [trust_runs.Arrival(k, frame.stamp_ns, frame.stamp_ns + delay_ns)
-         for k, frame in enumerate(frames)],
+        [trust_runs.Arrival(k, stamp_ns, stamp_ns + delay_ns)
+         for k, stamp_ns in enumerate(stamps_ns)],
         [ImuSample(int(ns), tuple(row[:3].tolist()), tuple(row[3:].tolist()))
          for ns, row in zip(imu_ns, imu, strict=True)],
         lambda number: trust_runs.numbered_image(number, shape), sightings,
@@ -106,15 +99,15 @@ def read_euroc(folder: Path) -> tuple[Recording, TrueTrajectory]:
     return recording, truth
 
 
-def _corners(text: str) -> _Corners | None:
-    """Stamp, corners by number and pixels of an image's file; None without corners."""
+def _corners(text: str) -> tuple[int, NDArray[np.int64], Array] | None:
+    """Stamp [ns], corners by number (N,) and pixels (N, 2) of an image; None without any."""
     lines = text.splitlines()[1:]
     if not lines:
         return None
     table = np.loadtxt(io.StringIO('\n'.join(lines)), delimiter=',', ndmin=2)
     ids = (4 * table[:, -2] + table[:, -1]).astype(np.int64)
     order = np.argsort(ids)
-    return _Corners(int(lines[0].partition(',')[0]), ids[order], table[order, 5:7])
+    return int(lines[0].partition(',')[0]), ids[order], table[order, 5:7]
 
 
 # -- paths against the truth ------------------------------------------------------------------

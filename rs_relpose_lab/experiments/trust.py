@@ -142,26 +142,20 @@ class BagRow:
     frame_ms: float   # median, frames with a pair
 
 
-class Task(NamedTuple):
-    """A bag to simulate, or the path of a recording, and its rows."""
-
-    bag: BagPlan | Path
-    rows: tuple[str, ...]
+# A bag to simulate, or the path of a recording, and its rows.
+Task = tuple[BagPlan | Path, Sequence[str]]
 
 
 def tasks(rows: Sequence[str], bags: int, seconds: float, first_seed: int, *, right: int = 0,
           rendered: int = 0, recordings: Sequence[Path] = ()) -> list[Task]:
     """Bags and recordings to measure; arguments as the options of the command."""
-    wrong = tuple(rows)
-    chosen = [Task(plan, wrong) for plan in plans(bags, seconds, first_seed)]
     # The same readouts, however many of them are rendered.
-    with_images = plans(max(bags, rendered), seconds, first_seed, images=True)
-    chosen += [Task(plan, wrong) for plan in with_images[:rendered]]
-    chosen += [Task(path, wrong) for path in recordings]
+    with_images = plans(max(bags, rendered), seconds, first_seed, images=True)[:rendered]
     # Seeds of their own.
-    chosen += [Task(plan, (RIGHT,))
-               for plan in plans(right, seconds, first_seed + 10_000, noises=(1.0, 0.5, 2.0))]
-    return chosen
+    for_alarms = plans(right, seconds, first_seed + 10_000, noises=(1.0, 0.5, 2.0))
+    with_rows: list[BagPlan | Path] = [*plans(bags, seconds, first_seed), *with_images,
+                                       *recordings]
+    return [*((bag, rows) for bag in with_rows), *((plan, (RIGHT,)) for plan in for_alarms)]
 
 
 def measure(task: Task) -> list[BagRow]:
@@ -169,12 +163,12 @@ def measure(task: Task) -> list[BagRow]:
 
     The run with the right configuration comes first: it determines the informative seconds.
     """
-    recording = (trust_runs.recording_at(task.bag) if isinstance(task.bag, Path)
-                 else recording_of(task.bag))
+    bag, rows = task
+    recording = trust_runs.recording_at(bag) if isinstance(bag, Path) else recording_of(bag)
     right = list(trust_runs.run(recording, recording.configured))
     motion = trust_runs.informative_motion(recording, [pair for pair, _ in right])
     found = []
-    for name in task.rows:
+    for name in rows:
         row = ROWS[name]
         # Twice the same stream: the configuration and its error agree.
         drawn = [recording.source.seed, _WRONG]

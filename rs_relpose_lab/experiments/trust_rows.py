@@ -287,15 +287,11 @@ class TruePair(NamedTuple):
     gyro_noise_density: float
 
 
-class PairInformation(NamedTuple):
-    """`quantities` (11, 11) about c; `rotation` (3, 3): its outer product, in sigmas."""
+def pair_information(pair: TruePair, camera: RollingShutterCamera) -> tuple[Array, Array]:
+    """Information (11, 11) of a pair about the quantities; outer product (3, 3) of its rotation.
 
-    quantities: Array
-    rotation: Array
-
-
-def pair_information(pair: TruePair, camera: RollingShutterCamera) -> PairInformation:
-    """Information of a pair about the quantities, and its rotation."""
+    The latter in sigmas.
+    """
     unknowns = _UNKNOWNS + _FREE
     residuals = _Residuals(pair, camera)(_STEP * np.eye(unknowns + 1, unknowns, -1))
     jacobian = (residuals[1:] - residuals[0]).T / _STEP
@@ -307,8 +303,8 @@ def pair_information(pair: TruePair, camera: RollingShutterCamera) -> PairInform
     rotation = Rotation.from_matrix(pair.R).as_rotvec()
     length = (math.sqrt(float(rotation @ information @ rotation))
               / max(float(np.linalg.norm(rotation)), 1e-9))
-    return PairInformation(by_c.T @ by_c - mixed.T @ np.linalg.solve(H, mixed),
-                           length**2 * np.outer(rotation, rotation))
+    return (by_c.T @ by_c - mixed.T @ np.linalg.solve(H, mixed),
+            length**2 * np.outer(rotation, rotation))
 
 
 class _Residuals:

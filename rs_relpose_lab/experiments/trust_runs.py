@@ -429,9 +429,9 @@ def informative_motion(recording: Recording,
         true = _true_pair(recording, pair)
         if true is not None:
             second = int(seconds_between(recording.arrivals[0].stamp_ns, pair.stamp_ns))
-            information = trust_rows.pair_information(true, recording.camera)
-            motion.quantities[second] += information.quantities
-            motion.rotations[second] += information.rotation
+            quantities, rotation = trust_rows.pair_information(true, recording.camera)
+            motion.quantities[second] += quantities
+            motion.rotations[second] += rotation
     return motion
 
 
