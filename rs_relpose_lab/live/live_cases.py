@@ -54,16 +54,6 @@ class Case(NamedTuple):
     jump_ns: int = 0   # of all stamps, halfway
 
 
-class Played(NamedTuple):
-    """Outcome of a case: first seconds of the words (NaN: never), and what was published."""
-
-    bag: Path
-    named: float
-    poses: list[PoseWithCovarianceStamped]
-    references: list[TimeReference]
-    last: str   # the node's last message
-
-
 def of(kind: Any, change: Callable[[Any, int, float], Any], delay: float = 0.0) -> Edit:
     """A message of a kind changed in place, or replaced; False: not sent."""
     def edit(message: Any, number: int, seconds: float) -> list[tuple[float, Any]]:
@@ -199,8 +189,13 @@ _CASES = (
 CASES = {case.name: case for case in _CASES}
 
 
-def play(case: Case, folder: Path) -> Played:
-    """Play a case to a node of its own; the bag is rendered once into `folder`."""
+def play(case: Case, folder: Path) -> tuple[
+        Path, float, list[PoseWithCovarianceStamped], list[TimeReference], str]:
+    """Play a case to a node of its own; the bag is rendered once into `folder`.
+
+    Returns the bag, the first seconds of the words (NaN: never), what was published, and the
+    node's last message.
+    """
     bag, file = render_once(SimulationConfig(
         duration=SECONDS, fps=FPS, width=480, height=360, fx=340.0, edge_samples=1, seed=24,
         plan=f'walk:{SECONDS:g}', readout_time=READOUT), folder)
@@ -231,7 +226,7 @@ def play(case: Case, folder: Path) -> Played:
                 if any(re.search(case.words, text) for text in texts):
                     named = due
     last = [status.message for item in diagnostics for status in item.status]
-    return Played(bag, named, poses, references, last[-1] if last else '')
+    return bag, named, poses, references, last[-1] if last else ''
 
 
 def _messages(bag: Path, case: Case) -> list[tuple[float, Any]]:
