@@ -118,7 +118,7 @@ def test_a_user_without_a_home_directory(monkeypatch, bag):
     node._settings.current = Parameters.from_mapping(KNOWN)
     SensorNode._use_calibration(node, Calibrated(CAMERA, TEXT, ''))
     assert 'ROS_HOME' in node._error.call_args.args[0]
-    assert node._adopt.call_args.args[0] == TEXT and node._begin.called
+    assert node.adopt.call_args.args[0] == TEXT and node._begin.called
 
 
 # -- without ROS ---------------------------------------------------------------------------------
