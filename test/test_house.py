@@ -29,7 +29,7 @@ BUDGETS = {
     'rs_relpose_ros/odometry': (3028, 11),
     'rs_relpose_ros/offline': (1838, 8),
     'rs_relpose_ros/pipeline': (3536, 12),
-    'rs_relpose_ros/solvers': (1181, 6),
+    'rs_relpose_ros/solvers': (1212, 6),
     'rs_relpose_ros/tracking': (1224, 5),
     'rs_relpose_lab': (9950, 49),
     'test': (18500, 49),

@@ -24,7 +24,7 @@ from rs_relpose_ros.geometry.so3 import (
     rotated,
     rotated_back,
 )
-from rs_relpose_ros.jit import kernel, KernelInterface, small_kernel
+from rs_relpose_ros.jit import inlined_kernel, kernel, KernelInterface, small_kernel
 from rs_relpose_ros.solvers.algebra import cholesky, lu_factor, lu_solve, newton_step, normalise
 
 
@@ -268,6 +268,34 @@ def write_nearest_vector(sample: Sample, factors: RowTimeFactors, R: Array, y: A
         normalise(y)
 
 
+@inlined_kernel
+def linearise(sample: Sample, factors: RowTimeFactors, axes: Array, R: Array, y: Array,
+              system: Array, right: Array) -> tuple[float, float]:
+    """Write the n + 1 equations of a Newton step (`polish`); ``|A(R) y|^2`` and ``|A(R)|^2``."""
+    n, k, m = sample.f1.shape[0], axes.shape[0], y.shape[0]
+    write_rows(sample, factors, R, system, k)
+    squares, size2 = 0.0, 0.0
+    for i in range(n):
+        # b = y_1 + p y_2 + q y_3, and d((f_1 x h) . b) = theta . (h x (b x f_1)), h = R f_2
+        b = (y[0], y[1], y[2])
+        if m > 3:
+            p, q = factors.p[i], factors.q[i]
+            b = (b[0] + p * y[3] + q * y[6], b[1] + p * y[4] + q * y[7],
+                 b[2] + p * y[5] + q * y[8])
+        by_theta = cross(rotated(R, sample.f2[i]), cross(b, sample.f1[i]))
+        for j in range(k):
+            system[i, j] = dot(axes[j], by_theta)
+        right[i] = 0.0
+        for j in range(m):
+            right[i] -= system[i, k + j] * y[j]
+            size2 += system[i, k + j] ** 2
+        squares += right[i] * right[i]
+    for j in range(n + 1):
+        system[n, j] = y[j - k] if j >= k else 0.0
+    right[n] = 0.0
+    return squares, size2
+
+
 @kernel
 def polish(sample: Sample, factors: RowTimeFactors, axes: Array, R: Array, y: Array,
            steps: int) -> bool:
@@ -276,37 +304,18 @@ def polish(sample: Sample, factors: RowTimeFactors, axes: Array, R: Array, y: Ar
     R moves about the `axes` (k, 3), n equations having n + 1 = m + k unknowns with ``|y| = 1``. A
     step that does not reduce the error is shortened.
     """
-    n, k, m = sample.f1.shape[0], axes.shape[0], y.shape[0]
+    n, k = sample.f1.shape[0], axes.shape[0]
     system, right, pivots = np.zeros((n + 1, n + 1)), np.empty(n + 1), np.empty(n + 1, np.int64)
-    step, turn, error = np.zeros(n + 1), np.empty(3), math.inf
+    step, turn, error, size2 = np.zeros(n + 1), np.empty(3), math.inf, 0.0
     R_new, y_new = R.copy(), y.copy()
     for _ in range(steps):
-        write_rows(sample, factors, R_new, system, k)
-        squares, size2 = 0.0, 0.0
-        for i in range(n):
-            # b = y_1 + p y_2 + q y_3, and d((f_1 x h) . b) = theta . (h x (b x f_1)), h = R f_2
-            b = (y_new[0], y_new[1], y_new[2])
-            if m > 3:
-                p, q = factors.p[i], factors.q[i]
-                b = (b[0] + p * y_new[3] + q * y_new[6], b[1] + p * y_new[4] + q * y_new[7],
-                     b[2] + p * y_new[5] + q * y_new[8])
-            by_theta = cross(rotated(R_new, sample.f2[i]), cross(b, sample.f1[i]))
-            for j in range(k):
-                system[i, j] = dot(axes[j], by_theta)
-            right[i] = 0.0
-            for j in range(m):
-                right[i] -= system[i, k + j] * y_new[j]
-                size2 += system[i, k + j] ** 2
-            squares += right[i] * right[i]
+        squares, size2 = linearise(sample, factors, axes, R_new, y_new, system, right)
         if squares < error:
             error = squares
             copy_matrix(R_new, R)
             copy_vector(y_new, y)
             if error < 1e-30 * size2:   # rounding
                 return True
-            for j in range(n + 1):
-                system[n, j] = y[j - k] if j >= k else 0.0
-            right[n] = 0.0
             lu_factor(system, pivots)
             lu_solve(system, pivots, right)
             copy_vector(right, step)
@@ -323,7 +332,7 @@ def polish(sample: Sample, factors: RowTimeFactors, axes: Array, R: Array, y: Ar
             step *= 0.2 / length
             turn *= 0.2 / length
         multiply(exp_so3(turn), R, R_new)
-        for j in range(m):
+        for j in range(len(y)):
             y_new[j] = y[j] + step[k + j]
         normalise(y_new)
     return error < 1e-24 * size2

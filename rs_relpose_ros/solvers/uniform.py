@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rs_relpose_ros.geometry import so3
+from rs_relpose_ros.geometry import Array, so3
 from rs_relpose_ros.jit import kernel
 from rs_relpose_ros.solvers import algebra, common
 from rs_relpose_ros.solvers.angular import MAX_5PT, solve_5pt
@@ -79,11 +79,37 @@ MAX_11PT = MAX_5PT   # one per start
 
 
 @kernel
+def _reach_rank_8(sample: Sample, factors: common.RowTimeFactors, R: Array, y: Array) -> bool:
+    """Move `R` (3, 3) in place to a rotation with rank 8 of A(R) and null vector `y` (9,).
+
+    Levenberg-Marquardt on the smallest singular value, whose vector y is a function of R (variable
+    projection); then Newton's method.
+    """
+    axes, R_new, error, damping = np.eye(3), R.copy(), np.inf, 0.1
+    system, right, factor = np.zeros((12, 12)), np.empty(12), np.zeros((12, 12))
+    hessian, gradient, damped = np.zeros((12, 12)), np.zeros(12), np.eye(12)
+    damped[3:] *= 1e-9   # of y only what Cholesky's method needs
+    for _ in range(30):
+        common.write_nearest_vector(sample, factors, R_new, y)
+        squares, size2 = common.linearise(sample, factors, axes, R_new, y, system, right)
+        damping *= 0.1 if squares < error else 10.0
+        if squares < error:
+            error = squares
+            so3.copy_matrix(R_new, R)
+            if error < 1e-20 * size2:
+                return common.polish(sample, factors, axes, R, y, 8)
+            hessian, gradient = system.T @ system, -(system.T @ right)
+        algebra.cholesky(hessian + damping * damped, factor)
+        so3.multiply(so3.exp_so3(algebra.newton_step(factor, gradient)[:3]), R, R_new)
+    return False
+
+
+@kernel
 def solve_uniform_11pt(sample: Sample, known: Knowledge, out: Solutions) -> int:
     """A rotation at which the 11x9 matrix A(R) has rank 8; its null vector is (t, d_1, d_2).
 
-    Newton's method from the known rotation, or from the rotations of the angular 5-point solver on
-    the first five matches (section 'Uniform 11-point algorithm'; the paper's three 9x9
+    Iterative, from the known rotation, or from the rotations of the angular 5-point solver on the
+    first five matches (section 'Uniform 11-point algorithm'; the paper's three 9x9
     determinants are badly scaled). It does not find all solutions: at low velocities they are 0.1
     to 0.3 degrees apart, and a start converges to any of them.
 
@@ -98,16 +124,12 @@ def solve_uniform_11pt(sample: Sample, known: Knowledge, out: Solutions) -> int:
     if not known.predicted:
         starts = solve_5pt(Sample(sample.f1[:5], sample.f2[:5], sample.tau1[:5], sample.tau2[:5]),
                            known, start)
-    y, axes = np.empty(9), np.eye(3)
+    y = np.empty(9)
     count = 0
     for k in range(starts):
         R = out.R[count]
         so3.copy_matrix(start.R[k], R)
-        for _ in range(8):   # from the nearest vector again if Newton's method is stuck
-            common.write_nearest_vector(sample, factors, R, y)
-            if common.polish(sample, factors, axes, R, y, 8):
-                if not common.is_known(R, out.R[:count]) \
-                        and common.write_solution(sample, factors, R, y, out.x[count]):
-                    count += 1
-                break
+        if _reach_rank_8(sample, factors, R, y) and not common.is_known(R, out.R[:count]) \
+                and common.write_solution(sample, factors, R, y, out.x[count]):
+            count += 1
     return count
