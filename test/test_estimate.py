@@ -220,6 +220,28 @@ def test_equal_state_gives_equal_bits_another_seed_or_solver_nearly_the_same():
         assert rotation_error(a.R, other.R) < 0.02, solver
 
 
+@pytest.mark.parametrize(('solver', 'noise', 'motion', 'limits'), [
+    ('angular_5pt', 0.5, {'speed': 0.0, 'outliers': 0.3}, (0.1, 1.0, 0.0)),
+    ('uniform_9pt', 0.01, {'speed': 10.0}, (0.004, 0.1, 0.2)),
+    ('uniform_9pt', 0.01, {'speed': 10.0, 'direction': 'sideways'}, (0.004, 0.1, 0.2)),
+], ids=str)
+def test_alternating_refinement(solver, noise, motion, limits):
+    """R, t [deg], v1: medians over 8 scenes; two thirds of those of the best hypothesis."""
+    config = replace(CONFIG, solver=solver, pixel_sigma=noise)
+    medians = []
+    for refinement in ('none', 'alternating'):
+        errors = []
+        for seed in range(8):
+            scene = make_scene(seed, **NO_NOISE | {'outliers': 0.0, 'pixel_noise': noise} | motion)
+            pose = estimate(scene, replace(config, refinement=refinement))
+            errors.append((rotation_error(pose.R, scene.R), direction_error(pose.t, scene.t),
+                           np.linalg.norm(pose.linear_velocity1 - scene.v1)))
+        medians.append(np.median(errors, axis=0))
+    hypothesis, refined = medians
+    assert (refined <= 0.67 * hypothesis).all()
+    assert (refined <= limits).all()
+
+
 def test_pure_rotation_has_a_rotation_and_no_translation():
     for rate in (0.0, 1.0):
         scene = make_scene(9, pure_rotation=True, rate=rate)

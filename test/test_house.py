@@ -21,7 +21,7 @@ BUDGETS = {
     'rs_relpose_ros/calibrate': (2835, 8),
     'rs_relpose_ros/cli': (1485, 6),
     'rs_relpose_ros/config': (808, 3),
-    'rs_relpose_ros/estimator': (3845, 12),
+    'rs_relpose_ros/estimator': (3851, 12),
     'rs_relpose_ros/geometry': (1268, 6),
     'rs_relpose_ros/imu': (1195, 4),
     'rs_relpose_ros/messages': (1442, 5),

@@ -316,8 +316,8 @@ class Estimation:
                                               config.threshold, scales, self._gyro_error())
         inliers = sampson.select_inliers(matches, state, config.threshold)
         if config.refinement == 'alternating' and inliers.sum() >= 12:
-            state = self._in_front(fit.refine_alternating(
-                matches.observations, inliers, state, config.pixel_sigma, free))
+            used = fit.FitMatches(matches.observations, inliers.astype(float), config.pixel_sigma)
+            state = self._in_front(fit.refine_alternating(used, state, free))
             inliers = sampson.select_inliers(matches, state, config.threshold)
         used = fit.FitMatches(matches.observations, inliers.astype(float), config.pixel_sigma)
         log_scale = self.priors.velocity.log_scale

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from rs_relpose_ros.estimator import priors, sampson
 from rs_relpose_ros.estimator.priors import PARAMETERS, Priors, SCALE, TwoViewState
@@ -126,50 +125,57 @@ def gauss_newton(matches: FitMatches, start: TwoViewState, prior: Priors,
 # -- Refinement of the paper (its section 'Refinement'), as a selectable mode ---------------------
 #
 # Alternates between the rotation and ``(t, d_1, d_2)``: minimises the squared Sampson errors plus
-# ``l_t (|t| - 1)^2 + l_d (|d_1|^2 + |d_2|^2)``.
+# ``l_t (|t| - 1)^2 + l_d (|d_1|^2 + |d_2|^2)``. Errors do not depend on the common scale of
+# ``(t, d_1, d_2)``: here ``|t| = 1``, the limit of a large l_t.
 
-# The paper gives no values; residuals here are in units of the pixel noise.
-TRANSLATION_WEIGHT = 1e3
+# l_d, with residuals in units of the pixel noise; the paper gives no value.
 VELOCITY_WEIGHT = 1e-2
 ALTERNATIONS = 10
 
 
-def refine_alternating(observations: Array, inliers: NDArray[np.bool_], start: TwoViewState,
-                       pixel_sigma: float, velocities: bool = True) -> TwoViewState:
-    """Refine a state on its inliers by alternation; gyro corrections stay unchanged.
-
-    `observations` (N, 20), `pixel_sigma` [px]: noise of a match. Without `velocities`,
-    ``d_1 = d_2 = 0`` (angular and global models).
-    """
-    from scipy.optimize import least_squares  # a tenth of the imports of a node
-
-    used = np.ascontiguousarray(observations[inliers])
-    state, cost = start, np.inf
-
-    def rotated(theta: Array) -> TwoViewState:
-        return state._replace(R=np.ascontiguousarray(
-            Rotation.from_rotvec(theta).as_matrix() @ state.R))
-
-    def placed(x: Array) -> TwoViewState:
-        d = x[3:] if velocities else np.zeros(6)
-        return state._replace(t=x[:3].copy(), d1=d[:3].copy(), d2=d[3:].copy())
-
-    def errors(x: Array) -> Array:
-        return np.concatenate([
-            sampson.residuals(used, placed(x)) / pixel_sigma,
-            [np.sqrt(TRANSLATION_WEIGHT) * (np.linalg.norm(x[:3]) - 1.0)],
-            np.sqrt(VELOCITY_WEIGHT) * x[3:]])
-
+@kernel
+def refine_alternating(matches: FitMatches, start: TwoViewState,
+                       velocities: bool) -> TwoViewState:
+    """Refine a state by alternation; gyro corrections, and d without `velocities`, are kept."""
+    state, cost = start, math.inf
     for _ in range(ALTERNATIONS):
-        state = rotated(least_squares(
-            lambda theta: sampson.residuals(used, rotated(theta)) / pixel_sigma, np.zeros(3),
-            method='lm').x)
-        found = least_squares(errors, np.concatenate([state.t, state.d1, state.d2]), method='lm')
-        state, previous, cost = placed(found.x), cost, float(found.cost)
+        previous = cost
+        state, _ = _refine_part(matches, state, 0, priors.TANGENT)
+        end = priors.DW1 if velocities else priors.D1
+        state, cost = _refine_part(matches, state, priors.TANGENT, end)
         if previous - cost < 1e-6 * cost:
             break
-    scale = float(np.linalg.norm(state.t))
-    return state._replace(t=state.t / scale, d1=state.d1 / scale, d2=state.d2 / scale)
+    return state
+
+
+@kernel
+def _refine_part(matches: FitMatches, state: TwoViewState, first: int,
+                 end: int) -> tuple[TwoViewState, float]:
+    """Levenberg-Marquardt over the unknowns from `first` to before `end`; also the cost."""
+    hessian, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
+    factor, step = np.zeros((end - first, end - first)), np.zeros(PARAMETERS)
+    candidate, cost, damping = state, math.inf, FIRST_DAMPING
+    for _ in range(60):
+        data = linearised(matches, candidate)
+        d = np.concatenate((candidate.d1, candidate.d2))
+        total = data.cost + VELOCITY_WEIGHT * (d * d).sum()
+        damping *= 0.1 if total <= cost else 10.0
+        if total <= cost:
+            gain, state, cost = cost - total, candidate, total
+            if gain <= 1e-8 * cost:
+                break
+            hessian, gradient = data.hessian, data.gradient
+            gradient[priors.D1:priors.DW1] += VELOCITY_WEIGHT * d
+            for i in range(priors.D1, priors.DW1):
+                hessian[i, i] += VELOCITY_WEIGHT
+        damped = hessian[first:end, first:end].copy()
+        for i in range(end - first):
+            damped[i, i] += damping * damped[i, i] + 1e-12
+        if not cholesky(damped, factor):
+            break
+        step[first:end] = newton_step(factor, gradient[first:end])
+        candidate = priors.moved(state, step)
+    return state, cost
 
 
 # -- Rotation alone: a robust fit with the gyro's prior -------------------------------------------
