@@ -25,7 +25,7 @@ BUDGETS = {
     'rs_relpose_ros/geometry': (1268, 6),
     'rs_relpose_ros/imu': (1195, 4),
     'rs_relpose_ros/messages': (1442, 5),
-    'rs_relpose_ros/nodes': (2262, 9),
+    'rs_relpose_ros/nodes': (2264, 9),
     'rs_relpose_ros/odometry': (3028, 11),
     'rs_relpose_ros/offline': (1838, 8),
     'rs_relpose_ros/pipeline': (3536, 12),

@@ -6,6 +6,7 @@ from dataclasses import replace
 import itertools
 from pathlib import Path
 import re
+import threading
 from typing import Any
 
 from conftest import Clock, ROOT
@@ -15,11 +16,13 @@ import rclpy
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.task import Task
 
 from rs_relpose_ros.config.settings import Declared, Parameters
 from rs_relpose_ros.estimator.result import RelativePose, Status
 from rs_relpose_ros.nodes import diagnostics
 from rs_relpose_ros.nodes.diagnostics import ERROR, OK, Silence, Statistics, WARN
+from rs_relpose_ros.nodes.inputs import KeptWaitSet
 from rs_relpose_ros.nodes.parameters import NodeParameters
 from rs_relpose_ros.pipeline.findings import Assessment, Finding, FindingState
 from rs_relpose_ros.pipeline.monitor import Applied, Tracked
@@ -350,6 +353,31 @@ def node(module_ros_domain_id: int) -> Iterator[Node]:
     yield node
     node.destroy_node()
     context.try_shutdown()
+
+
+def test_a_task_that_nothing_announces_is_run(node):
+    """Its guard was read while rclpy looked for other work: a node would not end."""
+    executor, done = KeptWaitSet(context=node.context), threading.Event()
+    executor.add_node(node)
+
+    def add() -> None:
+        timer.cancel()
+        executor._tasks.append((Task(done.set, executor=executor), None, None))
+
+    def spin() -> None:
+        while not done.is_set():
+            executor.spin_once()
+
+    timer, thread = node.create_timer(0.01, add), threading.Thread(target=spin)
+    thread.start()
+    try:
+        assert done.wait(20.0)
+    finally:
+        executor.create_task(done.set)
+        thread.join()
+        executor.release()
+        executor.remove_node(node)
+        node.destroy_timer(timer)
 
 
 CHANGES: list[Parameters] = []

@@ -51,8 +51,8 @@ class KeptWaitSet(SingleThreadedExecutor):
     executor.
     """
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
         self._in_use = ExitStack()   # handles that must not be destroyed
         self._wait_set: Any = None
         self._events_at = 0.0
@@ -76,10 +76,12 @@ class KeptWaitSet(SingleThreadedExecutor):
         for event in events:
             self._events_at = now
             event.add_to_wait_set(wait_set)
-        wait_set.wait(-1)
+        # rclpy has read the guard of a task that came while it looked for other work.
+        waiting = any(not task.done() for task, _, _ in self._tasks)
+        wait_set.wait(0 if waiting else -1)
         if not self.context.ok():
             raise ExternalShutdownException
-        if (wait_set.get_ready_entities('guard_condition')
+        if (waiting or wait_set.get_ready_entities('guard_condition')
                 or wait_set.get_ready_entities('service')
                 or any(event.is_ready(wait_set) for event in events)):
             self.release()
