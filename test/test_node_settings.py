@@ -281,7 +281,7 @@ def test_a_late_node_gets_a_latched_camera_info_and_says_why_no_image_comes(
             assert node.output.count(f'no image on {BAG_TOPICS["image"]} for 5 s; ') == 1
             assert 'incompatible' not in node.output
             # Stamped by the clock of the graph, at steady times.
-            assert stamp_of(diagnostics[-1]) == 100 * faults.SECOND
+            wait_until(lambda: stamp_of(diagnostics[-1]) == 100 * faults.SECOND, 'time', node)
 
 
 def test_a_wrong_parameter_is_detected_and_poses_are_withheld(ros_domain_id, bundled_bag):
