@@ -324,11 +324,12 @@ def test_truth_is_not_interpolated_across_a_hole():
 
 
 @pytest.mark.parametrize('count, quat', [(3, (0, 0, 0, 1)), (9, (0, 0, 0, 0)),
-                                         (9, (0, 0, 0, np.nan))])
+                                         (9, (0, 0, 0, np.nan)), (9, (0, 0, 0, 1e200))])
 def test_unusable_truth_is_refused(count, quat):
     with pytest.raises(InputError):
         TrueTrajectory(START_NS + np.arange(count), np.zeros((count, 3)),
                        np.tile(np.array(quat, dtype=float), (count, 1)))
+
 
 
 # -- parameter files -------------------------------------------------------------------------

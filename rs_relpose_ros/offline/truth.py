@@ -43,7 +43,7 @@ class TrueTrajectory:
         if len(order) < _MIN_POSES:
             raise InputError(f'the ground truth has {len(order)} poses of distinct stamps; at '
                              f'least {_MIN_POSES} are needed')
-        norms = np.linalg.norm(quats, axis=1)
+        norms = np.linalg.norm(quats.clip(-2.0, 2.0), axis=1)   # squares of damaged ones overflow
         if not (np.isfinite(positions).all() and np.isfinite(quats).all()
                 and (np.abs(norms - 1.0) < 1e-2).all()):
             raise InputError('the ground truth has a pose that is not finite, or whose quaternion '
