@@ -331,7 +331,6 @@ def test_unusable_truth_is_refused(count, quat):
                        np.tile(np.array(quat, dtype=float), (count, 1)))
 
 
-
 # -- parameter files -------------------------------------------------------------------------
 
 def test_parameter_file_and_assignments(tmp_path):
