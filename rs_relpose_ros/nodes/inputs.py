@@ -76,7 +76,7 @@ class KeptWaitSet(SingleThreadedExecutor):
         for event in events:
             self._events_at = now
             event.add_to_wait_set(wait_set)
-        # rclpy has read the guard of a task that came while it looked for other work.
+        # Tasks whose guard rclpy has read while it looked for other work: nothing else wakes it.
         waiting = any(not task.done() for task, _, _ in self._tasks)
         wait_set.wait(0 if waiting else -1)
         if not self.context.ok():
